@@ -1,0 +1,5 @@
+"""The learners of bidex-meta, one file each, and the small pieces they share.
+
+Nothing is imported here: a learner is loaded by its full name (``bidex_algos.mtppo:MTPPO``), so that listing learners
+costs no import of torch.
+"""

@@ -1,0 +1,9 @@
+"""The words that a learner's config may use; imports no torch."""
+
+from typing import Literal
+
+Activation = Literal["elu", "relu", "tanh"]
+"""Non-linearity of hidden layers."""
+
+Autocast = Literal["auto", "on", "off"]
+"""Whether hidden layers run in bfloat16; see :mod:`bidex_algos.precision`."""

@@ -1,0 +1,58 @@
+"""Multi-task and meta reinforcement learning for two dexterous hands on MuJoCo.
+
+    from bidex_meta import Benchmark
+    world = Benchmark("MT4", seed=0).make_world("train", num_envs=1024)
+
+Importing registers the Gymnasium ids (`bidex-meta/MT4-v1`, ...); torch and MuJoCo are loaded
+when a name first needs them.
+"""
+
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
+
+from bidex_meta.errors import BidexError
+from bidex_meta.registration import register_ids
+from bidex_meta.suite import Suite, load_suite, suite_names
+
+if TYPE_CHECKING:
+    from bidex_meta.benchmark import Benchmark, Task, make_task_world
+    from bidex_meta.world import World
+
+__all__ = [
+    "Benchmark",
+    "BidexError",
+    "Suite",
+    "Task",
+    "World",
+    "__version__",
+    "load_suite",
+    "make_task_world",
+    "suite_names",
+]
+
+_LAZY = {
+    "Benchmark": "bidex_meta.benchmark",
+    "Task": "bidex_meta.benchmark",
+    "World": "bidex_meta.world",
+    "make_task_world": "bidex_meta.benchmark",
+}
+
+try:
+    __version__ = version("bidex-meta")
+except PackageNotFoundError:  # run from a checkout that was never installed
+    __version__ = "0.0.0"
+
+register_ids()
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(_LAZY[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

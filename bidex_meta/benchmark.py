@@ -1,0 +1,337 @@
+"""`Benchmark("ML20")`: a suite file and a seed become task classes, tasks and worlds.
+
+The four properties and `Task` are Meta-World's, so that code written against it finds what it looks for. No task and no
+physics is made here: this module decides which numbers belong to which task and what a world is asked for.
+"""
+
+import hashlib
+import operator
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, NamedTuple, cast
+
+import numpy as np
+
+from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.suite import SPLITS, ListedTask, Split, Suite, SuiteClass, load_suite
+from bidex_meta.tasks import registry
+
+if TYPE_CHECKING:
+    import torch
+    from gymnasium.vector import AutoresetMode
+
+    from bidex_meta.tasks.base import TaskClass
+    from bidex_meta.tasks.variation import VariationSpace
+    from bidex_meta.world import Slot, World
+
+TaskSampling = Literal["uniform", "fixed"]
+
+_NUMBERS = np.dtype("<f8")
+_TASKS_ALONE = 50
+_DEFAULT_ROWS = {"cpu": 1024, "accelerator": 8192}
+
+
+class Task(NamedTuple):
+    """One task class with one variation. `data` holds plain numbers: nothing is run to read it."""
+
+    env_name: str
+    """Name of the task class, a key of `train_classes` or `test_classes`."""
+    data: bytes
+    """The variation as little-endian float64 numbers, in the order of the class's `variation_space.names`."""
+
+    @classmethod
+    def from_variation(cls, env_name: str, variation: np.ndarray) -> "Task":
+        """The task of a class with this variation, shape (size,)."""
+        return cls(env_name, np.asarray(variation, dtype=_NUMBERS).tobytes())
+
+    @property
+    def variation(self) -> np.ndarray:
+        """The numbers of `data`: shape (size,), float64, a copy."""
+        return np.frombuffer(self.data, dtype=_NUMBERS).astype(np.float64)
+
+
+class Benchmark:
+    """A suite with its task classes, its tasks and the worlds made of them.
+
+    The same name and seed give the same tasks in every process; no global random generator is read or written.
+
+    Args:
+        name_or_path: A shipped suite (`bidex_meta.suite_names()`), or the path of a suite file of your own.
+        seed: Chooses the tasks; also the default seed of the worlds. A whole number from 0 on.
+
+    Raises:
+        BidexError: Unknown suite, faulty suite file, or a seed that is none.
+
+    Example:
+        >>> from bidex_meta import Benchmark
+        >>> ml4 = Benchmark("ML4", seed=0)
+        >>> list(ml4.test_classes), len(ml4.train_tasks)
+        (['TwoCatchUnderarm'], 150)
+    """
+
+    def __init__(self, name_or_path: str | Path, *, seed: int = 0) -> None:
+        self.suite: Suite = load_suite(name_or_path)
+        self.seed = _checked_seed(seed)
+        self._classes = {entry.name: _task_class(self.suite, entry) for entry in self.suite.classes}
+        self._tasks = {
+            split: [task for entry in self.suite.split_classes(split) for task in self._draw(entry, split)]
+            for split in SPLITS
+        }
+        overlap = set(self._tasks["train"]) & set(self._tasks["test"])
+        if overlap:
+            raise BidexError(f"{self.suite.file}: expected no task in both splits, got {len(overlap)} in both.")
+        actions = {name: task_class.action_size for name, task_class in self._classes.items()}
+        if len(set(actions.values())) > 1:
+            raise BidexError(
+                f"{self.suite.file}: base: expected classes with one number of actions, got {actions}. "
+                'Write base = "moving".'
+            )
+
+    def __repr__(self) -> str:
+        return f"Benchmark({self.name!r}, seed={self.seed})"
+
+    @property
+    def name(self) -> str:
+        """The suite's name."""
+        return self.suite.name
+
+    @property
+    def train_classes(self) -> "dict[str, TaskClass]":
+        """Task classes of the train split by name, in the order of the suite file."""
+        return self._split_classes("train")
+
+    @property
+    def test_classes(self) -> "dict[str, TaskClass]":
+        """Task classes of the test split by name; empty in a multi-task suite."""
+        return self._split_classes("test")
+
+    @property
+    def train_tasks(self) -> list[Task]:
+        """Tasks of the train split, class after class."""
+        return list(self._tasks["train"])
+
+    @property
+    def test_tasks(self) -> list[Task]:
+        """Tasks of the test split, class after class; empty in a multi-task suite."""
+        return list(self._tasks["test"])
+
+    @property
+    def padded_size(self) -> int:
+        """Width to which every observation is padded, before a one-hot: the widest class of the suite, both splits."""
+        return max(task_class.observation_size for task_class in self._classes.values())
+
+    def make_world(
+        self,
+        split: str = "train",
+        num_envs: int | None = None,
+        device: "str | torch.device" = "auto",
+        seed: int | None = None,
+        autoreset_mode: "AutoresetMode | str | None" = None,
+        threads: int | None = None,
+    ) -> "World":
+        """A batched world of one split.
+
+        In a training world (SAME_STEP) of a multi-task suite every episode draws one of its class's tasks; in a meta
+        suite, and in every evaluation world (DISABLED), row j of a class keeps task j modulo their number.
+
+        Args:
+            split: `"train"` or `"test"`.
+            num_envs: Rows over all classes, divided evenly; left out, 1024 on the CPU and 8192 on an accelerator.
+            device: `"auto"` (CUDA where there is one), `"cpu"`, `"cuda"`, ... or a `torch.device`.
+            seed: Seed of starts and task draws; left out, the benchmark's.
+            autoreset_mode: SAME_STEP (the default, for training) or DISABLED (for evaluation); also as text.
+            threads: Engine threads on the CPU; left out, one per core. Results do not depend on it.
+
+        Raises:
+            BidexError: A split without classes, too few rows, an unknown mode or device.
+        """
+        slots = self._slots(self._checked_split(split))
+        evaluation = _checked_mode(autoreset_mode).name == "DISABLED"
+        return _make_world(
+            slots,
+            num_envs,
+            device,
+            self.seed if seed is None else seed,
+            autoreset_mode,
+            threads,
+            observation=self.suite.observation,
+            pad_to=self.padded_size,
+            task_sampling="fixed" if evaluation or self.suite.kind == "meta" else "uniform",
+        )
+
+    def _draw(self, entry: SuiteClass, split: Split) -> list[Task]:
+        space = self._classes[entry.name].variation_space
+        if entry.tasks:
+            listed = [task for task in entry.tasks if task.split == split]
+            return [Task.from_variation(entry.name, _listed(space, self.seed, entry.name, task)) for task in listed]
+        return _drawn(space, self.seed, entry.name, split, self.suite.tasks_per_class or 0)
+
+    def _split_classes(self, split: Split) -> "dict[str, TaskClass]":
+        return {entry.name: self._classes[entry.name] for entry in self.suite.split_classes(split)}
+
+    def _checked_split(self, split: str) -> Split:
+        if split not in self.suite.splits:
+            raise BidexError(
+                f"{self.name} has the splits {', '.join(self.suite.splits)}, got {split!r}. Name one of these."
+            )
+        return cast(Split, split)
+
+    def _slots(self, split: Split) -> "list[Slot]":
+        from bidex_meta.world import Slot
+
+        slots = []
+        for entry in self.suite.split_classes(split):
+            task_class = self._classes[entry.name]
+            variations = [task.variation for task in self._tasks[split] if task.env_name == entry.name]
+            if self.suite.task_id == "class":
+                slots.append(Slot(entry.name, task_class, np.stack(variations), entry.reward_scale))
+                continue
+            names = [f"{entry.name}/{task.name}" for task in entry.tasks if task.split == split]
+            for name, variation in zip(names, variations, strict=True):
+                slots.append(Slot(name, task_class, variation[None], entry.reward_scale))
+        return slots
+
+
+def make_task_world(
+    task_name: str,
+    num_envs: int | None = None,
+    device: "str | torch.device" = "auto",
+    seed: int = 0,
+    autoreset_mode: "AutoresetMode | str | None" = None,
+    threads: int | None = None,
+    task_sampling: TaskSampling | None = None,
+    moving_base: bool | None = None,
+) -> "World":
+    """A world of one class as it is on its own: goal visible, no one-hot, no padding, 50 tasks drawn by the seed.
+
+    Args:
+        task_name: A task class, e.g. `"HandOver"` (which alone has a fixed base: 398 observations, 40 actions).
+        num_envs: Rows; left out, 1024 on the CPU and 8192 on an accelerator.
+        device: As in `Benchmark.make_world`.
+        seed: Chooses the tasks, the starts and the task draws.
+        autoreset_mode: As in `Benchmark.make_world`.
+        threads: As in `Benchmark.make_world`.
+        task_sampling: `"uniform"`: each episode draws a task; `"fixed"`: row j keeps task j modulo 50. Left out:
+            uniform in training worlds, fixed in evaluation worlds.
+        moving_base: Drive the hands' bases or fix them; left out, as the class has it on its own.
+
+    Raises:
+        BidexError: Unknown class, too few rows, an unknown mode or device.
+    """
+    from bidex_meta.world import Slot
+
+    task_class = registry.get(task_name, moving_base)
+    tasks = _drawn(task_class.variation_space, _checked_seed(seed), task_name, "train", _TASKS_ALONE)
+    slot = Slot(task_name, task_class, np.stack([task.variation for task in tasks]))
+    if task_sampling is None:
+        task_sampling = "fixed" if _checked_mode(autoreset_mode).name == "DISABLED" else "uniform"
+    return _make_world(
+        [slot],
+        num_envs,
+        device,
+        seed,
+        autoreset_mode,
+        threads,
+        observation="plain",
+        pad_to=None,
+        task_sampling=task_sampling,
+    )
+
+
+def _make_world(
+    slots: "list[Slot]",
+    num_envs: int | None,
+    device: "str | torch.device",
+    seed: int,
+    autoreset_mode: "AutoresetMode | str | None",
+    threads: int | None,
+    *,
+    observation: Literal["plain", "one-hot", "masked"],
+    pad_to: int | None,
+    task_sampling: TaskSampling,
+) -> "World":
+    from bidex_meta.world import World
+
+    place = _checked_device(device)
+    if num_envs is None:
+        num_envs = _DEFAULT_ROWS["cpu" if place.type == "cpu" else "accelerator"]
+    if not isinstance(num_envs, int | np.integer) or isinstance(num_envs, bool) or num_envs < len(slots):
+        names = ", ".join(slot.name for slot in slots)
+        raise BidexError(f"num_envs: expected at least {len(slots)}, a row each for {names}; got {num_envs!r}.")
+    return World(
+        slots,
+        int(num_envs),
+        device=place,
+        seed=_checked_seed(seed),
+        autoreset_mode=_checked_mode(autoreset_mode),
+        observation=observation,
+        pad_to=pad_to,
+        task_sampling=task_sampling,
+        threads=threads,
+    )
+
+
+def _task_class(suite: Suite, entry: SuiteClass) -> "TaskClass":
+    try:
+        task_class = registry.get(entry.name, moving_base=True if suite.base == "moving" else None)
+        for task in entry.tasks:
+            for component in task.fixed:
+                if component not in task_class.variation_space.names:
+                    raise unknown_name(f"component of {entry.name}", component, task_class.variation_space.names)
+    except BidexError as error:
+        raise BidexError(f"{suite.file}: classes: {error}") from error
+    return task_class
+
+
+def _generator(*key: object) -> np.random.Generator:
+    # sha256 rather than hash(): the latter differs from process to process.
+    digest = hashlib.sha256("\x1f".join(map(str, ("bidex-meta task", *key))).encode()).digest()
+    return np.random.Generator(np.random.Philox(np.random.SeedSequence(int.from_bytes(digest, "little"))))
+
+
+def _drawn(space: "VariationSpace", seed: int, name: str, split: Split, count: int) -> list[Task]:
+    variations = space.sample(_generator(seed, name, split), count)
+    return [Task.from_variation(name, variation) for variation in variations]
+
+
+def _listed(space: "VariationSpace", seed: int, name: str, task: ListedTask) -> np.ndarray:
+    variation = space.sample(_generator(seed, name, "listed", task.name), 1)[0]
+    for component, value in task.fixed.items():
+        variation[space.names.index(component)] = value
+    return variation
+
+
+def _checked_seed(seed: object) -> int:
+    try:
+        number = operator.index(seed)  # type: ignore[arg-type]
+    except TypeError:
+        number = -1
+    if number < 0 or isinstance(seed, bool):
+        raise BidexError(f"seed: expected a whole number from 0 on, got {seed!r}.")
+    return number
+
+
+def _checked_mode(mode: "AutoresetMode | str | None") -> "AutoresetMode":
+    from gymnasium.vector import AutoresetMode
+
+    if mode is None:
+        return AutoresetMode.SAME_STEP
+    modes = {"SAME_STEP": AutoresetMode.SAME_STEP, "DISABLED": AutoresetMode.DISABLED}
+    name = mode.name if isinstance(mode, AutoresetMode) else str(mode)
+    for known, value in modes.items():
+        if name.upper().replace("-", "").replace("_", "") == known.replace("_", ""):
+            return value
+    raise unknown_name("autoreset_mode", name, modes)
+
+
+def _checked_device(device: "str | torch.device") -> "torch.device":
+    import torch
+
+    if device == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        place = torch.device(device)
+    except (RuntimeError, TypeError) as error:
+        raise BidexError(f"device: expected auto, cpu, cuda or cuda:N, got {device!r}.") from error
+    if place.type == "cuda" and not torch.cuda.is_available():
+        raise BidexError(f"device: expected one that is here, got {device!r} without a CUDA device. Use cpu or auto.")
+    return place

@@ -1,0 +1,1 @@
+"""Adapters for outsiders: each turns the world into what one other library expects."""

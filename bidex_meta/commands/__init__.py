@@ -1,0 +1,23 @@
+"""The subcommands of ``bidex-meta``, one module each with a function ``main(arguments)``.
+
+This table is all that ``bidex-meta --help`` needs; the modules are imported when they are called.
+"""
+
+from typing import NamedTuple
+
+
+class Command(NamedTuple):
+    """Where a subcommand lives and what it does."""
+
+    module: str
+    summary: str
+
+
+COMMANDS: dict[str, Command] = {
+    "run": Command("bidex_meta.commands.run", "train a learner on a suite or a task, then evaluate it"),
+    "evaluate": Command("bidex_meta.commands.evaluate", "success and return of a trained run, per task class"),
+    "list": Command("bidex_meta.commands.list", "the suites, tasks or algos there are"),
+    "render": Command("bidex_meta.commands.render", "a picture or a film of a task"),
+    "plot": Command("bidex_meta.commands.plot", "learning curves of a run, as a picture"),
+    "bench": Command("bidex_meta.commands.bench", "measure speed, scaling or stability of the world"),
+}

@@ -1,0 +1,85 @@
+"""The learners by name: the only place in ``bidex_meta`` that names any.
+
+An entry is ``"module:Class"``. Beside the class the module holds ``PRESETS``: a dict from preset name to an instance of
+the learner's config dataclass, with at least ``paper`` and ``laptop``. The class offers:
+
+* ``Class(world, config, seed)``, and the methods ``bidex_algos.runner.Learner`` names;
+* ``policy_state_dict()`` and ``load_policy(state, device)``, which gives an agent for ``bidex_meta.evaluate`` from the
+  entry ``learner.policy`` of a checkpoint.
+"""
+
+import importlib
+from dataclasses import dataclass
+from typing import Any
+
+from bidex_meta.errors import BidexError, unknown_name
+
+ALGOS: dict[str, str] = {
+    "mtppo": "bidex_algos.mtppo:MTPPO",
+    "ppo": "bidex_algos.mtppo:MTPPO",  # of one task it is plain PPO
+}
+
+
+@dataclass(frozen=True)
+class LearnerKind:
+    """A learner and its presets."""
+
+    name: str
+    """Name in ``ALGOS``."""
+    make: Any
+    """The learner's class."""
+    presets: dict[str, Any]
+    """Configs by name; all of one dataclass."""
+
+
+def learner_kind(name: str) -> LearnerKind:
+    """Load a learner by name.
+
+    Raises:
+        BidexError: There is none of this name, or its package is not installed.
+    """
+    if name not in ALGOS:
+        raise unknown_name("algo", name, ALGOS)
+    module_name, _, class_name = ALGOS[name].partition(":")
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        raise BidexError(f"The algo {name!r} needs {error.name}, which is not installed.") from error
+    return LearnerKind(name, getattr(module, class_name), dict(module.PRESETS))
+
+
+def choose_preset(kind: LearnerKind, asked: str, device: str) -> tuple[str, str]:
+    """The preset's name and, in words, why this one.
+
+    Args:
+        kind: The learner.
+        asked: A preset's name, or ``auto``.
+        device: ``cpu``, ``cuda``, ``cuda:0``, ...
+    """
+    if asked != "auto":
+        if asked not in kind.presets:
+            raise unknown_name("preset", asked, ["auto", *kind.presets])
+        return asked, "as asked"
+    if device.startswith("cpu"):
+        return "laptop", "the device is a CPU"
+    if "tuned" in kind.presets:
+        return "tuned", "the device is a GPU and paper is known not to be best"
+    return "paper", "the device is a GPU"
+
+
+def resolve_device(asked: str) -> str:
+    """``auto`` to ``cuda`` where there is one, else ``cpu``; anything else as it is.
+
+    Raises:
+        BidexError: torch does not know the device, or it is not there.
+    """
+    import torch
+
+    if asked == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        torch.zeros(1, device=asked)
+    except Exception as error:  # torch raises RuntimeError, AssertionError or its own kinds
+        reason = str(error).splitlines()[0]
+        raise BidexError(f"Device {asked!r} cannot be used ({reason}). Expected auto, cpu or cuda:N.") from None
+    return asked

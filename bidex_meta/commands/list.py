@@ -1,0 +1,87 @@
+"""``bidex-meta list``: what there is."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import tyro
+
+from bidex_meta.commands.parsing import Switch, parse
+from bidex_meta.errors import unknown_name
+
+
+@dataclass(frozen=True)
+class ListFlags:
+    """The suites, tasks or algos there are.
+
+    Example: bidex-meta list tasks --json
+    """
+
+    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="suites|tasks|algos")]
+    """suites, tasks or algos."""
+    json: Switch = False
+    """Print JSON."""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Print a table or JSON, one row for each."""
+    flags = parse(ListFlags, arguments, "list")
+    kinds: dict[str, Callable[[], list[dict[str, Any]]]] = {"suites": _suites, "tasks": _tasks, "algos": _algos}
+    if flags.what not in kinds:
+        raise unknown_name("list", flags.what, kinds)
+    rows = kinds[flags.what]()
+    if flags.json:
+        print(json.dumps(rows, indent=2))
+        return
+    from bidex_meta.commands.tables import plain_table, print_table
+
+    columns = list(rows[0]) if rows else ["name"]
+    print_table(plain_table([column.replace("_", " ") for column in columns], [_cells(row) for row in rows]))
+
+
+def _suites() -> list[dict[str, Any]]:
+    from bidex_meta.suite import load_suite, suite_names
+
+    suites = [load_suite(name) for name in suite_names()]
+    return [
+        {
+            "name": suite.name,
+            "kind": suite.kind,
+            "train_classes": [entry.name for entry in suite.split_classes("train")],
+            "test_classes": [entry.name for entry in suite.split_classes("test")],
+            "summary": suite.description,
+        }
+        for suite in suites
+    ]
+
+
+def _tasks() -> list[dict[str, Any]]:
+    from bidex_meta.tasks import registry
+
+    tasks = [(name, registry.get(name)) for name in registry.names()]
+    return [
+        {
+            "name": name,
+            "observation": task.observation_size,
+            "action": task.action_size,
+            "episode_steps": task.episode_steps,
+            "summary": task.summary,
+        }
+        for name, task in tasks
+    ]
+
+
+def _algos() -> list[dict[str, Any]]:
+    from bidex_meta.commands.learners import ALGOS, learner_kind
+
+    rows = []
+    for name in ALGOS:
+        kind = learner_kind(name)
+        summary = (kind.make.__doc__ or "").strip().splitlines()[0]
+        rows.append({"name": name, "presets": list(kind.presets), "summary": summary})
+    return rows
+
+
+def _cells(row: dict[str, Any]) -> list[Any]:
+    return [", ".join(value) if isinstance(value, list) else value for value in row.values()]

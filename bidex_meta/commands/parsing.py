@@ -1,0 +1,124 @@
+"""Flags to dataclasses by tyro, with every complaint on one line."""
+
+import contextlib
+import dataclasses
+import difflib
+import io
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any, NoReturn, TypeVar
+
+import tyro
+from tyro.constructors import PrimitiveConstructorSpec
+
+from bidex_meta.errors import BidexError
+
+Options = TypeVar("Options")
+
+
+def _whole_number(words: list[str]) -> int:
+    try:
+        value = float(words[0].replace("_", ""))
+        if value != int(value) or value < 0:
+            raise ValueError
+    except (ValueError, OverflowError):
+        raise ValueError(f"expected a whole number such as 20000000 or 2e7, not {words[0]!r}") from None
+    return int(value)
+
+
+StepCount = Annotated[
+    int,
+    PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="INT",
+        instance_from_str=_whole_number,
+        is_instance=lambda value: isinstance(value, int),
+        str_from_instance=lambda value: [str(value)],
+    ),
+]
+"""A whole number that may be written 2e7."""
+
+Switch = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+"""A flag without a value and without a ``--no-`` twin."""
+
+
+RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+"""A run folder, as the first word."""
+
+
+def parse(options: type[Options], arguments: Sequence[str], command: str, default: Options | None = None) -> Options:
+    """The flags of one subcommand.
+
+    Args:
+        options: A dataclass whose docstring opens with a sentence and an example: it heads the help text.
+        arguments: What follows the subcommand's name.
+        command: The subcommand's name.
+        default: Values of the flags that are not given; the dataclass's own by default.
+
+    Raises:
+        BidexError: An unknown flag (with the nearest one) or a bad value.
+        SystemExit: After printing the help text.
+    """
+    complaint = io.StringIO()
+    keywords: dict[str, Any] = {} if default is None else {"default": default}
+    try:
+        # tyro prints a box of several lines and exits; we keep its words and drop the box.
+        with contextlib.redirect_stderr(complaint):
+            parsed, unknown = tyro.cli(
+                options, args=list(arguments), prog=f"bidex-meta {command}", return_unknown_args=True, **keywords
+            )
+    except SystemExit as stop:
+        if stop.code in (0, None):
+            raise
+        raise BidexError(f"{_one_line(complaint.getvalue())}. See bidex-meta {command} --help.") from None
+    if unknown:
+        _refuse(unknown[0], options if default is None else default, command)
+    return parsed
+
+
+def peek(arguments: Sequence[str], flag: str) -> str | None:
+    """The value of ``flag`` before the real parse, which may need it to know its own defaults; None if not given."""
+    for place, word in enumerate(arguments):
+        if word == flag and place + 1 < len(arguments):
+            return arguments[place + 1]
+        if word.startswith(f"{flag}="):
+            return word.partition("=")[2]
+    return None
+
+
+def _refuse(word: str, options: Any, command: str) -> NoReturn:
+    end = f"See bidex-meta {command} --help."
+    if not word.startswith("-"):
+        raise BidexError(f"Unexpected {word!r} after bidex-meta {command}. {end}")
+    flag = word.split("=")[0]
+    near = difflib.get_close_matches(flag, list(_flags(options)), n=1, cutoff=0.5)
+    hint = f"Did you mean {near[0]}? " if near else ""
+    raise BidexError(f"Unknown flag {flag} of bidex-meta {command}. {hint}{end}")
+
+
+def _flags(options: Any, prefix: str = "--") -> Iterator[str]:
+    """Every flag of a dataclass and of those it holds."""
+    for field in dataclasses.fields(options):
+        name = prefix + field.name.replace("_", "-")
+        value = getattr(options, field.name, field.default)
+        if dataclasses.is_dataclass(value):
+            yield from _flags(value, f"{name}.")
+        else:
+            yield name
+            if isinstance(value, bool):
+                yield f"{prefix}no-{field.name.replace('_', '-')}"
+
+
+def _one_line(box: str) -> str:
+    """The message in tyro's box: what stands between its title and the first rule."""
+    lines = [line.strip().strip("│").strip() for line in box.splitlines()]
+    # Where the terminal cannot draw, the title is a line of its own with a rule below, not part of the upper edge.
+    start = next((i + 1 for i, line in enumerate(lines) if line and set(line) <= set("-")), 0)
+    start = 1 if box.lstrip().startswith("╭") else start
+    words: list[str] = []
+    for line in lines[start:]:
+        if words and re.fullmatch(r"[─-]+|╰.*", line):
+            break
+        words += [line] if line else []
+    return " ".join(words).rstrip(".") or "Bad command line"

@@ -1,0 +1,167 @@
+"""What ``bidex-meta run`` was asked for, resolved to values: flags, presets, and the config of a run to be resumed."""
+
+import dataclasses
+import json
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from bidex_meta.commands.learners import LearnerKind, choose_preset, learner_kind, resolve_device
+from bidex_meta.commands.parsing import StepCount, Switch, parse, peek
+from bidex_meta.errors import BidexError
+from bidex_meta.record.folder import RunFolder
+
+_ROWS_AND_STEPS = {"cpu": (1024, 20_000_000), "gpu": (8192, 200_000_000)}
+
+
+@dataclass(frozen=True)
+class RunFlags:
+    """Train a learner on a suite or on a single task, then evaluate it beside a random policy.
+
+    Example: bidex-meta run --suite MT4 --algo mtppo --learner.gamma 0.99
+    """
+
+    suite: str | None = None
+    """Suite to train on: a name (see `bidex-meta list suites`) or the path of a TOML file."""
+    task: str | None = None
+    """Train on this task class alone, instead of a suite."""
+    algo: str = "mtppo"
+    """Learner (see `bidex-meta list algos`)."""
+    preset: str = "auto"
+    """Values of the learner's config that no flag sets; auto: laptop on a CPU, on a GPU tuned or else paper."""
+    num_envs: int = 0
+    """Rows stepped together, over all tasks."""
+    steps: StepCount = 0
+    """Environment steps to train for, over all rows; 2e7 is understood."""
+    seed: int = 0
+    """Seed of tasks, starts and learner."""
+    device: str = "auto"
+    """auto, cpu or cuda:N."""
+    threads: int | None = None
+    """Threads of torch and of the physics; None: one per core. A resumed run keeps its own."""
+    run_dir: Path | None = None
+    """Folder of this run; None: runs/SUITE/ALGO/DATE_seedSEED."""
+    resume: Path | None = None
+    """Continue this run from its last checkpoint, with its own config; only --steps may change."""
+    evaluate: bool = True
+    """Evaluate at the end."""
+    episodes: int = 4
+    """Episodes of each task in that evaluation."""
+    print_config: Switch = False
+    """Print the resolved config as JSON and stop."""
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """Everything decided before anything is made."""
+
+    flags: RunFlags
+    """As parsed."""
+    kind: LearnerKind
+    """The learner."""
+    learner_config: Any
+    """An instance of the learner's config dataclass."""
+    config: dict[str, Any]
+    """The resolved config as it is written to ``config.json``."""
+    folder: RunFolder | None
+    """The run to be resumed, if any."""
+    preset_reason: str
+    """Why this preset."""
+
+
+def plan_run(arguments: Sequence[str]) -> RunPlan:
+    """Parse in two stages: algo, preset and device first, since they decide what the other flags are and default to.
+
+    Raises:
+        BidexError: Bad flags, or flags that contradict the run to be resumed.
+    """
+    resume = peek(arguments, "--resume")
+    folder = RunFolder.open(Path(resume)) if resume else None
+    stored = folder.config() if folder else {}
+    kind = learner_kind(peek(arguments, "--algo") or stored.get("algo", RunFlags.algo))
+    device = resolve_device(peek(arguments, "--device") or stored.get("device", RunFlags.device))
+    preset, reason = choose_preset(kind, peek(arguments, "--preset") or stored.get("preset", RunFlags.preset), device)
+    learner_default = kind.presets[preset]
+    if folder:
+        learner_default = _stored_learner(type(learner_default), stored, folder)
+    flags = parse(*_options(arguments, learner_default, stored, device))
+    config = _resolved(flags, preset, device, stored)
+    if folder:
+        _refuse_changes(stored, config, folder)
+    return RunPlan(flags, kind, flags.learner, config, folder, reason)
+
+
+def _options(arguments: Sequence[str], learner: Any, stored: dict[str, Any], device: str) -> tuple[Any, ...]:
+    """The arguments of ``parse``: ``RunFlags`` with a field ``learner``, and the defaults."""
+    # The learner's dataclass is known only now, and its fields shall be flags with their help texts.
+    options = dataclasses.make_dataclass(
+        "RunOptions", [("learner", type(learner), field(default=learner))], bases=(RunFlags,), frozen=True
+    )
+    options.__doc__ = RunFlags.__doc__
+    rows, steps = _ROWS_AND_STEPS["cpu" if device.startswith("cpu") else "gpu"]
+    names = {entry.name for entry in dataclasses.fields(RunFlags)}
+    known = {name: value for name, value in stored.items() if name in names}
+    default = options(**{"num_envs": rows, "steps": steps, **known, "learner": learner})
+    return options, arguments, "run", default
+
+
+def _resolved(flags: Any, preset: str, device: str, stored: dict[str, Any]) -> dict[str, Any]:
+    if (flags.suite is None) == (flags.task is None):
+        raise BidexError("Name what to train on: either --suite SUITE or --task TASK, for example --suite MT4.")
+    for name in ("num_envs", "threads", "episodes"):
+        value = getattr(flags, name)
+        if value is not None and value < 1:
+            raise BidexError(f"--{name.replace('_', '-')} must be at least 1, not {value}.")
+    suite = flags.suite
+    if suite is not None and suite.endswith(".toml"):
+        suite = str(Path(suite).expanduser().resolve())  # a run may be resumed from another folder
+    config = {
+        "suite": suite,
+        "task": flags.task,
+        "algo": flags.algo,
+        "preset": preset,
+        "learner": dataclasses.asdict(flags.learner),
+        "num_envs": flags.num_envs,
+        "steps": flags.steps,
+        "seed": flags.seed,
+        "device": device,
+        "threads": flags.threads or stored.get("threads") or _cores(),
+    }
+    return json.loads(json.dumps(config))  # tuples to lists, so that it equals what is read back
+
+
+def _cores() -> int:
+    # The cores we may use, not those of the machine: containers and batch systems give a share.
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+
+
+def _stored_learner(config_class: Any, stored: dict[str, Any], folder: RunFolder) -> Any:
+    values = {name: tuple(v) if isinstance(v, list) else v for name, v in stored.get("learner", {}).items()}
+    unknown = set(values) - {entry.name for entry in dataclasses.fields(config_class)}
+    if unknown:
+        raise BidexError(
+            f"{folder.config_path} sets {', '.join(sorted(unknown))}, which this version of {stored['algo']} does not "
+            "have. Resume with the version in versions.json."
+        )
+    return config_class(**values)
+
+
+def _refuse_changes(stored: dict[str, Any], config: dict[str, Any], folder: RunFolder) -> None:
+    before, after = _flat(stored), _flat(config)
+    for name in sorted(before.keys() | after.keys()):
+        if name != "steps" and before.get(name) != after.get(name):
+            flag = "--" + name.replace("_", "-")
+            raise BidexError(
+                f"{flag} is {before.get(name)} in {folder.path}, not {after.get(name)}: "
+                f"a resumed run keeps its config. Leave {flag} out, or start a new run."
+            )
+
+
+def _flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in config.items():
+        flat.update(_flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value})
+    return flat

@@ -1,0 +1,77 @@
+"""Results as tables for people."""
+
+import sys
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.table import Table
+
+from bidex_meta.evaluate import Evaluation, Interval, compare
+
+_NONE = "–"
+
+
+def evaluation_table(title: str, policy: Evaluation, random: Evaluation | None = None) -> Table:
+    """Success, return and score per class; beside a random policy's, where there is one, with the difference.
+
+    Args:
+        title: Heads the table.
+        policy: What was found of the policy.
+        random: The same of a random policy on the same tasks.
+    """
+    table = Table(title=title, title_justify="left", caption_justify="left")
+    table.caption = "[..] 95 % bootstrap interval over episodes; success: at any step of the episode"
+    table.add_column("task")
+    headers = ["episodes", "length", "success", "return [95 %]", "score"]
+    if random is not None:
+        headers += ["random success", "random return [95 %]", "return above random [95 %]"]
+    for header in headers:
+        table.add_column(header, justify="right")
+    differences = compare(policy, random) if random is not None else {}
+    rows, others = policy.to_json(), random.to_json() if random is not None else None
+    for name, row in rows["classes"].items():
+        episodes = f"{row['episodes']}" + (f" ({row['unstable']} unstable)" if row["unstable"] else "")
+        cells = [name, episodes, f"{row['length']:.1f}", _percent(row["success"])]
+        cells += [_ranged(row["return"], row["return_interval"]), _score(row["score"])]
+        if others is not None:
+            other, difference = others["classes"][name], differences[name]
+            cells += [_percent(other["success"]), _ranged(other["return"], other["return_interval"])]
+            cells += [_ranged(difference.value, difference.interval, sign=True)]
+        table.add_row(*cells)
+    for key, label in (("mean", "mean over tasks"), ("iqm", "interquartile mean")):
+        success, score = rows["aggregate"]["success"], rows["aggregate"]["score"]
+        cells = [label, "", "", _percent(success[key]), "", _score(score[key] if score else None)]
+        if others is not None:
+            cells += [_percent(others["aggregate"]["success"][key])]
+        table.add_row(*cells, style="dim")
+    return table
+
+
+def plain_table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> Table:
+    """A table of anything; numbers to the right."""
+    table = Table()
+    for place, column in enumerate(columns):
+        numbers = bool(rows) and all(isinstance(row[place], int | float) for row in rows)
+        table.add_column(column, justify="right" if numbers else "left")
+    for row in rows:
+        table.add_row(*(f"{cell:,.4g}" if isinstance(cell, float) else str(cell) for cell in row))
+    return table
+
+
+def print_table(table: Table) -> None:
+    """To stdout; wide enough for every column where stdout is a file or a pipe."""
+    Console(width=None if sys.stdout.isatty() else 180).print(table)
+
+
+def _percent(value: float) -> str:
+    return f"{100 * value:.1f} %"
+
+
+def _score(value: float | None) -> str:
+    return _NONE if value is None else f"{value:.1f}"
+
+
+def _ranged(value: float, interval: Interval | None, sign: bool = False) -> str:
+    form = "+.4g" if sign else ".4g"
+    ends = _NONE if interval is None else f"{interval[0]:{form}}, {interval[1]:{form}}"
+    return f"{value:{form}} \\[{ends}]"

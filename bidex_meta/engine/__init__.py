@@ -1,0 +1,1 @@
+"""The one door to physics. Tasks and learners never import an engine."""

@@ -1,0 +1,112 @@
+"""C MuJoCo on all cores of the machine: ``mujoco.batch``."""
+
+import os
+import warnings
+from collections.abc import Sequence
+
+import mujoco
+import mujoco.batch
+import numpy as np
+import torch
+from torch import Tensor
+
+# What a simulation carries from one step to the next; the fields that a model has none of are skipped.
+_STATE = ("time", "qpos", "qvel", "act", "history", "qacc_warmstart", "ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos",
+          "mocap_quat")  # fmt: skip
+_BAD = [int(w) for w in (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)]
+
+
+def default_threads() -> int:
+    """Number of CPUs this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class CpuEngine:
+    """Simulations of models of equal structure, in double precision. See ``Engine`` for the views.
+
+    Sensors are refreshed by a velocity stage after each step, which costs about a tenth of the speed but makes
+    positions and velocities those of the new state; a persistent batch takes its next step from there.
+    """
+
+    device = torch.device("cpu")
+
+    def __init__(self, models: Sequence[mujoco.MjModel], rows: Sequence[int], threads: int | None = None) -> None:
+        """Builds the batch.
+
+        Args:
+            models: The distinct models, of equal structure.
+            rows: For each simulation the index of its model.
+            threads: Engine threads; None takes all CPUs. Results do not depend on it.
+        """
+        self.num = len(rows)
+        # MuJoCo would print each broken row to stderr and to a log file in the working folder; unstable() tells it.
+        mujoco.set_mju_user_warning(_silent)
+        self.batch = mujoco.batch.Batch(models[0], self.num, nthread=threads or default_threads(), persistent=True)
+        if len(models) > 1:
+            self.batch.set_models([models[i] for i in rows])
+        self._state = {name: self._bind(name) for name in _STATE if 0 not in self.batch.bind(name).shape}
+        self.qpos, self.qvel, self.ctrl = (self._state[n] for n in ("qpos", "qvel", "ctrl"))
+        self.xfrc_applied = self._state["xfrc_applied"]
+        self.sensordata = self._bind("sensordata")
+        self._failed = torch.zeros(self.num, dtype=torch.bool)
+
+    def _bind(self, name: str) -> Tensor:
+        with warnings.catch_warnings():  # torch warns that outputs of the batch are read-only; nothing here writes them
+            warnings.simplefilter("ignore")
+            return torch.from_numpy(self.batch.bind(name))
+
+    def step(self, substeps: int, active: Tensor | None = None) -> None:
+        """Advances all simulations, or those of the mask ``active``."""
+        ids = None if active is None else active.numpy()
+        try:
+            self.batch.step(ids=ids, nstep=substeps, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        except mujoco.batch.SimulationError as error:
+            # A broken row can meet more contacts than its memory holds; it keeps its old state, the others have finished.
+            self._failed[torch.as_tensor(error.ids)] = True
+
+    def unstable(self) -> Tensor:
+        """Which simulations broke since their last reset. Shape (num,), bool."""
+        bad = torch.from_numpy((self.batch.warning[:, _BAD, 1] > 0).any(axis=1))
+        # One non-finite addend makes the sum non-finite.
+        return bad | self._failed | ~self.sensordata.sum(dim=1).isfinite()
+
+    def reset(self, mask: Tensor, qpos: Tensor) -> None:
+        """Starts the simulations of a mask anew at given positions (one row per true entry), at rest, without forces."""
+        ids = mask.nonzero().squeeze(1)
+        self.batch.warning[ids] = 0
+        self._failed[ids] = False
+        for value in self._state.values():
+            value[ids] = 0.0
+        self.qpos[ids] = qpos.to(self.qpos.dtype)
+        self.batch.forward(ids=ids.int().numpy(), stage=mujoco.mjtStage.mjSTAGE_VEL)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Everything that decides the future of the simulations, copied."""
+        return {name: value.clone() for name, value in self._state.items()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Puts back what ``state_dict`` gave and refreshes position and velocity sensors."""
+        self.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self._failed[:] = False
+        for name, value in state.items():
+            self._state[name].copy_(value)
+        self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
+
+    def model(self, row: int) -> mujoco.MjModel:
+        """The model of a simulation, for pictures and checks."""
+        return self.batch.get_model(row)
+
+    def data(self, row: int) -> mujoco.MjData:
+        """A copy of a simulation's data, forwarded, for pictures and checks."""
+        model, data = self.batch.get_model(row), self.batch.get_data(row)
+        mujoco.mj_forward(model, data)
+        return data
+
+    def contact_depth(self, row: int) -> float:
+        """Deepest penetration among a simulation's contacts, metres, 0 without contact."""
+        distances = self.data(row).contact.dist
+        return float(max(0.0, -np.min(distances))) if len(distances) else 0.0
+
+
+def _silent(message: str) -> None:
+    """Swallows MuJoCo's warnings: the counters that ``unstable`` reads hold the same facts."""

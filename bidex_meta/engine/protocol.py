@@ -1,0 +1,58 @@
+"""What the world asks of an engine."""
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+
+class Engine(Protocol):
+    """A batch of simulations of equal structure.
+
+    The views are created once and stay; the world writes ``qpos``, ``qvel``, ``ctrl`` and ``xfrc_applied`` in place.
+
+    Attributes:
+        num: Number of simulations.
+        device: Where the views live.
+        qpos: Positions, shape (num, nq).
+        qvel: Velocities, shape (num, nv).
+        ctrl: Position targets, shape (num, nu).
+        xfrc_applied: World-frame force and torque at bodies' centres of mass, shape (num, nbody, 6).
+        sensordata: Sensor values, shape (num, nsensordata).
+    """
+
+    num: int
+    device: torch.device
+    qpos: Tensor
+    qvel: Tensor
+    ctrl: Tensor
+    xfrc_applied: Tensor
+    sensordata: Tensor
+
+    def step(self, substeps: int, active: Tensor | None = None) -> None:
+        """Advances all simulations, or those of the mask ``active`` (num,), and refreshes their sensors.
+
+        Sensors of positions and velocities then describe the new state; those of forces the last substep.
+        """
+        ...
+
+    def unstable(self) -> Tensor:
+        """Which simulations broke (bad numbers or non-finite values) since their last reset. Shape (num,), bool."""
+        ...
+
+    def reset(self, mask: Tensor, qpos: Tensor) -> None:
+        """Starts the simulations of a mask (num,) anew.
+
+        Args:
+            mask: Which simulations, shape (num,), bool.
+            qpos: Their start positions: one row for each true entry on a CPU engine.
+        """
+        ...
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Everything that decides the future of the simulations, copied."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Puts back what ``state_dict`` gave."""
+        ...

@@ -1,0 +1,353 @@
+"""How good is a policy: success and return per class, over a fixed number of episodes of every task.
+
+The protocol: the world keeps each row on one task of its slot and does not reset by itself (autoreset DISABLED). Every
+task is played ``episodes_per_task`` times, whole episodes, by the mean action; a task that ends early is not played
+more often, so easy tasks cannot crowd out hard ones. An episode is a success if ``info["success"]`` was true at any
+step; its return is the sum of the unscaled reward.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+
+from bidex_meta.errors import BidexError
+
+Interval = tuple[float, float]
+"""Lower and upper end of a 95 % bootstrap interval."""
+
+_RESAMPLES = 2000
+_BOOTSTRAP_SEED = 0
+
+
+class Agent(Protocol):
+    """Whatever can be judged."""
+
+    def eval_action(self, obs: torch.Tensor) -> torch.Tensor:
+        """Actions ``(num_envs, action)`` in [-1, 1] for observations ``(num_envs, observation)``; no exploration."""
+        ...
+
+    def reset(self, env_mask: torch.Tensor) -> None:
+        """A new episode begins in the rows of ``env_mask``, bool ``(num_envs,)``: forget what was known of them."""
+        ...
+
+
+class ZeroAgent:
+    """Does nothing: action 0 everywhere.
+
+    Args:
+        action_space: The world's batched action space, shape ``(num_envs, action)``.
+    """
+
+    def __init__(self, action_space: Any):
+        self._shape = action_space.shape
+
+    def eval_action(self, obs: torch.Tensor) -> torch.Tensor:
+        """Zeros ``(num_envs, action)`` on the device of ``obs``."""
+        return torch.zeros(self._shape, device=obs.device)
+
+    def reset(self, env_mask: torch.Tensor) -> None:
+        """Nothing is remembered."""
+
+
+class RandomAgent:
+    """Uniform actions, the same on every device.
+
+    Args:
+        action_space: The world's batched action space, a Box of shape ``(num_envs, action)``.
+        seed: Of this agent's own generator.
+    """
+
+    def __init__(self, action_space: Any, seed: int = 0):
+        self._low = torch.as_tensor(action_space.low)
+        self._range = torch.as_tensor(action_space.high) - self._low
+        self._generator = torch.Generator().manual_seed(seed)
+
+    def eval_action(self, obs: torch.Tensor) -> torch.Tensor:
+        """Uniform in the action space, ``(num_envs, action)`` on the device of ``obs``."""
+        # Drawn on the CPU: a generator on a GPU gives other numbers for the same seed.
+        return (self._low + self._range * torch.rand(self._range.shape, generator=self._generator)).to(obs.device)
+
+    def reset(self, env_mask: torch.Tensor) -> None:
+        """Nothing is remembered."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What a class's return is measured against for the normalised score."""
+
+    random: float
+    """Mean return of uniform actions."""
+    expert: float
+    """Mean return of the best known policy."""
+
+
+@dataclass(frozen=True)
+class ClassResult:
+    """The episodes of one class; arrays of shape ``(episodes,)``, in the order they were played."""
+
+    returns: np.ndarray
+    """Sum of the unscaled reward, float64."""
+    successes: np.ndarray
+    """Success at any step, float64 0 or 1."""
+    lengths: np.ndarray
+    """Steps, int64."""
+    tasks: np.ndarray
+    """Index of the played task in the class's pool, int64."""
+    unstable: int
+    """Episodes that ended because the physics broke."""
+    reference: Reference | None = None
+    """References of the normalised score, where both are known."""
+
+    @property
+    def episodes(self) -> int:
+        """How many episodes were played."""
+        return len(self.returns)
+
+    @property
+    def success(self) -> float:
+        """Success rate in [0, 1]."""
+        return float(self.successes.mean())
+
+    @property
+    def mean_return(self) -> float:
+        """Mean return."""
+        return float(self.returns.mean())
+
+    @property
+    def score(self) -> float | None:
+        """100 · (R − R_random) / (R_expert − R_random); None where a reference is missing."""
+        scores = self.scores
+        return None if scores is None else float(scores.mean())
+
+    @property
+    def scores(self) -> np.ndarray | None:
+        """The normalised score of every episode, ``(episodes,)``."""
+        reference = self.reference
+        if reference is None or reference.expert == reference.random:
+            return None
+        return 100 * (self.returns - reference.random) / (reference.expert - reference.random)
+
+    def to_json(self) -> dict[str, Any]:
+        """Numbers of this class, ready for JSON."""
+        return {
+            "success": self.success,
+            "success_interval": bootstrap_interval(_mean, self.successes),
+            "return": self.mean_return,
+            "return_interval": bootstrap_interval(_mean, self.returns),
+            "length": float(self.lengths.mean()),
+            "score": self.score,
+            "episodes": self.episodes,
+            "tasks": len(np.unique(self.tasks)),
+            "unstable": self.unstable,
+        }
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What ``evaluate`` found."""
+
+    classes: dict[str, ClassResult]
+    """Per class, by name, in the world's order of slots."""
+    episodes_per_task: int
+    """Episodes of every task."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything but the single episodes, ready for JSON."""
+        return {
+            "episodes_per_task": self.episodes_per_task,
+            "classes": {name: result.to_json() for name, result in self.classes.items()},
+            "aggregate": {
+                "success": aggregate([result.successes for result in self.classes.values()]),
+                "score": aggregate([result.scores for result in self.classes.values()]),
+            },
+        }
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Mean return of one policy above another's, in one class."""
+
+    value: float
+    """Difference of the means."""
+    interval: Interval | None
+    """95 % bootstrap interval, both policies' episodes resampled; None with fewer than two episodes."""
+
+    @property
+    def excludes_zero(self) -> bool:
+        """Whether the interval lies on one side of zero."""
+        return self.interval is not None and (self.interval[0] > 0 or self.interval[1] < 0)
+
+
+def evaluate(
+    agent: Agent,
+    world: Any,
+    episodes_per_task: int = 4,
+    *,
+    seed: int | None = None,
+    references: Mapping[str, Reference] | None = None,
+) -> Evaluation:
+    """Play every task of ``world`` ``episodes_per_task`` times and report per class.
+
+    Args:
+        agent: The policy.
+        world: A world in autoreset mode DISABLED with at least one row for each task. Rows that share a task share
+            its episodes.
+        episodes_per_task: Episodes of each task.
+        seed: Passed to the world's reset; None keeps the world's own.
+        references: Per class name, what the normalised score is measured against.
+
+    Raises:
+        BidexError: The world resets by itself, lacks rows, or ``episodes_per_task`` is not positive.
+    """
+    _check(world, episodes_per_task)
+    obs, _ = world.reset(seed=seed)
+    tasks = world.task_index.clone()
+    remaining = _quota(world, tasks, episodes_per_task)
+    rounds: list[dict[str, torch.Tensor]] = []
+    while bool((playing := remaining > 0).any()):
+        if rounds:
+            obs, _ = world.reset(options={"reset_mask": playing})
+        agent.reset(playing)
+        rounds.append({"row": torch.nonzero(playing).squeeze(1), **_play(agent, world, obs, playing)})
+        remaining -= playing.long()
+    episodes = {key: torch.cat([played[key] for played in rounds]).cpu().numpy() for key in rounds[0]}
+    slots, task_of_row = world.task_id.cpu().numpy()[episodes["row"]], tasks.cpu().numpy()[episodes["row"]]
+    classes = {}
+    for slot, name in enumerate(world.task_names):
+        own = slots == slot
+        classes[name] = ClassResult(
+            returns=episodes["return"][own],
+            successes=episodes["success"][own].astype(np.float64),
+            lengths=episodes["length"][own],
+            tasks=task_of_row[own],
+            unstable=int(episodes["unstable"][own].sum()),
+            reference=(references or {}).get(name),
+        )
+    return Evaluation(classes, episodes_per_task)
+
+
+def compare(a: Evaluation, b: Evaluation) -> dict[str, Difference]:
+    """Mean return of ``a`` minus that of ``b`` for every class both have, with a bootstrap interval.
+
+    Args:
+        a: For example the trained policy.
+        b: For example a random one, over the same tasks.
+    """
+    differences = {}
+    for name in (name for name in a.classes if name in b.classes):
+        ours, theirs = a.classes[name].returns, b.classes[name].returns
+        interval = bootstrap_interval(_mean_difference, ours, theirs)
+        differences[name] = Difference(float(ours.mean() - theirs.mean()), interval)
+    return differences
+
+
+def aggregate(samples: list[np.ndarray | None]) -> dict[str, Any] | None:
+    """Mean and interquartile mean over classes of the classes' means, the mean with a bootstrap interval.
+
+    Args:
+        samples: One array of episodes per class; None in any of them gives None, since a mean over some of the
+            classes would pass for one over all.
+    """
+    known = [sample for sample in samples if sample is not None]
+    if not known or len(known) < len(samples):
+        return None
+    from scipy.stats import trim_mean
+
+    means = np.array([sample.mean() for sample in known])
+    return {
+        "mean": float(means.mean()),
+        "interval": bootstrap_interval(_mean_of_means, *known),
+        "iqm": float(trim_mean(means, 0.25)),
+    }
+
+
+def bootstrap_interval(statistic: Callable[..., Any], *samples: np.ndarray) -> Interval | None:
+    """The 95 % percentile bootstrap interval of ``statistic``, each sample resampled by itself.
+
+    Args:
+        statistic: Takes the samples and ``axis``, works along it.
+        samples: Arrays ``(episodes,)``.
+
+    Returns:
+        Lower and upper end; None where a sample has fewer than two episodes. The same for the same input.
+    """
+    if min(len(sample) for sample in samples) < 2:
+        return None
+    from scipy.stats import bootstrap
+
+    result = bootstrap(
+        samples,
+        statistic,
+        n_resamples=_RESAMPLES,
+        batch=200,  # bounds memory: all resamples at once would be 2000 times the episodes
+        vectorized=True,
+        method="percentile",
+        rng=np.random.default_rng(_BOOTSTRAP_SEED),
+    )
+    return float(result.confidence_interval.low), float(result.confidence_interval.high)
+
+
+def _mean(sample: np.ndarray, axis: int = -1) -> Any:
+    return np.mean(sample, axis=axis)
+
+
+def _mean_difference(a: np.ndarray, b: np.ndarray, axis: int = -1) -> Any:
+    return np.mean(a, axis=axis) - np.mean(b, axis=axis)
+
+
+def _mean_of_means(*samples: np.ndarray, axis: int = -1) -> Any:
+    return sum(np.mean(sample, axis=axis) for sample in samples) / len(samples)
+
+
+def _check(world: Any, episodes_per_task: int) -> None:
+    if episodes_per_task < 1:
+        raise BidexError(f"Episodes per task must be at least 1, not {episodes_per_task}.")
+    mode = str(getattr(world.metadata["autoreset_mode"], "name", world.metadata["autoreset_mode"])).upper()
+    if mode != "DISABLED":
+        raise BidexError(f"Evaluation needs a world in autoreset mode DISABLED, but this one is in {mode}.")
+    if len(set(world.task_names)) != len(world.task_names):
+        raise BidexError(f"Results are kept by name, but the world's names are not unique: {world.task_names}.")
+
+
+def _quota(world: Any, tasks: torch.Tensor, episodes_per_task: int) -> torch.Tensor:
+    """Episodes each row has to play, ``(num_envs,)``: those of a task are split over the rows that play it."""
+    quota = torch.zeros_like(tasks)
+    for slot, name in enumerate(world.task_names):
+        for task in range(world.num_slot_tasks[slot]):
+            rows = torch.nonzero((world.task_id == slot) & (tasks == task)).squeeze(1)
+            if len(rows) == 0:
+                needed = max(world.num_slot_tasks) * world.num_tasks
+                raise BidexError(
+                    f"No row plays task {task} of {name}: {world.num_envs} rows are too few for "
+                    f"{sum(world.num_slot_tasks)} tasks. Use num_envs={needed}, or several times that."
+                )
+            share, extra = divmod(episodes_per_task, len(rows))
+            quota[rows] = share
+            quota[rows[:extra]] += 1
+    return quota
+
+
+@torch.no_grad()
+def _play(agent: Agent, world: Any, obs: torch.Tensor, playing: torch.Tensor) -> dict[str, torch.Tensor]:
+    """One episode in each row of ``playing``; its return, success, length, unstable, each ``(rows that played,)``."""
+    running = playing.clone()
+    returns = torch.zeros(world.num_envs, dtype=torch.float64, device=running.device)
+    lengths = torch.zeros(world.num_envs, dtype=torch.int64, device=running.device)
+    success, unstable = torch.zeros_like(running), torch.zeros_like(running)
+    for _ in range(int(world.max_episode_steps.max())):
+        obs, reward, terminated, truncated, info = world.step(agent.eval_action(obs))
+        gained = info.get("reward_unscaled", reward).double()
+        returns += torch.where(running, gained, torch.zeros_like(gained))
+        lengths += running
+        success |= running & info["success"]
+        unstable |= running & info.get("unstable", torch.zeros_like(running))
+        running &= ~(terminated | truncated)
+        if not bool(running.any()):
+            break
+    else:
+        raise RuntimeError(f"{int(running.sum())} rows did not end within their time limit; the world is at fault.")
+    played = {"return": returns, "success": success, "length": lengths, "unstable": unstable}
+    return {key: value[playing] for key, value in played.items()}

@@ -1,0 +1,1 @@
+"""The pair of hands: scene part, joints, actuators and their share of the observation."""

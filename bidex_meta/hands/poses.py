@@ -1,0 +1,32 @@
+"""Where a hand starts: position and orientation of its mount in the world (sheet 2.1 and section 4)."""
+
+import math
+from dataclasses import dataclass
+
+from bidex_meta.maths import quaternion_from_rpy, quaternion_product
+
+MOUNT_QUATERNION = (0.0, 0.0, -math.sqrt(0.5), math.sqrt(0.5))
+"""Orientation (w, x, y, z) of the mount for an unrotated actor: fingers to world -y, palm up, thumb to -x."""
+
+PALM_UP_AWAY = (0.0, 0.0, 0.0)
+"""Pose A of the sheet, roll pitch yaw: fingers to -y, palm up."""
+PALM_UP_BACK = (0.0, 0.0, math.pi)
+"""Pose B: fingers to +y, palm up; faces a hand in pose A."""
+
+
+@dataclass(frozen=True)
+class HandPose:
+    """Start pose of one hand.
+
+    Attributes:
+        position: Mount origin in the world, metres.
+        rpy: Roll, pitch, yaw of the actor, radians; R = Rz(yaw) Ry(pitch) Rx(roll), before the mount's own turn.
+    """
+
+    position: tuple[float, float, float]
+    rpy: tuple[float, float, float]
+
+    @property
+    def quaternion(self) -> tuple[float, float, float, float]:
+        """Orientation (w, x, y, z) of the mount in the world."""
+        return quaternion_product(quaternion_from_rpy(self.rpy), MOUNT_QUATERNION)

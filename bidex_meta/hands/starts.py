@@ -1,0 +1,143 @@
+"""Joint angles at the start of an episode, and room for the object that lies on the hand (design.md section 4)."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from bidex_meta.hands.hand import DISTAL_PER_MIDDLE, hand
+from bidex_meta.maths import dot, norm
+
+_WRIST = (0.0, 0.01, 0.256)
+"""Wrist origin in the mount frame, metres; the palm lies 0.034 further along the turned z (sheet 2.2)."""
+_PALM_OFFSET = 0.034
+_PALM_HALF_THICKNESS = 0.0111
+_ROOTS = ((0.033, 0.095), (0.011, 0.099), (-0.011, 0.095), (-0.034, 0.088))
+"""x and z of the four fingers' roots in the palm frame, metres, index to little finger (sheet 2.2)."""
+_CUP_LIFT, _CUP_TILT = 0.039, 0.571
+"""Metres of root height and radians of bend that a radian of LFJ4 gives the little finger (its axis, sheet 2.3)."""
+_LENGTHS = (0.045, 0.025, 0.024)
+_RADII = (0.01, 0.00805, 0.00705)
+"""Length and radius of proximal, middle and distal capsules, metres (sheet 2.5)."""
+_SLACK = 0.002
+"""Overlap left standing at a start, metres: contacts carry the object from the first step, far below the 5 mm allowed."""
+_MAX_CROSSING = 0.1
+"""Largest difference of neighbouring fingers' side angles that leaves their tips apart, rad:
+roots 22 mm apart, tips 94 mm out with radii of 7 mm, 3 mm of overlap allowed."""
+
+
+@dataclass(frozen=True)
+class _Indices:
+    """Positions of joints among the 24, four fingers each (index to little)."""
+
+    side: list[int]
+    base: list[int]
+    middle: list[int]
+    distal: list[int]
+    cup: int
+
+
+@lru_cache(maxsize=1)
+def _indices() -> _Indices:
+    find = hand().index
+    return _Indices(*(find(*(f"{f}J{k}" for f in ("FF", "MF", "RF", "LF"))) for k in (3, 2, 1, 0)), *find("LFJ4"))
+
+
+def noisy_joints(draws: Tensor, scale: float) -> Tensor:
+    """Joint angles clip(scale * range * u, limits), distal joints by the coupling, neighbouring fingers uncrossed.
+
+    Args:
+        draws: u in [-1, 1], shape (n, 24).
+        scale: Joint noise of the class, a share of each joint's range.
+
+    Returns:
+        Angles, rad, shape (n, 24).
+    """
+    low, high = (torch.as_tensor(x, dtype=draws.dtype, device=draws.device) for x in (hand().low, hand().high))
+    where = _indices()
+    joints = (draws * (scale * (high - low))).clamp(low, high)
+    side = joints[:, where.side]
+    crossing = (side[:, 1:] - side[:, :-1]).amax(dim=1, keepdim=True).clamp(min=_MAX_CROSSING)
+    joints[:, where.side] = side * (_MAX_CROSSING / crossing)
+    joints[:, where.distal] = torch.minimum(joints[:, where.middle] * DISTAL_PER_MIDDLE, high[where.distal])
+    return joints
+
+
+def make_room(joints: Tensor, position: Tensor, axis: Tensor, radius: float, half: float) -> tuple[Tensor, Tensor]:
+    """Lifts an egg off the palm and opens the fingers that noise would push into it.
+
+    The egg is a spheroid; its distance to the palm's plane and to the capsules of the four fingers is bounded from
+    below by its support in the direction of its centre.
+
+    Args:
+        joints: Joint angles, rad, shape (n, 24).
+        position: Centre of the egg in the mount frame, metres, shape (n, 3).
+        axis: Its long axis in the mount frame, unit, shape (n, 3).
+        radius: Short semi-axis, metres.
+        half: Long semi-axis, metres.
+
+    Returns:
+        The joints with opened fingers, shape (n, 24), and the egg's shift in the mount frame, metres, shape (n, 3).
+    """
+    x_axis, y_axis, z_axis = _palm_axes(joints)
+    wrist = position.new_tensor(_WRIST)
+    relative = position - wrist - _PALM_OFFSET * _wrist_z(joints)
+    centre = torch.stack([dot(relative, a) for a in (x_axis, y_axis, z_axis)], dim=1)
+    axis = torch.stack([dot(axis, a) for a in (x_axis, y_axis, z_axis)], dim=1)
+    square = half**2 - radius**2
+    reach = (radius**2 + square * axis[:, 1] ** 2).sqrt()
+    lift = (reach + _PALM_HALF_THICKNESS - _SLACK + centre[:, 1]).clamp(min=0.0)
+    centre = torch.stack((centre[:, 0], centre[:, 1] - lift, centre[:, 2]), dim=1)
+
+    start, along, length = _finger_segments(joints)
+    to_centre = centre[:, None, None] - start
+    t = dot(to_centre, along).clamp(min=0.0).minimum(length)
+    gap_vector = to_centre - t[..., None] * along
+    distance = norm(gap_vector)
+    reach = (radius**2 + square * (dot(gap_vector, axis[:, None, None]) / distance) ** 2).sqrt()
+    touched = (distance - reach - distance.new_tensor(_RADII) < -_SLACK).any(dim=2)
+    where = _indices()
+    joints = joints.clone()
+    for group in (where.base, where.middle, where.distal):
+        joints[:, group] = joints[:, group].masked_fill(touched, 0.0)
+    joints[:, where.cup] = joints[:, where.cup].masked_fill(touched[:, -1], 0.0)
+    return joints, -lift[:, None] * y_axis
+
+
+def _wrist_z(joints: Tensor) -> Tensor:
+    """The wrist's z axis after the first wrist joint, mount frame. Shape (n, 3)."""
+    a = joints[:, 0]
+    return torch.stack((a.sin(), torch.zeros_like(a), a.cos()), dim=1)
+
+
+def _palm_axes(joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The palm's x, y, z axes in the mount frame after both wrist joints, each (n, 3)."""
+    sa, ca, sb, cb = joints[:, 0].sin(), joints[:, 0].cos(), joints[:, 1].sin(), joints[:, 1].cos()
+    zero = torch.zeros_like(sa)
+    return (
+        torch.stack((ca, zero, -sa), dim=1),
+        torch.stack((sa * sb, cb, ca * sb), dim=1),
+        torch.stack((sa * cb, -sb, ca * cb), dim=1),
+    )
+
+
+def _finger_segments(joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Centre lines of the four fingers' capsules in the palm frame.
+
+    Returns:
+        Starts (n, 4, 3, 3), unit directions (n, 4, 3, 3) and lengths (3,): finger, link, coordinate.
+    """
+    where = _indices()
+    side = joints[:, where.side]
+    bend = torch.stack([joints[:, g] for g in (where.base, where.middle, where.distal)], dim=2)
+    bend[:, -1, 0] += _CUP_TILT * joints[:, where.cup]
+    bend = bend.cumsum(dim=2)
+    sin, cos = bend.sin(), bend.cos()
+    along = torch.stack((side.sin()[..., None] * cos, -sin, side.cos()[..., None] * cos), dim=3)
+    length = joints.new_tensor(_LENGTHS)
+    ends = (along * length[:, None]).cumsum(dim=2)
+    roots = joints.new_tensor([(x, 0.0, z) for x, z in _ROOTS]).repeat(len(joints), 1, 1)
+    roots[:, -1, 1] = -_CUP_LIFT * joints[:, where.cup]
+    start = roots[:, :, None] + torch.cat((torch.zeros_like(ends[:, :, :1]), ends[:, :, :-1]), dim=2)
+    return start, along, length

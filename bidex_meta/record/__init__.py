@@ -1,0 +1,12 @@
+"""Everything that writes to disk: the run folder, checkpoints, metrics, curves, pictures and films.
+
+Importing this package is cheap; torch, TensorBoard, matplotlib and imageio are loaded by the function that needs them.
+"""
+
+from bidex_meta.record.checkpoints import Checkpoints
+from bidex_meta.record.folder import RunFolder
+from bidex_meta.record.metrics import MetricsWriter, read_metrics
+from bidex_meta.record.progress import Progress
+from bidex_meta.record.recorder import Recorder
+
+__all__ = ["Checkpoints", "MetricsWriter", "Progress", "Recorder", "RunFolder", "read_metrics"]

@@ -1,0 +1,88 @@
+"""Checkpoints: ``step_<N>.pt`` (the last few) and ``last.pt``, written atomically and read without unpickling code."""
+
+import re
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+from bidex_meta.errors import BidexError
+from bidex_meta.record.atomic import remove_leftovers, write_atomic
+
+_STEP_FILE = re.compile(r"step_(\d+)\.pt")
+
+
+class Checkpoints:
+    """The checkpoints of one run.
+
+    Args:
+        folder: Where they lie; must exist.
+        keep: How many ``step_<N>.pt`` are kept. More than one, so that a file damaged after it was written
+            (a full disk, a failing one) does not end the run.
+    """
+
+    def __init__(self, folder: Path, keep: int = 3):
+        self.folder = folder
+        self.keep = keep
+
+    @property
+    def last(self) -> Path:
+        """The newest checkpoint; exists after the first ``save``."""
+        return self.folder / "last.pt"
+
+    def save(self, state: dict[str, Any], step: int) -> None:
+        """Write ``step_<step>.pt`` and ``last.pt``, then forget the oldest.
+
+        Args:
+            state: Nested dicts and lists of tensors, numbers and strings; nothing that needs code to be read back.
+            step: Environment steps so far; ``load`` returns it.
+        """
+        import torch
+
+        remove_leftovers(self.folder)
+        path = self.folder / f"step_{step}.pt"
+        write_atomic(path, lambda file: torch.save({"step": step, "state": state}, file))
+        with path.open("rb") as source:
+            write_atomic(self.last, lambda file: shutil.copyfileobj(source, file))
+        for old in self._step_files()[self.keep :]:
+            old.unlink(missing_ok=True)
+
+    def load(self) -> tuple[dict[str, Any], int] | None:
+        """The newest readable checkpoint as ``(state, step)`` with tensors on the CPU; None where there is none yet.
+
+        A torn file is passed over with a line on stderr.
+
+        Raises:
+            BidexError: There are checkpoints, but none of them can be read.
+        """
+        candidates = [path for path in [self.last, *self._step_files()] if path.exists()]
+        for path in candidates:
+            loaded = _read(path)
+            if loaded is not None:
+                return loaded
+        if candidates:
+            raise BidexError(
+                f"None of the {len(candidates)} checkpoints in {self.folder} can be read. Start a new run."
+            )
+        return None
+
+    def _step_files(self) -> list[Path]:
+        """``step_<N>.pt``, newest first."""
+        found = [(int(match[1]), path) for path in self.folder.iterdir() if (match := _STEP_FILE.fullmatch(path.name))]
+        return [path for _, path in sorted(found, reverse=True)]
+
+
+def _read(path: Path) -> tuple[dict[str, Any], int] | None:
+    import torch
+
+    try:
+        # weights_only: a checkpoint from somebody else must not be able to run code.
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        return content["state"], int(content["step"])
+    except Exception as error:  # torch raises a dozen kinds for a damaged file; each means "try the one before"
+        reason = (str(error).splitlines() or [""])[0][:100]
+        print(
+            f"Checkpoint {path} cannot be read ({type(error).__name__}: {reason}); trying an older one.",
+            file=sys.stderr,
+        )
+        return None

@@ -1,0 +1,77 @@
+"""Metrics of a run: a line of JSON and a TensorBoard point for each logged value, over environment steps."""
+
+import json
+import math
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from bidex_meta.record.atomic import write_atomic
+
+
+class MetricsWriter:
+    """Appends to ``metrics.jsonl`` and to TensorBoard's event file in the same folder.
+
+    Args:
+        folder: The run folder.
+        resume_step: Of the checkpoint a resumed run starts from. Whatever was logged after it is dropped from
+            both, since the resumed run logs it again. None for a new run.
+    """
+
+    def __init__(self, folder: Path, resume_step: int | None = None):
+        # Loaded here since it takes a second.
+        from torch.utils.tensorboard.writer import SummaryWriter
+
+        path = folder / "metrics.jsonl"
+        purge_step = None
+        if resume_step is not None:
+            drop_after(path, resume_step)
+            purge_step = resume_step + 1
+        self._file = path.open("a")
+        self._board = SummaryWriter(str(folder), purge_step=purge_step)
+
+    def log(self, metrics: Mapping[str, float], step: int) -> None:
+        """Write one line and one TensorBoard point per value.
+
+        Args:
+            metrics: Tag to number; a value that is not finite stands as null in the JSON.
+            step: Environment steps so far.
+        """
+        values = {tag: float(value) for tag, value in metrics.items()}
+        finite = {tag: value if math.isfinite(value) else None for tag, value in values.items()}
+        self._file.write(json.dumps({"step": step, "time": round(time.time(), 3), **finite}) + "\n")
+        self._file.flush()  # into the hands of the system: a killed process loses no line
+        for tag, value in values.items():
+            self._board.add_scalar(tag, value, step)
+
+    def flush(self) -> None:
+        """Also hand TensorBoard's buffered points to the system."""
+        self._board.flush()
+
+    def close(self) -> None:
+        """Write what is buffered and close both files."""
+        self._file.close()
+        self._board.close()
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """The lines of a ``metrics.jsonl``, without a last one torn by a crash.
+
+    Args:
+        path: The file.
+    """
+    rows = []
+    for line in path.read_text().splitlines():
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            break  # lines are only ever appended: what follows a torn one was never completed
+    return rows
+
+
+def drop_after(path: Path, step: int) -> None:
+    """Keep only the lines of ``path`` with a step up to ``step``; a missing file becomes an empty one."""
+    rows = [row for row in read_metrics(path) if row["step"] <= step] if path.exists() else []
+    text = "".join(json.dumps(row) + "\n" for row in rows)
+    write_atomic(path, lambda file: file.write(text.encode()))

@@ -1,0 +1,102 @@
+"""How training goes, on stderr: a live table in a terminal, a plain line every few seconds elsewhere."""
+
+import sys
+import time
+from collections.abc import Mapping
+from typing import TextIO
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+_PLAIN_SECONDS = 5.0
+_SUCCESS = "Train/success/"
+_RETURN = "Train/return/"
+
+
+class Progress:
+    """Shows steps per second, time left, mean return and success, and both per task.
+
+    Args:
+        total_steps: Environment steps of the whole run.
+        start_step: Where this process begins (a resumed run); its speed counts from there.
+        stream: Where to write; stderr by default, so that stdout keeps to results.
+    """
+
+    def __init__(self, total_steps: int, start_step: int = 0, stream: TextIO | None = None):
+        self._console = Console(file=stream or sys.stderr)
+        self._total = total_steps
+        self._start_step = start_step
+        self._start_time = time.monotonic()
+        self._last_line = -float("inf")
+        self._shown: dict[str, float] = {}
+        self._live = Live(console=self._console, auto_refresh=False) if self._console.is_terminal else None
+
+    def start(self) -> None:
+        """Begin; speed counts from here."""
+        self._start_time = time.monotonic()
+        if self._live is not None:
+            self._live.start()
+
+    def update(self, metrics: Mapping[str, float], step: int) -> None:
+        """Show what is new.
+
+        Args:
+            metrics: Tags of this iteration; those of earlier ones stay shown (an iteration may end no episode).
+            step: Environment steps so far.
+        """
+        self._shown.update({tag: value for tag, value in metrics.items() if value == value})
+        if self._live is not None:
+            self._live.update(self._table(step), refresh=True)
+        elif time.monotonic() - self._last_line >= _PLAIN_SECONDS or step >= self._total:
+            self._last_line = time.monotonic()
+            self._console.print(self._line(step), soft_wrap=True, highlight=False, markup=False)
+
+    def close(self) -> None:
+        """Leave the terminal as it was found, the last table standing."""
+        if self._live is not None:
+            self._live.stop()
+
+    def _tasks(self) -> list[str]:
+        prefixes = (_SUCCESS, _RETURN)
+        names = [tag[len(prefix) :] for tag in self._shown for prefix in prefixes if tag.startswith(prefix)]
+        return list(dict.fromkeys(names))
+
+    def _line(self, step: int) -> str:
+        parts = [self._speed(step), *self._overall()]
+        parts += [f"{name} {_percent(self._shown.get(_SUCCESS + name))}" for name in self._tasks()]
+        return " | ".join(parts)
+
+    def _table(self, step: int) -> Table:
+        title = "  ".join([self._speed(step), *self._overall()])
+        table = Table(title=title, title_justify="left", title_style="bold")
+        table.add_column("task")
+        for column in ("success", "return"):
+            table.add_column(column, justify="right")
+        for name in self._tasks():
+            table.add_row(name, _percent(self._shown.get(_SUCCESS + name)), _number(self._shown.get(_RETURN + name)))
+        return table
+
+    def _speed(self, step: int) -> str:
+        elapsed = max(time.monotonic() - self._start_time, 1e-9)
+        rate = (step - self._start_step) / elapsed
+        left = _duration((self._total - step) / rate) if rate > 0 else "?"
+        return f"{step:,} / {self._total:,} steps  {rate:,.0f} steps/s  {left} left"
+
+    def _overall(self) -> list[str]:
+        mean_return, success = self._shown.get("Train/mean_return"), self._shown.get("Train/success_rate")
+        return [f"return {_number(mean_return)}", f"success {_percent(success)}"]
+
+
+def _percent(value: float | None) -> str:
+    return "–" if value is None else f"{100 * value:.1f} %"
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.4g}"
+
+
+def _duration(seconds: float) -> str:
+    minutes, seconds = divmod(round(max(seconds, 0)), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"

@@ -1,0 +1,266 @@
+"""Reads and checks `suites/*.toml` into frozen dataclasses; `suites/README.md` explains the files field by field.
+
+Names of task classes and of the components of their variations are checked where the classes are known, in
+`bidex_meta.benchmark`.
+"""
+
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal, cast
+
+from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.paths import suites_dir
+
+Split = Literal["train", "test"]
+SPLITS: tuple[Split, Split] = ("train", "test")
+
+
+@dataclass(frozen=True)
+class ListedTask:
+    """One task that a suite file writes out, in place of drawing it."""
+
+    name: str
+    """Unique within its class, e.g. `"left"`."""
+    split: Split
+    """The split it belongs to."""
+    fixed: Mapping[str, float]
+    """Given components of the variation (metres and radians, world frame); the others are drawn by the seed."""
+
+
+@dataclass(frozen=True)
+class SuiteClass:
+    """One task class of a suite."""
+
+    name: str
+    """Name of the task class, e.g. `"CatchUnderarm"`."""
+    splits: tuple[Split, ...]
+    """Where it appears: train, test or both."""
+    reward_scale: float
+    """Factor on the reward the learner sees."""
+    tasks: tuple[ListedTask, ...]
+    """Listed tasks; empty where the tasks are drawn."""
+
+
+@dataclass(frozen=True)
+class Suite:
+    """What a suite file says, checked."""
+
+    name: str
+    """E.g. `"MT4"`."""
+    version: int
+    """The `-vN` of the Gymnasium id; goes up when results change."""
+    kind: Literal["multi-task", "meta"]
+    """Multi-task suites have a train split only; meta suites both, without a task in common."""
+    description: str
+    """One line for lists."""
+    observation: Literal["plain", "one-hot", "masked"]
+    """What is done to the padded observation: nothing, task id appended, goal entries zeroed."""
+    task_id: Literal["class", "task"]
+    """What one entry of the one-hot stands for: a class or a listed task."""
+    reward: Literal["paper"]
+    """Which reward formulas."""
+    base: Literal["moving", "alone"]
+    """Whether every class gets the moving base, or each what it has on its own."""
+    tasks_per_class: int | None
+    """Tasks drawn per class and split; None when every class lists its tasks."""
+    classes: tuple[SuiteClass, ...]
+    """In the order of rows, one-hot and task lists."""
+    file: Path
+    """Where it was read from."""
+
+    @property
+    def splits(self) -> tuple[Split, ...]:
+        """The splits that hold at least one class."""
+        return tuple(split for split in SPLITS if self.split_classes(split))
+
+    def split_classes(self, split: Split) -> tuple[SuiteClass, ...]:
+        """The classes of one split, in file order."""
+        return tuple(entry for entry in self.classes if split in entry.splits)
+
+
+def suite_names() -> list[str]:
+    """Names of the suites that this installation ships, sorted."""
+    return sorted(path.stem for path in suites_dir().glob("*.toml"))
+
+
+def load_suite(name_or_path: str | Path) -> Suite:
+    """Reads a shipped suite by name, or any suite file by path.
+
+    Args:
+        name_or_path: E.g. `"MT4"`, or the path of a `.toml` file (a `Path`, or a text that ends in `.toml`).
+
+    Raises:
+        BidexError: No such suite or file, or the file does not say what `suites/README.md` asks for.
+    """
+    text = str(name_or_path)
+    if isinstance(name_or_path, Path) or text.endswith(".toml"):
+        return _parse(Path(name_or_path).expanduser())
+    if text not in suite_names():
+        raise unknown_name("suite", text, suite_names())
+    return _parse(suites_dir() / f"{text}.toml")
+
+
+def _parse(file: Path) -> Suite:
+    try:
+        content = tomllib.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise BidexError(f"Expected a suite file at {file}, but {error.strerror or error}. Mend the path.") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise BidexError(f"{file}: expected TOML in UTF-8, but {error}.") from error
+    table = _Table(file, "", content)
+    suite = Suite(
+        name=table.text("name"),
+        version=table.count("version"),
+        kind=table.choice("kind", "multi-task", "meta"),
+        description=table.text("description"),
+        observation=table.choice("observation", "plain", "one-hot", "masked"),
+        task_id=table.choice("task_id", "class", "task"),
+        reward=table.choice("reward", "paper"),
+        base=table.choice("base", "moving", "alone"),
+        tasks_per_class=table.count("tasks_per_class") if "tasks_per_class" in content else None,
+        classes=tuple(_parse_class(entry) for entry in table.tables("classes")),
+        file=file,
+    )
+    table.finish()
+    _check(suite, table)
+    return suite
+
+
+def _parse_class(table: "_Table") -> SuiteClass:
+    split = table.choice("split", "train", "test", "both", default="train")
+    entry = SuiteClass(
+        name=table.text("name"),
+        splits=SPLITS if split == "both" else (cast(Split, split),),
+        reward_scale=table.number("reward_scale", default=1.0),
+        tasks=tuple(_parse_task(task) for task in table.tables("tasks", default=())),
+    )
+    table.finish()
+    if entry.reward_scale <= 0.0:
+        raise table.error("reward_scale", "a number above 0", entry.reward_scale)
+    return entry
+
+
+def _parse_task(table: "_Table") -> ListedTask:
+    fixed = table.table("fixed")
+    task = ListedTask(
+        name=table.text("name"),
+        split=table.choice("split", *SPLITS, default="train"),
+        fixed=MappingProxyType({key: fixed.number(key) for key in fixed.content}),
+    )
+    table.finish()
+    return task
+
+
+def _check(suite: Suite, table: "_Table") -> None:
+    _check_unique(table, "classes", [entry.name for entry in suite.classes])
+    expected = SPLITS if suite.kind == "meta" else ("train",)
+    if suite.splits != expected:
+        mend = "Give each class a split." if suite.kind == "meta" else 'Leave split out, or write kind = "meta".'
+        received = ", ".join(suite.splits)
+        raise table.error("classes", f"a {suite.kind} suite with the splits {', '.join(expected)}", received, mend)
+    all_listed = all(entry.tasks for entry in suite.classes)
+    if all_listed and suite.tasks_per_class is not None:
+        mend = "Leave it out: every class lists its tasks."
+        raise table.error("tasks_per_class", "nothing", suite.tasks_per_class, mend)
+    if not all_listed and suite.tasks_per_class is None:
+        raise table.error("tasks_per_class", "a whole number from 1 on", "nothing", "Add it, or list every task.")
+    if suite.task_id == "task" and not all_listed:
+        raise table.error("task_id", '"class", since not every class lists its tasks', suite.task_id)
+    for index, entry in enumerate(suite.classes):
+        if entry.tasks:
+            _check_listed(entry, _Table(table.file, f"classes[{index}].", {}))
+
+
+def _check_listed(entry: SuiteClass, table: "_Table") -> None:
+    _check_unique(table, "tasks", [task.name for task in entry.tasks])
+    listed = tuple(split for split in SPLITS if any(task.split == split for task in entry.tasks))
+    if listed != entry.splits:
+        mend = f"Make split of {entry.name} and of its tasks agree."
+        raise table.error("tasks", f"tasks in {' and '.join(entry.splits)}", f"in {' and '.join(listed)}", mend)
+    train, test = ([task for task in entry.tasks if task.split == split] for split in SPLITS)
+    for held_out in test:
+        for other in train:
+            if held_out.fixed == other.fixed:
+                received = f"{other.name!r} and {held_out.name!r} with the same fixed values"
+                raise table.error("tasks", "train and test tasks that differ", received, "Change one of them.")
+
+
+def _check_unique(table: "_Table", key: str, names: list[str]) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise table.error(f"{key}.name", "each name once", f"{name!r} {names.count(name)} times", "Remove one.")
+
+
+_REQUIRED: Any = object()
+
+
+class _Table:
+    """A TOML table that is asked for each of its keys by type, and at the end for keys nobody asked for."""
+
+    def __init__(self, file: Path, prefix: str, content: dict[str, Any]) -> None:
+        self.file = file
+        self.content = content
+        self._prefix = prefix
+        self._asked: list[str] = []
+
+    def text(self, key: str) -> str:
+        value = self._get(key, "a text in quotes", _REQUIRED)
+        if not isinstance(value, str) or not value.strip():
+            raise self.error(key, "a text in quotes", value)
+        return value
+
+    def choice(self, key: str, *choices: str, default: str = _REQUIRED) -> Any:
+        expected = " or ".join(f'"{choice}"' for choice in choices)
+        value = self._get(key, expected, default)
+        if not isinstance(value, str) or value not in choices:
+            raise self.error(key, expected, value)
+        return value
+
+    def count(self, key: str) -> int:
+        value = self._get(key, "a whole number from 1 on", _REQUIRED)
+        if type(value) is not int or value < 1:
+            raise self.error(key, "a whole number from 1 on", value)
+        return value
+
+    def number(self, key: str, default: float = _REQUIRED) -> float:
+        value = self._get(key, "a number", default)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise self.error(key, "a finite number", value)
+        return float(value)
+
+    def table(self, key: str) -> "_Table":
+        value = self._get(key, "a table", _REQUIRED)
+        if not isinstance(value, dict):
+            raise self.error(key, "a table such as { goal_x = 0.0 }", value)
+        return _Table(self.file, f"{self._prefix}{key}.", value)
+
+    def tables(self, key: str, default: Any = _REQUIRED) -> list["_Table"]:
+        expected = f"at least one [[{key}]] table"
+        value = self._get(key, expected, default)
+        if value is default:
+            return []
+        if not isinstance(value, list) or not value or not all(isinstance(entry, dict) for entry in value):
+            raise self.error(key, expected, value)
+        return [_Table(self.file, f"{self._prefix}{key}[{index}].", entry) for index, entry in enumerate(value)]
+
+    def finish(self) -> None:
+        for key in self.content:
+            if key not in self._asked:
+                where = f"{self.file}: {self._prefix}{key}"
+                raise BidexError(f"{where}: {unknown_name('key', key, self._asked)}")
+
+    def error(self, key: str, expected: str, received: object, mend: str = "") -> BidexError:
+        shown = received if isinstance(received, str) and mend else repr(received)
+        hint = mend or "See suites/README.md."
+        return BidexError(f"{self.file}: {self._prefix}{key}: expected {expected}, got {shown}. {hint}")
+
+    def _get(self, key: str, expected: str, default: Any) -> Any:
+        self._asked.append(key)
+        if key not in self.content and default is _REQUIRED:
+            near = [given for given in self.content if given not in self._asked]
+            raise self.error(key, expected, "nothing", f"Add {key} (keys given: {', '.join(near) or 'none'}).")
+        return self.content.get(key, default)

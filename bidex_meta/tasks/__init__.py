@@ -1,0 +1,1 @@
+"""The task classes: one file each."""

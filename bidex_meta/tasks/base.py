@@ -1,0 +1,121 @@
+"""What a task class is: one scene, one variation space, one reward formula, one success test."""
+
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+import mujoco
+import torch
+from torch import Tensor
+
+from bidex_meta.hands.poses import HandPose
+from bidex_meta.tasks.layout import Layout
+from bidex_meta.tasks.state import TaskState
+from bidex_meta.tasks.variation import VariationSpace
+
+CONTROL_RATE = 60
+"""Control steps per second of every class (sheet 1.1)."""
+
+
+class TaskClass(ABC):
+    """One of the manipulation tasks, batched over rows.
+
+    Methods take and return tensors whose first axis counts rows, in the engine's precision. Nothing here loops over
+    rows or keeps state: what a task freezes is in ``frozen``, what an episode draws is in ``draws``.
+
+    Attributes:
+        name: Name of the class, e.g. ``CatchUnderarm``.
+        summary: What it asks for, one line.
+        episode_steps: Time limit, control steps.
+        right: Start pose of the right hand.
+        left: Start pose of the left hand.
+        transition_scale: Scale of the base forces (sheet 1.3).
+        orientation_scale: Scale of the base torques.
+        start_draws: How many uniform numbers the start of an episode takes.
+        moving_base: Whether the hands' bases are driven (52 actions) or fixed (40).
+        camera_target: Point that pictures look at, world, metres.
+        camera_distance: Distance of the camera from it, metres.
+    """
+
+    name: ClassVar[str]
+    summary: ClassVar[str]
+    episode_steps: ClassVar[int]
+    right: ClassVar[HandPose]
+    left: ClassVar[HandPose]
+    transition_scale: ClassVar[float]
+    orientation_scale: ClassVar[float]
+    start_draws: ClassVar[int]
+    moves_by_default: ClassVar[bool] = True
+    camera_target: ClassVar[tuple[float, float, float]] = (0.0, -0.58, 0.5)
+    camera_distance: ClassVar[float] = 1.15
+
+    def __init__(self, moving_base: bool | None = None) -> None:
+        """Chooses the base.
+
+        Args:
+            moving_base: Drive the bases or fix them; None takes the class's own (fixed for HandOver alone).
+        """
+        self.moving_base = self.moves_by_default if moving_base is None else moving_base
+
+    @property
+    def observation_size(self) -> int:
+        """Entries of the observation before padding."""
+        return self.layout.size
+
+    @property
+    def action_size(self) -> int:
+        """Number of actions: 26 a hand with a moving base, 20 with a fixed one."""
+        return 52 if self.moving_base else 40
+
+    @property
+    @abstractmethod
+    def variation_space(self) -> VariationSpace:
+        """What a task of this class freezes."""
+
+    @property
+    @abstractmethod
+    def layout(self) -> Layout:
+        """The observation as named blocks."""
+
+    @abstractmethod
+    def add_objects(self, scene: mujoco.MjSpec) -> None:
+        """Adds everything but floor and hands to the scene."""
+
+    @abstractmethod
+    def freeze(self, variation: Tensor) -> dict[str, Tensor]:
+        """What reward and observation need of variations (n, variation_space.size), computed once; each (n, k)."""
+
+    @abstractmethod
+    def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
+        """Writes the start of an episode.
+
+        Args:
+            draws: Uniform numbers in [-1, 1], shape (n, start_draws).
+            frozen: The rows' frozen numbers, each (n, k).
+            qpos: Part name (``right/joints``, an object, ...) to its positions, views of shape (n, k) that hold the
+                nominal start and are written in place; MuJoCo's quaternion order (w, x, y, z).
+        """
+
+    @abstractmethod
+    def observe(self, state: TaskState) -> dict[str, Tensor]:
+        """The blocks of the layout that no sensor gives, by name, each (n, size)."""
+
+    @abstractmethod
+    def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
+        """Named terms, each (n,), that sum to the reward of the printed formula."""
+
+    @abstractmethod
+    def success(self, state: TaskState) -> Tensor:
+        """Whether the task is solved in this state. Shape (n,), bool."""
+
+    def failed(self, state: TaskState) -> Tensor:
+        """Whether the episode ends here other than by time. Shape (n,), bool; never by default."""
+        first = next(iter(state.frozen.values()))
+        return torch.zeros(len(first), dtype=torch.bool, device=first.device)
+
+    def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
+        """Goals to draw in pictures: poses (n, 7), quaternion (x, y, z, w), and semi-axes of an ellipsoid, metres."""
+        return []
+
+    def __repr__(self) -> str:
+        """The class's name and base."""
+        return f"{self.name}({'moving' if self.moving_base else 'fixed'} base)"

@@ -1,0 +1,88 @@
+"""What the throwing and catching classes share: an egg, its goal pose, the exponential reward of equations 1 to 5."""
+
+import torch
+from torch import Tensor
+
+from bidex_meta.hands.poses import HandPose
+from bidex_meta.hands.starts import make_room, noisy_joints
+from bidex_meta.maths import conjugate, multiply, norm, random_orientation, rotate, rotation_angle, wxyz, xyzw
+from bidex_meta.tasks.state import TaskState
+
+RADIUS, HALF_LENGTH = 0.03, 0.04
+"""Short and long semi-axis of the egg, metres (sheet 5.1)."""
+SEMI_AXES = (RADIUS, RADIUS, HALF_LENGTH)
+JOINT_DRAWS = 24
+SUCCESS_DISTANCE = 0.03
+"""Object within this distance of its goal, metres."""
+GOAL_RANGE = 0.03
+"""Half width of the goals' box, metres."""
+
+
+def goal_pose(position: Tensor, draws: Tensor) -> Tensor:
+    """Pose (n, 7), position and quaternion (x, y, z, w), from positions (n, 3) and orientation draws (n, 2)."""
+    return torch.cat((position, random_orientation(draws[:, 0], draws[:, 1])), dim=1)
+
+
+def start_hands(draws: Tensor, noise: float, qpos: dict[str, Tensor]) -> None:
+    """Gives both hands the same noisy joint angles (sheet 3.2). Draws in [-1, 1], shape (n, 24)."""
+    joints = noisy_joints(draws, noise)
+    qpos["right/joints"].copy_(joints)
+    qpos["left/joints"].copy_(joints)
+
+
+def start_egg(qpos: Tensor, draws: Tensor, noise: float) -> None:
+    """Shifts an egg from its nominal start and turns it at random.
+
+    Args:
+        qpos: The egg's positions (n, 7), written in place.
+        draws: Numbers in [-1, 1], shape (n, 5): three of position, two of orientation.
+        noise: Half width of the position noise, metres.
+    """
+    qpos[:, :3] += noise * draws[:, :3]
+    qpos[:, 3:] = wxyz(random_orientation(draws[:, 3], draws[:, 4]))
+
+
+def lay_egg_on_hand(egg: Tensor, joints: Tensor, pose: HandPose) -> None:
+    """Lifts an egg off the palm it lies on and opens the fingers that would stick in it.
+
+    Args:
+        egg: The egg's positions (n, 7), written in place.
+        joints: That hand's joint angles (n, 24), written in place.
+        pose: Start pose of that hand.
+    """
+    quaternion = xyzw(egg.new_tensor(pose.quaternion))
+    inverse = conjugate(quaternion)
+    position = rotate(inverse, egg[:, :3] - egg.new_tensor(pose.position))
+    axis = rotate(inverse, rotate(xyzw(egg[:, 3:]), egg.new_tensor((0.0, 0.0, 1.0))))
+    opened, shift = make_room(joints, position, axis, RADIUS, HALF_LENGTH)
+    joints.copy_(opened.float())
+    egg[:, :3] += rotate(quaternion, shift).float()
+
+
+def distances(state: TaskState, egg: str, goal: str) -> tuple[Tensor, Tensor]:
+    """Distance (m) and rotation (rad in [0, pi]) between an egg and its goal, each (n,)."""
+    target = state.frozen[goal]
+    translation = state.once(("distance", egg), lambda: norm(state[f"{egg}/position"] - target[:, :3]))
+    return translation, state.once(("angle", egg), lambda: rotation_angle(rotation_difference(state, egg, goal)))
+
+
+def rotation_difference(state: TaskState, egg: str, goal: str) -> Tensor:
+    """The egg's quaternion times the inverse of its goal's, (x, y, z, w), shape (n, 4)."""
+    inverse = state.frozen[f"{goal}_inverse"]
+    return state.once(("difference", egg), lambda: multiply(state.quaternion(f"{egg}/quaternion"), inverse))
+
+
+def pose_reward(state: TaskState, egg: str, goal: str, alpha: float) -> Tensor:
+    """exp(-0.2 (alpha d_t + d_r)), shape (n,)."""
+    translation, rotation = distances(state, egg, goal)
+    return torch.exp(-0.2 * (alpha * translation + rotation))
+
+
+def observe_goal(state: TaskState, egg: str, goal: str) -> dict[str, Tensor]:
+    """The two goal blocks of an egg."""
+    return {f"{goal}_pose": state.frozen[goal], f"{goal}_rotation_difference": rotation_difference(state, egg, goal)}
+
+
+def frozen_goal(name: str, pose: Tensor) -> dict[str, Tensor]:
+    """A goal pose (n, 7) and the inverse of its rotation, as frozen numbers."""
+    return {name: pose, f"{name}_inverse": conjugate(pose[:, 3:])}

@@ -1,0 +1,26 @@
+"""HandOver: appendix A.2.1, sheet 4.1."""
+
+from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
+from bidex_meta.tasks.one_egg import OneEgg
+
+
+class HandOver(OneEgg):
+    """Pass an egg from one upturned palm to the other across a gap of 4 cm.
+
+    Observation: Table 8 (398) with the fixed base, 422 with the moving one that the suites use. Reward: equation 1.
+    """
+
+    name = "HandOver"
+    summary = "Throw an egg from the right palm to the left one across a narrow gap"
+    episode_steps = 75
+    moves_by_default = False
+    right = HandPose((0.0, 0.0, 0.5), PALM_UP_AWAY)
+    left = HandPose((0.0, -1.0, 0.5), PALM_UP_BACK)
+    # With a moving base the figures of CatchUnderarm hold (design.md section 4); the original gives none.
+    transition_scale = 0.05
+    orientation_scale = 0.5
+    egg_start = (0.0, -0.39, 0.54)
+    goal_centre = (0.0, -0.64, 0.54)
+    position_noise = 0.01
+    joint_noise = 0.2
+    floor = 0.2

@@ -1,0 +1,146 @@
+"""The observation of a task as named blocks: sizes, indices, goal mask and documentation derive from it."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from bidex_meta.hands.hand import FINGERS, hand
+from bidex_meta.hands.pair import SIDES
+
+VELOCITY_SCALE = 0.2
+"""Scale of joint velocities and of objects' angular velocities (sheet 1.5)."""
+FORCE_SCALE = 10.0
+"""Scale of joint forces and of fingertip forces and torques (sheet 1.5)."""
+CLIP = 5.0
+"""Every entry is clipped to +-5 after its scale (sheet 1.2)."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """Consecutive entries of an observation.
+
+    Attributes:
+        name: What it is, e.g. ``right_joint_position``.
+        size: Number of entries.
+        sensors: Names of the sensors it is read from, in order; empty if the entries are computed.
+        scale: Factor on the sensors' values.
+        goal: Whether it tells the goal, so that meta suites zero it.
+        description: One line for documentation, with unit and frame.
+    """
+
+    name: str
+    size: int
+    sensors: tuple[str, ...] = ()
+    scale: float = 1.0
+    goal: bool = False
+    description: str = ""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """An observation: its blocks in order."""
+
+    blocks: tuple[Block, ...]
+
+    @property
+    def size(self) -> int:
+        """Number of entries."""
+        return sum(block.size for block in self.blocks)
+
+    def __iter__(self) -> Iterator[tuple[Block, slice]]:
+        """The blocks with their index ranges."""
+        start = 0
+        for block in self.blocks:
+            yield block, slice(start, start + block.size)
+            start += block.size
+
+    def range(self, name: str) -> slice:
+        """Index range of the named block; KeyError if there is none."""
+        for block, where in self:
+            if block.name == name:
+                return where
+        raise KeyError(f"No block {name!r}; there are {', '.join(b.name for b in self.blocks)}")
+
+    def goal_indices(self) -> list[int]:
+        """Indices of all entries that tell the goal."""
+        return [i for block, where in self if block.goal for i in range(where.start, where.stop)]
+
+
+def hand_blocks(side: str, moving: bool) -> tuple[Block, ...]:
+    """One hand's share of Table 7 (199 entries; 187 with a fixed base: no base entries, 20 actions)."""
+    joints = hand().joints
+    tips = [f"{side}/{finger}distal" for finger in FINGERS]
+    kinds = ("position", "quaternion", "linear_velocity", "angular_velocity")
+    blocks = [
+        Block(
+            f"{side}_joint_position",
+            len(joints),
+            tuple(f"{side}/{j}_position" for j in joints),
+            description="joint angles, mapped from the joint's range to [-1, 1]",
+        ),
+        Block(
+            f"{side}_joint_velocity",
+            len(joints),
+            tuple(f"{side}/{j}_velocity" for j in joints),
+            VELOCITY_SCALE,
+            description="joint velocities, 0.2 rad/s",
+        ),
+        Block(
+            f"{side}_joint_force",
+            len(joints),
+            tuple(f"{side}/{j}_force" for j in joints),
+            FORCE_SCALE,
+            description="actuator force at the joint, 10 N m; 0 for the coupled distal joints",
+        ),
+        Block(
+            f"{side}_fingertip_state",
+            65,
+            tuple(f"{tip}_{kind}" for tip in tips for kind in kinds),
+            description="per distal body: origin (m), quaternion (x, y, z, w), velocities (m/s, rad/s), world frame",
+        ),
+        Block(
+            f"{side}_fingertip_force_torque",
+            30,
+            tuple(f"{tip}_{kind}" for tip in tips for kind in ("force", "torque")),
+            FORCE_SCALE,
+            description="per distal body: force and torque at its origin, body frame, 10 N and 10 N m; holds the link's weight",
+        ),
+    ]
+    if moving:
+        blocks += [
+            Block(f"{side}_base_position", 3, (f"{side}/mount_position",), description="mount origin, world frame, m"),
+            Block(f"{side}_base_rotation", 3, description="roll, pitch, yaw of the mount against its start, rad"),
+        ]
+    actions = 26 if moving else 20
+    blocks.append(Block(f"{side}_action", actions, description="last actions of this hand, in [-1, 1]"))
+    return tuple(blocks)
+
+
+def object_blocks(sensors: str, name: str) -> tuple[Block, ...]:
+    """Pose and velocities of a free object (13 entries), read from the sensors ``<sensors>/...``."""
+    return (
+        Block(
+            f"{name}_pose",
+            7,
+            (f"{sensors}/position", f"{sensors}/quaternion"),
+            description="position (m) and quaternion (x, y, z, w), world frame",
+        ),
+        Block(f"{name}_linear_velocity", 3, (f"{sensors}/linear_velocity",), description="world frame, m/s"),
+        Block(
+            f"{name}_angular_velocity", 3, (f"{sensors}/angular_velocity",), VELOCITY_SCALE, description="world frame, 0.2 rad/s"
+        ),
+    )
+
+
+def goal_blocks(name: str) -> tuple[Block, ...]:
+    """Goal pose and the rotation from goal to object (11 entries), zeroed in meta suites."""
+    return (
+        Block(f"{name}_pose", 7, goal=True, description="position (m) and quaternion (x, y, z, w), world frame"),
+        Block(
+            f"{name}_rotation_difference", 4, goal=True, description="object times inverse goal quaternion, (x, y, z, w)"
+        ),
+    )
+
+
+def both_hands(moving: bool) -> tuple[Block, ...]:
+    """Table 7: 398 entries with moving bases, 374 with fixed ones."""
+    return tuple(block for side in SIDES for block in hand_blocks(side, moving))

@@ -1,0 +1,36 @@
+"""What a task class may look at: one transition of its rows."""
+
+from collections.abc import Callable
+
+from torch import Tensor
+
+from bidex_meta.maths import xyzw
+
+
+class TaskState:
+    """The state of a class's rows after a step: sensors by name and the frozen numbers of their tasks."""
+
+    def __init__(self, sensors: Tensor, addresses: dict[str, slice], frozen: dict[str, Tensor]) -> None:
+        """Wraps tensors; nothing is copied.
+
+        Args:
+            sensors: Sensor values of the rows, shape (n, nsensordata), in the engine's precision.
+            addresses: Sensor name to its slice.
+            frozen: What the class computed from each row's variation (``TaskClass.freeze``), each (n, k).
+        """
+        self._sensors, self._addresses, self._known = sensors, addresses, {}
+        self.frozen = frozen
+
+    def __getitem__(self, name: str) -> Tensor:
+        """Values of the named sensor, shape (n, k)."""
+        return self._sensors[:, self._addresses[name]]
+
+    def quaternion(self, name: str) -> Tensor:
+        """Orientation (x, y, z, w) read from the named framequat sensor, shape (n, 4)."""
+        return self.once(("quaternion", name), lambda: xyzw(self[name]))
+
+    def once(self, key: object, compute: Callable[[], Tensor]) -> Tensor:
+        """A value that reward, success and observation share, computed at its first use."""
+        if key not in self._known:
+            self._known[key] = compute()
+        return self._known[key]

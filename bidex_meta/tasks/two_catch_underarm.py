@@ -1,0 +1,84 @@
+"""TwoCatchUnderarm: appendix A.2.4, sheet 4.4."""
+
+import mujoco
+from torch import Tensor
+
+from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
+from bidex_meta.tasks import eggs
+from bidex_meta.tasks.base import TaskClass
+from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks
+from bidex_meta.tasks.scene import FreeObject
+from bidex_meta.tasks.state import TaskState
+from bidex_meta.tasks.variation import VariationSpace, box, join, orientation
+
+_ALPHA = 50.0
+_NOISE = 0.01
+_FLOOR = 0.2
+_GOALS = {"object1": (0.0, -0.79, 0.54), "object2": (0.0, -0.38, 0.54)}
+
+
+class TwoCatchUnderarm(TaskClass):
+    """Throw two eggs at once, each to the other hand.
+
+    Observation: Table 14 (446). Reward: equation 4. Both goals share one orientation, both eggs one start noise and
+    orientation (sheet 4.4). Success: each egg within 3 cm of its goal, both in the same step.
+    """
+
+    name = "TwoCatchUnderarm"
+    summary = "Throw two eggs at once, each to the other hand"
+    episode_steps = 75
+    right = HandPose((0.0, 0.0, 0.5), PALM_UP_AWAY)
+    left = HandPose((0.0, -1.15, 0.5), PALM_UP_BACK)
+    transition_scale = 0.05
+    orientation_scale = 0.5
+    start_draws = eggs.JOINT_DRAWS + 5
+
+    @property
+    def variation_space(self) -> VariationSpace:
+        """Both goal positions (world, metres) and the two draws of their common orientation."""
+        goals = [box(f"goal{i}", centre, eggs.GOAL_RANGE) for i, centre in enumerate(_GOALS.values(), start=1)]
+        return join(*goals, orientation("goal"))
+
+    @property
+    def layout(self) -> Layout:
+        """Table 14."""
+        tail = [(*object_blocks(f"object{i}", f"object{i}"), *goal_blocks(f"goal{i}")) for i in (1, 2)]
+        return Layout((*both_hands(self.moving_base), *tail[0], *tail[1]))
+
+    def add_objects(self, scene: mujoco.MjSpec) -> None:
+        """Two eggs: the first on the right hand, the second, of another colour, on the left."""
+        FreeObject("object1", "egg", (0.0, -0.39, 0.54)).add_to(scene)
+        FreeObject("object2", "egg", (0.0, -0.78, 0.54), colour=(0.45, 0.62, 0.30, 1.0)).add_to(scene)
+
+    def freeze(self, variation: Tensor) -> dict[str, Tensor]:
+        """``goal1``, ``goal2``: poses (n, 7); ``..._inverse``: inverses of their rotations (n, 4)."""
+        first = eggs.frozen_goal("goal1", eggs.goal_pose(variation[:, :3], variation[:, 6:]))
+        return first | eggs.frozen_goal("goal2", eggs.goal_pose(variation[:, 3:6], variation[:, 6:]))
+
+    def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
+        """Noisy hands with an egg on each."""
+        eggs.start_hands(draws[:, : eggs.JOINT_DRAWS], 0.2, qpos)
+        for name, side, pose in (("object1", "right", self.right), ("object2", "left", self.left)):
+            eggs.start_egg(qpos[name], draws[:, eggs.JOINT_DRAWS :], _NOISE)
+            eggs.lay_egg_on_hand(qpos[name], qpos[f"{side}/joints"], pose)
+
+    def observe(self, state: TaskState) -> dict[str, Tensor]:
+        """The goal blocks of both eggs."""
+        return eggs.observe_goal(state, "object1", "goal1") | eggs.observe_goal(state, "object2", "goal2")
+
+    def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
+        """``pose1`` and ``pose2``: exp(-0.2 (alpha d_ti + d_ri))."""
+        return {f"pose{i}": eggs.pose_reward(state, f"object{i}", f"goal{i}", _ALPHA) for i in (1, 2)}
+
+    def success(self, state: TaskState) -> Tensor:
+        """Each egg within 3 cm of its goal."""
+        first, second = (eggs.distances(state, f"object{i}", f"goal{i}")[0] for i in (1, 2))
+        return (first < eggs.SUCCESS_DISTANCE) & (second < eggs.SUCCESS_DISTANCE)
+
+    def failed(self, state: TaskState) -> Tensor:
+        """Either egg dropped; the reward is positive throughout."""
+        return (state["object1/position"][:, 2] <= _FLOOR) | (state["object2/position"][:, 2] <= _FLOOR)
+
+    def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
+        """Both goals."""
+        return [(frozen["goal1"], eggs.SEMI_AXES), (frozen["goal2"], eggs.SEMI_AXES)]

@@ -1,0 +1,6 @@
+"""The batched world: groups of equal structure, actions, observations, resets, episodes, random numbers."""
+
+from bidex_meta.world.groups import Slot
+from bidex_meta.world.world import World
+
+__all__ = ["Slot", "World"]

@@ -1,0 +1,100 @@
+"""Rows of equal structure share one engine batch."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bidex_meta.engine.cpu import CpuEngine
+from bidex_meta.engine.structure import same_structure
+from bidex_meta.tasks.base import TaskClass
+from bidex_meta.tasks.scene import Scene, compile_scene
+
+
+@dataclass(frozen=True)
+class Slot:
+    """A task class with its pool of tasks and its share of a world.
+
+    Attributes:
+        name: Name in reports, e.g. ``CatchUnderarm`` or ``CatchUnderarm/left``.
+        task_class: The class.
+        tasks: The pool of variations, shape (n, variation_space.size), float64.
+        reward_scale: Factor on the reward that the world returns.
+    """
+
+    name: str
+    task_class: TaskClass
+    tasks: np.ndarray
+    reward_scale: float = 1.0
+
+
+@dataclass(frozen=True)
+class Member:
+    """A slot's place: its rows in the world and in its group's engine, both contiguous."""
+
+    slot: int
+    scene: Scene
+    world_rows: slice
+    engine_rows: slice
+
+
+@dataclass(frozen=True)
+class Group:
+    """Slots whose models have the same structure, on one engine.
+
+    Attributes:
+        engine: The batch.
+        members: Its slots.
+        rows: World row of each simulation, shape (num,), int64.
+        span: The same as a slice of the world's rows if they are contiguous, else None.
+    """
+
+    engine: CpuEngine
+    members: tuple[Member, ...]
+    rows: Tensor
+    span: slice | None
+
+    def take(self, values: Tensor) -> Tensor:
+        """This group's rows of a tensor over the world's rows (a view where the rows are contiguous)."""
+        return values[self.span] if self.span is not None else values[self.rows]
+
+
+def split_rows(num_envs: int, slots: int) -> list[slice]:
+    """Contiguous rows for each slot, even; the first slots take the remainder."""
+    share, rest = divmod(num_envs, slots)
+    stops = [share * (i + 1) + min(i + 1, rest) for i in range(slots)]
+    return [slice(stop - share - (i < rest), stop) for i, stop in enumerate(stops)]
+
+
+def build_groups(slots: list[Slot], rows: list[slice], threads: int | None) -> list[Group]:
+    """Compiles the slots' scenes and puts those of equal structure together, in the slots' order."""
+    scenes: dict[tuple[str, bool], Scene] = {}
+    for slot in slots:
+        key = (slot.task_class.name, slot.task_class.moving_base)
+        if key not in scenes:
+            scenes[key] = compile_scene(slot.task_class)
+    pools: list[list[int]] = []
+    by_slot = [scenes[slot.task_class.name, slot.task_class.moving_base] for slot in slots]
+    for i, scene in enumerate(by_slot):
+        home = next((pool for pool in pools if same_structure(by_slot[pool[0]].model, scene.model)), None)
+        if home is None:
+            pools.append([i])
+        else:
+            home.append(i)
+    return [_build_group([(i, by_slot[i], rows[i]) for i in pool], threads) for pool in pools]
+
+
+def _build_group(places: list[tuple[int, Scene, slice]], threads: int | None) -> Group:
+    members, model_of_row, models, start = [], [], [], 0
+    for slot, scene, world_rows in places:
+        count = world_rows.stop - world_rows.start
+        members.append(Member(slot, scene, world_rows, slice(start, start + count)))
+        if scene.model not in models:
+            models.append(scene.model)
+        model_of_row += [models.index(scene.model)] * count
+        start += count
+    rows = torch.cat([torch.arange(m.world_rows.start, m.world_rows.stop) for m in members])
+    first, last = int(rows[0]), int(rows[-1])
+    span = slice(first, last + 1) if last - first + 1 == len(rows) else None
+    return Group(CpuEngine(models, model_of_row, threads), tuple(members), rows, span)

@@ -1,0 +1,82 @@
+"""From sensors to observations: one gather, one scale, a few computed blocks."""
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from bidex_meta.hands.hand import hand
+from bidex_meta.hands.pair import SIDES
+from bidex_meta.maths import conjugate, multiply, roll_pitch_yaw, xyzw
+from bidex_meta.tasks.layout import CLIP, Layout
+from bidex_meta.tasks.scene import Scene
+
+Rule = Literal["plain", "one-hot", "masked"]
+"""What a suite shows: everything; everything and the task's id; everything but the goal."""
+
+
+class Observer:
+    """Builds the observations of rows of one layout: a gather of sensors, then actions and base rotations.
+
+    The blocks that only a task can compute (goal pose and its like) are left at zero, which is also how a masked goal
+    looks, and so is the padding; ``Part`` fills in the former.
+    """
+
+    def __init__(self, scene: Scene, start_mounts: Tensor, width: int) -> None:
+        """Finds for every entry its sensor, factor and offset.
+
+        Args:
+            scene: A scene whose task has the layout.
+            start_mounts: Start orientation (x, y, z, w) of both mounts of each row, shape (num, 2, 4).
+            width: Entries of the observation with padding and task id.
+        """
+        self.layout: Layout = scene.task.layout
+        self._source = torch.zeros(width, dtype=torch.int64)
+        self._scale, self._offset = torch.zeros(2, width).unbind()
+        span, middle = (torch.as_tensor(x).float() for x in (hand().high - hand().low, hand().high + hand().low))
+        for block, where in self.layout:
+            if block.sensors:
+                self._source[where] = torch.cat([_indices(scene, name) for name in block.sensors])
+                self._scale[where] = block.scale
+            if block.name.endswith("joint_position"):
+                self._scale[where], self._offset[where] = 2.0 / span, -middle / span
+        self._start_inverse = conjugate(start_mounts)
+        self._mounts = torch.cat([_indices(scene, f"{side}/mount_quaternion") for side in SIDES])
+        self._actions = [self.layout.range(f"{side}_action") for side in SIDES]
+        moving = scene.task.moving_base
+        self._rotations = [self.layout.range(f"{side}_base_rotation") for side in SIDES] if moving else []
+
+    def __call__(self, sensors: Tensor, action: Tensor, rows: Tensor | slice, out: Tensor | None = None) -> Tensor:
+        """Observations without the tasks' own blocks, not yet clipped.
+
+        Args:
+            sensors: Sensor values of the rows, shape (n, nsensordata).
+            action: Their last actions, shape (n, a).
+            rows: Which of all rows these are.
+            out: Where to write them, shape (n, width), or None for a new tensor.
+
+        Returns:
+            Shape (n, width), float32.
+        """
+        values = torch.index_select(sensors.float(), 1, self._source, out=out).mul_(self._scale).add_(self._offset)
+        share = action.shape[1] // len(SIDES)
+        for i, where in enumerate(self._actions):
+            values[:, where] = action[:, i * share : (i + 1) * share]
+        if self._rotations:
+            mounts = sensors.index_select(1, self._mounts).view(-1, len(SIDES), 4)
+            rotation = roll_pitch_yaw(multiply(mounts, self._start_inverse[rows])).float()
+            for i, where in enumerate(self._rotations):
+                values[:, where] = rotation[:, i]
+        return values
+
+
+def clip(values: Tensor) -> Tensor:
+    """Clips entries to +-5, in place."""
+    return values.clamp_(-CLIP, CLIP)
+
+
+def _indices(scene: Scene, name: str) -> Tensor:
+    """Indices of a sensor in ``sensordata``; quaternions come out as (x, y, z, w)."""
+    where = scene.sensors[name]
+    indices = torch.arange(int(where.start), int(where.stop))
+    return xyzw(indices) if name.endswith("quaternion") else indices

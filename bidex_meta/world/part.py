@@ -1,0 +1,165 @@
+"""The rows of a world that one engine carries: controls, transitions, observations, starts."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from bidex_meta.maths import xyzw
+from bidex_meta.tasks.state import TaskState
+from bidex_meta.world.actions import Controls
+from bidex_meta.world.groups import Group, Member, Slot
+from bidex_meta.world.observations import Observer, Rule, clip
+
+
+@dataclass(frozen=True)
+class Transition:
+    """What a step did to a part's rows, before it is scaled or cleaned.
+
+    Attributes:
+        terms: Reward terms by name, each (num,); 0 where a class has no such term.
+        reward: Their sum, shape (num,).
+        success: Shape (num,), bool.
+        failed: Shape (num,), bool.
+        unstable: Shape (num,), bool.
+    """
+
+    terms: dict[str, Tensor]
+    reward: Tensor
+    success: Tensor
+    failed: Tensor
+    unstable: Tensor
+
+
+class Part:
+    """A group of rows with everything that turns engine numbers into transitions and back.
+
+    Attributes:
+        group: The rows and their engine.
+        engine_rows: Engine row of each of the world's rows, -1 where it is not of this part, shape (num_envs,).
+    """
+
+    def __init__(self, group: Group, slots: list[Slot], rule: Rule, width: int, substeps: int, num_envs: int) -> None:
+        """Prepares controls and observers.
+
+        Args:
+            group: The rows and their engine.
+            slots: The world's slots.
+            rule: What observations show.
+            width: Entries of an observation with padding and task id.
+            substeps: Engine steps per control step.
+            num_envs: Rows of the world.
+        """
+        self.engine_rows = torch.full((num_envs,), -1)
+        self.engine_rows[group.rows] = torch.arange(group.engine.num)
+        self.group, self._rule, self._substeps = group, rule, substeps
+        self._engine = group.engine
+        self._controls = Controls(group)
+        self._start = torch.stack([torch.from_numpy(m.scene.start_qpos) for m in group.members])
+        self._observer = Observer(group.members[0].scene, self._start_mounts(), width)
+        self._pools: list[dict[str, Tensor]] = []
+        self.set_pools(slots)
+
+    def _start_mounts(self) -> Tensor:
+        mounts = self._engine.sensordata.new_empty(self._engine.num, 2, 4)
+        for member in self.group.members:
+            task = member.scene.task
+            mounts[member.engine_rows] = xyzw(mounts.new_tensor([task.right.quaternion, task.left.quaternion]))
+        return mounts
+
+    def set_pools(self, slots: list[Slot]) -> None:
+        """Takes over the slots' pools of tasks."""
+        dtype = self._engine.sensordata.dtype
+        self._pools = [
+            m.scene.task.freeze(torch.as_tensor(slots[m.slot].tasks, dtype=dtype)) for m in self.group.members
+        ]
+
+    def frozen(self, member: int, task_index: Tensor) -> dict[str, Tensor]:
+        """Frozen numbers of rows of a member, by their tasks' indices in the pool."""
+        return {name: values[task_index] for name, values in self._pools[member].items()}
+
+    def control(self, action: Tensor) -> None:
+        """Writes the actions of the part's rows, shape (num, a), into the engine."""
+        self._controls.write(action)
+
+    def step(self, action: Tensor, active: Tensor | None) -> None:
+        """Applies actions, shape (num, a), and advances all rows, or those of the mask, by one control step."""
+        self.control(action)
+        self._engine.step(self._substeps, active)
+
+    def states(self, task_index: Tensor, rows: Tensor | None = None) -> Iterator[tuple[Member, slice, TaskState]]:
+        """The members that have rows here, the rows' place among the chosen ones, and their state.
+
+        Args:
+            task_index: Task of each of the part's rows, shape (num,).
+            rows: Chosen engine rows in ascending order, or None for all.
+        """
+        for i, member, where, chosen in self._places(rows):
+            frozen = self.frozen(i, task_index[chosen])
+            yield member, where, TaskState(self._engine.sensordata[chosen], member.scene.sensors, frozen)
+
+    def _places(self, rows: Tensor | None) -> Iterator[tuple[int, Member, slice, Tensor | slice]]:
+        """Index, member, place among the chosen rows, and engine rows of the members that have rows among them."""
+        for i, member in enumerate(self.group.members):
+            if rows is None:
+                yield i, member, member.engine_rows, member.engine_rows
+                continue
+            bounds = rows.new_tensor((member.engine_rows.start, member.engine_rows.stop))
+            first, last = torch.searchsorted(rows, bounds).tolist()
+            if last > first:
+                yield i, member, slice(first, last), rows[first:last]
+
+    def transition(self, states: list[tuple[Member, slice, TaskState]]) -> Transition:
+        """Reward, success and ends of the step just made, for all rows."""
+        num, sensors = self._engine.num, self._engine.sensordata
+        terms: dict[str, Tensor] = {}
+        reward = sensors.new_empty(num)
+        success, failed = torch.empty(2, num, dtype=torch.bool, device=sensors.device).unbind()
+        for member, where, state in states:
+            task = member.scene.task
+            named = task.reward_terms(state)
+            for name, value in named.items():
+                terms.setdefault(name, sensors.new_zeros(num))[where] = value
+            reward[where] = torch.stack(list(named.values())).sum(dim=0) if len(named) > 1 else next(iter(named.values()))
+            success[where], failed[where] = task.success(state), task.failed(state)
+        return Transition(terms, reward, success, failed, self._engine.unstable())
+
+    def observe(
+        self,
+        states: list[tuple[Member, slice, TaskState]],
+        action: Tensor,
+        rows: Tensor | None = None,
+        out: Tensor | None = None,
+    ) -> Tensor:
+        """Observations of rows (None: all) without the task id, shape (n, width), float32.
+
+        Args:
+            states: What ``states`` gave for these rows.
+            action: Last actions of these rows, shape (n, a).
+            rows: Engine rows in ascending order.
+            out: Where to write them, shape (n, width), or None for a new tensor.
+        """
+        chosen = slice(None) if rows is None else rows
+        values = self._observer(self._engine.sensordata[chosen], action, chosen, out)
+        if self._rule != "masked":
+            for member, where, state in states:
+                for name, block in member.scene.task.observe(state).items():
+                    values[where, self._observer.layout.range(name)] = block.float()
+        return clip(values)
+
+    def starts(self, rows: Tensor, draws: Tensor, task_index: Tensor) -> Tensor:
+        """Start positions of episodes, shape (n, nq): a pure function of the draws and the tasks.
+
+        Args:
+            rows: Engine rows in ascending order, shape (n,).
+            draws: Their uniform numbers in [-1, 1], shape (n, at least the classes' start_draws).
+            task_index: Their tasks, shape (n,).
+        """
+        qpos = self._engine.qpos.new_empty(len(rows), self._start.shape[1])
+        for i, member, where, _ in self._places(rows):
+            qpos[where] = self._start[i]
+            views = {name: qpos[where, place] for name, place in member.scene.qpos.items()}
+            task = member.scene.task
+            task.start(draws[where, : task.start_draws], self.frozen(i, task_index[where]), views)
+        return qpos

@@ -1,0 +1,65 @@
+"""Counter-based random numbers: a pure function of key and counter, with no generator to store.
+
+Threefry-2x32 with 20 rounds (Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"), in integer torch
+operations, so that the numbers are the same on every device, for any subset of rows, and for free after a resume.
+"""
+
+import hashlib
+
+import torch
+from torch import Tensor
+
+_MASK = 0xFFFFFFFF
+_PARITY = 0x1BD11BDA
+_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
+
+
+def threefry(key: tuple[Tensor, Tensor], counter: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Two 32-bit words per counter.
+
+    Args:
+        key: Two words of the key.
+        counter: Two words of the counter.
+
+    Returns:
+        Two words. All tensors int64 with values below 2^32, broadcast together.
+    """
+    k0, k1 = key
+    keys = (k0, k1, k0 ^ k1 ^ _PARITY)
+    x0, x1 = torch.broadcast_tensors((counter[0] + k0) & _MASK, (counter[1] + k1) & _MASK)
+    for block in range(5):
+        for r in _ROTATIONS[block % 2]:
+            x0 = (x0 + x1) & _MASK
+            x1 = (((x1 << r) & _MASK) | (x1 >> (32 - r))) ^ x0
+        x0 = (x0 + keys[(block + 1) % 3]) & _MASK
+        x1 = (x1 + keys[(block + 2) % 3] + (block + 1)) & _MASK
+    return x0, x1
+
+
+def row_keys(seed: int, name: str, count: int, device: torch.device) -> Tensor:
+    """One key per row of a class, from seed, class name and index in the class alone.
+
+    Returns:
+        Words, shape (count, 2), int64.
+    """
+    digest = hashlib.sha256(f"{seed}/{name}".encode()).digest()
+    words = [torch.tensor(int.from_bytes(digest[i : i + 4], "little"), device=device) for i in (0, 4)]
+    index = torch.arange(count, device=device)
+    return torch.stack(threefry((words[0], words[1]), (index, torch.zeros_like(index))), dim=1)
+
+
+def uniform(keys: Tensor, episode: Tensor, draws: int) -> Tensor:
+    """Uniform numbers in [0, 1) that depend on key, episode and draw alone.
+
+    Args:
+        keys: Row keys, shape (n, 2).
+        episode: Episode counter of each row, shape (n,), int64.
+        draws: How many numbers each row takes.
+
+    Returns:
+        Multiples of 2^-24, so exact in single precision. Shape (n, draws), float64.
+    """
+    pairs = torch.arange((draws + 1) // 2, device=keys.device)
+    words = threefry((keys[:, :1], keys[:, 1:]), (episode[:, None], pairs[None]))
+    bits = torch.stack(words, dim=2).flatten(1)[:, :draws]
+    return (bits >> 8).double() * 2.0**-24

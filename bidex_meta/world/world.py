@@ -1,0 +1,376 @@
+"""The batched world: all rows of a suite, stepped together.
+
+The way of one observation: ``Part.step`` (engine) -> ``sensordata`` -> ``Observer`` (gather, scale) ->
+``TaskClass.observe`` (goal blocks) -> ``World._observe`` (padding, task id) -> the learner's network.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from torch import Tensor
+
+from bidex_meta.errors import BidexError
+from bidex_meta.tasks.base import CONTROL_RATE
+from bidex_meta.tasks.layout import CLIP
+from bidex_meta.world import actions
+from bidex_meta.world.episodes import Episodes
+from bidex_meta.world.groups import Slot, build_groups, split_rows
+from bidex_meta.world.observations import Rule
+from bidex_meta.world.part import Part, Transition
+from bidex_meta.world.random import row_keys
+from bidex_meta.world.rendering import render_row
+from bidex_meta.world.starts import Starts
+from bidex_meta.world.threads import one_torch_thread
+
+
+class World(VectorEnv):
+    """Every task of a suite in one Gymnasium vector environment of torch tensors.
+
+    Arrays are fresh tensors on ``device``; NumPy actions are accepted. Rows of a slot are contiguous. Positions and
+    velocities in observations are those of the state after the step; force entries are those of its last substep, and
+    zero right after a reset.
+
+    Attributes:
+        task_id: Slot of each row, shape (num_envs,), int64.
+        task_names: Names of the slots.
+        num_tasks: Number of slots.
+        task_index: Task of its slot's pool that each row plays, shape (num_envs,), int64.
+        slot_rows: Rows of each slot.
+        max_episode_steps: Time limit of each row, control steps, shape (num_envs,), int64.
+        num_id_columns: Trailing observation entries that are the one-hot task id.
+    """
+
+    def __init__(
+        self,
+        slots: Sequence[Slot],
+        num_envs: int,
+        *,
+        device: str | torch.device = "cpu",
+        seed: int = 0,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
+        observation: Rule = "plain",
+        pad_to: int | None = None,
+        task_sampling: str = "fixed",
+        threads: int | None = None,
+    ) -> None:
+        """Builds the world; no row is started before ``reset``.
+
+        Args:
+            slots: Task classes with their pools of tasks.
+            num_envs: Rows over all slots, split evenly; the first slots take the remainder.
+            device: Where tensors live; only "cpu" has an engine so far.
+            seed: Decides every draw.
+            autoreset_mode: SAME_STEP (training) or DISABLED (evaluation), as a member or its name.
+            observation: "plain", "one-hot" (task id appended) or "masked" (goal entries zero).
+            pad_to: Observation entries before the task id; None takes the widest class.
+            task_sampling: "uniform": each autoreset draws a task of the slot's pool; "fixed": row j keeps task j mod n.
+            threads: Engine threads; None takes all CPUs. Trajectories do not depend on it.
+
+        Raises:
+            BidexError: Fewer rows than slots, unknown device, mode or sampling, or too narrow a padding.
+        """
+        self.device = torch.device(device)
+        if self.device.type != "cpu":
+            raise BidexError(f"Expected device 'cpu', got {str(device)!r}: the GPU engine is not part of this version.")
+        if num_envs < len(slots):
+            raise BidexError(f"Expected at least {len(slots)} rows, one for each of the suite's classes, got {num_envs}.")
+        if task_sampling not in ("uniform", "fixed"):
+            raise BidexError(f"Expected task_sampling 'uniform' or 'fixed', got {task_sampling!r}.")
+        self.num_envs, self.slots, self.seed = num_envs, list(slots), seed
+        self.autoreset_mode = _autoreset(autoreset_mode)
+        self.metadata = {
+            "autoreset_mode": self.autoreset_mode, "render_modes": ["rgb_array"], "render_fps": CONTROL_RATE
+        }  # fmt: skip
+        self.render_mode = "rgb_array"
+        self.task_names = [slot.name for slot in slots]
+        self.num_tasks = len(slots)
+        self.slot_rows = split_rows(num_envs, len(slots))
+        counts = torch.tensor([rows.stop - rows.start for rows in self.slot_rows])
+        self.task_id = torch.arange(len(slots)).repeat_interleave(counts)
+        self.max_episode_steps = torch.tensor([s.task_class.episode_steps for s in slots])[self.task_id]
+        self._scale = torch.tensor([slot.reward_scale for slot in slots], dtype=torch.float32)[self.task_id]
+        self._uniform_tasks = task_sampling == "uniform"
+        groups = build_groups(self.slots, self.slot_rows, threads)
+        timestep = groups[0].engine.batch.get_model(0).opt.timestep
+        self.substeps = round(1.0 / (CONTROL_RATE * timestep))
+        self._make_spaces(observation, pad_to)
+        self.parts = [
+            Part(g, self.slots, observation, self.observation_size, self.substeps, num_envs) for g in groups
+        ]
+        self.episodes = Episodes.fresh(num_envs, self.device)
+        self._index_in_slot = torch.cat([torch.arange(rows.stop - rows.start) for rows in self.slot_rows])
+        self._set_pool_sizes()
+        self._action = torch.zeros(num_envs, self.action_size)
+        self._obs = torch.zeros(num_envs, self.observation_size)
+        self._ready = False
+        self._seed_rows(seed)
+
+    def _make_spaces(self, observation: Rule, pad_to: int | None) -> None:
+        widest = max(slot.task_class.observation_size for slot in self.slots)
+        self._width = widest if pad_to is None else pad_to
+        if self._width < widest:
+            raise BidexError(f"Expected pad_to of at least {widest}, the widest class, got {pad_to}.")
+        self.action_size = max(slot.task_class.action_size for slot in self.slots)
+        self.num_id_columns = self.num_tasks if observation == "one-hot" else 0
+        self.observation_size = self._width + self.num_id_columns
+        self.single_observation_space = Box(-CLIP, CLIP, (self.observation_size,), np.float32)
+        self.single_action_space = Box(-1.0, 1.0, (self.action_size,), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+
+    def _set_pool_sizes(self) -> None:
+        self.num_slot_tasks = [len(slot.tasks) for slot in self.slots]
+        self._pool_size = torch.tensor(self.num_slot_tasks)[self.task_id]
+        self.task_index = self._index_in_slot % self._pool_size
+
+    def _seed_rows(self, seed: int) -> None:
+        self.seed = seed
+        pairs = zip(self.slots, self.slot_rows, strict=True)
+        keys = torch.cat([row_keys(seed, s.name, rows.stop - rows.start, self.device) for s, rows in pairs])
+        draws = max(slot.task_class.start_draws for slot in self.slots)
+        self._starts = Starts(self.parts, keys, draws, self._pool_size if self._uniform_tasks else None)
+        self.episodes = Episodes.fresh(self.num_envs, self.device)
+
+    def set_tasks(self, pools: dict[str, np.ndarray]) -> None:
+        """Replaces the pools of tasks of some slots; row j of a slot plays task j mod n from the next full reset on.
+
+        Args:
+            pools: Slot name to variations, shape (n, variation_space.size).
+
+        Raises:
+            BidexError: Unknown slot or a wrong shape.
+        """
+        for name, tasks in pools.items():
+            if name not in self.task_names:
+                raise BidexError(f"Expected a slot among {', '.join(self.task_names)}, got {name!r}.")
+            i = self.task_names.index(name)
+            size = self.slots[i].task_class.variation_space.size
+            tasks = np.asarray(tasks, dtype=np.float64)
+            if tasks.ndim != 2 or len(tasks) == 0 or tasks.shape[1] != size:
+                raise BidexError(f"Expected tasks of {name} with shape (n, {size}), got {tasks.shape}.")
+            self.slots[i] = Slot(name, self.slots[i].task_class, tasks, self.slots[i].reward_scale)
+        self._set_pool_sizes()
+        for part in self.parts:
+            part.set_pools(self.slots)
+        number = self.episodes.number
+        self._seed_rows(self.seed)  # starts that were drawn ahead may depend on the old tasks
+        self.episodes.number = number
+        self._ready = False
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
+        """Starts episodes.
+
+        Args:
+            seed: Starts all random numbers anew; None goes on with the next episodes of the old seed.
+            options: ``reset_mask``: which rows to start, shape (num_envs,), bool; all by default.
+
+        Returns:
+            Observations (num_envs, d) and an empty info.
+        """
+        mask = self._reset_mask(options)
+        if seed is not None:
+            self._seed_rows(seed)
+        first = not self._ready or seed is not None
+        stagger = self.autoreset_mode == AutoresetMode.SAME_STEP and first
+        self._ready = True
+        with one_torch_thread():
+            self._begin(mask, stagger)
+        return self._obs.clone(), {}
+
+    def _reset_mask(self, options: dict[str, Any] | None) -> Tensor:
+        mask = (options or {}).get("reset_mask")
+        if mask is None:
+            return torch.ones(self.num_envs, dtype=torch.bool)
+        mask = torch.as_tensor(mask)
+        if mask.shape != (self.num_envs,) or mask.dtype != torch.bool:
+            raise BidexError(
+                f"Expected a bool reset_mask of shape ({self.num_envs},), got {mask.dtype} of shape {tuple(mask.shape)}."
+            )
+        if not self._ready and not mask.all():
+            raise BidexError("Expected a full reset first, got a reset_mask with false entries; call reset() once without.")
+        return mask
+
+    def _begin(self, mask: Tensor, stagger: bool) -> None:
+        """Starts new episodes in the rows of a mask and refreshes their observations."""
+        # The number counts for all rows: starts of the others may be drawn in the same go.
+        task_index, share, qpos = self._starts.take(mask, self.episodes.number + 1, self.task_index)
+        self.episodes.number = self.episodes.number + mask
+        self.task_index = torch.where(mask, task_index, self.task_index)
+        elapsed = (share * self.max_episode_steps).long() if stagger else torch.zeros_like(self.episodes.elapsed)
+        self.episodes.begin(mask, elapsed)
+        self._action = torch.where(mask[:, None], 0.0, self._action)
+        for part, start in zip(self.parts, qpos, strict=True):
+            chosen = part.group.take(mask)
+            rows = chosen.nonzero().squeeze(1)
+            if len(rows):
+                part.group.engine.reset(chosen, start)
+                self._refresh(part, rows)
+
+    def _refresh(self, part: Part, rows: Tensor) -> None:
+        """Writes the observations of some of a part's rows."""
+        world_rows = part.group.rows[rows]
+        states = list(part.states(part.group.take(self.task_index), rows))
+        self._obs[world_rows] = self._with_id(part.observe(states, self._action[world_rows], rows), world_rows)
+
+    def _with_id(self, obs: Tensor, world_rows: Tensor) -> Tensor:
+        """Writes the one-hot task id into observations of the given rows."""
+        if self.num_id_columns:
+            obs[:, self._width :] = torch.nn.functional.one_hot(self.task_id[world_rows], self.num_tasks)
+        return obs
+
+    def step(self, action: Tensor | np.ndarray) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+        """Advances every row by one control step (1/60 s).
+
+        Args:
+            action: Shape (num_envs, a), clipped to [-1, 1]; a row with a non-finite number ends as unstable.
+
+        Returns:
+            Observations (num_envs, d), rewards, terminated and truncated (num_envs,), and info. In SAME_STEP mode the
+            observation of an ended row is already that of its next episode; ``final_obs`` has the last one.
+            ``info["success"]``, ``["unstable"]``, ``["reward_terms"]``, ``["reward_unscaled"]`` and ``["episode"]``
+            describe the transition just made.
+
+        Raises:
+            BidexError: A wrong shape, or no reset since the world was made or got other tasks.
+        """
+        action = torch.as_tensor(action, dtype=torch.float32, device=self.device)
+        if not self._ready:
+            raise BidexError("Expected reset() before step(): the rows have no episode yet.")
+        if action.shape != (self.num_envs, self.action_size):
+            raise BidexError(f"Expected actions of shape ({self.num_envs}, {self.action_size}), got {tuple(action.shape)}.")
+        with one_torch_thread():
+            return self._advance(action)
+
+    def _advance(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+        action, broken = actions.clean(action)
+        disabled = self.autoreset_mode == AutoresetMode.DISABLED
+        active = ~self.episodes.finished
+        self._action = torch.where(active[:, None], action, self._action) if disabled else action
+        for part in self.parts:
+            part.step(part.group.take(self._action), part.group.take(active) if disabled else None)
+        return self._finish(active, broken & active)
+
+    def _finish(self, active: Tensor, broken: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+        """Turns the engines' new state into what ``step`` returns, and starts new episodes."""
+        reward, success, failed, unstable, terms, obs = self._collect(broken)
+        unscaled = torch.where(active & ~unstable, reward, 0.0)
+        reward = unscaled * self._scale
+        episodes = self.episodes
+        episodes.add(active, reward, unscaled, success & ~unstable)
+        terminated = failed & ~unstable & active | episodes.terminated
+        late = (episodes.elapsed >= self.max_episode_steps) & ~terminated
+        truncated = (late | unstable) & active | episodes.truncated
+        ended = (terminated | truncated) & active
+        broken = unstable & active
+        if self.device.type != "cpu" or broken.any():  # on the CPU looking costs less than a pass over all observations
+            obs = torch.where(broken[:, None], self._obs, obs)
+        statistics = episodes.statistics()
+        info: dict[str, Any] = {
+            "success": success & ~unstable,
+            "unstable": broken,
+            "reward_terms": {n: torch.where(active & ~unstable, t, 0.0) for n, t in terms.items()},
+            "reward_unscaled": unscaled,
+            "final_obs": obs,
+            "_final_obs": ended,
+            "episode": statistics,
+            "_episode": ended & episodes.counts,
+        }
+        info["final_info"] = {k: info[k] for k in ("success", "unstable", "reward_unscaled", "episode")}
+        info["_final_info"] = ended
+        self._obs = obs.clone()
+        if self.autoreset_mode == AutoresetMode.SAME_STEP:
+            if ended.any():
+                self._begin(ended, stagger=False)
+        else:
+            episodes.terminated, episodes.truncated = terminated, truncated
+            episodes.finished = episodes.finished | ended
+        return self._obs.clone(), reward, terminated, truncated, info
+
+    def _collect(self, broken: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Tensor], Tensor]:
+        """Reward, success, failed, unstable, reward terms and observations of all rows after a step."""
+        n = self.num_envs
+        reward, obs = torch.empty(n), torch.empty(n, self.observation_size)
+        success, failed, unstable = (torch.zeros(n, dtype=torch.bool) for _ in range(3))
+        terms: dict[str, Tensor] = {}
+        for part in self.parts:
+            group = part.group
+            states = list(part.states(group.take(self.task_index)))
+            made: Transition = part.transition(states)
+            where = group.rows if group.span is None else group.span
+            reward[where] = made.reward.float()
+            for name, value in made.terms.items():
+                terms.setdefault(name, torch.zeros(n))[where] = value.float()
+            success[where], failed[where], unstable[where] = made.success, made.failed, made.unstable
+            out = None if group.span is None else obs[group.span]
+            values = self._with_id(part.observe(states, group.take(self._action), out=out), group.rows)
+            if out is None:
+                obs[group.rows] = values
+        return reward, success, failed, unstable | broken, terms, obs
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that decides the future of the world: tensors and numbers, copied."""
+        return {
+            "seed": self.seed,
+            "episodes": self.episodes.state_dict(),
+            "task_index": self.task_index.clone(),
+            "action": self._action.clone(),
+            "observation": self._obs.clone(),
+            "engines": [part.group.engine.state_dict() for part in self.parts],
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Puts back what ``state_dict`` gave, on a world of the same suite and rows."""
+        if state["observation"].shape != self._obs.shape:
+            raise BidexError(
+                f"Expected a state of {tuple(self._obs.shape)} observations, got {tuple(state['observation'].shape)}; "
+                "build the world with the same suite and num_envs."
+            )
+        self._seed_rows(int(state["seed"]))
+        self.episodes.load_state_dict(state["episodes"])
+        self.task_index, self._action = state["task_index"].clone(), state["action"].clone()
+        self._obs = state["observation"].clone()
+        for part, engine in zip(self.parts, state["engines"], strict=True):
+            part.group.engine.load_state_dict(engine)
+        self._ready = True
+
+    def render(self, row: int = 0, width: int = 640, height: int = 480, camera: str | None = None) -> np.ndarray:
+        """A picture of a row with its goal, shape (height, width, 3), uint8."""
+        return render_row(self, row, width, height, camera)
+
+    @property
+    def task_name(self) -> list[str]:
+        """Slot name of each row."""
+        return [self.task_names[i] for i in self.task_id.tolist()]
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """An attribute for each row: its own entry of a per-row attribute, else the world's value."""
+        value = getattr(self, name)
+        per_row = isinstance(value, (Tensor, list, tuple)) and len(value) == self.num_envs
+        return tuple(value) if per_row else (value,) * self.num_envs
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Sets an attribute of the world."""
+        setattr(self, name, values)
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Calls a method of the world (or reads an attribute) and returns the result for each row."""
+        value = getattr(self, name)
+        if not callable(value):
+            return self.get_attr(name)
+        return (value(*args, **kwargs),) * self.num_envs
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Nothing is held outside memory."""
+
+
+def _autoreset(mode: str | AutoresetMode) -> AutoresetMode:
+    allowed = (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED)
+    for member in allowed:
+        if mode == member or (isinstance(mode, str) and mode.upper().replace("-", "_") == member.name):
+            return member
+    raise BidexError(f"Expected autoreset_mode SAME_STEP or DISABLED, got {mode!r}.")

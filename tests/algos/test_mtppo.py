@@ -1,0 +1,216 @@
+import io
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from bidex_algos.mtppo import MTPPO, PRESETS, MTPPOConfig
+from bidex_algos.networks import gaussian_log_prob
+from bidex_algos.rollout import collect
+from bidex_meta.errors import BidexError
+from tests.algos.toy import ToyWorld, nearness
+
+SMALL = MTPPOConfig(
+    hidden=(32, 32), rollout_steps=8, learning_rate_range=(1e-5, 2e-3), std_range=(0.05, 1.0), autocast="off"
+)
+
+
+def equal(a: object, b: object) -> bool:
+    """Whether two nested states are bit-equal."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        return a.keys() == b.keys() and all(equal(a[k], b[k]) for k in a)
+    if isinstance(a, list | tuple) and isinstance(b, list | tuple):
+        return len(a) == len(b) and all(map(equal, a, b))
+    if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
+        return torch.equal(a, b)
+    return a == b
+
+
+def mean_errors(learner: MTPPO, world: ToyWorld, targets: list[float]) -> list[float]:
+    """Distance of the mean action from each task's target."""
+    obs, _ = world.reset(seed=1)
+    action = learner.eval_action(obs)
+    return [float((action[world.task_id == k] - t).abs().max()) for k, t in enumerate(targets)]
+
+
+def test_a_bandit_is_learned():
+    world = ToyWorld([nearness(0.6)])
+    learner = MTPPO(world, SMALL, seed=0)
+    metrics = [learner.iterate() for _ in range(60)]
+    assert mean_errors(learner, world, [0.6])[0] < 0.15
+    assert metrics[-1]["Train/success_rate"] > 0.5 > metrics[0]["Train/success_rate"]
+    assert metrics[-1]["Policy/std"] < 0.8
+    assert learner.env_steps == 60 * 8 * 32
+
+
+@pytest.mark.parametrize("heads", [True, False])
+def test_two_tasks_at_odds_are_learned_though_one_pays_a_thousandfold(heads: bool):
+    world = ToyWorld([nearness(0.4), nearness(-0.4, scale=1000.0)])
+    learner = MTPPO(world, replace(SMALL, value_heads=heads), seed=0)
+    for _ in range(60):
+        learner.iterate()
+    assert max(mean_errors(learner, world, [0.4, -0.4])) < 0.2
+
+
+def test_without_normalisation_per_task_the_small_task_is_lost():
+    world = ToyWorld([nearness(0.4), nearness(-0.4, scale=1000.0)])
+    raw = replace(SMALL, per_task_advantages=False, per_task_values=False, clip_apart=False)
+    learner = MTPPO(world, raw, seed=0)
+    for _ in range(60):
+        learner.iterate()
+    assert mean_errors(learner, world, [0.4, -0.4])[0] > 0.3
+
+
+@pytest.mark.parametrize(("terminal", "value"), [(False, 5.0), (True, 1.0)])
+def test_a_time_limit_is_bootstrapped_and_a_true_end_is_not(terminal: bool, value: float):
+    # Reward 1 at each step and gamma 0.8: worth 1 / (1 - 0.8) = 5 where only the clock stops an episode of one step.
+    world = ToyWorld([lambda action: torch.ones(len(action))], horizon=1, terminal=terminal)
+    learner = MTPPO(world, replace(SMALL, gamma=0.8, critic_learning_rate=3e-3), seed=0)
+    for _ in range(60):
+        learner.iterate()
+    obs, _ = world.reset(seed=1)
+    assert_close(learner._final_value(obs, world.task_id), torch.full((32,), value), rtol=0.05, atol=0)
+
+
+def test_a_transition_that_broke_physics_teaches_nothing():
+    states = []
+    for garbage in (0.0, 1e8, float("nan")):
+        world = ToyWorld([nearness(0.6), nearness(0.0)], unstable=((2, 5), (3, 40), (7, 0)), garbage=garbage)
+        learner = MTPPO(world, SMALL, seed=0)
+        assert learner.iterate()["Train/unstable"] == 3
+        states.append(learner.state_dict())
+    assert equal(states[0], states[1]) and equal(states[0], states[2])
+
+
+def test_a_broken_transition_cuts_the_trace_but_keeps_the_value_before_it():
+    world = ToyWorld([nearness(0.6)], horizon=100, unstable=((5, 3),))
+    learner = MTPPO(world, replace(SMALL, per_task_advantages=False), seed=0)
+    learner.iterate()
+    batch, _ = learner._prepare()
+    weights = batch.weights.view(8, 32)
+    assert weights[5, 3] == 0 and weights.sum() == 8 * 32 - 1
+    assert batch.advantages.view(8, 32)[5, 3] == 0
+
+
+@pytest.mark.parametrize("autocast", ["off", "on"])
+def test_the_first_ratio_is_one(autocast: str):
+    world = ToyWorld([nearness(0.6)], rows=37, actions=20)
+    learner = MTPPO(world, replace(SMALL, autocast=autocast), seed=0)
+    for _ in range(3):
+        learner.iterate()
+    obs = learner.obs
+    assert obs is not None
+    collect(world, learner.rollout, obs, learner._sample, learner._final_value, learner.episodes)
+    batch, _ = learner._prepare()
+    part = batch.select(torch.randperm(len(batch.obs))[:50])
+    with torch.autocast("cpu", dtype=torch.bfloat16, enabled=learner.low_precision):
+        mean = learner.policy.actor(part.obs)
+    log_prob = gaussian_log_prob(part.actions, mean, learner.policy.actor.log_std)
+    assert_close(torch.exp(log_prob - part.old_log_probs), torch.ones(50), rtol=0, atol=1e-3)
+
+
+def test_the_step_size_follows_the_kl():
+    learner = MTPPO(ToyWorld([nearness(0.6)]), SMALL, seed=0)
+    rates = []
+    for kl in (0.04, 0.016, 0.001):
+        learner._adapt_learning_rate(torch.tensor(kl))
+        rates.append(float(learner.learning_rate))
+    assert rates == pytest.approx([2e-4, 2e-4, 3e-4])
+    for kl, bound in ((1.0, 1e-5), (0.0, 2e-3)):
+        for _ in range(40):
+            learner._adapt_learning_rate(torch.tensor(kl))
+        assert float(learner.learning_rate) == pytest.approx(bound)
+    assert learner.actor_adam.param_groups[0]["lr"] is learner.learning_rate
+
+
+@pytest.mark.parametrize("desired_kl", [1e-6, 1e6])
+def test_an_update_moves_the_step_size_towards_the_desired_kl(desired_kl: float):
+    learner = MTPPO(ToyWorld([nearness(0.6)]), replace(SMALL, desired_kl=desired_kl, learning_rate=1e-3), seed=0)
+    metrics = learner.iterate()
+    assert (metrics["Policy/lr"] < 1e-3) == (metrics["Policy/kl"] > desired_kl)
+    assert metrics["Policy/lr"] != 1e-3
+
+
+def test_the_standard_deviation_keeps_its_bounds():
+    learner = MTPPO(ToyWorld([nearness(0.6)]), replace(SMALL, std_range=(0.79, 0.81)), seed=0)
+    for _ in range(10):
+        learner.iterate()
+    std = learner.policy.actor.log_std.exp()
+    assert std.min() > 0.789
+    assert std.max() < 0.811
+
+
+@pytest.mark.parametrize("config", [SMALL, replace(SMALL, autocast="on", critic_learning_rate=1e-3)])
+def test_save_load_resume_is_bit_equal(config: MTPPOConfig):
+    tasks = [nearness(0.6), nearness(0.0)]
+    unbroken = MTPPO(ToyWorld(tasks), config, seed=0)
+    for _ in range(3):
+        unbroken.iterate()
+    file = io.BytesIO()
+    torch.save({"learner": unbroken.state_dict(), "env": unbroken.world.state_dict()}, file)
+    file.seek(0)
+    state = torch.load(file, weights_only=True)
+    resumed = MTPPO(ToyWorld(tasks), config, seed=77)
+    resumed.world.load_state_dict(state["env"])
+    resumed.load_state_dict(state["learner"])
+    for _ in range(3):
+        a, b = unbroken.iterate(), resumed.iterate()
+        assert {k: v for k, v in a.items() if "Perf" not in k} == {k: v for k, v in b.items() if "Perf" not in k}
+    assert equal(unbroken.state_dict(), resumed.state_dict())
+    assert float(resumed.learning_rate) != config.learning_rate
+
+
+def test_a_saved_state_does_not_change_with_the_learner():
+    learner = MTPPO(ToyWorld([nearness(0.6)]), SMALL, seed=0)
+    learner.iterate()
+    state, again = learner.state_dict(), learner.state_dict()
+    learner.iterate()
+    assert equal(state, again) and not equal(state, learner.state_dict())
+
+
+def test_the_policy_alone_loads_for_a_world_of_another_size():
+    world = ToyWorld([nearness(0.6), nearness(0.0)])
+    learner = MTPPO(world, SMALL, seed=0)
+    for _ in range(3):
+        learner.iterate()
+    policy = MTPPO.load_policy(learner.state_dict()["policy"])
+    obs = torch.randn(5, 3)
+    assert torch.equal(policy.eval_action(obs), learner.eval_action(obs))
+    assert policy.eval_action(1e3 * obs).abs().max() <= 1.0
+    policy.reset(torch.ones(5, dtype=torch.bool))
+
+
+def test_a_checkpoint_of_another_world_size_is_refused():
+    learner = MTPPO(ToyWorld([nearness(0.6)], rows=8), SMALL, seed=0)
+    learner.iterate()
+    with pytest.raises(BidexError, match=r"num_envs.*\(8, 2\).*\(9, 2\)"):
+        MTPPO(ToyWorld([nearness(0.6)], rows=9), SMALL, seed=0).load_state_dict(learner.state_dict())
+
+
+def test_config_errors_name_the_field():
+    for field, value in (("epochs", 0), ("gamma", 1.5), ("std_range", (1.0, 0.5))):
+        with pytest.raises(BidexError, match=field):
+            replace(SMALL, **{field: value})
+    with pytest.raises(BidexError, match="num_envs"):
+        MTPPO(ToyWorld([nearness(0.6)], rows=1), replace(SMALL, rollout_steps=1), seed=0)
+
+
+def test_the_paper_preset_is_table_47():
+    paper = PRESETS["paper"]
+    assert (paper.hidden, paper.rollout_steps, paper.num_minibatches, paper.epochs) == ((2048, 1024, 512), 8, 4, 5)
+    assert (paper.clip, paper.max_grad_norm, paper.learning_rate, paper.init_std) == (0.2, 1.0, 3e-4, 0.8)
+    assert (paper.gamma, paper.lam, paper.desired_kl, paper.entropy_weight) == (0.96, 0.95, 0.016, 0.0)
+
+
+def test_the_config_is_shown_without_importing_torch():
+    code = "import sys, bidex_algos.mtppo_config as m; assert m.PRESETS; sys.exit('torch' in sys.modules)"
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+        ).returncode
+        == 0
+    )

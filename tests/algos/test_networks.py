@@ -1,0 +1,73 @@
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.distributions import Independent, Normal, kl_divergence
+from torch.testing import assert_close
+
+from bidex_algos.networks import MLP, GaussianActor, gaussian_entropy, gaussian_kl, gaussian_log_prob
+from bidex_algos.normalise import ObservationNormaliser, RunningStats
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**31), st.integers(1, 6))
+def test_gaussian_formulas_agree_with_torch_distributions(seed: int, actions: int):
+    g = torch.Generator().manual_seed(seed)
+    action, mean_p, mean_q = torch.randn(3, 5, actions, generator=g, dtype=torch.float64)
+    log_p, log_q = torch.randn(2, actions, generator=g, dtype=torch.float64)
+    p, q = (Independent(Normal(m, s.exp()), 1) for m, s in ((mean_p, log_p), (mean_q, log_q)))
+    assert_close(gaussian_log_prob(action, mean_p, log_p), p.log_prob(action))
+    assert_close(gaussian_kl(mean_p, log_p, mean_q, log_q), kl_divergence(p, q))
+    assert_close(gaussian_entropy(log_p).expand(5), p.entropy())
+
+
+def test_initial_weights_follow_the_seed_and_leave_the_global_generator_alone():
+    before = torch.random.get_rng_state()
+    nets = [GaussianActor(7, (16, 8), 3, 0.8, torch.Generator().manual_seed(s)) for s in (0, 0, 1)]
+    assert torch.equal(torch.random.get_rng_state(), before)
+    assert torch.equal(nets[0].mean.head.weight, nets[1].mean.head.weight)
+    assert not torch.equal(nets[0].mean.head.weight, nets[2].mean.head.weight)
+    weight = nets[0].mean.head.weight
+    assert_close(weight @ weight.T, 1e-4 * torch.eye(3), atol=1e-8, rtol=1e-4)
+    assert_close(nets[0].log_std.exp(), torch.full((3,), 0.8))
+
+
+def test_the_output_layer_stays_float32_under_autocast():
+    net = MLP(4, (8,), 2, 1.0, torch.Generator())
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert net.body(torch.ones(3, 4)).dtype == torch.bfloat16
+        assert net(torch.ones(3, 4)).dtype == torch.float32
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**31), st.lists(st.integers(1, 9), min_size=1, max_size=5))
+def test_running_stats_equal_those_of_the_whole_stream(seed: int, sizes: list[int]):
+    x = 100.0 + torch.randn(sum(sizes), 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    stats = RunningStats((3,))
+    for part in x.split(sizes):
+        stats.merge(part.mean(0), part.var(0, correction=0), len(part))
+    assert_close(stats.mean, x.mean(0))
+    assert_close(stats.var, x.var(0, correction=0))
+
+
+def test_running_stats_skip_empty_groups_and_forget_beyond_max_count():
+    stats = RunningStats((2,), max_count=10)
+    for _ in range(50):
+        stats.merge(torch.tensor([5.0, 9.0]), torch.tensor([0.0, 4.0]), torch.tensor([0.0, 10.0]))
+    assert stats.mean.tolist() == [0.0, 9.0] and stats.var.tolist() == [1.0, 4.0]
+    for _ in range(20):
+        stats.merge(torch.tensor([5.0, -9.0]), torch.tensor([1.0, 1.0]), torch.tensor([1.0, 10.0]))
+    assert_close(stats.mean[1], torch.tensor(-9.0, dtype=torch.float64), atol=1e-3, rtol=0)
+
+
+def test_observations_are_normalised_and_task_ids_are_not():
+    obs = torch.cat([torch.randn(200, 2) * 50 + 7, torch.zeros(200, 1), torch.ones(200, 1)], dim=1)
+    normaliser = ObservationNormaliser(4, num_id_columns=1)
+    normaliser.update(obs)
+    out = normaliser(obs)
+    assert_close(out[:, :2].mean(0), torch.zeros(2), atol=1e-4, rtol=0)
+    assert_close(out[:, :2].std(0, correction=0), torch.ones(2), atol=1e-3, rtol=0)
+    assert torch.equal(out[:, 2:], obs[:, 2:])
+    assert normaliser(obs + 1e6)[:, :3].eq(10.0).all()
+    off = ObservationNormaliser(4, enabled=False)
+    off.update(obs)
+    assert torch.equal(off(obs), obs)

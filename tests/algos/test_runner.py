@@ -1,0 +1,88 @@
+import os
+import signal
+from typing import Any
+
+import pytest
+import torch
+
+from bidex_algos.mtppo import MTPPO, MTPPOConfig
+from bidex_algos.runner import checkpoint, resume, train
+from tests.algos.toy import ToyWorld, nearness
+
+CONFIG = MTPPOConfig(hidden=(8,), rollout_steps=4, autocast="off")
+ITERATION = 4 * 16
+
+
+class Notes:
+    """A record that keeps everything, and may do something after an iteration."""
+
+    def __init__(self, after: Any = lambda iteration: None):
+        self.logged: list[int] = []
+        self.saved: list[tuple[int, dict[str, Any]]] = []
+        self.after = after
+
+    def log(self, metrics: dict[str, float], step: int) -> None:
+        assert all(isinstance(value, float) for value in metrics.values())
+        self.logged.append(step)
+        self.after(len(self.logged))
+
+    def save(self, state: dict[str, Any], step: int) -> None:
+        self.saved.append((step, state))
+
+
+def make() -> tuple[MTPPO, ToyWorld]:
+    world = ToyWorld([nearness(0.5)], rows=16)
+    return MTPPO(world, CONFIG, seed=0), world
+
+
+def test_training_ends_at_the_budget_and_saves_the_end():
+    learner, world = make()
+    notes = Notes()
+    assert train(learner, world, total_steps=3 * ITERATION - 1, record=notes) is False
+    assert notes.logged == [ITERATION, 2 * ITERATION, 3 * ITERATION]
+    assert [step for step, _ in notes.saved] == [3 * ITERATION]
+    assert train(learner, world, total_steps=ITERATION, record=notes) is False
+    assert len(notes.logged) == 3 and len(notes.saved) == 1
+
+
+def test_checkpoints_come_in_time_and_the_last_is_not_written_twice():
+    learner, world = make()
+    notes = Notes()
+    train(learner, world, total_steps=3 * ITERATION, record=notes, checkpoint_seconds=0.0)
+    assert [step for step, _ in notes.saved] == notes.logged
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_after_the_iteration_and_saves(number: signal.Signals):
+    before = signal.getsignal(number)
+    learner, world = make()
+    notes = Notes(after=lambda i: os.kill(os.getpid(), number) if i == 2 else None)
+    assert train(learner, world, total_steps=100 * ITERATION, record=notes) is True
+    assert [step for step, _ in notes.saved] == [2 * ITERATION]
+    assert signal.getsignal(number) is before
+
+
+def test_a_second_signal_acts_at_once():
+    learner, world = make()
+
+    def twice(iteration: int) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        train(learner, world, total_steps=100 * ITERATION, record=Notes(after=twice))
+
+
+def test_an_interrupted_run_ends_like_an_unbroken_one():
+    whole, world = make()
+    train(whole, world, total_steps=4 * ITERATION, record=Notes())
+    first, first_world = make()
+    notes = Notes()
+    train(first, first_world, total_steps=2 * ITERATION, record=notes)
+    second, second_world = make()
+    resume(second, second_world, notes.saved[-1][1])
+    train(second, second_world, total_steps=4 * ITERATION, record=Notes())
+    a, b = checkpoint(whole, world)["learner"], checkpoint(second, second_world)["learner"]
+    assert a["env_steps"] == b["env_steps"] == 4 * ITERATION
+    assert all(torch.equal(a["critic"][k], b["critic"][k]) for k in a["critic"])
+    assert all(torch.equal(a["policy"]["weights"][k], b["policy"]["weights"][k]) for k in a["policy"]["weights"])

@@ -1,0 +1,148 @@
+import io
+import json
+import math
+
+import numpy as np
+import pytest
+
+from bidex_meta.errors import BidexError
+from bidex_meta.record import MetricsWriter, Progress, RunFolder, read_metrics
+from bidex_meta.record.plots import plot_learning_curves
+from bidex_meta.record.video import check_suffix, write_image, write_video
+
+CONFIG = {"suite": "MT4", "task": None, "algo": "mtppo", "seed": 3, "learner": {"hidden": [8]}}
+
+
+def board_points(folder, tag):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(folder))
+    events.Reload()
+    return [(event.step, event.value) for event in events.Scalars(tag)]
+
+
+def test_run_folder_is_complete_when_made(tmp_path):
+    folder = RunFolder.create(CONFIG, root=tmp_path)
+    assert folder.path.parent == tmp_path / "MT4" / "mtppo"
+    assert folder.path.name.endswith("_seed3")
+    assert {path.name for path in folder.path.iterdir()} == {
+        "config.json",
+        "versions.json",
+        "metrics.jsonl",
+        "checkpoints",
+        "videos",
+    }
+    assert RunFolder.open(folder.path).config() == CONFIG
+    versions = json.loads((folder.path / "versions.json").read_text())
+    assert versions["packages"]["torch"]
+
+
+def test_two_runs_in_one_second_do_not_share_a_folder(tmp_path):
+    paths = {RunFolder.create(CONFIG, root=tmp_path).path for _ in range(3)}
+    assert len(paths) == 3
+
+
+def test_a_used_folder_is_refused_and_left_alone(tmp_path):
+    (tmp_path / "mine").write_text("precious")
+    with pytest.raises(BidexError, match="not empty"):
+        RunFolder.create(CONFIG, path=tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+
+
+def test_opening_a_parent_names_the_runs_below(tmp_path):
+    folder = RunFolder.create(CONFIG, root=tmp_path)
+    with pytest.raises(BidexError, match=folder.path.name):
+        RunFolder.open(tmp_path)
+
+
+def test_metrics_go_to_both_and_resume_drops_what_came_after_the_checkpoint(tmp_path):
+    writer = MetricsWriter(tmp_path)
+    for step in (10, 20, 30):
+        writer.log({"Train/mean_return": step}, step)
+    writer.close()
+    with (tmp_path / "metrics.jsonl").open("a") as file:
+        file.write('{"step": 40, "Train/me')  # torn by the crash
+    resumed = MetricsWriter(tmp_path, resume_step=20)
+    assert [row["step"] for row in read_metrics(tmp_path / "metrics.jsonl")] == [10, 20]
+    resumed.log({"Train/mean_return": -1.0}, 30)
+    resumed.close()
+    rows = read_metrics(tmp_path / "metrics.jsonl")
+    assert [(row["step"], row["Train/mean_return"]) for row in rows] == [(10, 10.0), (20, 20.0), (30, -1.0)]
+    assert board_points(tmp_path, "Train/mean_return") == [(10, 10.0), (20, 20.0), (30, -1.0)]
+
+
+def test_a_value_that_is_not_finite_stays_valid_json(tmp_path):
+    writer = MetricsWriter(tmp_path)
+    writer.log({"Loss/value": math.nan, "Loss/policy": math.inf, "ok": 1}, 1)
+    writer.close()
+    row = json.loads((tmp_path / "metrics.jsonl").read_text(), parse_constant=pytest.fail)
+    assert (row["Loss/value"], row["Loss/policy"], row["ok"]) == (None, None, 1.0)
+
+
+def test_progress_without_a_terminal_is_one_plain_line(monkeypatch):
+    stream = io.StringIO()
+    progress = Progress(1000, start_step=500, stream=stream)
+    progress.start()
+    metrics = {"Train/mean_return": 3.25, "Train/success_rate": 0.5, "Train/success/HandOver": 0.25}
+    progress.update(metrics, 600)
+    progress.update(metrics, 700)  # within the same five seconds
+    progress.close()
+    lines = stream.getvalue().splitlines()
+    assert len(lines) == 1
+    for part in ("600 / 1,000 steps", "steps/s", "left", "return 3.25", "success 50.0 %", "HandOver 25.0 %"):
+        assert part in lines[0]
+
+
+def test_progress_in_a_terminal_is_a_table(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    monkeypatch.setenv("TERM", "xterm")
+    stream = Terminal()
+    progress = Progress(1000, stream=stream)
+    progress.start()
+    progress.update({"Train/success/HandOver": 0.25, "Train/return/HandOver": 7.0}, 600)
+    progress.close()
+    assert "HandOver" in stream.getvalue()
+    assert "25.0 %" in stream.getvalue()
+
+
+def test_curves_are_drawn_and_an_empty_run_says_so(tmp_path):
+    metrics = tmp_path / "metrics.jsonl"
+    metrics.write_text("")
+    with pytest.raises(BidexError, match="no finished episode"):
+        plot_learning_curves(metrics, tmp_path / "c.png")
+    names = [f"T{i}" for i in range(5)]
+    rows = [{"step": 0, "Loss/value": 1.0}]
+    rows += [{"step": s, **{f"Train/{k}/{n}": s * 1e-6 for n in names for k in ("return", "success")}} for s in (1, 2)]
+    metrics.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    plot_learning_curves(metrics, tmp_path / "new" / "c.png")
+    assert (tmp_path / "new" / "c.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_missing_matplotlib_names_the_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
+    with pytest.raises(BidexError, match=r"bidex-meta\[plot\]"):
+        plot_learning_curves(tmp_path / "metrics.jsonl", tmp_path / "c.png")
+
+
+def test_picture_and_film_read_back(tmp_path):
+    import imageio.v3 as imageio
+
+    frame = np.zeros((50, 70, 3), np.uint8)
+    frame[:, :35, 0] = 255
+    write_image(tmp_path / "a.png", frame)
+    assert (imageio.imread(tmp_path / "a.png") == frame).all()
+    assert write_video(tmp_path / "a.mp4", [frame] * 5, fps=60) == 5
+    film = imageio.imread(tmp_path / "a.mp4")
+    assert film.shape == (5, 50, 70, 3)
+    assert abs(film[2].astype(int) - frame).mean() < 10
+
+
+def test_endings_and_the_missing_extra(tmp_path, monkeypatch):
+    with pytest.raises(BidexError, match=r"\.mp4"):
+        check_suffix(tmp_path / "a.gif")
+    monkeypatch.setitem(__import__("sys").modules, "imageio_ffmpeg", None)
+    with pytest.raises(BidexError, match=r"bidex-meta\[video\]"):
+        write_video(tmp_path / "a.mp4", [], fps=60)

@@ -1,0 +1,251 @@
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import AutoresetMode
+from hypothesis import given
+from hypothesis import strategies as st
+
+import bidex_meta.world
+from bidex_meta.benchmark import Benchmark, Task, make_task_world
+from bidex_meta.errors import BidexError
+from bidex_meta.suite import suite_names
+from bidex_meta.tasks import registry
+
+MT4_CLASSES = ["CatchUnderarm", "HandOver", "CatchAbreast", "TwoCatchUnderarm"]
+
+
+@dataclass
+class Asked:
+    """Stands in for World and keeps what it was asked for."""
+
+    slots: list[Any]
+    num_envs: int
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(bidex_meta.world, "World", lambda slots, num_envs, **options: Asked(slots, num_envs, options))
+    yield
+
+
+def own_suite(folder: Path, **replaced: str) -> Path:
+    text = (
+        'name = "own"\nversion = 1\nkind = "multi-task"\ndescription = "own"\nobservation = "one-hot"\n'
+        'task_id = "class"\nreward = "paper"\nbase = "moving"\ntasks_per_class = 3\n[[classes]]\nname = "HandOver"\n'
+    )
+    for old, new in replaced.items():
+        text = text.replace(old, new)
+    file = folder / "own.toml"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+@given(st.lists(st.floats(width=64), max_size=12))
+def test_task_keeps_every_bit_of_its_variation(numbers: list[float]) -> None:
+    task = Task.from_variation("HandOver", np.array(numbers))
+    assert len(task.data) == 8 * len(numbers)
+    np.testing.assert_array_equal(task.variation, np.array(numbers))
+
+
+def test_classes_and_task_counts() -> None:
+    mt4, ml4 = Benchmark("MT4"), Benchmark("ML4")
+    assert list(mt4.train_classes) == MT4_CLASSES
+    assert mt4.test_classes == {} and mt4.test_tasks == []
+    assert [task.env_name for task in mt4.train_tasks] == [name for name in MT4_CLASSES for _ in range(50)]
+    assert list(ml4.train_classes) == MT4_CLASSES[:3]
+    assert list(ml4.test_classes) == MT4_CLASSES[3:]
+    assert (len(ml4.train_tasks), len(ml4.test_tasks)) == (150, 50)
+
+
+def test_hand_over_moves_in_suites_and_stands_alone(asked: None) -> None:
+    in_suite = Benchmark("MT4").train_classes["HandOver"]
+    assert (in_suite.observation_size, in_suite.action_size) == (422, 52)
+    alone = make_task_world("HandOver", num_envs=2).slots[0].task_class
+    assert (alone.observation_size, alone.action_size) == (398, 40)
+
+
+@pytest.mark.parametrize("name", suite_names())
+def test_tasks_are_distinct_and_disjoint(name: str) -> None:
+    benchmark = Benchmark(name, seed=3)
+    tasks = benchmark.train_tasks + benchmark.test_tasks
+    assert len({(task.env_name, task.data) for task in tasks}) == len(tasks)
+
+
+@pytest.mark.parametrize("name", ["MT4", "ML4"])
+def test_drawn_tasks_lie_in_their_space(name: str) -> None:
+    benchmark = Benchmark(name)
+    classes = benchmark.train_classes | benchmark.test_classes
+    for task in benchmark.train_tasks + benchmark.test_tasks:
+        assert classes[task.env_name].variation_space.contains(task.variation)
+
+
+def test_tasks_depend_on_seed_class_and_split_only(tmp_path: Path) -> None:
+    mt4, ml4 = Benchmark("MT4", seed=5), Benchmark("ML4", seed=5)
+    assert ml4.train_tasks == mt4.train_tasks[:150]
+    assert set(ml4.test_tasks).isdisjoint(mt4.train_tasks)
+    assert Benchmark("MT4", seed=6).train_tasks != mt4.train_tasks
+    own = Benchmark(own_suite(tmp_path, **{"= 3": "= 50"}), seed=5)
+    assert own.train_tasks == mt4.train_tasks[50:100]
+
+
+def test_tasks_touch_no_global_generator() -> None:
+    np.random.seed(1)
+    torch.manual_seed(1)
+    before = np.random.get_state()[1].copy(), torch.get_rng_state()  # type: ignore[index, union-attr]
+    Benchmark("MT4")
+    np.testing.assert_array_equal(before[0], np.random.get_state()[1])  # type: ignore[index]
+    assert torch.equal(before[1], torch.get_rng_state())
+
+
+def test_same_tasks_in_a_new_process() -> None:
+    code = "from bidex_meta import Benchmark\nprint(*(t.data.hex() for t in Benchmark('ML4', seed=9).train_tasks))"
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=_ROOT).stdout
+    assert printed.split() == [task.data.hex() for task in Benchmark("ML4", seed=9).train_tasks]
+
+
+_ROOT = Path(__file__).parents[1]
+
+
+def test_listed_tasks_fix_the_goal_and_share_the_drawn_rest() -> None:
+    mt1, ml1, other = Benchmark("MT1"), Benchmark("ML1"), Benchmark("MT1", seed=1)
+    names = mt1.train_classes["CatchUnderarm"].variation_space.names
+    goal = [names.index(f"goal_{axis}") for axis in "xyz"]
+    expected = [(0.0, -0.79, 0.54), (0.03, -0.79, 0.54), (-0.03, -0.79, 0.54), (0.0, -0.82, 0.54)]
+    np.testing.assert_array_equal([task.variation[goal] for task in mt1.train_tasks], expected)
+    assert ml1.train_tasks + ml1.test_tasks == mt1.train_tasks
+    assert list(ml1.train_classes) == list(ml1.test_classes) == ["CatchUnderarm"]
+    assert other.train_tasks != mt1.train_tasks
+
+
+@pytest.mark.parametrize(
+    ("name", "split", "observation", "pad_to", "sampling"),
+    [
+        ("MT1", "train", "one-hot", 422, "uniform"),
+        ("MT4", "train", "one-hot", 446, "uniform"),
+        ("ML1", "test", "masked", 422, "fixed"),
+        ("ML4", "train", "masked", 446, "fixed"),
+        ("ML4", "test", "masked", 446, "fixed"),
+    ],
+)
+def test_what_a_world_is_asked_for(
+    asked: None, name: str, split: str, observation: str, pad_to: int, sampling: str
+) -> None:
+    world = Benchmark(name, seed=4).make_world(split, num_envs=9, device="cpu", threads=2)
+    assert world.num_envs == 9
+    assert world.options == {
+        "device": torch.device("cpu"),
+        "seed": 4,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+        "observation": observation,
+        "pad_to": pad_to,
+        "task_sampling": sampling,
+        "threads": 2,
+    }
+
+
+def test_evaluation_worlds_keep_their_tasks(asked: None) -> None:
+    for mode in ("DISABLED", "disabled", "Disabled", AutoresetMode.DISABLED):
+        world = Benchmark("MT4").make_world(autoreset_mode=mode)
+        assert world.options["autoreset_mode"] is AutoresetMode.DISABLED
+        assert world.options["task_sampling"] == "fixed"
+    assert Benchmark("MT4").make_world(autoreset_mode="same-step").options["task_sampling"] == "uniform"
+
+
+def test_slots(asked: None) -> None:
+    mt1 = Benchmark("MT1")
+    slots = mt1.make_world().slots
+    assert [slot.name for slot in slots] == [f"CatchUnderarm/{name}" for name in ("original", "left", "right", "back")]
+    assert all(slot.tasks.shape == (1, 5) for slot in slots)
+    (slot,) = Benchmark("ML1").make_world("train").slots
+    assert (slot.name, slot.tasks.shape) == ("CatchUnderarm", (3, 5))
+    mt4 = Benchmark("MT4").make_world().slots
+    assert [slot.name for slot in mt4] == MT4_CLASSES
+    assert [len(slot.tasks) for slot in mt4] == [50] * 4
+
+
+def test_reward_scale_reaches_its_slot(asked: None, tmp_path: Path) -> None:
+    file = own_suite(tmp_path, **{'"HandOver"': '"HandOver"\nreward_scale = 0.1'})
+    assert Benchmark(file).make_world().slots[0].reward_scale == 0.1
+
+
+def test_task_world_has_the_tasks_of_the_suites(asked: None) -> None:
+    world = make_task_world("CatchAbreast", num_envs=3, device="cpu", seed=2)
+    expected = [t.variation for t in Benchmark("MT4", seed=2).train_tasks if t.env_name == "CatchAbreast"]
+    np.testing.assert_array_equal(world.slots[0].tasks, expected)
+    assert world.options["observation"] == "plain" and world.options["pad_to"] is None
+    assert world.options["task_sampling"] == "uniform"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"num_envs": 3}, "num_envs: expected at least 4, a row each for CatchUnderarm, HandOver"),
+        ({"num_envs": 4.5}, "num_envs: expected at least 4"),
+        ({"split": "test"}, "MT4 has the splits train, got 'test'"),
+        ({"autoreset_mode": "NEXT_STEP"}, "Unknown autoreset_mode 'NEXT_STEP'"),
+        ({"device": "gpu"}, "device: expected auto, cpu, cuda or cuda:N, got 'gpu'"),
+        ({"seed": -1}, "seed: expected a whole number from 0 on, got -1"),
+    ],
+)
+def test_bad_worlds(asked: None, arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(BidexError, match=message):
+        Benchmark("MT4").make_world(**arguments)
+
+
+def test_bad_names_and_seeds(tmp_path: Path) -> None:
+    with pytest.raises(BidexError, match="Did you mean 'HandOver'"):
+        make_task_world("Handover")
+    with pytest.raises(BidexError, match=r"own\.toml: classes: Unknown task class 'HandOvr'\. Did you mean 'HandOver'"):
+        Benchmark(own_suite(tmp_path, HandOver="HandOvr"))
+    listed = own_suite(
+        tmp_path,
+        **{
+            "tasks_per_class = 3\n": "",
+            '"HandOver"': '"HandOver"\n[[classes.tasks]]\nname = "a"\nfixed = { goal_q = 0 }',
+        },
+    )
+    with pytest.raises(BidexError, match="Unknown component of HandOver 'goal_q'"):
+        Benchmark(listed)
+    with pytest.raises(BidexError, match="seed: expected a whole number"):
+        Benchmark("MT4", seed=0.5)  # type: ignore[arg-type]
+
+
+def test_classes_of_different_actions_are_refused(tmp_path: Path) -> None:
+    more = {'"HandOver"': '"HandOver"\n[[classes]]\nname = "CatchUnderarm"'}
+    Benchmark(own_suite(tmp_path, **more))
+    with pytest.raises(BidexError, match="base: expected classes with one number of actions"):
+        Benchmark(own_suite(tmp_path, **more, moving="alone"))
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_every_class_draws_fifty_tasks(asked: None, name: str) -> None:
+    (slot,) = make_task_world(name).slots
+    assert len(np.unique(slot.tasks, axis=0)) == 50
+
+
+@pytest.mark.parametrize(
+    ("name", "split", "width", "one_hot"),
+    [
+        ("MT1", "train", 426, 4),
+        ("MT4", "train", 450, 4),
+        ("ML1", "test", 422, 0),
+        ("ML4", "train", 446, 0),
+        ("ML4", "test", 446, 0),
+    ],
+)
+def test_real_world_observations(name: str, split: str, width: int, one_hot: int) -> None:
+    world = Benchmark(name).make_world(split, num_envs=8, device="cpu", threads=1)
+    obs, _ = world.reset(seed=0)
+    assert obs.shape == (8, width) and world.single_action_space.shape == (52,)
+    if one_hot:
+        expected = torch.eye(one_hot)[world.task_id]
+        assert torch.equal(obs[:, -one_hot:], expected)
+    world.close()

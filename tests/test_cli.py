@@ -1,0 +1,293 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from bidex_meta.cli import main
+from bidex_meta.commands import COMMANDS, worlds
+from bidex_meta.record import RunFolder, read_metrics
+from tests.fakes import ToyWorld
+
+SMALL = ["--suite", "MT4", "--num-envs", "6", "--threads", "1", "--device", "cpu"]
+SMALL += ["--learner.hidden", "8", "--learner.rollout-steps", "4", "--learner.num-minibatches", "2"]
+
+
+def toy(config, split, rows, mode):
+    return ToyWorld(rows or 6, mode, config["seed"])
+
+
+@pytest.fixture
+def toy_worlds(monkeypatch):
+    monkeypatch.setattr(worlds, "_world", toy)
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
+
+
+def run(*arguments):
+    return main(["run", *SMALL, *map(str, arguments)])
+
+
+def final(path):
+    loaded = RunFolder.open(path).checkpoints.load()
+    assert loaded is not None
+    return loaded
+
+
+def same(a, b):
+    if isinstance(a, torch.Tensor):
+        return torch.equal(a, b)
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, list | tuple):
+        return len(a) == len(b) and all(map(same, a, b))
+    return a == b
+
+
+# Help and errors.
+
+
+def test_help_is_quick_and_needs_no_torch():
+    code = "import sys; from bidex_meta.cli import main; main(['--help']); print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.rstrip().endswith("False")
+    for name in COMMANDS:
+        assert f"\n  {name}" in done.stdout
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_each_help_opens_with_a_sentence_and_an_example(command, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([command, "--help"])
+    assert stop.value.code == 0
+    usage, sentence, example = capsys.readouterr().out.split("\n\n")[:3]
+    assert usage.startswith(f"usage: bidex-meta {command}")
+    assert sentence.rstrip().endswith(".")
+    assert " ".join(example.split()).startswith(f"Example: bidex-meta {command} ")
+
+
+def test_help_of_run_names_every_field_of_the_learner(capsys):
+    from dataclasses import fields
+
+    from bidex_algos.mtppo import MTPPOConfig
+
+    with pytest.raises(SystemExit):
+        main(["run", "--help"])
+    text = capsys.readouterr().out
+    for field in fields(MTPPOConfig):
+        assert f"--learner.{field.name.replace('_', '-')}" in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ("rum", "Did you mean 'run'?"),
+        ("run --suite MT4 --num-evns 4", "Did you mean --num-envs?"),
+        ("run --suite MT4 --learner.gama 0.9", "Did you mean --learner.gamma?"),
+        ("run --suite MT4 --num-envs many", "--num-envs"),
+        ("run --suite MT4 --num-envs 0", "at least 1"),
+        ("run --suite MT4 --steps 2.5", "2e7"),
+        ("run --suite MT4 --learner.gamma 7", "gamma must lie in [0, 1]"),
+        ("run --suite MT4 --algo mtpo", "Did you mean 'mtppo'?"),
+        ("run --suite MT4 --preset lap", "Did you mean 'laptop'?"),
+        ("run --suite MT4 --device gpu", "auto, cpu or cuda:N"),
+        ("run", "either --suite SUITE or --task TASK"),
+        ("run --suite MT4 --task HandOver", "either --suite SUITE or --task TASK"),
+        ("run --suite MT5", "Did you mean 'MT4'?"),
+        ("run --resume nowhere", "not a run folder"),
+        ("list suits", "Did you mean 'suites'?"),
+        ("list", "suites|tasks|algos"),
+        ("evaluate nowhere", "not a run folder"),
+        ("evaluate nowhere --split tets", "'train', 'test'"),
+        ("bench speed", "Unknown bench"),
+        ("render --task HandOver --out a.gif", ".png"),
+        ("render --task HandOver --out a.mp4 --width 101", "even"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(arguments, expected, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments.split()) == 2
+    captured = capsys.readouterr()
+    assert expected in captured.err
+    assert captured.err.startswith("bidex-meta: ")
+    assert captured.err.count("\n") == 1
+    assert captured.out == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_debug_shows_the_traceback():
+    with pytest.raises(ValueError, match="Did you mean 'run'"):
+        main(["rum", "--debug"])
+
+
+# Config.
+
+
+def test_print_config_is_json_of_everything_and_writes_nothing(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run("--steps", "2e7", "--learner.gamma", "0.91", "--print-config") == 0
+    config = json.loads(capsys.readouterr().out)
+    assert (config["suite"], config["task"], config["algo"], config["preset"]) == ("MT4", None, "mtppo", "laptop")
+    assert config["steps"] == 20_000_000
+    assert config["learner"]["gamma"] == 0.91
+    assert config["learner"]["hidden"] == [8]
+    assert config["threads"] == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_preset_sets_what_no_flag_sets(capsys):
+    assert (
+        main(["run", *SMALL[:2], "--device", "cpu", "--preset", "paper", "--learner.epochs", "3", "--print-config"])
+        == 0
+    )
+    learner = json.loads(capsys.readouterr().out)["learner"]
+    assert (learner["hidden"], learner["gamma"], learner["epochs"]) == ([2048, 1024, 512], 0.96, 3)
+
+
+# Run, resume, evaluate, plot, render.
+
+
+def test_run_trains_evaluates_and_can_be_looked_at_again(toy_worlds, tmp_path, capsys):
+    path = tmp_path / "r"
+    assert run("--steps", 240, "--run-dir", path, "--episodes", 2) == 0
+    captured = capsys.readouterr()
+    for text in ("Near", "Far", "random return", "return above random"):
+        assert text in captured.out
+    assert "Preset laptop: the device is a CPU." in captured.err
+    assert str(path) in captured.err
+    assert [row["step"] for row in read_metrics(path / "metrics.jsonl")] == list(range(24, 241, 24))
+    assert final(path)[1] == 240
+    report = json.loads((path / "evaluation.json").read_text())
+    assert report["policy"]["classes"]["Near"]["episodes"] == 6
+
+    assert main(["evaluate", str(path), "--random", "--json", "--episodes", "2"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["steps"] == 240
+    assert found["policy"] == report["policy"]  # the policy of the checkpoint is the one that was trained
+    assert found["random"] == report["random"]
+    assert set(found["return_above_random"]["Far"]) == {"value", "interval"}
+
+    assert main(["evaluate", str(path)]) == 0
+    assert "Near" in capsys.readouterr().out
+    assert main(["plot", str(path)]) == 0
+    assert (path / "curves.png").stat().st_size > 0
+
+
+def test_a_resumed_run_equals_an_unbroken_one(toy_worlds, tmp_path):
+    assert run("--steps", 240, "--run-dir", tmp_path / "whole", "--no-evaluate") == 0
+    assert run("--steps", 96, "--run-dir", tmp_path / "parts", "--no-evaluate") == 0
+    torch.set_num_threads(2)
+    assert main(["run", "--resume", str(tmp_path / "parts"), "--steps", "240", "--no-evaluate"]) == 0
+    assert torch.get_num_threads() == 1
+    assert same(final(tmp_path / "whole"), final(tmp_path / "parts"))
+    rows = [read_metrics(tmp_path / name / "metrics.jsonl") for name in ("whole", "parts")]
+    keep = [[{k: v for k, v in row.items() if k != "time" and not k.startswith("Perf/")} for row in r] for r in rows]
+    assert keep[0] == keep[1]
+    assert RunFolder.open(tmp_path / "parts").config()["steps"] == 240
+
+
+def test_resume_refuses_a_changed_config_and_takes_the_same_one(toy_worlds, tmp_path, capsys):
+    path = tmp_path / "r"
+    assert run("--steps", 24, "--run-dir", path, "--no-evaluate", "--seed", 4) == 0
+    for flag, value in (("--learner.gamma", "0.5"), ("--num-envs", "12"), ("--seed", "5"), ("--suite", "MT1")):
+        capsys.readouterr()
+        assert main(["run", "--resume", str(path), flag, value]) == 2
+        assert f"{flag} is " in capsys.readouterr().err
+    assert main(["run", "--resume", str(path), "--seed", "4", "--no-evaluate"]) == 0
+
+
+def test_resume_without_a_checkpoint_starts_over(toy_worlds, tmp_path):
+    path = tmp_path / "r"
+    assert run("--steps", 48, "--run-dir", path, "--no-evaluate") == 0
+    whole = final(path)
+    for file in (path / "checkpoints").iterdir():
+        file.unlink()
+    assert main(["evaluate", str(path)]) == 2
+    assert main(["run", "--resume", str(path), "--no-evaluate"]) == 0
+    assert same(whole, final(path))
+    assert [row["step"] for row in read_metrics(path / "metrics.jsonl")] == [24, 48]
+
+
+_TRAIN = """
+import functools, sys, time
+import bidex_algos.runner as runner
+from bidex_meta.cli import main
+from bidex_meta.commands import worlds
+from tests.fakes import ToyWorld
+class Slow(ToyWorld):
+    def step(self, action):
+        time.sleep(0.002)
+        return super().step(action)
+worlds._world = lambda config, split, rows, mode: Slow(rows or 6, mode, config["seed"])
+runner.train = functools.partial(runner.train, checkpoint_seconds=0.0)
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_a_killed_run_resumes_to_the_same_end(number, toy_worlds, tmp_path):
+    path, steps = tmp_path / "killed", 9600
+    command = [sys.executable, "-c", _TRAIN, "run", *SMALL, "--steps", str(steps), "--run-dir", str(path)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 60
+    while not list(path.glob("checkpoints/step_*.pt")) and time.monotonic() < deadline and process.poll() is None:
+        time.sleep(0.01)
+    process.send_signal(number)
+    _, errors = process.communicate()
+    if number == signal.SIGTERM:
+        assert process.returncode == 0
+        assert f"bidex-meta run --resume {path}" in errors
+    stopped = final(path)[1]
+    assert 0 < stopped < steps, errors
+    goal = stopped + 480
+    assert main(["run", "--resume", str(path), "--steps", str(goal), "--no-evaluate"]) == 0
+    assert run("--steps", goal, "--run-dir", tmp_path / "whole", "--no-evaluate") == 0
+    assert same(final(path), final(tmp_path / "whole"))
+
+
+def test_render_picture_and_film(monkeypatch, toy_worlds, tmp_path, capsys):
+    monkeypatch.setattr(worlds, "check_names", lambda config: None)
+    flags = ["render", "--task", "Near", "--width", "64", "--height", "48", "--policy", "random"]
+    assert main([*flags, "--out", str(tmp_path / "a.png"), "--steps", "2"]) == 0
+    assert capsys.readouterr().out == f"{tmp_path / 'a.png'}\n"
+    import imageio.v3 as imageio
+
+    assert imageio.imread(tmp_path / "a.png")[0, :, 0].tolist() == [0] * 2 + [255] * 62
+    assert main(["render", "--task", "Nearer", "--out", str(tmp_path / "b.png")]) == 2
+    assert "Did you mean 'Near'?" in capsys.readouterr().err
+
+
+# List and bench.
+
+
+def test_list_suites_and_algos_as_json(capsys):
+    assert main(["list", "suites", "--json"]) == 0
+    suites = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
+    assert suites["ML4"]["test_classes"] == ["TwoCatchUnderarm"]
+    assert main(["list", "algos", "--json"]) == 0
+    algos = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
+    assert {"paper", "laptop"} <= set(algos["mtppo"]["presets"])
+    assert main(["list", "algos"]) == 0
+    assert "mtppo" in capsys.readouterr().out
+
+
+def test_bench_hands_on_the_flags_that_were_given(monkeypatch, capsys):
+    def world(suite, num_envs=7, threads=None):
+        return {"suite": suite, "num_envs": num_envs, "ratio": 0.93}
+
+    fake = SimpleNamespace(world=world)
+    monkeypatch.setitem(sys.modules, "bidex_meta.bench", fake)
+    monkeypatch.setattr("bidex_meta.bench", fake, raising=False)
+    assert main(["bench", "world", "--suite", "MT1", "--num-envs", "12", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"suite": "MT1", "num_envs": 12, "ratio": 0.93}
+    assert main(["bench", "world"]) == 0
+    assert "0.93" in capsys.readouterr().out
+    assert main(["bench", "world", "--seed", "3"]) == 2
+    assert "takes no --seed" in capsys.readouterr().err

@@ -1,0 +1,150 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bidex_meta.errors import BidexError
+from bidex_meta.evaluate import (
+    ClassResult,
+    Evaluation,
+    RandomAgent,
+    Reference,
+    ZeroAgent,
+    aggregate,
+    bootstrap_interval,
+    compare,
+    evaluate,
+)
+from tests.fakes import STEPS_OF_TASK, Seeker, ToyWorld
+
+
+def result(returns, reference=None):
+    returns = np.asarray(returns, np.float64)
+    return ClassResult(returns, returns > 0, np.ones(len(returns), np.int64), np.zeros(len(returns)), 0, reference)
+
+
+def mean(sample, axis=-1):
+    return np.mean(sample, axis=axis)
+
+
+@pytest.mark.parametrize("rows", [6, 8, 12, 30])
+def test_every_task_is_played_equally_often_whatever_the_rows_and_lengths(rows):
+    found = evaluate(Seeker(), ToyWorld(rows, "DISABLED"), episodes_per_task=3)
+    for name, tasks in (("Near", 3), ("Far", 2)):
+        counts = np.bincount(found.classes[name].tasks, minlength=tasks)
+        assert counts.tolist() == [3] * tasks
+        assert found.classes[name].lengths.tolist() == [STEPS_OF_TASK[t] for t in found.classes[name].tasks]
+
+
+def test_return_is_the_sum_of_unscaled_rewards_until_the_episode_ends():
+    world = ToyWorld(6, "DISABLED")
+    found = evaluate(ZeroAgent(world.action_space), world, episodes_per_task=1, seed=5)
+    obs, _ = ToyWorld(6, "DISABLED").reset(seed=5)
+    distance = (obs[:, 0] - obs[:, 1]).abs()
+    expected = world.max_episode_steps * (1 - distance)
+    # Rows 0-2 are Near's three tasks; rows 3 and 4 Far's two, row 5 repeats its first and is left out.
+    assert np.allclose(found.classes["Near"].returns, expected[:3].numpy())
+    assert np.allclose(found.classes["Far"].returns, expected[3:5].numpy())
+
+
+def test_success_counts_any_step_and_is_kept_by_name():
+    found = evaluate(Seeker(), ToyWorld(6, "DISABLED"), episodes_per_task=2)
+    assert list(found.classes) == ["Near", "Far"]
+    assert found.classes["Near"].success == 1.0
+    zero = evaluate(ZeroAgent(ToyWorld(6, "DISABLED").action_space), ToyWorld(6, "DISABLED"), 2)
+    assert zero.classes["Far"].success == 0.0
+
+
+def test_agent_is_told_which_rows_begin():
+    seeker = Seeker()
+    evaluate(seeker, ToyWorld(8, "DISABLED"), episodes_per_task=3)
+    # Near: 4 rows on 3 tasks, of which tasks 1 and 2 have one row each: three rounds.
+    assert len(seeker.masks) == 3
+    assert seeker.masks[0].all()
+    assert seeker.masks[2].tolist() == [False, True, True, False, False, False, False, False]
+
+
+def test_same_seed_same_evaluation():
+    def once():
+        world = ToyWorld(6, "DISABLED")
+        return evaluate(RandomAgent(world.action_space, 3), world, 4, seed=1).to_json()
+
+    assert once() == once()
+    json.dumps(once(), allow_nan=False)
+
+
+def test_random_agent_is_uniform_and_ignores_torchs_global_generator():
+    space = ToyWorld(5000, "DISABLED").action_space
+    torch.manual_seed(0)
+    first = RandomAgent(space, 1).eval_action(torch.zeros(5000, 2))
+    torch.manual_seed(7)
+    assert torch.equal(first, RandomAgent(space, 1).eval_action(torch.zeros(5000, 2)))
+    assert first.shape == (5000, 1)
+    assert first.min() >= -1
+    assert first.max() <= 1
+    assert abs(first.mean()) < 0.05
+    assert abs(first.std() - 3**-0.5) < 0.02
+
+
+def test_refusals_name_the_mend():
+    with pytest.raises(BidexError, match="DISABLED"):
+        evaluate(Seeker(), ToyWorld(6, "SAME_STEP"), 1)
+    with pytest.raises(BidexError, match="num_envs=6"):
+        evaluate(Seeker(), ToyWorld(4, "DISABLED"), 1)
+    with pytest.raises(BidexError, match="at least 1"):
+        evaluate(Seeker(), ToyWorld(6, "DISABLED"), 0)
+
+
+def test_bootstrap_interval_covers_the_mean_about_as_often_as_it_says():
+    generator = np.random.default_rng(0)
+    hits = 0
+    for _ in range(200):
+        low, high = bootstrap_interval(mean, generator.normal(2.0, 1.0, 40)) or (0, 0)
+        hits += low <= 2.0 <= high
+    assert 180 <= hits <= 199
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=30), st.floats(-100, 100))
+def test_bootstrap_interval_holds_the_mean_and_moves_with_it(values, shift):
+    sample = np.array(values)
+    low, high = bootstrap_interval(mean, sample) or (1, 0)
+    assert low - 1e-9 <= sample.mean() <= high + 1e-9 or sample.std() > 0
+    assert sample.min() - 1e-9 <= low <= high <= sample.max() + 1e-9
+    moved = bootstrap_interval(mean, sample + shift) or (1, 0)
+    assert np.allclose(moved, (low + shift, high + shift), atol=1e-6)
+
+
+def test_one_episode_has_no_interval():
+    assert bootstrap_interval(mean, np.array([1.0])) is None
+
+
+def test_compare_tells_a_difference_from_noise():
+    generator = np.random.default_rng(1)
+    noise, other = generator.normal(0, 1, 100), generator.normal(0, 1, 100)
+    same = compare(Evaluation({"A": result(noise)}, 4), Evaluation({"A": result(other)}, 4))["A"]
+    better = compare(Evaluation({"A": result(noise + 2)}, 4), Evaluation({"A": result(other)}, 4))["A"]
+    assert not same.excludes_zero
+    assert better.excludes_zero
+    assert better.value == pytest.approx(same.value + 2)
+    assert better.interval is not None
+    assert better.interval[0] < better.value < better.interval[1]
+
+
+def test_score_needs_both_references_and_all_classes():
+    scored = result([1.0, 3.0], Reference(random=1.0, expert=5.0))
+    assert scored.score == pytest.approx(25.0)
+    assert result([1.0, 3.0]).score is None
+    both = Evaluation({"A": scored, "B": result([1.0])}, 2).to_json()
+    assert both["aggregate"]["score"] is None
+    assert both["classes"]["A"]["score"] == pytest.approx(25.0)
+
+
+def test_iqm_drops_the_outer_quarters():
+    found = aggregate([np.array([v, v]) for v in (0.0, 1.0, 2.0, 100.0)])
+    assert found is not None
+    assert found["mean"] == pytest.approx(25.75)
+    assert found["iqm"] == pytest.approx(1.5)

@@ -1,0 +1,201 @@
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bidex_meta.errors import BidexError
+from bidex_meta.suite import load_suite, suite_names
+from bidex_meta.tasks import registry
+
+META = """
+name = "own"
+version = 1
+kind = "meta"
+description = "two classes"
+observation = "masked"
+task_id = "class"
+reward = "paper"
+base = "moving"
+tasks_per_class = 5
+
+[[classes]]
+name = "CatchUnderarm"
+split = "train"
+
+[[classes]]
+name = "HandOver"
+split = "test"
+"""
+
+LISTED = """
+name = "own"
+version = 1
+kind = "meta"
+description = "one class"
+observation = "masked"
+task_id = "task"
+reward = "paper"
+base = "moving"
+
+[[classes]]
+name = "CatchUnderarm"
+split = "both"
+
+[[classes.tasks]]
+name = "near"
+fixed = { goal_x = 0.0 }
+
+[[classes.tasks]]
+name = "far"
+split = "test"
+fixed = { goal_x = 0.1 }
+"""
+
+
+def write(folder: Path, text: str) -> Path:
+    file = folder / "own.toml"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def test_shipped_suites() -> None:
+    assert suite_names() == ["ML1", "ML1-wide", "ML4", "MT1", "MT4"]
+
+
+@pytest.mark.parametrize("name", suite_names())
+def test_shipped_suite_is_sound(name: str) -> None:
+    suite = load_suite(name)
+    assert suite.name == name
+    assert {entry.name for entry in suite.classes} <= set(registry.names())
+    assert suite.observation == ("masked" if suite.kind == "meta" else "one-hot")
+    assert suite.splits == (("train", "test") if suite.kind == "meta" else ("train",))
+
+
+def test_composition_of_mt4_and_ml4() -> None:
+    mt4, ml4 = load_suite("MT4"), load_suite("ML4")
+    assert [c.name for c in mt4.classes] == ["CatchUnderarm", "HandOver", "CatchAbreast", "TwoCatchUnderarm"]
+    assert [c.name for c in ml4.split_classes("train")] == ["CatchUnderarm", "HandOver", "CatchAbreast"]
+    assert [c.name for c in ml4.split_classes("test")] == ["TwoCatchUnderarm"]
+    assert mt4.tasks_per_class == ml4.tasks_per_class == 50
+
+
+@pytest.mark.parametrize(("name", "distance"), [("MT1", 0.03), ("ML1", 0.03), ("ML1-wide", 0.12)])
+def test_listed_goals(name: str, distance: float) -> None:
+    (entry,) = load_suite(name).classes
+    goals = {task.name: tuple(task.fixed[f"goal_{axis}"] for axis in "xyz") for task in entry.tasks}
+    assert goals == {
+        "original": (0.0, -0.79, 0.54),
+        "left": (distance, -0.79, 0.54),
+        "right": (-distance, -0.79, 0.54),
+        "back": (0.0, pytest.approx(-0.79 - distance), 0.54),
+    }
+    held_out = [task.name for task in entry.tasks if task.split == "test"]
+    assert held_out == ([] if name == "MT1" else ["back"])
+
+
+def test_unknown_name_names_the_nearest_and_all() -> None:
+    with pytest.raises(BidexError, match=r"Did you mean 'MT4'\? Known: ML1, ML1-wide, ML4, MT1, MT4"):
+        load_suite("MT44")
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(BidexError, match=r"absent\.toml, but No such file"):
+        load_suite(tmp_path / "absent.toml")
+
+
+def test_own_file_as_path_and_as_text(tmp_path: Path) -> None:
+    file = write(tmp_path, META)
+    assert load_suite(file) == load_suite(str(file))
+    assert load_suite(file).classes[0].reward_scale == 1.0
+
+
+FAULTS = {
+    "unknown key": (
+        META,
+        'base = "moving"',
+        'base = "moving"\nbasis = 1',
+        "basis: Unknown key 'basis'. Did you mean 'base'",
+    ),
+    "unknown key in a class": (META, 'split = "test"', 'splitt = "test"', r"classes[1].splitt: Unknown key"),
+    "missing key": (META, 'reward = "paper"\n', "", 'reward: expected "paper", got nothing. Add reward'),
+    "text for a number": (META, "version = 1", 'version = "1"', "version: expected a whole number from 1 on, got '1'"),
+    "boolean for a number": (
+        META,
+        "version = 1",
+        "version = true",
+        "version: expected a whole number from 1 on, got True",
+    ),
+    "number for a text": (META, 'name = "own"', "name = 3", "name: expected a text in quotes, got 3"),
+    "unknown choice": (META, '"masked"', '"hidden"', "observation: expected"),
+    "no tasks": (META, "tasks_per_class = 5", "tasks_per_class = 0", "tasks_per_class: expected a whole number"),
+    "tasks neither drawn nor listed": (META, "tasks_per_class = 5\n", "", "tasks_per_class: expected a whole number"),
+    "empty split": (META, 'split = "test"', 'split = "train"', "a meta suite with the splits train, test, got train"),
+    "test split in MT": (META, '"meta"', '"multi-task"', "a multi-task suite with the splits train, got train, test"),
+    "class twice": (META, '"HandOver"', '"CatchUnderarm"', "classes.name: expected each name once"),
+    "no class": (META, META[META.index("[[") :], "classes = []", "classes: expected at least one [[classes]] table"),
+    "class is no table": (META, META[META.index("[[") :], 'classes = ["HandOver"]', "classes: expected at least one"),
+    "one-hot over tasks that are not listed": (META, '"class"', '"task"', 'task_id: expected "class"'),
+    "negative scale": (
+        META,
+        'split = "test"',
+        'split = "test"\nreward_scale = -1',
+        "reward_scale: expected a number above 0",
+    ),
+    "overlap": (
+        LISTED,
+        "goal_x = 0.1",
+        "goal_x = 0.0",
+        "expected train and test tasks that differ, got 'near' and 'far'",
+    ),
+    "task twice": (LISTED, '"far"', '"near"', "classes[0].tasks.name: expected each name once"),
+    "listed split absent": (LISTED, 'split = "both"', 'split = "test"', "classes"),
+    "listed and counted": (
+        LISTED,
+        "version = 1",
+        "version = 1\ntasks_per_class = 3",
+        "tasks_per_class: expected nothing",
+    ),
+    "value is no number": (
+        LISTED,
+        "goal_x = 0.1",
+        'goal_x = "0.1"',
+        "classes[0].tasks[1].fixed.goal_x: expected a finite",
+    ),
+    "value is not finite": (LISTED, "goal_x = 0.1", "goal_x = nan", "goal_x: expected a finite number, got nan"),
+    "no TOML": (META, 'name = "own"', "name: own", "expected TOML in UTF-8"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_fault_names_file_key_and_mend(fault: str, tmp_path: Path) -> None:
+    text, old, new, message = FAULTS[fault]
+    assert old in text
+    load_suite(write(tmp_path, text))
+    file = write(tmp_path, text.replace(old, new, 1))
+    with pytest.raises(BidexError) as raised:
+        load_suite(file)
+    assert str(raised.value).startswith(str(file))
+    assert message in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+KEYS = ["name", "version", "kind", "observation", "task_id", "reward", "base", "tasks_per_class", "classes", "other"]
+VALUES = ["3", "-1", "true", '"train"', '"class"', "[]", "{}", "1.5", "[{}]", '[{ name = "HandOver" }]']
+
+
+@given(st.dictionaries(st.sampled_from(KEYS), st.sampled_from(VALUES)))
+def test_any_other_content_is_a_bidex_error(tmp_path_factory: pytest.TempPathFactory, content: dict[str, str]) -> None:
+    text = "\n".join(f"{key} = {value}" for key, value in content.items())
+    with pytest.raises(BidexError):
+        load_suite(write(tmp_path_factory.getbasetemp(), text))
+
+
+def test_readme_explains_every_key() -> None:
+    from bidex_meta.paths import suites_dir
+
+    readme = (suites_dir() / "README.md").read_text(encoding="utf-8")
+    for key in [*KEYS[:-1], "description", "split", "reward_scale", "tasks", "fixed"]:
+        assert f"| `{key}` |" in readme
+    for name in suite_names():
+        assert f"| {name} |" in readme
