@@ -21,7 +21,12 @@ _SAMPLES_PER_STEP = 2
 
 
 def world(
-    suite: str = "MT4", num_envs: int = 1024, steps: int = 40, repeats: int = 7, threads: int | None = None, seed: int = 0
+    suite: str = "MT4",
+    num_envs: int = 1024,
+    steps: int = 40,
+    repeats: int = 7,
+    threads: int | None = None,
+    seed: int = 0,
 ) -> dict[str, Any]:
     """Speed of the whole world against bare engine steps.
 
@@ -79,7 +84,9 @@ def _paired_steps(full: World, bare: World, steps: int, generator: torch.Generat
     return full_time, bare_time
 
 
-def scaling(suite: str = "MT4", num_envs: int = 1024, steps: int = 40, repeats: int = 5, seed: int = 0) -> dict[str, Any]:
+def scaling(
+    suite: str = "MT4", num_envs: int = 1024, steps: int = 40, repeats: int = 5, seed: int = 0
+) -> dict[str, Any]:
     """Speed of the world over engine threads, repeats interleaved.
 
     Returns:
@@ -144,7 +151,8 @@ def _stability(made: World, steps: int, seed: int) -> dict[str, Any]:
     held, left = torch.zeros(made.num_envs, made.action_size), torch.zeros(made.num_envs, dtype=torch.int64)
     unstable = warnings = 0
     fastest, depths = 0.0, []
-    for step in range(math.ceil(steps / made.num_envs)):
+    control_steps = math.ceil(steps / made.num_envs)
+    for _ in range(control_steps):
         action = _rough_actions(held, left, generator)
         info = made.step(action)[-1]
         unstable += int(info["unstable"].sum())
@@ -155,7 +163,7 @@ def _stability(made: World, steps: int, seed: int) -> dict[str, Any]:
     depth = torch.tensor(depths)
     shallow = float((depth <= MAX_PENETRATION).double().mean())
     return {
-        "env_steps": made.num_envs * (step + 1),
+        "env_steps": made.num_envs * control_steps,
         "unstable": unstable,
         "warnings": warnings,
         "fastest_object": round(fastest, 2),

@@ -11,9 +11,14 @@ import torch
 from torch import Tensor
 
 # What a simulation carries from one step to the next; the fields that a model has none of are skipped.
-_STATE = ("time", "qpos", "qvel", "act", "history", "qacc_warmstart", "ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos",
-          "mocap_quat")  # fmt: skip
-_BAD = [int(w) for w in (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)]
+_STATE_FIELDS = (
+    "time qpos qvel act history qacc_warmstart ctrl qfrc_applied xfrc_applied eq_active mocap_pos mocap_quat userdata"
+)
+_STATE = tuple(_STATE_FIELDS.split())
+_BAD = [
+    int(w)
+    for w in (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+]
 
 
 def default_threads() -> int:
@@ -61,7 +66,7 @@ class CpuEngine:
         try:
             self.batch.step(ids=ids, nstep=substeps, stage=mujoco.mjtStage.mjSTAGE_VEL)
         except mujoco.batch.SimulationError as error:
-            # A broken row can meet more contacts than its memory holds; it keeps its old state, the others have finished.
+            # A broken row can meet more contacts than its memory holds; it keeps its old state, the others are done.
             self._failed[torch.as_tensor(error.ids)] = True
 
     def unstable(self) -> Tensor:
@@ -71,14 +76,12 @@ class CpuEngine:
         return bad | self._failed | ~self.sensordata.sum(dim=1).isfinite()
 
     def reset(self, mask: Tensor, qpos: Tensor) -> None:
-        """Starts the simulations of a mask anew at given positions (one row per true entry), at rest, without forces."""
-        ids = mask.nonzero().squeeze(1)
-        self.batch.warning[ids] = 0
-        self._failed[ids] = False
-        for value in self._state.values():
-            value[ids] = 0.0
-        self.qpos[ids] = qpos.to(self.qpos.dtype)
-        self.batch.forward(ids=ids.int().numpy(), stage=mujoco.mjtStage.mjSTAGE_VEL)
+        """Starts the simulations of a mask anew, at rest, at given positions (one row per true entry)."""
+        ids = mask.numpy()
+        self.batch.reset(ids=ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self._failed[mask] = False
+        self.qpos[mask] = qpos.to(self.qpos.dtype)
+        self.batch.forward(ids=ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Everything that decides the future of the simulations, copied."""

@@ -5,8 +5,7 @@ import numpy as np
 
 # Numbers that mujoco_warp keeps per world (its 4.0 Model; the spec's engine sheet, section 1.1); the C engine takes a
 # whole model per simulation and is freer, but both engines shall group alike.
-_PER_WORLD = frozenset(
-    """
+_PER_WORLD_FIELDS = """
     qpos0 qpos_spring
     body_pos body_quat body_ipos body_iquat body_mass body_subtreemass body_inertia body_invweight0 body_gravcomp
     jnt_solref jnt_solimp jnt_pos jnt_axis jnt_stiffness jnt_range jnt_actfrcrange jnt_margin
@@ -19,11 +18,11 @@ _PER_WORLD = frozenset(
     tendon_damping tendon_armature tendon_frictionloss tendon_lengthspring tendon_length0 tendon_invweight0
     actuator_gainprm actuator_biasprm actuator_dynprm actuator_forcerange actuator_ctrlrange actuator_gear actuator_acc0
     actuator_lengthrange
-    """.split()
-)
+"""
+_PER_WORLD = frozenset(_PER_WORLD_FIELDS.split())
 # Names, pictures, and numbers that follow from those above.
 _FREE_PREFIXES = ("name", "light_", "cam_", "mat_", "tex_", "vis", "bvh_", "site_rgba")
-_FREE = frozenset("names paths dof_M0 dof_length stat".split())
+_FREE = frozenset(["names", "paths", "dof_M0", "dof_length", "stat"])
 
 
 def differing_fields(a: mujoco.MjModel, b: mujoco.MjModel) -> list[str]:

@@ -21,7 +21,7 @@ _LENGTHS = (0.045, 0.025, 0.024)
 _RADII = (0.01, 0.00805, 0.00705)
 """Length and radius of proximal, middle and distal capsules, metres (sheet 2.5)."""
 _SLACK = 0.002
-"""Overlap left standing at a start, metres: contacts carry the object from the first step, far below the 5 mm allowed."""
+"""Overlap left at a start, metres: contacts carry the object from the first step; 5 mm would be allowed."""
 _MAX_CROSSING = 0.1
 """Largest difference of neighbouring fingers' side angles that leaves their tips apart, rad:
 roots 22 mm apart, tips 94 mm out with radii of 7 mm, 3 mm of overlap allowed."""
@@ -41,7 +41,7 @@ class _Indices:
 @lru_cache(maxsize=1)
 def _indices() -> _Indices:
     find = hand().index
-    return _Indices(*(find(*(f"{f}J{k}" for f in ("FF", "MF", "RF", "LF"))) for k in (3, 2, 1, 0)), *find("LFJ4"))
+    return _Indices(*(find(*(f"{f}J{k}" for f in ("FF", "MF", "RF", "LF"))) for k in (3, 2, 1, 0)), cup=find("LFJ4")[0])
 
 
 def noisy_joints(draws: Tensor, scale: float) -> Tensor:

@@ -102,7 +102,7 @@ def hand_blocks(side: str, moving: bool) -> tuple[Block, ...]:
             30,
             tuple(f"{tip}_{kind}" for tip in tips for kind in ("force", "torque")),
             FORCE_SCALE,
-            description="per distal body: force and torque at its origin, body frame, 10 N and 10 N m; holds the link's weight",
+            description="per distal body: force (10 N), torque (10 N m) at its origin, body frame, own weight included",
         ),
     ]
     if moving:
@@ -126,7 +126,11 @@ def object_blocks(sensors: str, name: str) -> tuple[Block, ...]:
         ),
         Block(f"{name}_linear_velocity", 3, (f"{sensors}/linear_velocity",), description="world frame, m/s"),
         Block(
-            f"{name}_angular_velocity", 3, (f"{sensors}/angular_velocity",), VELOCITY_SCALE, description="world frame, 0.2 rad/s"
+            f"{name}_angular_velocity",
+            3,
+            (f"{sensors}/angular_velocity",),
+            VELOCITY_SCALE,
+            description="world frame, 0.2 rad/s",
         ),
     )
 
@@ -136,7 +140,10 @@ def goal_blocks(name: str) -> tuple[Block, ...]:
     return (
         Block(f"{name}_pose", 7, goal=True, description="position (m) and quaternion (x, y, z, w), world frame"),
         Block(
-            f"{name}_rotation_difference", 4, goal=True, description="object times inverse goal quaternion, (x, y, z, w)"
+            f"{name}_rotation_difference",
+            4,
+            goal=True,
+            description="object times inverse goal quaternion, (x, y, z, w)",
         ),
     )
 

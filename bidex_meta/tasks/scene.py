@@ -50,7 +50,7 @@ class Scene:
         task: The class whose scene it is.
         model: The compiled model.
         sensors: Sensor name to its slice of ``sensordata``.
-        qpos: ``right/base`` (7, moving bases only), ``right/joints`` (24), ``left/...`` and each object (7) to its slice.
+        qpos: ``right/base`` (7, moving only), ``right/joints`` (24), ``left/...`` and each object (7) to its slice.
         base_bodies: Body ids of the two bases, right and left.
     """
 
@@ -61,7 +61,9 @@ class Scene:
     def sensors(self) -> dict[str, slice]:
         """Sensor name to its slice of ``sensordata``."""
         m = self.model
-        return {m.sensor(i).name: slice(a, a + n) for i, (a, n) in enumerate(zip(m.sensor_adr, m.sensor_dim, strict=True))}
+        return {
+            m.sensor(i).name: slice(a, a + n) for i, (a, n) in enumerate(zip(m.sensor_adr, m.sensor_dim, strict=True))
+        }
 
     @cached_property
     def qpos(self) -> dict[str, slice]:

@@ -10,7 +10,7 @@ class VariationSpace:
     """The box from which a class's variations are drawn uniformly.
 
     Attributes:
-        names: Component names, e.g. ``goal_x``; the unit is that of the quantity (metres, radians, or a draw in [-1, 1]).
+        names: Component names, e.g. ``goal_x``; in metres, radians, or a draw in [-1, 1].
         low: Lower ends.
         high: Upper ends.
     """
@@ -29,7 +29,7 @@ class VariationSpace:
         return len(self.names)
 
     def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """n variations, uniform in the box. Shape (n, size), float64."""
+        """N variations, uniform in the box. Shape (n, size), float64."""
         return rng.uniform(self.low, self.high, size=(n, self.size))
 
     def contains(self, vector: np.ndarray) -> bool:

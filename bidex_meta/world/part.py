@@ -121,7 +121,9 @@ class Part:
             named = task.reward_terms(state)
             for name, value in named.items():
                 terms.setdefault(name, sensors.new_zeros(num))[where] = value
-            reward[where] = torch.stack(list(named.values())).sum(dim=0) if len(named) > 1 else next(iter(named.values()))
+            reward[where] = (
+                torch.stack(list(named.values())).sum(dim=0) if len(named) > 1 else next(iter(named.values()))
+            )
             success[where], failed[where] = task.success(state), task.failed(state)
         return Transition(terms, reward, success, failed, self._engine.unstable())
 

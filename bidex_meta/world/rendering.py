@@ -35,7 +35,7 @@ def render_row(world: "World", row: int, width: int, height: int, camera: str | 
         renderer = mujoco.Renderer(model, height, width)
     except Exception as error:  # the drawing library raises errors of many kinds when it finds no display
         raise BidexError(
-            f"Expected a way to draw, got {type(error).__name__}; without a screen set MUJOCO_GL=egl or MUJOCO_GL=osmesa."
+            f"Expected a way to draw, got {type(error).__name__}; without a screen set MUJOCO_GL=egl or osmesa."
         ) from error
     with renderer:
         renderer.update_scene(data, _camera(world, row, name))
@@ -60,5 +60,7 @@ def _add_ghosts(world: "World", row: int, scene: mujoco.MjvScene) -> None:
         rotation = np.zeros(9)
         mujoco.mju_quat2Mat(rotation, wxyz(pose[0, 3:]).numpy())
         geom = scene.geoms[scene.ngeom]
-        mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_ELLIPSOID, np.array(size), pose[0, :3].numpy(), rotation, _GHOST)
+        mujoco.mjv_initGeom(
+            geom, mujoco.mjtGeom.mjGEOM_ELLIPSOID, np.array(size), pose[0, :3].numpy(), rotation, _GHOST
+        )
         scene.ngeom += 1

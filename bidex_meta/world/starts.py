@@ -72,9 +72,8 @@ class Starts:
         many = rows.repeat_interleave(_AHEAD)
         ahead = torch.arange(_AHEAD).repeat(len(rows))
         draws = uniform(self._keys[many], number[many] + ahead, self._draws)
-        if self._pool_size is None:
-            tasks = task_index[many]
-        else:
+        tasks = task_index[many]
+        if self._pool_size is not None:
             tasks = (draws[:, _TASK_DRAW] * self._pool_size[many]).long()
         self._task_index[rows] = tasks.view(-1, _AHEAD)
         self._elapsed_share[rows] = draws[:, _ELAPSED_DRAW].view(-1, _AHEAD)

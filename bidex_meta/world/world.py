@@ -78,7 +78,9 @@ class World(VectorEnv):
         if self.device.type != "cpu":
             raise BidexError(f"Expected device 'cpu', got {str(device)!r}: the GPU engine is not part of this version.")
         if num_envs < len(slots):
-            raise BidexError(f"Expected at least {len(slots)} rows, one for each of the suite's classes, got {num_envs}.")
+            raise BidexError(
+                f"Expected at least {len(slots)} rows, one for each of the suite's classes, got {num_envs}."
+            )
         if task_sampling not in ("uniform", "fixed"):
             raise BidexError(f"Expected task_sampling 'uniform' or 'fixed', got {task_sampling!r}.")
         self.num_envs, self.slots, self.seed = num_envs, list(slots), seed
@@ -99,9 +101,7 @@ class World(VectorEnv):
         timestep = groups[0].engine.batch.get_model(0).opt.timestep
         self.substeps = round(1.0 / (CONTROL_RATE * timestep))
         self._make_spaces(observation, pad_to)
-        self.parts = [
-            Part(g, self.slots, observation, self.observation_size, self.substeps, num_envs) for g in groups
-        ]
+        self.parts = [Part(g, self.slots, observation, self.observation_size, self.substeps, num_envs) for g in groups]
         self.episodes = Episodes.fresh(num_envs, self.device)
         self._index_in_slot = torch.cat([torch.arange(rows.stop - rows.start) for rows in self.slot_rows])
         self._set_pool_sizes()
@@ -189,10 +189,12 @@ class World(VectorEnv):
         mask = torch.as_tensor(mask)
         if mask.shape != (self.num_envs,) or mask.dtype != torch.bool:
             raise BidexError(
-                f"Expected a bool reset_mask of shape ({self.num_envs},), got {mask.dtype} of shape {tuple(mask.shape)}."
+                f"Expected a bool reset_mask of shape ({self.num_envs},), got {mask.dtype} {tuple(mask.shape)}."
             )
         if not self._ready and not mask.all():
-            raise BidexError("Expected a full reset first, got a reset_mask with false entries; call reset() once without.")
+            raise BidexError(
+                "Expected a full reset first, got a reset_mask with false entries; call reset() once without."
+            )
         return mask
 
     def _begin(self, mask: Tensor, stagger: bool) -> None:
@@ -242,7 +244,9 @@ class World(VectorEnv):
         if not self._ready:
             raise BidexError("Expected reset() before step(): the rows have no episode yet.")
         if action.shape != (self.num_envs, self.action_size):
-            raise BidexError(f"Expected actions of shape ({self.num_envs}, {self.action_size}), got {tuple(action.shape)}.")
+            raise BidexError(
+                f"Expected actions of shape ({self.num_envs}, {self.action_size}), got {tuple(action.shape)}."
+            )
         with one_torch_thread():
             return self._advance(action)
 

@@ -1,0 +1,114 @@
+"""The sheet's tables of the hand (spec sections 2.3 to 2.7), typed once more: what the model is held against."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+# joint, low, high (rad), damping, armature, actuated, kp, effort limit (N m); the order of Table 7.
+JOINTS = [
+    ("WRJ1", -0.489, 0.14, 0.5, 0.005, True, 5.0, 4.785),
+    ("WRJ0", -0.698, 0.489, 0.5, 0.005, True, 5.0, 2.175),
+    ("FFJ3", -0.349, 0.349, 0.1, 0.001, True, 1.0, 0.9),
+    ("FFJ2", 0.0, 1.571, 0.1, 0.001, True, 1.0, 0.9),
+    ("FFJ1", 0.0, 1.571, 0.1, 0.001, True, 1.0, 0.7245),
+    ("FFJ0", 0.0, 1.571, 0.1, 0.001, False, 0.0, 0.0),
+    ("MFJ3", -0.349, 0.349, 0.1, 0.001, True, 1.0, 0.9),
+    ("MFJ2", 0.0, 1.571, 0.1, 0.001, True, 1.0, 0.9),
+    ("MFJ1", 0.0, 1.571, 0.1, 0.001, True, 1.0, 0.7245),
+    ("MFJ0", 0.0, 1.571, 0.1, 0.001, False, 0.0, 0.0),
+    ("RFJ3", -0.349, 0.349, 0.1, 0.001, True, 1.0, 0.9),
+    ("RFJ2", 0.0, 1.571, 0.1, 0.001, True, 1.0, 0.9),
+    ("RFJ1", 0.0, 1.571, 0.1, 0.001, True, 1.0, 0.7245),
+    ("RFJ0", 0.0, 1.571, 0.1, 0.001, False, 0.0, 0.0),
+    ("LFJ4", 0.0, 0.785, 0.1, 0.001, True, 1.0, 0.9),
+    ("LFJ3", -0.349, 0.349, 0.1, 0.001, True, 1.0, 0.9),
+    ("LFJ2", 0.0, 1.571, 0.1, 0.001, True, 1.0, 0.9),
+    ("LFJ1", 0.0, 1.571, 0.1, 0.001, True, 1.0, 0.7245),
+    ("LFJ0", 0.0, 1.571, 0.1, 0.001, False, 0.0, 0.0),
+    ("THJ4", -1.047, 1.047, 0.1, 0.001, True, 1.0, 2.3722),
+    ("THJ3", 0.0, 1.222, 0.1, 0.001, True, 1.0, 1.45),
+    ("THJ2", -0.209, 0.209, 0.1, 0.001, True, 1.0, 0.99),
+    ("THJ1", -0.524, 0.524, 0.1, 0.001, True, 1.0, 0.99),
+    ("THJ0", -1.571, 0.0, 0.1, 0.001, True, 1.0, 0.81),
+]
+NAMES = [joint[0] for joint in JOINTS]
+LOW = np.array([joint[1] for joint in JOINTS])
+HIGH = np.array([joint[2] for joint in JOINTS])
+ACTUATED = [0, 1, 2, 3, 4, 6, 7, 8, 10, 11, 12, 14, 15, 16, 17, 19, 20, 21, 22, 23]
+
+# Geoms of one hand that may meet; all others of the same hand pass through each other.
+PAIRS = {
+    frozenset(pair)
+    for pair in (
+        *(("thdistal", other) for other in ["ffdistal", "ffmiddle", "ffproximal", "mfproximal", "mfdistal", "rfdistal", "lfdistal", "palm0"]),
+        ("mfdistal", "ffdistal"),
+        ("rfdistal", "mfdistal"),
+        ("lfdistal", "rfdistal"),
+        ("mfproximal", "ffproximal"),
+        ("rfproximal", "mfproximal"),
+        ("lfproximal", "rfproximal"),
+        ("lfdistal", "mfdistal"),
+        ("lfdistal", "rfmiddle"),
+        ("lfmiddle", "rfdistal"),
+        ("lfmiddle", "rfmiddle"),
+    )
+}  # fmt: skip
+
+TIPS = ("ffdistal", "mfdistal", "rfdistal", "lfdistal", "thdistal")
+CENTRE_OF_MASS = (0.0016, 0.0081, 0.2917)
+LINEAR_DAMPING, ANGULAR_DAMPING = 501.0, (2.60, 2.65, 1.12)
+
+# Actor at the origin, unrotated (2.7); metres, world.
+ZERO_POSE = {
+    "forearm": (0.0, 0.0, -0.01),
+    "wrist": (0.0, -0.256, -0.01),
+    "palm": (0.0, -0.29, -0.01),
+    "hand_point": (0.0, -0.37, 0.01),
+    "ffdistal": (-0.033, -0.475, -0.01),
+    "mfdistal": (-0.011, -0.479, -0.01),
+    "rfdistal": (0.011, -0.475, -0.01),
+    "lfdistal": (0.034, -0.468, -0.01),
+    "thdistal": (-0.0976, -0.3827, -0.001),
+}
+"""Fingers: reward fingertip points, the distal origin and 2 cm along its z."""
+
+# Pose tables of section 4: actor roll, pitch, yaw and the mount's world quaternion (w, x, y, z); then per class.
+MOUNTS = {
+    "A": ((0, 0, 0), (0, 0, -0.7071, 0.7071)),
+    "B": ((0, 0, np.pi), (0.7071, -0.7071, 0, 0)),
+    "C": ((np.pi, 1.57, 1.57), (0.7071, 0, -0.7071, -0.0006)),
+    "D": ((np.pi, -1.57, 1.57), (0, 0.7071, -0.0006, -0.7071)),
+    "E": ((np.pi, 0, 1.57), (0.4998, 0.4998, -0.5002, -0.5002)),
+    "F": ((np.pi, 0, 3.14), (0.7071, 0.7071, -0.0006, -0.0006)),
+    "G": ((np.pi, 0, 0), (0, 0, -0.7071, -0.7071)),
+}
+_A, _B = MOUNTS["A"][1], MOUNTS["B"][1]
+# class: mount position and quaternion (w, x, y, z), right then left.
+CLASS_MOUNTS = {
+    "HandOver": (((0, 0, 0.5), _A), ((0, -1, 0.5), _B)),
+    "CatchUnderarm": (((0, 0, 0.5), _A), ((0, -1.15, 0.5), _B)),
+    "CatchOver2Underarm": (((0, 0, 0.5), (0.9988, -0.0496, -0.0008, 0)), ((0, -0.8, 0.5), _B)),
+    "TwoCatchUnderarm": (((0, 0, 0.5), _A), ((0, -1.15, 0.5), _B)),
+    "CatchAbreast": (
+        ((0, -0.55, 0.5), (0.5877, -0.3927, -0.5881, 0.3931)),
+        ((0, -1.15, 0.5), (0.3927, -0.5877, -0.3931, 0.5881)),
+    ),
+}
+# class: transition and orientation scale (1.4).
+SCALES = {
+    "HandOver": (0.05, 0.5),
+    "CatchUnderarm": (0.05, 0.5),
+    "CatchOver2Underarm": (0.1, 2.0),
+    "TwoCatchUnderarm": (0.05, 0.5),
+    "CatchAbreast": (0.5, 1.0),
+}
+
+
+def rotation(wxyz: np.ndarray | tuple[float, ...]) -> Rotation:
+    """A rotation from MuJoCo's (w, x, y, z)."""
+    return Rotation.from_quat(np.asarray(wxyz, dtype=float), scalar_first=True)
+
+
+def same_orientation(a: np.ndarray | tuple[float, ...], b: np.ndarray | tuple[float, ...], tolerance: float) -> bool:
+    """Whether two quaternions agree entry by entry, up to their common sign."""
+    a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    return bool(min(np.abs(a - b).max(), np.abs(a + b).max()) <= tolerance)

@@ -1,0 +1,238 @@
+"""The hand against the sheet's section 2."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from bidex_meta.hands.hand import CENTRE_OF_MASS, hand, hand_spec
+from bidex_meta.hands.pair import SIDES, add_hands, damp_bases
+from bidex_meta.hands.poses import HandPose
+from bidex_meta.tasks import registry
+from bidex_meta.tasks.scene import build_spec, compile_scene
+from tests.hands import sheet
+
+
+@pytest.fixture(scope="module")
+def model() -> mujoco.MjModel:
+    return hand_spec().compile()
+
+
+def pair_model(moving: bool) -> mujoco.MjModel:
+    """Both hands at the origin's height, unrotated, the left one out of reach."""
+    scene = mujoco.MjSpec()
+    add_hands(scene, HandPose((0, 0, 0), (0, 0, 0)), HandPose((5, 0, 0), (0, 0, 0)), moving)
+    model = scene.compile()
+    damp_bases(model)
+    return model
+
+
+def test_counts_and_mass(model: mujoco.MjModel) -> None:
+    assert model.nbody == 26 + 2, "26 bodies besides the world and the massless base"
+    assert (model.nv, model.nu, model.ntendon, model.nsensor) == (24, 20, 4, 72 + 20 + 10 + 4)
+    assert model.body_mass.sum() == pytest.approx(5.011, abs=5e-4)
+    assert model.body("base").mass == 0.0
+    solid = [model.geom(i).name for i in range(model.ngeom) if model.geom_contype[i]]
+    assert len(solid) == 20
+    capsules_and_boxes = {mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX}
+    assert {int(model.geom(name).type[0]) for name in solid} == {int(kind) for kind in capsules_and_boxes}
+
+
+def test_all_but_the_base_float(model: mujoco.MjModel) -> None:
+    assert all(model.body_gravcomp[2:] == 1.0)
+
+
+def test_centre_of_mass(model: mujoco.MjModel) -> None:
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.body("mount").xmat.reshape(3, 3), np.eye(3), atol=1e-12)
+    centre = data.subtree_com[model.body("mount").id] - data.body("mount").xpos
+    np.testing.assert_allclose(centre, sheet.CENTRE_OF_MASS, atol=1e-4)
+    np.testing.assert_allclose(data.body("base").xpos - data.body("mount").xpos, CENTRE_OF_MASS, atol=1e-12)
+
+
+def test_joint_tables(model: mujoco.MjModel) -> None:
+    known = hand()
+    assert list(known.joints) == sheet.NAMES
+    np.testing.assert_array_equal(known.low, sheet.LOW)
+    np.testing.assert_array_equal(known.high, sheet.HIGH)
+    assert known.actuated.tolist() == sheet.ACTUATED
+    np.testing.assert_array_equal(known.control_low, sheet.LOW[sheet.ACTUATED])
+    np.testing.assert_array_equal(known.control_high, sheet.HIGH[sheet.ACTUATED])
+    assert known.index("WRJ1", "FFJ0", "THJ0") == [0, 5, 23]
+    for i, (name, low, high, damping, armature, *_) in enumerate(sheet.JOINTS):
+        joint = model.joint(name)
+        assert (joint.id, joint.range.tolist(), joint.limited[0]) == (i, [low, high], 1), name
+        assert (joint.damping[0], joint.armature[0]) == (damping, armature), name
+
+
+def test_actuators(model: mujoco.MjModel) -> None:
+    rows = [joint for joint in sheet.JOINTS if joint[5]]
+    assert [sheet.NAMES.index(joint[0]) for joint in rows] == sheet.ACTUATED
+    for i, (name, low, high, *_, kp, effort) in enumerate(rows):
+        actuator = model.actuator(i)
+        assert model.joint(actuator.trnid[0]).name == name
+        assert actuator.ctrlrange.tolist() == [low, high], name
+        assert (actuator.gainprm[0], actuator.biasprm[1]) == (kp, -kp), name
+        assert actuator.forcerange.tolist() == [-effort, effort], name
+
+
+def test_self_collision_pairs(model: mujoco.MjModel) -> None:
+    named = [
+        frozenset(model.geom(g).name.removeprefix("C_") for g in pair)
+        for pair in zip(model.pair_geom1, model.pair_geom2, strict=True)
+    ]
+    assert len(named) == 18 and set(named) == sheet.PAIRS
+    assert set(model.pair_dim) == {1}
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_zero_pose_kinematics(moving: bool) -> None:
+    model = pair_model(moving)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    for name, expected in sheet.ZERO_POSE.items():
+        if name == "hand_point":
+            found = data.site("right/hand_point").xpos
+        else:
+            body = data.body(f"right/{name}")
+            found = body.xpos + (0.02 * body.xmat.reshape(3, 3)[:, 2] if name in sheet.TIPS else 0.0)
+        np.testing.assert_allclose(found, expected, atol=6e-4, err_msg=name)
+    palm = data.body("right/palm").xmat.reshape(3, 3)
+    np.testing.assert_allclose(palm, np.array([[-1, 0, 0], [0, 0, -1], [0, -1, 0]]), atol=1e-9)
+
+
+@pytest.mark.parametrize("pose", sheet.MOUNTS)
+def test_mount_quaternions_of_the_named_poses(pose: str) -> None:
+    rpy, expected = sheet.MOUNTS[pose]
+    assert sheet.same_orientation(HandPose((0, 0, 0), rpy).quaternion, expected, 2e-3)
+
+
+@pytest.mark.parametrize("name", registry.names())
+@pytest.mark.parametrize("moving", [False, True])
+def test_mounts_of_the_classes(name: str, moving: bool) -> None:
+    model = compile_scene(registry.get(name, moving)).model
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    for side, (position, quaternion) in zip(SIDES, sheet.CLASS_MOUNTS[name], strict=True):
+        mount = data.body(f"{side}/mount")
+        np.testing.assert_allclose(mount.xpos, position, atol=1e-9, err_msg=side)
+        assert sheet.same_orientation(mount.xquat, quaternion, 2e-3), (side, mount.xquat)
+
+
+def test_upright_and_tilted_hands_look_where_the_sheet_says() -> None:
+    def palm_axes(name: str, side: str) -> tuple[np.ndarray, np.ndarray, mujoco.MjData]:
+        model = compile_scene(registry.get(name)).model
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        axes = data.body(f"{side}/palm").xmat.reshape(3, 3)
+        return axes[:, 2], -axes[:, 1], data
+
+    fingers, palm, data = palm_axes("CatchOver2Underarm", "right")
+    np.testing.assert_allclose(fingers, (-0.002, 0.099, 0.995), atol=3e-3)
+    np.testing.assert_allclose(palm, (0, -0.995, 0.099), atol=3e-3)
+    np.testing.assert_allclose(data.site("right/hand_point").xpos, (0, 0.027, 0.869), atol=1.5e-3)
+    for side, tilt in (("right", -0.3825), ("left", 0.3825)):
+        fingers, palm, _ = palm_axes("CatchAbreast", side)
+        np.testing.assert_allclose(fingers, (-1, 0, 0), atol=2e-3)
+        np.testing.assert_allclose(palm, (0, tilt, 0.924), atol=2e-3)
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_moving_bases_are_damped_as_the_sheet_says(name: str) -> None:
+    model = compile_scene(registry.get(name, True)).model
+    for side in SIDES:
+        first = model.joint(f"{side}/free").dofadr[0]
+        expected = (*(sheet.LINEAR_DAMPING,) * 3, *sheet.ANGULAR_DAMPING)
+        np.testing.assert_allclose(model.dof_damping[first : first + 6], expected)
+    assert compile_scene(registry.get(name, False)).model.nv == model.nv - 12
+
+
+def test_a_middle_joint_tops_out_where_its_distal_ends() -> None:
+    """The tendon holds the middle joint back once the distal one stands at its limit: about 1.50 rad."""
+    model = compile_scene(registry.get("HandOver")).model
+    data = mujoco.MjData(model)
+    mujoco.mj_resetData(model, data)
+    data.qpos[model.joint("object/free").qposadr[0]] = 3.0  # the egg out of the way
+    heights = []
+    for _ in range(round(2.0 / model.opt.timestep)):
+        data.ctrl[:] = 0.0
+        for finger in ("FF", "MF", "RF", "LF"):
+            data.actuator(f"right/A_{finger}J1").ctrl = 1.571
+        mujoco.mj_step(model, data)
+        heights.append([float(data.joint(f"right/FFJ{k}").qpos[0]) for k in (1, 0)])
+    for finger in ("FF", "MF", "RF", "LF"):
+        middle, distal = (float(data.joint(f"right/{finger}J{k}").qpos[0]) for k in (1, 0))
+        assert middle == pytest.approx(1.50, abs=0.02), finger
+        assert distal == pytest.approx(1.571, abs=0.03), finger
+    path = np.array(heights)
+    # On the way the tendon leaves +-0.001 m, that is 0.14 rad at the distal joint, and a little softness.
+    assert np.abs(path[:, 1] - path[:, 0] * 0.00805 / 0.00705).max() < 0.001 / 0.00705 + 0.06
+    assert float(data.joint("left/FFJ1").qpos[0]) == pytest.approx(0.0, abs=0.02)
+
+
+def kind(geom: str) -> str:
+    return geom.split("/")[0]
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_contact_bits(name: str) -> None:
+    """Hand and hand, hand and object, all and floor may meet; a hand with itself only in its listed pairs."""
+    model = compile_scene(registry.get(name)).model
+    solid = [model.geom(i) for i in range(model.ngeom) if model.geom_contype[i] or model.geom_conaffinity[i]]
+    kinds = {kind(geom.name) for geom in solid}
+    assert {"right", "left", "floor"} < kinds
+    for a in solid:
+        for b in solid:
+            if a.id >= b.id:
+                continue
+            meets = bool((a.contype[0] & b.conaffinity[0]) | (b.contype[0] & a.conaffinity[0]))
+            same_hand = kind(a.name) == kind(b.name) and kind(a.name) in SIDES
+            assert meets == (not same_hand), (a.name, b.name)
+    assert model.npair == 2 * 18
+
+
+def test_visible_rings_never_collide() -> None:
+    spec = build_spec(registry.get("HandOver"))
+    rings = [geom for geom in spec.geoms if geom.name.endswith("V_ring")]
+    assert len(rings) == 2
+    assert all(geom.contype == 0 and geom.conaffinity == 0 for geom in rings)
+
+
+def test_contacts_of_random_hands_are_among_the_pairs() -> None:
+    """What MuJoCo really reports: over random joint angles, same-hand contacts are listed and without friction."""
+    model = compile_scene(registry.get("HandOver")).model
+    data, rng, met = mujoco.MjData(model), np.random.default_rng(0), set()
+    for _ in range(200):
+        for side in SIDES:
+            first = model.joint(f"{side}/WRJ1").qposadr[0]
+            data.qpos[first : first + 24] = rng.uniform(sheet.LOW, sheet.HIGH)
+        mujoco.mj_fwdPosition(model, data)
+        for contact in data.contact:
+            a, b = (model.geom(int(g)).name for g in contact.geom)
+            if kind(a) == kind(b):
+                met.add(frozenset(n.split("/C_")[1] for n in (a, b)))
+                assert contact.dim == 1, (a, b)
+    assert met and met <= sheet.PAIRS
+
+
+def test_the_three_kinds_really_meet() -> None:
+    """Egg put into a palm, a hand put into the other, the egg put on the floor: MuJoCo finds the contacts."""
+    model = compile_scene(registry.get("HandOver", True)).model
+    data = mujoco.MjData(model)
+
+    def meetings(**places: tuple[float, float, float]) -> set[frozenset[str]]:
+        mujoco.mj_resetData(model, data)
+        for joint, place in places.items():
+            first = model.joint(f"{joint}/free").qposadr[0]
+            data.qpos[first : first + 3] = place
+        mujoco.mj_fwdPosition(model, data)
+        return {frozenset(kind(model.geom(int(g)).name) for g in contact.geom) for contact in data.contact}
+
+    away = (3.0, 0.0, 2.0)
+    right = data.qpos[model.joint("right/free").qposadr[0] :][:3].copy()
+    palm = (right[0], -0.34, 0.52)
+    assert meetings(object=away) == set()
+    assert frozenset({"right", "object"}) in meetings(object=palm)
+    assert frozenset({"right", "left"}) in meetings(object=away, left=tuple(right + (0.01, -0.3, 0)))
+    assert frozenset({"object", "floor"}) in meetings(object=(3.0, 0.0, 0.02))
+    assert frozenset({"right", "floor"}) in meetings(object=away, right=(right[0], right[1], 0.02))
