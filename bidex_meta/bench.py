@@ -115,7 +115,12 @@ def scaling(
 
 
 def stability(
-    task: str | None = None, steps: int = 1_000_000, num_envs: int = 512, threads: int | None = None, seed: int = 0
+    suite: str | None = None,
+    task: str | None = None,
+    steps: int = 1_000_000,
+    num_envs: int = 512,
+    threads: int | None = None,
+    seed: int = 0,
 ) -> dict[str, Any]:
     """Whether the physics holds under rough actions (design.md section 4).
 
@@ -123,7 +128,9 @@ def stability(
     contacts are taken from a sample of rows.
 
     Args:
-        task: Class to test; None tests every class, with the base it has in the suites, and HandOver with both.
+        suite: Test the classes of this suite, with the bases they have there.
+        task: Test this class, with a moving base and, where it has one of its own, the fixed one. With neither suite
+            nor task every class is tested.
         steps: Environment steps a class.
         num_envs: Rows.
         threads: Engine threads; None takes all CPUs.
@@ -133,14 +140,21 @@ def stability(
         By class: unstable rows, warnings, fastest object (m/s), share of sampled steps without penetration above 5 mm,
         the 99.9 % quantile of depth (m), and whether all bars hold.
     """
+    result = {}
+    for name, moving in _variants(suite, task):
+        made = make_task_world(name, num_envs=num_envs, seed=seed, threads=threads, moving_base=moving)
+        result[name if moving else f"{name} (fixed base)"] = _stability(made, steps, seed)
+    return result
+
+
+def _variants(suite: str | None, task: str | None) -> list[tuple[str, bool]]:
+    """Names of the classes to test, each with whether its base moves."""
+    if suite is not None and task is None:
+        benchmark = Benchmark(suite)
+        classes = benchmark.train_classes | benchmark.test_classes
+        return [(name, task_class.moving_base) for name, task_class in classes.items()]
     names = [task] if task else registry.names()
-    variants = [(name, base) for name in names for base in ((True, False) if name == "HandOver" else (True,))]
-    return {
-        name if moving else f"{name} (fixed base)": _stability(
-            make_task_world(name, num_envs=num_envs, seed=seed, threads=threads, moving_base=moving), steps, seed
-        )
-        for name, moving in variants
-    }
+    return [(n, moving) for n in names for moving in (True, False) if moving or not registry.get(n).moving_base]
 
 
 def _stability(made: World, steps: int, seed: int) -> dict[str, Any]:

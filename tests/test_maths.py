@@ -57,7 +57,7 @@ def test_norm_and_dot(a: np.ndarray, b: np.ndarray) -> None:
 @given(quaternions)
 def test_orders_of_quaternion_entries(a: np.ndarray) -> None:
     q, turn = normal(a)
-    np.testing.assert_array_equal(maths.wxyz(q).numpy(), turn.as_quat(scalar_first=True))
+    np.testing.assert_allclose(maths.wxyz(q).numpy(), turn.as_quat(scalar_first=True), atol=1e-15)
     np.testing.assert_array_equal(maths.xyzw(maths.wxyz(q)).numpy(), q.numpy())
 
 

@@ -23,8 +23,10 @@ class BenchFlags:
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="world|scaling|stability")]
     """world, scaling or stability."""
-    suite: str = "MT4"
-    """Suite to measure."""
+    suite: str | None = None
+    """Suite to measure: world and scaling take MT4 by default, stability every task class there is."""
+    task: str | None = None
+    """For stability: this task class alone."""
     num_envs: int | None = None
     """Rows stepped together; for this and the flags below None leaves the measurement its default."""
     steps: StepCount | None = None

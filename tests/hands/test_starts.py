@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings, target
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation
@@ -142,6 +142,7 @@ def test_a_flexed_finger_under_the_egg_is_opened(scene: Scene, finger: int) -> N
     assert depth(scene, opened[0], centre[0] + shift[0], upright) < 0.005
 
 
+@settings(max_examples=300)
 @given(u=hnp.arrays(np.float64, 24, elements=st.floats(-1, 1)), place=hnp.arrays(np.float64, 5, elements=st.floats(-1, 1)))
 def test_no_start_of_the_noise_is_deep_in_the_hand(scene: Scene, u: np.ndarray, place: np.ndarray) -> None:
     """The extremes of the noise, not only likely draws: the egg never starts 5 mm deep."""
@@ -151,4 +152,6 @@ def test_no_start_of_the_noise_is_deep_in_the_hand(scene: Scene, u: np.ndarray, 
     centre = torch.tensor([[0.01 * place[0], -0.04 + 0.01 * place[1], 0.39 + 0.01 * place[2]]], dtype=torch.float64)
     axis = torch.from_numpy(turn.apply([0.0, 0.0, 1.0]))[None]
     opened, shift = make_room(joints, centre, axis, RADIUS, HALF_LENGTH)
-    assert depth(scene, opened[0], centre[0] + shift[0], turn.as_quat()) < 0.005
+    deep = depth(scene, opened[0], centre[0] + shift[0], turn.as_quat())
+    target(deep)  # hypothesis climbs towards the deepest start it can find
+    assert deep < 0.005

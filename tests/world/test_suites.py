@@ -1,0 +1,151 @@
+import pytest
+import torch
+
+from bidex_meta import Benchmark
+from bidex_meta.world import World
+from tests.world.play import class_world, play, random_actions, suite_world
+
+
+def goal_indices(world: World, slot: int) -> list[int]:
+    return world.slots[slot].task_class.layout.goal_indices()
+
+
+def unmasked(world: World) -> World:
+    """The same rows with the goal shown."""
+    width = world.observation_size - world.num_id_columns
+    return World(
+        world.slots, world.num_envs, seed=world.seed, pad_to=width, autoreset_mode=world.autoreset_mode, threads=1
+    )
+
+
+@pytest.mark.parametrize(
+    ("suite", "split", "width"),
+    [("MT1", "train", 426), ("MT4", "train", 450), ("ML1", "train", 422), ("ML1", "test", 422), ("ML4", "train", 446),
+     ("ML4", "test", 446)],
+)  # fmt: skip
+def test_widths_one_hots_and_padding(suite: str, split: str, width: int) -> None:
+    world = suite_world(suite, 9, split=split)
+    obs, _ = world.reset(seed=0)
+    assert obs.shape == (9, width)
+    steps = play(world, random_actions(world, 40))
+    for values in [obs] + [step[name] for step in steps for name in ("obs", "info/final_obs")]:
+        if suite.startswith("MT"):
+            assert torch.equal(values[:, -world.num_tasks :], torch.eye(world.num_tasks)[world.task_id])
+        padded = width - world.num_id_columns
+        for slot, rows in zip(world.slots, world.slot_rows, strict=True):
+            assert (values[rows, slot.task_class.observation_size : padded] == 0).all()
+        assert values[:, : min(s.task_class.observation_size for s in world.slots) - 22].abs().sum(dim=1).min() > 1
+
+
+def test_goals_are_visible_in_mt() -> None:
+    world = suite_world("MT4", 12)
+    obs, _ = world.reset(seed=0)
+    for step in [None, *random_actions(world, 40)]:
+        if step is not None:
+            obs = world.step(step)[0]
+        for slot, rows in zip(world.slots, world.slot_rows, strict=True):
+            variations = torch.as_tensor(slot.tasks)[world.task_index[rows]]
+            names, layout = slot.task_class.variation_space.names, slot.task_class.layout
+            for goal in [b.name for b, _ in layout if b.goal and b.name.endswith("_pose")]:
+                x = names.index(goal.removesuffix("_pose") + "_x")
+                block = layout.range(goal)
+                shown = obs[rows, block.start : block.start + 3]
+                assert torch.equal(shown, variations[:, x : x + 3].float())
+                assert torch.allclose(obs[rows, block.start + 3 : block.stop].norm(dim=1), torch.ones(len(shown)))
+
+
+@pytest.mark.parametrize(("suite", "split"), [("ML4", "train"), ("ML4", "test"), ("ML1", "train"), ("ML1", "test")])
+def test_goals_are_zero_in_ml_and_nothing_else_is_touched(suite: str, split: str) -> None:
+    world = suite_world(suite, 6, "SAME_STEP", split)
+    shown = unmasked(world)
+    first, second = world.reset(seed=0)[0], shown.reset(seed=0)[0]
+    actions = random_actions(world, 60)
+    pairs = [(first, second)]
+    for a, b in zip(play(world, actions), play(shown, actions), strict=True):
+        pairs += [(a["obs"], b["obs"]), (a["info/final_obs"], b["info/final_obs"])]
+        for name in ("reward", "terminated", "truncated", "info/success"):
+            assert torch.equal(a[name], b[name])
+    for masked, plain in pairs:
+        for slot, rows in enumerate(world.slot_rows):
+            goal = goal_indices(world, slot)
+            assert len(goal) == (22 if world.task_names[slot] == "TwoCatchUnderarm" else 11)
+            assert (masked[rows][:, goal] == 0).all()
+            assert (plain[rows][:, goal] != 0).any(dim=1).all()
+            rest = sorted(set(range(world.observation_size)) - set(goal))
+            assert torch.equal(masked[rows][:, rest], plain[rows][:, rest])
+
+
+def test_ml_rows_keep_task_j_mod_n() -> None:
+    world = suite_world("ML4", 3 * 52)
+    world.reset(seed=0)
+    expected = (torch.arange(52) % 50).repeat(3)
+    assert torch.equal(world.task_index, expected)
+    small = suite_world("ML1", 7)
+    small.reset(seed=0)
+    small.episodes.elapsed = small.max_episode_steps - 1  # every row ends at once and begins anew
+    assert small.step(torch.zeros(7, 52))[3].all()
+    assert small.task_index.tolist() == [0, 1, 2, 0, 1, 2, 0]
+
+
+def test_evaluation_of_mt_keeps_task_j_mod_n() -> None:
+    world = suite_world("MT4", 4 * 51, "DISABLED")
+    world.reset(seed=0)
+    for mask in (None, torch.ones(204, dtype=torch.bool)):
+        assert torch.equal(world.task_index, (torch.arange(51) % 50).repeat(4))
+        world.reset(options={"reset_mask": mask})
+    mt1 = suite_world("MT1", 8)
+    mt1.reset(seed=0)
+    assert mt1.task_names == [f"CatchUnderarm/{n}" for n in ("original", "left", "right", "back")]
+    assert mt1.task_index.tolist() == [0] * 8
+
+
+def test_mt_draws_every_task_equally_often_on_autoreset() -> None:
+    world = suite_world("MT4", 64)
+    world.reset(seed=0)
+    counts, same = torch.zeros(4, 50), 0
+    rounds = 40
+    for _ in range(rounds):
+        world.episodes.elapsed = world.max_episode_steps - 1
+        before = world.task_index
+        _, _, terminated, truncated, _ = world.step(torch.zeros(64, 52))
+        assert (terminated | truncated).all()
+        counts.index_put_((world.task_id, world.task_index), torch.ones(64), accumulate=True)
+        same += int((world.task_index == before).sum())
+    expected = rounds * 16 / 50
+    chi_square = ((counts - expected) ** 2 / expected).sum(dim=1)
+    assert (chi_square < 95).all(), chi_square  # 49 degrees of freedom: 95 is the 99.99 % quantile
+    assert (counts > 0).all()
+    assert same < 3 * rounds * 64 / 50
+
+
+def test_a_class_in_a_suite_moves_as_on_its_own() -> None:
+    suite = suite_world("MT4", 12)
+    suite.reset(seed=0)
+    actions = random_actions(suite, 40)
+    played = play(suite, actions)
+    for slot, rows in enumerate(suite.slot_rows):
+        name = suite.task_names[slot]
+        alone = class_world(name, 3, moving_base=True)
+        alone.reset(seed=0)
+        size = alone.observation_size
+        for step, action in zip(played, actions, strict=True):
+            own = play(alone, [action[rows]])[0]
+            for key in ("reward", "terminated", "truncated", "info/success"):
+                assert torch.equal(step[key][rows], own[key]), (name, key)
+            for key in ("obs", "info/final_obs"):
+                assert torch.equal(step[key][rows, :size], own[key]), (name, key)
+
+
+def test_hand_over_alone_has_a_fixed_base() -> None:
+    world = class_world("HandOver", 2)
+    assert world.reset(seed=0)[0].shape == (2, 398)
+    assert world.single_action_space.shape == (40,)
+
+
+def test_train_and_test_worlds_of_ml1_play_their_listed_tasks() -> None:
+    train, test = (suite_world("ML1", 3, split=split) for split in ("train", "test"))
+    benchmark = Benchmark("ML1")
+    assert torch.equal(
+        torch.as_tensor(train.slots[0].tasks), torch.tensor([t.variation.tolist() for t in benchmark.train_tasks])
+    )
+    assert test.num_slot_tasks == [1]
