@@ -142,7 +142,10 @@ def stability(
     """
     result = {}
     for name, moving in _variants(suite, task):
-        made = make_task_world(name, num_envs=num_envs, seed=seed, threads=threads, moving_base=moving)
+        # Rows that end are reset by hand, so that the step that ended them is measured too.
+        made = make_task_world(
+            name, num_envs=num_envs, seed=seed, autoreset_mode="DISABLED", threads=threads, moving_base=moving
+        )
         result[name if moving else f"{name} (fixed base)"] = _stability(made, steps, seed)
     return result
 
@@ -167,13 +170,14 @@ def _stability(made: World, steps: int, seed: int) -> dict[str, Any]:
     fastest, depths = 0.0, []
     control_steps = math.ceil(steps / made.num_envs)
     for _ in range(control_steps):
-        action = _rough_actions(held, left, generator)
-        info = made.step(action)[-1]
+        info = made.step(_rough_actions(held, left, generator))[-1]
         unstable += int(info["unstable"].sum())
         warnings += int((engine.batch.warning[:, :, 1] > 0).sum())
         fastest = max(fastest, max(float(engine.sensordata[:, w].norm(dim=1).max()) for w in velocities))
         sample = torch.randint(made.num_envs, (_SAMPLES_PER_STEP,), generator=generator).tolist()
         depths += [engine.contact_depth(row) for row in sample]
+        if info["_final_obs"].any():
+            made.reset(options={"reset_mask": info["_final_obs"]})
     depth = torch.tensor(depths)
     shallow = float((depth <= MAX_PENETRATION).double().mean())
     return {

@@ -5,6 +5,7 @@ The way of one observation: ``Part.step`` (engine) -> ``sensordata`` -> ``Observ
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -129,7 +130,7 @@ class World(VectorEnv):
         self.task_index = self._index_in_slot % self._pool_size
 
     def _seed_rows(self, seed: int) -> None:
-        self.seed = seed
+        self.seed = int(seed)
         pairs = zip(self.slots, self.slot_rows, strict=True)
         keys = torch.cat([row_keys(seed, s.name, rows.stop - rows.start, self.device) for s, rows in pairs])
         draws = max(slot.task_class.start_draws for slot in self.slots)
@@ -145,6 +146,7 @@ class World(VectorEnv):
         Raises:
             BidexError: Unknown slot or a wrong shape.
         """
+        slots = list(self.slots)
         for name, tasks in pools.items():
             if name not in self.task_names:
                 raise BidexError(f"Expected a slot among {', '.join(self.task_names)}, got {name!r}.")
@@ -153,7 +155,11 @@ class World(VectorEnv):
             tasks = np.asarray(tasks, dtype=np.float64)
             if tasks.ndim != 2 or len(tasks) == 0 or tasks.shape[1] != size:
                 raise BidexError(f"Expected tasks of {name} with shape (n, {size}), got {tasks.shape}.")
-            self.slots[i] = Slot(name, self.slots[i].task_class, tasks, self.slots[i].reward_scale)
+            slots[i] = replace(slots[i], tasks=tasks)
+        self._set_pools(slots)
+
+    def _set_pools(self, slots: list[Slot]) -> None:
+        self.slots = slots
         self._set_pool_sizes()
         for part in self.parts:
             part.set_pools(self.slots)
@@ -174,6 +180,10 @@ class World(VectorEnv):
         """
         mask = self._reset_mask(options)
         if seed is not None:
+            if not mask.all():
+                raise BidexError(
+                    "Expected a seed with a full reset, got it with a reset_mask; a seed starts all rows anew."
+                )
             self._seed_rows(seed)
         first = not self._ready or seed is not None
         stagger = self.autoreset_mode == AutoresetMode.SAME_STEP and first
@@ -271,8 +281,9 @@ class World(VectorEnv):
         truncated = (late | unstable) & active | episodes.truncated
         ended = (terminated | truncated) & active
         broken = unstable & active
-        if self.device.type != "cpu" or broken.any():  # on the CPU looking costs less than a pass over all observations
-            obs = torch.where(broken[:, None], self._obs, obs)
+        kept = broken | ~active
+        if self.device.type != "cpu" or kept.any():  # on the CPU looking costs less than a pass over all observations
+            obs = torch.where(kept[:, None], self._obs, obs)
         statistics = episodes.statistics()
         info: dict[str, Any] = {
             "success": success & ~unstable,
@@ -291,7 +302,7 @@ class World(VectorEnv):
             if ended.any():
                 self._begin(ended, stagger=False)
         else:
-            episodes.terminated, episodes.truncated = terminated, truncated
+            episodes.terminated, episodes.truncated = terminated.clone(), truncated.clone()
             episodes.finished = episodes.finished | ended
         return self._obs.clone(), reward, terminated, truncated, info
 
@@ -320,6 +331,8 @@ class World(VectorEnv):
         """Everything that decides the future of the world: tensors and numbers, copied."""
         return {
             "seed": self.seed,
+            "slots": list(self.task_names),
+            "tasks": [torch.tensor(slot.tasks) for slot in self.slots],
             "episodes": self.episodes.state_dict(),
             "task_index": self.task_index.clone(),
             "action": self._action.clone(),
@@ -329,11 +342,13 @@ class World(VectorEnv):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Puts back what ``state_dict`` gave, on a world of the same suite and rows."""
-        if state["observation"].shape != self._obs.shape:
+        here, there = (self.task_names, tuple(self._obs.shape)), (state["slots"], tuple(state["observation"].shape))
+        if here != there:
             raise BidexError(
-                f"Expected a state of {tuple(self._obs.shape)} observations, got {tuple(state['observation'].shape)}; "
-                "build the world with the same suite and num_envs."
+                f"Expected the state of a world of {here[0]} with observations {here[1]}, got one of {there[0]} with "
+                f"{there[1]}; build the world with the same suite, split and num_envs."
             )
+        self._set_pools([replace(s, tasks=t.numpy()) for s, t in zip(self.slots, state["tasks"], strict=True)])
         self._seed_rows(int(state["seed"]))
         self.episodes.load_state_dict(state["episodes"])
         self.task_index, self._action = state["task_index"].clone(), state["action"].clone()
@@ -354,7 +369,7 @@ class World(VectorEnv):
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """An attribute for each row: its own entry of a per-row attribute, else the world's value."""
         value = getattr(self, name)
-        per_row = isinstance(value, (Tensor, list, tuple)) and len(value) == self.num_envs
+        per_row = name == "task_name" or (isinstance(value, Tensor) and value.shape[:1] == (self.num_envs,))
         return tuple(value) if per_row else (value,) * self.num_envs
 
     def set_attr(self, name: str, values: Any) -> None:
@@ -375,6 +390,6 @@ class World(VectorEnv):
 def _autoreset(mode: str | AutoresetMode) -> AutoresetMode:
     allowed = (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED)
     for member in allowed:
-        if mode == member or (isinstance(mode, str) and mode.upper().replace("-", "_") == member.name):
+        if mode == member or (isinstance(mode, str) and mode.upper().replace("_", "") == member.name.replace("_", "")):
             return member
     raise BidexError(f"Expected autoreset_mode SAME_STEP or DISABLED, got {mode!r}.")

@@ -37,21 +37,49 @@ ACTUATED = [0, 1, 2, 3, 4, 6, 7, 8, 10, 11, 12, 14, 15, 16, 17, 19, 20, 21, 22, 
 
 # Geoms of one hand that may meet; all others of the same hand pass through each other.
 PAIRS = {
-    frozenset(pair)
+    frozenset(pair.split("-"))
     for pair in (
-        *(("thdistal", other) for other in ["ffdistal", "ffmiddle", "ffproximal", "mfproximal", "mfdistal", "rfdistal", "lfdistal", "palm0"]),
-        ("mfdistal", "ffdistal"),
-        ("rfdistal", "mfdistal"),
-        ("lfdistal", "rfdistal"),
-        ("mfproximal", "ffproximal"),
-        ("rfproximal", "mfproximal"),
-        ("lfproximal", "rfproximal"),
-        ("lfdistal", "mfdistal"),
-        ("lfdistal", "rfmiddle"),
-        ("lfmiddle", "rfdistal"),
-        ("lfmiddle", "rfmiddle"),
+        "thdistal-ffdistal",
+        "thdistal-ffmiddle",
+        "thdistal-ffproximal",
+        "thdistal-mfproximal",
+        "thdistal-mfdistal",
+        "thdistal-rfdistal",
+        "thdistal-lfdistal",
+        "thdistal-palm0",
+        "mfdistal-ffdistal",
+        "rfdistal-mfdistal",
+        "lfdistal-rfdistal",
+        "mfproximal-ffproximal",
+        "rfproximal-mfproximal",
+        "lfproximal-rfproximal",
+        "lfdistal-mfdistal",
+        "lfdistal-rfmiddle",
+        "lfmiddle-rfdistal",
+        "lfmiddle-rfmiddle",
     )
-}  # fmt: skip
+}
+
+# Collision geoms (2.5) but the forearm's, a mesh there: position in the body, size, condim; capsules (radius, half
+# length)
+# along the body's z (the wrist's along its x), boxes by half sizes.
+GEOMS = {
+    "wrist": ((0, 0, 0), (0.015, 0.01), 3),
+    "palm0": ((0.011, 0, 0.038), (0.032, 0.0111, 0.049), 3),
+    "palm1": ((-0.032, 0, 0.014), (0.011, 0.0111, 0.025), 3),
+    "lfmetacarpal": ((-0.0165, 0, 0.01), (0.0095, 0.0111, 0.025), 3),
+    "thproximal": ((0, 0, 0.019), (0.013, 0.019), 3),
+    "thmiddle": ((0, 0, 0.016), (0.011, 0.016), 3),
+    "thdistal": ((0, 0, 0.013), (0.00918, 0.013), 4),
+} | {
+    f"{finger}{link}": ((0, 0, height), (radius, height), condim)
+    for finger in ("ff", "mf", "rf", "lf")
+    for link, height, radius, condim in (
+        ("proximal", 0.0225, 0.01, 3),
+        ("middle", 0.0125, 0.00805, 3),
+        ("distal", 0.012, 0.00705, 4),
+    )
+}
 
 TIPS = ("ffdistal", "mfdistal", "rfdistal", "lfdistal", "thdistal")
 CENTRE_OF_MASS = (0.0016, 0.0081, 0.2917)

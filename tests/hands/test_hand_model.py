@@ -85,6 +85,31 @@ def test_self_collision_pairs(model: mujoco.MjModel) -> None:
     assert set(model.pair_dim) == {1}
 
 
+def test_collision_geoms(model: mujoco.MjModel) -> None:
+    solid = {model.geom(i).name: model.geom(i) for i in range(model.ngeom) if model.geom_contype[i]}
+    assert set(solid) == {f"C_{name}" for name in [*sheet.GEOMS, "forearm"]}
+    for name, (position, size, condim) in sheet.GEOMS.items():
+        geom = solid[f"C_{name}"]
+        np.testing.assert_allclose(geom.pos, position, atol=1e-9, err_msg=name)
+        np.testing.assert_allclose(geom.size[: len(size)], size, err_msg=name)
+        assert geom.type[0] == (mujoco.mjtGeom.mjGEOM_CAPSULE if len(size) == 2 else mujoco.mjtGeom.mjGEOM_BOX), name
+        assert geom.condim[0] == condim, name
+        assert model.body(geom.bodyid[0]).name == name.rstrip("01"), name
+    assert all(geom.friction.tolist() == [1.0, 0.005, 0.001] for geom in solid.values())
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_eggs(name: str) -> None:
+    """Sheet 5.1: semi-axes 3, 3 and 4 cm, 500 kg per cubic metre."""
+    model = compile_scene(registry.get(name)).model
+    eggs = [model.geom(i) for i in range(model.ngeom) if model.geom(i).type[0] == mujoco.mjtGeom.mjGEOM_ELLIPSOID]
+    assert len(eggs) == (2 if name == "TwoCatchUnderarm" else 1)
+    for egg in eggs:
+        assert egg.size.tolist() == [0.03, 0.03, 0.04] and egg.condim[0] == 4
+        assert model.body(egg.bodyid[0]).mass[0] == pytest.approx(0.0754, abs=1e-4)
+        assert model.body_gravcomp[egg.bodyid[0]] == 0.0
+
+
 @pytest.mark.parametrize("moving", [False, True])
 def test_zero_pose_kinematics(moving: bool) -> None:
     model = pair_model(moving)
@@ -233,6 +258,6 @@ def test_the_three_kinds_really_meet() -> None:
     palm = (right[0], -0.34, 0.52)
     assert meetings(object=away) == set()
     assert frozenset({"right", "object"}) in meetings(object=palm)
-    assert frozenset({"right", "left"}) in meetings(object=away, left=tuple(right + (0.01, -0.3, 0)))
+    assert frozenset({"right", "left"}) in meetings(object=away, left=(right[0] + 0.01, right[1] - 0.3, right[2]))
     assert frozenset({"object", "floor"}) in meetings(object=(3.0, 0.0, 0.02))
     assert frozenset({"right", "floor"}) in meetings(object=away, right=(right[0], right[1], 0.02))

@@ -86,7 +86,9 @@ def test_making_room_only_opens_fingers_and_only_lifts(pose: tuple[np.ndarray, n
     assert not changed[:, [i for i in range(24) if i not in FLEXED]].any()
     assert (opened.numpy()[changed] == 0.0).all()
     for row in range(3):
-        wrist = Rotation.from_rotvec([0, float(joints[row, 0]), 0]) * Rotation.from_rotvec([float(joints[row, 1]), 0, 0])
+        wrist = Rotation.from_rotvec([0, float(joints[row, 0]), 0]) * Rotation.from_rotvec(
+            [float(joints[row, 1]), 0, 0]
+        )
         out_of_palm = wrist.apply([0.0, -1.0, 0.0])
         height = float(shift[row].numpy() @ out_of_palm)
         assert height >= -1e-15
@@ -143,7 +145,9 @@ def test_a_flexed_finger_under_the_egg_is_opened(scene: Scene, finger: int) -> N
 
 
 @settings(max_examples=300)
-@given(u=hnp.arrays(np.float64, 24, elements=st.floats(-1, 1)), place=hnp.arrays(np.float64, 5, elements=st.floats(-1, 1)))
+@given(
+    u=hnp.arrays(np.float64, 24, elements=st.floats(-1, 1)), place=hnp.arrays(np.float64, 5, elements=st.floats(-1, 1))
+)
 def test_no_start_of_the_noise_is_deep_in_the_hand(scene: Scene, u: np.ndarray, place: np.ndarray) -> None:
     """The extremes of the noise, not only likely draws: the egg never starts 5 mm deep."""
     turn = Rotation.from_rotvec([np.pi * place[3], 0, 0]) * Rotation.from_rotvec([0, np.pi * place[4], 0])

@@ -7,7 +7,17 @@ import torch
 from bidex_meta.hands.pair import SIDES
 from bidex_meta.world import World
 from tests.hands import sheet
-from tests.tasks.worlds import CASES, MOVING, each_case, each_moving, engine_of, mixed_world, objects_of, scene_of, world_of
+from tests.tasks.worlds import (
+    CASES,
+    MOVING,
+    each_case,
+    each_moving,
+    engine_of,
+    mixed_world,
+    objects_of,
+    scene_of,
+    world_of,
+)
 
 FORCE, TORQUE = 1666.67, 16.667
 """Newton and newton metre per unit of scale (sheet 1.3)."""
@@ -52,7 +62,9 @@ def free_bases(name: str, actions: np.ndarray) -> tuple[World, np.ndarray, np.nd
 
 def turned(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Angle between the orientations of all rows and hands, rad."""
-    return (sheet.rotation(after[..., 3:].reshape(-1, 4)) * sheet.rotation(before[..., 3:].reshape(-1, 4)).inv()).magnitude()
+    return (
+        sheet.rotation(after[..., 3:].reshape(-1, 4)) * sheet.rotation(before[..., 3:].reshape(-1, 4)).inv()
+    ).magnitude()
 
 
 @each_moving
@@ -118,7 +130,9 @@ def check_controls(name: str, ctrl: np.ndarray, wrench: np.ndarray, action: np.n
         hand = action[:, i * share : (i + 1) * share]
         names = [model.actuator(k).name for k in range(20 * i, 20 * i + 20)]
         assert names == [f"{side}/A_{sheet.NAMES[k]}" for k in sheet.ACTUATED]
-        np.testing.assert_allclose(ctrl[:, 20 * i : 20 * i + 20], low + (hand[:, :20] + 1) / 2 * (high - low), atol=1e-12)
+        np.testing.assert_allclose(
+            ctrl[:, 20 * i : 20 * i + 20], low + (hand[:, :20] + 1) / 2 * (high - low), atol=1e-12
+        )
         if share == 26:
             transition, orientation = sheet.SCALES[name]
             body = model.body(f"{side}/base").id

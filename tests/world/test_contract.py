@@ -226,7 +226,7 @@ def test_make_vec_gives_a_world_that_plays() -> None:
     obs, _ = made.reset(seed=0)
     assert isinstance(obs, Tensor) and obs.shape == (8, 450)
     for _ in range(3):
-        obs, reward, terminated, truncated, info = made.step(made.action_space.sample())
+        obs, *_, info = made.step(made.action_space.sample())
     assert obs.shape == (8, 450) and info["success"].shape == (8,)
     made.close()
 

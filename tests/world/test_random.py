@@ -45,7 +45,7 @@ def test_threefry_is_a_bijection_of_words(counters: list[tuple[int, int]], k0: i
 def test_uniform_numbers_look_uniform() -> None:
     values = uniform(row_keys(0, "A", 2000, CPU), torch.arange(2000) % 7, 31)
     assert values.shape == (2000, 31) and values.dtype == torch.float64
-    assert 0.0 <= float(values.min()) and float(values.max()) < 1.0
+    assert float(values.min()) >= 0.0 and float(values.max()) < 1.0
     assert torch.equal(values, values.float().double())
     assert abs(float(values.mean()) - 0.5) < 5 * (1 / 12 / values.numel()) ** 0.5
     assert abs(float(values.var()) - 1 / 12) < 1e-3
@@ -98,7 +98,7 @@ def test_how_many_episodes_are_drawn_ahead_changes_nothing(monkeypatch: pytest.M
         monkeypatch.setattr(starts_module, "_AHEAD", ahead)
         world = suite_world("MT4", 8)
         world.reset(seed=0)
-        played.append(play(world, random_actions(world, 100)))
-    assert number_of_ends(played[0]) > 20
+        played.append(play(world, random_actions(world, 60)))
+    assert number_of_ends(played[0]) > 12
     assert_same(played[0], played[1])
     assert_same(played[0], played[2])

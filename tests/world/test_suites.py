@@ -145,7 +145,19 @@ def test_hand_over_alone_has_a_fixed_base() -> None:
 def test_train_and_test_worlds_of_ml1_play_their_listed_tasks() -> None:
     train, test = (suite_world("ML1", 3, split=split) for split in ("train", "test"))
     benchmark = Benchmark("ML1")
-    assert torch.equal(
-        torch.as_tensor(train.slots[0].tasks), torch.tensor([t.variation.tolist() for t in benchmark.train_tasks])
-    )
+    assert train.slots[0].tasks.tolist() == [task.variation.tolist() for task in benchmark.train_tasks]
+    assert test.slots[0].tasks.tolist() == [task.variation.tolist() for task in benchmark.test_tasks]
     assert test.num_slot_tasks == [1]
+
+
+def test_observations_are_those_of_the_state_after_the_step() -> None:
+    """Not of the last substep's beginning, where MuJoCo's sensors stand after a plain step."""
+    world = class_world("CatchUnderarm", 4)
+    world.reset(seed=0)
+    part, layout = world.parts[0], world.slots[0].task_class.layout
+    place, shown = part.group.members[0].scene.qpos["object"].start, layout.range("object_pose").start
+    for action in random_actions(world, 10):
+        obs = world.step(action)[-1]["final_obs"]
+        going = world.episodes.elapsed > 0
+        qpos = part.group.engine.qpos[going, place : place + 3]
+        assert torch.allclose(obs[going, shown : shown + 3].double(), qpos, atol=1e-7, rtol=0.0)

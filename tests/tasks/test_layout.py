@@ -1,0 +1,315 @@
+"""Every index range of Tables 7, 8, 10, 12, 14 and 16: where it stands, and what it holds at a known state."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from bidex_meta.hands.pair import SIDES
+from bidex_meta.tasks import registry
+from bidex_meta.world import World
+from tests.hands import sheet
+from tests.tasks.formulas import OBJECT_OF_GOAL, goals
+from tests.tasks.tables import SIZES, TABLES, block_names
+from tests.tasks.worlds import CASES, each_case, engine_of, objects_of, observe, scene_of, world_of
+
+STEPS = 3
+
+
+@pytest.fixture(scope="module")
+def worlds() -> dict[tuple[str, bool], World]:
+    """A world of three rows for each case, started."""
+    made = {case: world_of(*case, 3, observation="plain") for case in CASES}
+    return made
+
+
+def started(worlds: dict[tuple[str, bool], World], name: str, moving: bool) -> World:
+    world = worlds[name, moving]
+    world.reset(seed=7)
+    return world
+
+
+def places(name: str, moving: bool) -> dict[str, slice]:
+    """The printed ranges by what stands there."""
+    return {what: slice(first, last + 1) for first, last, what in TABLES[name, moving]}
+
+
+@each_case
+def test_layout_is_the_printed_table(name: str, moving: bool) -> None:
+    task, table = registry.get(name, moving), TABLES[name, moving]
+    assert [block.name for block, _ in task.layout] == [block_names(what) for *_, what in table]
+    for first, last, what in table:
+        assert task.layout.range(block_names(what)) == slice(first, last + 1), what
+    assert [first for first, *_ in table] == [0, *(last + 1 for _, last, _ in table[:-1])]
+
+
+@each_case
+def test_sizes(name: str, moving: bool) -> None:
+    task = registry.get(name, moving)
+    assert (task.observation_size, task.action_size) == SIZES[name, moving]
+    assert task.layout.size == TABLES[name, moving][-1][1] + 1
+
+
+@each_case
+def test_goal_indices(name: str, moving: bool) -> None:
+    printed = [
+        i for first, last, what in TABLES[name, moving] if what.startswith("goal") for i in range(first, last + 1)
+    ]
+    assert registry.get(name, moving).layout.goal_indices() == printed
+
+
+def test_a_wrong_block_name_is_answered_with_the_names_there_are() -> None:
+    with pytest.raises(KeyError, match="right_joint_position"):
+        registry.get("HandOver").layout.range("joint_positions")
+
+
+def test_every_block_says_what_it_is() -> None:
+    for name, moving in CASES:
+        assert all(block.description for block, _ in registry.get(name, moving).layout), name
+
+
+# ----------------------------------------------------------------------------------------- values by hand
+
+
+@each_case
+def test_a_joint_at_its_limit_reads_one(worlds: dict[tuple[str, bool], World], name: str, moving: bool) -> None:
+    world, where = started(worlds, name, moving), places(name, moving)
+    engine, scene = engine_of(world), scene_of(world)
+    for side in SIDES:
+        for row, angles in enumerate((sheet.LOW, sheet.HIGH, 0.5 * (sheet.LOW + sheet.HIGH))):
+            engine.qpos[row, scene.qpos[f"{side}/joints"]] = torch.from_numpy(angles)
+    obs = observe(world)
+    for side in SIDES:
+        found = obs[:, where[f"{side} dof position"]]
+        np.testing.assert_allclose(found, np.array([[-1.0], [1.0], [0.0]]) * np.ones(24), atol=1e-6)
+
+
+@each_case
+def test_one_joint_moves_one_entry(worlds: dict[tuple[str, bool], World], name: str, moving: bool) -> None:
+    world, where = started(worlds, name, moving), places(name, moving)
+    engine, scene = engine_of(world), scene_of(world)
+    engine.qpos[:] = torch.from_numpy(scene.start_qpos)
+    nominal = observe(world)
+    for i, side in ((0, "right"), (5, "left"), (14, "right"), (23, "left")):
+        engine.qpos[:] = torch.from_numpy(scene.start_qpos)
+        engine.qpos[0, scene.qpos[f"{side}/joints"].start + i] = sheet.HIGH[i] or sheet.LOW[i]
+        obs = observe(world)
+        entries = np.concatenate(
+            [np.arange(p.start, p.stop) for what, p in where.items() if what.endswith("dof position")]
+        )
+        changed = entries[obs[0, entries] != nominal[0, entries]]
+        assert changed.tolist() == [where[f"{side} dof position"].start + i]
+        np.testing.assert_array_equal(obs[1], nominal[1])
+
+
+@each_case
+def test_an_object_pose_set_by_hand_stands_at_its_indices(
+    worlds: dict[tuple[str, bool], World], name: str, moving: bool
+) -> None:
+    world, where = started(worlds, name, moving), places(name, moving)
+    engine, scene = engine_of(world), scene_of(world)
+    xyzw = np.array((0.1, -0.5, 0.7, 0.5)) / np.linalg.norm((0.1, -0.5, 0.7, 0.5))
+    for i, body in enumerate(objects_of(scene)):
+        pose = torch.tensor([0.3 + i, -0.2, 1.7, *np.roll(xyzw, 1)], dtype=torch.float64)
+        engine.qpos[1, scene.qpos[body]] = pose
+        first = scene.model.joint(f"{body}/free").dofadr[0]
+        engine.qvel[1, first : first + 6] = torch.tensor([0.4, -0.5, 0.6 + i, 1.0, 2.0, -3.0])
+    before = observe(world)
+    for i, body in enumerate(objects_of(scene)):
+        np.testing.assert_allclose(before[1, where[f"{body} pose"]], (0.3 + i, -0.2, 1.7, *xyzw), atol=1e-6)
+        np.testing.assert_allclose(before[1, where[f"{body} linear velocity"]], (0.4, -0.5, 0.6 + i), atol=1e-6)
+        # MuJoCo's free joint holds the angular velocity in the body's frame; the table's is the world's, times 0.2.
+        world_rate = 0.2 * Rotation.from_quat(xyzw).apply((1.0, 2.0, -3.0))
+        np.testing.assert_allclose(before[1, where[f"{body} angle velocity"]], world_rate, atol=1e-6)
+
+
+@each_case
+def test_goal_entries_hold_the_tasks_goal(worlds: dict[tuple[str, bool], World], name: str, moving: bool) -> None:
+    world, where = started(worlds, name, moving), places(name, moving)
+    engine, scene = engine_of(world), scene_of(world)
+    half = np.sqrt(0.5)
+    for body in objects_of(scene):
+        start = scene.qpos[body].start
+        engine.qpos[:, start + 3 : start + 7] = torch.tensor([half, 0.0, half, 0.0], dtype=torch.float64)
+    obs = observe(world)
+    for row in range(world.num_envs):
+        task = world.slots[0].tasks[int(world.task_index[row])]
+        for goal, (position, turn) in goals(name, task).items():
+            np.testing.assert_allclose(obs[row, where[f"{goal} pose"]], (*position, *turn), atol=1e-6)
+            difference = Rotation.from_quat((0.0, half, 0.0, half)) * Rotation.from_quat(turn).inv()
+            found = obs[row, where[f"{goal} rot - {OBJECT_OF_GOAL[goal]} rot"]]
+            np.testing.assert_allclose(found, difference.as_quat(), atol=1e-6)
+    assert len({tuple(obs[row, where[next(iter(goals(name, task))) + " pose"]]) for row in range(3)}) == 3
+
+
+@each_case
+def test_velocities_are_scaled_and_everything_is_clipped(
+    worlds: dict[tuple[str, bool], World], name: str, moving: bool
+) -> None:
+    world, where = started(worlds, name, moving), places(name, moving)
+    engine, scene = engine_of(world), scene_of(world)
+    for side in SIDES:
+        first = scene.model.joint(f"{side}/WRJ1").dofadr[0]
+        engine.qvel[0, first : first + 24] = torch.linspace(-2.0, 2.0, 24)
+        engine.qvel[1, first : first + 24] = 40.0
+        engine.qvel[2, first : first + 24] = -40.0
+    body = objects_of(scene)[0]
+    engine.qpos[1, scene.qpos[body].start] = 7.0
+    obs = observe(world)
+    for side in SIDES:
+        found = obs[:, where[f"{side} dof velocity"]]
+        np.testing.assert_allclose(found[0], 0.2 * np.linspace(-2.0, 2.0, 24), atol=1e-6)
+        assert (found[1] == 5.0).all() and (found[2] == -5.0).all()
+    assert obs[1, where[f"{body} pose"].start] == 5.0
+    assert np.abs(obs).max() == 5.0
+
+
+@pytest.mark.parametrize("name", [name for name, moving in CASES if moving])
+def test_base_entries(worlds: dict[tuple[str, bool], World], name: str) -> None:
+    """Position of the mount's origin in the world; roll, pitch and yaw against its start, zero there."""
+    world, where = started(worlds, name, True), places(name, True)
+    engine, scene = engine_of(world), scene_of(world)
+    obs = observe(world)
+    for side, (position, _) in zip(SIDES, sheet.CLASS_MOUNTS[name], strict=True):
+        np.testing.assert_allclose(obs[:, where[f"{side} base position"]], np.tile(position, (3, 1)), atol=1e-6)
+        np.testing.assert_allclose(obs[:, where[f"{side} base rotation"]], 0.0, atol=1e-6)
+    turns = np.array(
+        [[[0.3, -0.4, 0.5], [3.0, 0.2, -3.0], [0.0, -1.2, 0.0]], [[-0.7, 0.1, 2.0], [0, 0, 0], [-3.1, 1.0, 3.1]]]
+    )
+    moved = np.array((0.2, -0.1, 0.4))
+    for i, side in enumerate(SIDES):
+        place = scene.qpos[f"{side}/base"]
+        start = sheet.rotation(scene.start_qpos[place][3:])
+        for row in range(3):
+            turned = Rotation.from_euler("xyz", turns[i, row]) * start
+            mount = np.array(sheet.CLASS_MOUNTS[name][i][0]) + moved
+            base = mount + turned.apply(sheet.CENTRE_OF_MASS)
+            engine.qpos[row, place] = torch.from_numpy(np.concatenate((base, turned.as_quat(scalar_first=True))))
+    obs = observe(world)
+    for i, side in enumerate(SIDES):
+        mount = np.array(sheet.CLASS_MOUNTS[name][i][0]) + moved
+        np.testing.assert_allclose(obs[:, where[f"{side} base position"]], np.tile(mount, (3, 1)), atol=1e-6)
+        np.testing.assert_allclose(obs[:, where[f"{side} base rotation"]], turns[i], atol=1e-6)
+
+
+@each_case
+def test_last_actions(worlds: dict[tuple[str, bool], World], name: str, moving: bool) -> None:
+    world, where = started(worlds, name, moving), places(name, moving)
+    obs, _ = world.reset(seed=7)
+    for side in SIDES:
+        assert (obs[:, where[f"{side} actions"]] == 0).all()
+    action = torch.rand(3, world.action_size, generator=torch.Generator().manual_seed(3)) * 2 - 1
+    action[0, 0] = 1.5
+    obs, *_ = world.step(action)
+    found = torch.cat([obs[:, where[f"{side} actions"]] for side in SIDES], dim=1)
+    np.testing.assert_array_equal(found.numpy(), action.clamp(-1, 1).numpy())
+    obs, _ = world.reset(options={"reset_mask": np.array([True, False, False])})
+    found = torch.cat([obs[:, where[f"{side} actions"]] for side in SIDES], dim=1)
+    assert (found[0] == 0).all() and torch.equal(found[1:], action[1:])
+
+
+# ------------------------------------------------------------- every entry, computed anew from plain MuJoCo
+
+
+def replay(world: World, row: int, actions: torch.Tensor) -> tuple[mujoco.MjData, mujoco.MjData]:
+    """The row's episode in plain C MuJoCo: data forwarded at the end, and data as the last substep left it."""
+    scene, model = scene_of(world), scene_of(world).model
+    data = mujoco.MjData(model)
+    data.qpos[:] = engine_of(world).qpos[row].numpy()
+    low, high = sheet.LOW[sheet.ACTUATED], sheet.HIGH[sheet.ACTUATED]
+    transition, orientation = sheet.SCALES[scene.task.name]
+    for action in actions[:, row].double().numpy():
+        for i, side in enumerate(SIDES):
+            mine = action[i * len(action) // 2 : (i + 1) * len(action) // 2]
+            data.ctrl[20 * i : 20 * i + 20] = low + (mine[:20] + 1) / 2 * (high - low)
+            wrench = np.concatenate((mine[20:23] * 1e5 / 60 * transition, mine[23:26] * 1e3 / 60 * orientation))
+            data.body(f"{side}/base").xfrc_applied = wrench if len(wrench) else 0.0
+        for _ in range(round(1 / 60 / model.opt.timestep)):
+            mujoco.mj_step(model, data)
+    last = mujoco.MjData(model)
+    mujoco.mj_copyData(last, model, data)
+    mujoco.mj_forward(model, data)
+    return data, last
+
+
+def frame(
+    model: mujoco.MjModel, data: mujoco.MjData, body: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Origin, quaternion (x, y, z, w), linear and angular velocity of a body's frame, in world axes."""
+    twist = np.zeros(6)
+    mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, model.body(body).id, twist, 0)
+    return data.body(body).xpos, np.roll(data.body(body).xquat, -1), twist[3:], twist[:3]
+
+
+def expected(
+    world: World, row: int, what: str, data: mujoco.MjData, last: mujoco.MjData, action: np.ndarray
+) -> np.ndarray:
+    """What the table's words ask for, scaled by sheet 1.5."""
+    scene, model = scene_of(world), scene_of(world).model
+    subject, _, rest = what.partition(" ")
+    joints = [model.joint(f"{subject}/{j}") for j in sheet.NAMES] if subject in SIDES else []
+    dofs = [joint.dofadr[0] for joint in joints]
+    tips = [f"{subject}/{tip}" for tip in sheet.TIPS]
+    goal = goals(scene.task.name, world.slots[0].tasks[int(world.task_index[row])])
+    match rest:
+        case "dof position":
+            return (2 * data.qpos[[j.qposadr[0] for j in joints]] - sheet.HIGH - sheet.LOW) / (sheet.HIGH - sheet.LOW)
+        case "dof velocity":
+            return 0.2 * data.qvel[dofs]
+        case "dof force":
+            return 10 * last.qfrc_actuator[dofs]
+        case "fingertip pose, linear velocity, angle velocity":
+            return np.concatenate([np.concatenate(frame(model, data, tip)) for tip in tips])
+        case "fingertip force, torque":
+            sensed = [last.sensor(f"{tip}_{kind}").data for tip in tips for kind in ("force", "torque")]
+            return 10 * np.concatenate(sensed)
+        case "base position":
+            return data.body(f"{subject}/mount").xpos
+        case "base rotation":
+            begin = mujoco.MjData(model)
+            mujoco.mj_kinematics(model, begin)
+            now, then = (sheet.rotation(d.body(f"{subject}/mount").xquat) for d in (data, begin))
+            return (now * then.inv()).as_euler("xyz")
+        case "actions":
+            return np.split(action, 2)[SIDES.index(subject)]
+        case "pose" if subject in goal:
+            return np.concatenate(goal[subject])
+        case "pose":
+            return np.concatenate(frame(model, data, f"{subject}/object")[:2])
+        case "linear velocity":
+            return frame(model, data, f"{subject}/object")[2]
+        case "angle velocity":
+            return 0.2 * frame(model, data, f"{subject}/object")[3]
+    turn = Rotation.from_quat(frame(model, data, f"{OBJECT_OF_GOAL[subject]}/object")[1])
+    return (turn * Rotation.from_quat(goal[subject][1]).inv()).as_quat()
+
+
+@each_case
+def test_every_range_equals_plain_mujoco(worlds: dict[tuple[str, bool], World], name: str, moving: bool) -> None:
+    world = started(worlds, name, moving)
+    generator = torch.Generator().manual_seed(11)
+    actions = torch.rand(STEPS, 3, world.action_size, generator=generator) * 2 - 1
+    replays = [replay(world, row, actions) for row in range(3)]
+    for action in actions:
+        obs, *_ = world.step(action)
+    for row, (data, last) in enumerate(replays):
+        for first, stop, what in TABLES[name, moving]:
+            wanted = np.clip(expected(world, row, what, data, last, actions[-1, row].numpy()), -5.0, 5.0)
+            found = obs[row, first : stop + 1].numpy()
+            np.testing.assert_allclose(found, wanted, atol=2e-5, rtol=1e-5, err_msg=f"{what}, row {row}")
+
+
+@each_case
+def test_forces_are_those_of_the_model(worlds: dict[tuple[str, bool], World], name: str, moving: bool) -> None:
+    """Joint force: the actuator's, within its effort limit, zero for coupled joints; fingertips feel something."""
+    world, where = started(worlds, name, moving), places(name, moving)
+    for _ in range(2):
+        obs, *_ = world.step(torch.ones(3, world.action_size))
+    efforts = np.array([joint[7] for joint in sheet.JOINTS])
+    for side in SIDES:
+        force = obs[:, where[f"{side} dof force"]].numpy()
+        assert (np.abs(force) <= 10 * efforts + 1e-5).all()
+        assert (force[:, [5, 9, 13, 18]] == 0).all()
+        assert (np.abs(force[:, sheet.ACTUATED]) > 0).mean() > 0.9
+        assert (obs[:, where[f"{side} fingertip force, torque"]].abs().sum(dim=1) > 0).all()

@@ -1,0 +1,93 @@
+"""The mask means something: goals are told in multi-task worlds and hidden in meta ones (design.md section 4)."""
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from bidex_meta.tasks import registry
+from bidex_meta.world import World
+from tests.tasks.worlds import each_case, engine_of, mixed_world, world_of
+
+RULES = ["plain", "one-hot", "masked"]
+
+
+def variants(name: str, moving: bool) -> np.ndarray:
+    """A task, and for each of its numbers one that differs in this alone."""
+    space = registry.get(name, moving).variation_space
+    low, high = np.array(space.low), np.array(space.high)
+    base = low + 0.2 * (high - low)
+    return np.stack([base, *(base + 0.35 * (high - low) * np.eye(space.size)[i] for i in range(space.size))])
+
+
+def twins(name: str, moving: bool, rule: str) -> tuple[Tensor, Tensor]:
+    """Observations and rewards of rows in one and the same state, each with another task, after a step."""
+    tasks = variants(name, moving)
+    world = world_of(name, moving, len(tasks), tasks=tasks, observation=rule)
+    world.reset(seed=3)
+    assert world.task_index.tolist() == list(range(len(tasks)))
+    engine = engine_of(world)
+    engine.reset(torch.ones(len(tasks), dtype=torch.bool), engine.qpos[:1].repeat(len(tasks), 1))
+    action = torch.rand(1, world.action_size, generator=torch.Generator().manual_seed(6)) * 2 - 1
+    obs, reward, *_ = world.step(action.repeat(len(tasks), 1))
+    assert (engine.qpos == engine.qpos[0]).all(), "rows of one state stay in one state"
+    return obs, reward
+
+
+@each_case
+@pytest.mark.parametrize("rule", RULES)
+def test_tasks_are_told_apart_exactly_where_they_should_be(name: str, moving: bool, rule: str) -> None:
+    obs, reward = twins(name, moving, rule)
+    assert (reward[1:] != reward[0]).all(), "each number of a variation enters the reward"
+    differs = (obs[1:] != obs[0]).any(dim=1)
+    assert not differs.any() if rule == "masked" else differs.all()
+
+
+@each_case
+def test_what_differs_are_goal_entries(name: str, moving: bool) -> None:
+    obs, _ = twins(name, moving, "plain")
+    goal = registry.get(name, moving).layout.goal_indices()
+    rest = [i for i in range(obs.shape[1]) if i not in set(goal)]
+    assert torch.equal(obs[1:, rest], obs[:1, rest].expand(len(obs) - 1, -1))
+
+
+def played(world: World) -> list[Tensor]:
+    """Observations of a short run, its resets included."""
+    generator = torch.Generator().manual_seed(9)
+    obs, _ = world.reset(seed=4)
+    found = [obs]
+    for _ in range(5):
+        action = torch.rand(world.num_envs, world.action_size, generator=generator) * 2 - 1
+        obs, *_, info = world.step(action)
+        found += [obs, info["final_obs"]]
+    obs, _ = world.reset(options={"reset_mask": torch.arange(world.num_envs) % 2 == 0})
+    return [*found, obs]
+
+
+@each_case
+def test_the_mask_zeroes_the_goal_and_nothing_else(name: str, moving: bool) -> None:
+    goal = registry.get(name, moving).layout.goal_indices()
+    plain, masked = (played(world_of(name, moving, 4, observation=rule)) for rule in ("plain", "masked"))
+    for seen, hidden in zip(plain, masked, strict=True):
+        assert seen[:, goal].any(dim=1).all()
+        wanted = seen.clone()
+        wanted[:, goal] = 0.0
+        assert torch.equal(hidden, wanted)
+
+
+def test_the_mask_in_a_mixed_world() -> None:
+    """Goal entries by each class's own layout, padding behind it, and the task id only where it is asked for."""
+    plain, masked, told = (
+        played(mixed_world(2, observation=rule, pad_to=450)) for rule in ("plain", "masked", "one-hot")
+    )
+    world = mixed_world(2)
+    for seen, hidden, named in zip(plain, masked, told, strict=True):
+        assert torch.equal(named[:, :450], seen)
+        assert torch.equal(named[:, 450:], torch.eye(world.num_tasks).repeat_interleave(2, dim=0))
+        for slot, rows in zip(world.slots, world.slot_rows, strict=True):
+            layout = slot.task_class.layout
+            wanted = seen[rows].clone()
+            wanted[:, layout.goal_indices()] = 0.0
+            assert torch.equal(hidden[rows], wanted)
+            assert (seen[rows, layout.size :] == 0).all()
+            assert (seen[rows][:, layout.goal_indices()] != 0).any(dim=1).all()

@@ -1,0 +1,99 @@
+import json
+import math
+
+import pytest
+import torch
+
+from bidex_meta import bench
+from bidex_meta.cli import main
+from tests.world.play import CLASSES, suite_world
+
+
+def test_bench_world_prints_both_speeds_and_their_ratio(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(bench.world, "__defaults__", ("MT4", 1024, 2, 3, None, 0))  # three repeats of two steps
+    assert main(["bench", "world", "--suite", "MT4", "--num-envs", "8", "--threads", "1", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["suite"], found["num_envs"], found["threads"]) == ("MT4", 8, 1)
+    assert sum(found["groups"]) == 8
+    for name in ("env_steps_per_s", "engine_steps_per_s"):
+        assert 10 < found[name] < 1e6
+    # Medians of each need not come from one repeat, so that the quotient is near the ratio only.
+    assert found["ratio"] == pytest.approx(found["env_steps_per_s"] / found["engine_steps_per_s"], rel=0.3)
+
+
+def test_bench_world_as_a_table(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(bench.world, "__defaults__", ("MT4", 8, 1, 1, 1, 0))
+    assert main(["bench", "world"]) == 0
+    assert "ratio" in capsys.readouterr().out
+
+
+def test_the_bare_engines_do_the_physics_of_the_world() -> None:
+    full, bare = suite_world("MT4", 12), suite_world("MT4", 12)
+    full.reset(seed=0)
+    bare.reset(seed=0)
+    number = full.episodes.number
+    times = bench._paired_steps(full, bare, 60, torch.Generator().manual_seed(0))
+    assert (full.episodes.number > number).any()  # resets are followed
+    assert min(times) > 0.0
+    for a, b in zip(full.parts, bare.parts, strict=True):
+        mine, its = a.group.engine.state_dict(), b.group.engine.state_dict()
+        for name in ("qpos", "qvel", "ctrl", "xfrc_applied"):
+            begun = (full._action == 0).all(dim=1)[a.group.rows]  # a row just begun has not been stepped by either
+            assert torch.equal(mine[name], its[name]) or begun.any(), name
+            assert torch.equal(mine[name][~begun], its[name][~begun]), name
+
+
+def test_bench_scaling_compares_with_one_thread() -> None:
+    found = bench.scaling("MT4", num_envs=8, steps=2, repeats=1)
+    assert found["speedup"]["1"] == 1.0
+    assert found["env_steps_per_s"].keys() == found["speedup"].keys()
+
+
+def test_bench_stability_counts_what_it_saw() -> None:
+    found = bench.stability(task="HandOver", steps=40, num_envs=8, threads=1)
+    assert list(found) == ["HandOver", "HandOver (fixed base)"]
+    for result in found.values():
+        assert (result["env_steps"], result["unstable"], result["warnings"]) == (40, 0, 0)
+        assert result["depth_samples"] == 10
+        assert 0.0 < result["fastest_object"] < bench.MAX_OBJECT_SPEED
+        assert result["holds"] is True
+    assert json.loads(json.dumps(found)) == found
+
+
+def test_stability_of_a_suite_takes_its_classes_of_both_splits_and_that_of_nothing_all() -> None:
+    found = bench.stability("ML4", steps=2, num_envs=2, threads=1)
+    assert list(found) == ["CatchUnderarm", "HandOver", "CatchAbreast", "TwoCatchUnderarm"]
+    found = bench.stability(steps=2, num_envs=2, threads=1)
+    assert sorted(found) == sorted([*CLASSES, "HandOver (fixed base)"])
+
+
+def test_stability_does_not_hold_when_physics_breaks(monkeypatch: pytest.MonkeyPatch) -> None:
+    rough = bench._rough_actions
+
+    def broken(*given: torch.Tensor) -> torch.Tensor:
+        action = rough(*given)  # type: ignore[arg-type]
+        action[0, 0] = math.nan
+        return action
+
+    monkeypatch.setattr(bench, "_rough_actions", broken)
+    result = bench.stability(task="CatchUnderarm", steps=16, num_envs=4, threads=1)["CatchUnderarm"]
+    assert result["unstable"] == 4 and result["holds"] is False
+
+
+def test_rough_actions_are_half_uniform_half_held_extremes() -> None:
+    generator = torch.Generator().manual_seed(0)
+    held, left = torch.zeros(200, 5), torch.zeros(200, dtype=torch.int64)
+    actions = torch.stack([bench._rough_actions(held, left, generator).clone() for _ in range(120)])
+    uniform, extreme = actions[:, :100], actions[:, 100:]
+    assert abs(float(uniform.mean())) < 0.02 and abs(float(uniform.std()) - 3**-0.5) < 0.01
+    assert (uniform[1:] != uniform[:-1]).any(dim=2).all()
+    assert set(extreme.unique().tolist()) == {-1.0, 1.0}
+    lengths = []
+    for row in range(100):
+        changes = (extreme[1:, row] != extreme[:-1, row]).any(dim=1).nonzero().squeeze(1)
+        lengths += changes.diff().tolist()
+    assert min(lengths) >= 5
+    assert 35 < max(lengths) <= 80  # two holds in a row may draw the same signs
+    assert sum(length > 40 for length in lengths) < 0.1 * len(lengths)

@@ -1,0 +1,147 @@
+"""From the command to the checkpoint and back on real physics, as small as it goes."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from bidex_meta.cli import main
+from bidex_meta.record import RunFolder, read_metrics
+from tests.world.play import CLASSES
+
+SMALL = ["--suite", "MT4", "--num-envs", "8", "--threads", "1", "--device", "cpu", "--seed", "3"]
+SMALL += ["--learner.hidden", "16", "--learner.rollout-steps", "4", "--learner.num-minibatches", "2"]
+ITERATION = 8 * 4
+ROOT = Path(__file__).parents[1]
+
+# Checkpoints come once a minute; here, after every iteration.
+_OFTEN = """
+import functools, sys
+import bidex_algos.runner as runner
+from bidex_meta.cli import main
+runner.train = functools.partial(runner.train, checkpoint_seconds=0.0)
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (ROOT, ROOT / "algos")))}
+
+
+def command(*arguments: object, cwd: Path) -> str:
+    line = [sys.executable, "-m", "bidex_meta.cli", *map(str, arguments)]
+    done = subprocess.run(line, env=environment(), cwd=cwd, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def final(path: Path) -> tuple[dict[str, Any], int]:
+    loaded = RunFolder.open(path).checkpoints.load()
+    assert loaded is not None
+    return loaded
+
+
+def differences(a: Any, b: Any, where: str = "") -> list[str]:
+    """Where two states differ."""
+    if isinstance(a, dict):
+        missing = [f"{where}/{key}" for key in a.keys() ^ b.keys()]
+        return missing + [d for key in a.keys() & b.keys() for d in differences(a[key], b[key], f"{where}/{key}")]
+    if isinstance(a, list | tuple):
+        assert len(a) == len(b)
+        return [d for i, (x, y) in enumerate(zip(a, b, strict=True)) for d in differences(x, y, f"{where}/{i}")]
+    same = torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
+    return [] if same else [where]
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
+    """A run that SIGKILL met, then resumed to its end; and that end."""
+    path = tmp_path_factory.mktemp("killed") / "run"
+    line = [sys.executable, "-c", _OFTEN, "run", *SMALL, "--steps", "10000000", "--run-dir", str(path)]
+    process = subprocess.Popen(line, env=environment(), cwd=path.parent, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 100
+    while process.poll() is None and time.monotonic() < deadline:
+        if any(int(file.stem[5:]) >= 20 * ITERATION for file in path.glob("checkpoints/step_*.pt")):
+            break
+        time.sleep(0.005)
+    process.send_signal(signal.SIGKILL)
+    _, errors = process.communicate()
+    assert process.returncode == -signal.SIGKILL, errors
+    stopped = final(path)[1]
+    assert stopped >= 19 * ITERATION  # the last file itself may not have been replaced yet
+    goal = stopped + 40 * ITERATION
+    command("run", "--resume", path, "--steps", goal, "--no-evaluate", cwd=path.parent)
+    return path, goal
+
+
+def test_a_killed_run_resumes_to_the_end_of_an_unbroken_one(killed: tuple[Path, int], tmp_path: Path) -> None:
+    path, goal = killed
+    whole = tmp_path / "whole"
+    command("run", *SMALL, "--steps", goal, "--run-dir", whole, "--no-evaluate", cwd=tmp_path)
+    a, b = final(path), final(whole)
+    assert a[1] == b[1] == goal
+    assert differences(a[0], b[0]) == []
+    episodes = b[0]["env"]["episodes"]["number"]
+    assert int(episodes.min()) >= 1  # every row was reset on the way
+    rows = [read_metrics(folder / "metrics.jsonl") for folder in (path, whole)]
+    assert [row["step"] for row in rows[0]] == list(range(ITERATION, goal + 1, ITERATION))
+    keep = [[{k: v for k, v in row.items() if k != "time" and not k.startswith("Perf/")} for row in r] for r in rows]
+    assert keep[0] == keep[1]
+    assert {file.name for file in tmp_path.iterdir()} == {"whole"}  # nothing is left beside the run, no MuJoCo log
+
+
+def test_evaluate_reports_every_class(killed: tuple[Path, int], capsys: pytest.CaptureFixture[str]) -> None:
+    path, goal = killed
+    assert main(["evaluate", str(path), "--episodes", "1", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["steps"], found["split"]) == (goal, "train")
+    classes = found["policy"]["classes"]
+    assert sorted(classes) == sorted(set(CLASSES) - {"CatchOver2Underarm"})
+    assert [result["episodes"] for result in classes.values()] == [50] * 4
+    for result in classes.values():
+        assert 0.0 <= result["success"] <= 1.0
+        assert result["return"] > 0.0
+
+
+def test_list_tasks_has_the_sizes_of_the_tables(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["list", "tasks", "--json"]) == 0
+    found = {row["name"]: (row["observation"], row["action"]) for row in json.loads(capsys.readouterr().out)}
+    assert found == {
+        "HandOver": (398, 40),
+        "CatchUnderarm": (422, 52),
+        "CatchOver2Underarm": (422, 52),
+        "TwoCatchUnderarm": (446, 52),
+        "CatchAbreast": (422, 52),
+    }
+
+
+def _draws(backend: str) -> bool:
+    code = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8)"
+    done = subprocess.run([sys.executable, "-c", code], env={**os.environ, "MUJOCO_GL": backend}, capture_output=True)
+    return done.returncode == 0
+
+
+@pytest.fixture(scope="module")
+def gl() -> str:
+    """A way to draw that works here; it can be chosen only before MuJoCo is imported, hence the processes."""
+    for backend in dict.fromkeys((os.environ.get("MUJOCO_GL", "egl"), "egl", "osmesa")):
+        if _draws(backend):
+            return backend
+    pytest.skip("MuJoCo cannot draw on this machine")
+
+
+def test_render_writes_a_picture_with_something_on_it(gl: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    imageio = pytest.importorskip("imageio.v3")
+    monkeypatch.setenv("MUJOCO_GL", gl)
+    out = command("render", "--task", "HandOver", "--width", 160, "--height", 120, "--out", "x.png", cwd=tmp_path)
+    assert out.strip() == "x.png"
+    picture = imageio.imread(tmp_path / "x.png")
+    assert picture.shape == (120, 160, 3)
+    assert picture.std() > 5.0

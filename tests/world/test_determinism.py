@@ -1,0 +1,204 @@
+import io
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from bidex_meta.engine.cpu import CpuEngine
+from bidex_meta.errors import BidexError
+from bidex_meta.world import World
+from tests.world.play import (
+    CLASSES,
+    assert_same,
+    class_world,
+    engine_state,
+    number_of_ends,
+    play,
+    random_actions,
+    suite_world,
+    world_at,
+)
+
+
+def test_one_and_two_threads_give_the_same_bits_over_500_steps() -> None:
+    played, states = [], []
+    for threads in (1, 2):
+        world = suite_world("MT4", 12, threads=threads)
+        world.reset(seed=0)
+        played.append(play(world, random_actions(world, 500)))
+        states.append(engine_state(world))
+    assert number_of_ends(played[0]) > 50
+    assert_same(*played)
+    for a, b in zip(*states, strict=True):
+        assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_torchs_threads_change_nothing() -> None:
+    played = []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        world = suite_world("MT4", 64)
+        world.reset(seed=0)
+        played.append(play(world, random_actions(world, 12)))
+        assert torch.get_num_threads() == threads
+    assert_same(*played)
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_a_rows_trajectory_does_not_depend_on_the_number_of_rows(name: str) -> None:
+    compare_sizes(name, steps=40, small=8)
+
+
+@pytest.mark.parametrize("small", [1, 3])
+def test_nor_in_odd_sizes(small: int) -> None:
+    compare_sizes("TwoCatchUnderarm", steps=20, small=small)
+
+
+def test_nor_over_many_episodes() -> None:
+    compare_sizes("CatchOver2Underarm", steps=120, small=8)
+
+
+def compare_sizes(name: str, steps: int, small: int) -> None:
+    played = []
+    for rows in (small, 64):
+        world = class_world(name, rows)
+        world.reset(seed=0)
+        played.append(play(world, random_actions(world, steps, rows=64)))
+    assert number_of_ends(played[1]) > 5
+    assert_same(*played, rows_a=slice(None), rows_b=slice(small))
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_128_resets_equal_128_fresh_worlds(name: str) -> None:
+    used = class_world(name, 128, "DISABLED", moving_base=True)
+    used.reset(seed=0)
+    odd, actions = torch.arange(128) % 2 == 1, random_actions(used, 30)
+    play(used, actions[:10])
+    used.reset(options={"reset_mask": odd})
+    play(used, actions[:5])  # the odd rows are reset in the midst of an episode, after few steps and after many
+    used.reset(options={"reset_mask": ~odd})
+    used.reset(options={"reset_mask": odd})
+    assert torch.equal(used.episodes.number, torch.where(odd, 2, 1))
+    fresh = world_at(used)
+    obs, _ = fresh.reset()
+    assert torch.equal(obs, used._obs)
+    same_engines(used, fresh)
+    assert_same(play(used, actions[10:]), play(fresh, actions[10:]))
+    same_engines(used, fresh)
+
+
+def same_engines(a: World, b: World) -> None:
+    for mine, its in zip(a.parts, b.parts, strict=True):
+        assert torch.equal(mine.group.engine.sensordata, its.group.engine.sensordata)
+    for x, y in zip(engine_state(a), engine_state(b), strict=True):
+        assert all(torch.equal(x[key], y[key]) for key in x)
+
+
+def test_an_engines_reset_leaves_nothing_behind() -> None:
+    """Bit for bit a new batch: no warm start, no force, no stale sensor, no counter."""
+    world = class_world("CatchUnderarm", 32)
+    world.reset(seed=0)
+    engine = world.parts[0].group.engine
+    start = engine.qpos.clone()
+    play(world, random_actions(world, 20))
+    engine.qpos[5] = float("nan")
+    engine.step(2)
+    assert engine.unstable().nonzero().tolist() == [[5]]
+    engine.reset(torch.ones(32, dtype=torch.bool), start)
+    assert not engine.unstable().any()
+    fresh = CpuEngine([engine.model(0)], [0] * 32, threads=1)
+    fresh.reset(torch.ones(32, dtype=torch.bool), start)
+    for _ in range(20):
+        assert torch.equal(engine.sensordata, fresh.sensordata)
+        assert all(torch.equal(v, fresh.state_dict()[k]) for k, v in engine.state_dict().items())
+        for one in (engine, fresh):
+            one.ctrl[:] = 0.3
+            one.xfrc_applied[:, 2] = 1.0
+            one.step(2)
+
+
+# Saving and loading.
+
+
+def through_a_file(state: dict[str, Any]) -> dict[str, Any]:
+    file = io.BytesIO()
+    torch.save(state, file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
+
+
+@pytest.mark.parametrize(
+    ("suite", "mode", "before"), [("MT4", "SAME_STEP", 57), ("ML4", "SAME_STEP", 5), ("MT4", "DISABLED", 20)]
+)
+def test_a_loaded_world_continues_bit_for_bit(suite: str, mode: str, before: int) -> None:
+    world, other = (suite_world(suite, 12, mode, seed=seed) for seed in (0, 9))
+    other.slots = world.slots  # the seed of a benchmark chooses the tasks, too
+    other.set_tasks({slot.name: slot.tasks for slot in world.slots})
+    actions = random_actions(world, before + 100)
+    world.reset(seed=4)
+    play(world, actions[:before])
+    state = through_a_file(world.state_dict())
+    kept = world.state_dict()
+    unbroken = play(world, actions[before:])
+    other.load_state_dict(state)
+    assert_same(unbroken, play(other, actions[before:]))
+    assert number_of_ends(unbroken) >= (10 if mode == "SAME_STEP" else 4)
+    world.load_state_dict(kept)  # also into a world that went on
+    assert_same(unbroken, play(world, actions[before:]))
+
+
+def test_frozen_rows_stay_frozen_through_a_file() -> None:
+    world, other = (suite_world("MT4", 8, "DISABLED") for _ in range(2))
+    world.reset(seed=0)
+    actions = random_actions(world, 100)
+    play(world, actions[:80])
+    assert world.episodes.finished.any()
+    other.load_state_dict(through_a_file(world.state_dict()))
+    assert_same(play(world, actions[80:]), play(other, actions[80:]))
+
+
+def test_loading_does_not_tie_the_worlds_together() -> None:
+    world, other = (suite_world("MT4", 8) for _ in range(2))
+    world.reset(seed=0)
+    state = world.state_dict()
+    copy = through_a_file(state)
+    other.load_state_dict(state)
+    play(other, random_actions(world, 30))
+    same(state, copy)
+
+
+def same(a: Any, b: Any) -> None:
+    if isinstance(a, dict):
+        assert a.keys() == b.keys()
+        for key in a:
+            same(a[key], b[key])
+    elif isinstance(a, list):
+        for x, y in zip(a, b, strict=True):
+            same(x, y)
+    else:
+        assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
+
+
+def test_a_state_can_be_saved_whatever_integer_the_seed_was() -> None:
+    world = suite_world("MT4", 4)
+    world.reset(seed=np.int64(3))  # type: ignore[arg-type]
+    through_a_file(world.state_dict())
+
+
+@pytest.mark.parametrize(("suite", "rows", "split"), [("MT4", 9, "train"), ("ML4", 8, "train"), ("MT1", 8, "train")])
+def test_a_state_of_another_size_is_refused(suite: str, rows: int, split: str) -> None:
+    world, other = suite_world("MT4", 8), suite_world(suite, rows, split=split)
+    world.reset(seed=0)
+    other.reset(seed=0)
+    before = other.state_dict()
+    with pytest.raises(BidexError, match=r"Expected a state of .*same suite and num_envs"):
+        other.load_state_dict(world.state_dict())
+    same(before, other.state_dict())
+
+
+def test_a_state_of_another_suite_with_equal_sizes_is_refused() -> None:
+    world, other = (suite_world("ML4", 6, split=split) for split in ("train", "test"))
+    world.reset(seed=0)
+    with pytest.raises(BidexError):
+        other.load_state_dict(world.state_dict())

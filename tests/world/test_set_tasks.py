@@ -1,0 +1,105 @@
+import numpy as np
+import pytest
+import torch
+
+from bidex_meta.errors import BidexError
+from bidex_meta.world import World
+from tests.world.play import assert_same, play, random_actions, suite_world
+
+SPACE = {"CatchUnderarm": 5, "HandOver": 5, "CatchAbreast": 5, "TwoCatchUnderarm": 8}
+
+
+def pool(world: World, name: str, count: int, seed: int = 0) -> np.ndarray:
+    slot = world.slots[world.task_names.index(name)]
+    return slot.task_class.variation_space.sample(np.random.default_rng(seed), count)
+
+
+def shown_goals(world: World, obs: torch.Tensor, slot: int) -> torch.Tensor:
+    layout = world.slots[slot].task_class.layout
+    goal = next(block.name for block, _ in layout if block.goal)
+    start = layout.range(goal).start
+    return obs[world.slot_rows[slot], start : start + 3]
+
+
+def test_rows_play_the_given_tasks() -> None:
+    world = suite_world("MT4", 16, "DISABLED")
+    before, _ = world.reset(seed=0)
+    tasks = {"CatchUnderarm": pool(world, "CatchUnderarm", 3), "TwoCatchUnderarm": pool(world, "TwoCatchUnderarm", 7)}
+    world.set_tasks(tasks)
+    assert world.num_slot_tasks == [3, 50, 50, 7]
+    obs, _ = world.reset()
+    assert world.task_index.tolist() == [0, 1, 2, 0, *range(4), *range(4), *range(4)]
+    for _ in range(2):
+        for name, given in tasks.items():
+            slot = world.task_names.index(name)
+            expected = torch.as_tensor(given)[world.task_index[world.slot_rows[slot]], :3].float()
+            assert torch.equal(shown_goals(world, obs, slot), expected)
+        assert torch.equal(shown_goals(world, obs, 1), shown_goals(world, before, 1))
+        obs = world.step(torch.zeros(16, 52))[0]
+
+
+def test_the_reward_is_that_of_the_new_task() -> None:
+    world = suite_world("ML4", 6, "DISABLED")
+    world.reset(seed=0)
+    world.set_tasks({"CatchUnderarm": pool(world, "CatchUnderarm", 1)})
+    obs, _ = world.reset(seed=0)
+    twin = suite_world("ML4", 6, "DISABLED")
+    assert torch.equal(twin.reset(seed=0)[0], obs)  # the goal is hidden
+    a, b = (play(made, random_actions(world, 10)) for made in (world, twin))
+    assert all((x["reward"][:2] != y["reward"][:2]).all() for x, y in zip(a, b, strict=True))
+    for step in (*a, *b):
+        del step["info/episode/unscaled"], step["info/final_info/episode/unscaled"]
+    assert_same(a, b, slice(2, None))
+
+
+def test_episodes_draw_among_the_new_tasks() -> None:
+    world = suite_world("MT4", 32)
+    world.reset(seed=0)
+    world.set_tasks({name: pool(world, name, 2) for name in SPACE})
+    world.reset()
+    seen = set()
+    for _ in range(6):
+        world.episodes.elapsed = world.max_episode_steps - 1
+        world.step(torch.zeros(32, 52))
+        seen |= set(world.task_index.tolist())
+    assert seen == {0, 1}
+
+
+def test_a_reset_must_follow() -> None:
+    world = suite_world("MT4", 4)
+    world.reset(seed=0)
+    world.set_tasks({"HandOver": pool(world, "HandOver", 1)})
+    with pytest.raises(BidexError, match=r"reset\(\) before step\(\)"):
+        world.step(torch.zeros(4, 52))
+    world.reset()
+    world.step(torch.zeros(4, 52))
+
+
+def test_starts_go_on_with_the_next_episodes() -> None:
+    world = suite_world("MT4", 4, "DISABLED")
+    first, _ = world.reset(seed=0)
+    world.set_tasks({})
+    second, _ = world.reset()
+    assert (first != second).any(dim=1).all()
+    assert world.episodes.number.tolist() == [1] * 4
+
+
+@pytest.mark.parametrize(
+    ("tasks", "message"),
+    [
+        ({"HandOvr": np.zeros((1, 5))}, "Expected a slot among .*got 'HandOvr'"),
+        ({"HandOver": np.zeros((1, 4))}, r"HandOver with shape \(n, 5\), got \(1, 4\)"),
+        ({"HandOver": np.zeros(5)}, r"HandOver with shape \(n, 5\), got \(5,\)"),
+        ({"HandOver": np.zeros((0, 5))}, r"HandOver with shape \(n, 5\), got \(0, 5\)"),
+        ({"TwoCatchUnderarm": np.zeros((2, 5))}, r"TwoCatchUnderarm with shape \(n, 8\)"),
+    ],
+)
+def test_bad_tasks_are_named_and_change_nothing(tasks: dict[str, np.ndarray], message: str) -> None:
+    world = suite_world("MT4", 4)
+    world.reset(seed=0)
+    good = pool(world, "CatchUnderarm", 1)
+    with pytest.raises(BidexError, match=message):
+        world.set_tasks({"CatchUnderarm": good, **tasks})
+    assert world.num_slot_tasks == [50] * 4
+    assert [len(slot.tasks) for slot in world.slots] == [50] * 4
+    world.step(torch.zeros(4, 52))
