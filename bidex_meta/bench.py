@@ -74,7 +74,7 @@ def _paired_steps(full: World, bare: World, steps: int, generator: torch.Generat
         for part in bare.parts:
             part.control(part.group.take(action))
             start = time.perf_counter()
-            part.group.engine.step(bare.substeps)
+            part.group.engine.step(part.substeps)
             bare_time += time.perf_counter() - start
         begun = full.episodes.number != number
         for part, source in zip(bare.parts, full.parts, strict=True):

@@ -15,10 +15,9 @@ _STATE_FIELDS = (
     "time qpos qvel act history qacc_warmstart ctrl qfrc_applied xfrc_applied eq_active mocap_pos mocap_quat userdata"
 )
 _STATE = tuple(_STATE_FIELDS.split())
-_BAD = [
-    int(w)
-    for w in (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
-]
+# A full arena drops contacts or constraints in silence: as broken as a bad number.
+_BAD_NAMES = ("BADQPOS", "BADQVEL", "BADQACC", "CONTACTFULL", "CNSTRFULL")
+_BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_{name}")) for name in _BAD_NAMES]
 
 
 def default_threads() -> int:

@@ -17,6 +17,10 @@ _ROOTS = ((0.033, 0.095), (0.011, 0.099), (-0.011, 0.095), (-0.034, 0.088))
 """x and z of the four fingers' roots in the palm frame, metres, index to little finger (sheet 2.2)."""
 _CUP_LIFT, _CUP_TILT = 0.039, 0.571
 """Metres of root height and radians of bend that a radian of LFJ4 gives the little finger (its axis, sheet 2.3)."""
+_METACARPAL = ((-0.0335, 0.019, 0.040), (-0.0335, 0.033, 0.068))
+"""Ends of the little finger's metacarpal in the palm frame: x and z in metres, between them the height that a radian of
+LFJ4 gives (sheet 2.3, 2.5)."""
+_METACARPAL_RADIUS = 0.0111
 _LENGTHS = (0.045, 0.025, 0.024)
 _RADII = (0.01, 0.00805, 0.00705)
 """Length and radius of proximal, middle and distal capsules, metres (sheet 2.5)."""
@@ -91,18 +95,38 @@ def make_room(joints: Tensor, position: Tensor, axis: Tensor, radius: float, hal
     centre = torch.stack((centre[:, 0], centre[:, 1] - lift, centre[:, 2]), dim=1)
 
     start, along, length = _finger_segments(joints)
-    to_centre = centre[:, None, None] - start
-    t = dot(to_centre, along).clamp(min=0.0).minimum(length)
-    gap_vector = to_centre - t[..., None] * along
-    distance = norm(gap_vector)
-    reach = (radius**2 + square * (dot(gap_vector, axis[:, None, None]) / distance) ** 2).sqrt()
-    touched = (distance - reach - distance.new_tensor(_RADII) < -_SLACK).any(dim=2)
+    gap = _gap(centre[:, None, None], axis[:, None, None], radius, square, start, along, length)
+    touched = (gap - gap.new_tensor(_RADII) < -_SLACK).any(dim=2)
     where = _indices()
     joints = joints.clone()
     for group in (where.base, where.middle, where.distal):
         joints[:, group] = joints[:, group].masked_fill(touched, 0.0)
-    joints[:, where.cup] = joints[:, where.cup].masked_fill(touched[:, -1], 0.0)
+    raised = touched[:, -1] | _meets_metacarpal(joints[:, where.cup], centre, axis, radius, square)
+    joints[:, where.cup] = joints[:, where.cup].masked_fill(raised, 0.0)
     return joints, -lift[:, None] * y_axis
+
+
+def _gap(
+    centre: Tensor, axis: Tensor, radius: float, square: float, start: Tensor, along: Tensor, length: Tensor
+) -> Tensor:
+    """Lower bound of the distance between an egg and line segments, by its support towards the nearest point."""
+    to_centre = centre - start
+    t = dot(to_centre, along).clamp(min=0.0).minimum(length)
+    gap_vector = to_centre - t[..., None] * along
+    distance = norm(gap_vector)
+    reach = (radius**2 + square * (dot(gap_vector, axis) / distance) ** 2).sqrt()
+    return distance - reach
+
+
+def _meets_metacarpal(cup: Tensor, centre: Tensor, axis: Tensor, radius: float, square: float) -> Tensor:
+    """Whether LFJ4, shape (n,), lifts the little finger's metacarpal into an egg. Shape (n,), bool."""
+    low, high = (
+        torch.stack((torch.full_like(cup, x), -rise * cup, torch.full_like(cup, z)), dim=1)
+        for x, rise, z in _METACARPAL
+    )
+    length = norm(high - low)
+    along = (high - low) / length[:, None]
+    return _gap(centre, axis, radius, square, low, along, length) < _METACARPAL_RADIUS - _SLACK
 
 
 def _wrist_z(joints: Tensor) -> Tensor:

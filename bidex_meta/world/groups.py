@@ -77,12 +77,17 @@ def build_groups(slots: list[Slot], rows: list[slice], threads: int | None) -> l
     pools: list[list[int]] = []
     by_slot = [scenes[slot.task_class.name, slot.task_class.moving_base] for slot in slots]
     for i, scene in enumerate(by_slot):
-        home = next((pool for pool in pools if same_structure(by_slot[pool[0]].model, scene.model)), None)
+        home = next((pool for pool in pools if _alike(by_slot[pool[0]], scene)), None)
         if home is None:
             pools.append([i])
         else:
             home.append(i)
     return [_build_group([(i, by_slot[i], rows[i]) for i in pool], threads) for pool in pools]
+
+
+def _alike(a: Scene, b: Scene) -> bool:
+    """Whether two scenes may share an engine and an observer."""
+    return a.task.layout == b.task.layout and same_structure(a.model, b.model)
 
 
 def _build_group(places: list[tuple[int, Scene, slice]], threads: int | None) -> Group:

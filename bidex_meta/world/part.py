@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.maths import xyzw
+from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.world.actions import Controls
 from bidex_meta.world.groups import Group, Member, Slot
@@ -37,10 +38,11 @@ class Part:
 
     Attributes:
         group: The rows and their engine.
+        substeps: Engine steps per control step.
         engine_rows: Engine row of each of the world's rows, -1 where it is not of this part, shape (num_envs,).
     """
 
-    def __init__(self, group: Group, slots: list[Slot], rule: Rule, width: int, substeps: int, num_envs: int) -> None:
+    def __init__(self, group: Group, slots: list[Slot], rule: Rule, width: int, num_envs: int) -> None:
         """Prepares controls and observers.
 
         Args:
@@ -48,12 +50,12 @@ class Part:
             slots: The world's slots.
             rule: What observations show.
             width: Entries of an observation with padding and task id.
-            substeps: Engine steps per control step.
             num_envs: Rows of the world.
         """
         self.engine_rows = torch.full((num_envs,), -1)
         self.engine_rows[group.rows] = torch.arange(group.engine.num)
-        self.group, self._rule, self._substeps = group, rule, substeps
+        self.group, self._rule = group, rule
+        self.substeps = round(1.0 / (CONTROL_RATE * group.members[0].scene.model.opt.timestep))
         self._engine = group.engine
         self._controls = Controls(group)
         self._start = torch.stack([torch.from_numpy(m.scene.start_qpos) for m in group.members])
@@ -86,7 +88,7 @@ class Part:
     def step(self, action: Tensor, active: Tensor | None) -> None:
         """Applies actions, shape (num, a), and advances all rows, or those of the mask, by one control step."""
         self.control(action)
-        self._engine.step(self._substeps, active)
+        self._engine.step(self.substeps, active)
 
     def states(self, task_index: Tensor, rows: Tensor | None = None) -> Iterator[tuple[Member, slice, TaskState]]:
         """The members that have rows here, the rows' place among the chosen ones, and their state.

@@ -99,10 +99,8 @@ class World(VectorEnv):
         self._scale = torch.tensor([slot.reward_scale for slot in slots], dtype=torch.float32)[self.task_id]
         self._uniform_tasks = task_sampling == "uniform"
         groups = build_groups(self.slots, self.slot_rows, threads)
-        timestep = groups[0].engine.batch.get_model(0).opt.timestep
-        self.substeps = round(1.0 / (CONTROL_RATE * timestep))
         self._make_spaces(observation, pad_to)
-        self.parts = [Part(g, self.slots, observation, self.observation_size, self.substeps, num_envs) for g in groups]
+        self.parts = [Part(g, self.slots, observation, self.observation_size, num_envs) for g in groups]
         self.episodes = Episodes.fresh(num_envs, self.device)
         self._index_in_slot = torch.cat([torch.arange(rows.stop - rows.start) for rows in self.slot_rows])
         self._set_pool_sizes()
