@@ -279,7 +279,7 @@ def test_list_suites_and_algos_as_json(capsys):
 
 
 def test_bench_hands_on_the_flags_that_were_given(monkeypatch, capsys):
-    def world(suite, num_envs=7, threads=None):
+    def world(suite="MT4", num_envs=7, threads=None):
         return {"suite": suite, "num_envs": num_envs, "ratio": 0.93}
 
     fake = SimpleNamespace(world=world)
