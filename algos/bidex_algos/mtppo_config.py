@@ -10,7 +10,7 @@ from bidex_meta.errors import BidexError
 class MTPPOConfig:
     """Everything that can be set about MT-PPO; the defaults are the preset ``laptop``."""
 
-    hidden: tuple[int, ...] = (512, 256, 128)
+    hidden: tuple[int, ...] = (256, 256, 128)
     """Widths of the hidden layers, of actor and critic alike."""
     activation: Activation = "elu"
     """Non-linearity of the hidden layers."""
@@ -20,7 +20,7 @@ class MTPPOConfig:
     """Standard deviation of the actions at the start."""
     std_range: tuple[float, float] = (0.05, 1.5)
     """Bounds of the standard deviation of the actions."""
-    rollout_steps: int = 16
+    rollout_steps: int = 8
     """Steps taken in every row between two updates."""
     num_minibatches: int = 4
     """Mini-batches per epoch; each holds shuffled steps of all rows."""
@@ -28,7 +28,7 @@ class MTPPOConfig:
     """Passes over the rollout per update."""
     clip: float = 0.2
     """How far the likelihood ratio may leave 1 before it earns nothing more."""
-    gamma: float = 0.98
+    gamma: float = 0.93
     """Discount per step."""
     lam: float = 0.95
     """Trace decay of the advantage estimate."""
@@ -36,11 +36,11 @@ class MTPPOConfig:
     """Adam's step size at the start."""
     adaptive_learning_rate: bool = True
     """Divide the step size by 1.5 when the KL exceeds twice desired_kl, multiply it when below half."""
-    desired_kl: float = 0.016
+    desired_kl: float = 0.03
     """KL of the sampling policy from the current one that the adaptive step size aims at."""
     learning_rate_range: tuple[float, float] = (1e-5, 1e-2)
     """Bounds of the adaptive step size."""
-    critic_learning_rate: float | None = None
+    critic_learning_rate: float | None = 1e-3
     """A fixed step size for the critic; None makes it follow the actor's."""
     value_loss_weight: float = 2.0
     """Factor of the value loss. Adam undoes it; it matters only beside max_grad_norm."""
@@ -93,6 +93,7 @@ PRESETS: dict[str, MTPPOConfig] = {
         lam=0.95,
         learning_rate=3e-4,
         desired_kl=0.016,
+        critic_learning_rate=None,
         value_loss_weight=2.0,
         entropy_weight=0.0,
         max_grad_norm=1.0,
