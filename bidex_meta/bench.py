@@ -80,7 +80,7 @@ def _paired_steps(full: World, bare: World, steps: int, generator: torch.Generat
         for part, source in zip(bare.parts, full.parts, strict=True):
             mask = part.group.take(begun)
             if mask.any():
-                part.group.engine.reset(mask, source.group.engine.qpos[mask])
+                part.group.engine.reset(mask, source.group.engine.placement()[mask])
     return full_time, bare_time
 
 
@@ -193,7 +193,7 @@ def _stability(made: World, steps: int, seed: int) -> dict[str, Any]:
 
 
 def _is_speed(sensor: str) -> bool:
-    return sensor.endswith("/linear_velocity") and sensor.startswith("object")
+    return sensor.endswith("/linear_velocity")
 
 
 def _rough_actions(held: Tensor, left: Tensor, generator: torch.Generator) -> Tensor:

@@ -52,6 +52,7 @@ class CpuEngine:
         self.qpos, self.qvel, self.ctrl = (self._state[n] for n in ("qpos", "qvel", "ctrl"))
         self.xfrc_applied = self._state["xfrc_applied"]
         self.sensordata = self._bind("sensordata")
+        self._mocap = [self._state[name] for name in ("mocap_pos", "mocap_quat") if name in self._state]
         self._failed = torch.zeros(self.num, dtype=torch.bool)
 
     def _bind(self, name: str) -> Tensor:
@@ -74,12 +75,22 @@ class CpuEngine:
         # One non-finite addend makes the sum non-finite.
         return bad | self._failed | ~self.sensordata.sum(dim=1).isfinite()
 
-    def reset(self, mask: Tensor, qpos: Tensor) -> None:
+    def placement(self) -> Tensor:
+        """What ``reset`` takes, of every simulation as it stands, a copy. Shape (num, nq + 7 nmocap)."""
+        if not self._mocap:
+            return self.qpos.clone()
+        return torch.cat((self.qpos, torch.cat(self._mocap, dim=2).flatten(1)), dim=1)
+
+    def reset(self, mask: Tensor, start: Tensor) -> None:
         """Starts the simulations of a mask anew, at rest, at given positions (one row per true entry)."""
         ids = mask.numpy()
         self.batch.reset(ids=ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         self._failed[mask] = False
-        self.qpos[mask] = qpos.to(self.qpos.dtype)
+        start, nq = start.to(self.qpos.dtype), self.qpos.shape[1]
+        self.qpos[mask] = start[:, :nq]
+        if self._mocap:
+            position, quaternion = start[:, nq:].unflatten(1, (-1, 7)).split((3, 4), dim=2)
+            self._mocap[0][mask], self._mocap[1][mask] = position, quaternion
         self.batch.forward(ids=ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
 
     def state_dict(self) -> dict[str, Tensor]:

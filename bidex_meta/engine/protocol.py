@@ -36,16 +36,21 @@ class Engine(Protocol):
         """
         ...
 
+    def placement(self) -> Tensor:
+        """What ``reset`` takes, of every simulation as it stands, a copy. Shape (num, nq + 7 nmocap)."""
+        ...
+
     def unstable(self) -> Tensor:
         """Which simulations broke (bad numbers or non-finite values) since their last reset. Shape (num,), bool."""
         ...
 
-    def reset(self, mask: Tensor, qpos: Tensor) -> None:
+    def reset(self, mask: Tensor, start: Tensor) -> None:
         """Starts the simulations of a mask (num,) anew.
 
         Args:
             mask: Which simulations, shape (num,), bool.
-            qpos: Their start positions: one row for each true entry on a CPU engine.
+            start: Their start positions, shape (k, nq + 7 nmocap): ``qpos``, then position and quaternion (w, x, y, z)
+                of each fixture that may stand elsewhere from task to task; one row for each true entry on a CPU engine.
         """
         ...
 

@@ -13,6 +13,17 @@ PALM_UP_AWAY = (0.0, 0.0, 0.0)
 PALM_UP_BACK = (0.0, 0.0, math.pi)
 """Pose B: fingers to +y, palm up; faces a hand in pose A."""
 
+PALM_LEFT_AHEAD = (math.pi, 0.5 * math.pi, 0.5 * math.pi)
+"""Pose C: fingers to -x, palm to -y, thumb up: a right hand that faces a left one (the sheet's 1.57 made exact)."""
+PALM_RIGHT_AHEAD = (math.pi, -0.5 * math.pi, 0.5 * math.pi)
+"""Pose D: fingers to -x, palm to +y, thumb down."""
+PALM_DOWN_AHEAD = (math.pi, 0.0, 0.5 * math.pi)
+"""Pose E: fingers to -x, palm down."""
+PALM_DOWN_AWAY = (math.pi, 0.0, math.pi)
+"""Pose F: fingers to -y, palm down."""
+PALM_DOWN_BACK = (math.pi, 0.0, 0.0)
+"""Pose G: fingers to +y, palm down; faces a hand in pose F."""
+
 
 @dataclass(frozen=True)
 class HandPose:

@@ -148,6 +148,11 @@ def goal_blocks(name: str) -> tuple[Block, ...]:
     )
 
 
+def point_block(name: str, sensor: str, description: str) -> Block:
+    """A point that moves with an object: its position (3 entries), read from one sensor."""
+    return Block(name, 3, (sensor,), description=f"{description}, world frame, m")
+
+
 def both_hands(moving: bool) -> tuple[Block, ...]:
     """Table 7: 398 entries with moving bases, 374 with fixed ones."""
     return tuple(block for side in SIDES for block in hand_blocks(side, moving))

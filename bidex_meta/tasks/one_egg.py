@@ -8,7 +8,7 @@ from torch import Tensor
 from bidex_meta.tasks import eggs
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks
-from bidex_meta.tasks.scene import FreeObject
+from bidex_meta.tasks.scene import SceneObject
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace, box, join, orientation
 
@@ -47,7 +47,7 @@ class OneEgg(TaskClass):
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
         """One egg."""
-        FreeObject("object", "egg", self.egg_start).add_to(scene)
+        SceneObject("object", "egg", self.egg_start).add_to(scene)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """``goal``: the goal pose, (n, 7); ``goal_inverse``: the inverse of its rotation, (n, 4)."""

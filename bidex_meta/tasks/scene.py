@@ -10,26 +10,35 @@ import numpy as np
 from bidex_meta import paths
 from bidex_meta.hands.hand import hand
 from bidex_meta.hands.pair import FIXTURE, OBJECT, SIDES, add_hands, damp_bases, set_contact_bits
+from bidex_meta.maths import quaternion_from_rpy
 
 if TYPE_CHECKING:
     from bidex_meta.tasks.base import TaskClass
 
 
 @dataclass(frozen=True)
-class FreeObject:
-    """A free body of a scene.
+class SceneObject:
+    """An object of a scene: a free body, or a fixture whose place differs from task to task (a mocap body).
 
     Attributes:
         name: Prefix of its sensors and joints in the scene.
-        asset: File under assets/objects/ without its ending; its body is called ``object``, its joint ``free``.
+        asset: File under assets/objects/ without its ending. Its body is called ``object``; the joint of a free one is
+            called ``free``.
         position: Nominal start in the world, metres.
-        colour: Red, green, blue, alpha of its material, or None to keep the asset's.
+        rpy: Nominal roll, pitch, yaw, radians; R = Rz(yaw) Ry(pitch) Rx(roll).
+        colour: Red, green, blue, alpha of its materials, or None to keep the asset's.
     """
 
     name: str
     asset: str
     position: tuple[float, float, float]
+    rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
     colour: tuple[float, float, float, float] | None = None
+
+    @property
+    def quaternion(self) -> tuple[float, float, float, float]:
+        """Nominal orientation (w, x, y, z)."""
+        return quaternion_from_rpy(self.rpy)
 
     def add_to(self, scene: mujoco.MjSpec) -> None:
         """Puts the object into a scene at its nominal start."""
@@ -38,8 +47,41 @@ class FreeObject:
         if self.colour is not None:
             for material in part.materials:
                 material.rgba = self.colour
-        part.body("object").pos = self.position
+        part.body("object").pos, part.body("object").quat = self.position, self.quaternion
         scene.attach(part, prefix=f"{self.name}/", frame=scene.worldbody.add_frame())
+
+
+def add_table(
+    scene: mujoco.MjSpec,
+    size: tuple[float, float, float],
+    centre: tuple[float, float, float],
+    friction: float = 1.0,
+    priority: int = 0,
+) -> None:
+    """Adds a fixed box, the table of a task.
+
+    Args:
+        scene: The scene.
+        size: Full edge lengths, metres.
+        centre: Its centre in the world, metres.
+        friction: Sliding friction.
+        priority: Above 0 the table's friction rules every contact with it; else the larger friction of a pair does.
+    """
+    floor = scene.geom("floor")
+    scene.worldbody.add_geom(
+        name="table",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=[0.5 * edge for edge in size],
+        pos=centre,
+        material="table",
+        friction=[friction, 0.005, 0.001],
+        priority=priority,
+        contype=floor.contype,
+        conaffinity=floor.conaffinity,
+        margin=floor.margin,
+        solref=floor.solref,
+        solimp=floor.solimp,
+    )
 
 
 @dataclass(frozen=True)
@@ -50,7 +92,9 @@ class Scene:
         task: The class whose scene it is.
         model: The compiled model.
         sensors: Sensor name to its slice of ``sensordata``.
-        qpos: ``right/base`` (7, moving only), ``right/joints`` (24), ``left/...`` and each object (7) to its slice.
+        qpos: Name of a part to its slice of a start (``qpos``, then the poses of movable fixtures): ``right/base`` (7,
+            moving only), ``right/joints`` (24), ``left/...``, each free object or movable fixture (7) by its name, and
+            each joint of an object (1) by its full name, e.g. ``bottle/slide``.
         base_bodies: Body ids of the two bases, right and left.
     """
 
@@ -67,7 +111,7 @@ class Scene:
 
     @cached_property
     def qpos(self) -> dict[str, slice]:
-        """Name of a part to its slice of ``qpos``."""
+        """Name of a part to its slice of a start."""
         found: dict[str, slice] = {}
         for side in SIDES:
             first = self.model.joint(f"{side}/{hand().joints[0]}").qposadr[0]
@@ -78,7 +122,18 @@ class Scene:
                 part = joint.name.removesuffix("/free")
                 name = f"{part}/base" if part in SIDES else part
                 found[name] = slice(joint.qposadr[0], joint.qposadr[0] + 7)
+            elif joint.name.partition("/")[0] not in SIDES:
+                found[joint.name] = slice(joint.qposadr[0], joint.qposadr[0] + 1)
+        for i, body in enumerate(self._mocap_bodies):
+            first = self.model.nq + 7 * i
+            found[self.model.body(body).name.removesuffix("/object")] = slice(first, first + 7)
         return found
+
+    @cached_property
+    def _mocap_bodies(self) -> list[int]:
+        """Body ids of the movable fixtures, in the order of ``mocap_pos``."""
+        place = self.model.body_mocapid
+        return sorted((i for i in range(self.model.nbody) if place[i] >= 0), key=lambda i: place[i])
 
     @cached_property
     def base_bodies(self) -> tuple[int, int]:
@@ -88,8 +143,9 @@ class Scene:
 
     @cached_property
     def start_qpos(self) -> np.ndarray:
-        """Positions at the nominal start, all hand joints zero. Shape (nq,)."""
-        return self.model.qpos0.copy()
+        """The nominal start, all hand joints zero. Shape (nq + 7 nmocap,)."""
+        fixtures = [np.concatenate((self.model.body_pos[i], self.model.body_quat[i])) for i in self._mocap_bodies]
+        return np.concatenate((self.model.qpos0, *fixtures))
 
 
 def build_spec(task: "TaskClass") -> mujoco.MjSpec:

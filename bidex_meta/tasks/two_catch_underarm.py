@@ -7,7 +7,7 @@ from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
 from bidex_meta.tasks import eggs
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks
-from bidex_meta.tasks.scene import FreeObject
+from bidex_meta.tasks.scene import SceneObject
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace, box, join, orientation
 
@@ -47,8 +47,8 @@ class TwoCatchUnderarm(TaskClass):
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
         """Two eggs: the first on the right hand, the second, of another colour, on the left."""
-        FreeObject("object1", "egg", (0.0, -0.39, 0.54)).add_to(scene)
-        FreeObject("object2", "egg", (0.0, -0.78, 0.54), colour=(0.45, 0.62, 0.30, 1.0)).add_to(scene)
+        SceneObject("object1", "egg", (0.0, -0.39, 0.54)).add_to(scene)
+        SceneObject("object2", "egg", (0.0, -0.78, 0.54), colour=(0.45, 0.62, 0.30, 1.0)).add_to(scene)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """``goal1``, ``goal2``: poses (n, 7); ``..._inverse``: inverses of their rotations (n, 4)."""

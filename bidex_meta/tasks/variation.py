@@ -47,6 +47,11 @@ def join(*parts: VariationSpace) -> VariationSpace:
     )
 
 
+def component(name: str, low: float, high: float) -> VariationSpace:
+    """A space of one number."""
+    return VariationSpace((name,), (low,), (high,))
+
+
 def box(prefix: str, centre: tuple[float, float, float], half: float) -> VariationSpace:
     """A cube of positions around a centre: components ``<prefix>_x``, ``_y``, ``_z`` in metres."""
     return VariationSpace(

@@ -40,6 +40,7 @@ class Part:
         group: The rows and their engine.
         substeps: Engine steps per control step.
         engine_rows: Engine row of each of the world's rows, -1 where it is not of this part, shape (num_envs,).
+        start_size: Numbers of a start: ``qpos`` and the poses of movable fixtures.
     """
 
     def __init__(self, group: Group, slots: list[Slot], rule: Rule, width: int, num_envs: int) -> None:
@@ -59,6 +60,7 @@ class Part:
         self._engine = group.engine
         self._controls = Controls(group)
         self._start = torch.stack([torch.from_numpy(m.scene.start_qpos) for m in group.members])
+        self.start_size = self._start.shape[1]
         self._observer = Observer(group.members[0].scene, self._start_mounts(), width)
         self._pools: list[dict[str, Tensor]] = []
         self.set_pools(slots)
@@ -153,14 +155,14 @@ class Part:
         return clip(values)
 
     def starts(self, rows: Tensor, draws: Tensor, task_index: Tensor) -> Tensor:
-        """Start positions of episodes, shape (n, nq): a pure function of the draws and the tasks.
+        """Start positions of episodes, shape (n, start_size): a pure function of the draws and the tasks.
 
         Args:
             rows: Engine rows in ascending order, shape (n,).
             draws: Their uniform numbers in [-1, 1], shape (n, at least the classes' start_draws).
             task_index: Their tasks, shape (n,).
         """
-        qpos = self._engine.qpos.new_empty(len(rows), self._start.shape[1])
+        qpos = self._engine.qpos.new_empty(len(rows), self.start_size)
         for i, member, where, _ in self._places(rows):
             qpos[where] = self._start[i]
             views = {name: qpos[where, place] for name, place in member.scene.qpos.items()}

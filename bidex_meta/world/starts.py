@@ -38,7 +38,7 @@ class Starts:
         self._first = torch.full((num,), -_AHEAD)
         self._task_index = torch.zeros(num, _AHEAD, dtype=torch.int64)
         self._elapsed_share = torch.zeros(num, _AHEAD, dtype=torch.float64)
-        self._qpos = [torch.zeros(p.group.engine.num, _AHEAD, p.group.engine.qpos.shape[1]).double() for p in parts]
+        self._qpos = [torch.zeros(p.group.engine.num, _AHEAD, p.start_size).double() for p in parts]
 
     def take(self, mask: Tensor, number: Tensor, task_index: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
         """The starts of the mask's rows.
@@ -49,8 +49,8 @@ class Starts:
             task_index: Task that every row keeps where none is drawn, shape (n,).
 
         Returns:
-            Task of every row (n,), elapsed share in [0, 1) of every row (n,), and for each part the positions (k, nq)
-            of its k rows in the mask; the former two are valid where the mask is true.
+            Task of every row (n,), elapsed share in [0, 1) of every row (n,), and for each part the starts
+            (k, start_size) of its k rows in the mask; the former two are valid where the mask is true.
         """
         place = number - self._first
         if ((place >= _AHEAD) & mask).any():

@@ -1,0 +1,53 @@
+"""Where objects stand at the start: what a task freezes and what an episode adds.
+
+A task freezes the shift of each table object or fixture from its nominal place; an episode adds a small jitter. Turns
+are about the world's vertical through the object's own origin.
+"""
+
+import torch
+from torch import Tensor
+
+from bidex_meta.maths import multiply, wxyz, xyzw
+from bidex_meta.tasks.variation import VariationSpace
+
+SHIFT = 0.03
+"""Half width of a task's shift along x and y, metres (design.md section 4)."""
+TURN = 0.2617993877991494
+"""Half width of a task's turn, radians: 15 degrees."""
+JITTER = 0.005
+"""Half width of an episode's additional shift, metres."""
+JITTER_TURN = 0.05
+"""Half width of an episode's additional turn, radians."""
+DRAWS = 3
+"""Uniform numbers that an episode draws for an object that it jitters: x, y, turn."""
+
+
+def placed(name: str, shift: float = SHIFT, turn: float = TURN) -> VariationSpace:
+    """An object's shift and turn as components ``<name>_x``, ``<name>_y`` (metres) and ``<name>_yaw`` (radians)."""
+    half = (shift, shift, turn)
+    return VariationSpace((f"{name}_x", f"{name}_y", f"{name}_yaw"), tuple(-h for h in half), half)
+
+
+def yaw_quaternion(yaw: Tensor) -> Tensor:
+    """Turns about z as quaternions (x, y, z, w), shape (n, 4), rounded to single precision.
+
+    Sines of a vector unit and of its scalar tail may differ in the last bit of double precision, and a row's start must
+    not depend on its place in a batch.
+    """
+    half, zero = 0.5 * yaw, torch.zeros_like(yaw)
+    return torch.stack((zero, zero, half.sin(), half.cos()), dim=-1).float().to(yaw.dtype)
+
+
+def place(pose: Tensor, frozen: Tensor, draws: Tensor | None = None) -> None:
+    """Shifts and turns objects from their nominal place.
+
+    Args:
+        pose: Positions and quaternions (w, x, y, z) of a start, shape (n, 7), nominal; written in place.
+        frozen: The tasks' x, y (metres) and yaw (radians), shape (n, 3).
+        draws: Uniform numbers in [-1, 1] for the episodes' jitter, shape (n, 3); None for a fixture, which has none.
+    """
+    shift = frozen
+    if draws is not None:
+        shift = frozen + draws * draws.new_tensor((JITTER, JITTER, JITTER_TURN))
+    pose[:, :2] += shift[:, :2]
+    pose[:, 3:] = wxyz(multiply(yaw_quaternion(shift[:, 2]), xyzw(pose[:, 3:])))
