@@ -272,7 +272,7 @@ def _make_world(
 
 def _task_class(suite: Suite, entry: SuiteClass) -> "TaskClass":
     try:
-        task_class = registry.get(entry.name, moving_base=True if suite.base == "moving" else None)
+        task_class = registry.get(entry.name, True if suite.base == "moving" else None, **entry.options)
         for task in entry.tasks:
             for component in task.fixed:
                 if component not in task_class.variation_space.names:

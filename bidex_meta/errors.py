@@ -19,4 +19,4 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> BidexError:
     names = sorted(known)
     near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.4)
     hint = f" Did you mean {near[0]!r}?" if near else ""
-    return BidexError(f"Unknown {kind} {name!r}.{hint} Known: {', '.join(names)}.")
+    return BidexError(f"Unknown {kind} {name!r}.{hint} Known: {', '.join(names) or 'none'}.")

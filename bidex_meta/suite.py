@@ -43,6 +43,8 @@ class SuiteClass:
     """Factor on the reward the learner sees."""
     tasks: tuple[ListedTask, ...]
     """Listed tasks; empty where the tasks are drawn."""
+    options: Mapping[str, float]
+    """What else the class lets one choose, by the names of its constructor's arguments."""
 
 
 @dataclass(frozen=True)
@@ -137,11 +139,21 @@ def _parse_class(table: "_Table") -> SuiteClass:
         splits=SPLITS if split == "both" else (cast(Split, split),),
         reward_scale=table.number("reward_scale", default=1.0),
         tasks=tuple(_parse_task(task) for task in table.tables("tasks", default=())),
+        options=MappingProxyType(_parse_options(table) if "options" in table.content else {}),
     )
     table.finish()
     if entry.reward_scale <= 0.0:
         raise table.error("reward_scale", "a number above 0", entry.reward_scale)
     return entry
+
+
+def _parse_options(table: "_Table") -> dict[str, float]:
+    options = table.table("options")
+    # A whole number stays one: it may count something.
+    return {
+        key: options.number(key) if isinstance(options.content[key], float) else options.count(key)
+        for key in options.content
+    }
 
 
 def _parse_task(table: "_Table") -> ListedTask:

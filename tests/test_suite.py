@@ -4,6 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import BidexError
 from bidex_meta.suite import load_suite, suite_names
 from bidex_meta.tasks import registry
@@ -60,7 +61,7 @@ def write(folder: Path, text: str) -> Path:
 
 
 def test_shipped_suites() -> None:
-    assert suite_names() == ["ML1", "ML1-wide", "ML4", "MT1", "MT4"]
+    assert suite_names() == ["ML1", "ML1-wide", "ML20", "ML4", "MT1", "MT20", "MT4"]
 
 
 @pytest.mark.parametrize("name", suite_names())
@@ -80,6 +81,31 @@ def test_composition_of_mt4_and_ml4() -> None:
     assert mt4.tasks_per_class == ml4.tasks_per_class == 50
 
 
+def test_composition_of_mt20_and_ml20() -> None:
+    """Appendix, section D: eleven classes at a tenth of their reward, five held out."""
+    mt20, ml20 = load_suite("MT20"), load_suite("ML20")
+    assert {c.name for c in mt20.classes} == set(registry.names()) and len(mt20.classes) == 20
+    scaled = """GraspAndPlace DoorOpenOutward DoorOpenInward BottleCap StackBlock DoorCloseInward DoorCloseOutward
+        LiftUnderarm ReOrientation OpenScissors SwingCup"""
+    for suite in (mt20, ml20):
+        assert {c.name for c in suite.classes if c.reward_scale == 0.1} == set(scaled.split())
+        assert {c.reward_scale for c in suite.classes} == {0.1, 1.0}
+    held_out = {"DoorCloseOutward", "HandOver", "LiftUnderarm", "OpenScissors", "TwoCatchUnderarm"}
+    assert {c.name for c in ml20.split_classes("test")} == held_out
+    assert {c.name for c in ml20.split_classes("train")} == set(registry.names()) - held_out
+    assert mt20.tasks_per_class == ml20.tasks_per_class == 50
+
+
+def test_a_class_takes_its_options(tmp_path: Path) -> None:
+    head = META[: META.index("[[classes]]")].replace("meta", "multi-task")
+    text = head + '[[classes]]\nname = "PourWater"\noptions = { water = 30 }\n'
+    suite = load_suite(write(tmp_path, text))
+    assert dict(suite.classes[0].options) == {"water": 30}
+    assert Benchmark(suite.file).train_classes["PourWater"].water == 30  # type: ignore[attr-defined]
+    with pytest.raises(BidexError, match=r"Unknown option of PourWater 'watr'\. Did you mean 'water'"):
+        Benchmark(write(tmp_path, text.replace("water =", "watr =")))
+
+
 @pytest.mark.parametrize(("name", "distance"), [("MT1", 0.03), ("ML1", 0.03), ("ML1-wide", 0.12)])
 def test_listed_goals(name: str, distance: float) -> None:
     (entry,) = load_suite(name).classes
@@ -95,7 +121,7 @@ def test_listed_goals(name: str, distance: float) -> None:
 
 
 def test_unknown_name_names_the_nearest_and_all() -> None:
-    with pytest.raises(BidexError, match=r"Did you mean 'MT4'\? Known: ML1, ML1-wide, ML4, MT1, MT4"):
+    with pytest.raises(BidexError, match=r"Did you mean 'MT4'\? Known: ML1, ML1-wide, ML20, ML4, MT1, MT20, MT4"):
         load_suite("MT44")
 
 
@@ -195,7 +221,7 @@ def test_readme_explains_every_key() -> None:
     from bidex_meta.paths import suites_dir
 
     readme = (suites_dir() / "README.md").read_text(encoding="utf-8")
-    for key in [*KEYS[:-1], "description", "split", "reward_scale", "tasks", "fixed"]:
+    for key in [*KEYS[:-1], "description", "split", "reward_scale", "options", "tasks", "fixed"]:
         assert f"| `{key}` |" in readme
     for name in suite_names():
         assert f"| {name} |" in readme

@@ -18,6 +18,9 @@ COMMANDS: dict[str, Command] = {
     "evaluate": Command("bidex_meta.commands.evaluate", "success and return of a trained run, per task class"),
     "list": Command("bidex_meta.commands.list", "the suites, tasks or algos there are"),
     "render": Command("bidex_meta.commands.render", "a picture or a film of a task"),
+    "witness": Command("bidex_meta.commands.witness", "find or replay actions that solve a task"),
+    "baseline": Command("bidex_meta.commands.baseline", "measure the references of the normalised score"),
+    "gallery": Command("bidex_meta.commands.gallery", "write the page that shows every task"),
     "plot": Command("bidex_meta.commands.plot", "learning curves of a run, as a picture"),
     "bench": Command("bidex_meta.commands.bench", "measure speed, scaling or stability of the world"),
 }

@@ -11,20 +11,20 @@ import tyro
 from bidex_meta.commands.parsing import StepCount, Switch, parse
 from bidex_meta.errors import BidexError, unknown_name
 
-_KINDS = ("world", "scaling", "stability")
+_KINDS = ("world", "scaling", "mixing", "stability")
 
 
 @dataclass(frozen=True)
 class BenchFlags:
-    """Measure the world: its speed against bare physics, its scaling over threads, or the physics' stability.
+    """Measure the world: its speed against bare physics, over threads, against its classes alone, or its stability.
 
     Example: bidex-meta bench world --suite MT4 --num-envs 1024 --json
     """
 
-    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="world|scaling|stability")]
-    """world, scaling or stability."""
+    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="world|scaling|mixing|stability")]
+    """world, scaling, mixing or stability."""
     suite: str | None = None
-    """Suite to measure: world and scaling take MT4 by default, stability every task class there is."""
+    """Suite to measure: by default world and scaling take MT4, mixing MT20, stability every task class there is."""
     task: str | None = None
     """For stability: this task class alone."""
     num_envs: int | None = None

@@ -44,6 +44,7 @@ def main(arguments: Sequence[str]) -> None:
     from bidex_meta.commands.tables import evaluation_table, print_table
     from bidex_meta.evaluate import RandomAgent, compare, evaluate
     from bidex_meta.record import RunFolder
+    from bidex_meta.references import references
 
     folder = RunFolder.open(flags.run)
     config = {**folder.config(), "device": resolve_device(flags.device)}
@@ -51,10 +52,12 @@ def main(arguments: Sequence[str]) -> None:
     policy, step = worlds.load_policy(folder, config["device"])
     world = worlds.evaluation_world(config, flags.split, flags.num_envs)
     seed = worlds.EVALUATION_SEED if flags.seed is None else flags.seed
-    found = evaluate(policy, world, flags.episodes, seed=seed)
+    # Both references are of moving bases, as suites have them.
+    known = references() if config["suite"] is not None else {}
+    found = evaluate(policy, world, flags.episodes, seed=seed, references=known)
     random = None
     if flags.random:
-        random = evaluate(RandomAgent(world.action_space), world, flags.episodes, seed=seed)
+        random = evaluate(RandomAgent(world.action_space), world, flags.episodes, seed=seed, references=known)
     world.close()
     if not flags.json:
         title = f"{config['algo']} on {config['suite'] or config['task']}, {flags.split} tasks, {step:,} steps"

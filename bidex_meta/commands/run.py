@@ -68,12 +68,15 @@ def _evaluate(plan: RunPlan, folder: Any, learner: Any) -> None:
     from bidex_meta.commands.tables import evaluation_table, print_table
     from bidex_meta.evaluate import RandomAgent, evaluate
     from bidex_meta.record.atomic import write_json
+    from bidex_meta.references import references
 
     _say(f"Evaluating: {plan.flags.episodes} episodes of each task, and as many of a random policy.")
     world = worlds.evaluation_world(plan.config)
     seed, episodes = worlds.EVALUATION_SEED, plan.flags.episodes
-    trained = evaluate(learner, world, episodes, seed=seed)
-    random = evaluate(RandomAgent(world.action_space), world, episodes, seed=seed)
+    # Both references are of moving bases, as suites have them.
+    known = references() if plan.config["suite"] is not None else {}
+    trained = evaluate(learner, world, episodes, seed=seed, references=known)
+    random = evaluate(RandomAgent(world.action_space), world, episodes, seed=seed, references=known)
     world.close()
     write_json(folder.path / "evaluation.json", {"policy": trained.to_json(), "random": random.to_json()})
     title = f"{plan.config['algo']} on {plan.config['suite'] or plan.config['task']}, {learner.env_steps:,} steps"

@@ -1,6 +1,7 @@
 """What a task class is: one scene, one variation space, one reward formula, one success test."""
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import ClassVar
 
 import mujoco
@@ -12,6 +13,20 @@ from bidex_meta.tasks.layout import Layout
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace
 
+
+@dataclass(frozen=True)
+class Solver:
+    """What a class asks of the contact solver beyond the common profile (bidex_meta/hands/README.md)."""
+
+    iterations: int = 10
+    """Newton iterations at most."""
+    line_search: int = 20
+    """Steps of a line search at most."""
+    integrator: mujoco.mjtIntegrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+
+
+FIRM = Solver(100, 50)
+"""For light bodies between hands and table: with the common caps the solver stops early and kicks them."""
 CONTROL_RATE = 60
 """Control steps per second of every class (sheet 1.1)."""
 
@@ -25,6 +40,9 @@ class TaskClass(ABC):
     Attributes:
         name: Name of the class, e.g. ``CatchUnderarm``.
         summary: What it asks for, one line.
+        formula: The printed reward, in the words of the reward terms' docstring.
+        solved: When it counts as solved, one line.
+        deviations: What differs from the appendix on purpose, a line each.
         episode_steps: Time limit, control steps.
         right: Start pose of the right hand.
         left: Start pose of the left hand.
@@ -32,12 +50,16 @@ class TaskClass(ABC):
         orientation_scale: Scale of the base torques.
         start_draws: How many uniform numbers the start of an episode takes.
         moving_base: Whether the hands' bases are driven (52 actions) or fixed (40).
+        solver: What the class asks of the contact solver.
         camera_target: Point that pictures look at, world, metres.
         camera_distance: Distance of the camera from it, metres.
     """
 
     name: ClassVar[str]
     summary: ClassVar[str]
+    formula: ClassVar[str]
+    solved: ClassVar[str]
+    deviations: ClassVar[tuple[str, ...]] = ()
     episode_steps: ClassVar[int]
     right: ClassVar[HandPose]
     left: ClassVar[HandPose]
@@ -45,6 +67,7 @@ class TaskClass(ABC):
     orientation_scale: ClassVar[float]
     start_draws: ClassVar[int]
     moves_by_default: ClassVar[bool] = True
+    solver: ClassVar[Solver] = Solver()
     camera_target: ClassVar[tuple[float, float, float]] = (0.0, -0.58, 0.5)
     camera_distance: ClassVar[float] = 1.15
 

@@ -42,19 +42,23 @@ def start_egg(qpos: Tensor, draws: Tensor, noise: float) -> None:
     qpos[:, 3:] = wxyz(random_orientation(draws[:, 3], draws[:, 4]))
 
 
-def lay_egg_on_hand(egg: Tensor, joints: Tensor, pose: HandPose) -> None:
-    """Lifts an egg off the palm it lies on and opens the fingers that would stick in it.
+def lay_egg_on_hand(
+    egg: Tensor, joints: Tensor, pose: HandPose, radius: float = RADIUS, half: float = HALF_LENGTH
+) -> None:
+    """Lifts an egg, or what a spheroid bounds, off the palm it lies on and opens the fingers that would stick in it.
 
     Args:
         egg: The egg's positions (n, 7), written in place.
         joints: That hand's joint angles (n, 24), written in place.
         pose: Start pose of that hand.
+        radius: Short semi-axis, metres.
+        half: Long semi-axis, metres.
     """
     quaternion = xyzw(egg.new_tensor(pose.quaternion))
     inverse = conjugate(quaternion)
     position = rotate(inverse, egg[:, :3] - egg.new_tensor(pose.position))
     axis = rotate(inverse, rotate(xyzw(egg[:, 3:]), egg.new_tensor((0.0, 0.0, 1.0))))
-    opened, shift = make_room(joints, position, axis, RADIUS, HALF_LENGTH)
+    opened, shift = make_room(joints, position, axis, radius, half)
     joints.copy_(opened.float())
     egg[:, :3] += rotate(quaternion, shift).float()
 

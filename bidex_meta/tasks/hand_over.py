@@ -12,6 +12,7 @@ class HandOver(OneEgg):
 
     name = "HandOver"
     summary = "Throw an egg from the right palm to the left one across a narrow gap"
+    deviations = ("In a suite its bases move like CatchUnderarm's (52 actions); on its own they are fixed (40).",)
     episode_steps = 75
     moves_by_default = False
     right = HandPose((0.0, 0.0, 0.5), PALM_UP_AWAY)

@@ -26,6 +26,8 @@ class OneEgg(TaskClass):
         floor: The episode fails when the egg's height falls to this, metres.
     """
 
+    formula = "exp(-0.2 (50 d + r)), d and r the distance and the angle between egg and goal"
+    solved = "egg within 3 cm of its goal"
     egg_start: ClassVar[tuple[float, float, float]]
     goal_centre: ClassVar[tuple[float, float, float]]
     position_noise: ClassVar[float]

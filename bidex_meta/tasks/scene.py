@@ -152,6 +152,8 @@ def build_spec(task: "TaskClass") -> mujoco.MjSpec:
     """The editable scene of a task class: floor, hands, objects."""
     spec = mujoco.MjSpec.from_file(str(paths.assets_dir() / "scene" / "scene.xml"))
     spec.modelname = task.name
+    spec.option.iterations, spec.option.ls_iterations = task.solver.iterations, task.solver.line_search
+    spec.option.integrator = task.solver.integrator
     set_contact_bits(spec.geoms, FIXTURE)
     add_hands(spec, task.right, task.left, task.moving_base)
     task.add_objects(spec)

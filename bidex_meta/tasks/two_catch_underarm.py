@@ -26,6 +26,9 @@ class TwoCatchUnderarm(TaskClass):
 
     name = "TwoCatchUnderarm"
     summary = "Throw two eggs at once, each to the other hand"
+    formula = "exp(-0.2 (50 d1 + r1)) + exp(-0.2 (50 d2 + r2)), distance and angle of each egg and its goal"
+    solved = "each egg within 3 cm of its goal in the same step"
+    deviations = ("Success asks it of each egg, the original of the sum of both distances (6 cm).",)
     episode_steps = 75
     right = HandPose((0.0, 0.0, 0.5), PALM_UP_AWAY)
     left = HandPose((0.0, -1.15, 0.5), PALM_UP_BACK)

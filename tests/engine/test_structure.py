@@ -13,6 +13,7 @@ from bidex_meta.world.groups import build_groups, split_rows
 from tests.tasks.worlds import CASES, MOVING, slot
 
 ONE_EGG = {("HandOver", True), ("CatchUnderarm", True), ("CatchOver2Underarm", True), ("CatchAbreast", True)}
+DOORS = {case for case in CASES if case[0].startswith("Door")}
 SUBSTEPS = 4
 
 
@@ -24,7 +25,7 @@ def scenes() -> dict[tuple[str, bool], Scene]:
 def test_classes_that_differ_in_numbers_share_a_batch(scenes: dict[tuple[str, bool], Scene]) -> None:
     for a in scenes:
         for b in scenes:
-            together = a == b or {a, b} <= ONE_EGG
+            together = a == b or {a, b} <= ONE_EGG or {a, b} <= DOORS
             assert same_structure(scenes[a].model, scenes[b].model) == together, (a, b)
 
 
@@ -72,11 +73,13 @@ def test_other_numbers_are_no_other_structure(change: str) -> None:
 
 def test_groups_of_a_mixed_world() -> None:
     slots = [slot(registry.get(name, True)) for name in MOVING]
-    groups = build_groups(slots, split_rows(11, len(slots)), 1)
+    groups = build_groups(slots, split_rows(23, len(slots)), 1)
     names = [[member.scene.task.name for member in group.members] for group in groups]
-    assert sorted(map(sorted, names)) == sorted([sorted(name for name, _ in ONE_EGG), ["TwoCatchUnderarm"]])
+    shared = [sorted(name for name, _ in ONE_EGG), sorted(name for name in MOVING if name.startswith("Door"))]
+    alone = [[name] for name in MOVING if not any(name in group for group in shared)]
+    assert sorted(map(sorted, names)) == sorted([*shared, *alone])
     rows = torch.cat([group.rows for group in groups])
-    assert sorted(rows.tolist()) == list(range(11))
+    assert sorted(rows.tolist()) == list(range(23))
     for group in groups:
         assert group.engine.num == len(group.rows)
         for member in group.members:

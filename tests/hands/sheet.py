@@ -109,7 +109,9 @@ MOUNTS = {
     "F": ((np.pi, 0, 3.14), (0.7071, 0.7071, -0.0006, -0.0006)),
     "G": ((np.pi, 0, 0), (0, 0, -0.7071, -0.7071)),
 }
-_A, _B = MOUNTS["A"][1], MOUNTS["B"][1]
+_A, _B, _C, _D, _E, _F, _G = (MOUNTS[pose][1] for pose in "ABCDEFG")
+_DOORS = (((0.55, 0.2, 0.6), _C), ((0.55, -0.2, 0.6), _D))
+_PALMS_DOWN = (((0.55, 0.2, 0.8), _E), ((0.55, -0.2, 0.8), _E))
 # class: mount position and quaternion (w, x, y, z), right then left.
 CLASS_MOUNTS = {
     "HandOver": (((0, 0, 0.5), _A), ((0, -1, 0.5), _B)),
@@ -120,6 +122,25 @@ CLASS_MOUNTS = {
         ((0, -0.55, 0.5), (0.5877, -0.3927, -0.5881, 0.3931)),
         ((0, -1.15, 0.5), (0.3927, -0.5877, -0.3931, 0.5881)),
     ),
+    "LiftUnderarm": (((0, 0.05, 0.45), _A), ((0, -1.25, 0.45), _B)),
+    "DoorOpenOutward": _DOORS,
+    "DoorOpenInward": _DOORS,
+    "DoorCloseOutward": _DOORS,
+    "DoorCloseInward": (((0.9, 0.5, 0.6), _C), ((0.9, -0.5, 0.6), _D)),
+    # The two poses of sheet 4.12, exchanged (design.md section 4): the left hand is the one over the cap.
+    "BottleCap": (
+        ((0, -0.25, 0.45), (0.298, 0.298, -0.6413, 0.6413)),
+        ((0, -1.05, 0.5), (0, 0, 0.5102, 0.8601)),
+    ),
+    "PushBlock": _PALMS_DOWN,
+    "SwingCup": (((0.35, 0.2, 0.8), _C), ((0.35, -0.2, 0.8), _D)),
+    "OpenScissors": _PALMS_DOWN,
+    "ReOrientation": (((0, 0, 0.5), _A), ((0, -1.15, 0.5), _B)),
+    "OpenPenCap": _PALMS_DOWN,
+    "Switch": _PALMS_DOWN,
+    "StackBlock": (((0, 0.6, 0.7), _F), ((0, -0.6, 0.7), _G)),
+    "PourWater": (((0.55, 0.2, 0.6), _C), ((0.55, -0.2, 0.6), _D)),
+    "GraspAndPlace": _PALMS_DOWN,
 }
 # class: transition and orientation scale (1.4).
 SCALES = {
@@ -128,7 +149,24 @@ SCALES = {
     "CatchOver2Underarm": (0.1, 2.0),
     "TwoCatchUnderarm": (0.05, 0.5),
     "CatchAbreast": (0.5, 1.0),
+    "LiftUnderarm": (0.25, 1.0),
+    "DoorOpenOutward": (0.5, 0.5),
+    "DoorOpenInward": (0.5, 0.5),
+    "DoorCloseOutward": (0.5, 0.5),
+    "DoorCloseInward": (0.5, 0.5),
+    "BottleCap": (0.1, 0.1),
+    "PushBlock": (0.5, 0.1),
+    "SwingCup": (0.1, 0.1),
+    "OpenScissors": (0.5, 0.1),
+    "ReOrientation": (0.05, 0.5),
+    "OpenPenCap": (0.5, 0.1),
+    "Switch": (0.5, 0.1),
+    "StackBlock": (0.2, 0.02),
+    "PourWater": (0.5, 0.1),
+    "GraspAndPlace": (0.5, 0.1),
 }
+# class: start angles (section 6) of the joints that do not start at zero, both hands.
+DEFAULT_JOINTS = {"BottleCap": {"THJ4": -1.04, "THJ3": 1.2, "THJ0": -1.57}}
 
 
 def rotation(wxyz: np.ndarray | tuple[float, ...]) -> Rotation:

@@ -1,5 +1,7 @@
 """Observation tables of the appendix, typed as they are printed: first index, last index, what stands there."""
 
+from math import pi
+
 Row = tuple[int, int, str]
 
 TABLE_7: list[Row] = [
@@ -51,18 +53,126 @@ TABLE_10: list[Row] = [
     (411, 417, "goal pose"),
     (418, 421, "goal rot - object rot"),
 ]
+# Table 32 prints the rows of Table 14.
 TABLE_14: list[Row] = [
     *TABLE_7,
     (398, 404, "object1 pose"),
     (405, 407, "object1 linear velocity"),
     (408, 410, "object1 angle velocity"),
     (411, 417, "goal1 pose"),
-    (418, 421, "goal1 rot - object1 rot"),
+    (418, 421, "goal1 rot - object rot"),
     (422, 428, "object2 pose"),
     (429, 431, "object2 linear velocity"),
     (432, 434, "object2 angle velocity"),
     (435, 441, "goal2 pose"),
     (442, 445, "goal2 rot - object2 rot"),
+]
+TABLE_18: list[Row] = [
+    *TABLE_7,
+    (398, 404, "object pose"),
+    (405, 407, "object linear velocity"),
+    (408, 410, "object angle velocity"),
+    (411, 417, "goal pose"),
+    (418, 421, "goal rot - object rot"),
+    (422, 424, "object right handle position"),
+    (425, 427, "object left handle position"),
+]
+# Table 22 prints the same rows.
+TABLE_20: list[Row] = [
+    *TABLE_7,
+    (398, 404, "object pose"),
+    (405, 407, "object linear velocity"),
+    (408, 410, "object angle velocity"),
+    (411, 417, "goal pose"),
+    (418, 421, "goal rot - object rot"),
+    (422, 424, "door right handle position"),
+    (425, 427, "door left handle position"),
+]
+TABLE_24: list[Row] = [
+    *TABLE_7,
+    (398, 404, "bottle pose"),
+    (405, 407, "bottle linear velocity"),
+    (408, 410, "bottle angle velocity"),
+    (411, 413, "bottle cap position"),
+]
+TABLE_26: list[Row] = [
+    *TABLE_7,
+    (398, 404, "block1 pose"),
+    (405, 407, "block1 linear velocity"),
+    (408, 410, "block1 angle velocity"),
+    (411, 413, "block1 position"),
+    (414, 416, "block2 position"),
+]
+TABLE_28: list[Row] = [
+    *TABLE_7,
+    (398, 404, "cup pose"),
+    (405, 407, "cup linear velocity"),
+    (408, 410, "cup angle velocity"),
+    (411, 417, "goal pose"),
+    (418, 421, "goal rot - object rot"),
+    (422, 424, "cup right handle position"),
+    (425, 427, "cup left handle position"),
+]
+TABLE_30: list[Row] = [
+    *TABLE_7,
+    (398, 404, "scissors pose"),
+    (405, 407, "scissors linear velocity"),
+    (408, 410, "scissors angle velocity"),
+    (411, 417, "goal pose"),
+    (418, 421, "goal rot - object rot"),
+    (422, 424, "scissors right handle position"),
+    (425, 427, "scissors left handle position"),
+]
+TABLE_34: list[Row] = [
+    *TABLE_7,
+    (398, 404, "pen pose"),
+    (405, 407, "pen linear velocity"),
+    (408, 410, "pen angle velocity"),
+    (411, 417, "goal pose"),
+    (418, 421, "goal rot - object rot"),
+    (422, 424, "pen body position"),
+    (425, 427, "pen cap position"),
+]
+TABLE_36: list[Row] = [
+    *TABLE_7,
+    (398, 404, "switch1 pose"),
+    (405, 407, "switch1 linear velocity"),
+    (408, 410, "switch1 angle velocity"),
+    (411, 417, "goal pose"),
+    (418, 421, "goal rot - object rot"),
+    (422, 424, "switch1 position"),
+    (425, 427, "switch2 position"),
+]
+TABLE_38: list[Row] = [
+    *TABLE_7,
+    (398, 404, "block1 pose"),
+    (405, 407, "block1 linear velocity"),
+    (408, 410, "block1 angle velocity"),
+    (411, 417, "goal pose"),
+    (418, 421, "goal rot - object rot"),
+    (422, 424, "block1 position"),
+    (425, 427, "block2 position"),
+]
+TABLE_40: list[Row] = [
+    *TABLE_7,
+    (398, 404, "kettle pose"),
+    (405, 407, "kettle linear velocity"),
+    (408, 410, "kettle angle velocity"),
+    (411, 417, "goal pose"),
+    (418, 421, "goal rot - object rot"),
+    (422, 424, "kettle handle position"),
+    (425, 427, "bucket position"),
+]
+# The appendix has no table for GraspAndPlace; these are the rows of sheet 4.21.
+SHEET_421: list[Row] = [
+    *TABLE_7,
+    (398, 404, "bucket pose"),
+    (405, 407, "bucket linear velocity"),
+    (408, 410, "bucket angle velocity"),
+    (411, 413, "bucket position"),
+    (414, 417, "bucket link quaternion"),
+    (418, 420, "block position"),
+    (421, 424, "block quaternion"),
 ]
 # Tables 12 and 16 print the rows of Table 10; with a moving base HandOver has them too (design.md section 4).
 TABLES: dict[tuple[str, bool], list[Row]] = {
@@ -72,6 +182,21 @@ TABLES: dict[tuple[str, bool], list[Row]] = {
     ("CatchOver2Underarm", True): TABLE_10,
     ("TwoCatchUnderarm", True): TABLE_14,
     ("CatchAbreast", True): TABLE_10,
+    ("LiftUnderarm", True): TABLE_18,
+    ("DoorOpenOutward", True): TABLE_20,
+    ("DoorOpenInward", True): TABLE_20,
+    ("DoorCloseOutward", True): TABLE_20,
+    ("DoorCloseInward", True): TABLE_20,
+    ("BottleCap", True): TABLE_24,
+    ("PushBlock", True): TABLE_26,
+    ("SwingCup", True): TABLE_28,
+    ("OpenScissors", True): TABLE_30,
+    ("ReOrientation", True): TABLE_14,
+    ("OpenPenCap", True): TABLE_34,
+    ("Switch", True): TABLE_36,
+    ("StackBlock", True): TABLE_38,
+    ("PourWater", True): TABLE_40,
+    ("GraspAndPlace", True): SHEET_421,
 }
 SIZES = {
     ("HandOver", False): (398, 40),
@@ -80,24 +205,90 @@ SIZES = {
     ("CatchOver2Underarm", True): (422, 52),
     ("TwoCatchUnderarm", True): (446, 52),
     ("CatchAbreast", True): (422, 52),
+    ("LiftUnderarm", True): (428, 52),
+    ("DoorOpenOutward", True): (428, 52),
+    ("DoorOpenInward", True): (428, 52),
+    ("DoorCloseOutward", True): (428, 52),
+    ("DoorCloseInward", True): (428, 52),
+    ("BottleCap", True): (414, 52),
+    ("PushBlock", True): (417, 52),
+    ("SwingCup", True): (428, 52),
+    ("OpenScissors", True): (428, 52),
+    ("ReOrientation", True): (446, 52),
+    ("OpenPenCap", True): (428, 52),
+    ("Switch", True): (428, 52),
+    ("StackBlock", True): (428, 52),
+    ("PourWater", True): (428, 52),
+    ("GraspAndPlace", True): (425, 52),
 }
 """Observations and actions of each class and base."""
 
+EPISODE_STEPS = {
+    "HandOver": 75,
+    "CatchUnderarm": 75,
+    "CatchOver2Underarm": 75,
+    "TwoCatchUnderarm": 75,
+    "CatchAbreast": 150,
+    "LiftUnderarm": 500,
+    "DoorOpenOutward": 250,
+    "DoorOpenInward": 250,
+    "DoorCloseOutward": 250,
+    "DoorCloseInward": 250,
+    "BottleCap": 125,
+    "PushBlock": 125,
+    "SwingCup": 300,
+    "OpenScissors": 150,
+    "ReOrientation": 600,
+    "OpenPenCap": 125,
+    "Switch": 125,
+    "StackBlock": 250,
+    "PourWater": 125,
+    "GraspAndPlace": 500,
+}
+"""Time limits in control steps (sheet 1.4)."""
 
-def block_names(description: str) -> str:
+_FLAT, _AHEAD = (0.0, 0.0, 0.0), (0.0, 0.0, 0.5 * pi)
+PLACES: dict[str, dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]]] = {
+    "HandOver": {"object": ((0, -0.39, 0.54), _FLAT)},
+    "CatchUnderarm": {"object": ((0, -0.39, 0.54), _FLAT)},
+    "CatchOver2Underarm": {"object": ((0, 0.05, 1.03), _FLAT)},
+    "TwoCatchUnderarm": {"object1": ((0, -0.39, 0.54), _FLAT), "object2": ((0, -0.78, 0.54), _FLAT)},
+    "CatchAbreast": {"object": ((-0.39, -0.55, 0.54), _FLAT)},
+    "LiftUnderarm": {"object": ((0, -0.6, 0.465), _FLAT)},
+    "DoorOpenOutward": {"object": ((0, 0, 0.7), _FLAT)},
+    "DoorOpenInward": {"object": ((0, 0, 0.7), (0, pi, 0))},
+    "DoorCloseOutward": {"object": ((0, 0, 0.7), _FLAT)},
+    "DoorCloseInward": {"object": ((0, 0, 0.7), (0, pi, 0))},
+    "BottleCap": {"bottle": ((0, -0.6, 0.5), (0, -0.7, 0))},
+    "PushBlock": {"block1": ((0, -0.2, 0.625), _FLAT), "block2": ((0, 0.2, 0.625), _FLAT)},
+    "SwingCup": {"cup": ((0, 0, 0.6845), _AHEAD)},
+    "OpenScissors": {"scissors": ((0, 0, 0.608), _AHEAD)},
+    "ReOrientation": {"object1": ((0, -0.76, 0.60), _FLAT), "object2": ((0, -0.39, 0.60), _FLAT)},
+    "OpenPenCap": {"pen": ((0, 0, 0.612), (0.5 * pi, 0.5 * pi, 0))},
+    "Switch": {"switch1": ((0, -0.2, 0.65), (pi, 0.5 * pi, 0)), "switch2": ((0, 0.2, 0.65), (pi, 0.5 * pi, 0))},
+    "StackBlock": {"block1": ((0, -0.1, 0.625), _FLAT), "block2": ((0, 0.1, 0.625), _FLAT)},
+    "PourWater": {"kettle": ((0, 0, 0.474), _AHEAD), "bucket": ((0, -0.3, 0.453), _FLAT)},
+    "GraspAndPlace": {"bucket": ((0, 0.2, 0.653), _FLAT), "block": ((0, -0.2, 0.625), _FLAT)},
+}
+"""Nominal start of every object: position (world, metres; resting on its table, sheet 9) and roll, pitch, yaw. Object 1
+is the one on the left hand's side (-y); CatchOver2Underarm's egg is raised to 1.03 (design.md section 4)."""
+
+_WORDS = {
+    "dof position": "joint_position",
+    "dof velocity": "joint_velocity",
+    "dof force": "joint_force",
+    "fingertip pose, linear velocity, angle velocity": "fingertip_state",
+    "fingertip force, torque": "fingertip_force_torque",
+    "actions": "action",
+    "angle velocity": "angular_velocity",
+}
+
+
+def block_name(description: str) -> str:
     """The layout's name of what a table's row describes."""
-    words = {
-        "dof position": "joint_position",
-        "dof velocity": "joint_velocity",
-        "dof force": "joint_force",
-        "fingertip pose, linear velocity, angle velocity": "fingertip_state",
-        "fingertip force, torque": "fingertip_force_torque",
-        "base position": "base_position",
-        "base rotation": "base_rotation",
-        "actions": "action",
-        "pose": "pose",
-        "linear velocity": "linear_velocity",
-        "angle velocity": "angular_velocity",
-    }
     subject, _, rest = description.partition(" ")
-    return f"{subject}_rotation_difference" if rest.startswith("rot - ") else f"{subject}_{words[rest]}"
+    if rest.startswith("rot - "):
+        return f"{subject}_rotation_difference"
+    if rest.endswith("handle position") and subject != "kettle":
+        return rest.replace(" ", "_")
+    return f"{subject}_{_WORDS.get(rest, rest.replace(' ', '_'))}"

@@ -1,21 +1,22 @@
 """Actions: position targets, and forces that move a base without turning it (sheet 1.2, 1.3; design.md section 4)."""
 
 import numpy as np
-import pytest
 import torch
 
 from bidex_meta.hands.pair import SIDES
 from bidex_meta.world import World
 from tests.hands import sheet
 from tests.tasks.worlds import (
-    CASES,
     MOVING,
     each_case,
     each_moving,
     engine_of,
     mixed_world,
+    object_joints_of,
     objects_of,
+    restart,
     scene_of,
+    send_hands_away,
     world_of,
 )
 
@@ -44,12 +45,12 @@ def free_bases(name: str, actions: np.ndarray) -> tuple[World, np.ndarray, np.nd
     world.reset(seed=0)
     engine, scene = engine_of(world), scene_of(world)
     qpos = torch.from_numpy(scene.start_qpos).repeat(len(actions), 1)
-    for i, side in enumerate(SIDES):
-        qpos[:, scene.qpos[f"{side}/base"].start] += 5.0 * i
-        qpos[:, scene.qpos[f"{side}/base"].start + 2] += 5.0
+    send_hands_away(scene, qpos)
+    for i, joint in enumerate(name for name in object_joints_of(scene) if name.startswith("water")):
+        qpos[:, scene.qpos[joint]] = -9.0 - i  # drops have three slides each; so no two of them meet
     for i, body in enumerate(objects_of(scene)):
         qpos[:, scene.qpos[body]] = torch.tensor([-9.0 - i, 0.0, 4.0, 1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
-    engine.reset(torch.ones(len(actions), dtype=torch.bool), qpos)
+    restart(world, qpos)
     places = [scene.qpos[f"{side}/base"] for side in SIDES]
     before = np.stack([engine.qpos[:, place].numpy().copy() for place in places], axis=1)
     one_hand = np.concatenate((np.tile(held(), (len(actions), 1)), actions), axis=1)
@@ -164,8 +165,3 @@ def test_actions_are_clipped() -> None:
     engine = engine_of(world)
     np.testing.assert_array_equal(engine.ctrl[0].numpy(), engine.ctrl[1].numpy())
     np.testing.assert_array_equal(engine.xfrc_applied[0].numpy(), engine.xfrc_applied[1].numpy())
-
-
-@pytest.mark.parametrize("name", sorted({name for name, _ in CASES}))
-def test_the_sheets_tables_hold_every_class(name: str) -> None:
-    assert name in sheet.SCALES and name in sheet.CLASS_MOUNTS

@@ -1,5 +1,6 @@
 """Variation spaces, the registry and what a class freezes."""
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -10,17 +11,57 @@ from scipy.spatial.transform import Rotation
 from bidex_meta.errors import BidexError
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
+from bidex_meta.tasks.scene import compile_scene
 from bidex_meta.tasks.variation import VariationSpace, box, join, orientation
-from tests.tasks.formulas import goals
-from tests.tasks.worlds import each_case
+from tests.tasks.formulas import FORMULAS
+from tests.tasks.formulas_throws import Eggs
+from tests.tasks.worlds import CASES, each_case
 
-# class: centre of each goal (sheet 4.1 to 4.5, world, metres), +-3 cm by design.md section 4.
-GOALS = {
-    "HandOver": [(0, -0.64, 0.54)],
-    "CatchUnderarm": [(0, -0.79, 0.54)],
-    "CatchOver2Underarm": [(0, -0.40, 0.55)],
-    "TwoCatchUnderarm": [(0, -0.79, 0.54), (0, -0.38, 0.54)],
-    "CatchAbreast": [(-0.39, -1.15, 0.54)],
+TURN = np.deg2rad(15)
+
+
+def around(prefix: str, *centre: float, half: float) -> dict[str, tuple[float, float]]:
+    """Ends of components ``<prefix>_x``, ``_y``, ``_z`` about a centre."""
+    return {f"{prefix}_{axis}": (c - half, c + half) for axis, c in zip("xyz", centre, strict=False)}
+
+
+def placed(*names: str) -> dict[str, tuple[float, float]]:
+    """What a task freezes of objects on a table (design.md section 4): 3 cm along x and y, 15 degrees."""
+    return {k: v for name in names for k, v in (*around(name, 0, 0, half=0.03).items(), (f"{name}_yaw", (-TURN, TURN)))}
+
+
+def goal(name: str, *centres: tuple[float, float, float]) -> dict[str, tuple[float, float]]:
+    """Goals of sheet 4.1 to 4.5 give or take 3 cm and, once for all, the two draws of their orientation."""
+    names = [name] if len(centres) == 1 else [f"{name}{i}" for i in (1, 2)]
+    positions = [around(prefix, *centre, half=0.03) for prefix, centre in zip(names, centres, strict=True)]
+    return {k: v for ends in positions for k, v in ends.items()} | ORIENTATION
+
+
+ORIENTATION = {"goal_u0": (-1.0, 1.0), "goal_u1": (-1.0, 1.0)}
+OPENING = {"base_y": (-0.05, 0.05), "start_angle": (0.0, 0.15)}
+CLOSING = {"base_y": (-0.05, 0.05), "start_angle": (1.3, 1.57)}
+# class: components and their ends (design.md section 4), metres and radians.
+SPACES = {
+    "HandOver": goal("goal", (0, -0.64, 0.54)),
+    "CatchUnderarm": goal("goal", (0, -0.79, 0.54)),
+    "CatchOver2Underarm": goal("goal", (0, -0.40, 0.55)),
+    "TwoCatchUnderarm": goal("goal", (0, -0.79, 0.54), (0, -0.38, 0.54)),
+    "CatchAbreast": goal("goal", (-0.39, -1.15, 0.54)),
+    "LiftUnderarm": placed("object") | around("goal", 0, 0, half=0.05) | {"goal_height": (0.25, 0.45)},
+    "DoorOpenOutward": OPENING,
+    "DoorOpenInward": OPENING,
+    "DoorCloseOutward": CLOSING,
+    "DoorCloseInward": CLOSING,
+    "BottleCap": placed("bottle") | {"bottle_y": (-0.01, 0.0)},  # the thumb is in the way of more
+    "PushBlock": placed("block1", "block2"),
+    "SwingCup": placed("cup") | {"yaw_change": (np.pi / 2, np.pi)},
+    "OpenScissors": placed("scissors") | {"target_angle": (-0.15, 0.3)},
+    "ReOrientation": ORIENTATION,
+    "OpenPenCap": placed("pen"),
+    "Switch": around("switch1", 0, 0, half=0.03) | around("switch2", 0, 0, half=0.03),
+    "StackBlock": placed("block1", "block2") | around("target", 0, 0, half=0.03),
+    "PourWater": placed("kettle", "bucket"),
+    "GraspAndPlace": placed("bucket", "block"),
 }
 
 
@@ -42,32 +83,43 @@ def test_samples_lie_inside_and_fill_the_box(name: str, moving: bool) -> None:
 
 
 @each_case
-def test_goals_vary_about_the_sheets_place(name: str, moving: bool) -> None:
+def test_a_task_freezes_what_the_design_says(name: str, moving: bool) -> None:
     space = registry.get(name, moving).variation_space
-    assert len(set(space.names)) == space.size
-    prefixes = ["goal"] if len(GOALS[name]) == 1 else ["goal1", "goal2"]
-    for prefix, centre in zip(prefixes, GOALS[name], strict=True):
-        for axis, middle in zip("xyz", centre, strict=True):
-            i = space.names.index(f"{prefix}_{axis}")
-            assert (space.low[i], space.high[i]) == pytest.approx((middle - 0.03, middle + 0.03))
-    draws = [i for i, label in enumerate(space.names) if label in ("goal_u0", "goal_u1")]
-    assert [(space.low[i], space.high[i]) for i in draws] == [(-1.0, 1.0)] * 2
-    assert space.size == 3 * len(GOALS[name]) + 2
+    found = dict(zip(space.names, zip(space.low, space.high, strict=True), strict=True))
+    assert len(found) == space.size == len(SPACES[name]) > 0
+    assert found.keys() == SPACES[name].keys()
+    for component, ends in SPACES[name].items():
+        assert found[component] == pytest.approx(ends, abs=1e-9), component
 
 
 @each_case
-def test_what_a_task_freezes(name: str, moving: bool) -> None:
+def test_what_is_frozen_is_one_row_a_task(name: str, moving: bool) -> None:
+    """Each (n, k) in the variation's precision, the rows of tasks independent of each other, and so the ghosts."""
+    task = registry.get(name, moving)
+    pool = torch.from_numpy(task.variation_space.sample(np.random.default_rng(1), 7))
+    frozen, alone = task.freeze(pool), task.freeze(pool[2:3])
+    assert frozen
+    for label, value in frozen.items():
+        assert value.ndim == 2 and len(value) == 7 and value.dtype == torch.float64, label
+        np.testing.assert_array_equal(value[2].numpy(), alone[label][0].numpy(), err_msg=label)
+    for pose, size in task.ghosts(frozen):
+        assert pose.shape == (7, 7) and len(size) == 3
+        np.testing.assert_allclose(pose[:, 3:].norm(dim=1).numpy(), 1.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("name, moving", [case for case in CASES if isinstance(FORMULAS[case[0]], Eggs)])
+def test_goals_of_eggs(name: str, moving: bool) -> None:
     task = registry.get(name, moving)
     pool = task.variation_space.sample(np.random.default_rng(1), 7)
     frozen = task.freeze(torch.from_numpy(pool))
-    assert all(len(value) == 7 for value in frozen.values())
+    data = mujoco.MjData(compile_scene(task).model)
     for row in range(7):
-        for goal, (position, turn) in goals(name, pool[row]).items():
-            np.testing.assert_allclose(frozen[goal][row].numpy(), (*position, *turn), atol=1e-7)
-            inverse = Rotation.from_quat(frozen[f"{goal}_inverse"][row].numpy())
-            np.testing.assert_allclose((inverse * Rotation.from_quat(turn)).magnitude(), 0.0, atol=1e-6)
-    ghosts = task.ghosts(frozen)
-    assert [tuple(pose.shape) for pose, _ in ghosts] == [(7, 7)] * len(GOALS[name])
+        named = dict(zip(task.variation_space.names, pool[row], strict=True))
+        for label, (position, turn) in FORMULAS[name].goals(data, named).items():
+            np.testing.assert_allclose(frozen[label][row].numpy(), (*position, *turn.as_quat()), atol=1e-7)
+            inverse = Rotation.from_quat(frozen[f"{label}_inverse"][row].numpy())
+            np.testing.assert_allclose((inverse * turn).magnitude(), 0.0, atol=1e-6)
+    assert len(task.ghosts(frozen)) == len(FORMULAS[name].body_of_goal)
 
 
 def test_joined_spaces_keep_their_order() -> None:
@@ -90,6 +142,10 @@ def test_any_box_holds_its_samples(size: int, count: int, seed: int) -> None:
     space = VariationSpace(tuple(f"x{i}" for i in range(size)), tuple(low), tuple(high))
     samples = space.sample(rng, count)
     assert samples.shape == (count, size) and all(space.contains(sample) for sample in samples)
+
+
+def test_the_registry_names_the_twenty_classes() -> None:
+    assert sorted(registry.names()) == sorted(SPACES) and len(SPACES) == 20
 
 
 @pytest.mark.parametrize("name", registry.names())
@@ -115,5 +171,5 @@ def test_an_unknown_class_is_answered_with_the_nearest(typo: str, near: str) -> 
 
 
 def test_an_unknown_class_that_is_near_to_none_still_lists_them() -> None:
-    with pytest.raises(BidexError, match="Known: CatchAbreast"):
+    with pytest.raises(BidexError, match="Known: BottleCap, CatchAbreast"):
         registry.get("qqqqqq")

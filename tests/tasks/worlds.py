@@ -9,12 +9,15 @@ import torch
 from torch import Tensor
 
 from bidex_meta.engine.cpu import CpuEngine
+from bidex_meta.hands.pair import SIDES
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.scene import Scene
 from bidex_meta.world import Slot, World
+from tests.tasks.oracle import Task
+from tests.tasks.tables import TABLES
 
-CASES = [(name, moving) for name in registry.names() for moving in sorted({registry.get(name).moving_base, True})]
+CASES = list(TABLES)
 """Every class with each base it is used with."""
 MOVING = [name for name, moving in CASES if moving]
 each_case = pytest.mark.parametrize("name, moving", CASES, ids=[f"{n}-{'moving' if m else 'fixed'}" for n, m in CASES])
@@ -52,8 +55,25 @@ def scene_of(world: World) -> Scene:
 
 
 def objects_of(scene: Scene) -> list[str]:
-    """Names of a scene's free objects."""
-    return [name for name in scene.qpos if "/" not in name]
+    """Names of a scene's free objects, drops of water included."""
+    return [name for name, place in scene.qpos.items() if "/" not in name and place.start < scene.model.nq]
+
+
+def fixtures_of(scene: Scene) -> list[str]:
+    """Names of a scene's fixtures whose place differs from task to task."""
+    return [name for name, place in scene.qpos.items() if place.start >= scene.model.nq]
+
+
+def object_joints_of(scene: Scene) -> list[str]:
+    """Full names of the joints of a scene's objects, e.g. ``bottle/slide``."""
+    return [name for name in scene.qpos if "/" in name and name.partition("/")[0] not in SIDES]
+
+
+def task_of(world: World, row: int) -> Task:
+    """The numbers that a row's task froze, by component name."""
+    owner = world.slots[int(world.task_id[row])]
+    names = owner.task_class.variation_space.names
+    return dict(zip(names, owner.tasks[int(world.task_index[row])].tolist(), strict=True))
 
 
 def observe(world: World, action: Tensor | None = None) -> np.ndarray:
@@ -64,16 +84,47 @@ def observe(world: World, action: Tensor | None = None) -> np.ndarray:
     return part.observe(list(part.states(world.task_index)), action).double().numpy()
 
 
+def set_pose(world: World, row: int, part: str, values: np.ndarray) -> None:
+    """Writes positions of a free object or an object's joint into a row and takes its velocity away."""
+    engine, scene = engine_of(world), scene_of(world)
+    engine.qpos[row, scene.qpos[part]] = torch.from_numpy(np.asarray(values, dtype=np.float64))
+    first, size = dofs_of(scene, part)
+    engine.qvel[row, first : first + size] = 0.0
+
+
+def dofs_of(scene: Scene, part: str) -> tuple[int, int]:
+    """First degree of freedom of a free object or an object's joint, and how many it has."""
+    free = "/" not in part
+    return int(scene.model.joint(f"{part}/free" if free else part).dofadr[0]), 6 if free else 1
+
+
+def send_hands_away(scene: Scene, start: Tensor) -> None:
+    """Moves the bases in starts (n, nq + 7 nmocap) far from the objects, the floor and each other."""
+    for i, side in enumerate(SIDES):
+        first = scene.qpos[f"{side}/base"].start
+        start[:, first] += 5.0 * i
+        start[:, first + 2] += 5.0
+
+
+def restart(world: World, start: Tensor) -> None:
+    """Starts all rows of a world of one class anew at given positions, shape (n, nq + 7 nmocap)."""
+    engine_of(world).reset(torch.ones(world.num_envs, dtype=torch.bool), start)
+
+
 class Lens:
     """MuJoCo's own view of a row: plain C kinematics of its positions."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self.model, self.data = model, mujoco.MjData(model)
 
-    def look(self, qpos: Tensor | np.ndarray, qvel: Tensor | np.ndarray | None = None) -> mujoco.MjData:
-        """Data at given positions, with frames, contacts and, if velocities are given, these."""
-        self.data.qpos[:] = np.asarray(qpos)
+    def look(self, place: Tensor | np.ndarray, qvel: Tensor | np.ndarray | None = None) -> mujoco.MjData:
+        """Data with frames and contacts at given positions: ``qpos``, then the poses of fixtures if they are given."""
+        place, nq = np.asarray(place), self.model.nq
+        self.data.qpos[:] = place[:nq]
         self.data.qvel[:] = 0.0 if qvel is None else np.asarray(qvel)
+        if len(place) > nq:
+            fixtures = place[nq:].reshape(-1, 7)
+            self.data.mocap_pos[:], self.data.mocap_quat[:] = fixtures[:, :3], fixtures[:, 3:]
         mujoco.mj_fwdPosition(self.model, self.data)
         mujoco.mj_fwdVelocity(self.model, self.data)
         return self.data

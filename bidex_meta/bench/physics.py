@@ -1,15 +1,12 @@
-"""What ``bidex-meta bench`` measures: speed as ratios within one process, and whether the physics holds."""
+"""Whether the physics holds under rough actions."""
 
 import math
-import statistics
-import time
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from bidex_meta.benchmark import Benchmark, make_task_world
-from bidex_meta.engine.cpu import default_threads
 from bidex_meta.tasks import registry
 from bidex_meta.world import World
 
@@ -18,100 +15,6 @@ MAX_OBJECT_SPEED = 20.0
 MAX_PENETRATION = 0.005
 """Depth of contacts that counts as penetration, metres."""
 _SAMPLES_PER_STEP = 2
-
-
-def world(
-    suite: str = "MT4",
-    num_envs: int = 1024,
-    steps: int = 40,
-    repeats: int = 7,
-    threads: int | None = None,
-    seed: int = 0,
-) -> dict[str, Any]:
-    """Speed of the whole world against bare engine steps.
-
-    A second world's engines are stepped bare: the same states, controls, threads, sensors and substeps. They follow
-    the first world's resets outside the clock, so both do the same physics.
-
-    Args:
-        suite: Suite to step.
-        num_envs: Rows.
-        steps: Environment steps of each repeat.
-        repeats: Interleaved repeats; medians are reported.
-        threads: Engine threads; None takes all CPUs.
-        seed: Seed of world and actions.
-
-    Returns:
-        ``env_steps_per_s``, ``engine_steps_per_s`` (also in environment steps) and their ``ratio``.
-    """
-    full, bare = (Benchmark(suite, seed=seed).make_world("train", num_envs=num_envs, threads=threads) for _ in range(2))
-    full.reset(seed=seed)
-    bare.reset(seed=seed)
-    generator = torch.Generator().manual_seed(seed)
-    _paired_steps(full, bare, 10, generator)
-    times = [_paired_steps(full, bare, steps, generator) for _ in range(repeats)]
-    done = num_envs * steps
-    return {
-        "suite": suite,
-        "num_envs": num_envs,
-        "threads": threads or default_threads(),
-        "env_steps_per_s": round(statistics.median(done / t for t, _ in times)),
-        "engine_steps_per_s": round(statistics.median(done / t for _, t in times)),
-        "ratio": round(statistics.median(b / f for f, b in times), 4),
-        "groups": [part.group.engine.num for part in full.parts],
-    }
-
-
-def _paired_steps(full: World, bare: World, steps: int, generator: torch.Generator) -> tuple[float, float]:
-    """Seconds that the world and the bare engines took for the same steps."""
-    full_time = bare_time = 0.0
-    for _ in range(steps):
-        action = 2.0 * torch.rand(full.num_envs, full.action_size, generator=generator) - 1.0
-        number = full.episodes.number
-        start = time.perf_counter()
-        full.step(action)
-        full_time += time.perf_counter() - start
-        for part in bare.parts:
-            part.control(part.group.take(action))
-            start = time.perf_counter()
-            part.group.engine.step(part.substeps)
-            bare_time += time.perf_counter() - start
-        begun = full.episodes.number != number
-        for part, source in zip(bare.parts, full.parts, strict=True):
-            mask = part.group.take(begun)
-            if mask.any():
-                part.group.engine.reset(mask, source.group.engine.placement()[mask])
-    return full_time, bare_time
-
-
-def scaling(
-    suite: str = "MT4", num_envs: int = 1024, steps: int = 40, repeats: int = 5, seed: int = 0
-) -> dict[str, Any]:
-    """Speed of the world over engine threads, repeats interleaved.
-
-    Returns:
-        ``env_steps_per_s`` by number of threads and ``speedup`` against one thread.
-    """
-    counts = sorted({1, 2, default_threads()} & set(range(1, default_threads() + 1)))
-    worlds = {n: Benchmark(suite, seed=seed).make_world("train", num_envs=num_envs, threads=n) for n in counts}
-    speeds: dict[int, list[float]] = {n: [] for n in counts}
-    for made in worlds.values():
-        made.reset(seed=seed)
-    for repeat in range(repeats + 1):
-        for n, made in worlds.items():
-            generator = torch.Generator().manual_seed(repeat)
-            start = time.perf_counter()
-            for _ in range(steps):
-                made.step(2.0 * torch.rand(num_envs, made.action_size, generator=generator) - 1.0)
-            if repeat:  # the first one warms up
-                speeds[n].append(num_envs * steps / (time.perf_counter() - start))
-    median = {n: statistics.median(v) for n, v in speeds.items()}
-    return {
-        "suite": suite,
-        "num_envs": num_envs,
-        "env_steps_per_s": {str(n): round(v) for n, v in median.items()},
-        "speedup": {str(n): round(v / median[1], 3) for n, v in median.items()},
-    }
 
 
 def stability(

@@ -1,0 +1,63 @@
+"""``bidex-meta baseline``: the references of the normalised score."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from bidex_meta.commands.parsing import Switch, parse
+from bidex_meta.errors import unknown_name
+
+_KINDS = ("random",)
+
+
+@dataclass(frozen=True)
+class BaselineFlags:
+    """Measure the return and success of uniform actions per class, and store them as the score's zero.
+
+    Example: bidex-meta baseline random --suite MT20
+    """
+
+    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="random")]
+    """random."""
+    suite: str = "MT20"
+    """Suite whose train tasks are played."""
+    episodes: int = 4
+    """Episodes of each task."""
+    seed: int = 0
+    """Seed of tasks, starts and actions."""
+    threads: int | None = None
+    """Threads of the physics; None: one per core."""
+    out: Path | None = None
+    """File to write; None: the installation's own, which `evaluate` reads."""
+    json: Switch = False
+    """Print JSON."""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Measure, store, print."""
+    flags = parse(BaselineFlags, arguments, "baseline")
+    if flags.what not in _KINDS:
+        raise unknown_name("baseline", flags.what, _KINDS)
+    from bidex_meta import references
+    from bidex_meta.commands import worlds
+    from bidex_meta.evaluate import RandomAgent, evaluate
+    from bidex_meta.record.versions import collect_versions
+
+    config: dict[str, Any] = {"suite": flags.suite, "task": None, "seed": flags.seed, "device": "cpu"}
+    world = worlds.evaluation_world({**config, "threads": flags.threads})
+    found = evaluate(RandomAgent(world.action_space, flags.seed), world, flags.episodes, seed=worlds.EVALUATION_SEED)
+    world.close()
+    numbers = {name: result.to_json() for name, result in found.classes.items()}
+    made = {"policy": "uniform actions", "suite": flags.suite, "seed": flags.seed, "versions": collect_versions()}
+    kept = ("return", "return_interval", "success", "episodes", "unstable")
+    path = references.store("random", {n: {k: row[k] for k in kept} for n, row in numbers.items()}, made, flags.out)
+    if flags.json:
+        print(json.dumps(numbers, indent=2))
+        return
+    from bidex_meta.commands.tables import evaluation_table, print_table
+
+    print_table(evaluation_table(f"uniform actions on {flags.suite}, stored in {path}", found, None))

@@ -1,0 +1,128 @@
+"""``bidex-meta witness``: actions that prove that a task can be solved."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from bidex_meta.commands.parsing import Switch, parse
+from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.witness.config import PlannerConfig
+
+
+@dataclass(frozen=True)
+class WitnessFlags:
+    """Replay the recorded actions that solve a task, from its start and from ten slightly shifted ones, or search some.
+
+    Example: bidex-meta witness --task CatchUnderarm
+    """
+
+    task: str | None = None
+    """Task class."""
+    all: Switch = False
+    """Every class there is, instead of one."""
+    find: Switch = False
+    """Search with a sampling planner on the printed reward, and store the best episode found if it holds."""
+    tries: int = 1
+    """Searches with other seeds before giving up."""
+    out: Path | None = None
+    """Also write a film (.mp4) of the witness, or a picture (.png) of its last step."""
+    camera: str | None = None
+    """front, side, top or back."""
+    threads: int | None = None
+    """Threads of the physics; None: one per core."""
+    json: Switch = False
+    """Print JSON."""
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
+    """The search."""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Search or replay, and print what was found."""
+    flags = parse(WitnessFlags, arguments, "witness")
+    names = _names(flags)
+    if flags.find:
+        for name in names:
+            _find(name, flags)
+    rows = [_replay(name, flags) for name in names]
+    if flags.out is not None:
+        _film(names[0], flags)
+    if flags.json:
+        print(json.dumps(rows, indent=2))
+        return
+    from bidex_meta.commands.tables import plain_table, print_table
+
+    print_table(plain_table(list(rows[0]), [list(row.values()) for row in rows]))
+
+
+def _names(flags: WitnessFlags) -> list[str]:
+    from bidex_meta.tasks import registry
+
+    if flags.all == (flags.task is not None):
+        raise BidexError("witness: expected --task T or --all, got " + ("both." if flags.all else "neither."))
+    if flags.all and flags.out is not None:
+        raise BidexError("witness: a film shows one class; give --task T with --out.")
+    if flags.task is not None and flags.task not in registry.names():
+        raise unknown_name("task", flags.task, registry.names())
+    return registry.names() if flags.task is None else [flags.task]
+
+
+def _replay(name: str, flags: WitnessFlags) -> dict[str, Any]:
+    from bidex_meta.witness.replay import replay
+    from bidex_meta.witness.store import load_witness, witness_path
+
+    if not witness_path(name).is_file():
+        return {"task": name, "found": False, "return": None, "first_success": None, "shifted": None, "steps": None}
+    witness = load_witness(name)
+    result = replay(name, witness, flags.threads)
+    return {
+        "task": name,
+        "found": result.found,
+        "return": round(result.total, 3),
+        "first_success": result.first_success,
+        "shifted": result.succeeded,
+        "steps": len(witness.actions),
+    }
+
+
+def _find(name: str, flags: WitnessFlags) -> None:
+    """Searches with one seed after another until an episode holds; keeps it."""
+    from dataclasses import asdict, replace
+
+    from bidex_meta.record.versions import collect_versions
+    from bidex_meta.witness.planner import Planner
+    from bidex_meta.witness.replay import replay
+    from bidex_meta.witness.store import Witness, save_witness
+
+    for attempt in range(flags.tries):
+        config = replace(flags.planner, seed=flags.planner.seed + attempt)
+        found = Planner(name, config, flags.threads).search(_reporter(name))
+        made = {"return": found.total, "first_success": found.first_success, "planner": asdict(config)}
+        witness = Witness(found.actions, made | {"versions": collect_versions()})
+        if found.first_success is not None and replay(name, witness, flags.threads).found:
+            print(f"{name}: stored {save_witness(name, witness.actions, witness.made)}")
+            return
+        print(f"{name}: seed {config.seed} gave a return of {found.total:.3f}, first success {found.first_success}.")
+
+
+def _reporter(name: str) -> Any:
+    def report(steps: int, total: float, success: bool) -> None:
+        print(f"{name}: step {steps}, return {total:.3f}{', success' if success else ''}", flush=True)
+
+    return report
+
+
+def _film(name: str, flags: WitnessFlags) -> None:
+    from bidex_meta.record import video
+    from bidex_meta.tasks.base import CONTROL_RATE
+    from bidex_meta.witness.replay import frames
+    from bidex_meta.witness.store import load_witness
+
+    assert flags.out is not None
+    pictures = frames(name, load_witness(name), flags.camera)
+    if video.check_suffix(flags.out) == ".mp4":
+        video.write_video(flags.out, pictures, CONTROL_RATE)
+        return
+    *_, last = pictures
+    video.write_image(flags.out, last)

@@ -1,0 +1,68 @@
+"""The page that shows every task class: written by ``bidex-meta gallery``, so that it cannot contradict the code."""
+
+from pathlib import Path
+
+from bidex_meta import references
+from bidex_meta.benchmark import make_task_world
+from bidex_meta.record import video
+from bidex_meta.tasks import registry
+from bidex_meta.tasks.base import TaskClass
+from bidex_meta.tasks.variation import VariationSpace
+
+VIEWS = ("front", "side")
+_HEAD = """# The task classes
+
+Written by `bidex-meta gallery`; change the classes, not this page. Pictures show the start of the first task; green is
+a goal. Sizes are those of moving bases. d is a distance in metres, r an angle in radians; *left* and *right* are the
+distances of a hand's point (8 cm along the palm, 2 cm out of it) to its point on the object. Variations are drawn
+uniformly and frozen by a task. Random: mean return and success of uniform actions.
+"""
+
+
+def write(page: Path, width: int = 360, height: int = 270) -> None:
+    """Writes the page, and the pictures into ``images/tasks/`` beside it.
+
+    Args:
+        page: The Markdown file.
+        width: Of the pictures, pixels.
+        height: Of the pictures, pixels.
+    """
+    random = references.load("random")
+    sections = [_HEAD]
+    for name in registry.names():
+        for view in VIEWS:
+            _picture(name, view, page.parent / _image(name, view), width, height)
+        sections.append(_section(registry.get(name, True), random.get(name)))
+    page.write_text("\n".join(sections))
+
+
+def _image(name: str, view: str) -> str:
+    return f"images/tasks/{name}_{view}.png"
+
+
+def _picture(name: str, view: str, path: Path, width: int, height: int) -> None:
+    world = make_task_world(name, num_envs=1, seed=0, autoreset_mode="DISABLED", threads=1)
+    world.reset(seed=0)
+    video.write_image(path, world.render(row=0, width=width, height=height, camera=view))
+    world.close()
+
+
+def _section(task: TaskClass, random: dict | None) -> str:
+    pictures = " ".join(f"![{task.name}, {view}]({_image(task.name, view)})" for view in VIEWS)
+    rows = [
+        ("observation, action", f"{task.observation_size}, {task.action_size}"),
+        ("episode", f"{task.episode_steps} steps"),
+        ("reward", f"`{task.formula}`"),
+        ("success", task.solved),
+        ("variation", _variation(task.variation_space)),
+        ("deviations", " ".join(task.deviations) or "none"),
+    ]
+    if random is not None:
+        rows.append(("random", f"return {random['return']:.4g}, success {100 * random['success']:.1f} %"))
+    table = "\n".join(f"| {key} | {value} |" for key, value in rows)
+    return f"## {task.name}\n\n{task.summary}.\n\n{pictures}\n\n| | |\n|---|---|\n{table}\n"
+
+
+def _variation(space: VariationSpace) -> str:
+    parts = zip(space.names, space.low, space.high, strict=True)
+    return ", ".join(f"{name} {low:.3g} … {high:.3g}" for name, low, high in parts)

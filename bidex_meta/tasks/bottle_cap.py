@@ -1,0 +1,102 @@
+"""BottleCap: appendix A.2.9, sheet 4.12."""
+
+import math
+
+import mujoco
+import torch
+from torch import Tensor
+
+from bidex_meta.hands.hand import hand
+from bidex_meta.hands.poses import HandPose
+from bidex_meta.maths import dot
+from bidex_meta.tasks.base import FIRM, TaskClass
+from bidex_meta.tasks.layout import Layout, both_hands, object_blocks, point_block
+from bidex_meta.tasks.placement import DRAWS, SHIFT, TURN, place
+from bidex_meta.tasks.reach import apart, reach
+from bidex_meta.tasks.scene import SceneObject, add_table
+from bidex_meta.tasks.state import TaskState
+from bidex_meta.tasks.variation import VariationSpace
+
+_TILT = 0.87
+_PALM_NORMAL = (math.sin(_TILT), 0.0, math.cos(_TILT))
+"""Out of the right palm at the start, world."""
+_LIFT, _AHEAD = 0.006, 0.015
+"""How far the bottle starts from the original's place, metres: along the palm's normal, since there it is in the hand,
+and along the fingers, so that it can be turned without meeting the thumb."""
+_BOTTLE = SceneObject(
+    "bottle", "bottle", (_LIFT * _PALM_NORMAL[0], -0.6 - _AHEAD, 0.5 + _LIFT * _PALM_NORMAL[2]), (0.0, -0.7, 0.0)
+)
+_AHEAD_RANGE = 0.01
+_OPENED = 0.03
+_THUMB = {"THJ4": -1.04, "THJ3": 1.2, "THJ0": -1.57}
+"""Joint angles at the start other than 0, rad (sheet 6)."""
+
+
+class BottleCap(TaskClass):
+    """Pull the cap off a bottle that lies in the right hand, with the left.
+
+    Observation: Table 24 (414). Reward: equation 11, left hand to cap and right hand to bottle as printed; so the two
+    hands' start poses of the original are exchanged and the left one starts over the cap. Success: the cap more than
+    3 cm off.
+    The cap's point is its centre, which moves with it, everywhere: d_target is 14.4 cm plus the pull, a constant more
+    than the original's, which measures a link frame near the bottle's origin. Tasks shift the bottle in the palm's
+    plane, not through the palm: 3 cm either way along its axis, and 1 cm to the fingers only, for the thumb is behind.
+    """
+
+    name = "BottleCap"
+    summary = "Hold a bottle in one hand and pull its cap off with the other"
+    episode_steps = 125
+    right = HandPose((0.0, -0.25, 0.45), (0.0, _TILT, 0.0))
+    left = HandPose((0.0, -1.05, 0.5), (0.5, math.pi, math.pi))
+    transition_scale = 0.1
+    orientation_scale = 0.1
+    start_draws = DRAWS
+    solver = FIRM
+    camera_target = (0.0, -0.62, 0.52)
+
+    @property
+    def variation_space(self) -> VariationSpace:
+        """The bottle's place: ``bottle_x`` along its axis, ``bottle_y`` along the fingers (metres), ``bottle_yaw``."""
+        names = ("bottle_x", "bottle_y", "bottle_yaw")
+        return VariationSpace(names, (-SHIFT, -_AHEAD_RANGE, -TURN), (SHIFT, 0.0, TURN))
+
+    @property
+    def layout(self) -> Layout:
+        """Table 24."""
+        tail = (
+            *object_blocks("bottle", "bottle"),
+            point_block("bottle_cap_position", "bottle/cap_position", "centre of the cap"),
+        )
+        return Layout((*both_hands(self.moving_base), *tail))
+
+    def add_objects(self, scene: mujoco.MjSpec) -> None:
+        """A low table and the bottle on the right palm."""
+        add_table(scene, (0.3, 0.3, 0.1), (0.0, -0.6, 0.05))
+        _BOTTLE.add_to(scene)
+
+    def freeze(self, variation: Tensor) -> dict[str, Tensor]:
+        """``bottle``: place (n, 3)."""
+        return {"bottle": variation}
+
+    def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
+        """Thumbs bent, the bottle on the right palm, cap on."""
+        for side in ("right", "left"):
+            qpos[f"{side}/joints"][:, hand().index(*_THUMB)] = draws.new_tensor(tuple(_THUMB.values()))
+        bottle = qpos["bottle"]
+        nominal, normal = bottle[:, :3].clone(), bottle.new_tensor(_PALM_NORMAL)
+        place(bottle, frozen["bottle"], draws)
+        bottle[:, :3] -= dot(bottle[:, :3] - nominal, normal)[:, None] * normal
+
+    def observe(self, state: TaskState) -> dict[str, Tensor]:
+        """Nothing: every block is read from sensors."""
+        return {}
+
+    def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
+        """Equation 11: ``left`` -d_left, ``right`` -d_right, ``target`` 30 d_target, ``constant`` 0.2."""
+        left, right = reach(state, "left", "bottle/cap_position"), reach(state, "right", "bottle/position")
+        target = 30.0 * apart(state, "bottle/position", "bottle/cap_position")
+        return {"left": -left, "right": -right, "target": target, "constant": torch.full_like(left, 0.2)}
+
+    def success(self, state: TaskState) -> Tensor:
+        """The cap more than 3 cm off."""
+        return state["bottle/slide"][:, 0] > _OPENED

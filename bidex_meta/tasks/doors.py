@@ -1,0 +1,194 @@
+"""The four door classes: appendix A.2.7 and A.2.8, sheet 4.7."""
+
+import math
+from typing import ClassVar
+
+import mujoco
+import torch
+from torch import Tensor
+
+from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
+from bidex_meta.maths import conjugate, multiply, quaternion_from_rpy, xyzw
+from bidex_meta.tasks.base import FIRM, TaskClass
+from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
+from bidex_meta.tasks.reach import apart, reach
+from bidex_meta.tasks.scene import SceneObject
+from bidex_meta.tasks.state import TaskState
+from bidex_meta.tasks.variation import VariationSpace, component, join
+
+_BASE = (0.0, 0.0, 0.7)
+_SHIFT = 0.05
+_TRAVEL = 0.5 * math.pi
+_NEARLY_OPEN = (1.3, 1.57)
+_NEARLY_SHUT = (0.0, 0.15)
+_OPEN_DISTANCE = 0.5
+_SHUT_ANGLE = 0.1 * _TRAVEL
+_HANDLE_DEPTH = 0.04
+_SHUT = ("Success asks for shut leaves; the original's, handles less than 0.5 m apart, accepts them 60 degrees open.",)
+
+
+class _Door(TaskClass):
+    """A double swing door that two hands open or close.
+
+    Observation: Tables 20 and 22 (428). Leaf and handle of the right hand are those at +y. The two classes that open
+    succeed when the handle points are more than 0.5 m apart, those that close when both leaves are within a tenth of
+    their travel of shut: the published test, handle points less than 0.5 m apart, accepts leaves that stand open by
+    60 degrees.
+
+    Decided here: a task freezes the door's place along y and one start angle for both leaves, which start at rest;
+    an episode draws nothing. The goal block holds the base pose, which is also the object's. d_target is the full
+    distance of the two handle points. The Inward classes have the same door turned upside down, so that it swings
+    towards the hands; their handle points lie behind the pulls that then face the hands.
+
+    Attributes:
+        opens: Whether the class opens the door or closes it.
+        inward: Whether the leaves swing towards the hands.
+    """
+
+    opens: ClassVar[bool]
+    inward: ClassVar[bool]
+    episode_steps = 250
+    right = HandPose((0.55, 0.2, 0.6), PALM_LEFT_AHEAD)
+    left = HandPose((0.55, -0.2, 0.6), PALM_RIGHT_AHEAD)
+    transition_scale = 0.5
+    orientation_scale = 0.5
+    start_draws = 0
+    solver = FIRM
+    camera_target = (0.05, 0.0, 0.68)
+    camera_distance = 2.0
+
+    @property
+    def variation_space(self) -> VariationSpace:
+        """The base's shift along y, metres; the start angle of both leaves, radians."""
+        angles = _NEARLY_SHUT if self.opens else _NEARLY_OPEN
+        return join(component("base_y", -_SHIFT, _SHIFT), component("start_angle", *angles))
+
+    @property
+    def layout(self) -> Layout:
+        """Tables 20 and 22."""
+        handles = [
+            point_block(f"{side}_handle_position", f"object/{side}_handle_position", f"behind the {side} leaf's pull")
+            for side in ("right", "left")
+        ]
+        return Layout(
+            (*both_hands(self.moving_base), *object_blocks("object", "object"), *goal_blocks("goal"), *handles)
+        )
+
+    def add_objects(self, scene: mujoco.MjSpec) -> None:
+        """The door, its handle points on the side of the hands."""
+        SceneObject("object", "door", _BASE, self._base_rpy).add_to(scene)
+        if self.inward:
+            for side in ("right", "left"):
+                handle = scene.site(f"object/{side}_handle")
+                handle.pos = (-_HANDLE_DEPTH, *handle.pos[1:])
+
+    def freeze(self, variation: Tensor) -> dict[str, Tensor]:
+        """``goal``: the base pose (n, 7); ``goal_inverse``: inverse rotation (n, 4); ``angle``: both leaves' (n, 1)."""
+        position = variation.new_tensor(_BASE).repeat(len(variation), 1)
+        position[:, 1] += variation[:, 0]
+        turn = xyzw(variation.new_tensor(quaternion_from_rpy(self._base_rpy))).expand(len(variation), 4)
+        return {
+            "goal": torch.cat((position, turn), dim=1),
+            "goal_inverse": conjugate(turn),
+            "angle": variation[:, 1:],
+        }
+
+    def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
+        """The door at the task's place, both leaves at the task's angle."""
+        qpos["object"][:, :3] = frozen["goal"][:, :3]
+        for leaf in (1, 2):
+            qpos[f"object/hinge{leaf}"].copy_(frozen["angle"])
+
+    def observe(self, state: TaskState) -> dict[str, Tensor]:
+        """The goal blocks."""
+        difference = multiply(state.quaternion("object/quaternion"), state.frozen["goal_inverse"])
+        return {"goal_pose": state.frozen["goal"], "goal_rotation_difference": difference}
+
+    def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
+        """0.2 - d_left - d_right + 2 d_target (open) or 2 (1 - d_target) (close)."""
+        target = self._distance(state)
+        return {
+            "left": -reach(state, "left", "object/left_handle_position"),
+            "right": -reach(state, "right", "object/right_handle_position"),
+            "target": 2.0 * target if self.opens else 2.0 * (1.0 - target),
+            "constant": torch.full_like(target, 0.2),
+        }
+
+    def success(self, state: TaskState) -> Tensor:
+        """Open: handle points more than 0.5 m apart. Close: both leaves within a tenth of their travel of shut."""
+        if self.opens:
+            return self._distance(state) > _OPEN_DISTANCE
+        first, second = (state[f"object/hinge{leaf}_angle"][:, 0] for leaf in (1, 2))
+        return (first < _SHUT_ANGLE) & (second < _SHUT_ANGLE)
+
+    @property
+    def _base_rpy(self) -> tuple[float, float, float]:
+        """Orientation of the door's base: upright, or upside down about y."""
+        return (0.0, math.pi, 0.0) if self.inward else (0.0, 0.0, 0.0)
+
+    def _distance(self, state: TaskState) -> Tensor:
+        """Distance (m) between the two handle points, shape (n,)."""
+        return apart(state, "object/left_handle_position", "object/right_handle_position")
+
+
+class DoorOpenOutward(_Door):
+    """Push a double door open.
+
+    Observation: Table 20 (428). Reward: equation 7. Success: handle points more than 0.5 m apart.
+    """
+
+    name = "DoorOpenOutward"
+    summary = "Push a double door open"
+    formula = "0.2 - d_left - d_right + 2 d, d between the two handles"
+    solved = "handles more than 0.5 m apart"
+    opens = True
+    inward = False
+
+
+class DoorCloseInward(_Door):
+    """Push a double door shut that stands open towards the hands.
+
+    Observation: Table 20 (428). Reward: equation 8. Success: both leaves within 0.157 rad of shut. The hands start
+    farther out than in the other door classes, beside the open leaves.
+    """
+
+    name = "DoorCloseInward"
+    summary = "Push a double door shut that stands open towards the hands"
+    formula = "0.2 - d_left - d_right + 2 (1 - d), d between the two handles"
+    solved = "both leaves within a tenth of their travel of shut"
+    deviations = _SHUT
+    opens = False
+    inward = True
+    right = HandPose((0.9, 0.5, 0.6), PALM_LEFT_AHEAD)
+    left = HandPose((0.9, -0.5, 0.6), PALM_RIGHT_AHEAD)
+    camera_target = (0.3, 0.0, 0.65)
+    camera_distance = 2.3
+
+
+class DoorOpenInward(_Door):
+    """Pull a double door open by its handles.
+
+    Observation: Table 22 (428). Reward: equation 9. Success: handle points more than 0.5 m apart.
+    """
+
+    name = "DoorOpenInward"
+    summary = "Pull a double door open by its handles"
+    formula = "0.2 - d_left - d_right + 2 d, d between the two handles"
+    solved = "handles more than 0.5 m apart"
+    opens = True
+    inward = True
+
+
+class DoorCloseOutward(_Door):
+    """Pull a double door shut by its handles that stands open away from the hands.
+
+    Observation: Table 22 (428). Reward: equation 10. Success: both leaves within 0.157 rad of shut.
+    """
+
+    name = "DoorCloseOutward"
+    summary = "Pull a double door shut by its handles"
+    formula = "0.2 - d_left - d_right + 2 (1 - d), d between the two handles"
+    solved = "both leaves within a tenth of their travel of shut"
+    deviations = _SHUT
+    opens = False
+    inward = False

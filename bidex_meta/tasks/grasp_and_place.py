@@ -1,0 +1,116 @@
+"""GraspAndPlace: sheet 4.21 (the appendix has a picture of it and no section)."""
+
+import mujoco
+import torch
+from torch import Tensor
+
+from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
+from bidex_meta.maths import conjugate, rotate
+from bidex_meta.tasks.base import FIRM, TaskClass
+from bidex_meta.tasks.layout import Block, Layout, both_hands, object_blocks, point_block
+from bidex_meta.tasks.placement import DRAWS, place, placed
+from bidex_meta.tasks.reach import apart, reach
+from bidex_meta.tasks.scene import SceneObject, add_table
+from bidex_meta.tasks.state import TaskState
+from bidex_meta.tasks.variation import VariationSpace, join
+
+BUCKET_FLOOR, BUCKET_RIM = -0.049, 0.0445
+"""Heights of the inner floor and of the rim in the bucket's frame, metres (assets/objects/bucket.xml)."""
+_FLOOR_RADIUS, _RIM_RADIUS = 0.0255, 0.053
+"""Inner radius at these heights, to the middle of a wall, metres."""
+
+
+def inside_bucket(points: Tensor, bucket: Tensor, quaternion: Tensor) -> Tensor:
+    """Which points are in a bucket: between floor and rim, and within the wall's radius there.
+
+    Args:
+        points: World positions, metres, shape (n, k, 3).
+        bucket: World positions of the buckets' origins, shape (n, 3).
+        quaternion: Their orientations (x, y, z, w), shape (n, 4).
+
+    Returns:
+        Shape (n, k), bool.
+    """
+    x, y, z = rotate(conjugate(quaternion)[:, None], points - bucket[:, None]).unbind(-1)
+    share = (z - BUCKET_FLOOR) / (BUCKET_RIM - BUCKET_FLOOR)
+    radius = _FLOOR_RADIUS + (_RIM_RADIUS - _FLOOR_RADIUS) * share
+    return (share > 0.0) & (share < 1.0) & ((x * x + y * y).sqrt() < radius)
+
+
+class GraspAndPlace(TaskClass):
+    """Put a block into a bucket: the left hand takes the block, the right hand the bucket.
+
+    Table 1 x 1 m, 60 cm high. Observation: the sheet's (425). Reward: the sheet's formula with hand-point distances,
+    exp(-10 d_right) + exp(-10 d_left) + 2 exp(-10 d), d from the bucket's origin to the block's centre. Success: the
+    block's centre is inside the bucket (the original asks for d < 20 cm, which a block beside the bucket meets).
+
+    A task shifts and turns bucket and block. Both start on the table; the sheet's start inside it. Bucket
+    pose and bucket link have one orientation here, so entries 401-404 and 414-417 are equal.
+    """
+
+    name = "GraspAndPlace"
+    summary = "Put a block into a bucket"
+    formula = "exp(-10 d_left) + exp(-10 d_right) + 2 exp(-10 d), d between bucket and block"
+    solved = "the block's centre is inside the bucket"
+    deviations = ("Success asks that the block be in the bucket, the original that it be within 20 cm of it.",)
+    episode_steps = 500
+    right = HandPose((0.55, 0.2, 0.8), PALM_DOWN_AHEAD)
+    left = HandPose((0.55, -0.2, 0.8), PALM_DOWN_AHEAD)
+    transition_scale = 0.5
+    orientation_scale = 0.1
+    start_draws = 2 * DRAWS
+    solver = FIRM
+    camera_target = (0.1, 0.0, 0.68)
+    camera_distance = 1.7
+
+    @property
+    def variation_space(self) -> VariationSpace:
+        """Shift and turn of bucket and block."""
+        return join(placed("bucket"), placed("block"))
+
+    @property
+    def layout(self) -> Layout:
+        """The sheet's 425 entries."""
+        turn = "quaternion (x, y, z, w), world frame"
+        return Layout(
+            (
+                *both_hands(self.moving_base),
+                *object_blocks("bucket", "bucket"),
+                point_block("bucket_position", "bucket/position", "origin of the bucket"),
+                Block("bucket_link_quaternion", 4, ("bucket/quaternion",), description=turn),
+                point_block("block_position", "block/position", "centre of the block"),
+                Block("block_quaternion", 4, ("block/quaternion",), description=turn),
+            )
+        )
+
+    def add_objects(self, scene: mujoco.MjSpec) -> None:
+        """A table with a bucket and a block."""
+        add_table(scene, (1.0, 1.0, 0.6), (0.0, 0.0, 0.3))
+        SceneObject("bucket", "bucket", (0.0, 0.2, 0.657)).add_to(scene)
+        SceneObject("block", "cube", (0.0, -0.2, 0.625), colour=(0.85, 0.43, 0.30, 1.0)).add_to(scene)
+
+    def freeze(self, variation: Tensor) -> dict[str, Tensor]:
+        """``bucket``, ``block``: shifts and turns, each (n, 3)."""
+        return {"bucket": variation[:, :3], "block": variation[:, 3:]}
+
+    def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
+        """Places bucket and block."""
+        place(qpos["bucket"], frozen["bucket"], draws[:, :DRAWS])
+        place(qpos["block"], frozen["block"], draws[:, DRAWS:])
+
+    def observe(self, state: TaskState) -> dict[str, Tensor]:
+        """Nothing: every block of the layout is read from sensors."""
+        return {}
+
+    def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
+        """``left`` exp(-10 d_left), ``right`` exp(-10 d_right), ``target`` 2 exp(-10 d)."""
+        return {
+            "left": torch.exp(-10.0 * reach(state, "left", "block/position")),
+            "right": torch.exp(-10.0 * reach(state, "right", "bucket/position")),
+            "target": 2.0 * torch.exp(-10.0 * apart(state, "bucket/position", "block/position")),
+        }
+
+    def success(self, state: TaskState) -> Tensor:
+        """The block's centre is inside the bucket."""
+        block = state["block/position"][:, None]
+        return inside_bucket(block, state["bucket/position"], state.quaternion("bucket/quaternion"))[:, 0]

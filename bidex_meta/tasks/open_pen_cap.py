@@ -1,0 +1,101 @@
+"""OpenPenCap: appendix A.2.14, sheet 4.17."""
+
+import math
+
+import mujoco
+import torch
+from torch import Tensor
+
+from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
+from bidex_meta.maths import conjugate, multiply, rotate, xyzw
+from bidex_meta.tasks.base import Solver, TaskClass
+from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
+from bidex_meta.tasks.placement import DRAWS, place, placed
+from bidex_meta.tasks.reach import apart, reach
+from bidex_meta.tasks.scene import SceneObject, add_table
+from bidex_meta.tasks.state import TaskState
+from bidex_meta.tasks.variation import VariationSpace
+
+_PEN = SceneObject("pen", "pen", (0.0, 0.0, 0.612), (0.5 * math.pi, 0.5 * math.pi, 0.0))
+_OPEN = 0.3
+_BODY_POINT = 0.07
+"""Where the body point lies on the pen's axis, metres; the cap's point lies towards the other end."""
+_GHOST = (0.012, 0.012, 0.012)
+
+
+class OpenPenCap(TaskClass):
+    """Pull the cap off a pen that lies on a table: the left hand at its body, the right hand at its cap.
+
+    Observation: Table 34 (428). Reward: equation 16, d_target the distance of the points on body and cap. Success: they
+    are more than 0.3 m apart, that is the cap pulled 13 cm, its own length.
+    Goal position is the cap's point at 0.3 m with the body at the task's start place, goal orientation the pen's there;
+    reward and success do not read them. The pen lies on flats: the original rolls.
+    """
+
+    name = "OpenPenCap"
+    summary = "Pull the cap off a pen"
+    episode_steps = 125
+    right = HandPose((0.55, 0.2, 0.8), PALM_DOWN_AHEAD)
+    left = HandPose((0.55, -0.2, 0.8), PALM_DOWN_AHEAD)
+    transition_scale = 0.5
+    orientation_scale = 0.1
+    start_draws = DRAWS
+    solver = Solver(100, 50, mujoco.mjtIntegrator.mjINT_IMPLICIT)
+    camera_target = (0.12, 0.0, 0.66)
+
+    @property
+    def variation_space(self) -> VariationSpace:
+        """The pen's place."""
+        return placed("pen")
+
+    @property
+    def layout(self) -> Layout:
+        """Table 34."""
+        tail = (
+            *object_blocks("pen", "pen"),
+            *goal_blocks("goal"),
+            point_block("pen_body_position", "pen/body_position", "point on the pen's body for the left hand"),
+            point_block("pen_cap_position", "pen/cap_position", "point on the pen's cap for the right hand"),
+        )
+        return Layout((*both_hands(self.moving_base), *tail))
+
+    def add_objects(self, scene: mujoco.MjSpec) -> None:
+        """The table and the pen along y, cap to +y."""
+        add_table(scene, (0.5, 1.0, 0.6), (0.0, 0.0, 0.3))
+        _PEN.add_to(scene)
+
+    def freeze(self, variation: Tensor) -> dict[str, Tensor]:
+        """``pen``: place (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse of its rotation (n, 4)."""
+        pen = variation.new_tensor((*_PEN.position, *_PEN.quaternion)).repeat(len(variation), 1)
+        place(pen, variation)
+        rotation = xyzw(pen[:, 3:])
+        cap = pen[:, :3] + rotate(rotation, pen.new_tensor((0.0, 0.0, _BODY_POINT - _OPEN)))
+        return {"pen": variation, "goal": torch.cat((cap, rotation), dim=1), "goal_inverse": conjugate(rotation)}
+
+    def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
+        """The pen on the table, cap on."""
+        place(qpos["pen"], frozen["pen"], draws)
+
+    def observe(self, state: TaskState) -> dict[str, Tensor]:
+        """The goal blocks."""
+        difference = multiply(state.quaternion("pen/quaternion"), state.frozen["goal_inverse"])
+        return {"goal_pose": state.frozen["goal"], "goal_rotation_difference": difference}
+
+    def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
+        """Equation 16: exp(-10 d_left), exp(-10 d_right), ``target`` 5 d_target, ``constant`` -0.8."""
+        left = torch.exp(-10.0 * reach(state, "left", "pen/body_position"))
+        right = torch.exp(-10.0 * reach(state, "right", "pen/cap_position"))
+        return {"left": left, "right": right, "target": 5.0 * _gap(state), "constant": torch.full_like(left, -0.8)}
+
+    def success(self, state: TaskState) -> Tensor:
+        """The points on body and cap more than 0.3 m apart."""
+        return _gap(state) > _OPEN
+
+    def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
+        """Where the cap's point shall be."""
+        return [(frozen["goal"], _GHOST)]
+
+
+def _gap(state: TaskState) -> Tensor:
+    """Distance (m) of the points on body and cap, shape (n,)."""
+    return apart(state, "pen/body_position", "pen/cap_position")

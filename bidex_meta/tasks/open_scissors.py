@@ -1,0 +1,112 @@
+"""OpenScissors: appendix A.2.12, sheet 4.15."""
+
+import math
+
+import mujoco
+import torch
+from torch import Tensor
+
+from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
+from bidex_meta.maths import conjugate, multiply, rotate, xyzw
+from bidex_meta.tasks.base import FIRM, TaskClass
+from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
+from bidex_meta.tasks.placement import DRAWS, place, placed, yaw_quaternion
+from bidex_meta.tasks.reach import reach
+from bidex_meta.tasks.scene import SceneObject, add_table
+from bidex_meta.tasks.state import TaskState
+from bidex_meta.tasks.variation import VariationSpace, component, join
+
+_SCISSORS = SceneObject("scissors", "scissors", (0.0, 0.0, 0.608), (0.0, 0.0, 0.5 * math.pi))
+_SHUT = -0.59
+"""Hinge angle at the start, rad."""
+_TOLERANCE = 0.1
+_PIVOT, _RIGHT_HANDLE = (-0.0034, 0.0698, 0.0), (0.1, -0.2, 0.0)
+"""The pivot on the left hand's half, and the right handle's point from there on the other half, metres (sheet 5.6)."""
+_GHOST = (0.02, 0.02, 0.01)
+
+
+class OpenScissors(TaskClass):
+    """Open shears that lie on a table by a task's angle, each hand at its loop.
+
+    Observation: Table 30 (428). Reward: equation 14. Success: the hinge within 0.1 rad of the target angle.
+    The formula leaves the target angle open: a task freezes it (0 is 34 degrees open; shut, where episodes start, is
+    -0.59). The object pose is that of the left hand's half. The goal block is of the half that moves: its handle's
+    point and its orientation at the target angle, the other half lying at the task's start place; the rotation
+    difference is that half's too. Loops are hollow, so that fingers enter them; the original's are filled.
+    """
+
+    name = "OpenScissors"
+    summary = "Open shears to a given angle with both hands"
+    episode_steps = 150
+    right = HandPose((0.55, 0.2, 0.8), PALM_DOWN_AHEAD)
+    left = HandPose((0.55, -0.2, 0.8), PALM_DOWN_AHEAD)
+    transition_scale = 0.5
+    orientation_scale = 0.1
+    start_draws = DRAWS
+    solver = FIRM
+    camera_target = (0.08, 0.0, 0.66)
+
+    @property
+    def variation_space(self) -> VariationSpace:
+        """The scissors' place and ``target_angle`` of the hinge, radians."""
+        return join(placed("scissors"), component("target_angle", -0.15, 0.3))
+
+    @property
+    def layout(self) -> Layout:
+        """Table 30."""
+        tail = (
+            *object_blocks("scissors", "scissors"),
+            *goal_blocks("goal"),
+            point_block("right_handle_position", "scissors/right_handle_position", "in the right hand's loop"),
+            point_block("left_handle_position", "scissors/left_handle_position", "in the left hand's loop"),
+        )
+        return Layout((*both_hands(self.moving_base), *tail))
+
+    def add_objects(self, scene: mujoco.MjSpec) -> None:
+        """The table and the scissors flat on it, loops towards the hands."""
+        add_table(scene, (0.5, 1.0, 0.6), (0.0, 0.0, 0.3))
+        _SCISSORS.add_to(scene)
+
+    def freeze(self, variation: Tensor) -> dict[str, Tensor]:
+        """``scissors``: place (n, 3); ``target``: angle (n, 1); ``goal``: pose (n, 7); ``goal_inverse`` (n, 4)."""
+        root = variation.new_tensor((*_SCISSORS.position, *_SCISSORS.quaternion)).repeat(len(variation), 1)
+        place(root, variation[:, :3])
+        rotation = multiply(xyzw(root[:, 3:]), yaw_quaternion(variation[:, 3]))
+        pivot = root[:, :3] + rotate(xyzw(root[:, 3:]), root.new_tensor(_PIVOT))
+        handle = pivot + rotate(rotation, root.new_tensor(_RIGHT_HANDLE))
+        return {
+            "scissors": variation[:, :3],
+            "target": variation[:, 3:],
+            "goal": torch.cat((handle, rotation), dim=1),
+            "goal_inverse": conjugate(rotation),
+        }
+
+    def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
+        """The scissors on the table, shut."""
+        place(qpos["scissors"], frozen["scissors"], draws)
+        qpos["scissors/hinge"].fill_(_SHUT)
+
+    def observe(self, state: TaskState) -> dict[str, Tensor]:
+        """The goal blocks."""
+        difference = multiply(state.quaternion("scissors/half_quaternion"), state.frozen["goal_inverse"])
+        return {"goal_pose": state.frozen["goal"], "goal_rotation_difference": difference}
+
+    def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
+        """Equation 14: ``left`` -d_left, ``right`` -d_right, ``target`` 5 (0.59 - d_target), ``constant`` 2."""
+        left = reach(state, "left", "scissors/left_handle_position")
+        right = reach(state, "right", "scissors/right_handle_position")
+        target = 5.0 * (0.59 - _missing(state))
+        return {"left": -left, "right": -right, "target": target, "constant": torch.full_like(left, 2.0)}
+
+    def success(self, state: TaskState) -> Tensor:
+        """The hinge within 0.1 rad of the target angle."""
+        return _missing(state) < _TOLERANCE
+
+    def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
+        """Where the right handle's point shall be."""
+        return [(frozen["goal"], _GHOST)]
+
+
+def _missing(state: TaskState) -> Tensor:
+    """Distance (rad) of the hinge from the target angle, shape (n,)."""
+    return state.once("missing", lambda: (state["scissors/angle"] - state.frozen["target"]).abs()[:, 0])

@@ -1,0 +1,163 @@
+"""PourWater: appendix A.2.17, sheet 4.20."""
+
+import math
+
+import mujoco
+import torch
+from torch import Tensor
+
+from bidex_meta.errors import BidexError
+from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
+from bidex_meta.maths import conjugate, multiply, quaternion_from_rpy, rotate, xyzw
+from bidex_meta.tasks.base import FIRM, TaskClass
+from bidex_meta.tasks.grasp_and_place import inside_bucket
+from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
+from bidex_meta.tasks.placement import DRAWS, place, placed, yaw_quaternion
+from bidex_meta.tasks.reach import apart, reach
+from bidex_meta.tasks.scene import SceneObject, add_table
+from bidex_meta.tasks.state import TaskState
+from bidex_meta.tasks.variation import VariationSpace, join
+
+_KETTLE = SceneObject("kettle", "kettle", (0.0, 0.0, 0.478), (0.0, 0.0, 0.5 * math.pi))
+_BUCKET = SceneObject("bucket", "bucket", (0.0, -0.3, 0.457))
+_POUR_TILT = math.radians(40.0)
+"""Tilt of the goal's orientation, rad; water leaves at less (assets/objects/kettle.xml)."""
+_WATER = 12
+"""Drops by default: the physics shall stay well within three times the cost of HandOver."""
+_SIDE, _SPACING, _RISE = 5, 0.012, 0.011
+"""The drops start in layers of 5 x 5, 12 mm apart, each layer 11 mm above the last."""
+_FIRST_LAYER = -0.0025
+"""Height of the lowest drops' centres in the kettle's frame, metres: 0.5 mm above its floor."""
+_MOST_WATER = 125
+"""Five layers fit under the lid."""
+
+
+class PourWater(TaskClass):
+    """Pour water from a kettle, held by the right hand, into a bucket, held by the left.
+
+    Table 0.5 x 1 m, 40 cm high. Observation: Table 40 (428). Reward: equation 19; the kettle's point is its handle, the
+    bucket's its origin, the goal a point on the bucket's axis 1 cm below the rim, which moves with the bucket. The
+    upright kettle on the table holds its spout 5 cm above that, so the goal asks for a tilt (or for a lifted bucket).
+    Success: at least a third of the drops are inside the bucket; the original compares the spout with a point below the
+    bucket's bottom. The goal's orientation is the kettle's at the task's start, tilted by 40 degrees towards the spout.
+
+    A task shifts and turns kettle and bucket, and the water with the kettle. Water is drops of 5 mm radius without
+    friction, which no observation shows: twelve by default, 1.4 times the physics of HandOver; the paper's 30 take 2.4
+    times. The kettle has about the sheet's outline, a high floor and an open trough as spout, so that drops run out at
+    less than the goal's tilt. It weighs 1.5 kg; the sheet's 2.46 kg are those of the full body.
+    """
+
+    name = "PourWater"
+    summary = "Pour water from a kettle into a bucket"
+    formula = (
+        "1 - d_left - d_right + 2 (0.5 - d), d from the spout to a point 1 cm below the middle of the bucket's rim"
+    )
+    solved = "a third of the water is in the bucket"
+    deviations = (
+        "Success counts water, the original the distance of the spout and a point below the bucket's bottom.",
+        "Twelve drops without friction by default, the paper's 30 on demand.",
+        "The kettle weighs 1.5 kg and has a high floor and an open trough as spout.",
+    )
+    episode_steps = 125
+    right = HandPose((0.55, 0.2, 0.6), PALM_LEFT_AHEAD)
+    left = HandPose((0.55, -0.2, 0.6), PALM_RIGHT_AHEAD)
+    transition_scale = 0.5
+    orientation_scale = 0.1
+    start_draws = 2 * DRAWS
+    solver = FIRM
+    camera_target = (0.1, -0.05, 0.5)
+    camera_distance = 1.4
+
+    def __init__(self, moving_base: bool | None = None, water: int = _WATER) -> None:
+        """Chooses base and water.
+
+        Args:
+            moving_base: Drive the bases or fix them; None takes the class's own.
+            water: Number of drops, 1 to 125.
+        """
+        super().__init__(moving_base)
+        if not 1 <= water <= _MOST_WATER:
+            raise BidexError(f"Expected 1 to {_MOST_WATER} drops of water, got {water}.")
+        self.water = water
+
+    @property
+    def variation_space(self) -> VariationSpace:
+        """Shift and turn of kettle and bucket."""
+        return join(placed("kettle"), placed("bucket"))
+
+    @property
+    def layout(self) -> Layout:
+        """Table 40."""
+        return Layout(
+            (
+                *both_hands(self.moving_base),
+                *object_blocks("kettle", "kettle"),
+                *goal_blocks("goal"),
+                point_block("kettle_handle_position", "kettle/handle_position", "grip of the kettle's handle"),
+                point_block("bucket_position", "bucket/position", "origin of the bucket"),
+            )
+        )
+
+    def add_objects(self, scene: mujoco.MjSpec) -> None:
+        """A table with kettle and bucket; the drops' positions are their joints' (nominal place: the origin)."""
+        add_table(scene, (0.5, 1.0, 0.4), (0.0, 0.0, 0.2))
+        _KETTLE.add_to(scene)
+        _BUCKET.add_to(scene)
+        for i in range(self.water):
+            SceneObject(f"water{i}", "water", (0.0, 0.0, 0.0)).add_to(scene)
+
+    def freeze(self, variation: Tensor) -> dict[str, Tensor]:
+        """``kettle``, ``bucket``: shifts and turns (n, 3); ``goal_rotation``: (x, y, z, w), and its inverse (n, 4)."""
+        nominal = xyzw(variation.new_tensor(_KETTLE.quaternion))
+        tilt = xyzw(variation.new_tensor(quaternion_from_rpy((0.0, -_POUR_TILT, 0.0))))
+        goal = multiply(multiply(yaw_quaternion(variation[:, 2]), nominal), tilt)
+        return {
+            "kettle": variation[:, :3],
+            "bucket": variation[:, 3:],
+            "goal_rotation": goal,
+            "goal_rotation_inverse": conjugate(goal),
+        }
+
+    def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
+        """Places kettle and bucket, and the water in the kettle."""
+        kettle = qpos["kettle"]
+        place(kettle, frozen["kettle"], draws[:, :DRAWS])
+        place(qpos["bucket"], frozen["bucket"], draws[:, DRAWS:])
+        drops = rotate(xyzw(kettle[:, 3:])[:, None], self._fill(kettle)).float() + kettle[:, None, :3]
+        for i in range(self.water):
+            for k, axis in enumerate("xyz"):
+                qpos[f"water{i}/{axis}"][:, 0] = drops[:, i, k]
+
+    def _fill(self, like: Tensor) -> Tensor:
+        """The drops' places in the kettle's frame, metres, shape (water, 3)."""
+        i = torch.arange(self.water, device=like.device)
+        middle = 0.5 * (_SIDE - 1)
+        x, y = (i % _SIDE - middle) * _SPACING, (i // _SIDE % _SIDE - middle) * _SPACING
+        z = _FIRST_LAYER + i // _SIDE**2 * _RISE
+        return torch.stack((x, y, z), dim=1).to(like.dtype)
+
+    def observe(self, state: TaskState) -> dict[str, Tensor]:
+        """The goal blocks."""
+        frozen = state.frozen
+        return {
+            "goal_pose": torch.cat((state["bucket/mouth_position"], frozen["goal_rotation"]), dim=1),
+            "goal_rotation_difference": multiply(
+                state.quaternion("kettle/quaternion"), frozen["goal_rotation_inverse"]
+            ),
+        }
+
+    def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
+        """``constant`` 1, ``left`` -d_left, ``right`` -d_right, ``target`` 2 (0.5 - d_target)."""
+        left, right = reach(state, "left", "bucket/position"), reach(state, "right", "kettle/handle_position")
+        return {
+            "constant": torch.ones_like(left),
+            "left": -left,
+            "right": -right,
+            "target": 2.0 * (0.5 - apart(state, "kettle/spout_position", "bucket/mouth_position")),
+        }
+
+    def success(self, state: TaskState) -> Tensor:
+        """At least a third of the drops are inside the bucket."""
+        drops = torch.stack([state[f"water{i}/position"] for i in range(self.water)], dim=1)
+        inside = inside_bucket(drops, state["bucket/position"], state.quaternion("bucket/quaternion"))
+        return 3 * inside.sum(dim=1) >= self.water

@@ -1,0 +1,139 @@
+"""StackBlock: appendix A.2.16, sheet 4.19."""
+
+import mujoco
+import torch
+from torch import Tensor
+
+from bidex_meta.hands.poses import PALM_DOWN_AWAY, PALM_DOWN_BACK, HandPose
+from bidex_meta.maths import norm
+from bidex_meta.tasks.base import FIRM, TaskClass
+from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
+from bidex_meta.tasks.placement import DRAWS, place, placed
+from bidex_meta.tasks.reach import reach
+from bidex_meta.tasks.scene import SceneObject, add_table
+from bidex_meta.tasks.state import TaskState
+from bidex_meta.tasks.variation import VariationSpace, component, join
+
+_EDGE = 0.05
+"""Edge of a block, metres."""
+_STARTS = {"block1": (0.0, -0.1, 0.625), "block2": (0.0, 0.1, 0.625)}
+_BOTTOM = (0.0, 0.0, 0.625)
+"""Middle of the places where the bottom block shall stand, world, metres."""
+_TARGET_RANGE = 0.03
+_SUCCESS_DISTANCE = 0.03
+_SUCCESS_HEIGHT = 0.01
+"""Block 1 is on block 2 when its centre is one edge higher, give or take this, metres."""
+_BLOCK_FRICTION = 0.375
+"""Mean of the sheet's 0.25 for blocks and 0.5 for hands."""
+_TABLE_FRICTION = 0.225
+"""Mean of the sheet's 0.25 for blocks and 0.2 for the table."""
+
+
+class StackBlock(TaskClass):
+    """Stack two blocks: the left hand's block 1 on the right hand's block 2.
+
+    Table 0.5 x 1 m, 60 cm high. Observation: Table 38 (428); its goal is the top block's: target 1, upright and
+    unturned (the reward asks for no turn). Reward: equation 18, with each block's distance to its own target (the paper
+    prints target 1 twice). Success: each block within 3 cm of its target and block 1 on block 2: one edge higher within
+    1 cm, and within 3 cm above its middle.
+
+    A task shifts and turns both blocks and shifts the targets by up to 3 cm along x and y. Frictions are the means of
+    the sheet's figures; of four kinds of contact, two differ from them: block on block has 0.375 instead of 0.25, hand
+    on table 0.225 instead of 0.35.
+    """
+
+    name = "StackBlock"
+    summary = "Stack two blocks at a given place"
+    formula = "1.5 - d_left - d_right + 2 (0.24 - d), d the sum of both blocks' distances to their targets"
+    solved = "both blocks within 3 cm of their targets, block 1 on block 2"
+    deviations = (
+        "The printed formula names target 1 twice; here each block has its own.",
+        "Friction of block on block is 0.375 instead of 0.25, of hand on table 0.225 instead of 0.35.",
+    )
+    episode_steps = 250
+    right = HandPose((0.0, 0.6, 0.7), PALM_DOWN_AWAY)
+    left = HandPose((0.0, -0.6, 0.7), PALM_DOWN_BACK)
+    transition_scale = 0.2
+    orientation_scale = 0.02
+    start_draws = 2 * DRAWS
+    solver = FIRM
+    camera_target = (0.0, 0.0, 0.66)
+    camera_distance = 1.5
+
+    @property
+    def variation_space(self) -> VariationSpace:
+        """Shift and turn of both blocks, shift of the targets."""
+        target = [component(f"target_{axis}", -_TARGET_RANGE, _TARGET_RANGE) for axis in "xy"]
+        return join(placed("block1"), placed("block2"), *target)
+
+    @property
+    def layout(self) -> Layout:
+        """Table 38."""
+        return Layout(
+            (
+                *both_hands(self.moving_base),
+                *object_blocks("block1", "block1"),
+                *goal_blocks("goal"),
+                point_block("block1_position", "block1/position", "centre of block 1"),
+                point_block("block2_position", "block2/position", "centre of block 2"),
+            )
+        )
+
+    def add_objects(self, scene: mujoco.MjSpec) -> None:
+        """A slippery table with two slippery blocks of different colour."""
+        add_table(scene, (0.5, 1.0, 0.6), (0.0, 0.0, 0.3), friction=_TABLE_FRICTION, priority=2)
+        SceneObject("block1", "cube", _STARTS["block1"], colour=(0.85, 0.43, 0.30, 1.0)).add_to(scene)
+        SceneObject("block2", "cube", _STARTS["block2"]).add_to(scene)
+        for name in _STARTS:
+            cube = scene.geom(f"{name}/cube")
+            cube.friction[0], cube.priority = _BLOCK_FRICTION, 1
+
+    def freeze(self, variation: Tensor) -> dict[str, Tensor]:
+        """``block1``, ``block2``: shifts, turns (n, 3); ``goal``: the top block's pose (n, 7); ``target2`` (n, 3)."""
+        shift = torch.cat((variation[:, 6:8], torch.zeros_like(variation[:, :1])), dim=1)
+        bottom = shift + shift.new_tensor(_BOTTOM)
+        top = bottom + shift.new_tensor((0.0, 0.0, _EDGE))
+        turn = shift.new_tensor((0.0, 0.0, 0.0, 1.0)).expand(len(shift), 4)
+        return {
+            "block1": variation[:, :3],
+            "block2": variation[:, 3:6],
+            "goal": torch.cat((top, turn), dim=1),
+            "target2": bottom,
+        }
+
+    def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
+        """Places both blocks."""
+        place(qpos["block1"], frozen["block1"], draws[:, :DRAWS])
+        place(qpos["block2"], frozen["block2"], draws[:, DRAWS:])
+
+    def observe(self, state: TaskState) -> dict[str, Tensor]:
+        """The goal blocks; the goal is unturned, so block 1's own orientation is the difference."""
+        return {"goal_pose": state.frozen["goal"], "goal_rotation_difference": state.quaternion("block1/quaternion")}
+
+    def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
+        """``constant`` 1.5, ``left`` -d_left, ``right`` -d_right, ``target`` 2 (0.24 - d_target)."""
+        left, right = reach(state, "left", "block1/position"), reach(state, "right", "block2/position")
+        first, second = self._distances(state)
+        return {
+            "constant": torch.full_like(left, 1.5),
+            "left": -left,
+            "right": -right,
+            "target": 2.0 * (0.24 - (first + second)),
+        }
+
+    def success(self, state: TaskState) -> Tensor:
+        """Both blocks within 3 cm of their targets, block 1 on block 2."""
+        first, second = self._distances(state)
+        x, y, z = (state["block1/position"] - state["block2/position"]).unbind(1)
+        stacked = ((z - _EDGE).abs() < _SUCCESS_HEIGHT) & ((x * x + y * y).sqrt() < _SUCCESS_DISTANCE)
+        return (first < _SUCCESS_DISTANCE) & (second < _SUCCESS_DISTANCE) & stacked
+
+    def _distances(self, state: TaskState) -> tuple[Tensor, Tensor]:
+        """Distance (m) of each block from its target, each (n,)."""
+        first = state["block1/position"] - state.frozen["goal"][:, :3]
+        return norm(first), norm(state["block2/position"] - state.frozen["target2"])
+
+    def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
+        """Both targets."""
+        bottom = torch.cat((frozen["target2"], frozen["goal"][:, 3:]), dim=1)
+        return [(frozen["goal"], (0.025, 0.025, 0.025)), (bottom, (0.025, 0.025, 0.025))]

@@ -1,0 +1,104 @@
+"""SwingCup: appendix A.2.11, sheet 4.14."""
+
+import math
+
+import mujoco
+import torch
+from torch import Tensor
+
+from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
+from bidex_meta.maths import conjugate, multiply, rotation_angle, xyzw
+from bidex_meta.tasks.base import FIRM, TaskClass
+from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
+from bidex_meta.tasks.placement import DRAWS, place, placed, yaw_quaternion
+from bidex_meta.tasks.reach import reach
+from bidex_meta.tasks.scene import SceneObject, add_table
+from bidex_meta.tasks.state import TaskState
+from bidex_meta.tasks.variation import VariationSpace, component, join
+
+_CUP = SceneObject("cup", "cup", (0.0, 0.0, 0.6845), (0.0, 0.0, 0.5 * math.pi))
+_SUCCESS_ANGLE = 0.25 * math.pi
+_GHOST = (0.1, 0.012, 0.012)
+
+
+class SwingCup(TaskClass):
+    """Turn a two-handled cup about the vertical, each hand at its ear.
+
+    Observation: Table 28 (428). Reward: equation 13. Success: the cup within 45 degrees of its goal.
+    The goal's turn is counted from the nominal start (yaw 90 degrees), without the task's own start turn: it lies at
+    least 72 degrees away, so no start is a success. The original's goal, half a turn away, is one end of the range.
+    Goal position is the task's start position; reward and success do not read it.
+    """
+
+    name = "SwingCup"
+    summary = "Turn a two-handled cup with both hands"
+    episode_steps = 300
+    right = HandPose((0.35, 0.2, 0.8), PALM_LEFT_AHEAD)
+    left = HandPose((0.35, -0.2, 0.8), PALM_RIGHT_AHEAD)
+    transition_scale = 0.1
+    orientation_scale = 0.1
+    start_draws = DRAWS
+    solver = FIRM
+    camera_target = (0.08, 0.0, 0.68)
+
+    @property
+    def variation_space(self) -> VariationSpace:
+        """The cup's place and ``yaw_change``, the goal's turn from the nominal start, radians."""
+        return join(placed("cup"), component("yaw_change", 0.5 * math.pi, math.pi))
+
+    @property
+    def layout(self) -> Layout:
+        """Table 28."""
+        tail = (
+            *object_blocks("cup", "cup"),
+            *goal_blocks("goal"),
+            point_block("right_handle_position", "cup/right_handle_position", "middle of the right hand's ear"),
+            point_block("left_handle_position", "cup/left_handle_position", "middle of the left hand's ear"),
+        )
+        return Layout((*both_hands(self.moving_base), *tail))
+
+    def add_objects(self, scene: mujoco.MjSpec) -> None:
+        """The table and the cup, ears towards the hands."""
+        add_table(scene, (0.3, 0.3, 0.6), (0.0, 0.0, 0.3))
+        _CUP.add_to(scene)
+
+    def freeze(self, variation: Tensor) -> dict[str, Tensor]:
+        """``cup``: place (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse of its rotation (n, 4)."""
+        position = variation.new_tensor(_CUP.position).repeat(len(variation), 1)
+        position[:, :2] += variation[:, :2]
+        rotation = multiply(yaw_quaternion(variation[:, 3]), xyzw(variation.new_tensor(_CUP.quaternion)))
+        goal = torch.cat((position, rotation), dim=1)
+        return {"cup": variation[:, :3], "goal": goal, "goal_inverse": conjugate(rotation)}
+
+    def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
+        """The cup on the table, lid shut."""
+        place(qpos["cup"], frozen["cup"], draws)
+
+    def observe(self, state: TaskState) -> dict[str, Tensor]:
+        """The goal blocks."""
+        return {"goal_pose": state.frozen["goal"], "goal_rotation_difference": _difference(state)}
+
+    def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
+        """Equation 13: ``left`` -d_left, ``right`` -d_right, ``target`` 5 / (d_target + 0.1), ``constant`` -1."""
+        left = reach(state, "left", "cup/left_handle_position")
+        right = reach(state, "right", "cup/right_handle_position")
+        target = 5.0 / (_angle(state) + 0.1)
+        return {"left": -left, "right": -right, "target": target, "constant": torch.full_like(left, -1.0)}
+
+    def success(self, state: TaskState) -> Tensor:
+        """The cup within 45 degrees of its goal."""
+        return _angle(state) < _SUCCESS_ANGLE
+
+    def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
+        """The line of the ears at the goal."""
+        return [(frozen["goal"], _GHOST)]
+
+
+def _difference(state: TaskState) -> Tensor:
+    """The cup's quaternion times the inverse of its goal's, (x, y, z, w), shape (n, 4)."""
+    return state.once("difference", lambda: multiply(state.quaternion("cup/quaternion"), state.frozen["goal_inverse"]))
+
+
+def _angle(state: TaskState) -> Tensor:
+    """Rotation from cup to goal, rad in [0, pi], shape (n,)."""
+    return state.once("angle", lambda: rotation_angle(_difference(state)))

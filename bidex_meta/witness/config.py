@@ -1,0 +1,35 @@
+"""What can be set about the planner; imports no torch, so that a command line can show it at once."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class PlannerConfig:
+    """Everything that can be set about the planner."""
+
+    samples: int = 256
+    """Action sequences per round."""
+    copies: int = 1
+    """Slightly shifted states that each sequence is tried in; the mean over them counts: no plan that holds by luck."""
+    rounds: int = 4
+    """Rounds per plan."""
+    first_rounds: int = 12
+    """Rounds of the first plan, which has no predecessor."""
+    elite_share: float = 0.08
+    """Share of the sequences that mean and deviation move towards."""
+    kept_elites: int = 4
+    """Elites that are tried again in the next round."""
+    horizon: int = 50
+    """Control steps a plan looks ahead."""
+    knots: int = 9
+    """Knots of a plan; actions between them are interpolated linearly."""
+    execute: int = 8
+    """Control steps played before the next plan."""
+    std: float = 0.5
+    """Deviation of the knots in a first round."""
+    min_std: float = 0.12
+    """The deviation never falls below this."""
+    gamma: float = 0.98
+    """Discount per control step."""
+    seed: int = 0
+    """Of the samples."""

@@ -1,0 +1,146 @@
+"""A sampling planner: the cross-entropy method over knots in time, with a receding horizon, on the printed reward.
+
+From the present state it samples action sequences, keeps the best as elites, moves mean and deviation towards them, and
+after some rounds plays the first steps of the best sequence; the rest warm-starts the next plan.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bidex_meta.hands.hand import hand
+from bidex_meta.witness.config import PlannerConfig
+from bidex_meta.witness.simulator import Simulator, State
+
+LEVELS = 127
+"""Actions are whole multiples of 1/127, so that a byte holds one exactly."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a search found."""
+
+    actions: np.ndarray
+    """Actions of the whole episode, (T, action_size), multiples of 1/127."""
+    rewards: np.ndarray
+    """Unscaled rewards they gave, (T,)."""
+    first_success: int | None
+    """Index of the first successful step, None if there is none."""
+
+    @property
+    def total(self) -> float:
+        """Sum of the rewards."""
+        return float(self.rewards.sum())
+
+
+class Planner:
+    """The search for one class; see the module.
+
+    Args:
+        name: The class.
+        config: See :class:`PlannerConfig`.
+        threads: Engine threads; None takes all CPUs.
+    """
+
+    def __init__(self, name: str, config: PlannerConfig, threads: int | None = None):
+        self.config = config
+        self.simulator = Simulator(name, config.samples * config.copies, threads)
+        self._generator = torch.Generator().manual_seed(config.seed)
+        self._weights = interpolation(config.horizon, config.knots)
+
+    def search(self, report: Callable[[int, float, bool], None] | None = None) -> Plan:
+        """Plays one episode, planning as it goes.
+
+        Args:
+            report: Called after every plan with the steps played so far, the sum of their rewards, and whether one of
+                them was a success.
+        """
+        cfg, sim = self.config, self.simulator
+        states = sim.starts(cfg.copies - 1)
+        mean = rest_action(sim.action_size).repeat(cfg.knots, 1)
+        actions: list[Tensor] = []
+        rewards: list[float] = []
+        success: list[bool] = []
+        while len(rewards) < sim.episode_steps:
+            mean, best = self._plan(states, mean, cfg.rounds if actions else cfg.first_rounds)
+            steps = min(cfg.execute, sim.episode_steps - len(rewards))
+            states, got, won, alive = self._execute(states, best[:steps])
+            actions.append(best[:steps])
+            rewards += got
+            success += won
+            if report is not None:
+                report(len(rewards), sum(rewards), any(success))
+            if not alive:
+                break
+            mean = shifted(mean, steps, cfg.horizon)
+        played = torch.cat(actions)[: len(rewards)].numpy()
+        first = success.index(True) if any(success) else None
+        return Plan(played, np.array(rewards), first)
+
+    def _plan(self, states: list[State], mean: Tensor, rounds: int) -> tuple[Tensor, Tensor]:
+        """The new mean of the knots (K, a) and the actions (horizon, a) of the best sequence seen."""
+        cfg, sim = self.config, self.simulator
+        std = torch.full_like(mean, cfg.std)
+        discount = cfg.gamma ** torch.arange(cfg.horizon, dtype=torch.float64)
+        elites, best, best_score = mean[None], mean, -torch.inf
+        for _ in range(rounds):
+            noise = torch.randn(cfg.samples, *mean.shape, generator=self._generator)
+            knots = (mean + std * noise).clamp(-1.0, 1.0)
+            knots[: len(elites)] = elites
+            sim.load(states)
+            actions = quantised(torch.einsum("hk,nka->hna", self._weights, knots))
+            trace = sim.play(actions.repeat(1, cfg.copies, 1))
+            scores = (discount[:, None] * trace.rewards).sum(0).view(cfg.copies, -1).mean(0)
+            order = scores.argsort(descending=True)
+            chosen = knots[order[: max(2, round(cfg.elite_share * cfg.samples))]]
+            mean, std = chosen.mean(0), chosen.std(0).clamp(min=cfg.min_std)
+            elites = chosen[: cfg.kept_elites]
+            if scores[order[0]] > best_score:
+                best, best_score = chosen[0], float(scores[order[0]])
+        return mean, quantised(self._weights @ best)
+
+    def _execute(self, states: list[State], actions: Tensor) -> tuple[list[State], list[float], list[bool], bool]:
+        """Plays actions (T, a) in every copy; rewards and successes are those of the unshifted one, the first."""
+        sim, copies = self.simulator, self.config.copies
+        sim.load(states)
+        trace = sim.play(actions[:, None].expand(-1, sim.num, -1))
+        rows = range(0, sim.num, sim.num // copies)
+        return (
+            [sim.save(row) for row in rows],
+            trace.rewards[:, 0].tolist(),
+            trace.success[:, 0].tolist(),
+            bool(trace.alive[0]),
+        )
+
+
+def interpolation(horizon: int, knots: int) -> Tensor:
+    """Weights (horizon, knots) of linear interpolation; the first knot is the first step, the last one the last."""
+    place = torch.linspace(0.0, knots - 1.0, horizon)
+    return (1.0 - (place[:, None] - torch.arange(knots)).abs()).clamp(min=0.0)
+
+
+def shifted(knots: Tensor, steps: int, horizon: int) -> Tensor:
+    """The knots (K, a) of a plan of which so many steps have been played; the last value is held."""
+    place = torch.linspace(0.0, horizon - 1.0, len(knots)) + steps
+    weights = (1.0 - (place[:, None] * (len(knots) - 1) / (horizon - 1) - torch.arange(len(knots))).abs()).clamp(
+        min=0.0
+    )
+    weights[place >= horizon - 1] = 0.0
+    weights[place >= horizon - 1, -1] = 1.0
+    return weights @ knots
+
+
+def quantised(actions: Tensor) -> Tensor:
+    """Actions rounded to multiples of 1/127, float32."""
+    return (actions.clamp(-1.0, 1.0) * LEVELS).round() / LEVELS
+
+
+def rest_action(size: int) -> Tensor:
+    """The action (size,) that holds zero joint angles and leaves the bases alone."""
+    low, high = (torch.as_tensor(x).float() for x in (hand().control_low, hand().control_high))
+    one = torch.zeros(size // 2)
+    one[: len(low)] = (-(high + low) / (high - low)).clamp(-1.0, 1.0)
+    return one.repeat(2)

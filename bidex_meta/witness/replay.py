@@ -1,0 +1,54 @@
+"""Plays a witness again: from its start, and from starts that are shifted by a tenth of a millimetre."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from bidex_meta.witness.simulator import Simulator
+from bidex_meta.witness.store import Witness
+
+SHIFTED = 10
+"""Shifted starts that a witness is tried from."""
+NEEDED = 8
+"""Of these so many must succeed."""
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What a replay showed."""
+
+    total: float
+    """Return from the unshifted start."""
+    first_success: int | None
+    """Index of its first successful step."""
+    succeeded: int
+    """Shifted starts that succeed."""
+
+    @property
+    def found(self) -> bool:
+        """Whether this counts as a witness: it succeeds, and so do eight of ten shifted starts."""
+        return self.first_success is not None and self.succeeded >= NEEDED
+
+
+def frames(name: str, witness: Witness, camera: str | None = None, **size: int) -> Iterator[np.ndarray]:
+    """A picture before each step and after the last, (height, width, 3) uint8."""
+    simulator = Simulator(name, 1, threads=1)
+    for action in torch.from_numpy(witness.actions):
+        yield simulator.picture(camera=camera, **size)
+        simulator.play(action[None, None])
+    yield simulator.picture(camera=camera, **size)
+    simulator.close()
+
+
+def replay(name: str, witness: Witness, threads: int | None = None) -> Replay:
+    """Plays a witness of a class from its start and from ten shifted ones."""
+    simulator = Simulator(name, 1 + SHIFTED, threads)
+    simulator.load(simulator.starts(SHIFTED))
+    actions = torch.from_numpy(witness.actions)
+    trace = simulator.play(actions[:, None].expand(-1, simulator.num, -1))
+    simulator.close()
+    steps = trace.success[:, 0].nonzero().flatten().tolist()
+    won = trace.success.any(dim=0)
+    return Replay(float(trace.rewards[:, 0].sum()), steps[0] if steps else None, int(won[1:].sum()))

@@ -1,0 +1,121 @@
+"""Many rows of one task in one state: the world's own physics and reward, without its episodes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bidex_meta.benchmark import Benchmark
+from bidex_meta.errors import unknown_name
+from bidex_meta.world import Slot, World
+
+SUITE, SEED = "MT20", 0
+"""Witnesses are about task 0 of each class of this suite and seed."""
+SHIFT = 1e-4
+"""How far the objects' start is shifted to see whether a witness holds by more than luck, metres."""
+
+State = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What happened in T steps of N rows."""
+
+    rewards: Tensor
+    """Unscaled reward (T, N), float64; 0 from the step after an end on."""
+    success: Tensor
+    """Bool (T, N), counted until the end of the episode."""
+    alive: Tensor
+    """Bool (N,): the episode has not failed nor its physics broken."""
+
+
+def task_slot(name: str) -> Slot:
+    """The slot of a class with the one task that witnesses are about.
+
+    Raises:
+        BidexError: The suite has no such class.
+    """
+    benchmark = Benchmark(SUITE, seed=SEED)
+    if name not in benchmark.train_classes:
+        raise unknown_name("task", name, benchmark.train_classes)
+    task = next(t for t in benchmark.train_tasks if t.env_name == name)
+    return Slot(name, benchmark.train_classes[name], task.variation[None])
+
+
+class Simulator:
+    """N rows of a class's task 0, all at the same start.
+
+    Args:
+        name: The class.
+        num: Rows.
+        threads: Engine threads; None takes all CPUs.
+
+    Attributes:
+        action_size: Actions of a row.
+        episode_steps: Time limit, control steps.
+    """
+
+    def __init__(self, name: str, num: int, threads: int | None = None):
+        slot = task_slot(name)
+        self.num, self.task = num, slot.task_class
+        self.action_size, self.episode_steps = slot.task_class.action_size, slot.task_class.episode_steps
+        self._world = World([slot], num, autoreset_mode="DISABLED", seed=SEED, threads=threads)
+        self._world.reset(seed=SEED)
+        self._part = self._world.parts[0]
+        self._engine = self._part.group.engine
+        self._start = self._engine.placement()[0]
+        self._everyone = torch.ones(num, dtype=torch.bool)
+        self._engine.reset(self._everyone, self._start.expand(num, -1))
+
+    def starts(self, shifted: int) -> list[State]:
+        """The start state and so many in which every free object is shifted by 0.1 mm in the plane."""
+        generator = torch.Generator().manual_seed(SEED)
+        places = self._part.group.members[0].scene.qpos
+        objects = [where for part, where in places.items() if "/" not in part and where.stop <= self._nq]
+        states = []
+        for i in range(shifted + 1):
+            start = self._start.clone()
+            for where in objects if i else []:
+                angle = 2.0 * torch.pi * torch.rand(1, generator=generator, dtype=start.dtype)
+                start[where.start : where.start + 2] += SHIFT * torch.cat((angle.cos(), angle.sin()))
+            self._engine.reset(self._everyone, start.expand(self.num, -1))
+            states.append(self.save(0))
+        return states
+
+    @property
+    def _nq(self) -> int:
+        return self._engine.qpos.shape[1]
+
+    def save(self, row: int) -> State:
+        """The state of a row, copied."""
+        return {name: value[row].clone() for name, value in self._engine.state_dict().items()}
+
+    def load(self, states: list[State]) -> None:
+        """Puts the rows, in equal consecutive shares, into these states; their number must divide that of the rows."""
+        share = self.num // len(states)
+        names = states[0]
+        self._engine.load_state_dict(
+            {name: torch.stack([s[name] for s in states]).repeat_interleave(share, dim=0) for name in names}
+        )
+
+    def play(self, actions: Tensor) -> Trace:
+        """Plays actions (T, N, action_size) in [-1, 1] from where the rows stand."""
+        alive = torch.ones(self.num, dtype=torch.bool)
+        rewards, success = [], []
+        for action in actions:
+            self._part.step(action, None)
+            transition = self._part.transition(list(self._part.states(self._world.task_index)))
+            alive &= ~transition.unstable
+            rewards.append(torch.where(alive, transition.reward, 0.0))
+            success.append(alive & transition.success)
+            alive &= ~transition.failed
+        return Trace(torch.stack(rewards), torch.stack(success), alive)
+
+    def picture(self, width: int = 640, height: int = 480, camera: str | None = None) -> np.ndarray:
+        """The first row as it stands, (height, width, 3) uint8."""
+        return self._world.render(row=0, width=width, height=height, camera=camera)
+
+    def close(self) -> None:
+        """Ends the engine."""
+        self._world.close()

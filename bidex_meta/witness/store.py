@@ -1,0 +1,51 @@
+"""Witnesses on disk: one small file a class under ``assets/witnesses/``."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bidex_meta import paths
+from bidex_meta.errors import BidexError
+from bidex_meta.witness.planner import LEVELS
+
+
+@dataclass(frozen=True)
+class Witness:
+    """Recorded actions and what they were made with."""
+
+    actions: np.ndarray
+    """Actions (T, action_size), float32, multiples of 1/127."""
+    made: dict[str, Any]
+    """Return, step of the first success, how it was found, versions."""
+
+
+def witness_path(name: str) -> Path:
+    """Where the witness of a class lies."""
+    return paths.assets_dir() / "witnesses" / f"{name}.npz"
+
+
+def load_witness(name: str) -> Witness:
+    """The witness of a class.
+
+    Raises:
+        BidexError: There is none.
+    """
+    path = witness_path(name)
+    if not path.is_file():
+        raise BidexError(f"{name} has no witness yet. Search one: bidex-meta witness --task {name} --find")
+    with np.load(path, allow_pickle=False) as stored:
+        actions = stored["actions"].astype(np.float32) / LEVELS
+        return Witness(actions, json.loads(str(stored["made"])))
+
+
+def save_witness(name: str, actions: np.ndarray, made: dict[str, Any], path: Path | None = None) -> Path:
+    """Writes a witness; actions (T, action_size) must be multiples of 1/127."""
+    path = path or witness_path(name)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    levels = np.rint(actions * LEVELS).astype(np.int8)
+    with path.open("wb") as file:
+        np.savez_compressed(file, actions=levels, made=np.array(json.dumps(made)))
+    return path

@@ -1,0 +1,146 @@
+"""The classes with cubes, a bucket and water: equations 12, 18 and 19 of the appendix, and sheet 4.21."""
+
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tests.tasks.oracle import Goal, Judgement, Oracle, Task, at, frame, length, linear, pose, reach, shifted, start
+
+FLOOR, RIM = -0.0529, 0.0445
+"""Heights of the bucket's lower and upper end in its frame, metres (sheet 5.10)."""
+WALL = 0.004
+"""How far the middle of the bucket's wall may lie inside its outer face, metres."""
+UNSURE = 0.007
+"""Whatever lies this near to wall, floor or rim may count either way, metres: their thickness is the project's own."""
+MOUTH = (0.0, 0.0, RIM - 0.01)
+"""Where the spout shall be: on the bucket's axis, 1 cm below its rim."""
+
+
+def inside(data: mujoco.MjData, point: np.ndarray) -> tuple[bool, bool]:
+    """Whether a point surely lies in the bucket, and whether it may."""
+    position, turn = frame(data, "bucket/object")
+    x, y, z = turn.inv().apply(point - position)
+    radius = 0.0298 + (0.0569 - 0.0298) * (z - FLOOR) / (RIM - FLOOR) - WALL
+    depth = min(radius - np.hypot(x, y), z - FLOOR, RIM - z)
+    return depth > UNSURE, depth > -UNSURE
+
+
+class PushBlock(Oracle):
+    """Equation 12."""
+
+    places: ClassVar = {"block1": (-0.2, -0.2, 0.625), "block2": (-0.2, 0.2, 0.625)}
+
+    def points(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
+        return {f"block{i} position": data.body(f"block{i}/object").xpos.copy() for i in (1, 2)}
+
+    def judge(self, data: mujoco.MjData, task: Task) -> Judgement:
+        first, second = self.points(data).values()
+        d_1, d_2 = length(first - np.array(self.places["block1"])), length(second - np.array(self.places["block2"]))
+        terms = linear(data, first, second, 5 * (0.8 - (d_1 + d_2)), 2.0)
+        return Judgement(terms, max(d_1, d_2) <= 0.1, False, min(abs(d_1 - 0.1), abs(d_2 - 0.1)))
+
+    def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        return {
+            name: pose(shifted(np.array(place), *rng.uniform(-0.1, 0.1, 2), 0.005), Rotation.identity())
+            for name, place in self.places.items()
+        }
+
+
+class StackBlock(Oracle):
+    """Equation 18. Block 1 comes to lie on block 2 (design.md section 4)."""
+
+    body_of_goal: ClassVar = {"goal": "block1/object"}
+    entering: ClassVar = {"target_x", "target_y"}
+
+    def points(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
+        return {f"block{i} position": data.body(f"block{i}/object").xpos.copy() for i in (1, 2)}
+
+    def targets(self, task: Task) -> tuple[np.ndarray, np.ndarray]:
+        """Where block 1 and block 2 shall be."""
+        bottom = np.array((task["target_x"], task["target_y"], 0.625))
+        return shifted(bottom, 0, 0, 0.05), bottom
+
+    def goals(self, data: mujoco.MjData, task: Task) -> dict[str, Goal]:
+        return {"goal": (self.targets(task)[0], Rotation.identity())}
+
+    def judge(self, data: mujoco.MjData, task: Task) -> Judgement:
+        first, second = self.points(data).values()
+        g_1, g_2 = (length(p - t) for p, t in zip((first, second), self.targets(task), strict=True))
+        terms = linear(data, first, second, (0.24 - (g_1 + g_2)) * 2, 1.5)
+        x, y, z = first - second
+        edges = [g_1 - 0.03, g_2 - 0.03, abs(z - 0.05) - 0.01, np.hypot(x, y) - 0.03]
+        return Judgement(terms, all(edge < 0 for edge in edges), False, float(min(abs(edge) for edge in edges)))
+
+    def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        top, bottom = self.targets(task)
+        bottom = shifted(bottom, *rng.uniform(-0.02, 0.02, 2), 0.004)
+        top = shifted(top, *rng.uniform(-0.02, 0.02, 2), rng.uniform(0.004, 0.02))
+        return {"block1": pose(top, Rotation.identity()), "block2": pose(bottom, Rotation.identity())}
+
+
+class PourWater(Oracle):
+    """Equation 19. Success: at least a third of the water in the bucket."""
+
+    body_of_goal: ClassVar = {"goal": "kettle/object"}
+    spout, handle = (-0.2, 0.0, 0.07), (0.15, 0.0, 0.0)
+
+    def points(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
+        return {
+            "kettle handle position": at(data, "kettle/object", self.handle),
+            "bucket position": data.body("bucket/object").xpos.copy(),
+        }
+
+    def goals(self, data: mujoco.MjData, task: Task) -> dict[str, Goal]:
+        """The mouth of the bucket; the kettle's start tilted by 40 degrees about its y, spout down."""
+        tilt = Rotation.from_rotvec([0.0, -np.deg2rad(40.0), 0.0])
+        return {"goal": (at(data, "bucket/object", MOUTH), start(data, "kettle", task)[1] * tilt)}
+
+    @staticmethod
+    def water(data: mujoco.MjData) -> list[str]:
+        """Names of the drops."""
+        bodies = [data.model.body(i).name for i in range(data.model.nbody)]
+        return [name.removesuffix("/object") for name in bodies if name.startswith("water")]
+
+    def judge(self, data: mujoco.MjData, task: Task) -> Judgement:
+        handle, bucket = self.points(data).values()
+        d_target = length(at(data, "kettle/object", self.spout) - self.goals(data, task)["goal"][0])
+        terms = linear(data, bucket, handle, (0.5 - d_target) * 2, 1.0)
+        drops = [inside(data, data.body(f"{drop}/object").xpos) for drop in self.water(data)]
+        surely, perhaps = (3 * sum(found) >= len(drops) for found in zip(*drops, strict=True))
+        return Judgement(terms, surely, False, 0.0 if surely != perhaps else 1.0)
+
+    def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """Some of the drops in the middle of the bucket, which stands where the task puts it."""
+        position, turn = start(data, "bucket", task)
+        drops = self.water(data)
+        parts = {"bucket": pose(position, turn)}
+        for i, drop in enumerate(drops[: rng.integers(0, len(drops) + 1)]):
+            place = shifted(position, 0.012 * (i % 3 - 1), 0, 0.012 * (i // 3) - 0.02)
+            parts |= {f"{drop}/{axis}": place[k : k + 1] for k, axis in enumerate("xyz")}
+        return parts
+
+
+class GraspAndPlace(Oracle):
+    """Sheet 4.21 with one hand point a hand. Success: the block's centre in the bucket."""
+
+    def points(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
+        return {f"{name} position": data.body(f"{name}/object").xpos.copy() for name in ("bucket", "block")}
+
+    def judge(self, data: mujoco.MjData, task: Task) -> Judgement:
+        bucket, block = self.points(data).values()
+        d_left, d_right = reach(data, block, bucket)
+        terms = {
+            "left": float(np.exp(-10 * d_left)),
+            "right": float(np.exp(-10 * d_right)),
+            "target": 2 * float(np.exp(-10 * length(bucket - block))),
+        }
+        surely, perhaps = inside(data, block)
+        return Judgement(terms, surely, False, 0.0 if surely != perhaps else 1.0)
+
+    def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """The block over the middle of the bucket, or beside it."""
+        position, turn = start(data, "bucket", task)
+        beside = (0.12, 0, 0) if rng.random() < 0.5 else (0, 0, rng.uniform(0.01, 0.025))
+        return {"bucket": pose(position, turn), "block": pose(shifted(position, *beside), turn)}

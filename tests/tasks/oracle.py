@@ -1,0 +1,132 @@
+"""What the printed formulas are told with: MuJoCo's own frames and joints, in float64 with NumPy and SciPy.
+
+Nothing here or in the ``formulas_*`` modules imports the project. ``data`` is MuJoCo's own; a task is the dict of the
+numbers that it froze, by component name. Points on objects stand where the sheet's section 4 puts them in the frame of
+the object's root body.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+Task = dict[str, float]
+Goal = tuple[np.ndarray, Rotation]
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What the printed formulas say of one state; margins tell how far a comparison is from its edge (m or rad)."""
+
+    terms: dict[str, float]
+    success: bool
+    failed: bool
+    margin: float
+
+
+class Oracle:
+    """A class's formulas.
+
+    Attributes:
+        body_of_goal: Goal, as the tables name it, to the body whose orientation is compared with it.
+        entering: Components of a variation that enter reward or success of a given state (None: all of them).
+    """
+
+    body_of_goal: Mapping[str, str] = MappingProxyType({})
+    entering: frozenset[str] | set[str] | None = frozenset()
+
+    def judge(self, data: mujoco.MjData, task: Task) -> Judgement:
+        """Reward terms, success and end in a state."""
+        raise NotImplementedError
+
+    def points(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
+        """Positions of the points that the observation tables list, by the tables' words."""
+        return {}
+
+    def goals(self, data: mujoco.MjData, task: Task) -> dict[str, Goal]:
+        """Position and orientation of every goal, by the name it has in the tables."""
+        return {}
+
+    def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """Positions of some free parts and joints, drawn about the places where success is decided."""
+        raise NotImplementedError
+
+
+def frame(data: mujoco.MjData, body: str) -> Goal:
+    """Origin and orientation of a body."""
+    return data.body(body).xpos.copy(), Rotation.from_quat(data.body(body).xquat, scalar_first=True)
+
+
+def at(data: mujoco.MjData, body: str, offset: tuple[float, float, float]) -> np.ndarray:
+    """World position of a point given in a body's frame."""
+    return data.body(body).xpos + data.body(body).xmat.reshape(3, 3) @ np.array(offset)
+
+
+def angle(data: mujoco.MjData, joint: str) -> float:
+    """Position of a joint, m or rad."""
+    return float(data.joint(joint).qpos[0])
+
+
+def nominal(data: mujoco.MjData, body: str) -> Goal:
+    """Where the scene puts a body before any task and episode."""
+    model = data.model.body(body)
+    return model.pos.copy(), Rotation.from_quat(model.quat, scalar_first=True)
+
+
+def start(data: mujoco.MjData, name: str, task: Task) -> Goal:
+    """Where a task puts an object: shifted in x and y, turned about the vertical through its origin."""
+    position, turn = nominal(data, f"{name}/object")
+    return shifted(position, task[f"{name}_x"], task[f"{name}_y"], 0.0), about_z(task[f"{name}_yaw"]) * turn
+
+
+def about_z(yaw: float) -> Rotation:
+    """A turn about the vertical."""
+    return Rotation.from_rotvec([0.0, 0.0, yaw])
+
+
+def goal_rotation(u0: float, u1: float) -> Rotation:
+    """A turn by pi u0 about x, on the left, times one by pi u1 about y (sheet 3.3)."""
+    return Rotation.from_rotvec([np.pi * u0, 0, 0]) * Rotation.from_rotvec([0, np.pi * u1, 0])
+
+
+def rotation_distance(a: Rotation, b: Rotation) -> float:
+    """2 arcsin(min(1, |vec(a b*)|)) (sheet 3.4)."""
+    difference = (a * b.inv()).as_quat()
+    return 2.0 * float(np.arcsin(min(1.0, float(np.linalg.norm(difference[:3])))))
+
+
+def hand_point(data: mujoco.MjData, side: str) -> np.ndarray:
+    """The palm's origin + 8 cm along its z - 2 cm along its y (sheet 2.7)."""
+    return at(data, f"{side}/palm", (0.0, -0.02, 0.08))
+
+
+def shifted(position: np.ndarray, x: float, y: float, z: float) -> np.ndarray:
+    """A position moved along the world's axes."""
+    return position + np.array((x, y, z))
+
+
+def length(vector: np.ndarray) -> float:
+    """Euclidean length."""
+    return float(np.linalg.norm(vector))
+
+
+def reach(data: mujoco.MjData, left: np.ndarray, right: np.ndarray) -> tuple[float, float]:
+    """d_left and d_right: distances of the two hand points to the points they shall be at."""
+    return length(hand_point(data, "left") - left), length(hand_point(data, "right") - right)
+
+
+def linear(
+    data: mujoco.MjData, left: np.ndarray, right: np.ndarray, target: float, constant: float | None
+) -> dict[str, float]:
+    """Terms of the formulas of the form constant - d_left - d_right + target."""
+    d_left, d_right = reach(data, left, right)
+    terms = {"left": -d_left, "right": -d_right, "target": target}
+    return terms if constant is None else terms | {"constant": constant}
+
+
+def pose(position: np.ndarray, turn: Rotation) -> np.ndarray:
+    """Positions of a free part: x, y, z and quaternion (w, x, y, z)."""
+    return np.concatenate((position, turn.as_quat(scalar_first=True)))

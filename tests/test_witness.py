@@ -1,0 +1,133 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bidex_meta import paths
+from bidex_meta.cli import main
+from bidex_meta.witness.config import PlannerConfig
+from bidex_meta.witness.planner import LEVELS, Planner, interpolation, quantised, rest_action, shifted
+from bidex_meta.witness.replay import Replay, replay
+from bidex_meta.witness.simulator import SHIFT, Simulator, task_slot
+from bidex_meta.witness.store import Witness, load_witness, save_witness
+from bidex_meta.world import World
+
+SMALL = PlannerConfig(samples=6, rounds=2, first_rounds=2, horizon=6, knots=3, execute=3, copies=2)
+
+
+def random_actions(steps: int) -> torch.Tensor:
+    return quantised(2.0 * torch.rand(steps, 52, generator=torch.Generator().manual_seed(3)) - 1.0)
+
+
+def test_the_simulator_plays_what_the_world_plays() -> None:
+    actions = random_actions(40)
+    simulator = Simulator("HandOver", 2, threads=1)
+    trace = simulator.play(actions[:, None].expand(-1, 2, -1))
+    world = World([task_slot("HandOver")], 1, autoreset_mode="DISABLED", seed=0, threads=1)
+    world.reset(seed=0)
+    rewards, success, ended = [], [], False
+    for action in actions:
+        _, reward, terminated, truncated, info = world.step(action[None])
+        rewards.append(0.0 if ended else float(reward[0]))
+        success.append(bool(info["success"][0]) and not ended)
+        ended |= bool(terminated[0] | truncated[0])
+    np.testing.assert_allclose(trace.rewards[:, 0].float().numpy(), np.array(rewards, np.float32), rtol=1e-6)
+    assert trace.success[:, 0].tolist() == success
+    assert bool(trace.alive[0]) == (not ended)
+    torch.testing.assert_close(trace.rewards[:, 0], trace.rewards[:, 1], rtol=0, atol=0)
+
+
+def test_a_saved_state_continues_bit_for_bit_in_every_row() -> None:
+    actions = random_actions(20)[:, None].expand(-1, 2, -1)
+    simulator = Simulator("CatchUnderarm", 2, threads=1)
+    simulator.play(actions[:10])
+    state = simulator.save(0)
+    expected = simulator.play(actions[10:]).rewards
+    simulator.load([state])
+    assert torch.equal(simulator.play(actions[10:]).rewards, expected)
+
+
+def test_shifted_starts_move_the_objects_alone_and_by_a_tenth_of_a_millimetre() -> None:
+    simulator = Simulator("TwoCatchUnderarm", 1, threads=1)
+    first, *others = (state["qpos"] for state in simulator.starts(3))
+    places = simulator._part.group.members[0].scene.qpos
+    for other in others:
+        moved = (other - first).nonzero().flatten().tolist()
+        expected = [places[name].start + i for name in ("object1", "object2") for i in (0, 1)]
+        assert set(moved) <= set(expected)
+        for name in ("object1", "object2"):
+            start = places[name].start
+            assert float((other - first)[start : start + 2].norm()) == pytest.approx(SHIFT, rel=1e-6)
+
+
+def test_a_search_plays_the_episode_and_never_ends_below_doing_nothing() -> None:
+    planner = Planner("HandOver", SMALL, threads=1)
+    seen: list[int] = []
+    plan = planner.search(lambda steps, total, success: seen.append(steps))
+    assert plan.actions.shape == (len(plan.rewards), 52) and len(plan.rewards) <= 75
+    assert seen == sorted(seen)
+    assert np.abs(plan.actions * LEVELS - np.rint(plan.actions * LEVELS)).max() < 1e-4
+    # What the planner says it got is what the actions give.
+    played = replay("HandOver", Witness(plan.actions.astype(np.float32), {}), threads=1)
+    assert played.total == pytest.approx(plan.total, rel=1e-9)
+    assert played.first_success == plan.first_success
+
+
+def test_a_witness_survives_the_disk(tmp_path: Path) -> None:
+    actions = random_actions(30).numpy()
+    path = save_witness("HandOver", actions, {"return": 1.5}, tmp_path / "HandOver.npz")
+    assert path.stat().st_size < 10_000
+    with np.load(path) as stored:
+        np.testing.assert_array_equal(stored["actions"].astype(np.float32) / LEVELS, actions)
+        assert json.loads(str(stored["made"])) == {"return": 1.5}
+
+
+@pytest.mark.parametrize("first, succeeded, found", [(3, 8, True), (3, 7, False), (None, 10, False)])
+def test_found_means_the_start_and_eight_of_ten_shifted_ones(first: int | None, succeeded: int, found: bool) -> None:
+    assert Replay(0.0, first, succeeded).found is found
+
+
+@given(st.integers(2, 60), st.integers(2, 12))
+def test_interpolation_goes_through_its_knots(horizon: int, knots: int) -> None:
+    weights = interpolation(horizon, knots)
+    torch.testing.assert_close(weights.sum(1), torch.ones(horizon))
+    line = torch.linspace(-1.0, 1.0, knots)
+    torch.testing.assert_close(weights @ line, torch.linspace(-1.0, 1.0, horizon), atol=1e-5, rtol=0)
+
+
+@given(st.integers(3, 40), st.integers(2, 9), st.integers(0, 50))
+def test_a_plan_that_is_shifted_says_the_same_of_the_same_moment(horizon: int, knots: int, steps: int) -> None:
+    line = torch.linspace(0.0, 1.0, knots)[:, None]  # linear in time, so that no knot hides anything
+    moved = shifted(line, steps, horizon)
+    expected = (torch.linspace(0.0, horizon - 1.0, knots) + steps).clamp(max=horizon - 1.0) / (horizon - 1.0)
+    torch.testing.assert_close(moved[:, 0], expected, atol=1e-5, rtol=0)
+
+
+def test_the_rest_action_holds_the_start() -> None:
+    action = rest_action(52)
+    assert action.shape == (52,) and (action[20:26] == 0).all() and (action.abs() <= 1).all()
+    assert torch.equal(action[:26], action[26:])
+
+
+@pytest.mark.parametrize("words", [[], ["--task", "HandOver", "--all"], ["--task", "HandOve"]])
+def test_bad_calls_are_answered_in_one_line(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["witness", *words]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_missing_witness_says_how_to_search_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(paths, "assets_dir", lambda: tmp_path)
+    with pytest.raises(Exception, match="--task HandOver --find"):
+        load_witness("HandOver")
+
+
+def test_replay_of_what_is_missing_is_not_found(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("bidex_meta.witness.store.witness_path", lambda name: tmp_path / name)
+    assert main(["witness", "--task", "HandOver", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)[0]["found"] is False
