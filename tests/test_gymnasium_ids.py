@@ -17,12 +17,15 @@ ROOT = Path(__file__).parents[1]
 SUITE_IDS = [
     "bidex-meta/MT1-v1",
     "bidex-meta/MT4-v1",
+    "bidex-meta/MT20-v1",
     "bidex-meta/ML1-train-v1",
     "bidex-meta/ML1-test-v1",
     "bidex-meta/ML1-wide-train-v1",
     "bidex-meta/ML1-wide-test-v1",
     "bidex-meta/ML4-train-v1",
     "bidex-meta/ML4-test-v1",
+    "bidex-meta/ML20-train-v1",
+    "bidex-meta/ML20-test-v1",
 ]
 
 

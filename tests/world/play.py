@@ -10,15 +10,9 @@ from bidex_meta import Benchmark
 from bidex_meta.benchmark import make_task_world
 from bidex_meta.world import World
 
-CLASSES = [
-    "HandOver",
-    "CatchUnderarm",
-    "CatchOver2Underarm",
-    "TwoCatchUnderarm",
-    "CatchAbreast",
-    "DoorCloseInward",
-    "BottleCap",
-]
+THROWN = ["HandOver", "CatchUnderarm", "CatchOver2Underarm", "TwoCatchUnderarm", "CatchAbreast"]
+"""The classes that end early, when something is dropped."""
+CLASSES = [*THROWN, "DoorCloseInward", "BottleCap"]
 """What a world does is seen in these: one and two free objects, a movable fixture, an object with joints."""
 
 

@@ -4,7 +4,7 @@ from torch import Tensor
 
 from bidex_meta.world import World
 from tests.world.play import (
-    CLASSES,
+    THROWN,
     assert_same,
     class_world,
     flat,
@@ -107,7 +107,7 @@ def test_an_ended_row_shows_its_next_episode_as_a_fresh_world_does() -> None:
     assert ends >= 15
 
 
-@pytest.mark.parametrize("name", CLASSES)
+@pytest.mark.parametrize("name", THROWN)
 def test_time_limits_truncate_and_drops_terminate(name: str) -> None:
     world = class_world(name, 4)
     world.reset(seed=0)
