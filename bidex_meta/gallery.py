@@ -9,7 +9,7 @@ from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.variation import VariationSpace
 
-VIEWS = ("front", "side")
+VIEWS = ("back", "side")
 _HEAD = """# The task classes
 
 Written by `bidex-meta gallery`; change the classes, not this page. Pictures show the start of the first task; green is
@@ -27,13 +27,16 @@ def write(page: Path, width: int = 360, height: int = 270) -> None:
         width: Of the pictures, pixels.
         height: Of the pictures, pixels.
     """
-    random = references.load("random")
-    sections = [_HEAD]
     for name in registry.names():
         for view in VIEWS:
             _picture(name, view, page.parent / _image(name, view), width, height)
-        sections.append(_section(registry.get(name, True), random.get(name)))
-    page.write_text("\n".join(sections))
+    page.write_text(text())
+
+
+def text() -> str:
+    """The page: one section a class."""
+    random = references.load("random")
+    return "\n".join((_HEAD, *(_section(registry.get(name, True), random.get(name)) for name in registry.names())))
 
 
 def _image(name: str, view: str) -> str:

@@ -64,6 +64,12 @@ def test_shifted_starts_move_the_objects_alone_and_by_a_tenth_of_a_millimetre() 
             assert float((other - first)[start : start + 2].norm()) == pytest.approx(SHIFT, rel=1e-6)
 
 
+def test_fixtures_are_shifted_too() -> None:
+    first, *others = (state["mocap_pos"] for state in Simulator("Switch", 1, threads=1).starts(2))
+    for other in others:
+        torch.testing.assert_close((other - first).norm(dim=1), first.new_full((2,), SHIFT), rtol=1e-6, atol=0)
+
+
 def test_a_search_plays_the_episode_and_never_ends_below_doing_nothing() -> None:
     planner = Planner("HandOver", SMALL, threads=1)
     seen: list[int] = []

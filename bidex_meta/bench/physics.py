@@ -14,7 +14,7 @@ MAX_OBJECT_SPEED = 20.0
 """No object may move faster, m/s."""
 MAX_PENETRATION = 0.005
 """Depth of contacts that counts as penetration, metres."""
-_SAMPLES_PER_STEP = 2
+_SAMPLES_PER_STEP = 8
 
 
 def stability(

@@ -45,6 +45,12 @@ class BottleCap(TaskClass):
 
     name = "BottleCap"
     summary = "Hold a bottle in one hand and pull its cap off with the other"
+    formula = "0.2 - d_left - d_right + 30 d, d between the cap's centre and the bottle's origin"
+    solved = "cap more than 3 cm off"
+    deviations = (
+        "d is measured from the cap's centre: 14.4 cm more than the original's, a constant.",
+        "The hands' start poses are exchanged, so that the left hand starts over the cap.",
+    )
     episode_steps = 125
     right = HandPose((0.0, -0.25, 0.45), (0.0, _TILT, 0.0))
     left = HandPose((0.0, -1.05, 0.5), (0.5, math.pi, math.pi))

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
-from bidex_meta.maths import conjugate, multiply, quaternion_from_rpy, xyzw
-from bidex_meta.tasks.base import FIRM, TaskClass
+from bidex_meta.maths import quaternion_from_rpy, xyzw
+from bidex_meta.tasks.base import FAST, TaskClass
+from bidex_meta.tasks.goals import frozen_goal, observe_goal
 from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.reach import apart, reach
 from bidex_meta.tasks.scene import SceneObject
@@ -53,7 +54,7 @@ class _Door(TaskClass):
     transition_scale = 0.5
     orientation_scale = 0.5
     start_draws = 0
-    solver = FIRM
+    solver = FAST
     camera_target = (0.05, 0.0, 0.68)
     camera_distance = 2.0
 
@@ -87,11 +88,7 @@ class _Door(TaskClass):
         position = variation.new_tensor(_BASE).repeat(len(variation), 1)
         position[:, 1] += variation[:, 0]
         turn = xyzw(variation.new_tensor(quaternion_from_rpy(self._base_rpy))).expand(len(variation), 4)
-        return {
-            "goal": torch.cat((position, turn), dim=1),
-            "goal_inverse": conjugate(turn),
-            "angle": variation[:, 1:],
-        }
+        return {**frozen_goal(torch.cat((position, turn), dim=1)), "angle": variation[:, 1:]}
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
         """The door at the task's place, both leaves at the task's angle."""
@@ -101,8 +98,7 @@ class _Door(TaskClass):
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         """The goal blocks."""
-        difference = multiply(state.quaternion("object/quaternion"), state.frozen["goal_inverse"])
-        return {"goal_pose": state.frozen["goal"], "goal_rotation_difference": difference}
+        return observe_goal(state, "object/quaternion")
 
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
         """0.2 - d_left - d_right + 2 d_target (open) or 2 (1 - d_target) (close)."""

@@ -5,7 +5,8 @@ from torch import Tensor
 
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.hands.starts import make_room, noisy_joints
-from bidex_meta.maths import conjugate, multiply, norm, random_orientation, rotate, rotation_angle, wxyz, xyzw
+from bidex_meta.maths import conjugate, norm, random_orientation, rotate, rotation_angle, wxyz, xyzw
+from bidex_meta.tasks.goals import rotation_difference
 from bidex_meta.tasks.state import TaskState
 
 RADIUS, HALF_LENGTH = 0.03, 0.04
@@ -67,26 +68,11 @@ def distances(state: TaskState, egg: str, goal: str) -> tuple[Tensor, Tensor]:
     """Distance (m) and rotation (rad in [0, pi]) between an egg and its goal, each (n,)."""
     target = state.frozen[goal]
     translation = state.once(("distance", egg), lambda: norm(state[f"{egg}/position"] - target[:, :3]))
-    return translation, state.once(("angle", egg), lambda: rotation_angle(rotation_difference(state, egg, goal)))
-
-
-def rotation_difference(state: TaskState, egg: str, goal: str) -> Tensor:
-    """The egg's quaternion times the inverse of its goal's, (x, y, z, w), shape (n, 4)."""
-    inverse = state.frozen[f"{goal}_inverse"]
-    return state.once(("difference", egg), lambda: multiply(state.quaternion(f"{egg}/quaternion"), inverse))
+    difference = rotation_difference(state, f"{egg}/quaternion", goal)
+    return translation, state.once(("angle", egg), lambda: rotation_angle(difference))
 
 
 def pose_reward(state: TaskState, egg: str, goal: str, alpha: float) -> Tensor:
     """exp(-0.2 (alpha d_t + d_r)), shape (n,)."""
     translation, rotation = distances(state, egg, goal)
     return torch.exp(-0.2 * (alpha * translation + rotation))
-
-
-def observe_goal(state: TaskState, egg: str, goal: str) -> dict[str, Tensor]:
-    """The two goal blocks of an egg."""
-    return {f"{goal}_pose": state.frozen[goal], f"{goal}_rotation_difference": rotation_difference(state, egg, goal)}
-
-
-def frozen_goal(name: str, pose: Tensor) -> dict[str, Tensor]:
-    """A goal pose (n, 7) and the inverse of its rotation, as frozen numbers."""
-    return {name: pose, f"{name}_inverse": conjugate(pose[:, 3:])}

@@ -5,36 +5,14 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
-from bidex_meta.maths import conjugate, rotate
-from bidex_meta.tasks.base import FIRM, TaskClass
+from bidex_meta.tasks.base import FAST, TaskClass
+from bidex_meta.tasks.bucket import inside_bucket
 from bidex_meta.tasks.layout import Block, Layout, both_hands, object_blocks, point_block
-from bidex_meta.tasks.placement import DRAWS, place, placed
+from bidex_meta.tasks.placement import DRAWS, place_all, placed
 from bidex_meta.tasks.reach import apart, reach
 from bidex_meta.tasks.scene import SceneObject, add_table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace, join
-
-BUCKET_FLOOR, BUCKET_RIM = -0.049, 0.0445
-"""Heights of the inner floor and of the rim in the bucket's frame, metres (assets/objects/bucket.xml)."""
-_FLOOR_RADIUS, _RIM_RADIUS = 0.0255, 0.053
-"""Inner radius at these heights, to the middle of a wall, metres."""
-
-
-def inside_bucket(points: Tensor, bucket: Tensor, quaternion: Tensor) -> Tensor:
-    """Which points are in a bucket: between floor and rim, and within the wall's radius there.
-
-    Args:
-        points: World positions, metres, shape (n, k, 3).
-        bucket: World positions of the buckets' origins, shape (n, 3).
-        quaternion: Their orientations (x, y, z, w), shape (n, 4).
-
-    Returns:
-        Shape (n, k), bool.
-    """
-    x, y, z = rotate(conjugate(quaternion)[:, None], points - bucket[:, None]).unbind(-1)
-    share = (z - BUCKET_FLOOR) / (BUCKET_RIM - BUCKET_FLOOR)
-    radius = _FLOOR_RADIUS + (_RIM_RADIUS - _FLOOR_RADIUS) * share
-    return (share > 0.0) & (share < 1.0) & ((x * x + y * y).sqrt() < radius)
 
 
 class GraspAndPlace(TaskClass):
@@ -59,7 +37,7 @@ class GraspAndPlace(TaskClass):
     transition_scale = 0.5
     orientation_scale = 0.1
     start_draws = 2 * DRAWS
-    solver = FIRM
+    solver = FAST
     camera_target = (0.1, 0.0, 0.68)
     camera_distance = 1.7
 
@@ -95,8 +73,7 @@ class GraspAndPlace(TaskClass):
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
         """Places bucket and block."""
-        place(qpos["bucket"], frozen["bucket"], draws[:, :DRAWS])
-        place(qpos["block"], frozen["block"], draws[:, DRAWS:])
+        place_all(("bucket", "block"), qpos, frozen, draws)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         """Nothing: every block of the layout is read from sensors."""

@@ -5,8 +5,9 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
-from bidex_meta.maths import conjugate, multiply, norm
+from bidex_meta.maths import norm
 from bidex_meta.tasks.base import FIRM, TaskClass
+from bidex_meta.tasks.goals import frozen_goal, observe_goal
 from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, place, placed, yaw_quaternion
 from bidex_meta.tasks.reach import reach
@@ -77,7 +78,7 @@ class LiftUnderarm(TaskClass):
         start = torch.cat((placement[:, :2], torch.zeros_like(placement[:, :1])), dim=1) + placement.new_tensor(_START)
         turn = yaw_quaternion(placement[:, 2])
         goal = torch.cat((start + variation[:, 3:], turn), dim=1)
-        return {"object": placement, "goal": goal, "goal_inverse": conjugate(turn)}
+        return {"object": placement, **frozen_goal(goal)}
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
         """The pot at the task's place, jittered."""
@@ -85,8 +86,7 @@ class LiftUnderarm(TaskClass):
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         """The goal blocks."""
-        difference = multiply(state.quaternion("object/quaternion"), state.frozen["goal_inverse"])
-        return {"goal_pose": state.frozen["goal"], "goal_rotation_difference": difference}
+        return observe_goal(state, "object/quaternion")
 
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
         """0.2 - d_left - d_right + 3 (0.985 - d_target)."""

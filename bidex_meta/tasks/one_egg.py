@@ -7,6 +7,7 @@ from torch import Tensor
 
 from bidex_meta.tasks import eggs
 from bidex_meta.tasks.base import TaskClass
+from bidex_meta.tasks.goals import frozen_goal, observe_goal
 from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks
 from bidex_meta.tasks.scene import SceneObject
 from bidex_meta.tasks.state import TaskState
@@ -53,7 +54,7 @@ class OneEgg(TaskClass):
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """``goal``: the goal pose, (n, 7); ``goal_inverse``: the inverse of its rotation, (n, 4)."""
-        return eggs.frozen_goal("goal", eggs.goal_pose(variation[:, :3], variation[:, 3:]))
+        return frozen_goal(eggs.goal_pose(variation[:, :3], variation[:, 3:]))
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
         """Noisy hands, the egg on the right one."""
@@ -64,7 +65,7 @@ class OneEgg(TaskClass):
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         """The goal blocks."""
-        return eggs.observe_goal(state, "object", "goal")
+        return observe_goal(state, "object/quaternion")
 
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
         """``pose``: exp(-0.2 (alpha d_t + d_r))."""

@@ -4,6 +4,8 @@ A task freezes the shift of each table object or fixture from its nominal place;
 are about the world's vertical through the object's own origin.
 """
 
+from collections.abc import Iterable
+
 import torch
 from torch import Tensor
 
@@ -51,3 +53,9 @@ def place(pose: Tensor, frozen: Tensor, draws: Tensor | None = None) -> None:
         shift = frozen + draws * draws.new_tensor((JITTER, JITTER, JITTER_TURN))
     pose[:, :2] += shift[:, :2]
     pose[:, 3:] = wxyz(multiply(yaw_quaternion(shift[:, 2]), xyzw(pose[:, 3:])))
+
+
+def place_all(names: Iterable[str], qpos: dict[str, Tensor], frozen: dict[str, Tensor], draws: Tensor) -> None:
+    """Places several objects, each by the frozen numbers of its name and its share of the draws, ``DRAWS`` each."""
+    for name, jitter in zip(names, draws.split(DRAWS, dim=1), strict=True):
+        place(qpos[name], frozen[name], jitter)

@@ -9,10 +9,10 @@ from torch import Tensor
 from bidex_meta.errors import BidexError
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
 from bidex_meta.maths import conjugate, multiply, quaternion_from_rpy, rotate, xyzw
-from bidex_meta.tasks.base import FIRM, TaskClass
-from bidex_meta.tasks.grasp_and_place import inside_bucket
+from bidex_meta.tasks.base import FAST, TaskClass
+from bidex_meta.tasks.bucket import inside_bucket
 from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
-from bidex_meta.tasks.placement import DRAWS, place, placed, yaw_quaternion
+from bidex_meta.tasks.placement import DRAWS, place_all, placed, yaw_quaternion
 from bidex_meta.tasks.reach import apart, reach
 from bidex_meta.tasks.scene import SceneObject, add_table
 from bidex_meta.tasks.state import TaskState
@@ -64,7 +64,7 @@ class PourWater(TaskClass):
     transition_scale = 0.5
     orientation_scale = 0.1
     start_draws = 2 * DRAWS
-    solver = FIRM
+    solver = FAST
     camera_target = (0.1, -0.05, 0.5)
     camera_distance = 1.4
 
@@ -120,9 +120,8 @@ class PourWater(TaskClass):
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
         """Places kettle and bucket, and the water in the kettle."""
+        place_all(("kettle", "bucket"), qpos, frozen, draws)
         kettle = qpos["kettle"]
-        place(kettle, frozen["kettle"], draws[:, :DRAWS])
-        place(qpos["bucket"], frozen["bucket"], draws[:, DRAWS:])
         drops = rotate(xyzw(kettle[:, 3:])[:, None], self._fill(kettle)).float() + kettle[:, None, :3]
         for i in range(self.water):
             for k, axis in enumerate("xyz"):

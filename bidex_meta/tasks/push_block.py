@@ -6,9 +6,9 @@ from torch import Tensor
 
 from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
 from bidex_meta.maths import norm
-from bidex_meta.tasks.base import FIRM, TaskClass
+from bidex_meta.tasks.base import FAST, TaskClass
 from bidex_meta.tasks.layout import Layout, both_hands, object_blocks, point_block
-from bidex_meta.tasks.placement import DRAWS, place, placed
+from bidex_meta.tasks.placement import DRAWS, place_all, placed
 from bidex_meta.tasks.reach import reach
 from bidex_meta.tasks.scene import SceneObject, add_table
 from bidex_meta.tasks.state import TaskState
@@ -44,7 +44,7 @@ class PushBlock(TaskClass):
     transition_scale = 0.5
     orientation_scale = 0.1
     start_draws = 2 * DRAWS
-    solver = FIRM
+    solver = FAST
     camera_target = (0.1, 0.0, 0.68)
     camera_distance = 1.7
 
@@ -78,8 +78,7 @@ class PushBlock(TaskClass):
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
         """Places both blocks."""
-        place(qpos["block1"], frozen["block1"], draws[:, :DRAWS])
-        place(qpos["block2"], frozen["block2"], draws[:, DRAWS:])
+        place_all(_STARTS, qpos, frozen, draws)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         """Nothing: every block of the layout is read from sensors."""

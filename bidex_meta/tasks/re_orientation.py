@@ -7,7 +7,8 @@ from torch import Tensor
 from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
 from bidex_meta.maths import multiply, rotation_angle, wxyz, xyzw
 from bidex_meta.tasks import eggs
-from bidex_meta.tasks.base import FIRM, TaskClass
+from bidex_meta.tasks.base import FAST, TaskClass
+from bidex_meta.tasks.goals import frozen_goal, observe_goal
 from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks
 from bidex_meta.tasks.scene import SceneObject
 from bidex_meta.tasks.state import TaskState
@@ -53,7 +54,7 @@ class ReOrientation(TaskClass):
     transition_scale = 0.05
     orientation_scale = 0.5
     start_draws = eggs.JOINT_DRAWS + 5
-    solver = FIRM
+    solver = FAST
 
     @property
     def variation_space(self) -> VariationSpace:
@@ -76,7 +77,7 @@ class ReOrientation(TaskClass):
         frozen = {}
         for i, centre in enumerate(_GOALS.values(), start=1):
             position = variation.new_tensor(centre).expand(len(variation), 3)
-            frozen |= eggs.frozen_goal(f"goal{i}", eggs.goal_pose(position, variation))
+            frozen |= frozen_goal(eggs.goal_pose(position, variation), f"goal{i}")
         return frozen
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
@@ -89,7 +90,8 @@ class ReOrientation(TaskClass):
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         """The goal blocks of both cubes."""
-        return eggs.observe_goal(state, "object1", "goal1") | eggs.observe_goal(state, "object2", "goal2")
+        first = observe_goal(state, "object1/quaternion", "goal1")
+        return first | observe_goal(state, "object2/quaternion", "goal2")
 
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
         """``left`` -10 d_1, ``right`` -10 d_2, ``target`` -1.5 (r_1 + r_2)."""

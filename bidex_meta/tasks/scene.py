@@ -15,6 +15,9 @@ from bidex_meta.maths import quaternion_from_rpy
 if TYPE_CHECKING:
     from bidex_meta.tasks.base import TaskClass
 
+_STATED_TIME_STEP, _STATED_SOLREF = 1.0 / 240.0, 0.0084
+"""Time step and contact time constant of the files under assets/, seconds."""
+
 
 @dataclass(frozen=True)
 class SceneObject:
@@ -153,7 +156,7 @@ def build_spec(task: "TaskClass") -> mujoco.MjSpec:
     spec = mujoco.MjSpec.from_file(str(paths.assets_dir() / "scene" / "scene.xml"))
     spec.modelname = task.name
     spec.option.iterations, spec.option.ls_iterations = task.solver.iterations, task.solver.line_search
-    spec.option.integrator = task.solver.integrator
+    spec.option.integrator, spec.option.timestep = task.solver.integrator, task.solver.time_step
     set_contact_bits(spec.geoms, FIXTURE)
     add_hands(spec, task.right, task.left, task.moving_base)
     task.add_objects(spec)
@@ -164,4 +167,12 @@ def compile_scene(task: "TaskClass") -> Scene:
     """The compiled scene of a task class."""
     model = build_spec(task).compile()
     damp_bases(model)
+    _stiffen(model)
     return Scene(task, model)
+
+
+def _stiffen(model: mujoco.MjModel) -> None:
+    """The assets state the stiffest contacts and limits that 1/240 s allows; a shorter step allows stiffer ones."""
+    factor = model.opt.timestep / _STATED_TIME_STEP
+    for solref in (model.geom_solref, model.jnt_solref, model.dof_solref, model.tendon_solref_lim):
+        solref[np.isclose(solref[:, 0], _STATED_SOLREF), 0] *= factor

@@ -8,7 +8,7 @@ from bidex_meta.hands.poses import PALM_DOWN_AWAY, PALM_DOWN_BACK, HandPose
 from bidex_meta.maths import norm
 from bidex_meta.tasks.base import FIRM, TaskClass
 from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
-from bidex_meta.tasks.placement import DRAWS, place, placed
+from bidex_meta.tasks.placement import DRAWS, place_all, placed
 from bidex_meta.tasks.reach import reach
 from bidex_meta.tasks.scene import SceneObject, add_table
 from bidex_meta.tasks.state import TaskState
@@ -103,8 +103,7 @@ class StackBlock(TaskClass):
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
         """Places both blocks."""
-        place(qpos["block1"], frozen["block1"], draws[:, :DRAWS])
-        place(qpos["block2"], frozen["block2"], draws[:, DRAWS:])
+        place_all(_STARTS, qpos, frozen, draws)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         """The goal blocks; the goal is unturned, so block 1's own orientation is the difference."""

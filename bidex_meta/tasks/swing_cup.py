@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
-from bidex_meta.maths import conjugate, multiply, rotation_angle, xyzw
+from bidex_meta.maths import multiply, rotation_angle, xyzw
 from bidex_meta.tasks.base import FIRM, TaskClass
+from bidex_meta.tasks.goals import frozen_goal, observe_goal, rotation_difference
 from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, place, placed, yaw_quaternion
 from bidex_meta.tasks.reach import reach
@@ -32,6 +33,9 @@ class SwingCup(TaskClass):
 
     name = "SwingCup"
     summary = "Turn a two-handled cup with both hands"
+    formula = "-1 - d_left - d_right + 5 / (r + 0.1), r the angle between the cup and its goal"
+    solved = "cup within 45 degrees of its goal"
+    deviations = ("Goals lie 90 to 180 degrees from the nominal start; the original's is half a turn away.",)
     episode_steps = 300
     right = HandPose((0.35, 0.2, 0.8), PALM_LEFT_AHEAD)
     left = HandPose((0.35, -0.2, 0.8), PALM_RIGHT_AHEAD)
@@ -68,7 +72,7 @@ class SwingCup(TaskClass):
         position[:, :2] += variation[:, :2]
         rotation = multiply(yaw_quaternion(variation[:, 3]), xyzw(variation.new_tensor(_CUP.quaternion)))
         goal = torch.cat((position, rotation), dim=1)
-        return {"cup": variation[:, :3], "goal": goal, "goal_inverse": conjugate(rotation)}
+        return {"cup": variation[:, :3], **frozen_goal(goal)}
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
         """The cup on the table, lid shut."""
@@ -76,7 +80,7 @@ class SwingCup(TaskClass):
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         """The goal blocks."""
-        return {"goal_pose": state.frozen["goal"], "goal_rotation_difference": _difference(state)}
+        return observe_goal(state, "cup/quaternion")
 
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
         """Equation 13: ``left`` -d_left, ``right`` -d_right, ``target`` 5 / (d_target + 0.1), ``constant`` -1."""
@@ -94,11 +98,6 @@ class SwingCup(TaskClass):
         return [(frozen["goal"], _GHOST)]
 
 
-def _difference(state: TaskState) -> Tensor:
-    """The cup's quaternion times the inverse of its goal's, (x, y, z, w), shape (n, 4)."""
-    return state.once("difference", lambda: multiply(state.quaternion("cup/quaternion"), state.frozen["goal_inverse"]))
-
-
 def _angle(state: TaskState) -> Tensor:
     """Rotation from cup to goal, rad in [0, pi], shape (n,)."""
-    return state.once("angle", lambda: rotation_angle(_difference(state)))
+    return state.once("angle", lambda: rotation_angle(rotation_difference(state, "cup/quaternion")))

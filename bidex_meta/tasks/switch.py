@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
-from bidex_meta.maths import conjugate, multiply, norm, quaternion_from_rpy, quaternion_product, xyzw
-from bidex_meta.tasks.base import FIRM, TaskClass
+from bidex_meta.maths import norm, quaternion_from_rpy, quaternion_product, xyzw
+from bidex_meta.tasks.base import FAST, TaskClass
+from bidex_meta.tasks.goals import frozen_goal, observe_goal
 from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import SHIFT
 from bidex_meta.tasks.reach import reach
@@ -51,7 +52,7 @@ class Switch(TaskClass):
     transition_scale = 0.5
     orientation_scale = 0.1
     start_draws = 0
-    solver = FIRM
+    solver = FAST
     camera_target = (0.08, 0.0, 0.70)
     camera_distance = 1.1
 
@@ -90,7 +91,7 @@ class Switch(TaskClass):
             position[:, :2] += variation[:, 2 * i - 2 : 2 * i]
             frozen |= {name: position, f"goal{i}": position + variation.new_tensor(_PRESSED)}
         turn = xyzw(variation.new_tensor(_PRESSED_QUATERNION)).expand(len(variation), 4)
-        return frozen | {"goal": torch.cat((frozen["goal1"], turn), dim=1), "goal_inverse": conjugate(turn)}
+        return frozen | frozen_goal(torch.cat((frozen["goal1"], turn), dim=1))
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
         """Both housings at the task's places, buttons unpressed."""
@@ -99,8 +100,7 @@ class Switch(TaskClass):
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         """The goal blocks of switch 1."""
-        difference = multiply(state.quaternion("switch1/quaternion"), state.frozen["goal_inverse"])
-        return {"goal_pose": state.frozen["goal"], "goal_rotation_difference": difference}
+        return observe_goal(state, "switch1/quaternion")
 
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
         """2 - d_left - d_right + 50 (1.4 - d_target), d_target the sum over both buttons."""

@@ -6,6 +6,7 @@ from torch import Tensor
 from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
 from bidex_meta.tasks import eggs
 from bidex_meta.tasks.base import TaskClass
+from bidex_meta.tasks.goals import frozen_goal, observe_goal
 from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks
 from bidex_meta.tasks.scene import SceneObject
 from bidex_meta.tasks.state import TaskState
@@ -55,8 +56,8 @@ class TwoCatchUnderarm(TaskClass):
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """``goal1``, ``goal2``: poses (n, 7); ``..._inverse``: inverses of their rotations (n, 4)."""
-        first = eggs.frozen_goal("goal1", eggs.goal_pose(variation[:, :3], variation[:, 6:]))
-        return first | eggs.frozen_goal("goal2", eggs.goal_pose(variation[:, 3:6], variation[:, 6:]))
+        first = frozen_goal(eggs.goal_pose(variation[:, :3], variation[:, 6:]), "goal1")
+        return first | frozen_goal(eggs.goal_pose(variation[:, 3:6], variation[:, 6:]), "goal2")
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
         """Noisy hands with an egg on each."""
@@ -67,7 +68,8 @@ class TwoCatchUnderarm(TaskClass):
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         """The goal blocks of both eggs."""
-        return eggs.observe_goal(state, "object1", "goal1") | eggs.observe_goal(state, "object2", "goal2")
+        first = observe_goal(state, "object1/quaternion", "goal1")
+        return first | observe_goal(state, "object2/quaternion", "goal2")
 
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
         """``pose1`` and ``pose2``: exp(-0.2 (alpha d_ti + d_ri))."""

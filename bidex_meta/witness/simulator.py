@@ -69,10 +69,10 @@ class Simulator:
         self._engine.reset(self._everyone, self._start.expand(num, -1))
 
     def starts(self, shifted: int) -> list[State]:
-        """The start state and so many in which every free object is shifted by 0.1 mm in the plane."""
+        """The start state and so many in which every object or fixture is shifted by 0.1 mm in the plane."""
         generator = torch.Generator().manual_seed(SEED)
         places = self._part.group.members[0].scene.qpos
-        objects = [where for part, where in places.items() if "/" not in part and where.stop <= self._nq]
+        objects = [where for part, where in places.items() if "/" not in part]
         states = []
         for i in range(shifted + 1):
             start = self._start.clone()
@@ -82,10 +82,6 @@ class Simulator:
             self._engine.reset(self._everyone, start.expand(self.num, -1))
             states.append(self.save(0))
         return states
-
-    @property
-    def _nq(self) -> int:
-        return self._engine.qpos.shape[1]
 
     def save(self, row: int) -> State:
         """The state of a row, copied."""

@@ -18,6 +18,7 @@ from tests.tasks.worlds import (
     Lens,
     depths,
     dofs_of,
+    each_moving,
     engine_of,
     object_joints_of,
     objects_of,
@@ -44,6 +45,16 @@ def alone(name: str, rows: int) -> World:
     send_hands_away(scene_of(world), start)
     restart(world, start)
     return world
+
+
+@each_moving
+def test_contacts_and_limits_are_as_stiff_as_the_time_step_allows(name: str) -> None:
+    model = scene_of(world_of(name, True, 1)).model
+    meets = (model.geom_contype | model.geom_conaffinity) > 0
+    limited = (model.jnt_limited > 0) & (model.jnt_type != mujoco.mjtJoint.mjJNT_FREE)
+    for constants in (model.geom_solref[meets, 0], model.jnt_solref[limited, 0], model.tendon_solref_lim[:, 0]):
+        assert len(constants) and (constants >= 2.0 * model.opt.timestep).all()
+        assert (constants <= 2.02 * model.opt.timestep).all(), name
 
 
 def wait(world: World, steps: int) -> None:

@@ -37,6 +37,20 @@ def test_widths_one_hots_and_padding(suite: str, split: str, width: int) -> None
         assert values[:, : min(s.task_class.observation_size for s in world.slots) - 22].abs().sum(dim=1).min() > 1
 
 
+@pytest.mark.parametrize(
+    ("suite", "split", "classes", "width"),
+    [("MT20", "train", 20, 466), ("ML20", "train", 15, 446), ("ML20", "test", 5, 446)],
+)
+def test_one_world_steps_every_class_of_the_large_suites(suite: str, split: str, classes: int, width: int) -> None:
+    world = suite_world(suite, classes, split=split)
+    obs, _ = world.reset(seed=0)
+    assert obs.shape == (classes, width) and world.single_action_space.shape == (52,)
+    assert world.task_id.tolist() == list(range(classes))
+    assert [len(slot.tasks) for slot in world.slots] == [50] * classes
+    last = play(world, random_actions(world, 5))[-1]
+    assert last["obs"].shape == obs.shape and last["obs"].isfinite().all() and (last["obs"] != obs).any(dim=1).all()
+
+
 def test_goals_are_visible_in_mt() -> None:
     world = suite_world("MT4", 12)
     obs, _ = world.reset(seed=0)
