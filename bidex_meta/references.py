@@ -1,7 +1,7 @@
 """The two ends of the normalised score: per class the return of random actions and that of the best known policy.
 
-They hold for classes with moving bases, as every suite has them. Two files under ``assets/references/``:
-``random.json``, which ``bidex-meta baseline random`` measures, and ``expert.json``.
+They hold for classes with moving bases, as every suite has them. Files under ``assets/references/``: ``random.json``,
+which ``bidex-meta baseline random`` measures, and ``expert.json``; ``zero.json`` tells what doing nothing gives.
 """
 
 import json
@@ -12,7 +12,7 @@ from bidex_meta import paths
 from bidex_meta.evaluate import Reference
 from bidex_meta.record.atomic import write_json
 
-Kind = Literal["random", "expert"]
+Kind = Literal["random", "zero", "expert"]
 
 
 def reference_path(kind: Kind) -> Path:

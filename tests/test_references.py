@@ -36,18 +36,20 @@ def test_a_score_needs_both_ends(folder: Path) -> None:
     assert (found["HandOver"].random, found["HandOver"].expert) == (0.4, 30.0)
 
 
+@pytest.mark.parametrize("what", ["random", "zero"])
 def test_baseline_measures_every_class_and_stores_what_it_printed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(worlds, "_world", lambda config, split, rows, mode: ToyWorld(rows or 6, mode, config["seed"]))
     out = tmp_path / "random.json"
-    arguments = ["baseline", "random", "--suite", "MT4", "--episodes", "1", "--out", str(out), "--json"]
+    arguments = ["baseline", what, "--suite", "MT4", "--episodes", "1", "--out", str(out), "--json"]
     assert main(arguments) == 0
     printed, stored = json.loads(capsys.readouterr().out), json.loads(out.read_text())["classes"]
     assert printed.keys() == stored.keys()
     for name, row in stored.items():
         assert row["return"] == printed[name]["return"]
         assert row["episodes"] == printed[name]["episodes"] > 0
+        assert row["made"]["policy"].startswith({"random": "uniform", "zero": "zero"}[what])
         assert row["made"]["suite"] == "MT4" and row["made"]["versions"]["packages"]["mujoco"]
 
 

@@ -11,18 +11,20 @@ import tyro
 from bidex_meta.commands.parsing import Switch, parse
 from bidex_meta.errors import unknown_name
 
-_KINDS = ("random",)
+_POLICIES = {"random": "uniform actions", "zero": "zero actions"}
 
 
 @dataclass(frozen=True)
 class BaselineFlags:
-    """Measure the return and success of uniform actions per class, and store them as the score's zero.
+    """Measure the return and success of a policy that has learned nothing, per class, and store them.
+
+    Uniform actions are the zero of the normalised score.
 
     Example: bidex-meta baseline random --suite MT20
     """
 
-    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="random")]
-    """random."""
+    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="random|zero")]
+    """random: uniform actions; zero: the action 0, joints held in the middle of their range and bases at rest."""
     suite: str = "MT20"
     """Suite whose train tasks are played."""
     episodes: int = 4
@@ -40,24 +42,25 @@ class BaselineFlags:
 def main(arguments: Sequence[str]) -> None:
     """Measure, store, print."""
     flags = parse(BaselineFlags, arguments, "baseline")
-    if flags.what not in _KINDS:
-        raise unknown_name("baseline", flags.what, _KINDS)
+    if flags.what not in _POLICIES:
+        raise unknown_name("baseline", flags.what, _POLICIES)
     from bidex_meta import references
     from bidex_meta.commands import worlds
-    from bidex_meta.evaluate import RandomAgent, evaluate
+    from bidex_meta.evaluate import RandomAgent, ZeroAgent, evaluate
     from bidex_meta.record.versions import collect_versions
 
     config: dict[str, Any] = {"suite": flags.suite, "task": None, "seed": flags.seed, "device": "cpu"}
     world = worlds.evaluation_world({**config, "threads": flags.threads})
-    found = evaluate(RandomAgent(world.action_space, flags.seed), world, flags.episodes, seed=worlds.EVALUATION_SEED)
+    agent = RandomAgent(world.action_space, flags.seed) if flags.what == "random" else ZeroAgent(world.action_space)
+    found = evaluate(agent, world, flags.episodes, seed=worlds.EVALUATION_SEED)
     world.close()
     numbers = {name: result.to_json() for name, result in found.classes.items()}
-    made = {"policy": "uniform actions", "suite": flags.suite, "seed": flags.seed, "versions": collect_versions()}
+    made = {"policy": _POLICIES[flags.what], "suite": flags.suite, "seed": flags.seed, "versions": collect_versions()}
     kept = ("return", "return_interval", "success", "episodes", "unstable")
-    path = references.store("random", {n: {k: row[k] for k in kept} for n, row in numbers.items()}, made, flags.out)
+    path = references.store(flags.what, {n: {k: row[k] for k in kept} for n, row in numbers.items()}, made, flags.out)
     if flags.json:
         print(json.dumps(numbers, indent=2))
         return
     from bidex_meta.commands.tables import evaluation_table, print_table
 
-    print_table(evaluation_table(f"uniform actions on {flags.suite}, stored in {path}", found, None))
+    print_table(evaluation_table(f"{_POLICIES[flags.what]} on {flags.suite}, stored in {path}", found, None))

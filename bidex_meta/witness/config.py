@@ -15,6 +15,8 @@ class PlannerConfig:
     """Rounds per plan."""
     first_rounds: int = 12
     """Rounds of the first plan, which has no predecessor."""
+    rounds_after: int = 1
+    """Rounds per plan once the task has been solved."""
     elite_share: float = 0.08
     """Share of the sequences that mean and deviation move towards."""
     kept_elites: int = 4

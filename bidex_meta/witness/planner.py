@@ -65,7 +65,8 @@ class Planner:
         rewards: list[float] = []
         success: list[bool] = []
         while len(rewards) < sim.episode_steps:
-            mean, best = self._plan(states, mean, cfg.rounds if actions else cfg.first_rounds)
+            rounds = cfg.first_rounds if not actions else cfg.rounds_after if any(success) else cfg.rounds
+            mean, best = self._plan(states, mean, rounds)
             steps = min(cfg.execute, sim.episode_steps - len(rewards))
             states, got, won, alive = self._execute(states, best[:steps])
             actions.append(best[:steps])
