@@ -25,7 +25,11 @@ _NEARLY_SHUT = (0.0, 0.15)
 _OPEN_DISTANCE = 0.5
 _SHUT_ANGLE = 0.1 * _TRAVEL
 _HANDLE_DEPTH = 0.04
-_SHUT = ("Success asks for shut leaves; the original's, handles less than 0.5 m apart, accepts them 60 degrees open.",)
+_DAMPED = "The hinges are damped by 10 N m s/rad, the original's by 1: so a door does not fly open at a bump."
+_SHUT = (
+    "Success asks for shut leaves; the original's, handles less than 0.5 m apart, accepts them 60 degrees open.",
+    _DAMPED,
+)
 
 
 class _Door(TaskClass):
@@ -54,6 +58,7 @@ class _Door(TaskClass):
     transition_scale = 0.5
     orientation_scale = 0.5
     start_draws = 0
+    deviations = (_DAMPED,)
     solver = FAST
     camera_target = (0.05, 0.0, 0.68)
     camera_distance = 2.0
