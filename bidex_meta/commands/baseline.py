@@ -4,7 +4,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import tyro
 
@@ -57,7 +57,8 @@ def main(arguments: Sequence[str]) -> None:
     numbers = {name: result.to_json() for name, result in found.classes.items()}
     made = {"policy": _POLICIES[flags.what], "suite": flags.suite, "seed": flags.seed, "versions": collect_versions()}
     kept = ("return", "return_interval", "success", "episodes", "unstable")
-    path = references.store(flags.what, {n: {k: row[k] for k in kept} for n, row in numbers.items()}, made, flags.out)
+    kind = cast(references.Kind, flags.what)  # checked above
+    path = references.store(kind, {n: {k: row[k] for k in kept} for n, row in numbers.items()}, made, flags.out)
     if flags.json:
         print(json.dumps(numbers, indent=2))
         return
