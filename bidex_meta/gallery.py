@@ -2,20 +2,28 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from bidex_meta import references
 from bidex_meta.benchmark import make_task_world
 from bidex_meta.record import video
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.variation import VariationSpace
+from bidex_meta.witness.replay import frames
+from bidex_meta.witness.store import Witness, load_witness, witness_path
 
 VIEWS = ("back", "side")
+STRIP = 5
+"""Pictures of a witness."""
 _HEAD = """# The task classes
 
 Written by `bidex-meta gallery`; change the classes, not this page. Pictures show the start of the first task; green is
 a goal. Sizes are those of moving bases. d is a distance in metres, r an angle in radians; *left* and *right* are the
 distances of a hand's point (8 cm along the palm, 2 cm out of it) to its point on the object. Variations are drawn
-uniformly and frozen by a task. Random: mean return and success of uniform actions.
+uniformly and frozen by a task. Random: mean return and success of uniform actions. Witness: recorded actions that solve
+the first task; the strip shows them at the start, a third and two thirds of the way to the first success, at the first
+success and at the end of the episode.
 """
 
 
@@ -30,6 +38,9 @@ def write(page: Path, width: int = 360, height: int = 270) -> None:
     for name in registry.names():
         for view in VIEWS:
             _picture(name, view, page.parent / _image(name, view), width, height)
+        if witness_path(name).is_file():
+            strip = _strip(name, load_witness(name), width * 2 // 3, height * 2 // 3)
+            video.write_image(page.parent / _image(name, "witness"), strip)
     page.write_text(text())
 
 
@@ -50,6 +61,20 @@ def _picture(name: str, view: str, path: Path, width: int, height: int) -> None:
     world.close()
 
 
+def moments(first_success: int, steps: int) -> list[int]:
+    """Which frames of a witness are shown: as the page's head says; frame i is the state after i steps."""
+    solved = first_success + 1
+    return [0, round(solved / 3), round(2 * solved / 3), solved, steps]
+
+
+def _strip(name: str, witness: Witness, width: int, height: int) -> np.ndarray:
+    """The shown frames side by side, (height, STRIP * width, 3) uint8."""
+    wanted = moments(witness.made["first_success"], len(witness.actions))
+    drawn = frames(name, witness, wanted, width=width, height=height)
+    shown = dict(zip(sorted(set(wanted)), drawn, strict=True))
+    return np.concatenate([shown[i] for i in wanted], axis=1)
+
+
 def _section(task: TaskClass, random: dict | None) -> str:
     pictures = " ".join(f"![{task.name}, {view}]({_image(task.name, view)})" for view in VIEWS)
     rows = [
@@ -62,8 +87,17 @@ def _section(task: TaskClass, random: dict | None) -> str:
     ]
     if random is not None:
         rows.append(("random", f"return {random['return']:.4g}, success {100 * random['success']:.1f} %"))
+    rows.append(("witness", _witness(task.name)))
     table = "\n".join(f"| {key} | {value} |" for key, value in rows)
-    return f"## {task.name}\n\n{task.summary}.\n\n{pictures}\n\n| | |\n|---|---|\n{table}\n"
+    strip = f"![{task.name}, witness]({_image(task.name, 'witness')})\n" if witness_path(task.name).is_file() else ""
+    return f"## {task.name}\n\n{task.summary}.\n\n{pictures}\n\n| | |\n|---|---|\n{table}\n\n{strip}"
+
+
+def _witness(name: str) -> str:
+    if not witness_path(name).is_file():
+        return "none yet"
+    made = load_witness(name).made
+    return f"return {made['return']:.4g}, first success at step {made['first_success'] + 1}"
 
 
 def _variation(space: VariationSpace) -> str:

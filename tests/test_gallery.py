@@ -1,11 +1,13 @@
 import re
 from pathlib import Path
 
+import imageio.v3 as imageio
 import numpy as np
 import pytest
 
 from bidex_meta import gallery
 from bidex_meta.tasks import registry
+from bidex_meta.witness.store import Witness
 from tests.tasks.tables import SIZES
 
 
@@ -20,7 +22,7 @@ def test_every_class_has_a_section_with_all_that_a_newcomer_asks() -> None:
     for name, section in found.items():
         task = registry.get(name, True)
         assert section.startswith(f"\n{task.summary}.\n")
-        for fact in ("observation, action", "episode", "reward", "success", "variation", "deviations"):
+        for fact in ("observation, action", "episode", "reward", "success", "variation", "deviations", "witness"):
             assert len(re.findall(rf"^\| {fact} \| \S.* \|$", section, flags=re.M)) == 1, (name, fact)
         assert f"| {task.episode_steps} steps |" in section
         assert all(f"{component} " in section for component in task.variation_space.names)
@@ -45,8 +47,24 @@ def test_pictures_are_written_where_the_page_looks_for_them(tmp_path: Path, monk
             return np.zeros((height, width, 3), np.uint8)
 
     monkeypatch.setattr(gallery, "make_task_world", lambda *_, **__: Fake())
+    monkeypatch.setattr(gallery, "witness_path", lambda name: Path(__file__) if name == "HandOver" else tmp_path / name)
+    witness = Witness(np.zeros((40, 52), np.float32), {"first_success": 11, "return": 3.0})
+    monkeypatch.setattr(gallery, "load_witness", lambda name: witness)
+    monkeypatch.setattr(gallery, "frames", lambda name, witness, at, width, height: numbered(at, width, height))
     gallery.write(tmp_path / "tasks.md", width=8, height=6)
     links = re.findall(r"!\[[^]]*\]\(([^)]*)\)", (tmp_path / "tasks.md").read_text())
-    assert len(links) == 2 * len(registry.names()) == len(drawn)
+    assert len(links) == 2 * len(registry.names()) + 1 and len(drawn) == 2 * len(registry.names())
     assert set(drawn) == set(gallery.VIEWS)
     assert all((tmp_path / link).is_file() for link in links)
+    strip = imageio.imread(tmp_path / "images/tasks/HandOver_witness.png")
+    assert strip.shape == (4, 25, 3) and strip[0, ::5, 0].tolist() == [0, 4, 8, 12, 40]
+
+
+def numbered(at: list[int], width: int, height: int) -> list[np.ndarray]:
+    """A frame for each step that is asked for, once and in order, as bright as its number."""
+    return [np.full((height, width, 3), step, np.uint8) for step in sorted(set(at))]
+
+
+def test_a_witness_that_succeeds_at_once_or_at_the_end_still_has_five_frames() -> None:
+    assert gallery.moments(0, 30) == [0, 0, 1, 1, 30]
+    assert gallery.moments(29, 30) == [0, 10, 20, 30, 30]

@@ -5,7 +5,9 @@ import pytest
 
 from bidex_meta import references
 from bidex_meta.cli import main
-from bidex_meta.commands import worlds
+from bidex_meta.commands import experts, worlds
+from bidex_meta.errors import BidexError
+from bidex_meta.witness.replay import Replay
 from tests.fakes import ToyWorld
 
 
@@ -56,3 +58,39 @@ def test_baseline_measures_every_class_and_stores_what_it_printed(
 def test_an_unknown_baseline_names_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["baseline", "randon"]) == 2
     assert "Did you mean 'random'?" in capsys.readouterr().err
+
+
+def evaluated_run(path: Path, task: str | None, suite: str | None, returns: dict[str, float]) -> Path:
+    path.mkdir()
+    config = {"task": task, "suite": suite, "algo": "mtppo", "steps": 1000, "seed": 3}
+    (path / "config.json").write_text(json.dumps(config))
+    classes = {name: {"return": value} for name, value in returns.items()}
+    (path / "evaluation.json").write_text(json.dumps({"policy": {"classes": classes}}))
+    return path
+
+
+def test_the_expert_is_the_best_of_witness_and_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    totals = {"HandOver": 40.0, "CatchAbreast": 5.0, "CatchUnderarm": 90.0}
+    monkeypatch.setattr(experts, "witness_path", lambda name: Path(__file__) if name in totals else tmp_path / "none")
+    monkeypatch.setattr(experts, "load_witness", lambda name: name)
+    # CatchUnderarm's no longer holds: only three of ten shifted starts succeed.
+    monkeypatch.setattr(
+        experts, "replay", lambda name, *_: Replay(totals[name], 1, 3 if name == "CatchUnderarm" else 9)
+    )
+    suite = evaluated_run(tmp_path / "a", None, "MT4", {"HandOver": 30.0, "CatchAbreast": 20.0})
+    alone = evaluated_run(tmp_path / "b", "CatchAbreast", None, {"CatchAbreast": 12.0})
+    out = tmp_path / "expert.json"
+    words = ["baseline", "expert", "--suite", "MT4", "--runs", str(suite), str(alone), "--out", str(out), "--json"]
+    assert main(words) == 0
+    assert json.loads(capsys.readouterr().out) == {
+        "HandOver": {"return": 40.0, "source": "witness, task 0"},
+        "CatchAbreast": {"return": 20.0, "source": "mtppo on MT4, 1,000 steps, seed 3"},
+    }
+    assert json.loads(out.read_text())["classes"]["HandOver"]["return"] == 40.0
+
+
+def test_a_run_on_fixed_bases_is_no_expert_of_a_suite(tmp_path: Path) -> None:
+    with pytest.raises(BidexError, match="moving bases"):
+        experts.best_known([], [evaluated_run(tmp_path / "a", "HandOver", None, {"HandOver": 30.0})])

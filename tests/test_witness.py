@@ -9,11 +9,13 @@ from hypothesis import strategies as st
 
 from bidex_meta import paths
 from bidex_meta.cli import main
+from bidex_meta.record.versions import collect_versions
+from bidex_meta.tasks import registry
 from bidex_meta.witness.config import PlannerConfig
 from bidex_meta.witness.planner import LEVELS, Planner, interpolation, quantised, rest_action, shifted
 from bidex_meta.witness.replay import Replay, replay
 from bidex_meta.witness.simulator import SHIFT, Simulator, task_slot
-from bidex_meta.witness.store import Witness, load_witness, save_witness
+from bidex_meta.witness.store import Witness, load_witness, save_witness, witness_path
 from bidex_meta.world import World
 
 SMALL = PlannerConfig(samples=6, rounds=2, first_rounds=2, horizon=6, knots=3, execute=3, copies=2)
@@ -81,6 +83,7 @@ def test_a_search_plays_the_episode_and_never_ends_below_doing_nothing() -> None
     played = replay("HandOver", Witness(plan.actions.astype(np.float32), {}), threads=1)
     assert played.total == pytest.approx(plan.total, rel=1e-9)
     assert played.first_success == plan.first_success
+    assert plan.rival is not None and np.isfinite(plan.rival)
 
 
 def test_a_witness_survives_the_disk(tmp_path: Path) -> None:
@@ -137,3 +140,29 @@ def test_replay_of_what_is_missing_is_not_found(
     monkeypatch.setattr("bidex_meta.witness.store.witness_path", lambda name: tmp_path / name)
     assert main(["witness", "--task", "HandOver", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)[0]["found"] is False
+
+
+def test_a_search_keeps_its_best_episode_in_a_file_and_the_file_can_be_replayed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "attempt.npz"
+    words = ["witness", "--task", "CatchUnderarm", "--file", str(file), "--json"]
+    search = ["--find", "--planner.samples", "2", "--planner.first-rounds", "1", "--planner.rounds", "1"]
+    assert main([*words, *search, "--planner.horizon", "4", "--planner.knots", "2", "--planner.execute", "40"]) == 0
+    capsys.readouterr()
+    assert main(words) == 0
+    row = json.loads(capsys.readouterr().out)[0]
+    assert row["found"] is False and row["return"] == pytest.approx(load_witness("", file).made["return"], abs=1e-3)
+    assert main([*words[:-2], str(tmp_path / "none.npz")]) == 2
+    assert "--find --file" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in registry.names() if witness_path(name).is_file()])
+def test_every_stored_witness_holds(name: str) -> None:
+    witness = load_witness(name)
+    result, here = replay(name, witness), collect_versions()
+    assert result.found, (
+        f"{name}: success {result.first_success}, {result.succeeded} of 10 shifted starts, "
+        f"on {here['platform']} with {here['packages']}; made on {witness.made['versions']}"
+    )

@@ -16,15 +16,14 @@ _POLICIES = {"random": "uniform actions", "zero": "zero actions"}
 
 @dataclass(frozen=True)
 class BaselineFlags:
-    """Measure the return and success of a policy that has learned nothing, per class, and store them.
-
-    Uniform actions are the zero of the normalised score.
+    """Store the two ends of the normalised score: what a policy that has learned nothing gets, and the best known one.
 
     Example: bidex-meta baseline random --suite MT20
     """
 
-    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="random|zero")]
-    """random: uniform actions; zero: the action 0, joints held in the middle of their range and bases at rest."""
+    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="random|zero|expert")]
+    """random: uniform actions; zero: the action 0, joints held in the middle of their range and bases at rest;
+    expert: per class the best of its witness and of the runs given."""
     suite: str = "MT20"
     """Suite whose train tasks are played."""
     episodes: int = 4
@@ -33,6 +32,8 @@ class BaselineFlags:
     """Seed of tasks, starts and actions."""
     threads: int | None = None
     """Threads of the physics; None: one per core."""
+    runs: tuple[Path, ...] = ()
+    """expert: run folders of trained policies."""
     out: Path | None = None
     """File to write; None: the installation's own, which `evaluate` reads."""
     json: Switch = False
@@ -42,8 +43,30 @@ class BaselineFlags:
 def main(arguments: Sequence[str]) -> None:
     """Measure, store, print."""
     flags = parse(BaselineFlags, arguments, "baseline")
-    if flags.what not in _POLICIES:
-        raise unknown_name("baseline", flags.what, _POLICIES)
+    if flags.what == "expert":
+        _expert(flags)
+    elif flags.what in _POLICIES:
+        _measure(flags)
+    else:
+        raise unknown_name("baseline", flags.what, [*_POLICIES, "expert"])
+
+
+def _expert(flags: BaselineFlags) -> None:
+    from bidex_meta import references
+    from bidex_meta.benchmark import Benchmark
+    from bidex_meta.commands.experts import best_known
+    from bidex_meta.commands.tables import plain_table, print_table
+    from bidex_meta.record.versions import collect_versions
+
+    known = best_known(Benchmark(flags.suite).train_classes, flags.runs, flags.threads)
+    references.store("expert", known, {"versions": collect_versions()}, flags.out)
+    if flags.json:
+        print(json.dumps(known, indent=2))
+        return
+    print_table(plain_table(["class", "return", "source"], [[n, *row.values()] for n, row in known.items()]))
+
+
+def _measure(flags: BaselineFlags) -> None:
     from bidex_meta import references
     from bidex_meta.commands import worlds
     from bidex_meta.evaluate import RandomAgent, ZeroAgent, evaluate

@@ -23,9 +23,11 @@ class WitnessFlags:
     all: Switch = False
     """Every class there is, instead of one."""
     find: Switch = False
-    """Search with a sampling planner on the printed reward, and store the best episode found if it holds."""
+    """Search with a sampling planner on the printed reward, and store the episode found if it holds."""
     tries: int = 1
     """Searches with other seeds before giving up."""
+    file: Path | None = None
+    """Replay this file, not the stored witness; with --find keep the best episode here, whether it holds or not."""
     out: Path | None = None
     """Also write a film (.mp4) of the witness, or a picture (.png) of its last step."""
     camera: str | None = None
@@ -61,8 +63,8 @@ def _names(flags: WitnessFlags) -> list[str]:
 
     if flags.all == (flags.task is not None):
         raise BidexError("witness: expected --task T or --all, got " + ("both." if flags.all else "neither."))
-    if flags.all and flags.out is not None:
-        raise BidexError("witness: a film shows one class; give --task T with --out.")
+    if flags.all and (flags.out is not None or flags.file is not None):
+        raise BidexError("witness: films and files are of one class; give --task T with --out or --file.")
     if flags.task is not None and flags.task not in registry.names():
         raise unknown_name("task", flags.task, registry.names())
     return registry.names() if flags.task is None else [flags.task]
@@ -72,18 +74,20 @@ def _replay(name: str, flags: WitnessFlags) -> dict[str, Any]:
     from bidex_meta.witness.replay import replay
     from bidex_meta.witness.store import load_witness, witness_path
 
-    if not witness_path(name).is_file():
-        return {"task": name, "found": False, "return": None, "first_success": None, "shifted": None, "steps": None}
-    witness = load_witness(name)
-    result = replay(name, witness, flags.threads)
-    return {
-        "task": name,
-        "found": result.found,
-        "return": round(result.total, 3),
-        "first_success": result.first_success,
-        "shifted": result.succeeded,
-        "steps": len(witness.actions),
-    }
+    keys = ("found", "return", "first_success", "shifted", "steps", "rival")
+    if flags.file is None and not witness_path(name).is_file():
+        return {"task": name, **dict.fromkeys(keys), "found": False}
+    witness = load_witness(name, flags.file)
+    result, rival = replay(name, witness, flags.threads), witness.made.get("rival")
+    values = (
+        result.found,
+        round(result.total, 3),
+        result.first_success,
+        result.succeeded,
+        len(witness.actions),
+        None if rival is None else round(rival, 3),
+    )
+    return {"task": name, **dict(zip(keys, values, strict=True))}
 
 
 def _find(name: str, flags: WitnessFlags) -> None:
@@ -95,15 +99,23 @@ def _find(name: str, flags: WitnessFlags) -> None:
     from bidex_meta.witness.replay import replay
     from bidex_meta.witness.store import Witness, save_witness
 
+    rivals: list[float] = []
+    best = -float("inf")
     for attempt in range(flags.tries):
         config = replace(flags.planner, seed=flags.planner.seed + attempt)
-        found = Planner(name, config, flags.threads).search(_reporter(name))
-        made = {"return": found.total, "first_success": found.first_success, "planner": asdict(config)}
-        witness = Witness(found.actions, made | {"versions": collect_versions()})
-        if found.first_success is not None and replay(name, witness, flags.threads).found:
-            print(f"{name}: stored {save_witness(name, witness.actions, witness.made)}")
+        plan = Planner(name, config, flags.threads).search(_reporter(name))
+        lost = plan.total if plan.first_success is None else None
+        rivals += [total for total in (plan.rival, lost) if total is not None]
+        made = {"return": plan.total, "first_success": plan.first_success, "planner": asdict(config)}
+        made |= {"rival": max(rivals, default=None), "versions": collect_versions()}
+        witness = Witness(plan.actions, made)
+        holds = plan.first_success is not None and replay(name, witness, flags.threads).found
+        if holds or (flags.file is not None and plan.total > best):
+            best = plan.total
+            print(f"{name}: stored {save_witness(name, witness.actions, witness.made, flags.file)}")
+        if holds:
             return
-        print(f"{name}: seed {config.seed} gave a return of {found.total:.3f}, first success {found.first_success}.")
+        print(f"{name}: seed {config.seed} gave a return of {plan.total:.3f}, first success {plan.first_success}.")
 
 
 def _reporter(name: str) -> Any:
@@ -120,7 +132,7 @@ def _film(name: str, flags: WitnessFlags) -> None:
     from bidex_meta.witness.store import load_witness
 
     assert flags.out is not None
-    pictures = frames(name, load_witness(name), flags.camera)
+    pictures = frames(name, load_witness(name, flags.file), camera=flags.camera)
     if video.check_suffix(flags.out) == ".mp4":
         video.write_video(flags.out, pictures, CONTROL_RATE)
         return

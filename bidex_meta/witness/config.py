@@ -20,7 +20,11 @@ class PlannerConfig:
     elite_share: float = 0.08
     """Share of the sequences that mean and deviation move towards."""
     kept_elites: int = 4
-    """Elites that are tried again in the next round."""
+    """Elites that are tried again in the next round, and as parents of mutants."""
+    mutants: float = 0.5
+    """Share of the sequences that are an elite with few of its knots changed; the rest is drawn around the mean."""
+    mutated: float = 0.15
+    """Share of the actions that a mutant changes, at a random half of its knots."""
     horizon: int = 50
     """Control steps a plan looks ahead."""
     knots: int = 9

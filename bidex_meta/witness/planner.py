@@ -15,6 +15,8 @@ from bidex_meta.hands.hand import hand
 from bidex_meta.witness.config import PlannerConfig
 from bidex_meta.witness.simulator import Simulator, State
 
+RIVALS = 16
+"""Unsuccessful sequences of each plan that are played to the end of the episode."""
 LEVELS = 127
 """Actions are whole multiples of 1/127, so that a byte holds one exactly."""
 
@@ -29,6 +31,9 @@ class Plan:
     """Unscaled rewards they gave, (T,)."""
     first_success: int | None
     """Index of the first successful step, None if there is none."""
+    rival: float | None
+    """Highest return of the unsuccessful episodes that the search saw: before the first success, the best sequences
+    without one, their last action held to the end. None without any. Above ``total``, reward and success disagree."""
 
     @property
     def total(self) -> float:
@@ -48,6 +53,7 @@ class Planner:
     def __init__(self, name: str, config: PlannerConfig, threads: int | None = None):
         self.config = config
         self.simulator = Simulator(name, config.samples * config.copies, threads)
+        self._judge = Simulator(name, RIVALS, threads)
         self._generator = torch.Generator().manual_seed(config.seed)
         self._weights = interpolation(config.horizon, config.knots)
 
@@ -61,12 +67,17 @@ class Planner:
         cfg, sim = self.config, self.simulator
         states = sim.starts(cfg.copies - 1)
         mean = rest_action(sim.action_size).repeat(cfg.knots, 1)
+        elites = mean[None]
         actions: list[Tensor] = []
         rewards: list[float] = []
         success: list[bool] = []
+        rivals: list[float] = []
         while len(rewards) < sim.episode_steps:
             rounds = cfg.first_rounds if not actions else cfg.rounds_after if any(success) else cfg.rounds
-            mean, best = self._plan(states, mean, rounds)
+            mean, elites, unsuccessful = self._plan(states, mean, elites, rounds)
+            if not any(success):
+                rivals += [sum(rewards) + more for more in self._to_the_end(states[0], unsuccessful, len(rewards))]
+            best = quantised(self._weights @ elites[0])
             steps = min(cfg.execute, sim.episode_steps - len(rewards))
             states, got, won, alive = self._execute(states, best[:steps])
             actions.append(best[:steps])
@@ -77,31 +88,56 @@ class Planner:
             if not alive:
                 break
             mean = shifted(mean, steps, cfg.horizon)
+            elites = torch.stack([shifted(knots, steps, cfg.horizon) for knots in elites])
         played = torch.cat(actions)[: len(rewards)].numpy()
         first = success.index(True) if any(success) else None
-        return Plan(played, np.array(rewards), first)
+        return Plan(played, np.array(rewards), first, max(rivals, default=None))
 
-    def _plan(self, states: list[State], mean: Tensor, rounds: int) -> tuple[Tensor, Tensor]:
-        """The new mean of the knots (K, a) and the actions (horizon, a) of the best sequence seen."""
+    def _plan(self, states: list[State], mean: Tensor, elites: Tensor, rounds: int) -> tuple[Tensor, Tensor, Tensor]:
+        """The new mean of the knots (K, a); the best sequences seen, best first, (E, K, a); those without success."""
         cfg, sim = self.config, self.simulator
+        knots, order, won = elites, torch.arange(len(elites)), torch.zeros(len(elites), dtype=torch.bool)
         std = torch.full_like(mean, cfg.std)
         discount = cfg.gamma ** torch.arange(cfg.horizon, dtype=torch.float64)
-        elites, best, best_score = mean[None], mean, -torch.inf
         for _ in range(rounds):
-            noise = torch.randn(cfg.samples, *mean.shape, generator=self._generator)
-            knots = (mean + std * noise).clamp(-1.0, 1.0)
-            knots[: len(elites)] = elites
+            knots = self._sample(mean, std, elites)
             sim.load(states)
             actions = quantised(torch.einsum("hk,nka->hna", self._weights, knots))
             trace = sim.play(actions.repeat(1, cfg.copies, 1))
             scores = (discount[:, None] * trace.rewards).sum(0).view(cfg.copies, -1).mean(0)
-            order = scores.argsort(descending=True)
+            order, won = scores.argsort(descending=True), trace.success.any(0)[: cfg.samples]
             chosen = knots[order[: max(2, round(cfg.elite_share * cfg.samples))]]
             mean, std = chosen.mean(0), chosen.std(0).clamp(min=cfg.min_std)
             elites = chosen[: cfg.kept_elites]
-            if scores[order[0]] > best_score:
-                best, best_score = chosen[0], float(scores[order[0]])
-        return mean, quantised(self._weights @ best)
+        return mean, elites, knots[order[~won[order]]][:RIVALS]
+
+    def _to_the_end(self, state: State, knots: Tensor, played: int) -> list[float]:
+        """What is still to come of the episode's reward if these sequences (n, K, a) are played, the last action held.
+
+        Only of those that end without success.
+        """
+        sim, rest = self._judge, self.simulator.episode_steps - played
+        if not len(knots):
+            return []
+        actions = torch.einsum("hk,nka->hna", self._weights, knots[torch.arange(sim.num) % len(knots)])
+        actions = quantised(actions)[torch.arange(rest).clamp(max=self.config.horizon - 1)]
+        sim.load([state])
+        trace = sim.play(actions)
+        return trace.rewards.sum(0)[~trace.success.any(0)].tolist()
+
+    def _sample(self, mean: Tensor, std: Tensor, elites: Tensor) -> Tensor:
+        """Knots to try (samples, K, a): the mean, the elites, mutants of the elites, draws around the mean."""
+        cfg, random = self.config, self._generator
+        noise = torch.randn(cfg.samples, *mean.shape, generator=random)
+        mutants = round(cfg.mutants * cfg.samples)
+        parents = elites[torch.randint(len(elites), (mutants,), generator=random)]
+        which = torch.rand(mutants, 1, mean.shape[1], generator=random) < cfg.mutated
+        when = torch.rand(mutants, len(mean), 1, generator=random) < 0.5
+        knots = torch.cat((parents + cfg.std * which * when * noise[:mutants], mean + std * noise[mutants:]))
+        # What is kept goes first, so that the best sequence of a round never falls behind that of the round before.
+        kept = torch.cat((elites, mean[None]))[: cfg.samples]
+        knots[: len(kept)] = kept
+        return knots.clamp(-1.0, 1.0)
 
     def _execute(self, states: list[State], actions: Tensor) -> tuple[list[State], list[float], list[bool], bool]:
         """Plays actions (T, a) in every copy; rewards and successes are those of the unshifted one, the first."""

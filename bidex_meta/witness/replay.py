@@ -1,6 +1,6 @@
 """Plays a witness again: from its start, and from starts that are shifted by a tenth of a millimetre."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,13 +32,19 @@ class Replay:
         return self.first_success is not None and self.succeeded >= NEEDED
 
 
-def frames(name: str, witness: Witness, camera: str | None = None, **size: int) -> Iterator[np.ndarray]:
-    """A picture before each step and after the last, (height, width, 3) uint8."""
+def frames(
+    name: str, witness: Witness, at: Collection[int] | None = None, camera: str | None = None, **size: int
+) -> Iterator[np.ndarray]:
+    """Pictures of a witness, (height, width, 3) uint8: after as many steps as ``at`` says (0: the start).
+
+    None: after every step.
+    """
     simulator = Simulator(name, 1, threads=1)
-    for action in torch.from_numpy(witness.actions):
-        yield simulator.picture(camera=camera, **size)
-        simulator.play(action[None, None])
-    yield simulator.picture(camera=camera, **size)
+    for played in range(len(witness.actions) + 1):
+        if at is None or played in at:
+            yield simulator.picture(camera=camera, **size)
+        if played < len(witness.actions):
+            simulator.play(torch.from_numpy(witness.actions[played])[None, None])
     simulator.close()
 
 

@@ -19,7 +19,7 @@ class Witness:
     actions: np.ndarray
     """Actions (T, action_size), float32, multiples of 1/127."""
     made: dict[str, Any]
-    """Return, step of the first success, how it was found, versions."""
+    """Return, step of the first success, the best unsuccessful episode seen (``rival``), how it was found, versions."""
 
 
 def witness_path(name: str) -> Path:
@@ -27,13 +27,15 @@ def witness_path(name: str) -> Path:
     return paths.assets_dir() / "witnesses" / f"{name}.npz"
 
 
-def load_witness(name: str) -> Witness:
-    """The witness of a class.
+def load_witness(name: str, path: Path | None = None) -> Witness:
+    """The witness of a class, or the one in a file.
 
     Raises:
         BidexError: There is none.
     """
-    path = witness_path(name)
+    if path is not None and not path.is_file():
+        raise BidexError(f"Expected a file that `bidex-meta witness --find --file` wrote, got {path}, which is none.")
+    path = path or witness_path(name)
     if not path.is_file():
         raise BidexError(f"{name} has no witness yet. Search one: bidex-meta witness --task {name} --find")
     with np.load(path, allow_pickle=False) as stored:

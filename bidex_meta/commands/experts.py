@@ -1,0 +1,59 @@
+"""The upper end of the normalised score: per class the best of its witness and of trained policies."""
+
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from bidex_meta.errors import BidexError
+from bidex_meta.record import RunFolder
+from bidex_meta.tasks import registry
+from bidex_meta.witness.replay import replay
+from bidex_meta.witness.store import load_witness, witness_path
+
+
+def best_known(names: Iterable[str], runs: Sequence[Path], threads: int | None = None) -> dict[str, dict[str, Any]]:
+    """Return and source of the best policy of each class; a class of which nothing is known is left out.
+
+    Args:
+        names: The classes.
+        runs: Run folders with an ``evaluation.json``, as ``run`` leaves them.
+        threads: Engine threads.
+
+    Raises:
+        BidexError: A run has no evaluation, or plays a class with fixed bases.
+    """
+    candidates = [row for run in runs for row in _of_run(run)]
+    candidates += [row for name in names for row in _of_witness(name, threads)]
+    best: dict[str, dict[str, Any]] = {}
+    for name, row in candidates:
+        if name in names and row["return"] > best.get(name, {"return": -float("inf")})["return"]:
+            best[name] = row
+    return best
+
+
+def _of_witness(name: str, threads: int | None) -> list[tuple[str, dict[str, Any]]]:
+    """A witness that holds: one episode of one task."""
+    if not witness_path(name).is_file():
+        return []
+    played = replay(name, load_witness(name), threads)
+    return [(name, {"return": played.total, "source": "witness, task 0"})] if played.found else []
+
+
+def _of_run(run: Path) -> list[tuple[str, dict[str, Any]]]:
+    """What a run's evaluation says of its classes: the mean over all tasks."""
+    folder = RunFolder.open(run)
+    config, path = folder.config(), folder.path / "evaluation.json"
+    if config["task"] is not None and not registry.get(config["task"]).moving_base:
+        raise BidexError(
+            f"Expected a run with moving bases, as suites have them, but {run} plays {config['task']} fixed."
+        )
+    if not path.is_file():
+        raise BidexError(
+            f"{run} has no evaluation.json. Let the run end, or write one: bidex-meta evaluate {run} --json"
+        )
+    classes = json.loads(path.read_text())["policy"]["classes"]
+    source = (
+        f"{config['algo']} on {config['suite'] or config['task']}, {config['steps']:,} steps, seed {config['seed']}"
+    )
+    return [(name, {"return": row["return"], "source": source}) for name, row in classes.items()]
