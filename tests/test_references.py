@@ -77,7 +77,7 @@ def test_the_expert_is_the_best_of_witness_and_runs(
     monkeypatch.setattr(experts, "load_witness", lambda name: name)
     # CatchUnderarm's no longer holds: only three of ten shifted starts succeed.
     monkeypatch.setattr(
-        experts, "replay", lambda name, *_: Replay(totals[name], 1, 3 if name == "CatchUnderarm" else 9)
+        experts, "replay", lambda name, *_: Replay(totals[name], 1, 3 if name == "CatchUnderarm" else 9, 0.0)
     )
     suite = evaluated_run(tmp_path / "a", None, "MT4", {"HandOver": 30.0, "CatchAbreast": 20.0})
     alone = evaluated_run(tmp_path / "b", "CatchAbreast", None, {"CatchAbreast": 12.0})

@@ -83,6 +83,7 @@ def test_a_search_plays_the_episode_and_never_ends_below_doing_nothing() -> None
     played = replay("HandOver", Witness(plan.actions.astype(np.float32), {}), threads=1)
     assert played.total == pytest.approx(plan.total, rel=1e-9)
     assert played.first_success == plan.first_success
+    assert 0.0 <= played.deepest < 0.02
     assert plan.rival is not None and np.isfinite(plan.rival)
 
 
@@ -97,7 +98,7 @@ def test_a_witness_survives_the_disk(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("first, succeeded, found", [(3, 8, True), (3, 7, False), (None, 10, False)])
 def test_found_means_the_start_and_eight_of_ten_shifted_ones(first: int | None, succeeded: int, found: bool) -> None:
-    assert Replay(0.0, first, succeeded).found is found
+    assert Replay(0.0, first, succeeded, 0.0).found is found
 
 
 @given(st.integers(2, 60), st.integers(2, 12))

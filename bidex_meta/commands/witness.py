@@ -74,7 +74,7 @@ def _replay(name: str, flags: WitnessFlags) -> dict[str, Any]:
     from bidex_meta.witness.replay import replay
     from bidex_meta.witness.store import load_witness, witness_path
 
-    keys = ("found", "return", "first_success", "shifted", "steps", "rival")
+    keys = ("found", "return", "first_success", "shifted", "steps", "deepest_mm", "rival")
     if flags.file is None and not witness_path(name).is_file():
         return {"task": name, **dict.fromkeys(keys), "found": False}
     witness = load_witness(name, flags.file)
@@ -85,6 +85,7 @@ def _replay(name: str, flags: WitnessFlags) -> dict[str, Any]:
         result.first_success,
         result.succeeded,
         len(witness.actions),
+        round(1000.0 * result.deepest, 1),
         None if rival is None else round(rival, 3),
     )
     return {"task": name, **dict(zip(keys, values, strict=True))}

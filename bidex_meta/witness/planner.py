@@ -17,6 +17,8 @@ from bidex_meta.witness.simulator import Simulator, State
 
 RIVALS = 16
 """Unsuccessful sequences of each plan that are played to the end of the episode."""
+FINEST = 0.05
+"""Deviation of the finest mutants, as a share of the coarsest ones'."""
 LEVELS = 127
 """Actions are whole multiples of 1/127, so that a byte holds one exactly."""
 
@@ -133,7 +135,9 @@ class Planner:
         parents = elites[torch.randint(len(elites), (mutants,), generator=random)]
         which = torch.rand(mutants, 1, mean.shape[1], generator=random) < cfg.mutated
         when = torch.rand(mutants, len(mean), 1, generator=random) < 0.5
-        knots = torch.cat((parents + cfg.std * which * when * noise[:mutants], mean + std * noise[mutants:]))
+        # Large changes find a way, small ones the last centimetre.
+        size = cfg.std * FINEST ** torch.rand(mutants, 1, 1, generator=random)
+        knots = torch.cat((parents + size * which * when * noise[:mutants], mean + std * noise[mutants:]))
         # What is kept goes first, so that the best sequence of a round never falls behind that of the round before.
         kept = torch.cat((elites, mean[None]))[: cfg.samples]
         knots[: len(kept)] = kept

@@ -25,6 +25,8 @@ class Replay:
     """Index of its first successful step."""
     succeeded: int
     """Shifted starts that succeed."""
+    deepest: float
+    """Deepest contact from the unshifted start, metres: what passes through nothing stays below a few millimetres."""
 
     @property
     def found(self) -> bool:
@@ -53,8 +55,10 @@ def replay(name: str, witness: Witness, threads: int | None = None) -> Replay:
     simulator = Simulator(name, 1 + SHIFTED, threads)
     simulator.load(simulator.starts(SHIFTED))
     actions = torch.from_numpy(witness.actions)
-    trace = simulator.play(actions[:, None].expand(-1, simulator.num, -1))
+    depths: list[float] = []
+    repeated = actions[:, None].expand(-1, simulator.num, -1)
+    trace = simulator.play(repeated, lambda: depths.append(simulator.contact_depth(0)))
     simulator.close()
     steps = trace.success[:, 0].nonzero().flatten().tolist()
     won = trace.success.any(dim=0)
-    return Replay(float(trace.rewards[:, 0].sum()), steps[0] if steps else None, int(won[1:].sum()))
+    return Replay(float(trace.rewards[:, 0].sum()), steps[0] if steps else None, int(won[1:].sum()), max(depths))

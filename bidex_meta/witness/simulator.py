@@ -1,5 +1,6 @@
 """Many rows of one task in one state: the world's own physics and reward, without its episodes."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,8 +96,8 @@ class Simulator:
             {name: torch.stack([s[name] for s in states]).repeat_interleave(share, dim=0) for name in names}
         )
 
-    def play(self, actions: Tensor) -> Trace:
-        """Plays actions (T, N, action_size) in [-1, 1] from where the rows stand."""
+    def play(self, actions: Tensor, each_step: Callable[[], None] | None = None) -> Trace:
+        """Plays actions (T, N, action_size) in [-1, 1] from where the rows stand, and calls back after each step."""
         alive = torch.ones(self.num, dtype=torch.bool)
         rewards, success = [], []
         for action in actions:
@@ -106,7 +107,13 @@ class Simulator:
             rewards.append(torch.where(alive, transition.reward, 0.0))
             success.append(alive & transition.success)
             alive &= ~transition.failed
+            if each_step is not None:
+                each_step()
         return Trace(torch.stack(rewards), torch.stack(success), alive)
+
+    def contact_depth(self, row: int) -> float:
+        """Deepest penetration among a row's contacts, metres."""
+        return self._engine.contact_depth(row)
 
     def picture(self, width: int = 640, height: int = 480, camera: str | None = None) -> np.ndarray:
         """The first row as it stands, (height, width, 3) uint8."""
