@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 
 from bidex_meta import paths
 from bidex_meta.cli import main
+from bidex_meta.errors import BidexError
 from bidex_meta.record.versions import collect_versions
 from bidex_meta.tasks import registry
 from bidex_meta.witness.config import PlannerConfig
@@ -85,6 +87,11 @@ def test_a_search_plays_the_episode_and_never_ends_below_doing_nothing() -> None
     assert played.first_success == plan.first_success
     assert 0.0 <= played.deepest < 0.02
     assert plan.rival is not None and np.isfinite(plan.rival)
+
+
+def test_copies_that_do_not_divide_the_samples_are_refused() -> None:
+    with pytest.raises(BidexError, match="6 and 4"):
+        Planner("HandOver", replace(SMALL, copies=4))
 
 
 def test_a_witness_survives_the_disk(tmp_path: Path) -> None:

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 class PlannerConfig:
     """Everything that can be set about the planner."""
 
-    samples: int = 256
+    samples: int = 128
     """Action sequences per round."""
     copies: int = 1
-    """Slightly shifted states that each sequence is tried in; the mean over them counts: no plan that holds by luck."""
-    rounds: int = 4
+    """Slightly shifted states that are played side by side, a divisor of ``samples``: each sequence meets one of them,
+    the best ones of a plan meet all, and their mean counts: no plan that holds by luck."""
+    rounds: int = 3
     """Rounds per plan."""
-    first_rounds: int = 12
+    first_rounds: int = 10
     """Rounds of the first plan, which has no predecessor."""
     rounds_after: int = 1
     """Rounds per plan once the task has been solved."""
@@ -25,17 +26,17 @@ class PlannerConfig:
     """Share of the sequences that are an elite with few of its knots changed; the rest is drawn around the mean."""
     mutated: float = 0.15
     """Share of the actions that a mutant changes, at a random half of its knots."""
-    horizon: int = 50
+    horizon: int = 41
     """Control steps a plan looks ahead."""
     knots: int = 9
     """Knots of a plan; actions between them are interpolated linearly."""
-    execute: int = 8
-    """Control steps played before the next plan."""
+    execute: int = 10
+    """Control steps played before the next plan; whole spaces between knots keep the rest of the plan as it was."""
     std: float = 0.5
     """Deviation of the knots in a first round."""
     min_std: float = 0.12
     """The deviation never falls below this."""
-    gamma: float = 0.98
+    gamma: float = 0.97
     """Discount per control step."""
     seed: int = 0
     """Of the samples."""

@@ -11,9 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bidex_meta.errors import BidexError
 from bidex_meta.hands.hand import hand
 from bidex_meta.witness.config import PlannerConfig
-from bidex_meta.witness.simulator import Simulator, State
+from bidex_meta.witness.simulator import Simulator, State, Trace
 
 RIVALS = 16
 """Unsuccessful sequences of each plan that are played to the end of the episode."""
@@ -50,11 +51,16 @@ class Planner:
         name: The class.
         config: See :class:`PlannerConfig`.
         threads: Engine threads; None takes all CPUs.
+
+    Raises:
+        BidexError: Copies do not divide samples.
     """
 
     def __init__(self, name: str, config: PlannerConfig, threads: int | None = None):
+        if config.samples % config.copies:
+            raise BidexError(f"Expected samples that copies divide, got {config.samples} and {config.copies}.")
         self.config = config
-        self.simulator = Simulator(name, config.samples * config.copies, threads)
+        self.simulator = Simulator(name, config.samples, threads)
         self._judge = Simulator(name, RIVALS, threads)
         self._generator = torch.Generator().manual_seed(config.seed)
         self._weights = interpolation(config.horizon, config.knots)
@@ -74,20 +80,22 @@ class Planner:
         rewards: list[float] = []
         success: list[bool] = []
         rivals: list[float] = []
+        solved = torch.zeros(cfg.copies, dtype=torch.bool)
         while len(rewards) < sim.episode_steps:
-            rounds = cfg.first_rounds if not actions else cfg.rounds_after if any(success) else cfg.rounds
+            rounds = cfg.first_rounds if not actions else cfg.rounds_after if solved.all() else cfg.rounds
             mean, elites, unsuccessful = self._plan(states, mean, elites, rounds)
             if not any(success):
                 rivals += [sum(rewards) + more for more in self._to_the_end(states[0], unsuccessful, len(rewards))]
             best = quantised(self._weights @ elites[0])
             steps = min(cfg.execute, sim.episode_steps - len(rewards))
-            states, got, won, alive = self._execute(states, best[:steps])
+            states, trace = self._execute(states, best[:steps])
             actions.append(best[:steps])
-            rewards += got
-            success += won
+            rewards += trace.rewards[:, 0].tolist()
+            success += trace.success[:, 0].tolist()
+            solved |= trace.success.any(0)
             if report is not None:
                 report(len(rewards), sum(rewards), any(success))
-            if not alive:
+            if not trace.alive[0]:
                 break
             mean = shifted(mean, steps, cfg.horizon)
             elites = torch.stack([shifted(knots, steps, cfg.horizon) for knots in elites])
@@ -97,21 +105,30 @@ class Planner:
 
     def _plan(self, states: list[State], mean: Tensor, elites: Tensor, rounds: int) -> tuple[Tensor, Tensor, Tensor]:
         """The new mean of the knots (K, a); the best sequences seen, best first, (E, K, a); those without success."""
-        cfg, sim = self.config, self.simulator
+        cfg = self.config
         knots, order, won = elites, torch.arange(len(elites)), torch.zeros(len(elites), dtype=torch.bool)
         std = torch.full_like(mean, cfg.std)
-        discount = cfg.gamma ** torch.arange(cfg.horizon, dtype=torch.float64)
         for _ in range(rounds):
             knots = self._sample(mean, std, elites)
-            sim.load(states)
-            actions = quantised(torch.einsum("hk,nka->hna", self._weights, knots))
-            trace = sim.play(actions.repeat(1, cfg.copies, 1))
-            scores = (discount[:, None] * trace.rewards).sum(0).view(cfg.copies, -1).mean(0)
-            order, won = scores.argsort(descending=True), trace.success.any(0)[: cfg.samples]
+            # Each sequence meets one copy of the state, drawn anew every round.
+            knots = knots[torch.randperm(len(knots), generator=self._generator)]
+            scores, won = self._try(states, knots)
+            order = scores.argsort(descending=True)
             chosen = knots[order[: max(2, round(cfg.elite_share * cfg.samples))]]
             mean, std = chosen.mean(0), chosen.std(0).clamp(min=cfg.min_std)
             elites = chosen[: cfg.kept_elites]
+        if cfg.copies > 1:
+            best = knots[order[: cfg.samples // cfg.copies]]
+            scores, _ = self._try(states, best.repeat(cfg.copies, 1, 1))
+            elites = best[scores.view(cfg.copies, -1).mean(0).argsort(descending=True)[: cfg.kept_elites]]
         return mean, elites, knots[order[~won[order]]][:RIVALS]
+
+    def _try(self, states: list[State], knots: Tensor) -> tuple[Tensor, Tensor]:
+        """Discounted reward (samples,) of sequences, equal shares of them played from each state, and who succeeds."""
+        self.simulator.load(states)
+        trace = self.simulator.play(quantised(torch.einsum("hk,nka->hna", self._weights, knots)))
+        discount = self.config.gamma ** torch.arange(self.config.horizon, dtype=torch.float64)
+        return (discount[:, None] * trace.rewards).sum(0), trace.success.any(0)
 
     def _to_the_end(self, state: State, knots: Tensor, played: int) -> list[float]:
         """What is still to come of the episode's reward if these sequences (n, K, a) are played, the last action held.
@@ -143,18 +160,14 @@ class Planner:
         knots[: len(kept)] = kept
         return knots.clamp(-1.0, 1.0)
 
-    def _execute(self, states: list[State], actions: Tensor) -> tuple[list[State], list[float], list[bool], bool]:
-        """Plays actions (T, a) in every copy; rewards and successes are those of the unshifted one, the first."""
-        sim, copies = self.simulator, self.config.copies
+    def _execute(self, states: list[State], actions: Tensor) -> tuple[list[State], Trace]:
+        """Plays actions (T, a) in every copy; the states it leads to and what happened, a row for each copy."""
+        sim = self.simulator
         sim.load(states)
         trace = sim.play(actions[:, None].expand(-1, sim.num, -1))
-        rows = range(0, sim.num, sim.num // copies)
-        return (
-            [sim.save(row) for row in rows],
-            trace.rewards[:, 0].tolist(),
-            trace.success[:, 0].tolist(),
-            bool(trace.alive[0]),
-        )
+        rows = range(0, sim.num, sim.num // self.config.copies)
+        one_each = Trace(trace.rewards[:, rows], trace.success[:, rows], trace.alive[rows])
+        return [sim.save(row) for row in rows], one_each
 
 
 def interpolation(horizon: int, knots: int) -> Tensor:
