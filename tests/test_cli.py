@@ -171,6 +171,7 @@ def test_run_trains_evaluates_and_can_be_looked_at_again(toy_worlds, tmp_path, c
     assert found["steps"] == 240
     assert found["policy"] == report["policy"]  # the policy of the checkpoint is the one that was trained
     assert found["random"] == report["random"]
+    assert found["return_above_random"] == report["return_above_random"]
     assert set(found["return_above_random"]["Far"]) == {"value", "interval"}
 
     assert main(["evaluate", str(path)]) == 0

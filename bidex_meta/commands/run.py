@@ -4,6 +4,7 @@ import importlib
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 from bidex_meta.commands.run_config import RunPlan, plan_run
@@ -66,7 +67,7 @@ def _train(plan: RunPlan, folder: Any, world: Any, learner: Any, loaded: tuple[d
 def _evaluate(plan: RunPlan, folder: Any, learner: Any) -> None:
     from bidex_meta.commands import worlds
     from bidex_meta.commands.tables import evaluation_table, print_table
-    from bidex_meta.evaluate import RandomAgent, evaluate
+    from bidex_meta.evaluate import RandomAgent, compare, evaluate
     from bidex_meta.record.atomic import write_json
     from bidex_meta.references import references
 
@@ -78,7 +79,9 @@ def _evaluate(plan: RunPlan, folder: Any, learner: Any) -> None:
     trained = evaluate(learner, world, episodes, seed=seed, references=known)
     random = evaluate(RandomAgent(world.action_space), world, episodes, seed=seed, references=known)
     world.close()
-    write_json(folder.path / "evaluation.json", {"policy": trained.to_json(), "random": random.to_json()})
+    above = {name: asdict(difference) for name, difference in compare(trained, random).items()}
+    found = {"policy": trained.to_json(), "random": random.to_json(), "return_above_random": above}
+    write_json(folder.path / "evaluation.json", found)
     title = f"{plan.config['algo']} on {plan.config['suite'] or plan.config['task']}, {learner.env_steps:,} steps"
     print_table(evaluation_table(title, trained, random))
     _say(f"Again: bidex-meta evaluate {folder.path}   Curves: bidex-meta plot {folder.path}")
