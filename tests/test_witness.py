@@ -14,6 +14,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.record.versions import collect_versions
 from bidex_meta.tasks import registry
 from bidex_meta.witness.config import PlannerConfig
+from bidex_meta.witness.mutants import mutants, parts_of_the_hands
 from bidex_meta.witness.planner import LEVELS, Planner, interpolation, quantised, rest_action, shifted
 from bidex_meta.witness.replay import Replay, replay
 from bidex_meta.witness.simulator import SHIFT, Simulator, task_slot
@@ -122,6 +123,17 @@ def test_a_plan_that_is_shifted_says_the_same_of_the_same_moment(horizon: int, k
     moved = shifted(line, steps, horizon)
     expected = (torch.linspace(0.0, horizon - 1.0, knots) + steps).clamp(max=horizon - 1.0) / (horizon - 1.0)
     torch.testing.assert_close(moved[:, 0], expected, atol=1e-5, rtol=0)
+
+
+def test_mutants_change_a_few_actions_or_one_part_of_the_hands() -> None:
+    elites, generator = torch.zeros(1, 9, 52), torch.Generator().manual_seed(0)
+    changed = (mutants(elites, 400, PlannerConfig(), generator) != 0).any(1)
+    parts = parts_of_the_hands(52)
+    whole = (changed[:, None] == parts).all(2).any(1)
+    assert 0.35 < float(whole.float().mean()) < 0.65
+    assert 0.1 < float(changed[~whole].float().mean()) < 0.2
+    assert parts.sum(1).tolist() == [20, 20, 6, 6, 12] and parts[2].nonzero().flatten().tolist() == list(range(20, 26))
+    assert parts_of_the_hands(40).sum(1).tolist() == [20, 20]
 
 
 def test_the_rest_action_holds_the_start() -> None:

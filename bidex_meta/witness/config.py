@@ -23,9 +23,9 @@ class PlannerConfig:
     kept_elites: int = 4
     """Elites that are tried again in the next round, and as parents of mutants."""
     mutants: float = 0.5
-    """Share of the sequences that are an elite with few of its knots changed; the rest is drawn around the mean."""
+    """Share of the sequences that are an elite with some of its knots changed; the rest is drawn around the mean."""
     mutated: float = 0.15
-    """Share of the actions that a mutant changes, at a random half of its knots."""
+    """Share of the actions that a mutant changes which does not change one part of the hands."""
     horizon: int = 41
     """Control steps a plan looks ahead."""
     knots: int = 9

@@ -14,12 +14,11 @@ from torch import Tensor
 from bidex_meta.errors import BidexError
 from bidex_meta.hands.hand import hand
 from bidex_meta.witness.config import PlannerConfig
+from bidex_meta.witness.mutants import mutants
 from bidex_meta.witness.simulator import Simulator, State, Trace
 
 RIVALS = 16
 """Unsuccessful sequences of each plan that are played to the end of the episode."""
-FINEST = 0.05
-"""Deviation of the finest mutants, as a share of the coarsest ones'."""
 LEVELS = 127
 """Actions are whole multiples of 1/127, so that a byte holds one exactly."""
 
@@ -147,14 +146,9 @@ class Planner:
     def _sample(self, mean: Tensor, std: Tensor, elites: Tensor) -> Tensor:
         """Knots to try (samples, K, a): the mean, the elites, mutants of the elites, draws around the mean."""
         cfg, random = self.config, self._generator
-        noise = torch.randn(cfg.samples, *mean.shape, generator=random)
-        mutants = round(cfg.mutants * cfg.samples)
-        parents = elites[torch.randint(len(elites), (mutants,), generator=random)]
-        which = torch.rand(mutants, 1, mean.shape[1], generator=random) < cfg.mutated
-        when = torch.rand(mutants, len(mean), 1, generator=random) < 0.5
-        # Large changes find a way, small ones the last centimetre.
-        size = cfg.std * FINEST ** torch.rand(mutants, 1, 1, generator=random)
-        knots = torch.cat((parents + size * which * when * noise[:mutants], mean + std * noise[mutants:]))
+        changed = mutants(elites, round(cfg.mutants * cfg.samples), cfg, random)
+        drawn = mean + std * torch.randn(cfg.samples - len(changed), *mean.shape, generator=random)
+        knots = torch.cat((changed, drawn))
         # What is kept goes first, so that the best sequence of a round never falls behind that of the round before.
         kept = torch.cat((elites, mean[None]))[: cfg.samples]
         knots[: len(kept)] = kept

@@ -1,0 +1,51 @@
+"""Changed copies of good plans: what a search tries beside draws around its mean."""
+
+import torch
+from torch import Tensor
+
+from bidex_meta.hands.hand import hand
+from bidex_meta.witness.config import PlannerConfig
+
+FINEST = 0.05
+"""Deviation of the finest mutants, as a share of the coarsest ones': large changes find a way, small ones the rest."""
+
+
+def mutants(elites: Tensor, count: int, config: PlannerConfig, generator: torch.Generator) -> Tensor:
+    """So many elites with some of their knots changed, (count, K, a).
+
+    Half of them change a few actions, wherever they are, half one part of the hands, so that a grip can be carried
+    somewhere and a base stays while its fingers close. Half change a random half of their knots, each by itself, half
+    every knot from some time on by the same amount.
+
+    Args:
+        elites: Plans to change, (E, K, a).
+        count: How many mutants.
+        config: Its ``std`` and ``mutated``.
+        generator: Of the draws.
+    """
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(count, *shape, generator=generator)
+
+    parents = elites[torch.randint(len(elites), (count,), generator=generator)]
+    knots, size = parents.shape[1:]
+    parts = parts_of_the_hands(size)
+    part = parts[torch.randint(len(parts), (count,), generator=generator)][:, None]
+    which = torch.where(uniform(1, 1) < 0.5, uniform(1, size) < config.mutated, part)
+    noise = torch.randn(count, knots, size, generator=generator)
+    since = torch.arange(knots)[:, None] >= torch.randint(knots, (count, 1, 1), generator=generator)
+    change = torch.where(uniform(1, 1) < 0.5, noise * (uniform(knots, 1) < 0.5), noise[:, :1] * since)
+    return parents + config.std * FINEST ** uniform(1, 1) * which * change
+
+
+def parts_of_the_hands(size: int) -> Tensor:
+    """Masks of actions, bool (parts, size): each hand's fingers, each hand's base, both bases."""
+    joints = len(hand().control_low)
+    place = torch.arange(size)
+    one = size // 2
+    fingers = place % one < joints
+    right = place < one
+    parts = [fingers & right, fingers & ~right]
+    if one > joints:
+        parts += [~fingers & right, ~fingers & ~right, ~fingers]
+    return torch.stack(parts)
