@@ -68,7 +68,7 @@ def test_bench_stability_counts_what_it_saw() -> None:
     assert list(found) == ["HandOver", "HandOver (fixed base)"]
     for result in found.values():
         assert (result["env_steps"], result["unstable"], result["warnings"]) == (40, 0, 0)
-        assert result["depth_samples"] == 10
+        assert result["depth_samples"] == 5 * physics._SAMPLES_PER_STEP
         assert 0.0 < result["fastest_object"] < physics.MAX_OBJECT_SPEED
         assert result["holds"] is True
     assert json.loads(json.dumps(found)) == found
