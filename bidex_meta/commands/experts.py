@@ -1,7 +1,7 @@
 """The upper end of the normalised score: per class the best of its witness and of trained policies."""
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from bidex_meta.witness.replay import replay
 from bidex_meta.witness.store import load_witness, witness_path
 
 
-def best_known(names: Iterable[str], runs: Sequence[Path], threads: int | None = None) -> dict[str, dict[str, Any]]:
+def best_known(names: Collection[str], runs: Sequence[Path], threads: int | None = None) -> dict[str, dict[str, Any]]:
     """Return and source of the best policy of each class; a class of which nothing is known is left out.
 
     Args:
@@ -50,7 +50,7 @@ def _of_run(run: Path) -> list[tuple[str, dict[str, Any]]]:
         )
     if not path.is_file():
         raise BidexError(
-            f"{run} has no evaluation.json. Let the run end, or write one: bidex-meta evaluate {run} --json"
+            f"{run} has no evaluation.json. Let the run end, or write one: bidex-meta evaluate {run} --json > {path}"
         )
     classes = json.loads(path.read_text())["policy"]["classes"]
     source = (
