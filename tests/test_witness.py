@@ -132,8 +132,16 @@ def test_mutants_change_a_few_actions_or_one_part_of_the_hands() -> None:
     whole = (changed[:, None] == parts).all(2).any(1)
     assert 0.35 < float(whole.float().mean()) < 0.65
     assert 0.1 < float(changed[~whole].float().mean()) < 0.2
-    assert parts.sum(1).tolist() == [20, 20, 6, 6, 12] and parts[2].nonzero().flatten().tolist() == list(range(20, 26))
+    assert parts.sum(1).tolist() == [20, 20, 3, 3, 3, 3, 6] and parts[3].nonzero().flatten().tolist() == [23, 24, 25]
     assert parts_of_the_hands(40).sum(1).tolist() == [20, 20]
+
+
+def test_half_of_the_mutants_cross_the_hands_of_two_elites() -> None:
+    elites = torch.tensor([-0.5, 0.5])[:, None, None].expand(2, 9, 52)
+    made = mutants(elites, 400, replace(PlannerConfig(), std=0.0), torch.Generator().manual_seed(0))
+    right, left = made[:, :, :26], made[:, :, 26:]
+    assert bool((right == right[:, :1, :1]).all()) and bool((left == left[:, :1, :1]).all())
+    assert 0.15 < float((right[:, 0, 0] != left[:, 0, 0]).float().mean()) < 0.35
 
 
 def test_the_rest_action_holds_the_start() -> None:

@@ -20,7 +20,7 @@ class PlannerConfig:
     """Rounds per plan once the task has been solved."""
     elite_share: float = 0.08
     """Share of the sequences that mean and deviation move towards."""
-    kept_elites: int = 4
+    kept_elites: int = 8
     """Elites that are tried again in the next round, and as parents of mutants."""
     mutants: float = 0.5
     """Share of the sequences that are an elite with some of its knots changed; the rest is drawn around the mean."""

@@ -13,9 +13,10 @@ FINEST = 0.05
 def mutants(elites: Tensor, count: int, config: PlannerConfig, generator: torch.Generator) -> Tensor:
     """So many elites with some of their knots changed, (count, K, a).
 
-    Half of them change a few actions, wherever they are, half one part of the hands, so that a grip can be carried
-    somewhere and a base stays while its fingers close. Half change a random half of their knots, each by itself, half
-    every knot from some time on by the same amount.
+    Half of them take the left hand's actions from another elite, since what one hand does well seldom depends on the
+    other. Half of them change a few actions, wherever they are, half one part of the hands, so that a grip can be
+    carried somewhere and a base stays while its fingers close. Half change a random half of their knots, each by
+    itself, half every knot from some time on by the same amount.
 
     Args:
         elites: Plans to change, (E, K, a).
@@ -27,8 +28,10 @@ def mutants(elites: Tensor, count: int, config: PlannerConfig, generator: torch.
     def uniform(*shape: int) -> Tensor:
         return torch.rand(count, *shape, generator=generator)
 
-    parents = elites[torch.randint(len(elites), (count,), generator=generator)]
-    knots, size = parents.shape[1:]
+    knots, size = elites.shape[1:]
+    parents, others = (elites[torch.randint(len(elites), (count,), generator=generator)] for _ in range(2))
+    crossed = (uniform(1, 1) < 0.5) & (torch.arange(size) >= size // 2)
+    parents = torch.where(crossed, others, parents)
     parts = parts_of_the_hands(size)
     part = parts[torch.randint(len(parts), (count,), generator=generator)][:, None]
     which = torch.where(uniform(1, 1) < 0.5, uniform(1, size) < config.mutated, part)
@@ -39,13 +42,12 @@ def mutants(elites: Tensor, count: int, config: PlannerConfig, generator: torch.
 
 
 def parts_of_the_hands(size: int) -> Tensor:
-    """Masks of actions, bool (parts, size): each hand's fingers, each hand's base, both bases."""
-    joints = len(hand().control_low)
+    """Masks of actions, bool (parts, size): each hand's fingers; each base's force and torque; both bases' forces."""
+    joints, one = len(hand().control_low), size // 2
     place = torch.arange(size)
-    one = size // 2
-    fingers = place % one < joints
-    right = place < one
-    parts = [fingers & right, fingers & ~right]
+    finger, force = place % one < joints, (place % one >= joints) & (place % one < joints + 3)
+    hands = (place < one, place >= one)
+    parts = [finger & side for side in hands]
     if one > joints:
-        parts += [~fingers & right, ~fingers & ~right, ~fingers]
+        parts += [kind & side for side in hands for kind in (force, ~finger & ~force)] + [force]
     return torch.stack(parts)
