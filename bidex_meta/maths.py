@@ -7,9 +7,30 @@ depend on how many rows there are.
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
 
 import torch
 from torch import Tensor
+
+
+def constant(values: Sequence[Any], like: Tensor) -> Tensor:
+    """Fixed numbers, nested tuples of them, as a tensor of another one's dtype and device. Not to be written to.
+
+    They are brought to the device once: copied anew in every step, each would make the host wait for it.
+    """
+    return _constant(values, like.dtype, like.device)
+
+
+def indices(values: Sequence[int], like: Tensor) -> Tensor:
+    """Fixed indices on the device of a tensor, int64, brought there once. Not to be written to."""
+    return _constant(tuple(values), torch.int64, like.device)
+
+
+@lru_cache(maxsize=1024)
+def _constant(values: Sequence[Any], dtype: torch.dtype, device: torch.device) -> Tensor:
+    with torch.inference_mode(False):
+        return torch.tensor(values, dtype=dtype, device=device)
 
 
 def xyzw(wxyz: Tensor) -> Tensor:
@@ -39,7 +60,7 @@ def multiply(a: Tensor, b: Tensor) -> Tensor:
 
 def conjugate(q: Tensor) -> Tensor:
     """The inverse rotation of a unit quaternion (x, y, z, w). Shape (..., 4)."""
-    return q * q.new_tensor((-1.0, -1.0, -1.0, 1.0))
+    return q * constant((-1.0, -1.0, -1.0, 1.0), q)
 
 
 def norm(v: Tensor) -> Tensor:

@@ -75,7 +75,7 @@ def _stability(made: World, steps: int, seed: int) -> dict[str, Any]:
     for _ in range(control_steps):
         info = made.step(_rough_actions(held, left, generator))[-1]
         unstable += int(info["unstable"].sum())
-        warnings += int((engine.batch.warning[:, :, 1] > 0).sum())
+        warnings += int(engine.warnings().sum())
         fastest = max(fastest, max(float(engine.sensordata[:, w].norm(dim=1).max()) for w in velocities))
         sample = torch.randint(made.num_envs, (_SAMPLES_PER_STEP,), generator=generator).tolist()
         depths += [engine.contact_depth(row) for row in sample]

@@ -33,6 +33,7 @@ class CpuEngine:
     """
 
     device = torch.device("cpu")
+    masked = False
 
     def __init__(self, models: Sequence[mujoco.MjModel], rows: Sequence[int], threads: int | None = None) -> None:
         """Builds the batch.
@@ -74,6 +75,10 @@ class CpuEngine:
         bad = torch.from_numpy((self.batch.warning[:, _BAD, 1] > 0).any(axis=1))
         # One non-finite addend makes the sum non-finite.
         return bad | self._failed | ~self.sensordata.sum(dim=1).isfinite()
+
+    def warnings(self) -> Tensor:
+        """How many of MuJoCo's warnings each simulation has told since its last reset. Shape (num,), int64."""
+        return torch.from_numpy((self.batch.warning[:, :, 1] > 0).sum(axis=1))
 
     def placement(self) -> Tensor:
         """What ``reset`` takes, of every simulation as it stands, a copy. Shape (num, nq + 7 nmocap)."""

@@ -1,7 +1,9 @@
 """What the world asks of an engine."""
 
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
+import mujoco
 import torch
 from torch import Tensor
 
@@ -14,6 +16,8 @@ class Engine(Protocol):
     Attributes:
         num: Number of simulations.
         device: Where the views live.
+        masked: Whether the engine is of an accelerator's kind: resets are masked writes of full size, and nothing in
+            a step may wait for a value or have a shape that depends on one.
         qpos: Positions, shape (num, nq).
         qvel: Velocities, shape (num, nv).
         ctrl: Position targets, shape (num, nu).
@@ -23,6 +27,7 @@ class Engine(Protocol):
 
     num: int
     device: torch.device
+    masked: bool
     qpos: Tensor
     qvel: Tensor
     ctrl: Tensor
@@ -44,13 +49,18 @@ class Engine(Protocol):
         """Which simulations broke (bad numbers or non-finite values) since their last reset. Shape (num,), bool."""
         ...
 
+    def warnings(self) -> Tensor:
+        """How many kinds of trouble each simulation has told since its last reset. Shape (num,), int64."""
+        ...
+
     def reset(self, mask: Tensor, start: Tensor) -> None:
         """Starts the simulations of a mask (num,) anew.
 
         Args:
             mask: Which simulations, shape (num,), bool.
             start: Their start positions, shape (k, nq + 7 nmocap): ``qpos``, then position and quaternion (w, x, y, z)
-                of each fixture that may stand elsewhere from task to task; one row for each true entry on a CPU engine.
+                of each fixture that may stand elsewhere from task to task; one row for each true entry, or, where the
+                engine is ``masked``, one for every simulation.
         """
         ...
 
@@ -61,3 +71,19 @@ class Engine(Protocol):
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Puts back what ``state_dict`` gave."""
         ...
+
+    def model(self, row: int) -> mujoco.MjModel:
+        """The model of a simulation, for pictures and checks."""
+        ...
+
+    def data(self, row: int) -> mujoco.MjData:
+        """A copy of a simulation's data, forwarded by C MuJoCo, for pictures and checks."""
+        ...
+
+    def contact_depth(self, row: int) -> float:
+        """Deepest penetration among a simulation's contacts, metres, 0 without contact."""
+        ...
+
+
+EngineMaker = Callable[[Sequence[mujoco.MjModel], Sequence[int]], Engine]
+"""Makes an engine of models of equal structure and, for each simulation, the index of its model."""

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.hand import DISTAL_PER_MIDDLE, hand
-from bidex_meta.maths import dot, norm
+from bidex_meta.maths import constant, dot, norm
 
 _WRIST = (0.0, 0.01, 0.256)
 """Wrist origin in the mount frame, metres; the palm lies 0.034 further along the turned z (sheet 2.2)."""
@@ -35,17 +35,18 @@ roots 22 mm apart, tips 94 mm out with radii of 7 mm, 3 mm of overlap allowed.""
 class _Indices:
     """Positions of joints among the 24, four fingers each (index to little)."""
 
-    side: list[int]
-    base: list[int]
-    middle: list[int]
-    distal: list[int]
+    side: Tensor
+    base: Tensor
+    middle: Tensor
+    distal: Tensor
     cup: int
 
 
-@lru_cache(maxsize=1)
-def _indices() -> _Indices:
+@lru_cache(maxsize=4)
+def _indices(device: torch.device) -> _Indices:
     find = hand().index
-    return _Indices(*(find(*(f"{f}J{k}" for f in ("FF", "MF", "RF", "LF"))) for k in (3, 2, 1, 0)), cup=find("LFJ4")[0])
+    groups = [find(*(f"{f}J{k}" for f in ("FF", "MF", "RF", "LF"))) for k in (3, 2, 1, 0)]
+    return _Indices(*(torch.tensor(group, device=device) for group in groups), cup=find("LFJ4")[0])
 
 
 def noisy_joints(draws: Tensor, scale: float) -> Tensor:
@@ -58,8 +59,8 @@ def noisy_joints(draws: Tensor, scale: float) -> Tensor:
     Returns:
         Angles, rad, shape (n, 24).
     """
-    low, high = (torch.as_tensor(x, dtype=draws.dtype, device=draws.device) for x in (hand().low, hand().high))
-    where = _indices()
+    low, high = (constant(tuple(x.tolist()), draws) for x in (hand().low, hand().high))
+    where = _indices(draws.device)
     joints = (draws * (scale * (high - low))).clamp(low, high)
     side = joints[:, where.side]
     crossing = (side[:, 1:] - side[:, :-1]).amax(dim=1, keepdim=True).clamp(min=_MAX_CROSSING)
@@ -85,7 +86,7 @@ def make_room(joints: Tensor, position: Tensor, axis: Tensor, radius: float, hal
         The joints with opened fingers, shape (n, 24), and the egg's shift in the mount frame, metres, shape (n, 3).
     """
     x_axis, y_axis, z_axis = _palm_axes(joints)
-    wrist = position.new_tensor(_WRIST)
+    wrist = constant(_WRIST, position)
     relative = position - wrist - _PALM_OFFSET * _wrist_z(joints)
     centre = torch.stack([dot(relative, a) for a in (x_axis, y_axis, z_axis)], dim=1)
     axis = torch.stack([dot(axis, a) for a in (x_axis, y_axis, z_axis)], dim=1)
@@ -96,8 +97,8 @@ def make_room(joints: Tensor, position: Tensor, axis: Tensor, radius: float, hal
 
     start, along, length = _finger_segments(joints)
     gap = _gap(centre[:, None, None], axis[:, None, None], radius, square, start, along, length)
-    touched = (gap - gap.new_tensor(_RADII) < -_SLACK).any(dim=2)
-    where = _indices()
+    touched = (gap - constant(_RADII, gap) < -_SLACK).any(dim=2)
+    where = _indices(joints.device)
     joints = joints.clone()
     for group in (where.base, where.middle, where.distal):
         joints[:, group] = joints[:, group].masked_fill(touched, 0.0)
@@ -152,16 +153,16 @@ def _finger_segments(joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     Returns:
         Starts (n, 4, 3, 3), unit directions (n, 4, 3, 3) and lengths (3,): finger, link, coordinate.
     """
-    where = _indices()
+    where = _indices(joints.device)
     side = joints[:, where.side]
     bend = torch.stack([joints[:, g] for g in (where.base, where.middle, where.distal)], dim=2)
     bend[:, -1, 0] += _CUP_TILT * joints[:, where.cup]
     bend = bend.cumsum(dim=2)
     sin, cos = bend.sin(), bend.cos()
     along = torch.stack((side.sin()[..., None] * cos, -sin, side.cos()[..., None] * cos), dim=3)
-    length = joints.new_tensor(_LENGTHS)
+    length = constant(_LENGTHS, joints)
     ends = (along * length[:, None]).cumsum(dim=2)
-    roots = joints.new_tensor([(x, 0.0, z) for x, z in _ROOTS]).repeat(len(joints), 1, 1)
+    roots = constant(tuple((x, 0.0, z) for x, z in _ROOTS), joints).repeat(len(joints), 1, 1)
     roots[:, -1, 1] = -_CUP_LIFT * joints[:, where.cup]
     start = roots[:, :, None] + torch.cat((torch.zeros_like(ends[:, :, :1]), ends[:, :, :-1]), dim=2)
     return start, along, length

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from bidex_meta.hands.hand import hand
 from bidex_meta.hands.poses import HandPose
-from bidex_meta.maths import dot
+from bidex_meta.maths import constant, dot, indices
 from bidex_meta.tasks.base import FIRM, TaskClass
 from bidex_meta.tasks.layout import Layout, both_hands, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, SHIFT, TURN, place
@@ -87,9 +87,10 @@ class BottleCap(TaskClass):
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
         """Thumbs bent, the bottle on the right palm, cap on."""
         for side in ("right", "left"):
-            qpos[f"{side}/joints"][:, hand().index(*_THUMB)] = draws.new_tensor(tuple(_THUMB.values()))
+            joints = qpos[f"{side}/joints"]
+            joints[:, indices(hand().index(*_THUMB), joints)] = constant(tuple(_THUMB.values()), joints)
         bottle = qpos["bottle"]
-        nominal, normal = bottle[:, :3].clone(), bottle.new_tensor(_PALM_NORMAL)
+        nominal, normal = bottle[:, :3].clone(), constant(_PALM_NORMAL, bottle)
         place(bottle, frozen["bottle"], draws)
         bottle[:, :3] -= dot(bottle[:, :3] - nominal, normal)[:, None] * normal
 

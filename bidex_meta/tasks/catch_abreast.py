@@ -5,7 +5,7 @@ import math
 from torch import Tensor
 
 from bidex_meta.hands.poses import HandPose
-from bidex_meta.maths import norm
+from bidex_meta.maths import constant, norm
 from bidex_meta.tasks.one_egg import OneEgg
 from bidex_meta.tasks.state import TaskState
 
@@ -40,5 +40,5 @@ class CatchAbreast(OneEgg):
         dropped = super().failed(state)
         for side, anchor in _ANCHORS.items():
             palm = state[f"{side}/palm_position"]
-            dropped = dropped | (norm(palm - palm.new_tensor(anchor)) >= _ANCHOR_RADIUS)
+            dropped = dropped | (norm(palm - constant(anchor, palm)) >= _ANCHOR_RADIUS)
         return dropped

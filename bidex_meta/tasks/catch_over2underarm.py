@@ -5,7 +5,7 @@ import math
 from torch import Tensor
 
 from bidex_meta.hands.poses import PALM_UP_BACK, HandPose
-from bidex_meta.maths import norm
+from bidex_meta.maths import constant, norm
 from bidex_meta.tasks.one_egg import OneEgg
 from bidex_meta.tasks.state import TaskState
 
@@ -43,5 +43,5 @@ class CatchOver2Underarm(OneEgg):
         dropped = super().failed(state)
         for side, pose in (("right", self.right), ("left", self.left)):
             mount = state[f"{side}/mount_position"]
-            dropped = dropped | (norm(mount - mount.new_tensor(pose.position)) >= _ANCHOR_RADIUS)
+            dropped = dropped | (norm(mount - constant(pose.position, mount)) >= _ANCHOR_RADIUS)
         return dropped

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.hands.starts import make_room, noisy_joints
-from bidex_meta.maths import conjugate, norm, random_orientation, rotate, rotation_angle, wxyz, xyzw
+from bidex_meta.maths import conjugate, constant, norm, random_orientation, rotate, rotation_angle, wxyz, xyzw
 from bidex_meta.tasks.goals import rotation_difference
 from bidex_meta.tasks.state import TaskState
 
@@ -55,10 +55,10 @@ def lay_egg_on_hand(
         radius: Short semi-axis, metres.
         half: Long semi-axis, metres.
     """
-    quaternion = xyzw(egg.new_tensor(pose.quaternion))
+    quaternion = xyzw(constant(pose.quaternion, egg))
     inverse = conjugate(quaternion)
-    position = rotate(inverse, egg[:, :3] - egg.new_tensor(pose.position))
-    axis = rotate(inverse, rotate(xyzw(egg[:, 3:]), egg.new_tensor((0.0, 0.0, 1.0))))
+    position = rotate(inverse, egg[:, :3] - constant(pose.position, egg))
+    axis = rotate(inverse, rotate(xyzw(egg[:, 3:]), constant((0.0, 0.0, 1.0), egg)))
     opened, shift = make_room(joints, position, axis, radius, half)
     joints.copy_(opened.float())
     egg[:, :3] += rotate(quaternion, shift).float()

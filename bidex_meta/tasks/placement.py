@@ -9,7 +9,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-from bidex_meta.maths import multiply, wxyz, xyzw
+from bidex_meta.maths import constant, multiply, wxyz, xyzw
 from bidex_meta.tasks.variation import VariationSpace
 
 SHIFT = 0.03
@@ -50,7 +50,7 @@ def place(pose: Tensor, frozen: Tensor, draws: Tensor | None = None) -> None:
     """
     shift = frozen
     if draws is not None:
-        shift = frozen + draws * draws.new_tensor((JITTER, JITTER, JITTER_TURN))
+        shift = frozen + draws * constant((JITTER, JITTER, JITTER_TURN), draws)
     pose[:, :2] += shift[:, :2]
     pose[:, 3:] = wxyz(multiply(yaw_quaternion(shift[:, 2]), xyzw(pose[:, 3:])))
 

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
-from bidex_meta.maths import multiply, rotation_angle, wxyz, xyzw
+from bidex_meta.maths import constant, multiply, rotation_angle, wxyz, xyzw
 from bidex_meta.tasks import eggs
 from bidex_meta.tasks.base import FAST, TaskClass
 from bidex_meta.tasks.goals import frozen_goal, observe_goal
@@ -121,5 +121,5 @@ def _turn_away(cube: Tensor, goal_inverse: Tensor) -> None:
     """
     now = xyzw(cube[:, 3:])
     near = rotation_angle(multiply(now, goal_inverse)) < _START_ANGLE
-    turned = multiply(now.new_tensor((1.0, 0.0, 0.0, 0.0)).expand_as(now), now)
+    turned = multiply(constant((1.0, 0.0, 0.0, 0.0), now).expand_as(now), now)
     cube[:, 3:] = wxyz(torch.where(near[:, None], turned, now))

@@ -27,11 +27,11 @@ class Controls:
         """Reads ranges, bodies and scales of the group's classes."""
         engine, scene = group.engine, group.members[0].scene
         self._engine, self._moving = engine, scene.task.moving_base
-        low, high = (torch.as_tensor(x, dtype=engine.ctrl.dtype) for x in (hand().control_low, hand().control_high))
+        low, high = (engine.ctrl.new_tensor(x) for x in (hand().control_low, hand().control_high))
         self._middle, self._half = 0.5 * (high + low), 0.5 * (high - low)
         self._joints = len(low)
         self._bodies = scene.base_bodies
-        self._wrench = torch.empty(engine.num, 6, dtype=engine.ctrl.dtype)
+        self._wrench = engine.ctrl.new_empty(engine.num, 6)
         for member in group.members:
             task = member.scene.task
             self._wrench[member.engine_rows, :3] = FORCE_PER_SCALE * task.transition_scale

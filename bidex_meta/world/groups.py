@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bidex_meta.engine.cpu import CpuEngine
+from bidex_meta.engine.protocol import Engine, EngineMaker
 from bidex_meta.engine.structure import same_structure
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.scene import Scene, compile_scene
@@ -50,7 +50,7 @@ class Group:
         span: The same as a slice of the world's rows if they are contiguous, else None.
     """
 
-    engine: CpuEngine
+    engine: Engine
     members: tuple[Member, ...]
     rows: Tensor
     span: slice | None
@@ -67,7 +67,7 @@ def split_rows(num_envs: int, slots: int) -> list[slice]:
     return [slice(stop - share - (i < rest), stop) for i, stop in enumerate(stops)]
 
 
-def build_groups(slots: list[Slot], rows: list[slice], threads: int | None) -> list[Group]:
+def build_groups(slots: list[Slot], rows: list[slice], make_engine: EngineMaker) -> list[Group]:
     """Compiles the slots' scenes and puts those of equal structure together, in the slots' order."""
     scenes: dict[tuple[str, bool], Scene] = {}
     for slot in slots:
@@ -82,7 +82,7 @@ def build_groups(slots: list[Slot], rows: list[slice], threads: int | None) -> l
             pools.append([i])
         else:
             home.append(i)
-    return [_build_group([(i, by_slot[i], rows[i]) for i in pool], threads) for pool in pools]
+    return [_build_group([(i, by_slot[i], rows[i]) for i in pool], make_engine) for pool in pools]
 
 
 def _alike(a: Scene, b: Scene) -> bool:
@@ -90,7 +90,7 @@ def _alike(a: Scene, b: Scene) -> bool:
     return a.task.layout == b.task.layout and same_structure(a.model, b.model)
 
 
-def _build_group(places: list[tuple[int, Scene, slice]], threads: int | None) -> Group:
+def _build_group(places: list[tuple[int, Scene, slice]], make_engine: EngineMaker) -> Group:
     members, model_of_row, models, start = [], [], [], 0
     for slot, scene, world_rows in places:
         count = world_rows.stop - world_rows.start
@@ -102,4 +102,5 @@ def _build_group(places: list[tuple[int, Scene, slice]], threads: int | None) ->
     rows = torch.cat([torch.arange(m.world_rows.start, m.world_rows.stop) for m in members])
     first, last = int(rows[0]), int(rows[-1])
     span = slice(first, last + 1) if last - first + 1 == len(rows) else None
-    return Group(CpuEngine(models, model_of_row, threads), tuple(members), rows, span)
+    engine = make_engine(models, model_of_row)
+    return Group(engine, tuple(members), rows.to(engine.device), span)

@@ -31,17 +31,20 @@ class Observer:
             width: Entries of the observation with padding and task id.
         """
         self.layout: Layout = scene.task.layout
-        self._source = torch.zeros(width, dtype=torch.int64)
-        self._scale, self._offset = torch.zeros(2, width).unbind()
-        span, middle = (torch.as_tensor(x).float() for x in (hand().high - hand().low, hand().high + hand().low))
+        device = start_mounts.device
+        self._source = torch.zeros(width, dtype=torch.int64, device=device)
+        self._scale, self._offset = torch.zeros(2, width, device=device).unbind()
+        span, middle = (
+            torch.as_tensor(x).float().to(device) for x in (hand().high - hand().low, hand().high + hand().low)
+        )
         for block, where in self.layout:
             if block.sensors:
-                self._source[where] = torch.cat([_indices(scene, name) for name in block.sensors])
+                self._source[where] = torch.cat([_indices(scene, name) for name in block.sensors]).to(device)
                 self._scale[where] = block.scale
             if block.name.endswith("joint_position"):
                 self._scale[where], self._offset[where] = 2.0 / span, -middle / span
         self._start_inverse = conjugate(start_mounts)
-        self._mounts = torch.cat([_indices(scene, f"{side}/mount_quaternion") for side in SIDES])
+        self._mounts = torch.cat([_indices(scene, f"{side}/mount_quaternion") for side in SIDES]).to(device)
         self._actions = [self.layout.range(f"{side}_action") for side in SIDES]
         moving = scene.task.moving_base
         self._rotations = [self.layout.range(f"{side}_base_rotation") for side in SIDES] if moving else []

@@ -53,13 +53,14 @@ class Part:
             width: Entries of an observation with padding and task id.
             num_envs: Rows of the world.
         """
-        self.engine_rows = torch.full((num_envs,), -1)
-        self.engine_rows[group.rows] = torch.arange(group.engine.num)
+        device = group.engine.device
+        self.engine_rows = torch.full((num_envs,), -1, device=device)
+        self.engine_rows[group.rows] = torch.arange(group.engine.num, device=device)
         self.group, self._rule = group, rule
         self.substeps = round(1.0 / (CONTROL_RATE * group.members[0].scene.model.opt.timestep))
         self._engine = group.engine
         self._controls = Controls(group)
-        self._start = torch.stack([torch.from_numpy(m.scene.start_qpos) for m in group.members])
+        self._start = torch.stack([torch.from_numpy(m.scene.start_qpos) for m in group.members]).to(group.engine.qpos)
         self.start_size = self._start.shape[1]
         self._observer = Observer(group.members[0].scene, self._start_mounts(), width)
         self._pools: list[dict[str, Tensor]] = []
@@ -74,9 +75,9 @@ class Part:
 
     def set_pools(self, slots: list[Slot]) -> None:
         """Takes over the slots' pools of tasks."""
-        dtype = self._engine.sensordata.dtype
         self._pools = [
-            m.scene.task.freeze(torch.as_tensor(slots[m.slot].tasks, dtype=dtype)) for m in self.group.members
+            m.scene.task.freeze(torch.as_tensor(slots[m.slot].tasks).to(self._engine.sensordata))
+            for m in self.group.members
         ]
 
     def frozen(self, member: int, task_index: Tensor) -> dict[str, Tensor]:
@@ -154,18 +155,20 @@ class Part:
                     values[where, self._observer.layout.range(name)] = block.float()
         return clip(values)
 
-    def starts(self, rows: Tensor, draws: Tensor, task_index: Tensor) -> Tensor:
+    def starts(self, rows: Tensor | None, draws: Tensor, task_index: Tensor) -> Tensor:
         """Start positions of episodes, shape (n, start_size): a pure function of the draws and the tasks.
 
         Args:
-            rows: Engine rows in ascending order, shape (n,).
+            rows: Engine rows in ascending order, shape (n,); None: every row equally often, one after the other.
             draws: Their uniform numbers in [-1, 1], shape (n, at least the classes' start_draws).
             task_index: Their tasks, shape (n,).
         """
-        qpos = self._engine.qpos.new_empty(len(rows), self.start_size)
-        for i, member, where, _ in self._places(rows):
+        qpos = self._engine.qpos.new_empty(len(draws), self.start_size)
+        each = len(draws) // self._engine.num if rows is None else 1
+        for i, member, place, _ in self._places(rows):
+            where = slice(each * place.start, each * place.stop)
             qpos[where] = self._start[i]
-            views = {name: qpos[where, place] for name, place in member.scene.qpos.items()}
+            views = {name: qpos[where, columns] for name, columns in member.scene.qpos.items()}
             task = member.scene.task
             task.start(draws[where, : task.start_draws], self.frozen(i, task_index[where]), views)
         return qpos

@@ -33,12 +33,16 @@ class Starts:
         """
         self._parts, self._keys, self._pool_size = parts, keys, pool_size
         self._draws = _OWN_DRAWS + start_draws
-        num = len(keys)
+        num, device = len(keys), keys.device
         # The bank holds the episodes first ... first + _AHEAD - 1 of each row.
-        self._first = torch.full((num,), -_AHEAD)
-        self._task_index = torch.zeros(num, _AHEAD, dtype=torch.int64)
-        self._elapsed_share = torch.zeros(num, _AHEAD, dtype=torch.float64)
-        self._qpos = [torch.zeros(p.group.engine.num, _AHEAD, p.start_size).double() for p in parts]
+        self._first = torch.full((num,), -_AHEAD, device=device)
+        self._task_index = torch.zeros(num, _AHEAD, dtype=torch.int64, device=device)
+        self._elapsed_share = torch.zeros(num, _AHEAD, dtype=torch.float64, device=device)
+        self._qpos = [
+            torch.zeros(p.group.engine.num, _AHEAD, p.start_size, dtype=torch.float64, device=device) for p in parts
+        ]
+        self._masked = parts[0].group.engine.masked
+        self._takes = 0
 
     def take(self, mask: Tensor, number: Tensor, task_index: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
         """The starts of the mask's rows.
@@ -50,8 +54,11 @@ class Starts:
 
         Returns:
             Task of every row (n,), elapsed share in [0, 1) of every row (n,), and for each part the starts
-            (k, start_size) of its k rows in the mask; the former two are valid where the mask is true.
+            (k, start_size) of its k rows in the mask, or of all its rows where the engine is masked; all of them valid
+            where the mask is true.
         """
+        if self._masked:
+            return self._take_masked(number, task_index)
         place = number - self._first
         if ((place >= _AHEAD) & mask).any():
             half_used = place >= _AHEAD // 2
@@ -66,21 +73,49 @@ class Starts:
             [qpos[rows, at[rows]] for qpos, rows, at in zip(self._qpos, chosen, places, strict=True)],
         )
 
+    def _take_masked(self, number: Tensor, task_index: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """The same for all rows, without a look at any number: a row begins at most one episode a call."""
+        if self._takes % _AHEAD == 0:
+            self._draw_all(number, task_index)
+        self._takes += 1
+        place = (number - self._first)[:, None]
+        starts = []
+        for part, qpos in zip(self._parts, self._qpos, strict=True):
+            at = part.group.take(place)[:, :, None].expand(-1, 1, qpos.shape[2])
+            starts.append(qpos.gather(1, at)[:, 0])
+        return self._task_index.gather(1, place)[:, 0], self._elapsed_share.gather(1, place)[:, 0], starts
+
     def _draw(self, rows: Tensor, number: Tensor, task_index: Tensor) -> None:
         """Fills the bank of some of the world's rows, from the given episode numbers on."""
         self._first[rows] = number[rows]
         many = rows.repeat_interleave(_AHEAD)
         ahead = torch.arange(_AHEAD).repeat(len(rows))
-        draws = uniform(self._keys[many], number[many] + ahead, self._draws)
-        tasks = task_index[many]
-        if self._pool_size is not None:
-            tasks = (draws[:, _TASK_DRAW] * self._pool_size[many]).long()
-        self._task_index[rows] = tasks.view(-1, _AHEAD)
-        self._elapsed_share[rows] = draws[:, _ELAPSED_DRAW].view(-1, _AHEAD)
-        signed = 2.0 * draws[:, _OWN_DRAWS:] - 1.0
+        signed, tasks, share = self._numbers(many, number[many] + ahead, task_index)
+        self._task_index[rows], self._elapsed_share[rows] = tasks.view(-1, _AHEAD), share.view(-1, _AHEAD)
         for part, qpos in zip(self._parts, self._qpos, strict=True):
             engine_row = part.engine_rows[many]
             mine = engine_row >= 0
             if mine.any():
                 start = part.starts(engine_row[mine], signed[mine], tasks[mine])
                 qpos[engine_row[mine], ahead[mine]] = start.to(qpos.dtype)
+
+    def _draw_all(self, number: Tensor, task_index: Tensor) -> None:
+        """Fills the bank of all rows."""
+        self._first = number.clone()
+        rows = torch.arange(len(number), device=number.device)
+        for part, qpos in zip(self._parts, self._qpos, strict=True):
+            mine = part.group.take(rows)
+            ahead = torch.arange(_AHEAD, device=number.device).repeat(len(mine))
+            # A fixed length keeps repeat_interleave from asking the device for it.
+            many = mine.repeat_interleave(_AHEAD, output_size=_AHEAD * len(mine))
+            signed, tasks, share = self._numbers(many, number[many] + ahead, task_index)
+            self._task_index[mine], self._elapsed_share[mine] = tasks.view(-1, _AHEAD), share.view(-1, _AHEAD)
+            qpos.copy_(part.starts(None, signed, tasks).view(qpos.shape))
+
+    def _numbers(self, rows: Tensor, episode: Tensor, task_index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Draws in [-1, 1] (k, start_draws), task (k,) and elapsed share in [0, 1) (k,) of episodes of world rows."""
+        draws = uniform(self._keys[rows], episode, self._draws)
+        tasks = task_index[rows]
+        if self._pool_size is not None:
+            tasks = (draws[:, _TASK_DRAW] * self._pool_size[rows]).long()
+        return 2.0 * draws[:, _OWN_DRAWS:] - 1.0, tasks, draws[:, _ELAPSED_DRAW]

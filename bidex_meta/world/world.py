@@ -15,6 +15,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
+from bidex_meta.engine.choice import choose_engine
 from bidex_meta.errors import BidexError
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.layout import CLIP
@@ -52,6 +53,7 @@ class World(VectorEnv):
         num_envs: int,
         *,
         device: str | torch.device = "cpu",
+        engine: str = "auto",
         seed: int = 0,
         autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
         observation: Rule = "plain",
@@ -64,7 +66,9 @@ class World(VectorEnv):
         Args:
             slots: Task classes with their pools of tasks.
             num_envs: Rows over all slots, split evenly; the first slots take the remainder.
-            device: Where tensors live; only "cpu" has an engine so far.
+            device: Where tensors live: "cpu" or a CUDA device, e.g. "cuda:0".
+            engine: "c" (C MuJoCo, on the CPU), "warp" (mujoco_warp, on either) or "auto", which takes the one that is
+                fast on the device.
             seed: Decides every draw.
             autoreset_mode: SAME_STEP (training) or DISABLED (evaluation), as a member or its name.
             observation: "plain", "one-hot" (task id appended) or "masked" (goal entries zero).
@@ -73,11 +77,9 @@ class World(VectorEnv):
             threads: Engine threads; None takes all CPUs. Trajectories do not depend on it.
 
         Raises:
-            BidexError: Fewer rows than slots, unknown device, mode or sampling, or too narrow a padding.
+            BidexError: Fewer rows than slots, unknown device, engine, mode or sampling, or too narrow a padding.
         """
-        self.device = torch.device(device)
-        if self.device.type != "cpu":
-            raise BidexError(f"Expected device 'cpu', got {str(device)!r}: the GPU engine is not part of this version.")
+        self.device, make_engine = choose_engine(device, engine, threads)
         if num_envs < len(slots):
             raise BidexError(
                 f"Expected at least {len(slots)} rows, one for each of the suite's classes, got {num_envs}."
@@ -94,20 +96,26 @@ class World(VectorEnv):
         self.num_tasks = len(slots)
         self.slot_rows = split_rows(num_envs, len(slots))
         counts = torch.tensor([rows.stop - rows.start for rows in self.slot_rows])
-        self.task_id = torch.arange(len(slots)).repeat_interleave(counts)
-        self.max_episode_steps = torch.tensor([s.task_class.episode_steps for s in slots])[self.task_id]
-        self._scale = torch.tensor([slot.reward_scale for slot in slots], dtype=torch.float32)[self.task_id]
+        self.task_id = torch.arange(len(slots)).repeat_interleave(counts).to(self.device)
+        self.max_episode_steps = self._of_rows([s.task_class.episode_steps for s in slots])
+        self._scale = self._of_rows([slot.reward_scale for slot in slots]).float()
         self._uniform_tasks = task_sampling == "uniform"
-        groups = build_groups(self.slots, self.slot_rows, threads)
+        groups = build_groups(self.slots, self.slot_rows, make_engine)
         self._make_spaces(observation, pad_to)
         self.parts = [Part(g, self.slots, observation, self.observation_size, num_envs) for g in groups]
+        self._masked = groups[0].engine.masked
         self.episodes = Episodes.fresh(num_envs, self.device)
-        self._index_in_slot = torch.cat([torch.arange(rows.stop - rows.start) for rows in self.slot_rows])
+        counted = [torch.arange(rows.stop - rows.start, device=self.device) for rows in self.slot_rows]
+        self._index_in_slot = torch.cat(counted)
         self._set_pool_sizes()
-        self._action = torch.zeros(num_envs, self.action_size)
-        self._obs = torch.zeros(num_envs, self.observation_size)
+        self._action = torch.zeros(num_envs, self.action_size, device=self.device)
+        self._obs = torch.zeros(num_envs, self.observation_size, device=self.device)
         self._ready = False
         self._seed_rows(seed)
+
+    def _of_rows(self, of_slots: Sequence[float]) -> Tensor:
+        """A number of each slot as one of each row, shape (num_envs,)."""
+        return torch.tensor(of_slots, device=self.device)[self.task_id]
 
     def _make_spaces(self, observation: Rule, pad_to: int | None) -> None:
         widest = max(slot.task_class.observation_size for slot in self.slots)
@@ -116,6 +124,7 @@ class World(VectorEnv):
             raise BidexError(f"Expected pad_to of at least {widest}, the widest class, got {pad_to}.")
         self.action_size = max(slot.task_class.action_size for slot in self.slots)
         self.num_id_columns = self.num_tasks if observation == "one-hot" else 0
+        self._one_hot = torch.eye(self.num_tasks, device=self.device)[self.task_id]
         self.observation_size = self._width + self.num_id_columns
         self.single_observation_space = Box(-CLIP, CLIP, (self.observation_size,), np.float32)
         self.single_action_space = Box(-1.0, 1.0, (self.action_size,), np.float32)
@@ -124,7 +133,7 @@ class World(VectorEnv):
 
     def _set_pool_sizes(self) -> None:
         self.num_slot_tasks = [len(slot.tasks) for slot in self.slots]
-        self._pool_size = torch.tensor(self.num_slot_tasks)[self.task_id]
+        self._pool_size = self._of_rows(self.num_slot_tasks)
         self.task_index = self._index_in_slot % self._pool_size
 
     def _seed_rows(self, seed: int) -> None:
@@ -193,8 +202,8 @@ class World(VectorEnv):
     def _reset_mask(self, options: dict[str, Any] | None) -> Tensor:
         mask = (options or {}).get("reset_mask")
         if mask is None:
-            return torch.ones(self.num_envs, dtype=torch.bool)
-        mask = torch.as_tensor(mask)
+            return torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        mask = torch.as_tensor(mask, device=self.device)
         if mask.shape != (self.num_envs,) or mask.dtype != torch.bool:
             raise BidexError(
                 f"Expected a bool reset_mask of shape ({self.num_envs},), got {mask.dtype} {tuple(mask.shape)}."
@@ -216,6 +225,10 @@ class World(VectorEnv):
         self._action = torch.where(mask[:, None], 0.0, self._action)
         for part, start in zip(self.parts, qpos, strict=True):
             chosen = part.group.take(mask)
+            if self._masked:
+                part.group.engine.reset(chosen, start)
+                self._refresh_masked(part, chosen)
+                continue
             rows = chosen.nonzero().squeeze(1)
             if len(rows):
                 part.group.engine.reset(chosen, start)
@@ -227,10 +240,17 @@ class World(VectorEnv):
         states = list(part.states(part.group.take(self.task_index), rows))
         self._obs[world_rows] = self._with_id(part.observe(states, self._action[world_rows], rows), world_rows)
 
+    def _refresh_masked(self, part: Part, mask: Tensor) -> None:
+        """Writes the observations of a mask of a part's rows, with shapes that do not depend on the mask."""
+        group = part.group
+        states = list(part.states(group.take(self.task_index)))
+        new = self._with_id(part.observe(states, group.take(self._action)), group.rows)
+        self._obs[group.rows] = torch.where(mask[:, None], new, group.take(self._obs))
+
     def _with_id(self, obs: Tensor, world_rows: Tensor) -> Tensor:
         """Writes the one-hot task id into observations of the given rows."""
         if self.num_id_columns:
-            obs[:, self._width :] = torch.nn.functional.one_hot(self.task_id[world_rows], self.num_tasks)
+            obs[:, self._width :] = self._one_hot[world_rows]
         return obs
 
     def step(self, action: Tensor | np.ndarray) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
@@ -280,7 +300,7 @@ class World(VectorEnv):
         ended = (terminated | truncated) & active
         broken = unstable & active
         kept = broken | ~active
-        if self.device.type != "cpu" or kept.any():  # on the CPU looking costs less than a pass over all observations
+        if self._masked or kept.any():  # on the CPU looking costs less than a pass over all observations
             obs = torch.where(kept[:, None], self._obs, obs)
         statistics = episodes.statistics()
         info: dict[str, Any] = {
@@ -297,7 +317,7 @@ class World(VectorEnv):
         info["_final_info"] = ended
         self._obs = obs.clone()
         if self.autoreset_mode == AutoresetMode.SAME_STEP:
-            if ended.any():
+            if self._masked or ended.any():
                 self._begin(ended, stagger=False)
         else:
             episodes.terminated, episodes.truncated = terminated.clone(), truncated.clone()
@@ -307,8 +327,9 @@ class World(VectorEnv):
     def _collect(self, broken: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Tensor], Tensor]:
         """Reward, success, failed, unstable, reward terms and observations of all rows after a step."""
         n = self.num_envs
-        reward, obs = torch.empty(n), torch.empty(n, self.observation_size)
-        success, failed, unstable = (torch.zeros(n, dtype=torch.bool) for _ in range(3))
+        reward = torch.empty(n, device=self.device)
+        obs = torch.empty(n, self.observation_size, device=self.device)
+        success, failed, unstable = torch.zeros(3, n, dtype=torch.bool, device=self.device).unbind()
         terms: dict[str, Tensor] = {}
         for part in self.parts:
             group = part.group
@@ -317,7 +338,7 @@ class World(VectorEnv):
             where = group.rows if group.span is None else group.span
             reward[where] = made.reward.float()
             for name, value in made.terms.items():
-                terms.setdefault(name, torch.zeros(n))[where] = value.float()
+                terms.setdefault(name, torch.zeros(n, device=self.device))[where] = value.float()
             success[where], failed[where], unstable[where] = made.success, made.failed, made.unstable
             out = None if group.span is None else obs[group.span]
             values = self._with_id(part.observe(states, group.take(self._action), out=out), group.rows)

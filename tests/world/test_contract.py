@@ -80,7 +80,9 @@ def test_reward_terms_sum_to_the_reward(world: World) -> None:
     world.reset(seed=1)
     for action in random_actions(world, 30):
         _, reward, *_, info = world.step(action)
-        assert torch.allclose(sum(info["reward_terms"].values()), info["reward_unscaled"], atol=1e-6)
+        assert torch.allclose(
+            torch.stack([*info["reward_terms"].values()]).sum(dim=0), info["reward_unscaled"], atol=1e-6
+        )
         assert torch.equal(reward, info["reward_unscaled"])  # the suite's scale is 1
 
 

@@ -1,0 +1,50 @@
+"""Which engine a device gets."""
+
+import torch
+
+from bidex_meta.engine.protocol import EngineMaker
+from bidex_meta.errors import BidexError
+
+ENGINES = ("auto", "c", "warp")
+
+
+def choose_engine(
+    device: str | torch.device, engine: str = "auto", threads: int | None = None
+) -> tuple[torch.device, EngineMaker]:
+    """The device and what makes engines there.
+
+    Args:
+        device: "cpu" or a CUDA device.
+        engine: "c", "warp" or "auto": C MuJoCo on the CPU, mujoco_warp on a GPU.
+        threads: Threads of C MuJoCo; None takes all CPUs.
+
+    Raises:
+        BidexError: Unknown engine, a device that is not there, or C MuJoCo on a GPU.
+    """
+    place = _device(device)
+    if engine not in ENGINES:
+        raise BidexError(f"Expected an engine among {', '.join(ENGINES)}, got {engine!r}.")
+    if engine == "c" and place.type != "cpu":
+        raise BidexError(f"Expected device 'cpu' for the C engine, got {str(device)!r}; leave engine at 'auto'.")
+    if engine == "warp" or (engine == "auto" and place.type == "cuda"):
+        from bidex_meta.engine.warp import WarpEngine
+
+        return place, lambda models, rows: WarpEngine(models, rows, device=str(place))
+    from bidex_meta.engine.cpu import CpuEngine
+
+    return place, lambda models, rows: CpuEngine(models, rows, threads)
+
+
+def _device(device: str | torch.device) -> torch.device:
+    try:
+        place = torch.device(device)
+    except RuntimeError:
+        place = None
+    if place is None or place.type not in ("cpu", "cuda"):
+        raise BidexError(f"Expected device 'cpu' or 'cuda:N', got {str(device)!r}.")
+    if place.type == "cuda" and (place.index or 0) >= torch.cuda.device_count():
+        raise BidexError(
+            f"Expected one of {torch.cuda.device_count()} CUDA devices, got {str(device)!r}; "
+            "use device 'cpu', or install a torch build with CUDA."
+        )
+    return torch.device("cuda", place.index or 0) if place.type == "cuda" else place
