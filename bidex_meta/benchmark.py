@@ -127,6 +127,7 @@ class Benchmark:
         seed: int | None = None,
         autoreset_mode: "AutoresetMode | str | None" = None,
         threads: int | None = None,
+        engine: str = "auto",
     ) -> "World":
         """A batched world of one split.
 
@@ -140,9 +141,10 @@ class Benchmark:
             seed: Seed of starts and task draws; left out, the benchmark's.
             autoreset_mode: SAME_STEP (the default, for training) or DISABLED (for evaluation); also as text.
             threads: Engine threads on the CPU; left out, one per core. Results do not depend on it.
+            engine: `"c"` (C MuJoCo, on the CPU), `"warp"` (mujoco_warp, on either) or `"auto"`: what is fast there.
 
         Raises:
-            BidexError: A split without classes, too few rows, an unknown mode or device.
+            BidexError: A split without classes, too few rows, an unknown mode, device or engine.
         """
         slots = self._slots(self._checked_split(split))
         evaluation = _checked_mode(autoreset_mode).name == "DISABLED"
@@ -153,6 +155,7 @@ class Benchmark:
             self.seed if seed is None else seed,
             autoreset_mode,
             threads,
+            engine,
             observation=self.suite.observation,
             pad_to=self.padded_size,
             task_sampling="fixed" if evaluation or self.suite.kind == "meta" else "uniform",
@@ -200,6 +203,7 @@ def make_task_world(
     threads: int | None = None,
     task_sampling: TaskSampling | None = None,
     moving_base: bool | None = None,
+    engine: str = "auto",
 ) -> "World":
     """A world of one class as it is on its own: goal visible, no one-hot, no padding, 50 tasks drawn by the seed.
 
@@ -213,9 +217,10 @@ def make_task_world(
         task_sampling: `"uniform"`: each episode draws a task; `"fixed"`: row j keeps task j modulo 50. Left out:
             uniform in training worlds, fixed in evaluation worlds.
         moving_base: Drive the hands' bases or fix them; left out, as the class has it on its own.
+        engine: As in `Benchmark.make_world`.
 
     Raises:
-        BidexError: Unknown class, too few rows, an unknown mode or device.
+        BidexError: Unknown class, too few rows, an unknown mode, device or engine.
     """
     from bidex_meta.world import Slot
 
@@ -231,6 +236,7 @@ def make_task_world(
         seed,
         autoreset_mode,
         threads,
+        engine,
         observation="plain",
         pad_to=None,
         task_sampling=task_sampling,
@@ -244,6 +250,7 @@ def _make_world(
     seed: int,
     autoreset_mode: "AutoresetMode | str | None",
     threads: int | None,
+    engine: str,
     *,
     observation: Literal["plain", "one-hot", "masked"],
     pad_to: int | None,
@@ -267,6 +274,7 @@ def _make_world(
         pad_to=pad_to,
         task_sampling=task_sampling,
         threads=threads,
+        engine=engine,
     )
 
 

@@ -148,6 +148,7 @@ def test_what_a_world_is_asked_for(
         "pad_to": pad_to,
         "task_sampling": sampling,
         "threads": 2,
+        "engine": "auto",
     }
 
 

@@ -24,6 +24,8 @@ def stability(
     num_envs: int = 512,
     threads: int | None = None,
     seed: int = 0,
+    device: str = "cpu",
+    engine: str = "auto",
 ) -> dict[str, Any]:
     """Whether the physics holds under rough actions (design.md section 4).
 
@@ -38,6 +40,8 @@ def stability(
         num_envs: Rows.
         threads: Engine threads; None takes all CPUs.
         seed: Seed of world and actions.
+        device: Where the world lives.
+        engine: As in ``Benchmark.make_world``.
 
     Returns:
         By class: unstable rows, warnings, fastest object (m/s), share of sampled steps without penetration above 5 mm,
@@ -47,7 +51,14 @@ def stability(
     for name, moving in _variants(suite, task):
         # Rows that end are reset by hand, so that the step that ended them is measured too.
         made = make_task_world(
-            name, num_envs=num_envs, seed=seed, autoreset_mode="DISABLED", threads=threads, moving_base=moving
+            name,
+            num_envs=num_envs,
+            device=device,
+            seed=seed,
+            autoreset_mode="DISABLED",
+            threads=threads,
+            moving_base=moving,
+            engine=engine,
         )
         result[name if moving else f"{name} (fixed base)"] = _stability(made, steps, seed)
     return result

@@ -35,7 +35,10 @@ def world(
     Returns:
         ``env_steps_per_s``, ``engine_steps_per_s`` (also in environment steps) and their ``ratio``.
     """
-    full, bare = (Benchmark(suite, seed=seed).make_world("train", num_envs=num_envs, threads=threads) for _ in range(2))
+    full, bare = (
+        Benchmark(suite, seed=seed).make_world("train", device="cpu", num_envs=num_envs, threads=threads)
+        for _ in range(2)
+    )
     full.reset(seed=seed)
     bare.reset(seed=seed)
     generator = torch.Generator().manual_seed(seed)
@@ -84,7 +87,9 @@ def scaling(
         ``env_steps_per_s`` by number of threads and ``speedup`` against one thread.
     """
     counts = sorted({1, 2, default_threads()} & set(range(1, default_threads() + 1)))
-    worlds = {n: Benchmark(suite, seed=seed).make_world("train", num_envs=num_envs, threads=n) for n in counts}
+    worlds = {
+        n: Benchmark(suite, seed=seed).make_world("train", device="cpu", num_envs=num_envs, threads=n) for n in counts
+    }
     speeds: dict[int, list[float]] = {n: [] for n in counts}
     for made in worlds.values():
         made.reset(seed=seed)
@@ -123,7 +128,7 @@ def mixing(
         ``nv``, ``ngeom`` and ``group``, the number of its engine batch in the mixed world.
     """
     benchmark = Benchmark(suite, seed=seed)
-    full = benchmark.make_world("train", num_envs=num_envs, threads=threads)
+    full = benchmark.make_world("train", device="cpu", num_envs=num_envs, threads=threads)
     full.reset(seed=seed)
     mixed, classes = [_speed(full, steps)], {}
     for i, slot in enumerate(full.slots):

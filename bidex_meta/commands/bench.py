@@ -35,6 +35,8 @@ class BenchFlags:
     """Threads of the physics."""
     device: str | None = None
     """auto, cpu or cuda:N."""
+    engine: str | None = None
+    """auto, c or warp."""
     seed: int | None = None
     """Seed of the random actions."""
     json: Switch = False

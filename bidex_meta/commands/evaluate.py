@@ -29,6 +29,8 @@ class EvaluateFlags:
     """Rows stepped together, a multiple of the number of tasks; None: one per task."""
     device: str = "auto"
     """auto, cpu or cuda:N."""
+    engine: Literal["auto", "c", "warp"] = "auto"
+    """Physics; auto: the one that is fast on the device."""
     json: Switch = False
     """Print JSON."""
 
@@ -47,7 +49,7 @@ def main(arguments: Sequence[str]) -> None:
     from bidex_meta.references import references
 
     folder = RunFolder.open(flags.run)
-    config = {**folder.config(), "device": resolve_device(flags.device)}
+    config = {**folder.config(), "device": resolve_device(flags.device), "engine": flags.engine}
     torch.set_num_threads(config["threads"])
     policy, step = worlds.load_policy(folder, config["device"])
     world = worlds.evaluation_world(config, flags.split, flags.num_envs)

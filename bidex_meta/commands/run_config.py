@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from bidex_meta.commands.learners import LearnerKind, choose_preset, learner_kind, resolve_device
 from bidex_meta.commands.parsing import StepCount, Switch, parse, peek
@@ -40,6 +40,8 @@ class RunFlags:
     """Seed of tasks, starts and learner."""
     device: str = "auto"
     """auto, cpu or cuda:N."""
+    engine: Literal["auto", "c", "warp"] = "auto"
+    """Physics: C MuJoCo on the CPU, mujoco_warp on either; auto: the one that is fast on the device."""
     threads: int | None = None
     """Threads of torch and of the physics; None: one per core. A resumed run keeps its own."""
     run_dir: Path | None = None
@@ -80,7 +82,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     """
     resume = peek(arguments, "--resume")
     folder = RunFolder.open(Path(resume)) if resume else None
-    stored = folder.config() if folder else {}
+    stored = {"engine": "auto", **folder.config()} if folder else {}  # runs before 0.2 knew one engine
     kind = learner_kind(peek(arguments, "--algo") or stored.get("algo", RunFlags.algo))
     device = resolve_device(peek(arguments, "--device") or stored.get("device", RunFlags.device))
     preset, reason = choose_preset(kind, peek(arguments, "--preset") or stored.get("preset", RunFlags.preset), device)
@@ -128,6 +130,7 @@ def _resolved(flags: Any, preset: str, device: str, stored: dict[str, Any]) -> d
         "steps": flags.steps,
         "seed": flags.seed,
         "device": device,
+        "engine": flags.engine,
         "threads": flags.threads or stored.get("threads") or _cores(),
     }
     return json.loads(json.dumps(config))  # tuples to lists, so that it equals what is read back

@@ -51,6 +51,7 @@ def _world(config: dict[str, Any], split: str, rows: int | None, mode: str) -> A
         "seed": config["seed"],
         "device": config["device"],
         "threads": config["threads"],
+        "engine": config.get("engine", "auto"),
         "autoreset_mode": mode,
     }
     if config["suite"] is None:
