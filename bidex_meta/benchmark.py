@@ -146,8 +146,10 @@ class Benchmark:
         Raises:
             BidexError: A split without classes, too few rows, an unknown mode, device or engine.
         """
+        from bidex_meta.world.autoreset import checked_mode
+
         slots = self._slots(self._checked_split(split))
-        evaluation = _checked_mode(autoreset_mode).name == "DISABLED"
+        evaluation = checked_mode(autoreset_mode).name == "DISABLED"
         return _make_world(
             slots,
             num_envs,
@@ -223,12 +225,13 @@ def make_task_world(
         BidexError: Unknown class, too few rows, an unknown mode, device or engine.
     """
     from bidex_meta.world import Slot
+    from bidex_meta.world.autoreset import checked_mode
 
     task_class = registry.get(task_name, moving_base)
     tasks = _drawn(task_class.variation_space, _checked_seed(seed), task_name, "train", _TASKS_ALONE)
     slot = Slot(task_name, task_class, np.stack([task.variation for task in tasks]))
     if task_sampling is None:
-        task_sampling = "fixed" if _checked_mode(autoreset_mode).name == "DISABLED" else "uniform"
+        task_sampling = "fixed" if checked_mode(autoreset_mode).name == "DISABLED" else "uniform"
     return _make_world(
         [slot],
         num_envs,
@@ -257,6 +260,7 @@ def _make_world(
     task_sampling: TaskSampling,
 ) -> "World":
     from bidex_meta.world import World
+    from bidex_meta.world.autoreset import checked_mode
 
     place = _checked_device(device)
     if num_envs is None:
@@ -269,7 +273,7 @@ def _make_world(
         int(num_envs),
         device=place,
         seed=_checked_seed(seed),
-        autoreset_mode=_checked_mode(autoreset_mode),
+        autoreset_mode=checked_mode(autoreset_mode),
         observation=observation,
         pad_to=pad_to,
         task_sampling=task_sampling,
@@ -316,19 +320,6 @@ def _checked_seed(seed: object) -> int:
     if number < 0 or isinstance(seed, bool):
         raise BidexError(f"seed: expected a whole number from 0 on, got {seed!r}.")
     return number
-
-
-def _checked_mode(mode: "AutoresetMode | str | None") -> "AutoresetMode":
-    from gymnasium.vector import AutoresetMode
-
-    if mode is None:
-        return AutoresetMode.SAME_STEP
-    modes = {"SAME_STEP": AutoresetMode.SAME_STEP, "DISABLED": AutoresetMode.DISABLED}
-    name = mode.name if isinstance(mode, AutoresetMode) else str(mode)
-    for known, value in modes.items():
-        if name.upper().replace("-", "").replace("_", "") == known.replace("_", ""):
-            return value
-    raise unknown_name("autoreset_mode", name, modes)
 
 
 def _checked_device(device: "str | torch.device") -> "torch.device":

@@ -4,6 +4,7 @@ import inspect
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
@@ -11,22 +12,30 @@ import tyro
 from bidex_meta.commands.parsing import StepCount, Switch, parse
 from bidex_meta.errors import BidexError, unknown_name
 
-_KINDS = ("world", "scaling", "mixing", "stability")
+_KINDS = ("world", "scaling", "mixing", "stability", "gpu", "kernels")
 
 
 @dataclass(frozen=True)
 class BenchFlags:
-    """Measure the world: its speed against bare physics, over threads, against its classes alone, or its stability.
+    """Measure speed against bare physics, over threads or against the classes alone, stability, or an accelerator.
 
     Example: bidex-meta bench world --suite MT4 --num-envs 1024 --json
     """
 
-    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="world|scaling|mixing|stability")]
-    """world, scaling, mixing or stability."""
+    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="|".join(_KINDS))]
+    """world, scaling, mixing, stability, gpu or kernels."""
     suite: str | None = None
-    """Suite to measure: by default world and scaling take MT4, mixing MT20, stability every task class there is."""
+    """Suite to measure: by default world and scaling take MT4, mixing, gpu and kernels MT20, stability every class."""
     task: str | None = None
     """For stability: this task class alone."""
+    tasks: tuple[str, ...] | None = None
+    """For gpu: the classes to step alone, beside the suite."""
+    sizes: tuple[int, ...] | None = None
+    """For gpu: numbers of rows."""
+    learning: Switch = False
+    """For gpu: measure training with MT-PPO too."""
+    out: Path | None = None
+    """For gpu: file that takes each row of the table as it is measured; what is in it is not measured again."""
     num_envs: int | None = None
     """Rows stepped together; for this and the flags below None leaves the measurement its default."""
     steps: StepCount | None = None
@@ -51,11 +60,18 @@ def main(arguments: Sequence[str]) -> None:
     from bidex_meta import bench
 
     measure = getattr(bench, flags.what)
-    asked = {name: value for name, value in asdict(flags).items() if name not in ("what", "json") and value is not None}
+    asked = {
+        name: value
+        for name, value in asdict(flags).items()
+        if name not in ("what", "json", "learning") and value is not None
+    }
+    if flags.learning:
+        asked["make_learner"] = _make_learner
     understood = inspect.signature(measure).parameters
     for name in asked:
         if name not in understood:
-            raise BidexError(f"bench {flags.what} takes no --{name.replace('_', '-')}.")
+            flag = "learning" if name == "make_learner" else name.replace("_", "-")
+            raise BidexError(f"bench {flags.what} takes no --{flag}.")
     result = measure(**asked)
     if flags.json:
         print(json.dumps(result, indent=2))
@@ -63,6 +79,13 @@ def main(arguments: Sequence[str]) -> None:
     from bidex_meta.commands.tables import plain_table, print_table
 
     print_table(plain_table(["measure", "value"], list(_flat(result))))
+
+
+def _make_learner(world: Any) -> Any:
+    from bidex_meta.commands.learners import choose_preset, learner_kind
+
+    kind = learner_kind("mtppo")
+    return kind.make(world, kind.presets[choose_preset(kind, "auto", str(world.device))[0]], 0)
 
 
 def _flat(result: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:

@@ -20,6 +20,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.layout import CLIP
 from bidex_meta.world import actions
+from bidex_meta.world.autoreset import checked_mode, reset_mask
 from bidex_meta.world.episodes import Episodes
 from bidex_meta.world.groups import Slot, build_groups, split_rows
 from bidex_meta.world.observations import Rule
@@ -55,7 +56,7 @@ class World(VectorEnv):
         device: str | torch.device = "cpu",
         engine: str = "auto",
         seed: int = 0,
-        autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
+        autoreset_mode: str | AutoresetMode | None = None,
         observation: Rule = "plain",
         pad_to: int | None = None,
         task_sampling: str = "fixed",
@@ -87,7 +88,7 @@ class World(VectorEnv):
         if task_sampling not in ("uniform", "fixed"):
             raise BidexError(f"Expected task_sampling 'uniform' or 'fixed', got {task_sampling!r}.")
         self.num_envs, self.slots, self.seed = num_envs, list(slots), seed
-        self.autoreset_mode = _autoreset(autoreset_mode)
+        self.autoreset_mode = checked_mode(autoreset_mode)
         self.metadata = {
             "autoreset_mode": self.autoreset_mode, "render_modes": ["rgb_array"], "render_fps": CONTROL_RATE
         }  # fmt: skip
@@ -185,7 +186,7 @@ class World(VectorEnv):
         Returns:
             Observations (num_envs, d) and an empty info.
         """
-        mask = self._reset_mask(options)
+        mask = reset_mask(options, self.num_envs, self.device, self._ready)
         if seed is not None:
             if not mask.all():
                 raise BidexError(
@@ -198,21 +199,6 @@ class World(VectorEnv):
         with one_torch_thread():
             self._begin(mask, stagger)
         return self._obs.clone(), {}
-
-    def _reset_mask(self, options: dict[str, Any] | None) -> Tensor:
-        mask = (options or {}).get("reset_mask")
-        if mask is None:
-            return torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        mask = torch.as_tensor(mask, device=self.device)
-        if mask.shape != (self.num_envs,) or mask.dtype != torch.bool:
-            raise BidexError(
-                f"Expected a bool reset_mask of shape ({self.num_envs},), got {mask.dtype} {tuple(mask.shape)}."
-            )
-        if not self._ready and not mask.all():
-            raise BidexError(
-                "Expected a full reset first, got a reset_mask with false entries; call reset() once without."
-            )
-        return mask
 
     def _begin(self, mask: Tensor, stagger: bool) -> None:
         """Starts new episodes in the rows of a mask and refreshes their observations."""
@@ -404,11 +390,3 @@ class World(VectorEnv):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Nothing is held outside memory."""
-
-
-def _autoreset(mode: str | AutoresetMode) -> AutoresetMode:
-    allowed = (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED)
-    for member in allowed:
-        if mode == member or (isinstance(mode, str) and mode.upper().replace("_", "") == member.name.replace("_", "")):
-            return member
-    raise BidexError(f"Expected autoreset_mode SAME_STEP or DISABLED, got {mode!r}.")

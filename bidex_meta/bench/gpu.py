@@ -1,0 +1,175 @@
+"""What an accelerator gives: speed over the number of rows, memory a row, and where the time of a step goes."""
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from bidex_meta.benchmark import Benchmark, make_task_world
+from bidex_meta.errors import BidexError
+from bidex_meta.record.atomic import write_json
+from bidex_meta.world import World
+
+_SIZES = (1024, 4096, 16384, 32768)
+_TASKS = ("CatchUnderarm", "BottleCap", "DoorOpenOutward")
+"""A thrown egg, a jointed object and a movable fixture."""
+
+MakeLearner = Callable[[World], Any]
+"""Makes a learner on a world; its ``iterate`` collects one rollout and learns from it."""
+
+
+def gpu(
+    suite: str = "MT20",
+    tasks: Sequence[str] = _TASKS,
+    sizes: Sequence[int] = _SIZES,
+    steps: int = 20,
+    device: str = "cuda:0",
+    engine: str = "auto",
+    seed: int = 0,
+    out: Path | None = None,
+    make_learner: MakeLearner | None = None,
+) -> dict[str, Any]:
+    """Speed of a suite and of single classes over the number of rows.
+
+    Args:
+        suite: Suite to step.
+        tasks: Classes to step alone.
+        sizes: Numbers of rows.
+        steps: Control steps of each measurement, after as many to warm up.
+        device: Where the worlds live.
+        engine: As in ``Benchmark.make_world``.
+        seed: Seed of worlds and actions.
+        out: File that takes each row as it is measured; what is in it is not measured again.
+        make_learner: Where given, training is measured too.
+
+    Returns:
+        By subject and rows: ``env_steps_per_s``, ``training_steps_per_s``, ``mb_per_env`` (device memory) and
+        ``stages``, milliseconds of a step's physics, of its rewards and observations, and of its resets. Beside them,
+        for each number of rows, the suite over the harmonic mean of the classes.
+    """
+    setting = {"device": device, "engine": engine, "steps": steps, "machine": _machine(device)}
+    rows = _known(out, setting)
+    for subject in (suite, *tasks):
+        for size in sizes:
+            key = f"{subject} {size}"
+            if key not in rows:
+                rows[key] = _measured(subject, subject == suite, size, steps, device, engine, seed, make_learner)
+                if out is not None:
+                    write_json(out, {"setting": setting, "rows": rows})
+    ratios = {str(size): _ratio(rows, suite, tasks, size) for size in sizes} if tasks else {}
+    return {"setting": setting, "rows": rows, f"{suite} over its classes": ratios}
+
+
+def kernels(suite: str = "MT20", device: str = "cuda:0", engine: str = "warp") -> dict[str, Any]:
+    """Compiles what a suite's world needs, group by group, into the kernel cache; what lies there takes no time.
+
+    Args:
+        suite: The suite.
+        device: For which device.
+        engine: As in ``Benchmark.make_world``.
+
+    Returns:
+        By class the seconds that its world took to build and to make its first step.
+    """
+    took = {}
+    for name in Benchmark(suite).train_classes:
+        start = time.perf_counter()
+        made = make_task_world(name, num_envs=8, device=device, engine=engine, moving_base=True)
+        made.reset(seed=0)
+        _seconds(made, 1)
+        made.close()
+        took[name] = round(time.perf_counter() - start, 1)
+    return took
+
+
+def _known(out: Path | None, setting: dict[str, Any]) -> dict[str, Any]:
+    if out is None or not out.is_file():
+        return {}
+    stored = json.loads(out.read_text())
+    if stored["setting"] != setting:
+        raise BidexError(f"Expected {out} to be measured with {setting}, got {stored['setting']}; name another file.")
+    return stored["rows"]
+
+
+def _ratio(rows: dict[str, Any], suite: str, tasks: Sequence[str], size: int) -> float:
+    alone = [rows[f"{task} {size}"]["env_steps_per_s"] for task in tasks]
+    return round(rows[f"{suite} {size}"]["env_steps_per_s"] * sum(1.0 / x for x in alone) / len(alone), 4)
+
+
+def _measured(
+    subject: str, whole: bool, size: int, steps: int, device: str, engine: str, seed: int, make_learner: Any
+) -> dict[str, Any]:
+    before = _memory(device)
+    if whole:
+        made = Benchmark(subject, seed=seed).make_world("train", num_envs=size, device=device, engine=engine)
+    else:
+        made = make_task_world(subject, num_envs=size, device=device, engine=engine, seed=seed)
+    made.reset(seed=seed)
+    _seconds(made, steps)
+    seconds = _seconds(made, steps)
+    row: dict[str, Any] = {
+        "env_steps_per_s": round(size * steps / seconds),
+        "mb_per_env": round((_memory(device) - before) / size / 2**20, 3),
+        "stages": _stages(made, steps),
+    }
+    if make_learner is not None:
+        learner = make_learner(made)
+        learner.iterate()
+        row["training_steps_per_s"] = round(learner.iterate()["Perf/steps_per_second"])
+    made.close()
+    return row
+
+
+def _seconds(made: World, steps: int) -> float:
+    """Seconds that random steps take."""
+    generator = torch.Generator(made.device).manual_seed(0)
+    shape = steps, made.num_envs, made.action_size
+    actions = 2.0 * torch.rand(shape, generator=generator, device=made.device) - 1.0
+    start = _now(made.device)
+    for action in actions:
+        made.step(action)
+    return _now(made.device) - start
+
+
+def _stages(made: World, steps: int) -> dict[str, float]:
+    """Milliseconds of each stage of a step, the device idle between them: they add up to more than a step takes."""
+    nobody = torch.zeros(made.num_envs, dtype=torch.bool, device=made.device)
+    generator = torch.Generator(made.device).manual_seed(1)
+    took = dict.fromkeys(("physics", "rewards and observations", "resets"), 0.0)
+    for _ in range(steps):
+        action = torch.rand(made.num_envs, made.action_size, generator=generator, device=made.device) * 2.0 - 1.0
+        marks = [_now(made.device)]
+        for part in made.parts:
+            part.step(part.group.take(action), None)
+        marks.append(_now(made.device))
+        made._collect(nobody)
+        marks.append(_now(made.device))
+        made._begin(nobody, stagger=False)
+        marks.append(_now(made.device))
+        for name, start, end in zip(took, marks, marks[1:], strict=False):
+            took[name] += 1000.0 * (end - start) / steps
+    return {name: round(value, 3) for name, value in took.items()}
+
+
+def _now(device: torch.device) -> float:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def _memory(device: str) -> int:
+    """Bytes in use: of the device, whoever holds them, or of this process."""
+    if torch.device(device).type == "cuda":
+        torch.cuda.synchronize(device)
+        torch.cuda.empty_cache()
+        free, total = torch.cuda.mem_get_info(device)
+        return total - free
+    pages = int(Path("/proc/self/statm").read_text().split()[1]) if Path("/proc/self/statm").exists() else 0
+    return 4096 * pages
+
+
+def _machine(device: str) -> str:
+    return torch.cuda.get_device_name(device) if torch.device(device).type == "cuda" else "cpu"
