@@ -13,7 +13,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c const
 SOURCES := bidex_meta algos tests
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-all lint format clean
+.PHONY: help run test test-all bench-gpu-compile bench-gpu-sweep bench-gpu-train lint format clean
 .DELETE_ON_ERROR:
 
 help:
@@ -21,6 +21,7 @@ help:
 	@echo "make test      format, lint, types, tests (what CI runs)"
 	@echo "make test-all  the same with the slow tests"
 	@echo "make format    format the code and mend what ruff can mend"
+	@echo "make bench-gpu-compile, bench-gpu-sweep, bench-gpu-train  measure a GPU (docs/gpu.md)"
 	@echo "make clean     remove .venv, caches and built files (never runs/)"
 
 run: .venv/.installed
@@ -31,6 +32,31 @@ test: lint
 
 test-all: lint
 	$(BIN)/python -m pytest -q -n 2 -m "slow or not slow"
+
+# What to measure on a GPU; each target goes on where it stopped. On a machine that has the packages already, name its
+# interpreter: make bench-gpu-sweep CLI="python3 -m bidex_meta.cli".
+DEVICE ?= cuda:0
+OUT ?= gpu-results
+SIZES ?= 1024 4096 16384 32768
+ROWS ?= 8192
+TRAIN_STEPS ?= 60000000
+CLI ?= $(BIN)/bidex-meta
+INSTALLED := $(if $(filter $(BIN)/bidex-meta,$(CLI)),.venv/.installed)
+
+bench-gpu-compile: $(INSTALLED)
+	$(CLI) bench kernels --suite MT20 --device $(DEVICE)
+
+bench-gpu-sweep: $(INSTALLED)
+	mkdir -p $(OUT)
+	$(CLI) bench gpu --suite MT20 --device $(DEVICE) --engine warp --sizes $(SIZES) --learning --out $(OUT)/sweep.json --json
+
+# 225 seconds a suite; 124 says that the time was up.
+bench-gpu-train: $(INSTALLED)
+	for suite in MT4 MT20; do \
+		if test -d $(OUT)/$$suite; then what="--resume $(OUT)/$$suite"; \
+		else what="--suite $$suite --algo mtppo --device $(DEVICE) --engine warp --num-envs $(ROWS) --run-dir $(OUT)/$$suite"; fi; \
+		timeout --signal=INT --kill-after=30 225 $(CLI) run $$what --steps $(TRAIN_STEPS) || test $$? = 124 || exit 1; \
+	done
 
 lint: .venv/.installed-dev
 	$(BIN)/ruff format --check $(SOURCES)
