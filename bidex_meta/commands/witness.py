@@ -28,6 +28,8 @@ class WitnessFlags:
     """Searches with other seeds before giving up."""
     file: Path | None = None
     """Replay this file, not the stored witness; with --find keep the best episode here, whether it holds or not."""
+    improve: Path | None = None
+    """With --find: start from the episode in this file."""
     out: Path | None = None
     """Also write a film (.mp4) of the witness, or a picture (.png) of its last step."""
     camera: str | None = None
@@ -63,7 +65,9 @@ def _names(flags: WitnessFlags) -> list[str]:
 
     if flags.all == (flags.task is not None):
         raise BidexError("witness: expected --task T or --all, got " + ("both." if flags.all else "neither."))
-    if flags.all and (flags.out is not None or flags.file is not None):
+    if flags.improve is not None and not flags.find:
+        raise BidexError("witness: --improve says where a search starts; give it with --find.")
+    if flags.all and (flags.out is not None or flags.file is not None or flags.improve is not None):
         raise BidexError("witness: films and files are of one class; give --task T with --out or --file.")
     if flags.task is not None and flags.task not in registry.names():
         raise unknown_name("task", flags.task, registry.names())
@@ -98,17 +102,22 @@ def _find(name: str, flags: WitnessFlags) -> None:
     from bidex_meta.record.versions import collect_versions
     from bidex_meta.witness.planner import Planner
     from bidex_meta.witness.replay import replay
-    from bidex_meta.witness.store import Witness, save_witness
+    from bidex_meta.witness.store import Witness, load_witness, save_witness
 
+    earlier = None if flags.improve is None else load_witness(name, flags.improve)
     rivals: list[float] = []
     best = -float("inf")
     for attempt in range(flags.tries):
         config = replace(flags.planner, seed=flags.planner.seed + attempt)
-        plan = Planner(name, config, flags.threads).search(_reporter(name))
+        plan = Planner(name, config, flags.threads).search(
+            _reporter(name), None if earlier is None else earlier.actions
+        )
         lost = plan.total if plan.first_success is None else None
         rivals += [total for total in (plan.rival, lost) if total is not None]
         made = {"return": plan.total, "first_success": plan.first_success, "planner": asdict(config)}
         made |= {"rival": max(rivals, default=None), "versions": collect_versions()}
+        if earlier is not None:
+            made["improved"] = earlier.made
         witness = Witness(plan.actions, made)
         holds = plan.first_success is not None and replay(name, witness, flags.threads).found
         if holds or (flags.file is not None and plan.total > best):

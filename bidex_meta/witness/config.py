@@ -33,10 +33,13 @@ class PlannerConfig:
     execute: int = 10
     """Control steps played before the next plan; whole spaces between knots keep the rest of the plan as it was."""
     std: float = 0.5
-    """Deviation of the knots in a first round."""
+    """Deviation of the knots in a first round; a sequence takes a share of it, from all to a twentieth."""
     min_std: float = 0.12
     """The deviation never falls below this."""
     gamma: float = 0.97
     """Discount per control step."""
+    effort: float = 0.05
+    """Price of a control step of a base's full force or torque, in units of reward. A full force is up to 800 N: for
+    free, a hand soon presses on its table so hard that nothing moves it any more."""
     seed: int = 0
     """Of the samples."""

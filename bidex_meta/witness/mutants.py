@@ -7,7 +7,7 @@ from bidex_meta.hands.hand import hand
 from bidex_meta.witness.config import PlannerConfig
 
 FINEST = 0.05
-"""Deviation of the finest mutants, as a share of the coarsest ones': large changes find a way, small ones the rest."""
+"""Deviation of the finest changes, as a share of the coarsest ones': large changes find a way, small ones the rest."""
 
 
 def mutants(elites: Tensor, count: int, config: PlannerConfig, generator: torch.Generator) -> Tensor:

@@ -14,7 +14,7 @@ from torch import Tensor
 from bidex_meta.errors import BidexError
 from bidex_meta.hands.hand import hand
 from bidex_meta.witness.config import PlannerConfig
-from bidex_meta.witness.mutants import mutants
+from bidex_meta.witness.mutants import FINEST, mutants, parts_of_the_hands
 from bidex_meta.witness.simulator import Simulator, State, Trace
 
 RIVALS = 16
@@ -63,17 +63,23 @@ class Planner:
         self._judge = Simulator(name, RIVALS, threads)
         self._generator = torch.Generator().manual_seed(config.seed)
         self._weights = interpolation(config.horizon, config.knots)
+        self._of_bases = ~parts_of_the_hands(self.simulator.action_size)[:2].any(0)
 
-    def search(self, report: Callable[[int, float, bool], None] | None = None) -> Plan:
+    def search(
+        self, report: Callable[[int, float, bool], None] | None = None, earlier: np.ndarray | None = None
+    ) -> Plan:
         """Plays one episode, planning as it goes.
 
         Args:
             report: Called after every plan with the steps played so far, the sum of their rewards, and whether one of
                 them was a success.
+            earlier: Actions (T, action_size) of an earlier search: every plan also tries what they did at that time.
         """
         cfg, sim = self.config, self.simulator
         states = sim.starts(cfg.copies - 1)
         mean = rest_action(sim.action_size).repeat(cfg.knots, 1)
+        if earlier is not None:
+            mean = knots_of(earlier, 0, cfg)
         elites = mean[None]
         actions: list[Tensor] = []
         rewards: list[float] = []
@@ -98,6 +104,8 @@ class Planner:
                 break
             mean = shifted(mean, steps, cfg.horizon)
             elites = torch.stack([shifted(knots, steps, cfg.horizon) for knots in elites])
+            if earlier is not None:
+                elites = torch.cat((knots_of(earlier, len(rewards), cfg)[None], elites))
         played = torch.cat(actions)[: len(rewards)].numpy()
         first = success.index(True) if any(success) else None
         return Plan(played, np.array(rewards), first, max(rivals, default=None))
@@ -123,11 +131,16 @@ class Planner:
         return mean, elites, knots[order[~won[order]]][:RIVALS]
 
     def _try(self, states: list[State], knots: Tensor) -> tuple[Tensor, Tensor]:
-        """Discounted reward (samples,) of sequences, equal shares of them played from each state, and who succeeds."""
+        """Score (samples,) of sequences, equal shares of them played from each state, and who succeeds.
+
+        The score is the discounted sum of reward less effort.
+        """
         self.simulator.load(states)
-        trace = self.simulator.play(quantised(torch.einsum("hk,nka->hna", self._weights, knots)))
+        actions = quantised(torch.einsum("hk,nka->hna", self._weights, knots))
+        trace = self.simulator.play(actions)
+        effort = self.config.effort * actions[:, :, self._of_bases].square().sum(2)
         discount = self.config.gamma ** torch.arange(self.config.horizon, dtype=torch.float64)
-        return (discount[:, None] * trace.rewards).sum(0), trace.success.any(0)
+        return (discount[:, None] * (trace.rewards - effort)).sum(0), trace.success.any(0)
 
     def _to_the_end(self, state: State, knots: Tensor, played: int) -> list[float]:
         """What is still to come of the episode's reward if these sequences (n, K, a) are played, the last action held.
@@ -147,7 +160,9 @@ class Planner:
         """Knots to try (samples, K, a): the mean, the elites, mutants of the elites, draws around the mean."""
         cfg, random = self.config, self._generator
         changed = mutants(elites, round(cfg.mutants * cfg.samples), cfg, random)
-        drawn = mean + std * torch.randn(cfg.samples - len(changed), *mean.shape, generator=random)
+        count = cfg.samples - len(changed)
+        scale = FINEST ** torch.rand(count, 1, 1, generator=random)
+        drawn = mean + std * scale * torch.randn(count, *mean.shape, generator=random)
         knots = torch.cat((changed, drawn))
         # What is kept goes first, so that the best sequence of a round never falls behind that of the round before.
         kept = torch.cat((elites, mean[None]))[: cfg.samples]
@@ -179,6 +194,12 @@ def shifted(knots: Tensor, steps: int, horizon: int) -> Tensor:
     weights[place >= horizon - 1] = 0.0
     weights[place >= horizon - 1, -1] = 1.0
     return weights @ knots
+
+
+def knots_of(actions: np.ndarray, start: int, config: PlannerConfig) -> Tensor:
+    """The knots (K, a) of a plan that plays actions (T, a) from some step on; the last one is held."""
+    steps = start + torch.linspace(0.0, config.horizon - 1.0, config.knots).round().long()
+    return torch.from_numpy(actions)[steps.clamp(max=len(actions) - 1)]
 
 
 def quantised(actions: Tensor) -> Tensor:
