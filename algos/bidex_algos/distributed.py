@@ -90,9 +90,15 @@ def shut_down() -> None:
     _attendance = None
 
 
-def missing_ranks() -> list[int] | None:
-    """Processes that do not answer a roll call; None where nobody can tell."""
-    return None if _attendance is None else _attendance.call()
+def report_loss() -> list[int] | None:
+    """Which processes are missing, after a :class:`LostProcess`; None where another process says so."""
+    return [] if _attendance is None else _attendance.report()
+
+
+def on_loss(function: Callable[[], None]) -> None:
+    """Has ``function`` called before a process ends that cannot stop when asked, since it waits for a lost one."""
+    if _attendance is not None:
+        _attendance.on_loss = function
 
 
 def all_sum(x: Tensor) -> Tensor:

@@ -36,9 +36,8 @@ def main(arguments: Sequence[str]) -> None:
             distributed.shut_down()
             return
         folder, learner, stopped = _run(plan, distributed)
-        distributed.shut_down()
     except distributed.LostProcess as loss:
-        _report_loss(loss, distributed.missing_ranks())
+        _say_loss(loss, distributed)
         raise SystemExit(1) from None
     if stopped:
         command = resume_command(folder.path, launch().count)
@@ -66,11 +65,14 @@ def _run(plan: RunPlan, distributed: Any) -> tuple[Any, Any, bool]:
     world, learner, folder = distributed.together(lambda: _make(plan))
     folder = RunFolder(distributed.share(folder and folder.path)[0])
     _say(f"Run folder: {folder.path}")
+    waits = distributed.LostProcess("this one was asked to stop and waits for it")
+    distributed.on_loss(lambda: _say_loss(waits, distributed, folder))
     try:
         stopped = _train(plan, folder, world, learner, loaded)
+        distributed.shut_down()
     except distributed.LostProcess as loss:
-        loss.add_note(_what_is_left(folder, count))
-        raise
+        _say_loss(loss, distributed, folder)
+        raise SystemExit(1) from None
     world.close()
     return folder, learner, stopped
 
@@ -131,7 +133,7 @@ def _train(plan: RunPlan, folder: Any, world: Any, learner: Any, loaded: Checkpo
     resume_step = None
     if loaded is not None:
         state, resume_step = loaded
-        runner.resume(learner, world, state)
+        shared("distributed").together(lambda: runner.resume(learner, world, state))
         _say(f"Continuing at {resume_step:,} steps.")
     elif plan.folder is not None:
         resume_step = 0  # killed before its first checkpoint: the same seed takes it there again
@@ -141,21 +143,21 @@ def _train(plan: RunPlan, folder: Any, world: Any, learner: Any, loaded: Checkpo
         return runner.train(learner, world, total_steps=plan.config["steps"], record=record)
 
 
+def _say_loss(loss: Exception, distributed: Any, folder: Any = None) -> None:
+    """Say that another process is gone, and what is left; but only in the first process that notices."""
+    missing = distributed.report_loss()
+    if missing is None:
+        return
+    count, which = launch().count, ", ".join(map(str, missing))
+    gone = f"process {which} of {count} is gone or stuck" if which else f"one of {count} processes has ended"
+    left = "Training had not begun." if folder is None else _what_is_left(folder, count)
+    print(f"bidex-meta: {gone} ({loss}). {left}", file=sys.stderr, flush=True)
+
+
 def _what_is_left(folder: Any, processes: int) -> str:
     step = folder.checkpoints.newest_step() if folder.checkpoints_path.is_dir() else None
     saved = "There is no checkpoint yet" if step is None else f"The last checkpoint is at {step:,} steps"
     return f"{saved}, in {folder.checkpoints_path}. Continue: {resume_command(folder.path, processes)}"
-
-
-def _report_loss(loss: Exception, missing: list[int] | None) -> None:
-    """Say that another process is gone, in the first one that is still there."""
-    here = launch()
-    if missing is not None and here.rank != min(set(range(here.count)) - set(missing)):
-        return
-    which = ", ".join(map(str, missing or []))
-    gone = f"process {which} of {here.count} is gone or stuck" if which else f"one of {here.count} processes has ended"
-    rest = getattr(loss, "__notes__", ["Training had not begun."])
-    print(f"bidex-meta: {gone} ({loss}). {' '.join(rest)}", file=sys.stderr, flush=True)
 
 
 def _evaluate(plan: RunPlan, folder: Any, learner: Any) -> None:

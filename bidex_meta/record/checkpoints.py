@@ -60,7 +60,8 @@ class Checkpoints:
         Raises:
             BidexError: There are checkpoints, but none of them can be read.
         """
-        candidates = [path for path in [self.last, *self._step_files()] if path.exists()]
+        # last.pt comes last: a process that died between the two renames leaves it older than the newest step_<N>.pt.
+        candidates = [path for path in [*self._step_files(), self.last] if path.exists()]
         for path in candidates:
             loaded = _read(path)
             if loaded is not None:
