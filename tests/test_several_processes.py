@@ -7,12 +7,14 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
 from bidex_meta.cli import main
+from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder, read_metrics
 
 SMALL = ["--suite", "MT4", "--num-envs", "4", "--threads", "1", "--device", "cpu", "--seed", "3", "--no-evaluate"]
@@ -202,3 +204,20 @@ def test_a_run_from_before_several_processes_is_one_of_one(tmp_path: Path, capsy
     del config["processes"]
     RunFolder.create(config, tmp_path / "r")
     assert plan_run(["--resume", str(tmp_path / "r")]).config["processes"] == 1
+
+
+def test_processes_that_disagree_are_refused(tmp_path: Path) -> None:
+    from bidex_meta.commands.run import _agree
+    from bidex_meta.commands.run_config import plan_run
+
+    plan = plan_run(SMALL)
+
+    def agree(other: dict[str, Any], step: int | None = None) -> Any:
+        group = SimpleNamespace(share=lambda mine: [mine, (plan.config | other, step)], together=lambda check: check())
+        return _agree(plan, None, group)
+
+    assert agree({"threads": 99}).config["threads"] == 1
+    with pytest.raises(BidexError, match=r"Process 1 has steps = 5, not .* Start all with the same flags"):
+        agree({"steps": 5})
+    with pytest.raises(BidexError, match="Process 1 finds a checkpoint at 64 steps, process 0 at None"):
+        agree({}, 64)
