@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor
 
+from bidex_algos.distributed import pool_moments
+
 
 def successor_values(values: Tensor, last_values: Tensor, ended: Tensor, final_values: Tensor) -> Tensor:
     """Value of the state each transition led to, in a world that resets within the step.
@@ -55,7 +57,7 @@ def gae(
 
 
 def task_moments(x: Tensor, task_id: Tensor, num_tasks: int, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean, biased variance and count of ``x`` per task over the valid entries.
+    """Mean, biased variance and count of ``x`` per task over the valid entries of all processes.
 
     Args:
         x: Shape (T, N).
@@ -74,7 +76,7 @@ def task_moments(x: Tensor, task_id: Tensor, num_tasks: int, valid: Tensor) -> t
     count = total(torch.ones_like(x))
     mean = total(x) / count.clamp_min(1.0)
     var = total((x - mean[task_id]).square()) / count.clamp_min(1.0)
-    return mean, var, count
+    return pool_moments(mean, var, count)
 
 
 def normalise_per_task(x: Tensor, task_id: Tensor, num_tasks: int, valid: Tensor) -> Tensor:

@@ -5,6 +5,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bidex_algos.distributed import all_sum
+
 
 class EpisodeStatistics:
     """Fading sums over about the last ``window`` finished episodes of each task.
@@ -15,7 +17,7 @@ class EpisodeStatistics:
     Args:
         task_id: Task of each row, int64 (N,).
         task_names: Names of the tasks.
-        window: Number of episodes after which an old one counts 1/e.
+        window: Number of episodes, in each process, after which an old one counts 1/e.
     """
 
     def __init__(self, task_id: Tensor, task_names: list[str], window: float = 100.0):
@@ -35,8 +37,11 @@ class EpisodeStatistics:
         self.sums = self.sums * (1.0 - 1.0 / self.window) ** new[3] + new
 
     def metrics(self) -> dict[str, float]:
-        """Means per task, and means over the tasks that have finished an episode; a task without one is left out."""
-        returns, lengths, successes, counts = self.sums.tolist()
+        """Means per task, and means over the tasks that have finished an episode; a task without one is left out.
+
+        The episodes of all processes count.
+        """
+        returns, lengths, successes, counts = all_sum(self.sums).tolist()
         seen = [i for i, count in enumerate(counts) if count > 0]
         out: dict[str, float] = {}
         for i in seen:

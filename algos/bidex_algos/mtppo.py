@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.advantages import explained_variance, gae, normalise_per_task, successor_values, task_moments
+from bidex_algos.distributed import all_sum, broadcast, own_seed, sum_gradients, world_size
 from bidex_algos.episodes import EpisodeStatistics
 from bidex_algos.mtppo_config import PRESETS, MTPPOConfig
 from bidex_algos.networks import MLP, GaussianActor, gaussian_entropy, gaussian_kl, gaussian_log_prob
@@ -56,18 +57,24 @@ class Batch:
 class MTPPO:
     """Multi-task PPO on a batched world.
 
+    In a run of several processes each has a world and samples of its own, and all have the same networks: statistics
+    and gradients are those of the samples of all, so that a mini-batch is as many times larger.
+
     Args:
         world: A world that resets finished rows within the step.
         config: See :class:`MTPPOConfig`.
         seed: Of the initial weights, the sampled actions, the shuffling and the world's first reset.
 
     Attributes:
-        env_steps: Environment steps taken so far, over all rows.
+        env_steps: Environment steps taken so far, over all rows of all processes.
+        per_process: Entries of ``state_dict`` that differ from process to process.
         policy: The agent that evaluation uses: mean action, clamped.
 
     Raises:
         BidexError: Fewer samples in a rollout than mini-batches.
     """
+
+    per_process = ("generator", "episodes", "obs")
 
     def __init__(self, world: VectorWorld, config: MTPPOConfig, seed: int):
         samples = config.rollout_steps * world.num_envs
@@ -85,7 +92,7 @@ class MTPPO:
 
         # Weights come from a CPU generator, so that a seed means the same network on every device.
         init = torch.Generator().manual_seed(seed)
-        self.generator = torch.Generator(self.device).manual_seed(seed)
+        self.generator = torch.Generator(self.device).manual_seed(own_seed(seed))
         num_id_columns = int(getattr(world, "num_id_columns", 0))
         observations = ObservationNormaliser(d, num_id_columns, config.normalise_observations)
         actor = GaussianActor(d, config.hidden, a, config.init_std, init, config.activation)
@@ -93,7 +100,7 @@ class MTPPO:
         self.policy = GaussianPolicy(observations, actor, self.low_precision).to(self.device)
         self.critic = MLP(d, config.hidden, heads, 1.0, init, config.activation).to(self.device)
         self.shape = {"observations": d, "actions": a, "num_id_columns": num_id_columns}
-        horizon = config.value_horizon * samples / world.num_tasks
+        horizon = config.value_horizon * samples * world_size() / world.num_tasks
         self.return_stats = RunningStats((world.num_tasks,), max_count=horizon).to(self.device)
 
         # The step size is a tensor: adapting it needs no wait for the device.
@@ -119,7 +126,9 @@ class MTPPO:
         """
         started = time.perf_counter()
         if self.obs is None:
-            self.obs, _ = self.world.reset(seed=self.seed)
+            # The same seed has given the same weights everywhere, unless a machine computes differently.
+            broadcast([*self.policy.parameters(), *self.critic.parameters()])
+            self.obs, _ = self.world.reset(seed=own_seed(self.seed))
             self.policy.observations.update(self.obs)
         self.obs = collect(self.world, self.rollout, self.obs, self._sample, self._final_value, self.episodes)
         collected = time.perf_counter()
@@ -127,12 +136,13 @@ class MTPPO:
         batch, explained = self._prepare()
         losses = self._update(batch)
         self.policy.observations.update(self.rollout.obs)
-        self.env_steps += self.rollout.rewards.numel()
+        steps = self.rollout.rewards.numel() * world_size()
+        self.env_steps += steps
         metrics = self._metrics(losses, explained)
         done = time.perf_counter()
         metrics["Perf/collection_time"] = collected - started
         metrics["Perf/learning_time"] = done - collected
-        metrics["Perf/steps_per_second"] = self.rollout.rewards.numel() / (done - started)
+        metrics["Perf/steps_per_second"] = steps / (done - started)
         return metrics
 
     def eval_action(self, obs: Tensor) -> Tensor:
@@ -211,14 +221,18 @@ class MTPPO:
         """PPO's update: returns the means over all mini-batches of what it measured."""
         cfg, actor = self.config, self.policy.actor
         actor_weights, critic_weights = list(actor.parameters()), list(self.critic.parameters())
+        all_weights = actor_weights + critic_weights
         old_log_std = actor.log_std.detach().clone()
         low, high = (math.log(std) for std in cfg.std_range)
         measured: list[Tensor] = []
         for epoch in range(cfg.epochs):
             order = torch.randperm(len(batch.obs), generator=self.generator, device=self.device)
-            for number, index in enumerate(order.chunk(cfg.num_minibatches)):
+            parts = order.chunk(cfg.num_minibatches)
+            # Divided by the samples of all processes, losses and gradients become means by being summed over them.
+            counts = all_sum(torch.stack([batch.weights[index].sum() for index in parts])).clamp_min(1.0)
+            for number, (index, count) in enumerate(zip(parts, counts, strict=True)):
                 b = batch.select(index)
-                weight = b.weights / b.weights.sum().clamp_min(1.0)
+                weight = b.weights / count
                 with autocast(self.device, self.low_precision):
                     mean = actor(b.obs)
                 values = self._critic(b.obs, b.task_id)
@@ -228,25 +242,26 @@ class MTPPO:
                 surrogate = -(weight * torch.minimum(ratio * b.advantages, clipped * b.advantages)).sum()
                 value_loss = (weight * (values - b.targets).square()).sum()
                 entropy = gaussian_entropy(actor.log_std)
-                loss = surrogate + cfg.value_loss_weight * value_loss - cfg.entropy_weight * entropy
+                loss = surrogate + cfg.value_loss_weight * value_loss - cfg.entropy_weight / world_size() * entropy
 
                 with torch.no_grad():
                     kl = (weight * gaussian_kl(b.old_means, old_log_std, mean, actor.log_std)).sum()
                     outside = (weight * ((ratio - 1.0).abs() > cfg.clip)).sum()
-                    # The first mini-batch compares the sampling policy with itself and says nothing about the step.
-                    if cfg.adaptive_learning_rate and (epoch, number) != (0, 0):
-                        self._adapt_learning_rate(kl)
 
                 self.actor_adam.zero_grad()
                 self.critic_adam.zero_grad()
                 loss.backward()
-                for weights in [actor_weights, critic_weights] if cfg.clip_apart else [actor_weights + critic_weights]:
+                numbers = torch.stack([surrogate.detach(), value_loss.detach(), kl, outside])
+                measured.append(sum_gradients(all_weights, numbers))
+                # The first mini-batch compares the sampling policy with itself and says nothing about the step.
+                if cfg.adaptive_learning_rate and (epoch, number) != (0, 0):
+                    self._adapt_learning_rate(measured[-1][2])
+                for weights in [actor_weights, critic_weights] if cfg.clip_apart else [all_weights]:
                     nn.utils.clip_grad_norm_(weights, cfg.max_grad_norm)
                 self.actor_adam.step()
                 self.critic_adam.step()
                 with torch.no_grad():
                     actor.log_std.clamp_(low, high)
-                measured.append(torch.stack([surrogate.detach(), value_loss.detach(), kl, outside]))
         means = torch.stack(measured).mean(0)
         return dict(zip(("Loss/surrogate", "Loss/value", "Policy/kl", "Policy/clip_fraction"), means, strict=True))
 
@@ -260,7 +275,7 @@ class MTPPO:
         tensors = dict(losses)
         tensors["Policy/std"] = self.policy.actor.log_std.detach().exp().mean()
         tensors["Policy/lr"] = self.learning_rate
-        tensors["Train/unstable"] = (~self.rollout.valid).sum()
+        tensors["Train/unstable"] = all_sum((~self.rollout.valid).sum())
         for name, value in zip(self.world.task_names, explained, strict=True):
             tensors[f"Value/explained_variance/{name}"] = value
         # One transfer for all of them.

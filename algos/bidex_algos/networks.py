@@ -47,7 +47,7 @@ class MLP(nn.Module):
         """Maps (batch, inputs) to float32 (batch, outputs)."""
         features = self.body(x)
         with torch.autocast(x.device.type, enabled=False):
-            return self.head(features.float())
+            return self.head(features.to(self.head.weight.dtype))
 
 
 def _linear(inputs: int, outputs: int, gain: float, generator: torch.Generator) -> nn.Linear:

@@ -5,6 +5,8 @@ import math
 import torch
 from torch import Tensor, nn
 
+from bidex_algos.distributed import pool_moments
+
 
 class RunningStats(nn.Module):
     """Mean and variance of a stream, merged batch by batch (Chan et al.), element by element.
@@ -74,12 +76,12 @@ class ObservationNormaliser(nn.Module):
 
     @torch.no_grad()
     def update(self, obs: Tensor) -> None:
-        """Takes (..., columns) raw observations into the statistics."""
+        """Takes (..., columns) raw observations, of all processes, into the statistics."""
         if not self.enabled:
             return
         flat = obs.reshape(-1, obs.shape[-1])[:, : self.measured]
         var, mean = torch.var_mean(flat, dim=0, correction=0)
-        self.stats.merge(mean, var, flat.shape[0])
+        self.stats.merge(*pool_moments(mean, var, torch.full_like(mean, flat.shape[0], dtype=torch.float64)))
         self.shift[: self.measured] = self.stats.mean.float()
         # The floor keeps a column that has been constant so far from blowing up noise a thousandfold.
         self.scale[: self.measured] = self.stats.std(floor=3e-3).reciprocal().float()

@@ -1,5 +1,10 @@
-"""The training loop every learner runs in: iterate, report, save; and stop cleanly when asked to."""
+"""The training loop every learner runs in: iterate, report, save; and stop cleanly when asked to.
 
+In a run of several processes (:mod:`bidex_algos.distributed`) all make the same iterations and stop together; process 0
+writes for all.
+"""
+
+import math
 import signal
 import threading
 import time
@@ -8,7 +13,9 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any, Protocol
 
+from bidex_algos.distributed import any_process, gather, is_main, rank, world_size
 from bidex_algos.rollout import VectorWorld
+from bidex_meta.errors import BidexError
 
 
 class Learner(Protocol):
@@ -16,7 +23,12 @@ class Learner(Protocol):
 
     @property
     def env_steps(self) -> int:
-        """Environment steps taken so far, over all rows."""
+        """Environment steps taken so far, over all rows of all processes."""
+        ...
+
+    @property
+    def per_process(self) -> tuple[str, ...]:
+        """Entries of ``state_dict`` that differ from process to process; the others are the same in all."""
         ...
 
     def iterate(self) -> dict[str, float]:
@@ -49,45 +61,75 @@ def train(
     world: VectorWorld,
     *,
     total_steps: int,
-    record: Record,
+    record: Record | None,
     checkpoint_seconds: float = 60.0,
 ) -> bool:
     """Trains until ``total_steps`` environment steps are done, counting those of a resumed run.
 
-    SIGINT or SIGTERM finishes the current iteration, saves and returns; a second one acts at once.
+    SIGINT or SIGTERM, in any process, finishes the current iteration, saves and returns; a second one acts at once.
 
     Args:
         learner: The learner, already made on ``world``.
         world: The world, whose state is saved beside the learner's.
         total_steps: Environment steps in all.
-        record: Where metrics and checkpoints go.
+        record: Where metrics and checkpoints go; None in processes other than 0.
         checkpoint_seconds: Least time between two checkpoints; one more is always saved at the end.
 
     Returns:
         True if a signal ended the training early.
+
+    Raises:
+        LostProcess: Another process is gone. What was saved stays as it is.
     """
-    saved_at = time.monotonic()
+    # Of several processes one may be lost at any time, and then nothing more can be saved: so the first iteration is.
+    saved_at = time.monotonic() if world_size() == 1 else -math.inf
     saved_step = learner.env_steps
     with _stop_requests() as stop:
-        while learner.env_steps < total_steps and not stop.is_set():
-            record.log(learner.iterate(), learner.env_steps)
-            if time.monotonic() - saved_at >= checkpoint_seconds:
-                record.save(checkpoint(learner, world), learner.env_steps)
+        while learner.env_steps < total_steps and not any_process(stop.is_set()):
+            metrics = learner.iterate()
+            if record is not None:
+                record.log(metrics, learner.env_steps)
+            # Clocks differ: process 0's decides.
+            if any_process(is_main() and time.monotonic() - saved_at >= checkpoint_seconds):
+                _save(learner, world, record)
                 saved_at, saved_step = time.monotonic(), learner.env_steps
         if learner.env_steps != saved_step:
-            record.save(checkpoint(learner, world), learner.env_steps)
-        return stop.is_set() and learner.env_steps < total_steps
+            _save(learner, world, record)
+        return learner.env_steps < total_steps
 
 
-def checkpoint(learner: Learner, world: VectorWorld) -> dict[str, Any]:
-    """The state of a run: ``{"learner": ..., "env": ...}``, tensors and plain values only."""
-    return {"learner": learner.state_dict(), "env": world.state_dict()}
+def _save(learner: Learner, world: VectorWorld, record: Record | None) -> None:
+    state = checkpoint(learner, world)
+    if record is not None and state is not None:
+        record.save(state, learner.env_steps)
+
+
+def checkpoint(learner: Learner, world: VectorWorld) -> dict[str, Any] | None:
+    """The state of a run: ``{"learner": ..., "env": ...}``, tensors and plain values only.
+
+    Of several processes all must call it. Process 0 gets its own state with, under ``others``, what differs in each of
+    the others; they get None.
+    """
+    state = {"learner": learner.state_dict(), "env": world.state_dict()}
+    if world_size() == 1:
+        return state
+    own = {"learner": {name: state["learner"][name] for name in learner.per_process}, "env": state["env"]}
+    parts = gather(own)
+    return None if parts is None else {**state, "others": parts[1:]}
 
 
 def resume(learner: Learner, world: VectorWorld, state: dict[str, Any]) -> None:
-    """Restores what :func:`checkpoint` gave; training then continues bit for bit (CPU, same number of threads)."""
-    world.load_state_dict(state["env"])
-    learner.load_state_dict(state["learner"])
+    """Restores what :func:`checkpoint` gave; training then continues bit for bit (CPU, same number of threads).
+
+    Raises:
+        BidexError: The checkpoint is of another number of processes.
+    """
+    parts = [state, *state.get("others", [])]
+    if len(parts) != world_size():
+        raise BidexError(f"The checkpoint is of {len(parts)} processes, but here are {world_size()}. Start as many.")
+    mine = parts[rank()]
+    world.load_state_dict(mine["env"])
+    learner.load_state_dict({**state["learner"], **mine["learner"]})
 
 
 @contextmanager

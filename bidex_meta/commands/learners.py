@@ -3,7 +3,7 @@
 An entry is ``"module:Class"``. Beside the class the module holds ``PRESETS``: a dict from preset name to an instance of
 the learner's config dataclass, with at least ``paper`` and ``laptop``. The class offers:
 
-* ``Class(world, config, seed)``, and the methods ``bidex_algos.runner.Learner`` names;
+* ``Class(world, config, seed)``, and what ``bidex_algos.runner.Learner`` names;
 * ``policy_state_dict()`` and ``load_policy(state, device)``, which gives an agent for ``bidex_meta.evaluate`` from the
   entry ``learner.policy`` of a checkpoint.
 """
@@ -12,12 +12,18 @@ import importlib
 from dataclasses import dataclass
 from typing import Any
 
+from bidex_meta.commands.launch import launch
 from bidex_meta.errors import BidexError, unknown_name
 
 ALGOS: dict[str, str] = {
     "mtppo": "bidex_algos.mtppo:MTPPO",
     "ppo": "bidex_algos.mtppo:MTPPO",  # of one task it is plain PPO
 }
+
+
+def shared(name: str) -> Any:
+    """A module that all learners share: ``runner`` (the training loop) or ``distributed`` (several processes)."""
+    return importlib.import_module(f"bidex_algos.{name}")
 
 
 @dataclass(frozen=True)
@@ -71,14 +77,22 @@ def resolve_device(asked: str) -> str:
     """``auto`` to ``cuda`` where there is one, else ``cpu``; anything else as it is.
 
     Raises:
-        BidexError: torch does not know the device, or it is not there.
+        BidexError: torch does not know the device, or it is not there (for each of several processes).
     """
     import torch
 
     if asked == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
+        asked = "cuda" if torch.cuda.is_available() else "cpu"
+    here = launch()
+    if here.count > 1 and asked.startswith("cuda:"):
+        raise BidexError(f"Expected device auto, cpu or cuda, since each process takes a GPU of its own; got {asked}.")
+    if here.count > 1 and asked == "cuda" and here.local_count > torch.cuda.device_count():
+        raise BidexError(
+            f"Expected a GPU for each of the {here.local_count} processes on this machine, found "
+            f"{torch.cuda.device_count()}. Start fewer, or add --device cpu."
+        )
     try:
-        torch.zeros(1, device=asked)
+        torch.zeros(1, device=here.own_device(asked))
     except Exception as error:  # torch raises RuntimeError, AssertionError or its own kinds
         reason = str(error).splitlines()[0]
         raise BidexError(f"Device {asked!r} cannot be used ({reason}). Expected auto, cpu or cuda:N.") from None

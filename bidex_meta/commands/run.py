@@ -1,13 +1,22 @@
-"""``bidex-meta run``: config, world, learner, run folder, training, evaluation, in this order."""
+"""``bidex-meta run``: config, world, learner, run folder, training, evaluation, in this order.
 
-import importlib
+Of several processes (torchrun) each has a world and a learner; process 0 alone writes, speaks and evaluates.
+"""
+
+import contextlib
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
+from bidex_meta.commands.launch import launch, resume_command
+from bidex_meta.commands.learners import shared
 from bidex_meta.commands.run_config import RunPlan, plan_run
+from bidex_meta.errors import BidexError
+
+Checkpoint = tuple[dict[str, Any], int]
+"""State and environment steps."""
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -15,53 +24,140 @@ def main(arguments: Sequence[str]) -> None:
 
     Raises:
         BidexError: Bad input. Nothing has been written then.
+        SystemExit: Another process was lost (exit code 1), or has said what is wrong with the input (2).
     """
-    plan = plan_run(arguments)
-    if plan.flags.print_config:
-        print(json.dumps(plan.config, indent=2))
-        return
-    import torch
-
-    from bidex_meta.commands import worlds
-    from bidex_meta.record import RunFolder
-
-    config = plan.config
-    worlds.check_names(config)
-    # Sums depend on how torch splits them over threads: a resumed run must use the number it began with.
-    torch.set_num_threads(config["threads"])
-    subject = config["suite"] or config["task"]
-    _say(f"{config['algo']} on {subject}, {config['num_envs']} rows on {config['device']}, seed {config['seed']}")
-    _say(f"Preset {config['preset']}: {plan.preset_reason}.")
-    loaded = plan.folder.checkpoints.load() if plan.folder else None
-    world = worlds.training_world(config)
-    learner = plan.kind.make(world, plan.learner_config, config["seed"])
-    folder = plan.folder or RunFolder.create(config, plan.flags.run_dir)
-    if folder.config() != config:
-        folder.change_config(config)  # a resumed run with more steps
-    _say(f"Run folder: {folder.path}")
-    stopped = _train(plan, folder, world, learner, loaded)
-    world.close()
+    distributed = shared("distributed")
+    try:
+        distributed.init_from_environment()
+        plan = distributed.together(lambda: plan_run(arguments))
+        if plan.flags.print_config:
+            if launch().rank == 0:
+                print(json.dumps(plan.config, indent=2))
+            distributed.shut_down()
+            return
+        folder, learner, stopped = _run(plan, distributed)
+    except distributed.LostProcess as loss:
+        _say_loss(loss, distributed)
+        raise SystemExit(1) from None
     if stopped:
-        _say(f"Stopped after {learner.env_steps:,} steps and saved. Continue: bidex-meta run --resume {folder.path}")
-    elif plan.flags.evaluate:
+        command = resume_command(folder.path, launch().count)
+        _say(f"Stopped after {learner.env_steps:,} steps and saved. Continue: {command}")
+    elif plan.flags.evaluate and launch().rank == 0:
         _evaluate(plan, folder, learner)
 
 
-def _train(plan: RunPlan, folder: Any, world: Any, learner: Any, loaded: tuple[dict[str, Any], int] | None) -> bool:
+def _run(plan: RunPlan, distributed: Any) -> tuple[Any, Any, bool]:
+    """What all processes do: the run folder, the trained learner, and whether a signal ended it early."""
+    import torch
+
+    from bidex_meta.record import RunFolder
+
+    loaded = distributed.together(lambda: _read(plan))
+    plan = _agree(plan, loaded, distributed)
+    config, count = plan.config, launch().count
+    # Sums depend on how torch splits them over threads: a resumed run must use the number it began with.
+    torch.set_num_threads(config["threads"])
+    subject, times = config["suite"] or config["task"], f"{count} x " if count > 1 else ""
+    _say(
+        f"{config['algo']} on {subject}, {times}{config['num_envs']} rows on {config['device']}, seed {config['seed']}"
+    )
+    _say(f"Preset {config['preset']}: {plan.preset_reason}.")
+    world, learner, folder = distributed.together(lambda: _make(plan))
+    folder = RunFolder(distributed.share(folder and folder.path)[0])
+    _say(f"Run folder: {folder.path}")
+    waits = distributed.LostProcess("this one was asked to stop and waits for it")
+    distributed.on_loss(lambda: _say_loss(waits, distributed, folder))
+    try:
+        stopped = _train(plan, folder, world, learner, loaded)
+        distributed.shut_down()
+    except distributed.LostProcess as loss:
+        _say_loss(loss, distributed, folder)
+        raise SystemExit(1) from None
+    world.close()
+    return folder, learner, stopped
+
+
+def _read(plan: RunPlan) -> Checkpoint | None:
+    from bidex_meta.commands import worlds
+
+    worlds.check_names(plan.config)
+    return plan.folder.checkpoints.load() if plan.folder else None
+
+
+def _agree(plan: RunPlan, loaded: Checkpoint | None, distributed: Any) -> RunPlan:
+    """The plan with process 0's config.
+
+    Raises:
+        BidexError: The processes were started with different flags, or see different checkpoints.
+    """
+    everyone = distributed.share((plan.config, loaded and loaded[1]))
+
+    def check() -> None:
+        config, step = everyone[0]
+        for number, (other, other_step) in enumerate(everyone):
+            # Machines may differ in cores; the run keeps the threads of process 0.
+            differ = [f"{name} = {other[name]}, not {config[name]}" for name in config if other[name] != config[name]]
+            differ = [text for text in differ if not text.startswith("threads")]
+            if differ:
+                raise BidexError(f"Process {number} has {differ[0]} as process 0. Start all with the same flags.")
+            if other_step != step:
+                raise BidexError(
+                    f"Process {number} finds a checkpoint at {other_step} steps, process 0 at {step}. The run folder "
+                    "must be one that all machines see."
+                )
+
+    distributed.together(check)
+    return replace(plan, config=everyone[0][0])
+
+
+def _make(plan: RunPlan) -> tuple[Any, Any, Any]:
+    """World, learner and, in process 0, the run folder."""
+    from bidex_meta.commands import worlds
+    from bidex_meta.record import RunFolder
+
+    world = worlds.training_world(plan.config)
+    learner = plan.kind.make(world, plan.learner_config, plan.config["seed"])
+    if launch().rank > 0:
+        return world, learner, None
+    folder = plan.folder or RunFolder.create(plan.config, plan.flags.run_dir)
+    if folder.config() != plan.config:
+        folder.change_config(plan.config)  # a resumed run with more steps
+    return world, learner, folder
+
+
+def _train(plan: RunPlan, folder: Any, world: Any, learner: Any, loaded: Checkpoint | None) -> bool:
     """Train to the end; True if a signal ended it early."""
     from bidex_meta.record import Recorder
 
-    runner = importlib.import_module("bidex_algos.runner")
+    runner = shared("runner")
     resume_step = None
     if loaded is not None:
         state, resume_step = loaded
-        runner.resume(learner, world, state)
+        shared("distributed").together(lambda: runner.resume(learner, world, state))
         _say(f"Continuing at {resume_step:,} steps.")
     elif plan.folder is not None:
         resume_step = 0  # killed before its first checkpoint: the same seed takes it there again
         _say("No checkpoint yet: starting from the beginning.")
-    with Recorder(folder, plan.config["steps"], resume_step) as record:
+    recorder = Recorder(folder, plan.config["steps"], resume_step) if launch().rank == 0 else contextlib.nullcontext()
+    with recorder as record:
         return runner.train(learner, world, total_steps=plan.config["steps"], record=record)
+
+
+def _say_loss(loss: Exception, distributed: Any, folder: Any = None) -> None:
+    """Say that another process is gone, and what is left; but only in the first process that notices."""
+    missing = distributed.report_loss()
+    if missing is None:
+        return
+    count, which = launch().count, ", ".join(map(str, missing))
+    gone = f"process {which} of {count} is gone or stuck" if which else f"one of {count} processes has ended"
+    left = "Training had not begun." if folder is None else _what_is_left(folder, count)
+    print(f"bidex-meta: {gone} ({loss}). {left}", file=sys.stderr, flush=True)
+
+
+def _what_is_left(folder: Any, processes: int) -> str:
+    step = folder.checkpoints.newest_step() if folder.checkpoints_path.is_dir() else None
+    saved = "There is no checkpoint yet" if step is None else f"The last checkpoint is at {step:,} steps"
+    return f"{saved}, in {folder.checkpoints_path}. Continue: {resume_command(folder.path, processes)}"
 
 
 def _evaluate(plan: RunPlan, folder: Any, learner: Any) -> None:
@@ -88,4 +184,5 @@ def _evaluate(plan: RunPlan, folder: Any, learner: Any) -> None:
 
 
 def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+    if launch().rank == 0:
+        print(text, file=sys.stderr, flush=True)

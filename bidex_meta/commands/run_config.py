@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from bidex_meta.commands.launch import launch, resume_command
 from bidex_meta.commands.learners import LearnerKind, choose_preset, learner_kind, resolve_device
 from bidex_meta.commands.parsing import StepCount, Switch, parse, peek
 from bidex_meta.errors import BidexError
@@ -33,9 +34,9 @@ class RunFlags:
     preset: str = "auto"
     """Values of the learner's config that no flag sets; auto: laptop on a CPU, on a GPU tuned or else paper."""
     num_envs: int = 0
-    """Rows stepped together, over all tasks."""
+    """Rows stepped together by each process, over all tasks."""
     steps: StepCount = 0
-    """Environment steps to train for, over all rows; 2e7 is understood."""
+    """Environment steps to train for, over all rows of all processes; 2e7 is understood."""
     seed: int = 0
     """Seed of tasks, starts and learner."""
     device: str = "auto"
@@ -43,7 +44,8 @@ class RunFlags:
     engine: Literal["auto", "c", "warp"] = "auto"
     """Physics: C MuJoCo on the CPU, mujoco_warp on either; auto: the one that is fast on the device."""
     threads: int | None = None
-    """Threads of torch and of the physics; None: one per core. A resumed run keeps its own."""
+    """Threads of torch and of the physics in each process; None: one per core, shared by the processes of a machine. A
+    resumed run keeps its own."""
     run_dir: Path | None = None
     """Folder of this run; None: runs/SUITE/ALGO/DATE_seedSEED."""
     resume: Path | None = None
@@ -128,10 +130,11 @@ def _resolved(flags: Any, preset: str, device: str, stored: dict[str, Any]) -> d
         "learner": dataclasses.asdict(flags.learner),
         "num_envs": flags.num_envs,
         "steps": flags.steps,
+        "processes": launch().count,
         "seed": flags.seed,
         "device": device,
         "engine": flags.engine,
-        "threads": flags.threads or stored.get("threads") or _cores(),
+        "threads": flags.threads or stored.get("threads") or max(1, _cores() // launch().local_count),
     }
     return json.loads(json.dumps(config))  # tuples to lists, so that it equals what is read back
 
@@ -153,7 +156,12 @@ def _stored_learner(config_class: Any, stored: dict[str, Any], folder: RunFolder
 
 
 def _refuse_changes(stored: dict[str, Any], config: dict[str, Any], folder: RunFolder) -> None:
-    before, after = _flat(stored), _flat(config)
+    before, after = _flat({"processes": 1, **stored}), _flat(config)
+    if before["processes"] != after["processes"]:
+        raise BidexError(
+            f"{folder.path} has worlds of {before['processes']} process(es), not {after['processes']}. "
+            f"Continue: {resume_command(folder.path, before['processes'])}"
+        )
     for name in sorted(before.keys() | after.keys()):
         if name != "steps" and before.get(name) != after.get(name):
             flag = "--" + name.replace("_", "-")

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from bidex_meta.commands.launch import launch
 from bidex_meta.commands.learners import learner_kind
 from bidex_meta.errors import BidexError, unknown_name
 from bidex_meta.evaluate import Agent
@@ -49,7 +50,7 @@ def _world(config: dict[str, Any], split: str, rows: int | None, mode: str) -> A
 
     keywords: dict[str, Any] = {
         "seed": config["seed"],
-        "device": config["device"],
+        "device": launch().own_device(config["device"]),
         "threads": config["threads"],
         "engine": config.get("engine", "auto"),
         "autoreset_mode": mode,

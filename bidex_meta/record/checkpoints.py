@@ -47,6 +47,11 @@ class Checkpoints:
         for old in self._step_files()[self.keep :]:
             old.unlink(missing_ok=True)
 
+    def newest_step(self) -> int | None:
+        """Environment steps of the newest checkpoint, by the names of the files; None where there is none yet."""
+        files = self._step_files()
+        return int(files[0].stem.removeprefix("step_")) if files else None
+
     def load(self) -> tuple[dict[str, Any], int] | None:
         """The newest readable checkpoint as ``(state, step)`` with tensors on the CPU; None where there is none yet.
 
@@ -55,7 +60,8 @@ class Checkpoints:
         Raises:
             BidexError: There are checkpoints, but none of them can be read.
         """
-        candidates = [path for path in [self.last, *self._step_files()] if path.exists()]
+        # last.pt comes last: a process that died between the two renames leaves it older than the newest step_<N>.pt.
+        candidates = [path for path in [*self._step_files(), self.last] if path.exists()]
         for path in candidates:
             loaded = _read(path)
             if loaded is not None:

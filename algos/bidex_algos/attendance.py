@@ -1,0 +1,113 @@
+"""Which processes of a run are still there, for the message after one of them was lost."""
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from types import FrameType
+from typing import Any
+
+_BEAT_SECONDS = 0.5
+_LISTEN_SECONDS = 3.0
+# torchrun kills 30 s after it asked.
+_STOP_SECONDS = 12.0
+_END_SECONDS = 10.0
+
+
+class Attendance(threading.Thread):
+    """Counts up in the store twice a second, so that the others see that this process lives, whatever it is doing.
+
+    It may wait, deep inside a collective operation, for one that does not live. So if a signal asked it to end, it has
+    not done so for 12 seconds and somebody is missing, the thread ends the process.
+
+    Args:
+        store: The store the processes met at. torchrun keeps it, so that it outlives each of them.
+        rank: Number of this process.
+        count: Number of processes.
+
+    Attributes:
+        on_loss: Called before the thread ends the process.
+    """
+
+    def __init__(self, store: Any, rank: int, count: int):
+        super().__init__(name="attendance", daemon=True)
+        # A connection of its own: operations of one wait for each other.
+        self._store, self._rank, self._count = store.clone(), rank, count
+        self._closed = threading.Event()
+        self.on_loss: Callable[[], None] = lambda: None
+        self._signals, sent = os.pipe()
+        for end in (self._signals, sent):
+            os.set_blocking(end, False)
+        if threading.current_thread() is threading.main_thread():
+            # A handler written in Python would wait for the operation to return; this byte does not.
+            signal.set_wakeup_fd(sent, warn_on_full_buffer=False)
+        self.start()
+
+    def report(self) -> list[int] | None:
+        """Tells the others that this process ends because one is lost, and finds out which.
+
+        Returns:
+            Numbers of the missing processes, as far as can be told; None where another process was quicker to report
+            and will say it.
+        """
+        self._closed.set()
+        try:
+            self._store.set(f"reported {self._rank}", "")
+            return self._missing() if self._store.add("reports", 1) == 1 else None
+        except RuntimeError:
+            return []  # the store is gone too
+
+    def close(self) -> None:
+        """No longer takes part."""
+        self._closed.set()
+        if threading.current_thread() is threading.main_thread():
+            signal.set_wakeup_fd(-1)
+
+    def run(self) -> None:
+        """The thread's work."""
+        asked_at = None
+        while not self._closed.wait(_BEAT_SECONDS):
+            try:
+                self._store.add(f"beats {self._rank}", 1)
+                if asked_at is None and self._was_asked_to_end():
+                    asked_at = time.monotonic()
+                # With all others alive the iteration just takes long.
+                late = asked_at is not None and time.monotonic() - asked_at > _STOP_SECONDS
+                lost = late and self._missing()
+            except RuntimeError:
+                return
+            if lost and not self._closed.is_set():
+                self.on_loss()
+                os._exit(1)
+
+    def _missing(self) -> list[int]:
+        """Processes that neither count up nor have reported."""
+        before = self._beats()
+        time.sleep(_LISTEN_SECONDS)
+        silent = [i for i, (a, b) in enumerate(zip(before, self._beats(), strict=True)) if a == b and i != self._rank]
+        return [i for i in silent if not self._store.check([f"reported {i}"])]
+
+    def _beats(self) -> list[int]:
+        return [self._store.add(f"beats {i}", 0) for i in range(self._count)]
+
+    def _was_asked_to_end(self) -> bool:
+        try:
+            return bool(set(os.read(self._signals, 64)) & {signal.SIGINT, signal.SIGTERM})
+        except BlockingIOError:
+            return False
+
+
+def end_patiently() -> None:
+    """Leaves ten seconds between SIGTERM and the end of the process, where nobody else handles that signal.
+
+    torchrun sends it to all others as soon as one process is gone, which is just when they want to say so.
+    """
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        timer = threading.Timer(_END_SECONDS, os._exit, [128 + number])
+        timer.daemon = True
+        timer.start()
+
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, on_signal)

@@ -1,0 +1,43 @@
+"""How this process was started: on its own, or by torchrun as one of several that share a run."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Launch:
+    """The place of this process among those of the run, as torchrun says in the environment."""
+
+    rank: int = 0
+    """Number of this process, from 0; process 0 alone writes and speaks."""
+    count: int = 1
+    """Number of processes on all machines."""
+    local_rank: int = 0
+    """Number of this process on its machine."""
+    local_count: int = 1
+    """Number of processes on its machine."""
+
+    def own_device(self, device: str) -> str:
+        """The device of this process: of several on one machine, each takes the GPU of its number."""
+        return f"cuda:{self.local_rank}" if self.count > 1 and device == "cuda" else device
+
+
+def launch() -> Launch:
+    """What the environment says; read anew each time, since it is a few look-ups."""
+    # A batch system may set WORLD_SIZE for other reasons; torchrun also says where to meet.
+    if "MASTER_ADDR" not in os.environ:
+        return Launch()
+    names = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
+    defaults = (0, 1, 0, 1)
+    return Launch(*(int(os.environ.get(name, default)) for name, default in zip(names, defaults, strict=True)))
+
+
+def resume_command(path: Path, processes: int) -> str:
+    """The command that continues a run of so many processes."""
+    if processes == 1:
+        return f"bidex-meta run --resume {path}"
+    here = launch()
+    nodes = processes // here.local_count if here.count == processes else 1
+    machines = f"--nnodes {nodes} " if nodes > 1 else ""
+    return f"torchrun {machines}--nproc-per-node {processes // nodes} -m bidex_meta.cli run --resume {path}"

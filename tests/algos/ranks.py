@@ -1,0 +1,39 @@
+"""Runs a function in two processes that are joined as torchrun would join them."""
+
+import multiprocessing
+import os
+import signal
+import socket
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from bidex_algos import distributed
+
+
+def in_two_processes(function: Callable[[int], Any], folder: Path) -> list[Any]:
+    """What ``function(rank)`` returns in each; it joins the other itself."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    # Spawned, since a forked process would inherit torch's threads in an undefined state.
+    context = multiprocessing.get_context("spawn")
+    processes = [context.Process(target=_one, args=(function, rank, port, folder)) for rank in range(2)]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+    assert [process.exitcode for process in processes] == [0, 0]
+    return [torch.load(folder / f"{rank}.pt", weights_only=False) for rank in range(2)]
+
+
+def _one(function: Callable[[int], Any], rank: int, port: int, folder: Path) -> None:
+    torch.set_num_threads(1)
+    signal.alarm(100)  # a deadlock shall fail, not last
+    places = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": 2, "LOCAL_WORLD_SIZE": 2, "MASTER_PORT": port}
+    os.environ.update({name: str(value) for name, value in places.items()}, MASTER_ADDR="127.0.0.1")
+    result = function(rank)
+    distributed.shut_down()
+    torch.save(result, folder / f"{rank}.pt")

@@ -1,0 +1,249 @@
+"""Two processes on a toy world, joined by gloo."""
+
+import os
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from bidex_algos import distributed
+from bidex_algos.mtppo import MTPPO, MTPPOConfig
+from bidex_algos.rollout import collect
+from bidex_algos.runner import checkpoint, resume, train
+from bidex_meta.errors import BidexError
+from tests.algos.ranks import in_two_processes
+from tests.algos.toy import ToyWorld, nearness
+
+CONFIG = MTPPOConfig(hidden=(32, 32), rollout_steps=8, learning_rate_range=(1e-5, 2e-3), autocast="off")
+ONE_BATCH = replace(CONFIG, num_minibatches=1, entropy_weight=0.01)
+ROWS = 16
+ITERATION = 2 * 2 * ROWS * 8  # processes, tasks, rows, steps
+BROKEN = ((2, 5), (3, 40), (3, 41), (5, 41), (7, 1))  # more of them in odd rows: samples are not shared evenly
+
+
+def toy(rows: int = ROWS, unstable: Any = ()) -> ToyWorld:
+    return ToyWorld([nearness(0.6), nearness(-0.3, scale=1000.0)], rows=rows, unstable=unstable)
+
+
+def facts(learner: MTPPO) -> dict[str, torch.Tensor]:
+    """What one update decides."""
+    named = [*learner.policy.named_parameters("policy"), *learner.critic.named_parameters("critic")]
+    found = {name: p.detach().clone() for name, p in named} | {"learning rate": learner.learning_rate.clone()}
+    for name, stats in (("observations", learner.policy.observations.stats), ("returns", learner.return_stats)):
+        found |= {f"{name}.{key}": value.clone() for key, value in stats.state_dict().items()}
+    return found
+
+
+def in_precision(learner: MTPPO, dtype: torch.dtype) -> MTPPO:
+    """Casts the networks and the rollout; the running statistics are float64 anyway."""
+    learner.policy.actor.to(dtype), learner.critic.to(dtype)
+    for name, value in vars(learner.rollout).items():
+        if isinstance(value, torch.Tensor) and value.is_floating_point():
+            setattr(learner.rollout, name, value.to(dtype))
+    return learner
+
+
+def update(learner: MTPPO) -> dict[str, Any]:
+    batch, explained = learner._prepare()
+    losses = learner._update(batch)
+    learner.policy.observations.update(learner.rollout.obs)
+    lost = float((1.0 - batch.weights).sum())
+    return {"facts": facts(learner), "losses": losses, "explained": explained, "lost": lost}
+
+
+def one_update(rank: int, dtype: torch.dtype) -> Callable[[], dict[str, Any]]:
+    """An update on all rows in a process on its own; what is returned makes one on half of them in each of two."""
+    whole = MTPPO(toy(2 * ROWS, BROKEN), ONE_BATCH, seed=0)
+    first, _ = whole.world.reset(seed=0)
+    whole.policy.observations.update(first)
+    collect(whole.world, whole.rollout, first, whole._sample, whole._final_value, whole.episodes)
+    expected = update(in_precision(whole, dtype))
+
+    def in_two() -> dict[str, Any]:
+        half = in_precision(MTPPO(toy(), ONE_BATCH, seed=0), dtype)
+        half.policy.observations.update(first[rank::2])
+        for name, value in vars(whole.rollout).items():
+            if isinstance(value, torch.Tensor):
+                getattr(half.rollout, name).copy_(value[rank::2] if name == "last_obs" else value[:, rank::2])
+        return {"whole": expected, "half": update(half)}
+
+    return in_two
+
+
+class Notes:
+    def __init__(self, after: Any = lambda iteration: None):
+        self.metrics: list[dict[str, float]] = []
+        self.saved: list[tuple[int, dict[str, Any]]] = []
+        self.after = after
+
+    def log(self, metrics: dict[str, float], step: int) -> None:
+        self.metrics.append(metrics)
+        self.after(len(self.metrics))
+
+    def save(self, state: dict[str, Any], step: int) -> None:
+        self.saved.append((step, state))
+
+
+def make(rank: int) -> tuple[MTPPO, ToyWorld]:
+    world = toy(unstable=((2, 5), (3, 20), (3, 21)) if rank == 1 else ())
+    return MTPPO(world, CONFIG, seed=0), world
+
+
+def training(rank: int) -> dict[str, Any]:
+    """Four iterations at a stretch, and two and two with a checkpoint between."""
+    notes = Notes()
+    learner, world = make(rank)
+    train(learner, world, total_steps=4 * ITERATION, record=notes)
+    first, first_world = make(rank)
+    kept = Notes() if rank == 0 else None
+    train(first, first_world, total_steps=2 * ITERATION, record=kept)
+    [state] = distributed.share(kept.saved[-1][1] if kept else None)[:1]
+    again, again_world = make(rank)
+    assert state is not None
+    resume(again, again_world, state)
+    train(again, again_world, total_steps=4 * ITERATION, record=Notes())
+    ends = [{"learner": a.state_dict(), "env": w.state_dict()} for a, w in ((learner, world), (again, again_world))]
+    return {"metrics": notes.metrics, "saved": [step for step, _ in notes.saved], "whole": ends[0], "parts": ends[1]}
+
+
+def stopping(rank: int) -> tuple[bool, int, list[int]]:
+    """A signal to process 1 in the second iteration."""
+    learner, world = make(rank)
+    notes = Notes(lambda iteration: os.kill(os.getpid(), signal.SIGTERM) if (rank, iteration) == (1, 2) else None)
+    stopped = train(learner, world, total_steps=100 * ITERATION, record=notes)
+    return stopped, learner.env_steps, [step for step, _ in notes.saved]
+
+
+def bad_input(rank: int) -> str:
+    """What is raised where process 1 alone meets bad input."""
+
+    def work() -> int:
+        if rank == 1:
+            raise BidexError("no such thing")
+        return 5
+
+    try:
+        return str(distributed.together(work))
+    except (BidexError, SystemExit) as error:
+        return repr(error)
+
+
+def everything(rank: int) -> dict[str, Any]:
+    """One start of two processes for all tests, since importing torch takes longer than the rest."""
+    updates = {dtype: one_update(rank, dtype) for dtype in (torch.float64, torch.float32)}
+    distributed.init_from_environment()
+    found: dict[str, Any] = {dtype: in_two() for dtype, in_two in updates.items()}
+    found |= {"training": training(rank), "stopping": stopping(rank), "bad_input": bad_input(rank)}
+    found["seed"] = distributed.own_seed(7)
+    found["together"] = distributed.together(lambda: rank + 10)
+    return found
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
+    return in_two_processes(everything, tmp_path_factory.mktemp("ranks"))
+
+
+def same(a: Any, b: Any) -> bool:
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, list | tuple):
+        return len(a) == len(b) and all(map(same, a, b))
+    return torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
+
+
+def distances(update: dict[str, Any]) -> dict[str, float]:
+    """Relative distance, for each fact, of the update in two processes from that in one."""
+    whole, half = update["whole"]["facts"], update["half"]["facts"]
+    return {name: float((half[name] - whole[name]).norm() / whole[name].norm()) for name in whole}
+
+
+def test_an_update_of_two_processes_is_that_of_one_with_all_rows(found):
+    for here in found:
+        far = {name: d for name, d in distances(here[torch.float64]).items() if not d <= 1e-6}
+        assert far == {}
+
+
+def test_so_it_is_in_single_precision_up_to_its_rounding(found):
+    for here in found:
+        updates = (here[torch.float32][name]["facts"] for name in ("half", "whole"))
+        half, whole = (torch.cat([v.flatten() for k, v in u.items() if "." in k]).double() for u in updates)
+        assert (half - whole).norm() <= 1e-6 * whole.norm()
+
+
+def test_samples_of_the_two_were_uneven(found):
+    assert [here[torch.float64]["half"]["lost"] for here in found] == [1.0, 4.0]
+
+
+def test_statistics_and_losses_are_those_of_one_and_the_same_in_both(found):
+    a, b = (here[torch.float64] for here in found)
+    assert same(a["half"] | {"lost": 0}, b["half"] | {"lost": 0})
+    assert_close(a["half"]["losses"], a["whole"]["losses"])
+    assert_close(a["half"]["explained"], a["whole"]["explained"])
+
+
+def test_networks_stay_bit_equal_and_noise_differs(found):
+    a, b = (here["training"]["whole"]["learner"] for here in found)
+    own = MTPPO.per_process
+    assert same({k: v for k, v in a.items() if k not in own}, {k: v for k, v in b.items() if k not in own})
+    assert all(not same(a[name], b[name]) for name in own)
+    assert a["env_steps"] == 4 * ITERATION
+
+
+def test_metrics_are_those_of_all_processes(found):
+    a, b = (here["training"]["metrics"] for here in found)
+    assert [{k: v for k, v in m.items() if "Perf" not in k} for m in a] == [
+        {k: v for k, v in m.items() if "Perf" not in k} for m in b
+    ]
+    assert a[0]["Train/unstable"] == 3
+
+
+def test_a_resumed_run_equals_an_unbroken_one_in_each_process(found):
+    for here in found:
+        assert same(here["training"]["whole"], here["training"]["parts"])
+
+
+def test_the_first_iteration_and_the_last_are_saved_by_process_0_alone(found):
+    assert [here["training"]["saved"] for here in found] == [[ITERATION, 4 * ITERATION], []]
+
+
+def test_a_signal_to_one_stops_both_after_the_same_iteration(found):
+    assert found[0]["stopping"] == (True, 2 * ITERATION, [ITERATION, 2 * ITERATION])
+    assert found[1]["stopping"] == (True, 2 * ITERATION, [])
+
+
+def test_bad_input_in_one_ends_both_and_is_said_once(found):
+    assert [here["bad_input"] for here in found] == ["SystemExit(2)", "BidexError('no such thing')"]
+    assert [here["together"] for here in found] == [10, 11]
+
+
+def test_seeds_differ_and_the_first_process_keeps_the_runs_own(found):
+    assert found[0]["seed"] == 7
+    assert 0 <= found[1]["seed"] < 2**32 and found[1]["seed"] != 7
+
+
+def test_a_process_on_its_own_is_left_alone(monkeypatch):
+    for name in ("WORLD_SIZE", "MASTER_ADDR"):
+        monkeypatch.delenv(name, raising=False)
+    distributed.init_from_environment()
+    x = torch.randn(3)
+    assert (distributed.rank(), distributed.world_size(), distributed.is_main()) == (0, 1, True)
+    assert distributed.all_sum(x) is x
+    assert distributed.sum_gradients([], x) is x
+    assert distributed.share(5) == [5] and distributed.report_loss() == []
+    with pytest.raises(BidexError):
+        distributed.together(lambda: MTPPO(toy(1), replace(CONFIG, num_minibatches=999), seed=0))
+    distributed.shut_down()
+
+
+def test_a_checkpoint_of_more_processes_is_refused():
+    learner, world = make(0)
+    learner.iterate()
+    state = checkpoint(learner, world)
+    assert state is not None
+    with pytest.raises(BidexError, match="of 2 processes, but here are 1"):
+        resume(learner, world, {**state, "others": [state]})
