@@ -11,22 +11,23 @@ import tyro
 from bidex_meta.commands.parsing import StepCount, Switch, parse
 from bidex_meta.errors import BidexError, unknown_name
 
-_KINDS = ("world", "scaling", "mixing", "stability")
+_KINDS = ("world", "scaling", "mixing", "stability", "capacity")
 
 
 @dataclass(frozen=True)
 class BenchFlags:
-    """Measure the world: its speed against bare physics, over threads, against its classes alone, or its stability.
+    """Measure the world: its speed against bare physics, over threads, against its classes alone, its stability, or the room
+    its contacts need on a GPU.
 
     Example: bidex-meta bench world --suite MT4 --num-envs 1024 --json
     """
 
-    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="world|scaling|mixing|stability")]
-    """world, scaling, mixing or stability."""
+    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="world|scaling|mixing|stability|capacity")]
+    """world, scaling, mixing, stability or capacity."""
     suite: str | None = None
-    """Suite to measure: by default world and scaling take MT4, mixing MT20, stability every task class there is."""
+    """Suite to measure: by default world and scaling take MT4, mixing MT20, stability and capacity every class there is."""
     task: str | None = None
-    """For stability: this task class alone."""
+    """For stability and capacity: this task class alone."""
     num_envs: int | None = None
     """Rows stepped together; for this and the flags below None leaves the measurement its default."""
     steps: StepCount | None = None
