@@ -13,13 +13,14 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c const
 SOURCES := bidex_meta algos tests
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-all lint format clean
+.PHONY: help run test test-all test-parity lint format clean
 .DELETE_ON_ERROR:
 
 help:
 	@echo "make run       train MT-PPO on MT4 for STEPS=$(STEPS) environment steps and evaluate it"
 	@echo "make test      format, lint, types, tests (what CI runs)"
 	@echo "make test-all  the same with the slow tests"
+	@echo "make test-parity  compare both engines on every class (what CI runs too)"
 	@echo "make format    format the code and mend what ruff can mend"
 	@echo "make clean     remove .venv, caches and built files (never runs/)"
 
@@ -31,6 +32,9 @@ test: lint
 
 test-all: lint
 	$(BIN)/python -m pytest -q -n 2 -m "slow or not slow"
+
+test-parity: .venv/.installed-dev
+	$(BIN)/python -m pytest -q -n 2 -m parity
 
 lint: .venv/.installed-dev
 	$(BIN)/ruff format --check $(SOURCES)

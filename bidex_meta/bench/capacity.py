@@ -11,7 +11,7 @@ from bidex_meta.benchmark import make_task_world
 from bidex_meta.world import World
 
 _QUANTILES = {"median": 0.5, "q999": 0.999, "q9999": 0.9999, "max": 1.0}
-_SAMPLES_PER_STEP = 8
+_SAMPLES_PER_STEP = 32
 
 
 def capacity(
@@ -25,7 +25,7 @@ def capacity(
     """How many contacts and constraint rows a simulation has under rough actions (those of ``stability``).
 
     Contacts and rows are counted by C MuJoCo after every step of every row, candidate pairs of the broadphase and pairs
-    of the convex collider by mujoco_warp on a sample of 8 rows a step.
+    of the convex collider by mujoco_warp on a sample of 32 rows a step.
 
     Args:
         suite: Measure the classes of this suite.
@@ -55,7 +55,9 @@ def _capacity(made: World, steps: int, seed: int) -> dict[str, Any]:
     made.reset(seed=seed)
     engine = made.parts[0].group.engine
     probe = WarpEngine([engine.model(0)], [0], capacity=Capacity(contacts=2048, convex=512, rows=2048))
-    counts = {name: torch.from_numpy(engine.batch.bind(field)) for name, field in (("contacts", "ncon"), ("rows", "nefc"))}
+    counts = {
+        name: torch.from_numpy(engine.batch.bind(field)) for name, field in (("contacts", "ncon"), ("rows", "nefc"))
+    }
     found: dict[str, list[Tensor]] = {name: [] for name in (*counts, "candidates", "convex")}
     held, left = torch.zeros(made.num_envs, made.action_size), torch.zeros(made.num_envs, dtype=torch.int64)
     for _ in range(math.ceil(steps / made.num_envs)):

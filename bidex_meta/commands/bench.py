@@ -16,8 +16,7 @@ _KINDS = ("world", "scaling", "mixing", "stability", "capacity")
 
 @dataclass(frozen=True)
 class BenchFlags:
-    """Measure the world: its speed against bare physics, over threads, against its classes alone, its stability, or the room
-    its contacts need on a GPU.
+    """Measure the world: speed against bare physics, over threads, against its classes alone; stability; contacts.
 
     Example: bidex-meta bench world --suite MT4 --num-envs 1024 --json
     """
@@ -25,7 +24,7 @@ class BenchFlags:
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="world|scaling|mixing|stability|capacity")]
     """world, scaling, mixing, stability or capacity."""
     suite: str | None = None
-    """Suite to measure: by default world and scaling take MT4, mixing MT20, stability and capacity every class there is."""
+    """Suite to measure: by default world and scaling take MT4, mixing MT20, the others every task class there is."""
     task: str | None = None
     """For stability and capacity: this task class alone."""
     num_envs: int | None = None

@@ -1,4 +1,10 @@
-"""The Warp engine's own kernels: health and starts. One thread a world, or a number of a world."""
+"""The Warp engine's own kernels: health and starts. One thread a world, or a number of a world.
+
+Warp compiles them. Its ``and`` evaluates both sides, so bounds are tested by nested ``if``s.
+"""
+# pyright: reportIndexIssue=false, reportAttributeAccessIssue=false, reportOperatorIssue=false
+# pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
+# ruff: noqa: SIM102, UP018
 
 import warp as wp
 

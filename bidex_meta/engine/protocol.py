@@ -41,7 +41,10 @@ class Engine(Protocol):
         ...
 
     def unstable(self) -> Tensor:
-        """Which simulations broke (bad numbers or non-finite values) since their last reset. Shape (num,), bool."""
+        """Which simulations broke (bad numbers, non-finite values, no room for contacts) since their last reset.
+
+        Shape (num,), bool.
+        """
         ...
 
     def reset(self, mask: Tensor, start: Tensor) -> None:
@@ -49,8 +52,10 @@ class Engine(Protocol):
 
         Args:
             mask: Which simulations, shape (num,), bool.
-            start: Their start positions, shape (k, nq + 7 nmocap): ``qpos``, then position and quaternion (w, x, y, z)
-                of each fixture that may stand elsewhere from task to task; one row for each true entry on a CPU engine.
+            start: Start positions: ``qpos``, then position and quaternion (w, x, y, z) of each fixture that may stand
+                elsewhere from task to task. On the C engine one row for each true entry, shape (k, nq + 7 nmocap); on
+                the Warp engine, which must not count them, a row for every simulation, shape (num, nq + 7 nmocap), and
+                those outside the mask are ignored.
         """
         ...
 

@@ -38,8 +38,8 @@ _SENSOR_NAMES = (
     "FORCE TORQUE TOUCH"
 )
 _SENSORS = [int(getattr(mujoco.mjtSensor, f"mjSENS_{name}")) for name in _SENSOR_NAMES.split()]
-# With C's 1e-6, normals of an egg's contacts were up to 5e-3 rad off those of C (99th percentile); with this 1.5e-3; with
-# 1e-10 some contacts were lost.
+# Normals of an egg's contacts were off those of C by 5e-3 rad (99th percentile) with C's 1e-6, by 1.5e-3 with this one;
+# with 1e-10 some contacts were lost.
 _CCD_TOLERANCE = 1e-8
 _NO_SENSORS = int(mjw.DisableBit.SENSOR)
 
@@ -49,6 +49,9 @@ class WarpEngine:
 
     ``step`` and ``reset`` replay graphs and never wait for the device. Graphs hold pointers: write into arrays in
     place, and call ``recapture`` after changing the model otherwise.
+
+    On CUDA the graphs run on a stream of the engine's own, between what was given to torch's current stream before and
+    after the call: engines that are stepped under different torch streams overlap.
 
     A world with a bad number is told by ``unstable`` and stands at the model's reference pose until its reset: left
     alone, its NaNs would pass every broadphase test and take the room that its neighbours' contacts need.
@@ -74,14 +77,18 @@ class WarpEngine:
         self._models, self._rows = list(models), list(rows)
         self._device = wp.get_device(str(self.device))
         self._stream = wp.Stream(self._device) if self._device.is_cuda else None
+        self._lent = wp.stream_to_torch(self._stream) if self._stream is not None else None
         self._graphs: dict[str, Callable[[], None]] = {}
         with self._on_device():
             self._put(capacity or capacity_of(models))
             self._bind()
             self._substeps = 1
-            for work in (self._begin, self._advance, self._refresh):  # compiles: a capture must not
+            for work in (self._advance, self._begin):  # compiles all kernels, which a capture must not do
                 work()
-        self.reset(torch.ones(self.num, dtype=torch.bool), self.placement())
+        self._mask_view.fill_(True)
+        with self._on_device():
+            mjw.reset_data(self._m, self._d, reset=self._mask)
+        self._failed_view.zero_()
 
     def _put(self, capacity: Capacity) -> None:
         """Allocates model and data on the device."""
@@ -100,7 +107,7 @@ class WarpEngine:
         _put_static_frames(self._d, self._models, self._rows)
         d = self._d
         self._failed = wp.zeros(self.num, dtype=bool)
-        self._mask = wp.ones(self.num, dtype=bool)
+        self._mask = wp.zeros(self.num, dtype=bool)
         self._start = wp.zeros((self.num, d.qpos.shape[1] + 7 * d.mocap_pos.shape[1]), dtype=float)
 
     def _bind(self) -> None:
@@ -162,8 +169,10 @@ class WarpEngine:
         return {name: value.clone() for name, value in self._state.items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Puts back what ``state_dict`` gave, of this engine or the C one, and refreshes position and velocity sensors."""
-        self.reset(torch.ones(self.num, dtype=torch.bool), self.placement().nan_to_num())
+        """Puts back what ``state_dict`` gave, here or of the C engine, and refreshes position and velocity sensors."""
+        self._mask_view.fill_(True)
+        self._play("reset", self._begin)
+        self._failed_view.zero_()
         for name, value in state.items():
             self._state[name].copy_(value.reshape(self._state[name].shape))
         self._play("refresh", self._refresh)
@@ -193,10 +202,12 @@ class WarpEngine:
     def demand(self) -> tuple[int, int]:
         """Candidate pairs, and contacts that the convex collider found, of the state as it stands, over all worlds."""
         self._play("position", lambda: mjw.fwd_position(self._m, self._d, factorize=False))
-        contacts = int(self._d.nacon.numpy()[0])
-        kinds = self._models[0].geom_type[self._d.contact.geom.numpy()[:contacts]]
-        round_ones = (kinds == mujoco.mjtGeom.mjGEOM_ELLIPSOID).any(axis=1) & (kinds != mujoco.mjtGeom.mjGEOM_PLANE).all(axis=1)
-        return int(self._d.ncollision.numpy()[0]), int(round_ones.sum())
+        d = self._d
+        candidates, contacts, geoms = (wp.to_torch(x).cpu() for x in (d.ncollision, d.nacon, d.contact.geom))
+        kinds = self._models[0].geom_type[geoms[: int(contacts[0])].numpy()]
+        convex = (kinds == mujoco.mjtGeom.mjGEOM_ELLIPSOID).any(axis=1)
+        convex &= (kinds != mujoco.mjtGeom.mjGEOM_PLANE).all(axis=1)
+        return int(candidates[0]), int(convex.sum())
 
     # What the graphs hold.
 
@@ -269,20 +280,22 @@ class WarpEngine:
             return work
         with _no_garbage_collection(), wp.ScopedCapture(device=self._device, stream=self._stream) as capture:
             work()
-        return lambda: wp.capture_launch(capture.graph, stream=self._stream)
+        graph = capture.graph
+        assert graph is not None
+        return lambda: wp.capture_launch(graph, stream=self._stream)
 
     @contextmanager
     def _on_device(self) -> Iterator[None]:
         """Warp allocates and launches on the engine's stream, which waits for torch's, and torch's for it."""
-        if self._stream is None:
+        if self._lent is None:
             with wp.ScopedDevice(self._device):
                 yield
             return
-        ours, theirs = wp.stream_to_torch(self._stream), torch.cuda.current_stream(self.device)
-        ours.wait_stream(theirs)
+        theirs = torch.cuda.current_stream(self.device)
+        self._lent.wait_stream(theirs)
         with wp.ScopedStream(self._stream, sync_enter=False):
             yield
-        theirs.wait_stream(ours)
+        theirs.wait_stream(self._lent)
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from bidex_meta.engine.cpu import CpuEngine
 from bidex_meta.engine.warp import WarpEngine
+from bidex_meta.hands.pair import SIDES
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.world import World
@@ -32,6 +33,7 @@ GROUPS = (
 )
 """The classes of MT20 by equal structure."""
 ROWS, STEPS = 8, 40
+_NOISE = 1e-3
 _VELOCITY_SCALE = 0.2
 _KINDS = {
     "position": ("JOINTPOS", "FRAMEPOS"),
@@ -55,8 +57,16 @@ class Pair:
     warp: WarpEngine
     task_index: Tensor
     kinds: dict[str, Tensor] = field(init=False)
+    start: Tensor = field(init=False)
 
     def __post_init__(self) -> None:
+        self.start = self.c.placement()
+        # In starts, neighbouring fingers may stand at the very margin of their contact: moved by 1e-9 rad, C itself
+        # finds the contact or not, and after one step velocities differ by 5 %. So no start is left on that edge.
+        noise = torch.rand(self.start.shape, generator=torch.Generator().manual_seed(0), dtype=self.start.dtype)
+        for side in SIDES:
+            joints = self.part.group.members[0].scene.qpos[f"{side}/joints"]
+            self.start[:, joints] += _NOISE * noise[:, joints]
         model = self.part.group.members[0].scene.model
         self.kinds = {kind: torch.tensor(_addresses(model, names)) for kind, names in _KINDS.items()}
 
@@ -75,16 +85,18 @@ class Pair:
         self.warp.step(self.part.substeps)
 
     def restart(self) -> None:
-        """Puts the Warp engine where the C engine starts."""
+        """Puts both engines where the episodes start."""
         everyone = torch.ones(self.c.num, dtype=torch.bool)
-        self.c.reset(everyone, self.c.placement())
-        self.warp.reset(everyone, self.c.placement())
+        self.c.reset(everyone, self.start)
+        self.warp.reset(everyone, self.start)
 
     def apart(self) -> dict[str, Tensor]:
-        """Absolute differences by kind, each (num, k): metres and radians, quaternions up to their sign, velocities
-        times 0.2, forces in N and N m relative to those above 1, rewards relative to those above 1.
-        """  # noqa: D205
-        ours, theirs = self.warp.sensordata.double(), self.c.sensordata
+        """Absolute differences by kind, each (num, k).
+
+        In metres and radians, quaternions up to their sign, velocities times 0.2, forces (N, N m) and rewards relative
+        to those above 1.
+        """
+        ours, theirs = self.warp.sensordata.double().cpu(), self.c.sensordata
         found = {kind: (ours[:, at] - theirs[:, at]).abs() for kind, at in self.kinds.items()}
         at = self.kinds["quaternion"]
         found["quaternion"] = torch.minimum(found["quaternion"], (ours[:, at] + theirs[:, at]).abs())
@@ -104,14 +116,14 @@ class Pair:
         return reward
 
 
-def pair(names: tuple[str, ...], rows: int = ROWS, **options) -> Pair:
-    """Both engines at the same fresh starts of the classes' tasks."""
+def pair(names: tuple[str, ...], rows: int = ROWS, device: str = "cpu") -> Pair:
+    """Both engines at the same fresh starts of the classes' tasks; the Warp engine on the given device."""
     world = World([slot(registry.get(name, True)) for name in names], rows, autoreset_mode="DISABLED", threads=1)
     world.reset(seed=0)
     (part,) = world.parts
     models = list({id(m.scene.model): m.scene.model for m in part.group.members}.values())
     of_row = [i for i, m in enumerate(part.group.members) for _ in range(m.engine_rows.start, m.engine_rows.stop)]
-    both = Pair(part, WarpEngine(models, of_row, **options), part.group.take(world.task_index))
+    both = Pair(part, WarpEngine(models, of_row, device), part.group.take(world.task_index))
     both.restart()
     return both
 
