@@ -205,8 +205,8 @@ class WarpEngine:
         d = self._d
         candidates, contacts, geoms = (wp.to_torch(x).cpu() for x in (d.ncollision, d.nacon, d.contact.geom))
         kinds = self._models[0].geom_type[geoms[: int(contacts[0])].numpy()]
-        convex = (kinds == mujoco.mjtGeom.mjGEOM_ELLIPSOID).any(axis=1)
-        convex &= (kinds != mujoco.mjtGeom.mjGEOM_PLANE).all(axis=1)
+        round_ones = (mujoco.mjtGeom.mjGEOM_ELLIPSOID, mujoco.mjtGeom.mjGEOM_CYLINDER)
+        convex = np.isin(kinds, round_ones).any(axis=1) & (kinds != mujoco.mjtGeom.mjGEOM_PLANE).all(axis=1)
         return int(candidates[0]), int(convex.sum())
 
     # What the graphs hold.
