@@ -28,10 +28,10 @@ run: .venv/.installed
 	$(BIN)/bidex-meta run --suite MT4 --algo mtppo --steps $(STEPS)
 
 test: lint
-	$(BIN)/python -m pytest -q -n 2
+	$(BIN)/python -m pytest -q -n 2 --dist loadgroup
 
 test-all: lint
-	$(BIN)/python -m pytest -q -n 2 -m "slow or not slow"
+	$(BIN)/python -m pytest -q -n 2 --dist loadgroup -m "slow or not slow"
 
 test-parity: .venv/.installed-dev
 	$(BIN)/python -m pytest -q -n 2 -m parity

@@ -74,6 +74,18 @@ def test_bench_stability_counts_what_it_saw() -> None:
     assert json.loads(json.dumps(found)) == found
 
 
+@pytest.mark.timeout(900)  # a cold cache of Warp kernels compiles for a minute and more
+@pytest.mark.xdist_group("warp")
+def test_bench_capacity_counts_what_c_and_the_warp_engine_see() -> None:
+    (result,) = bench.capacity(task="CatchUnderarm", steps=24, num_envs=8, threads=1).values()
+    assert [result[name]["samples"] for name in ("contacts", "rows", "candidates", "convex")] == [24, 24, 96, 96]
+    for counts in result.values():
+        assert 0 <= counts["median"] <= counts["q999"] <= counts["q9999"] <= counts["max"]
+    assert 0 < result["contacts"]["max"] <= result["candidates"]["max"] < 60
+    assert result["contacts"]["max"] <= result["rows"]["max"]
+    assert json.loads(json.dumps(result)) == result
+
+
 def test_stability_of_a_suite_takes_its_classes_of_both_splits_and_that_of_nothing_all() -> None:
     found = bench.stability("ML4", steps=2, num_envs=2, threads=1)
     assert list(found) == ["CatchUnderarm", "HandOver", "CatchAbreast", "TwoCatchUnderarm"]

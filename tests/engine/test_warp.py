@@ -17,7 +17,8 @@ from tests.tasks.worlds import Lens
 
 SUBSTEPS, ROWS = 2, 4
 NAMES = ("HandOver", "CatchUnderarm", "CatchOver2Underarm", "CatchAbreast")
-pytestmark = pytest.mark.timeout(900)  # a cold cache compiles for two minutes and more
+# A cold cache compiles for a minute and more, and one test process shall do it, not all (--dist loadgroup).
+pytestmark = [pytest.mark.timeout(900), pytest.mark.xdist_group("warp")]
 
 
 @pytest.fixture(scope="module")

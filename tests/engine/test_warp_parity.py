@@ -18,15 +18,13 @@ FREE = {"position": 1e-3, "quaternion": 1e-3, "velocity": 1e-2, "reward": 1e-2, 
 above 1 N or N m."""
 WIDER = {
     # Two eggs roll on fingers from the start; an egg's contact normals differ by 1e-4 to 1e-3 rad in single precision.
-    "TwoCatchUnderarm": {"quaternion": 1e-2, "velocity": 3e-2},
-    # In nominal starts neighbouring fingers stand at the very margin of their contacts: there or not, by rounding.
-    "BottleCap": {"quaternion": 3e-3, "first force": 3e-3},
+    "TwoCatchUnderarm": {"position": 4e-3, "quaternion": 2e-2, "velocity": 6e-2},
     # Falling cubes meet fingers; the reward is steep where an angle is small (C rounded to single precision: 7e-3).
-    "ReOrientation": {"quaternion": 3e-3, "reward": 0.12},
+    "ReOrientation": {"quaternion": 2e-3, "reward": 6e-2},
 }
-"""Bars that chaos breaks, at twice what was measured: 5e-3 and 1.5e-2, 1.3e-3 and 1.5e-3, 1.1e-3 and 6e-2."""
-RESYNCHRONISED = {"position": 2e-6, "quaternion": 2e-5, "velocity": 2e-4, "force": 1e-4, "reward": 1e-5}
-"""95th percentiles where every step starts from the state of C; the largest measured were a quarter of them."""
+"""Bars that chaos breaks, at twice what was measured."""
+RESYNCHRONISED = {"position": 2e-6, "quaternion": 2e-5, "velocity": 2e-4, "force": 5e-5, "reward": 1e-5}
+"""95th percentiles where every step starts from the state of C, at five times the largest that was measured."""
 
 
 def over(apart: dict[str, Tensor], bars: dict[str, float]) -> dict[str, float]:
@@ -41,7 +39,8 @@ def marks(names: tuple[str, ...], device: str) -> list[pytest.MarkDecorator]:
     return [] if set(names) & set(ALWAYS) else [pytest.mark.parity]
 
 
-@pytest.mark.timeout(900)  # a cold cache compiles for two minutes and more
+@pytest.mark.timeout(900)  # a cold cache compiles for a minute and more
+@pytest.mark.xdist_group("warp")
 @pytest.mark.parametrize(
     "names, device",
     [
