@@ -62,7 +62,7 @@ class Pair:
     def __post_init__(self) -> None:
         self.start = self.c.placement()
         # In starts, neighbouring fingers may stand at the very margin of their contact: moved by 1e-9 rad, C itself
-        # finds the contact or not, and after one step velocities differ by 0.19 rad/s. So no start is left on that edge.
+        # finds the contact or not and differs by 0.19 rad/s after one step. So no start is left on that edge.
         noise = torch.rand(self.start.shape, generator=torch.Generator().manual_seed(0), dtype=self.start.dtype)
         for side in SIDES:
             joints = self.part.group.members[0].scene.qpos[f"{side}/joints"]
