@@ -13,13 +13,14 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c const
 SOURCES := bidex_meta algos tests
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-all bench-gpu-compile bench-gpu-sweep bench-gpu-train lint format clean
+.PHONY: help run test test-all test-parity bench-gpu-compile bench-gpu-sweep bench-gpu-train lint format clean
 .DELETE_ON_ERROR:
 
 help:
 	@echo "make run       train MT-PPO on MT4 for STEPS=$(STEPS) environment steps and evaluate it"
 	@echo "make test      format, lint, types, tests (what CI runs)"
 	@echo "make test-all  the same with the slow tests"
+	@echo "make test-parity  compare both engines on every class (what CI runs too)"
 	@echo "make format    format the code and mend what ruff can mend"
 	@echo "make bench-gpu-compile, bench-gpu-sweep, bench-gpu-train  measure a GPU (docs/gpu.md)"
 	@echo "make clean     remove .venv, caches and built files (never runs/)"
@@ -28,10 +29,13 @@ run: .venv/.installed
 	$(BIN)/bidex-meta run --suite MT4 --algo mtppo --steps $(STEPS)
 
 test: lint
-	$(BIN)/python -m pytest -q -n 2
+	$(BIN)/python -m pytest -q -n 2 --dist loadgroup
 
 test-all: lint
-	$(BIN)/python -m pytest -q -n 2 -m "slow or not slow"
+	$(BIN)/python -m pytest -q -n 2 --dist loadgroup -m "slow or not slow"
+
+test-parity: .venv/.installed-dev
+	$(BIN)/python -m pytest -q -n 2 -m parity
 
 # What to measure on a GPU; each target goes on where it stopped. On a machine that has the packages already, name its
 # interpreter: make bench-gpu-sweep CLI="python3 -m bidex_meta.cli".

@@ -74,6 +74,18 @@ def test_bench_stability_counts_what_it_saw() -> None:
     assert json.loads(json.dumps(found)) == found
 
 
+@pytest.mark.timeout(900)  # a cold cache of Warp kernels compiles for a minute and more
+@pytest.mark.xdist_group("warp")
+def test_bench_capacity_counts_what_c_and_the_warp_engine_see() -> None:
+    (result,) = bench.capacity(task="CatchUnderarm", steps=24, num_envs=8, threads=1).values()
+    assert [result[name]["samples"] for name in ("contacts", "rows", "candidates", "convex")] == [24, 24, 96, 96]
+    for counts in result.values():
+        assert 0 <= counts["median"] <= counts["q999"] <= counts["q9999"] <= counts["max"]
+    assert 0 < result["contacts"]["max"] <= result["candidates"]["max"] < 60
+    assert result["contacts"]["max"] <= result["rows"]["max"]
+    assert json.loads(json.dumps(result)) == result
+
+
 def test_stability_of_a_suite_takes_its_classes_of_both_splits_and_that_of_nothing_all() -> None:
     found = bench.stability("ML4", steps=2, num_envs=2, threads=1)
     assert list(found) == ["CatchUnderarm", "HandOver", "CatchAbreast", "TwoCatchUnderarm"]
@@ -82,14 +94,14 @@ def test_stability_of_a_suite_takes_its_classes_of_both_splits_and_that_of_nothi
 
 
 def test_stability_does_not_hold_when_physics_breaks(monkeypatch: pytest.MonkeyPatch) -> None:
-    rough = physics._rough_actions
+    rough = physics.rough_actions
 
     def broken(*given: torch.Tensor) -> torch.Tensor:
         action = rough(*given)  # type: ignore[arg-type]
         action[0, 0] = math.nan
         return action
 
-    monkeypatch.setattr(physics, "_rough_actions", broken)
+    monkeypatch.setattr(physics, "rough_actions", broken)
     result = bench.stability(task="CatchUnderarm", steps=16, num_envs=4, threads=1)["CatchUnderarm"]
     assert result["unstable"] == 4 and result["holds"] is False
 
@@ -97,7 +109,7 @@ def test_stability_does_not_hold_when_physics_breaks(monkeypatch: pytest.MonkeyP
 def test_rough_actions_are_half_uniform_half_held_extremes() -> None:
     generator = torch.Generator().manual_seed(0)
     held, left = torch.zeros(200, 5), torch.zeros(200, dtype=torch.int64)
-    actions = torch.stack([physics._rough_actions(held, left, generator).clone() for _ in range(120)])
+    actions = torch.stack([physics.rough_actions(held, left, generator).clone() for _ in range(120)])
     uniform, extreme = actions[:, :100], actions[:, 100:]
     assert abs(float(uniform.mean())) < 0.02 and abs(float(uniform.std()) - 3**-0.5) < 0.01
     assert (uniform[1:] != uniform[:-1]).any(dim=2).all()

@@ -48,7 +48,7 @@ def stability(
         the 99.9 % quantile of depth (m), and whether all bars hold.
     """
     result = {}
-    for name, moving in _variants(suite, task):
+    for name, moving in variants(suite, task):
         # Rows that end are reset by hand, so that the step that ended them is measured too.
         made = make_task_world(
             name,
@@ -64,7 +64,7 @@ def stability(
     return result
 
 
-def _variants(suite: str | None, task: str | None) -> list[tuple[str, bool]]:
+def variants(suite: str | None, task: str | None) -> list[tuple[str, bool]]:
     """Names of the classes to test, each with whether its base moves."""
     if suite is not None and task is None:
         benchmark = Benchmark(suite)
@@ -84,7 +84,7 @@ def _stability(made: World, steps: int, seed: int) -> dict[str, Any]:
     fastest, depths = 0.0, []
     control_steps = math.ceil(steps / made.num_envs)
     for _ in range(control_steps):
-        info = made.step(_rough_actions(held, left, generator))[-1]
+        info = made.step(rough_actions(held, left, generator))[-1]
         unstable += int(info["unstable"].sum())
         warnings += int(engine.warnings().sum())
         fastest = max(fastest, max(float(engine.sensordata[:, w].norm(dim=1).max()) for w in velocities))
@@ -110,7 +110,7 @@ def _is_speed(sensor: str) -> bool:
     return sensor.endswith("/linear_velocity")
 
 
-def _rough_actions(held: Tensor, left: Tensor, generator: torch.Generator) -> Tensor:
+def rough_actions(held: Tensor, left: Tensor, generator: torch.Generator) -> Tensor:
     """Uniform actions in the first half of the rows, held extremes in the second; both buffers are updated in place."""
     num, size = held.shape
     half = num // 2

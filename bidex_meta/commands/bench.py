@@ -12,7 +12,7 @@ import tyro
 from bidex_meta.commands.parsing import StepCount, Switch, parse
 from bidex_meta.errors import BidexError, unknown_name
 
-_KINDS = ("world", "scaling", "mixing", "stability", "gpu", "kernels")
+_KINDS = ("world", "scaling", "mixing", "stability", "capacity", "gpu", "kernels")
 
 
 @dataclass(frozen=True)
@@ -23,11 +23,11 @@ class BenchFlags:
     """
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="|".join(_KINDS))]
-    """world, scaling, mixing, stability, gpu or kernels."""
+    """world, scaling, mixing, stability, capacity, gpu or kernels."""
     suite: str | None = None
-    """Suite to measure: by default world and scaling take MT4, mixing, gpu and kernels MT20, stability every class."""
+    """Suite to measure: by default world and scaling take MT4, mixing, gpu and kernels MT20, the others every class."""
     task: str | None = None
-    """For stability: this task class alone."""
+    """For stability and capacity: this task class alone."""
     tasks: tuple[str, ...] | None = None
     """For gpu: the classes to step alone, beside the suite."""
     sizes: tuple[int, ...] | None = None

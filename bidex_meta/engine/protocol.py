@@ -46,7 +46,10 @@ class Engine(Protocol):
         ...
 
     def unstable(self) -> Tensor:
-        """Which simulations broke (bad numbers or non-finite values) since their last reset. Shape (num,), bool."""
+        """Which simulations broke (bad numbers, non-finite values, no room for contacts) since their last reset.
+
+        Shape (num,), bool.
+        """
         ...
 
     def warnings(self) -> Tensor:
@@ -58,9 +61,10 @@ class Engine(Protocol):
 
         Args:
             mask: Which simulations, shape (num,), bool.
-            start: Their start positions, shape (k, nq + 7 nmocap): ``qpos``, then position and quaternion (w, x, y, z)
-                of each fixture that may stand elsewhere from task to task; one row for each true entry, or, where the
-                engine is ``masked``, one for every simulation.
+            start: Start positions: ``qpos``, then position and quaternion (w, x, y, z) of each fixture that may stand
+                elsewhere from task to task. One row for each true entry, shape (k, nq + 7 nmocap); where the engine is
+                ``masked`` and must not count them one for every simulation, shape (num, nq + 7 nmocap), of which those
+                outside the mask are ignored.
         """
         ...
 

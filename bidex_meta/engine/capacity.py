@@ -1,0 +1,66 @@
+"""Room for contacts and constraints, which mujoco_warp allocates once and for all."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+
+
+@dataclass(frozen=True)
+class Capacity:
+    """Room per world.
+
+    Attributes:
+        contacts: Candidate pairs of the broadphase, and contacts; all worlds share one pool of so many each.
+        convex: Pairs of a kind that the convex collider (eggs, cylinders) takes on at a time; one pool too.
+        rows: Constraint rows, a hard limit for each world.
+    """
+
+    contacts: int
+    convex: int
+    rows: int
+
+
+_MEASURED = {
+    "HandOver": (30, 8, 48),
+    "CatchUnderarm": (29, 6, 55),
+    "CatchOver2Underarm": (19, 4, 31),
+    "TwoCatchUnderarm": (45, 9, 65),
+    "CatchAbreast": (25, 4, 44),
+    "LiftUnderarm": (31, 3, 71),
+    "DoorOpenOutward": (39, 0, 104),
+    "DoorOpenInward": (43, 0, 67),
+    "DoorCloseOutward": (35, 0, 56),
+    "DoorCloseInward": (48, 0, 52),
+    "BottleCap": (34, 4, 78),
+    "PushBlock": (36, 0, 80),
+    "SwingCup": (32, 4, 77),
+    "OpenScissors": (69, 0, 179),
+    "ReOrientation": (27, 0, 57),
+    "OpenPenCap": (49, 0, 101),
+    "Switch": (36, 0, 65),
+    "StackBlock": (39, 0, 95),
+    "PourWater": (74, 16, 168),
+    "GraspAndPlace": (42, 0, 116),
+}
+"""The most seen, by class: candidate pairs or contacts; contacts of eggs and cylinders; rows.
+
+From ``bidex-meta bench capacity --steps 30000``: contacts and rows of 30,208 states under rough actions (half uniform,
+half held at +-1), the other two in 3,776 of them (5,024 for the cylinders of pot, bottle, cup and kettle). Medians of
+rows lie between 9 and 103.
+"""
+_HEADROOM = 1.5
+"""A trained policy holds what rough actions only brush against, and room is cheap: 0.10 to 0.18 MB a world in all."""
+
+
+def capacity_of(models: Sequence[mujoco.MjModel]) -> Capacity:
+    """Room for models of the task classes, found by the models' names; an unknown name gets the largest room of all."""
+    names = [model.names.split(b"\0", 1)[0].decode() for model in models]
+    measured = [_MEASURED[name] for name in names] if set(names) <= set(_MEASURED) else list(_MEASURED.values())
+    contacts, convex, rows = (_HEADROOM * max(column) for column in zip(*measured, strict=True))
+    return Capacity(_up(contacts, 16), max(2, math.ceil(convex)), _up(rows, 16))
+
+
+def _up(value: float, multiple: int) -> int:
+    return multiple * math.ceil(value / multiple)

@@ -1,0 +1,78 @@
+"""The Warp engine's own kernels: health and starts. One thread a world, or a number of a world.
+
+Warp compiles them. Its ``and`` evaluates both sides, so bounds are tested by nested ``if``s.
+"""
+# pyright: reportIndexIssue=false, reportAttributeAccessIssue=false, reportOperatorIssue=false
+# pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
+# ruff: noqa: SIM102, UP018
+
+import warp as wp
+
+
+@wp.kernel(enable_backward=False)
+def watch(
+    qpos: wp.array2d[float],
+    qvel: wp.array2d[float],
+    qacc: wp.array2d[float],
+    limit: float,
+    failed: wp.array[bool],
+):
+    """Marks worlds with a number that is not finite or beyond the limit (a comparison with NaN is false)."""
+    world, i = wp.tid()
+    if not (wp.abs(qpos[world, i]) <= limit):
+        failed[world] = True
+    if i < qvel.shape[1]:
+        if not (wp.abs(qvel[world, i]) <= limit and wp.abs(qacc[world, i]) <= limit):
+            failed[world] = True
+
+
+@wp.kernel(enable_backward=False)
+def quarantine(
+    failed: wp.array[bool],
+    qpos0: wp.array2d[float],
+    qpos: wp.array2d[float],
+    qvel: wp.array2d[float],
+    warmstart: wp.array2d[float],
+):
+    """Puts failed worlds at rest at the reference pose."""
+    world, i = wp.tid()
+    if failed[world]:
+        qpos[world, i] = qpos0[world % qpos0.shape[0], i]
+        if i < qvel.shape[1]:
+            qvel[world, i] = 0.0
+            warmstart[world, i] = 0.0
+
+
+@wp.kernel(enable_backward=False)
+def place(
+    mask: wp.array[bool],
+    start: wp.array2d[float],
+    limit: float,
+    qpos: wp.array2d[float],
+    mocap_pos: wp.array2d[wp.vec3],
+    mocap_quat: wp.array2d[wp.quat],
+    failed: wp.array[bool],
+):
+    """Writes starts where the mask is true: ``qpos``, then position and quaternion of each mocap body.
+
+    A start with a bad number is not written: its world stays at the reference pose and counts as failed.
+    """
+    world = wp.tid()
+    if not mask[world]:
+        return
+    bad = bool(False)
+    for i in range(start.shape[1]):
+        bad = bad or not (wp.abs(start[world, i]) <= limit)
+    failed[world] = bad
+    if bad:
+        return
+    nq = qpos.shape[1]
+    for i in range(nq):
+        qpos[world, i] = start[world, i]
+    for i in range(mocap_pos.shape[1]):
+        k = nq + 7 * i
+        mocap_pos[world, i] = wp.vec3(start[world, k], start[world, k + 1], start[world, k + 2])
+        # Four numbers in MuJoCo's order, w first, whatever Warp calls them.
+        mocap_quat[world, i] = wp.quat(
+            start[world, k + 3], start[world, k + 4], start[world, k + 5], start[world, k + 6]
+        )

@@ -1,0 +1,358 @@
+"""MuJoCo on an accelerator: mujoco_warp, all substeps of a control step in one captured graph.
+
+The same code runs on the Warp CPU device, where tests compare it with C MuJoCo. What differs from the C engine on
+purpose: single precision, sparse constraint Jacobians (mujoco_warp refuses dense ones above 60 degrees of freedom), a
+solver tolerance of 1e-6 (its least), and fixed room for contacts (``capacity.py``).
+"""
+
+import copy
+import dataclasses
+import gc
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import torch
+import warp as wp
+from torch import Tensor
+
+from bidex_meta.engine import kernels
+from bidex_meta.engine.capacity import Capacity, capacity_of
+
+# What a simulation carries from one step to the next; the fields that a model has none of are skipped.
+_STATE_FIELDS = (
+    "time qpos qvel act history qacc_warmstart ctrl qfrc_applied xfrc_applied eq_active mocap_pos mocap_quat userdata"
+)
+_STATE = tuple(_STATE_FIELDS.split())
+# What a step changes and later steps or readers see.
+_STEPPED = ("time", "qpos", "qvel", "act", "history", "qacc_warmstart", "sensordata", "overflow")
+# Bits of a world whose contacts or constraints were dropped. Meeting an iteration limit is no fault: C stops there too.
+_LOST_NAMES = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD")
+_LOST = sum(int(mjw.OverflowType[name]) for name in _LOST_NAMES)
+# Sensors that kinematics, body velocities or the last substep give; ``_refresh`` would leave others behind the state.
+_SENSOR_NAMES = (
+    "JOINTPOS JOINTVEL JOINTACTFRC FRAMEPOS FRAMEQUAT FRAMEXAXIS FRAMEYAXIS FRAMEZAXIS FRAMELINVEL FRAMEANGVEL "
+    "FORCE TORQUE TOUCH"
+)
+_SENSORS = [int(getattr(mujoco.mjtSensor, f"mjSENS_{name}")) for name in _SENSOR_NAMES.split()]
+# Normals of an egg's contacts were off those of C by 5e-3 rad (99th percentile) with C's 1e-6, by 1.5e-3 with this one;
+# with 1e-10 some contacts were lost.
+_CCD_TOLERANCE = 1e-8
+_NO_SENSORS = int(mjw.DisableBit.SENSOR)
+
+
+class WarpEngine:
+    """Simulations of models of equal structure, in single precision. See ``Engine`` for the views.
+
+    ``step`` and ``reset`` replay graphs and never wait for the device. Graphs hold pointers: write into arrays in
+    place, and call ``recapture`` after changing the model otherwise.
+
+    On CUDA the graphs run on a stream of the engine's own, between what was given to torch's current stream before and
+    after the call: engines that are stepped under different torch streams overlap.
+
+    A world with a bad number is told by ``unstable`` and stands at the model's reference pose until its reset: left
+    alone, its NaNs would pass every broadphase test and take the room that its neighbours' contacts need.
+    """
+
+    masked = True
+
+    def __init__(
+        self,
+        models: Sequence[mujoco.MjModel],
+        rows: Sequence[int],
+        device: str | torch.device = "cpu",
+        capacity: Capacity | None = None,
+    ) -> None:
+        """Puts the models on the device and compiles the kernels.
+
+        Args:
+            models: The distinct models, of equal structure.
+            rows: For each simulation the index of its model.
+            device: "cpu" or a CUDA device.
+            capacity: Room for contacts and constraints; None takes what was measured for the models' classes.
+        """
+        wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # no banner and no line for each kernel
+        self.num, self.device = len(rows), torch.device(device)
+        self._models, self._rows = list(models), list(rows)
+        self._device = wp.get_device(str(self.device))
+        self._stream = wp.Stream(self._device) if self._device.is_cuda else None
+        self._lent = wp.stream_to_torch(self._stream) if self._stream is not None else None
+        self._graphs: dict[str, Callable[[], None]] = {}
+        with self._on_device():
+            self._put(capacity or capacity_of(models))
+            self._bind()
+            self._substeps = 1
+            for work in (self._advance, self._begin):  # compiles all kernels, which a capture must not do
+                work()
+        self._mask_view.fill_(True)
+        with self._on_device():
+            mjw.reset_data(self._m, self._d, reset=self._mask)
+        self._failed_view.zero_()
+
+    def _put(self, capacity: Capacity) -> None:
+        """Allocates model and data on the device."""
+        _check_sensors(self._models[0])
+        self._m = _put_models([_adapted(model) for model in self._models], self._rows)
+        self._m.opt.warn_overflow = 0  # unstable() tells it; printing from kernels wrecks the speed
+        self._m.opt.ccd_tolerance.fill_(_CCD_TOLERANCE)
+        self._m.opt.graph_conditional = not self._device.is_cuda or wp.is_conditional_graph_supported()
+        self._d = mjw.make_data(
+            _adapted(self._models[0]),
+            nworld=self.num,
+            nconmax=capacity.contacts,
+            nccdmax=capacity.convex,
+            njmax=capacity.rows,
+        )
+        _put_static_frames(self._d, self._models, self._rows)
+        d = self._d
+        self._failed = wp.zeros(self.num, dtype=bool)
+        self._mask = wp.zeros(self.num, dtype=bool)
+        self._start = wp.zeros((self.num, d.qpos.shape[1] + 7 * d.mocap_pos.shape[1]), dtype=float)
+
+    def _bind(self) -> None:
+        """Makes the torch views, once and for all."""
+        arrays = {name: getattr(self._d, name) for name in {*_STATE, *_STEPPED}}
+        views = {name: wp.to_torch(array) for name, array in arrays.items() if 0 not in array.shape}
+        self._state = {name: views[name] for name in _STATE if name in views}
+        self.qpos, self.qvel, self.ctrl = (views[name] for name in ("qpos", "qvel", "ctrl"))
+        self.xfrc_applied, self.sensordata = views["xfrc_applied"], views["sensordata"]
+        self._overflow, self._failed_view = views["overflow"], wp.to_torch(self._failed)
+        self._stepped = [views[name] for name in _STEPPED if name in views] + [self._failed_view]
+        self._mocap = [views[name] for name in ("mocap_pos", "mocap_quat") if name in views]
+        self._mask_view, self._start_view = wp.to_torch(self._mask), wp.to_torch(self._start)
+
+    def step(self, substeps: int, active: Tensor | None = None) -> None:
+        """Advances all simulations, or those of the mask ``active``; the others take the time but keep their state."""
+        kept = [] if active is None else [value.clone() for value in self._stepped]
+        self._substeps = substeps
+        self._play(f"step {substeps}", self._advance)
+        if active is not None:
+            for value, old in zip(self._stepped, kept, strict=True):
+                value.copy_(torch.where(active.view(-1, *[1] * (value.dim() - 1)), value, old))
+
+    def unstable(self) -> Tensor:
+        """Which simulations broke or lost contacts since their last reset. Shape (num,), bool.
+
+        All worlds share one pool of contacts; when it is full, whose contacts were lost is unknown and all are told.
+        """
+        lost = (self._overflow & _LOST) != 0
+        return lost | self._failed_view | ~self.sensordata.sum(dim=1).isfinite()
+
+    def warnings(self) -> Tensor:
+        """How many kinds of trouble each simulation has told since its last reset. Shape (num,), int64."""
+        return self.unstable().long()
+
+    def placement(self) -> Tensor:
+        """What ``reset`` takes, of every simulation as it stands, a copy. Shape (num, nq + 7 nmocap)."""
+        if not self._mocap:
+            return self.qpos.clone()
+        return torch.cat((self.qpos, torch.cat(self._mocap, dim=2).flatten(1)), dim=1)
+
+    def reset(self, mask: Tensor, start: Tensor) -> None:
+        """Starts the simulations of a mask anew, at rest, at given positions.
+
+        Position and velocity sensors of all simulations are refreshed, which changes only those whose state was
+        written by hand since their last step.
+
+        Args:
+            mask: Which simulations, shape (num,), bool.
+            start: Shape (num, nq + 7 nmocap); rows outside the mask are ignored. A start with a non-finite number
+                makes its simulation unstable.
+        """
+        self._mask_view.copy_(mask)
+        self._start_view.copy_(start)
+        self._play("reset", self._begin)
+
+    def recapture(self) -> None:
+        """Forgets the graphs; the next calls record new ones."""
+        self._graphs.clear()
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Everything that decides the future of the simulations, copied."""
+        return {name: value.clone() for name, value in self._state.items()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Puts back what ``state_dict`` gave, here or of the C engine, and refreshes position and velocity sensors."""
+        self._mask_view.fill_(True)
+        self._play("reset", self._begin)
+        self._failed_view.zero_()
+        for name, value in state.items():
+            self._state[name].copy_(value.reshape(self._state[name].shape))
+        self._play("refresh", self._refresh)
+
+    def model(self, row: int) -> mujoco.MjModel:
+        """The model of a simulation, for pictures and checks."""
+        return self._models[self._rows[row]]
+
+    def data(self, row: int) -> mujoco.MjData:
+        """A simulation's state in C MuJoCo, forwarded there, for pictures and checks."""
+        model = self.model(row)
+        data = mujoco.MjData(model)
+        for name, value in self._state.items():
+            target = np.asarray(getattr(data, name))
+            if name == "time":
+                data.time = float(value[row])
+            else:
+                target[...] = value[row].cpu().numpy().reshape(target.shape)
+        mujoco.mj_forward(model, data)
+        return data
+
+    def contact_depth(self, row: int) -> float:
+        """Deepest penetration among a simulation's contacts, metres, 0 without contact."""
+        distances = self.data(row).contact.dist
+        return float(max(0.0, -np.min(distances))) if len(distances) else 0.0
+
+    def demand(self) -> tuple[int, int]:
+        """Candidate pairs, and contacts that the convex collider found, of the state as it stands, over all worlds."""
+        self._play("position", lambda: mjw.fwd_position(self._m, self._d, factorize=False))
+        d = self._d
+        candidates, contacts, geoms = (wp.to_torch(x).cpu() for x in (d.ncollision, d.nacon, d.contact.geom))
+        kinds = self._models[0].geom_type[geoms[: int(contacts[0])].numpy()]
+        round_ones = (mujoco.mjtGeom.mjGEOM_ELLIPSOID, mujoco.mjtGeom.mjGEOM_CYLINDER)
+        convex = np.isin(kinds, round_ones).any(axis=1) & (kinds != mujoco.mjtGeom.mjGEOM_PLANE).all(axis=1)
+        return int(candidates[0]), int(convex.sum())
+
+    # What the graphs hold.
+
+    def _advance(self) -> None:
+        """The substeps of a control step, then position and velocity sensors of the new state."""
+        m, d = self._m, self._d
+        wanted = m.opt.disableflags
+        for left in reversed(range(self._substeps)):
+            self._watch()
+            wp.launch(
+                kernels.quarantine,
+                dim=(self.num, d.qpos.shape[1]),
+                inputs=[self._failed, m.qpos0],
+                outputs=[d.qpos, d.qvel, d.qacc_warmstart],
+                device=self._device,
+            )
+            m.opt.disableflags = wanted | _NO_SENSORS if left else wanted  # only the last substep's forces are read
+            mjw.step(m, d)
+        m.opt.disableflags = wanted
+        self._watch()
+        self._refresh()
+
+    def _watch(self) -> None:
+        """Marks worlds with a bad number (mj_checkPos, mj_checkVel, mj_checkAcc)."""
+        d = self._d
+        wp.launch(
+            kernels.watch,
+            dim=d.qpos.shape,
+            inputs=[d.qpos, d.qvel, d.qacc, mujoco.mjMAXVAL],
+            outputs=[self._failed],
+            device=self._device,
+        )
+
+    def _refresh(self) -> None:
+        """Position and velocity sensors of the state as it stands; force sensors are left alone."""
+        mjw.fwd_kinematics(self._m, self._d)
+        mjw.com_vel(self._m, self._d)
+        mjw.sensor_pos(self._m, self._d)
+        mjw.sensor_vel(self._m, self._d)
+
+    def _begin(self) -> None:
+        """Starts the masked worlds and refreshes sensors."""
+        d = self._d
+        mjw.reset_data(self._m, d, reset=self._mask)
+        wp.launch(
+            kernels.place,
+            dim=self.num,
+            inputs=[self._mask, self._start, mujoco.mjMAXVAL],
+            outputs=[d.qpos, d.mocap_pos, d.mocap_quat, self._failed],
+            device=self._device,
+        )
+        self._refresh()
+
+    # How they are run.
+
+    def _play(self, name: str, work: Callable[[], None]) -> None:
+        """Runs recorded work on the engine's stream, between what torch did before and will do after."""
+        with self._on_device():
+            if name not in self._graphs:
+                self._graphs[name] = self._record(work)
+            self._graphs[name]()
+
+    def _record(self, work: Callable[[], None]) -> Callable[[], None]:
+        if self._device.is_cuda and not wp.is_mempool_enabled(self._device):
+            warnings.warn(
+                f"Expected a memory pool on {self._device}, which graphs need to allocate, found none; every kernel is "
+                "launched from Python instead, about ten times slower.",
+                stacklevel=2,
+            )
+            return work
+        with _no_garbage_collection(), wp.ScopedCapture(device=self._device, stream=self._stream) as capture:
+            work()
+        graph = capture.graph
+        assert graph is not None
+        return lambda: wp.capture_launch(graph, stream=self._stream)
+
+    @contextmanager
+    def _on_device(self) -> Iterator[None]:
+        """Warp allocates and launches on the engine's stream, which waits for torch's, and torch's for it."""
+        if self._lent is None:
+            with wp.ScopedDevice(self._device):
+                yield
+            return
+        theirs = torch.cuda.current_stream(self.device)
+        self._lent.wait_stream(theirs)
+        with wp.ScopedStream(self._stream, sync_enter=False):
+            yield
+        theirs.wait_stream(self._lent)
+
+
+@contextmanager
+def _no_garbage_collection() -> Iterator[None]:
+    """An old graph collected during a capture would record its own destruction."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+def _adapted(model: mujoco.MjModel) -> mujoco.MjModel:
+    """A copy of a model with what mujoco_warp takes for the same physics."""
+    model = copy.copy(model)
+    model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
+    # C meets two boxes with a routine of their own and up to eight contacts. So does mujoco_warp with this flag (that
+    # has no other effect there); without it, boxes go through the convex collider, which gives four.
+    model.opt.disableflags |= int(mjw.DisableBit.NATIVECCD)
+    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # it has none, and refuses the flag
+    return model
+
+
+def _put_models(models: Sequence[mujoco.MjModel], rows: Sequence[int]) -> mjw.Model:
+    """One model on the device, in which the fields in which the given ones differ are per world."""
+    singles = [mjw.put_model(model) for model in models]
+    names = [f.name for f in dataclasses.fields(mjw.Model) if isinstance(getattr(singles[0], f.name), wp.array)]
+    values = {name: [getattr(single, name).numpy() for single in singles] for name in names}
+    differing = [n for n, v in values.items() if any(not np.array_equal(v[0], x, equal_nan=True) for x in v[1:])]
+    if not differing:
+        return singles[0]
+    model = mjw.put_model(models[0], batch_sizes=dict.fromkeys(differing, len(rows)))
+    for name in differing:
+        getattr(model, name).assign(np.concatenate(values[name])[rows])
+    return model
+
+
+def _put_static_frames(data: mjw.Data, models: Sequence[mujoco.MjModel], rows: Sequence[int]) -> None:
+    """Frames of the geoms that never move are computed nowhere in a step; here each world gets its own model's."""
+    found = []
+    for model in models:
+        found.append(mujoco.MjData(model))
+        mujoco.mj_kinematics(model, found[-1])
+    for name in ("xquat", "xmat", "ximat", "geom_xpos", "geom_xmat"):
+        array = getattr(data, name)
+        array.assign(np.stack([getattr(x, name) for x in found])[rows].reshape(array.numpy().shape))
+
+
+def _check_sensors(model: mujoco.MjModel) -> None:
+    unknown = sorted({mujoco.mjtSensor(kind).name for kind in model.sensor_type if kind not in _SENSORS})
+    if unknown:
+        raise NotImplementedError(f"Expected sensors among {_SENSOR_NAMES}, got {', '.join(unknown)}.")
