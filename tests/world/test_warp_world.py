@@ -1,0 +1,146 @@
+"""A world on mujoco_warp (Warp's CPU device) keeps the contract that worlds on C MuJoCo keep."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from bidex_meta import Benchmark
+from bidex_meta.errors import BidexError
+from bidex_meta.world import World
+from tests.world.play import assert_same, flat, play, random_actions
+from tests.world.test_masked import assert_steps_look_at_nothing
+
+ROWS = 6
+CLASSES = ("CatchUnderarm", "BottleCap")
+"""A free body between moving bases; an object with joints."""
+pytestmark = [pytest.mark.timeout(900), pytest.mark.xdist_group("warp")]
+
+
+def make(engine: str, mode: str = "SAME_STEP") -> World:
+    slots = [slot for slot in Benchmark("MT20").make_world(num_envs=20, device="cpu").slots if slot.name in CLASSES]
+    return World(
+        slots, ROWS, engine=engine, autoreset_mode=mode, observation="one-hot", task_sampling="uniform", threads=1
+    )
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    """Reset it before use."""
+    return make("warp")
+
+
+@pytest.fixture(scope="module")
+def evaluation_world() -> World:
+    return make("warp", "DISABLED")
+
+
+@pytest.fixture(scope="module")
+def reference() -> World:
+    return make("c")
+
+
+def close(a: Tensor, b: Tensor, tolerance: float = 1e-5) -> bool:
+    return bool((a - b).abs().max() < tolerance)
+
+
+def test_shapes_types_and_spaces(world: World, reference: World) -> None:
+    obs, _ = world.reset(seed=0)
+    assert world.observation_space == reference.observation_space and world.action_space == reference.action_space
+    assert world.observation_space.contains(obs.numpy())
+    expected, _ = reference.reset(seed=0)
+    action = random_actions(world, 1)[0]
+    found, wanted = flat(world.step(action)), flat(reference.step(action))
+    assert found.keys() == wanted.keys() and obs.dtype == expected.dtype
+    for name, value in wanted.items():
+        assert (found[name].shape, found[name].dtype) == (value.shape, value.dtype), name
+
+
+def test_a_seed_means_the_same_starts_and_tasks_as_on_c(world: World, reference: World) -> None:
+    for seed in (0, 3):
+        obs, expected = world.reset(seed=seed)[0], reference.reset(seed=seed)[0]
+        assert close(obs, expected) and torch.equal(world.task_index, reference.task_index)
+        assert torch.equal(world.episodes.elapsed, reference.episodes.elapsed)
+    assert not close(world.reset(seed=4)[0], world.reset(seed=5)[0], 1e-3)
+
+
+def test_the_same_seed_and_actions_give_the_same_run_again(world: World) -> None:
+    actions = random_actions(world, 30)
+    runs = []
+    for _ in range(2):
+        world.reset(seed=1)
+        runs.append(play(world, actions))
+    assert_same(*runs)
+
+
+def test_rows_that_end_start_anew_where_c_does(world: World, reference: World) -> None:
+    world.reset(seed=2)
+    reference.reset(seed=2)
+    ended = torch.zeros(ROWS, dtype=torch.bool)
+    for action in random_actions(world, 80):
+        found, wanted = flat(world.step(action)), flat(reference.step(action))
+        if not torch.equal(found["info/_final_obs"], wanted["info/_final_obs"]):
+            break  # an egg fell a step earlier in single precision
+        now = found["info/_final_obs"]
+        ended |= now
+        assert close(found["obs"][now], wanted["obs"][now]) if now.any() else True
+        assert torch.equal(found["obs"][~now], found["info/final_obs"][~now])
+    assert ended[:3].any(), "an egg was dropped"
+
+
+def test_a_reset_mask_starts_its_rows_alone(evaluation_world: World) -> None:
+    evaluation_world.reset(seed=0)
+    actions = random_actions(evaluation_world, 12)
+    play(evaluation_world, actions[:6])
+    before = flat(evaluation_world.step(actions[6]))["obs"]
+    mask = torch.arange(ROWS) % 2 == 0
+    after, _ = evaluation_world.reset(options={"reset_mask": mask})
+    assert torch.equal(after[~mask], before[~mask]) and not close(after[mask], before[mask], 1e-3)
+    assert (evaluation_world.episodes.elapsed == torch.where(mask, 0, 7)).all()
+
+
+def test_finished_rows_are_frozen(evaluation_world: World) -> None:
+    evaluation_world.reset(seed=0)
+    for action in random_actions(evaluation_world, 80):
+        last = flat(evaluation_world.step(action))
+    frozen = evaluation_world.episodes.finished
+    assert frozen[:3].all() and not frozen[3:].any()
+    states = [part.group.engine.state_dict() for part in evaluation_world.parts]
+    step = flat(evaluation_world.step(random_actions(evaluation_world, 1)[0]))
+    assert torch.equal(step["obs"][frozen], last["obs"][frozen]) and not step["reward"][frozen].any()
+    for part, before in zip(evaluation_world.parts, states, strict=True):
+        rows = part.group.take(frozen)
+        for name, value in part.group.engine.state_dict().items():
+            assert torch.equal(value[rows], before[name][rows]), name
+
+
+def test_a_broken_row_is_told_and_starts_anew(world: World) -> None:
+    world.reset(seed=0)
+    play(world, random_actions(world, 3))
+    part = world.parts[0]
+    part.group.engine.qpos[1, 30] = torch.nan
+    step = flat(world.step(random_actions(world, 1, seed=1)[0]))
+    broken = int(part.group.rows[1])
+    assert step["info/unstable"].tolist() == [row == broken for row in range(ROWS)]
+    assert bool(step["truncated"][broken]) and all(bool(value.isfinite().all()) for value in step.values())
+    assert not flat(world.step(random_actions(world, 1)[0]))["info/unstable"].any()
+
+
+def test_a_step_looks_at_no_number(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert_steps_look_at_nothing(world, monkeypatch)
+
+
+def test_a_saved_world_goes_on_as_it_would_have(world: World) -> None:
+    world.reset(seed=6)
+    actions = random_actions(world, 20)
+    play(world, actions[:10])
+    state = world.state_dict()
+    whole = play(world, actions[10:])
+    world.load_state_dict(state)
+    assert_same(whole, play(world, actions[10:]))
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    with pytest.raises(BidexError, match="c, warp"):
+        make("gpu")
+    with pytest.raises(BidexError, match="CUDA"):
+        World(make("c").slots, ROWS, device=f"cuda:{torch.cuda.device_count()}")
