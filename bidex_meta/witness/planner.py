@@ -76,7 +76,7 @@ class Planner:
             earlier: Actions (T, action_size) of an earlier search: every plan also tries what they did at that time.
         """
         cfg, sim = self.config, self.simulator
-        states = sim.starts(cfg.copies - 1)
+        states = sim.starts(cfg.copies - 1, seed=1 + cfg.seed)  # not those of the replay
         mean = rest_action(sim.action_size).repeat(cfg.knots, 1)
         if earlier is not None:
             mean = knots_of(earlier, 0, cfg)

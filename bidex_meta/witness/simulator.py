@@ -69,9 +69,9 @@ class Simulator:
         self._everyone = torch.ones(num, dtype=torch.bool)
         self._engine.reset(self._everyone, self._start.expand(num, -1))
 
-    def starts(self, shifted: int) -> list[State]:
+    def starts(self, shifted: int, seed: int = SEED) -> list[State]:
         """The start state and so many in which every object or fixture is shifted by 0.1 mm in the plane."""
-        generator = torch.Generator().manual_seed(SEED)
+        generator = torch.Generator().manual_seed(seed)
         places = self._part.group.members[0].scene.qpos
         objects = [where for part, where in places.items() if "/" not in part]
         states = []
