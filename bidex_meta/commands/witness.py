@@ -30,6 +30,8 @@ class WitnessFlags:
     """Replay this file, not the stored witness; with --find keep the best episode here, whether it holds or not."""
     improve: Path | None = None
     """With --find: start from the episode in this file."""
+    script: Switch = False
+    """With --find: play the class's script (bidex_meta/witness/scripts.py) instead of searching."""
     out: Path | None = None
     """Also write a film (.mp4) of the witness, or a picture (.png) of its last step."""
     camera: str | None = None
@@ -48,7 +50,7 @@ def main(arguments: Sequence[str]) -> None:
     names = _names(flags)
     if flags.find:
         for name in names:
-            _find(name, flags)
+            _play_script(name, flags) if flags.script else _find(name, flags)
     rows = [_replay(name, flags) for name in names]
     if flags.out is not None:
         _film(names[0], flags)
@@ -65,8 +67,8 @@ def _names(flags: WitnessFlags) -> list[str]:
 
     if flags.all == (flags.task is not None):
         raise BidexError("witness: expected --task T or --all, got " + ("both." if flags.all else "neither."))
-    if flags.improve is not None and not flags.find:
-        raise BidexError("witness: --improve says where a search starts; give it with --find.")
+    if (flags.improve is not None or flags.script) and not flags.find:
+        raise BidexError("witness: --improve and --script say how to find an episode; give them with --find.")
     if flags.all and (flags.out is not None or flags.file is not None or flags.improve is not None):
         raise BidexError("witness: films and files are of one class; give --task T with --out or --file.")
     if flags.task is not None and flags.task not in registry.names():
@@ -126,6 +128,26 @@ def _find(name: str, flags: WitnessFlags) -> None:
         if holds:
             return
         print(f"{name}: seed {config.seed} gave a return of {plan.total:.3f}, first success {plan.first_success}.")
+
+
+def _play_script(name: str, flags: WitnessFlags) -> None:
+    """Plays a class's script and keeps the episode if it holds."""
+    import numpy as np
+
+    from bidex_meta.record.versions import collect_versions
+    from bidex_meta.witness.puppets import Puppets
+    from bidex_meta.witness.replay import replay
+    from bidex_meta.witness.scripts import script_of
+    from bidex_meta.witness.store import Witness, save_witness
+
+    play = script_of(name)
+    hands = Puppets(name, flags.threads)
+    play(hands)
+    first = hands.success.index(True) if any(hands.success) else None
+    made = {"return": sum(hands.rewards), "first_success": first, "script": play.__name__, "rival": None}
+    witness = Witness(np.stack([a.numpy() for a in hands.actions]), made | {"versions": collect_versions()})
+    if flags.file is not None or replay(name, witness, flags.threads).found:
+        print(f"{name}: stored {save_witness(name, witness.actions, witness.made, flags.file)}")
 
 
 def _reporter(name: str) -> Any:

@@ -111,6 +111,14 @@ class Simulator:
                 each_step()
         return Trace(torch.stack(rewards), torch.stack(success), alive)
 
+    def sensor(self, name: str) -> Tensor:
+        """A sensor's values in all rows, (N, k), a copy."""
+        return self._engine.sensordata[:, self._part.group.members[0].scene.sensors[name]].clone()
+
+    def frozen(self, name: str) -> Tensor:
+        """A number that the task has frozen, in all rows, (N, k)."""
+        return self._part.frozen(0, self._world.task_index)[name]
+
     def contact_depth(self, row: int) -> float:
         """Deepest penetration among a row's contacts, metres."""
         return self._engine.contact_depth(row)

@@ -1,0 +1,98 @@
+"""Hands led to points in closed loop, for witnesses that a script finds where the planner stays in a local optimum.
+
+A script watches the mean of some shifted copies of the start, in which all hands do the same, so that what it does does
+not depend on one of them. The actions are recorded; played again they need no script.
+"""
+
+import torch
+from torch import Tensor
+
+from bidex_meta.hands.hand import FORCE_PER_SCALE, LINEAR_DAMPING, hand
+from bidex_meta.hands.pair import SIDES
+from bidex_meta.witness.planner import quantised, rest_action
+from bidex_meta.witness.simulator import Simulator
+
+_COPIES, _SEED = 16, 7
+_GAIN = 8.0
+"""Speed of a hand over its distance to where it is led, 1/s."""
+_KNUCKLES, _MIDDLES = ("FFJ2", "MFJ2", "RFJ2", "LFJ2"), ("FFJ1", "MFJ1", "RFJ1", "LFJ1")
+
+Point = tuple[float, float, float]
+
+
+class Puppets:
+    """Both hands of a class's task 0.
+
+    Args:
+        name: The class.
+        threads: Engine threads; None takes all CPUs.
+
+    Attributes:
+        actions: What was done so far, each (action_size,).
+        episode_steps: Time limit, control steps.
+    """
+
+    def __init__(self, name: str, threads: int | None = None):
+        self._simulator = Simulator(name, _COPIES, threads)
+        self._simulator.load(self._simulator.starts(_COPIES - 1, seed=_SEED))
+        self.actions: list[Tensor] = []
+        self.rewards: list[float] = []
+        self.success: list[bool] = []
+        self.episode_steps = self._simulator.episode_steps
+        self._rest = rest_action(self._simulator.action_size)
+        self._full_speed = FORCE_PER_SCALE * self._simulator.task.transition_scale / LINEAR_DAMPING[0]
+        half = self._simulator.action_size // 2
+        self._joints = len(hand().control_low)
+        self._fingers = {side: self._rest[i * half :][: self._joints] for i, side in enumerate(SIDES)}
+
+    def everywhere(self, sensor: str) -> Tensor:
+        """A sensor's values in all copies, (copies, k)."""
+        return self._simulator.sensor(sensor)
+
+    def where(self, sensor: str) -> Tensor:
+        """A sensor's mean over the copies, (k,)."""
+        return self.everywhere(sensor).mean(0)
+
+    def frozen(self, name: str) -> Tensor:
+        """A number that the task has frozen, (k,)."""
+        return self._simulator.frozen(name)[0]
+
+    def at(self, side: str) -> Tensor:
+        """Where a hand's point is, metres, (3,)."""
+        return self.where(f"{side}/hand_point_position")
+
+    def bend(self, side: str, knuckles: float, middles: float) -> None:
+        """Bends the four fingers of a hand, rad."""
+        low, high = (torch.as_tensor(x).float() for x in (hand().control_low, hand().control_high))
+        angles = torch.zeros(self._joints)
+        names = [hand().joints[i] for i in hand().actuated]
+        for joints, angle in ((_KNUCKLES, knuckles), (_MIDDLES, middles)):
+            for joint in joints:
+                angles[names.index(joint)] = angle
+        self._fingers[side] = (2.0 * (angles - low) / (high - low) - 1.0).clamp(-1.0, 1.0)
+
+    def lead(self, right: Point, left: Point, steps: int = 1, speed: float = 0.6) -> None:
+        """Leads the hands' points towards two points for some control steps, without turning the hands.
+
+        Args:
+            right: World, metres.
+            left: World, metres.
+            steps: Control steps; none is played after the end of the episode.
+            speed: At most, m/s.
+        """
+        for _ in range(min(steps, self.episode_steps - len(self.actions))):
+            action, half = self._rest.clone(), len(self._rest) // 2
+            for i, (side, goal) in enumerate(zip(SIDES, (right, left), strict=True)):
+                way = _GAIN * (torch.tensor(goal, dtype=torch.float64) - self.at(side))
+                way *= min(1.0, speed / (float(way.norm()) + 1e-9))
+                action[i * half :][: self._joints] = self._fingers[side]
+                action[i * half + self._joints :][:3] = (way / self._full_speed).float().clamp(-1.0, 1.0)
+            action = quantised(action)
+            trace = self._simulator.play(action.expand(1, _COPIES, -1))
+            self.actions.append(action)
+            self.rewards.append(float(trace.rewards[0, 0]))
+            self.success.append(bool(trace.success[0, 0]))
+
+    def over(self) -> bool:
+        """Whether the episode's time is up."""
+        return len(self.actions) >= self.episode_steps
