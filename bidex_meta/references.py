@@ -44,6 +44,6 @@ def store(kind: Kind, classes: dict[str, dict[str, Any]], made: dict[str, Any], 
 
 
 def references() -> dict[str, Reference]:
-    """The classes of which both ends are known."""
-    low, high = load("random"), load("expert")
-    return {name: Reference(low[name]["return"], high[name]["return"]) for name in low if name in high}
+    """The classes of which both ends are known, and the expert is above random actions: else a score means nothing."""
+    low, high = ({name: row["return"] for name, row in load(kind).items()} for kind in ("random", "expert"))
+    return {name: Reference(low[name], high[name]) for name in low if high.get(name, low[name]) > low[name]}
