@@ -31,9 +31,8 @@ def test_storing_keeps_the_other_classes_and_how_each_was_made(folder: Path) -> 
 
 
 def test_a_score_needs_both_ends_and_an_expert_above_random_actions(folder: Path) -> None:
-    references.store(
-        "random", {"HandOver": {"return": 0.4}, "Switch": {"return": 9.0}, "PushBlock": {"return": 5.0}}, {}
-    )
+    low = {"HandOver": {"return": 0.4}, "Switch": {"return": 9.0}, "PushBlock": {"return": 5.0}}
+    references.store("random", low, {})
     references.store("expert", {"HandOver": {"return": 30.0}, "PushBlock": {"return": 4.0}}, {})
     found = references.references()
     assert list(found) == ["HandOver"]
