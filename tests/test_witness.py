@@ -13,6 +13,7 @@ from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
 from bidex_meta.record.versions import collect_versions
 from bidex_meta.tasks import registry
+from bidex_meta.witness import steady
 from bidex_meta.witness.config import PlannerConfig
 from bidex_meta.witness.mutants import mutants, parts_of_the_hands
 from bidex_meta.witness.planner import LEVELS, Planner, interpolation, quantised, rest_action, shifted
@@ -194,3 +195,20 @@ def test_every_stored_witness_holds(name: str) -> None:
         f"{name}: success {result.first_success}, {result.succeeded} of 10 shifted starts, "
         f"on {here['platform']} with {here['packages']}; made on {witness.made['versions']}"
     )
+
+
+def test_steadying_keeps_an_episode_that_nothing_betters(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_changes(elites: torch.Tensor, count: int, *_: object) -> torch.Tensor:
+        return elites[:1].repeat(count, 1, 1)
+
+    monkeypatch.setattr(steady, "mutants", no_changes)
+    actions = load_witness("Switch").actions[:20]
+    told: list[int] = []
+    found = steady.steadied("Switch", actions, rounds=1, threads=1, report=lambda solved, _: told.append(solved))
+    np.testing.assert_array_equal(found, actions)
+    assert told == [10], "the witness succeeds at its seventh step, from any shifted start"
+
+
+def test_steady_needs_an_episode(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["witness", "--task", "Switch", "--find", "--steady", "3"]) == 2
+    assert "--improve" in capsys.readouterr().err

@@ -30,6 +30,8 @@ class WitnessFlags:
     """Replay this file, not the stored witness; with --find keep the best episode here, whether it holds or not."""
     improve: Path | None = None
     """With --find: start from the episode in this file."""
+    steady: int = 0
+    """With --find and --improve: no search, but so many rounds of small changes that shall stand shifted starts."""
     script: Switch = False
     """With --find: play the class's script (bidex_meta/witness/scripts.py) instead of searching."""
     out: Path | None = None
@@ -50,7 +52,7 @@ def main(arguments: Sequence[str]) -> None:
     names = _names(flags)
     if flags.find:
         for name in names:
-            _play_script(name, flags) if flags.script else _find(name, flags)
+            (_play_script if flags.script else _steady if flags.steady else _find)(name, flags)
     rows = [_replay(name, flags) for name in names]
     if flags.out is not None:
         _film(names[0], flags)
@@ -146,6 +148,33 @@ def _play_script(name: str, flags: WitnessFlags) -> None:
     first = hands.success.index(True) if any(hands.success) else None
     made = {"return": sum(hands.rewards), "first_success": first, "script": play.__name__, "rival": None}
     witness = Witness(np.stack([a.numpy() for a in hands.actions]), made | {"versions": collect_versions()})
+    if flags.file is not None or replay(name, witness, flags.threads).found:
+        print(f"{name}: stored {save_witness(name, witness.actions, witness.made, flags.file)}")
+
+
+def _steady(name: str, flags: WitnessFlags) -> None:
+    """Makes an episode safer against shifted starts and keeps it if it holds."""
+    import torch
+
+    from bidex_meta.record.versions import collect_versions
+    from bidex_meta.witness.replay import replay
+    from bidex_meta.witness.simulator import Simulator
+    from bidex_meta.witness.steady import steadied
+    from bidex_meta.witness.store import Witness, load_witness, save_witness
+
+    if flags.improve is None:
+        raise BidexError("witness: --steady makes an episode safer; give it with --improve FILE.")
+    earlier, seed = load_witness(name, flags.improve), flags.planner.seed
+
+    def report(solved: int, total: float) -> None:
+        print(f"{name}: {solved} of 10 shifted starts, mean return {total:.3f}", flush=True)
+
+    actions = steadied(name, earlier.actions, flags.steady, seed, flags.threads, report)
+    trace = Simulator(name, 1, flags.threads).play(torch.from_numpy(actions)[:, None])
+    won = trace.success[:, 0].nonzero().flatten().tolist()
+    made = earlier.made | {"return": float(trace.rewards.sum()), "first_success": won[0] if won else None}
+    made |= {"steadied": {"rounds": flags.steady, "seed": seed}, "versions": collect_versions()}
+    witness = Witness(actions, made)
     if flags.file is not None or replay(name, witness, flags.threads).found:
         print(f"{name}: stored {save_witness(name, witness.actions, witness.made, flags.file)}")
 
