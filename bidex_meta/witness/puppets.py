@@ -29,6 +29,8 @@ class Puppets:
 
     Attributes:
         actions: What was done so far, each (action_size,).
+        rewards: What it gave from the unshifted start.
+        success: Which of its steps were a success there.
         episode_steps: Time limit, control steps.
     """
 
