@@ -16,6 +16,7 @@ import torch
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder, read_metrics
+from tests.algos.ranks import same
 
 SMALL = ["--suite", "MT4", "--num-envs", "4", "--threads", "1", "--device", "cpu", "--seed", "3", "--no-evaluate"]
 SMALL += ["--learner.hidden", "16", "--learner.rollout-steps", "4", "--learner.num-minibatches", "2"]
@@ -80,14 +81,6 @@ def final(path: Path) -> tuple[dict[str, Any], int]:
     loaded = RunFolder.open(path).checkpoints.load()
     assert loaded is not None
     return loaded
-
-
-def same(a: Any, b: Any) -> bool:
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
-    if isinstance(a, list | tuple):
-        return len(a) == len(b) and all(map(same, a, b))
-    return torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
 
 
 def test_two_processes_train_mt4_and_end_with_equal_networks(tmp_path: Path) -> None:

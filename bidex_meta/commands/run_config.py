@@ -84,7 +84,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     """
     resume = peek(arguments, "--resume")
     folder = RunFolder.open(Path(resume)) if resume else None
-    stored = {"engine": "auto", **folder.config()} if folder else {}  # runs before 0.2 knew one engine
+    stored = {"engine": "auto", **folder.config()} if folder else {}  # older runs knew one engine
     kind = learner_kind(peek(arguments, "--algo") or stored.get("algo", RunFlags.algo))
     device = resolve_device(peek(arguments, "--device") or stored.get("device", RunFlags.device))
     preset, reason = choose_preset(kind, peek(arguments, "--preset") or stored.get("preset", RunFlags.preset), device)

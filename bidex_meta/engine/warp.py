@@ -21,6 +21,7 @@ from torch import Tensor
 
 from bidex_meta.engine import kernels
 from bidex_meta.engine.capacity import Capacity, capacity_of
+from bidex_meta.errors import BidexError
 
 # What a simulation carries from one step to the next; the fields that a model has none of are skipped.
 _STATE_FIELDS = (
@@ -355,4 +356,4 @@ def _put_static_frames(data: mjw.Data, models: Sequence[mujoco.MjModel], rows: S
 def _check_sensors(model: mujoco.MjModel) -> None:
     unknown = sorted({mujoco.mjtSensor(kind).name for kind in model.sensor_type if kind not in _SENSORS})
     if unknown:
-        raise NotImplementedError(f"Expected sensors among {_SENSOR_NAMES}, got {', '.join(unknown)}.")
+        raise BidexError(f"Expected sensors among {_SENSOR_NAMES}, got {', '.join(unknown)}.")

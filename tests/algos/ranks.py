@@ -37,3 +37,12 @@ def _one(function: Callable[[int], Any], rank: int, port: int, folder: Path) -> 
     result = function(rank)
     distributed.shut_down()
     torch.save(result, folder / f"{rank}.pt")
+
+
+def same(a: Any, b: Any) -> bool:
+    """Whether two nested states are equal bit for bit."""
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, list | tuple):
+        return len(a) == len(b) and all(map(same, a, b))
+    return torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b

@@ -15,7 +15,7 @@ from bidex_algos.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.rollout import collect
 from bidex_algos.runner import checkpoint, resume, train
 from bidex_meta.errors import BidexError
-from tests.algos.ranks import in_two_processes
+from tests.algos.ranks import in_two_processes, same
 from tests.algos.toy import ToyWorld, nearness
 
 CONFIG = MTPPOConfig(hidden=(32, 32), rollout_steps=8, learning_rate_range=(1e-5, 2e-3), autocast="off")
@@ -146,14 +146,6 @@ def everything(rank: int) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
     return in_two_processes(everything, tmp_path_factory.mktemp("ranks"))
-
-
-def same(a: Any, b: Any) -> bool:
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
-    if isinstance(a, list | tuple):
-        return len(a) == len(b) and all(map(same, a, b))
-    return torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
 
 
 def distances(update: dict[str, Any]) -> dict[str, float]:

@@ -11,8 +11,10 @@ from torch import Tensor
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.engine.cpu import CpuEngine
 from bidex_meta.engine.warp import WarpEngine
+from bidex_meta.errors import BidexError
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import Scene, compile_scene
+from tests.engine.test_cpu import BREAKAGES, same
 from tests.tasks.worlds import Lens
 
 SUBSTEPS, ROWS = 2, 4
@@ -79,18 +81,6 @@ def run(engine: WarpEngine, steps: int, seed: int, active: Tensor | None = None)
         engine.step(SUBSTEPS, active)
         found.append(torch.cat((engine.qpos, engine.qvel, engine.sensordata), dim=1).clone())
     return found
-
-
-def same(a: list[Tensor], b: list[Tensor], rows: list[int] | slice = slice(None)) -> bool:
-    return all(torch.equal(x[rows], y[rows]) for x, y in zip(a, b, strict=True))
-
-
-BREAKAGES = {
-    "NaN position": lambda engine: engine.qpos[1].__setitem__(30, torch.nan),
-    "infinite velocity": lambda engine: engine.qvel[1].__setitem__(3, torch.inf),
-    "huge velocity": lambda engine: engine.qvel[1].__setitem__(7, 1e12),
-    "NaN force": lambda engine: engine.xfrc_applied[1, 1].__setitem__(0, torch.nan),
-}
 
 
 @pytest.mark.parametrize("breakage", BREAKAGES)
@@ -275,5 +265,5 @@ def test_unknown_sensors_are_refused() -> None:
         "<mujoco><worldbody><body><freejoint/><geom name='a' size='1'/></body></worldbody>"
         "<sensor><clock/></sensor></mujoco>"
     )
-    with pytest.raises(NotImplementedError, match="CLOCK"):
+    with pytest.raises(BidexError, match="CLOCK"):
         WarpEngine([model], [0], capacity=Capacity(8, 1, 8))
