@@ -5,76 +5,36 @@ makes ``epochs`` passes over them in shuffled mini-batches. What is done differe
 stands in ``algos/README.md``.
 """
 
-import copy
 import math
-import time
-from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.advantages import explained_variance, gae, normalise_per_task, successor_values, task_moments
-from bidex_algos.distributed import all_sum, broadcast, own_seed, sum_gradients, world_size
-from bidex_algos.episodes import EpisodeStatistics
+from bidex_algos.distributed import all_sum, sum_gradients, world_size
 from bidex_algos.mtppo_config import PRESETS, MTPPOConfig
-from bidex_algos.networks import MLP, GaussianActor, gaussian_entropy, gaussian_kl, gaussian_log_prob
-from bidex_algos.normalise import ObservationNormaliser, RunningStats
-from bidex_algos.policy import GaussianPolicy
-from bidex_algos.precision import autocast, use_bfloat16
-from bidex_algos.rollout import Rollout, VectorWorld, collect
+from bidex_algos.networks import gaussian_entropy, gaussian_kl, gaussian_log_prob
+from bidex_algos.onpolicy import Batch, OnPolicy
+from bidex_algos.precision import autocast
+from bidex_algos.rollout import VectorWorld
+from bidex_algos.surgery import per_task_gradients, project_conflicting
 from bidex_meta.errors import BidexError
 
 __all__ = ["MTPPO", "PRESETS", "Batch", "MTPPOConfig"]
 
 
-@dataclass
-class Batch:
-    """A rollout made ready for the update, steps and rows flattened into B samples."""
+class MTPPO(OnPolicy):
+    """Multi-task PPO on a batched world; arguments and attributes as :class:`~bidex_algos.onpolicy.OnPolicy`.
 
-    obs: Tensor
-    """Normalised observations (B, d), in the precision the hidden layers run in."""
-    task_id: Tensor
-    """Task of each sample (B,)."""
-    actions: Tensor
-    """Sampled actions (B, a)."""
-    old_means: Tensor
-    """Means of the sampling policy (B, a)."""
-    old_log_probs: Tensor
-    """Log-density of the actions under the sampling policy (B,)."""
-    advantages: Tensor
-    """Normalised advantages (B,)."""
-    targets: Tensor
-    """What the critic shall predict, in its own units (B,)."""
-    weights: Tensor
-    """1, or 0 for a transition where physics broke (B,)."""
-
-    def select(self, index: Tensor) -> "Batch":
-        """The samples at ``index``."""
-        return Batch(**{name: value.index_select(0, index) for name, value in vars(self).items()})
-
-
-class MTPPO:
-    """Multi-task PPO on a batched world.
-
-    In a run of several processes each has a world and samples of its own, and all have the same networks: statistics
-    and gradients are those of the samples of all, so that a mini-batch is as many times larger.
-
-    Args:
-        world: A world that resets finished rows within the step.
-        config: See :class:`MTPPOConfig`.
-        seed: Of the initial weights, the sampled actions, the shuffling and the world's first reset.
-
-    Attributes:
-        env_steps: Environment steps taken so far, over all rows of all processes.
-        per_process: Entries of ``state_dict`` that differ from process to process.
-        policy: The agent that evaluation uses: mean action, clamped.
+    Several processes make a mini-batch as many times larger.
 
     Raises:
         BidexError: Fewer samples in a rollout than mini-batches.
     """
 
-    per_process = ("generator", "episodes", "obs")
+    name, remedy = "mtppo", "lower learning_rate"
+    config_type = MTPPOConfig
+    config: MTPPOConfig
 
     def __init__(self, world: VectorWorld, config: MTPPOConfig, seed: int):
         samples = config.rollout_steps * world.num_envs
@@ -83,26 +43,7 @@ class MTPPO:
                 f"mtppo: {config.num_minibatches} mini-batches need as many samples, but {world.num_envs} rows x "
                 f"{config.rollout_steps} steps give {samples}. Raise num_envs or lower num_minibatches."
             )
-        self.world, self.config, self.seed = world, config, seed
-        self.device = torch.device(world.device)
-        self.low_precision = use_bfloat16(config.autocast, self.device)
-        self.env_steps = 0
-        self.obs: Tensor | None = None
-        d, a = int(world.single_observation_space.shape[0]), int(world.single_action_space.shape[0])
-
-        # Weights come from a CPU generator, so that a seed means the same network on every device.
-        init = torch.Generator().manual_seed(seed)
-        self.generator = torch.Generator(self.device).manual_seed(own_seed(seed))
-        num_id_columns = int(getattr(world, "num_id_columns", 0))
-        observations = ObservationNormaliser(d, num_id_columns, config.normalise_observations)
-        actor = GaussianActor(d, config.hidden, a, config.init_std, init, config.activation)
-        heads = world.num_tasks if config.value_heads else 1
-        self.policy = GaussianPolicy(observations, actor, self.low_precision).to(self.device)
-        self.critic = MLP(d, config.hidden, heads, 1.0, init, config.activation).to(self.device)
-        self.shape = {"observations": d, "actions": a, "num_id_columns": num_id_columns}
-        horizon = config.value_horizon * samples * world_size() / world.num_tasks
-        self.return_stats = RunningStats((world.num_tasks,), max_count=horizon).to(self.device)
-
+        super().__init__(world, config, seed)
         # The step size is a tensor: adapting it needs no wait for the device.
         self.learning_rate = torch.tensor(config.learning_rate, device=self.device)
         self.critic_learning_rate = (
@@ -110,118 +51,12 @@ class MTPPO:
             if config.critic_learning_rate is None
             else torch.tensor(config.critic_learning_rate, device=self.device)
         )
-        self.actor_adam = torch.optim.Adam(actor.parameters(), lr=self.learning_rate, fused=True)
+        self.actor_adam = torch.optim.Adam(self.policy.actor.parameters(), lr=self.learning_rate, fused=True)
         self.critic_adam = torch.optim.Adam(self.critic.parameters(), lr=self.critic_learning_rate, fused=True)
-        self.rollout = Rollout(config.rollout_steps, world.num_envs, d, a, self.device)
-        self.episodes = EpisodeStatistics(world.task_id, world.task_names)
-
-    def iterate(self) -> dict[str, float]:
-        """Collects one rollout and learns from it.
-
-        Returns:
-            Metrics under TensorBoard-like tags; ``algos/README.md`` explains each.
-
-        Raises:
-            FloatingPointError: The loss is no longer finite.
-        """
-        started = time.perf_counter()
-        if self.obs is None:
-            # The same seed has given the same weights everywhere, unless a machine computes differently.
-            broadcast([*self.policy.parameters(), *self.critic.parameters()])
-            self.obs, _ = self.world.reset(seed=own_seed(self.seed))
-            self.policy.observations.update(self.obs)
-        self.obs = collect(self.world, self.rollout, self.obs, self._sample, self._final_value, self.episodes)
-        collected = time.perf_counter()
-
-        batch, explained = self._prepare()
-        losses = self._update(batch)
-        self.policy.observations.update(self.rollout.obs)
-        steps = self.rollout.rewards.numel() * world_size()
-        self.env_steps += steps
-        metrics = self._metrics(losses, explained)
-        done = time.perf_counter()
-        metrics["Perf/collection_time"] = collected - started
-        metrics["Perf/learning_time"] = done - collected
-        metrics["Perf/steps_per_second"] = steps / (done - started)
-        return metrics
-
-    def eval_action(self, obs: Tensor) -> Tensor:
-        """Mean action for raw observations (N, d), clamped to [-1, 1], (N, a). N need not be the training world's."""
-        return self.policy.eval_action(obs)
-
-    def reset(self, env_mask: Tensor) -> None:
-        """Nothing to forget between episodes."""
-
-    # The rollout.
-
-    def _sample(self, obs: Tensor) -> tuple[Tensor, Tensor]:
-        mean = self.policy.mean(obs)
-        noise = torch.randn(mean.shape, generator=self.generator, device=self.device)
-        # Not clamped: the world does that, and the density must be that of what was drawn.
-        return mean + self.policy.actor.log_std.exp() * noise, mean
-
-    def _final_value(self, obs: Tensor, task_id: Tensor) -> Tensor:
-        return self._in_reward_units(self._critic(self.policy.observations(obs), task_id), task_id)
-
-    # Values. The critic speaks in units of its task's running mean and deviation of returns.
-
-    def _critic(self, obs: Tensor, task_id: Tensor) -> Tensor:
-        with autocast(self.device, self.low_precision):
-            out = self.critic(obs)
-        if self.config.value_heads:
-            return out.gather(1, task_id[:, None]).squeeze(1)
-        return out.squeeze(1)
-
-    def _in_reward_units(self, values: Tensor, task_id: Tensor) -> Tensor:
-        if not self.config.per_task_values:
-            return values
-        return values * self.return_stats.std().float()[task_id] + self.return_stats.mean.float()[task_id]
-
-    def _in_critic_units(self, returns: Tensor, task_id: Tensor) -> Tensor:
-        if not self.config.per_task_values:
-            return returns
-        return (returns - self.return_stats.mean.float()[task_id]) / self.return_stats.std().float()[task_id]
-
-    @torch.no_grad()
-    def _prepare(self) -> tuple[Batch, Tensor]:
-        """Turns the rollout into a batch; also the explained variance per task (num_tasks,)."""
-        r, cfg, num_tasks = self.rollout, self.config, self.world.num_tasks
-        steps, rows = r.rewards.shape
-        task_id = self.world.task_id
-        flat_task_id = task_id.expand(steps, rows).reshape(-1)
-        obs = self.policy.observations(r.obs).flatten(0, 1)
-        if self.low_precision:
-            # Autocast would make this cast in every mini-batch; the result is the same.
-            obs = obs.bfloat16()
-
-        values = self._in_reward_units(self._critic(obs, flat_task_id), flat_task_id).view(steps, rows)
-        last_values = self._final_value(r.last_obs, task_id)
-        next_values = successor_values(values, last_values, r.ended, r.final_values)
-        advantages = gae(r.rewards, values, next_values, r.terminated, r.ended, cfg.gamma, cfg.lam, r.valid)
-        returns = advantages + values
-        explained = explained_variance(values, returns, task_id, num_tasks, r.valid)
-        self.return_stats.merge(*task_moments(returns, task_id, num_tasks, r.valid))
-        group = task_id if cfg.per_task_advantages else torch.zeros_like(task_id)
-        advantages = normalise_per_task(advantages, group, num_tasks, r.valid)
-
-        actions, old_means = r.actions.flatten(0, 1), r.means.flatten(0, 1)
-        batch = Batch(
-            obs=obs,
-            task_id=flat_task_id,
-            actions=actions,
-            old_means=old_means,
-            old_log_probs=gaussian_log_prob(actions, old_means, self.policy.actor.log_std),
-            advantages=advantages.flatten(),
-            targets=self._in_critic_units(returns.flatten(), flat_task_id),
-            weights=r.valid.flatten().float(),
-        )
-        return batch, explained
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
         """PPO's update: returns the means over all mini-batches of what it measured."""
         cfg, actor = self.config, self.policy.actor
-        actor_weights, critic_weights = list(actor.parameters()), list(self.critic.parameters())
-        all_weights = actor_weights + critic_weights
         old_log_std = actor.log_std.detach().clone()
         low, high = (math.log(std) for std in cfg.std_range)
         measured: list[Tensor] = []
@@ -231,39 +66,71 @@ class MTPPO:
             # Divided by the samples of all processes, losses and gradients become means by being summed over them.
             counts = all_sum(torch.stack([batch.weights[index].sum() for index in parts])).clamp_min(1.0)
             for number, (index, count) in enumerate(zip(parts, counts, strict=True)):
-                b = batch.select(index)
-                weight = b.weights / count
-                with autocast(self.device, self.low_precision):
-                    mean = actor(b.obs)
-                values = self._critic(b.obs, b.task_id)
-
-                ratio = torch.exp(gaussian_log_prob(b.actions, mean, actor.log_std) - b.old_log_probs)
-                clipped = ratio.clamp(1.0 - cfg.clip, 1.0 + cfg.clip)
-                surrogate = -(weight * torch.minimum(ratio * b.advantages, clipped * b.advantages)).sum()
-                value_loss = (weight * (values - b.targets).square()).sum()
-                entropy = gaussian_entropy(actor.log_std)
-                loss = surrogate + cfg.value_loss_weight * value_loss - cfg.entropy_weight / world_size() * entropy
-
-                with torch.no_grad():
-                    kl = (weight * gaussian_kl(b.old_means, old_log_std, mean, actor.log_std)).sum()
-                    outside = (weight * ((ratio - 1.0).abs() > cfg.clip)).sum()
-
-                self.actor_adam.zero_grad()
-                self.critic_adam.zero_grad()
-                loss.backward()
-                numbers = torch.stack([surrogate.detach(), value_loss.detach(), kl, outside])
-                measured.append(sum_gradients(all_weights, numbers))
+                measured.append(self._gradients(batch.select(index), count, old_log_std))
                 # The first mini-batch compares the sampling policy with itself and says nothing about the step.
                 if cfg.adaptive_learning_rate and (epoch, number) != (0, 0):
                     self._adapt_learning_rate(measured[-1][2])
-                for weights in [actor_weights, critic_weights] if cfg.clip_apart else [all_weights]:
+                actor_weights, critic_weights = list(actor.parameters()), list(self.critic.parameters())
+                for weights in [actor_weights, critic_weights] if cfg.clip_apart else [actor_weights + critic_weights]:
                     nn.utils.clip_grad_norm_(weights, cfg.max_grad_norm)
                 self.actor_adam.step()
                 self.critic_adam.step()
                 with torch.no_grad():
                     actor.log_std.clamp_(low, high)
+        names = ["Loss/surrogate", "Loss/value", "Policy/kl", "Policy/clip_fraction"]
+        if cfg.gradient_surgery == "pcgrad":
+            names.append("Policy/conflicts")
         means = torch.stack(measured).mean(0)
-        return dict(zip(("Loss/surrogate", "Loss/value", "Policy/kl", "Policy/clip_fraction"), means, strict=True))
+        return {**dict(zip(names, means, strict=True)), "Policy/lr": self.learning_rate}
+
+    def _gradients(self, b: Batch, count: Tensor, old_log_std: Tensor) -> Tensor:
+        """Puts the gradients of a mini-batch into the parameters; ``count`` samples are in it, over all processes.
+
+        Returns:
+            Surrogate loss, value loss, KL, share of clipped ratios and, with surgery, of conflicts: (4,) or (5,).
+        """
+        cfg, actor = self.config, self.policy.actor
+        weight = b.weights / count
+        with autocast(self.device, self.low_precision):
+            mean = actor(b.obs)
+        log_std = actor.log_std_of(b.obs)
+        values = self._critic(b.obs, b.task_id)
+
+        ratio = torch.exp(gaussian_log_prob(b.actions, mean, log_std) - b.old_log_probs)
+        clipped = ratio.clamp(1.0 - cfg.clip, 1.0 + cfg.clip)
+        earned = weight * torch.minimum(ratio * b.advantages, clipped * b.advantages)
+        surrogate = -earned.sum()
+        value_loss = (weight * (values - b.targets).square()).sum()
+        entropy = (weight * gaussian_entropy(log_std)).sum()
+        rest = cfg.value_loss_weight * value_loss - cfg.entropy_weight * entropy
+
+        with torch.no_grad():
+            kl = (weight * gaussian_kl(b.old_means, actor.log_std_of(b.obs, old_log_std), mean, log_std)).sum()
+            outside = (weight * ((ratio - 1.0).abs() > cfg.clip)).sum()
+        numbers = [surrogate.detach(), value_loss.detach(), kl, outside]
+
+        self.actor_adam.zero_grad()
+        self.critic_adam.zero_grad()
+        if cfg.gradient_surgery == "pcgrad":
+            numbers.append(self._operate(-earned, b.task_id))
+            rest.backward()
+        else:
+            (surrogate + rest).backward()
+        return sum_gradients([*actor.parameters(), *self.critic.parameters()], torch.stack(numbers))
+
+    def _operate(self, losses: Tensor, task_id: Tensor) -> Tensor:
+        """Puts the actor's gradient of the summed ``losses`` (B,), after surgery between tasks, into its parameters.
+
+        Returns:
+            The share of pairs of tasks in conflict, divided by the processes that will sum it.
+        """
+        weights = list(self.policy.actor.parameters())
+        per_task = losses.new_zeros(self.world.num_tasks).index_add(0, task_id, losses)
+        gradient, apart = project_conflicting(all_sum(per_task_gradients(per_task, weights)))
+        for parameter, part in zip(weights, gradient.split([p.numel() for p in weights]), strict=True):
+            # All processes have the whole of it, and sum it.
+            parameter.grad = part.view_as(parameter) / world_size()
+        return apart / world_size()
 
     def _adapt_learning_rate(self, kl: Tensor) -> None:
         low, high = self.config.learning_rate_range
@@ -271,62 +138,14 @@ class MTPPO:
         factor = torch.where(kl < 0.5 * self.config.desired_kl, 1.5, factor)
         self.learning_rate.mul_(factor).clamp_(low, high)
 
-    def _metrics(self, losses: dict[str, Tensor], explained: Tensor) -> dict[str, float]:
-        tensors = dict(losses)
-        tensors["Policy/std"] = self.policy.actor.log_std.detach().exp().mean()
-        tensors["Policy/lr"] = self.learning_rate
-        tensors["Train/unstable"] = all_sum((~self.rollout.valid).sum())
-        for name, value in zip(self.world.task_names, explained, strict=True):
-            tensors[f"Value/explained_variance/{name}"] = value
-        # One transfer for all of them.
-        numbers = torch.stack([value.double() for value in tensors.values()]).tolist()
-        metrics = self.episodes.metrics() | dict(zip(tensors, numbers, strict=True))
-        if not math.isfinite(metrics["Loss/surrogate"] + metrics["Loss/value"]):
-            raise FloatingPointError(
-                f"mtppo: the loss is not finite after {self.env_steps} steps; lower learning_rate."
-            )
-        return metrics
-
     # Checkpoints.
 
-    def policy_state_dict(self) -> dict[str, Any]:
-        """What :meth:`load_policy` needs: network, observation statistics, sizes and config."""
-        return {"config": asdict(self.config), "shape": dict(self.shape), "weights": self.policy.state_dict()}
-
-    @staticmethod
-    def load_policy(state: dict[str, Any], device: str | torch.device = "cpu") -> GaussianPolicy:
-        """The agent of a checkpoint, for a world of any number of rows.
-
-        Args:
-            state: ``checkpoint["learner"]["policy"]``.
-            device: Where to run it.
-        """
-        config, shape, device = MTPPOConfig(**state["config"]), state["shape"], torch.device(device)
-        observations = ObservationNormaliser(
-            shape["observations"], shape["num_id_columns"], config.normalise_observations
-        )
-        init = torch.Generator().manual_seed(0)
-        actor = GaussianActor(shape["observations"], config.hidden, shape["actions"], 1.0, init, config.activation)
-        policy = GaussianPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
-        policy.load_state_dict(state["weights"])
-        return policy
+    def _optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        return {"actor_adam": self.actor_adam, "critic_adam": self.critic_adam}
 
     def state_dict(self) -> dict[str, Any]:
         """A copy of everything but the world, as tensors and plain values (``torch.load(weights_only=True)``)."""
-        return copy.deepcopy(
-            {
-                "policy": self.policy_state_dict(),
-                "critic": self.critic.state_dict(),
-                "return_stats": self.return_stats.state_dict(),
-                "actor_adam": self.actor_adam.state_dict(),
-                "critic_adam": self.critic_adam.state_dict(),
-                "learning_rate": self.learning_rate,
-                "generator": self.generator.get_state(),
-                "episodes": self.episodes.state_dict(),
-                "obs": self.obs,
-                "env_steps": self.env_steps,
-            }
-        )
+        return {**super().state_dict(), "learning_rate": self.learning_rate.clone()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`state_dict` gave.
@@ -334,23 +153,9 @@ class MTPPO:
         Raises:
             BidexError: The checkpoint comes from a world of another size.
         """
-        obs = state["obs"]
-        expected = tuple(self.rollout.last_obs.shape)
-        if obs is not None and tuple(obs.shape) != expected:
-            raise BidexError(
-                f"mtppo: the checkpoint's world had (num_envs, observations) = {tuple(obs.shape)}, this one has "
-                f"{expected}. Resume with the run's own suite and num_envs."
-            )
-        self.policy.load_state_dict(state["policy"]["weights"])
-        self.critic.load_state_dict(state["critic"])
-        self.return_stats.load_state_dict(state["return_stats"])
+        super().load_state_dict(state)
         self.learning_rate.copy_(state["learning_rate"])
         for adam, rate in ((self.actor_adam, self.learning_rate), (self.critic_adam, self.critic_learning_rate)):
-            adam.load_state_dict(state["actor_adam" if adam is self.actor_adam else "critic_adam"])
             for group in adam.param_groups:
                 # Loading put a copy there; adapting must reach the optimiser.
                 group["lr"] = rate
-        self.generator.set_state(state["generator"].cpu())
-        self.episodes.load_state_dict(state["episodes"])
-        self.obs = None if obs is None else obs.to(self.device, copy=True)
-        self.env_steps = int(state["env_steps"])

@@ -1,37 +1,23 @@
 """What can be set about MT-PPO, and its presets; imports no torch, so that a command line can show it at once."""
 
 from dataclasses import dataclass
+from typing import ClassVar, Literal
 
-from bidex_algos.choices import Activation, Autocast
-from bidex_meta.errors import BidexError
+from bidex_algos.onpolicy_config import OnPolicyConfig
 
 
 @dataclass(frozen=True)
-class MTPPOConfig:
+class MTPPOConfig(OnPolicyConfig):
     """Everything that can be set about MT-PPO; the defaults are the preset ``laptop``."""
 
-    hidden: tuple[int, ...] = (256, 256, 128)
-    """Widths of the hidden layers, of actor and critic alike."""
-    activation: Activation = "elu"
-    """Non-linearity of the hidden layers."""
-    value_heads: bool = True
-    """Give the critic one output per task instead of one for all."""
-    init_std: float = 0.8
-    """Standard deviation of the actions at the start."""
-    std_range: tuple[float, float] = (0.05, 1.5)
-    """Bounds of the standard deviation of the actions."""
-    rollout_steps: int = 8
-    """Steps taken in every row between two updates."""
+    algo: ClassVar[str] = "mtppo"
+
     num_minibatches: int = 4
     """Mini-batches per epoch; each holds shuffled steps of all rows."""
     epochs: int = 4
     """Passes over the rollout per update."""
     clip: float = 0.2
     """How far the likelihood ratio may leave 1 before it earns nothing more."""
-    gamma: float = 0.93
-    """Discount per step."""
-    lam: float = 0.95
-    """Trace decay of the advantage estimate."""
     learning_rate: float = 3e-4
     """Adam's step size at the start."""
     adaptive_learning_rate: bool = True
@@ -50,16 +36,8 @@ class MTPPOConfig:
     """Gradients longer than this are shortened to it."""
     clip_apart: bool = True
     """Shorten the gradients of actor and critic apart, so that a large value error leaves the policy's step alone."""
-    normalise_observations: bool = True
-    """Give observations zero mean and unit variance by running statistics; the task's one-hot stays as it is."""
-    per_task_values: bool = True
-    """Let the critic predict returns normalised per task by running statistics."""
-    value_horizon: float = 100.0
-    """Iterations after which returns fade from those statistics."""
-    per_task_advantages: bool = True
-    """Normalise advantages within each task instead of over the whole batch."""
-    autocast: Autocast = "auto"
-    """Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX."""
+    gradient_surgery: Literal["none", "pcgrad"] = "none"
+    """pcgrad: take from each task's policy gradient what points against another task's (Yu et al. 2020)."""
 
     def __post_init__(self) -> None:
         """Rejects values that could only fail later.
@@ -67,16 +45,10 @@ class MTPPOConfig:
         Raises:
             BidexError: A field is out of its range.
         """
-        for name in ("rollout_steps", "num_minibatches", "epochs"):
-            if getattr(self, name) < 1:
-                raise BidexError(f"mtppo: {name} must be at least 1, got {getattr(self, name)}.")
-        for name in ("gamma", "lam"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise BidexError(f"mtppo: {name} must lie in [0, 1], got {getattr(self, name)}.")
-        for name in ("std_range", "learning_rate_range"):
-            low, high = getattr(self, name)
-            if not 0.0 < low <= high:
-                raise BidexError(f"mtppo: {name} must be two rising positive numbers, got {low} {high}.")
+        super().__post_init__()
+        self._at_least_one("num_minibatches")
+        self._at_least_one("epochs")
+        self._rising("learning_rate_range")
 
 
 PRESETS: dict[str, MTPPOConfig] = {

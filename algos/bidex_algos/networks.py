@@ -68,6 +68,11 @@ class GaussianActor(nn.Module):
         init_std: Standard deviation at the start.
         generator: CPU generator of the initial weights.
         activation: Name of the non-linearity.
+        heads: Output layers and rows of standard deviations; more than one: as many as the one-hot of the task has
+            columns, which then are the last of the observation and choose the head.
+
+    Attributes:
+        log_std: Logarithms of the standard deviations, (actions,); with more than one head (heads, actions).
     """
 
     def __init__(
@@ -78,14 +83,30 @@ class GaussianActor(nn.Module):
         init_std: float,
         generator: torch.Generator,
         activation: Activation = "elu",
+        heads: int = 1,
     ):
         super().__init__()
-        self.mean = MLP(observations, hidden, actions, 0.01, generator, activation)
-        self.log_std = nn.Parameter(torch.full((actions,), math.log(init_std)))
+        self.heads = heads
+        self.mean = MLP(observations, hidden, heads * actions, 0.01, generator, activation)
+        shape = (actions,) if heads == 1 else (heads, actions)
+        self.log_std = nn.Parameter(torch.full(shape, math.log(init_std)))
 
     def forward(self, x: Tensor) -> Tensor:
         """Mean action of normalised observations (batch, observations), float32 (batch, actions), not clamped."""
-        return self.mean(x)
+        out = self.mean(x)
+        if self.heads == 1:
+            return out
+        heads = out.unflatten(-1, (self.heads, -1))
+        return torch.einsum("...h,...ha->...a", x[..., -self.heads :].to(out.dtype), heads)
+
+    def log_std_of(self, x: Tensor, log_std: Tensor | None = None) -> Tensor:
+        """The rows of ``log_std`` (default: the present ones) that hold for observations (batch, observations).
+
+        Returns:
+            (actions,) with one head, else (batch, actions).
+        """
+        log_std = self.log_std if log_std is None else log_std
+        return log_std if self.heads == 1 else x[..., -self.heads :].to(log_std.dtype) @ log_std
 
 
 def gaussian_log_prob(action: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:

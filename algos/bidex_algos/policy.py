@@ -26,8 +26,14 @@ class GaussianPolicy(nn.Module):
     @torch.no_grad()
     def mean(self, obs: Tensor) -> Tensor:
         """Mean action of raw observations (N, d): float32 (N, a), not clamped."""
+        return self.distribution(obs)[0]
+
+    @torch.no_grad()
+    def distribution(self, obs: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean action (N, a) and logarithm of the standard deviation, (a,) or (N, a), of raw observations (N, d)."""
+        obs = self.observations(obs)
         with autocast(obs.device, self.low_precision):
-            return self.actor(self.observations(obs))
+            return self.actor(obs), self.actor.log_std_of(obs)
 
     def eval_action(self, obs: Tensor) -> Tensor:
         """Mean action of raw observations (N, d), clamped to [-1, 1]: (N, a)."""

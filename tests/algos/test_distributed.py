@@ -12,6 +12,7 @@ from torch.testing import assert_close
 
 from bidex_algos import distributed
 from bidex_algos.mtppo import MTPPO, MTPPOConfig
+from bidex_algos.mttrpo import MTTRPO, MTTRPOConfig
 from bidex_algos.rollout import collect
 from bidex_algos.runner import checkpoint, resume, train
 from bidex_meta.errors import BidexError
@@ -20,6 +21,9 @@ from tests.algos.toy import ToyWorld, nearness
 
 CONFIG = MTPPOConfig(hidden=(32, 32), rollout_steps=8, learning_rate_range=(1e-5, 2e-3), autocast="off")
 ONE_BATCH = replace(CONFIG, num_minibatches=1, entropy_weight=0.01)
+SURGERY = replace(ONE_BATCH, gradient_surgery="pcgrad", policy_heads=True)
+TRUST_REGION = MTTRPOConfig(hidden=(32, 32), rollout_steps=8, num_minibatches=1, fisher_stride=1)
+Learner = MTPPO | MTTRPO
 ROWS = 16
 ITERATION = 2 * 2 * ROWS * 8  # processes, tasks, rows, steps
 BROKEN = ((2, 5), (3, 40), (3, 41), (5, 41), (7, 1))  # more of them in odd rows: samples are not shared evenly
@@ -29,16 +33,22 @@ def toy(rows: int = ROWS, unstable: Any = ()) -> ToyWorld:
     return ToyWorld([nearness(0.6), nearness(-0.3, scale=1000.0)], rows=rows, unstable=unstable)
 
 
-def facts(learner: MTPPO) -> dict[str, torch.Tensor]:
+def make_learner(world: ToyWorld, config: Any) -> Learner:
+    return (MTTRPO if isinstance(config, MTTRPOConfig) else MTPPO)(world, config, seed=0)
+
+
+def facts(learner: Learner) -> dict[str, torch.Tensor]:
     """What one update decides."""
     named = [*learner.policy.named_parameters("policy"), *learner.critic.named_parameters("critic")]
-    found = {name: p.detach().clone() for name, p in named} | {"learning rate": learner.learning_rate.clone()}
+    found = {name: p.detach().clone() for name, p in named}
+    if isinstance(learner, MTPPO):
+        found["learning rate"] = learner.learning_rate.clone()
     for name, stats in (("observations", learner.policy.observations.stats), ("returns", learner.return_stats)):
         found |= {f"{name}.{key}": value.clone() for key, value in stats.state_dict().items()}
     return found
 
 
-def in_precision(learner: MTPPO, dtype: torch.dtype) -> MTPPO:
+def in_precision(learner: Learner, dtype: torch.dtype) -> Learner:
     """Casts the networks and the rollout; the running statistics are float64 anyway."""
     learner.policy.actor.to(dtype), learner.critic.to(dtype)
     for name, value in vars(learner.rollout).items():
@@ -47,7 +57,7 @@ def in_precision(learner: MTPPO, dtype: torch.dtype) -> MTPPO:
     return learner
 
 
-def update(learner: MTPPO) -> dict[str, Any]:
+def update(learner: Learner) -> dict[str, Any]:
     batch, explained = learner._prepare()
     losses = learner._update(batch)
     learner.policy.observations.update(learner.rollout.obs)
@@ -55,16 +65,16 @@ def update(learner: MTPPO) -> dict[str, Any]:
     return {"facts": facts(learner), "losses": losses, "explained": explained, "lost": lost}
 
 
-def one_update(rank: int, dtype: torch.dtype) -> Callable[[], dict[str, Any]]:
+def one_update(rank: int, dtype: torch.dtype, config: Any) -> Callable[[], dict[str, Any]]:
     """An update on all rows in a process on its own; what is returned makes one on half of them in each of two."""
-    whole = MTPPO(toy(2 * ROWS, BROKEN), ONE_BATCH, seed=0)
+    whole = make_learner(toy(2 * ROWS, BROKEN), config)
     first, _ = whole.world.reset(seed=0)
     whole.policy.observations.update(first)
     collect(whole.world, whole.rollout, first, whole._sample, whole._final_value, whole.episodes)
     expected = update(in_precision(whole, dtype))
 
     def in_two() -> dict[str, Any]:
-        half = in_precision(MTPPO(toy(), ONE_BATCH, seed=0), dtype)
+        half = in_precision(make_learner(toy(), config), dtype)
         half.policy.observations.update(first[rank::2])
         for name, value in vars(whole.rollout).items():
             if isinstance(value, torch.Tensor):
@@ -134,9 +144,10 @@ def bad_input(rank: int) -> str:
 
 def everything(rank: int) -> dict[str, Any]:
     """One start of two processes for all tests, since importing torch takes longer than the rest."""
-    updates = {dtype: one_update(rank, dtype) for dtype in (torch.float64, torch.float32)}
+    updates = {dtype: one_update(rank, dtype, ONE_BATCH) for dtype in (torch.float64, torch.float32)}
+    updates |= {c: one_update(rank, torch.float64, c) for c in (SURGERY, TRUST_REGION)}
     distributed.init_from_environment()
-    found: dict[str, Any] = {dtype: in_two() for dtype, in_two in updates.items()}
+    found: dict[Any, Any] = {name: in_two() for name, in_two in updates.items()}
     found |= {"training": training(rank), "stopping": stopping(rank), "bad_input": bad_input(rank)}
     found["seed"] = distributed.own_seed(7)
     found["together"] = distributed.together(lambda: rank + 10)
@@ -154,9 +165,10 @@ def distances(update: dict[str, Any]) -> dict[str, float]:
     return {name: float((half[name] - whole[name]).norm() / whole[name].norm()) for name in whole}
 
 
-def test_an_update_of_two_processes_is_that_of_one_with_all_rows(found):
+@pytest.mark.parametrize("which", [torch.float64, SURGERY, TRUST_REGION], ids=["ppo", "pcgrad", "trpo"])
+def test_an_update_of_two_processes_is_that_of_one_with_all_rows(found, which):
     for here in found:
-        far = {name: d for name, d in distances(here[torch.float64]).items() if not d <= 1e-6}
+        far = {name: d for name, d in distances(here[which]).items() if not d <= 1e-6}
         assert far == {}
 
 

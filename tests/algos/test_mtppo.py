@@ -56,6 +56,40 @@ def test_two_tasks_at_odds_are_learned_though_one_pays_a_thousandfold(heads: boo
     assert max(mean_errors(learner, world, [0.4, -0.4])) < 0.2
 
 
+@pytest.mark.parametrize("options", [{"policy_heads": True}, {"gradient_surgery": "pcgrad"}])
+def test_options_for_many_tasks_learn_them_too(options: dict[str, object]):
+    world = ToyWorld([nearness(0.4), nearness(-0.4, scale=1000.0)])
+    learner = MTPPO(world, replace(SMALL, **options), seed=0)
+    metrics = [learner.iterate() for _ in range(60)]
+    assert max(mean_errors(learner, world, [0.4, -0.4])) < 0.2
+    assert ("Policy/conflicts" in metrics[0]) == ("gradient_surgery" in options)
+    policy = MTPPO.load_policy(learner.state_dict()["policy"])
+    obs, _ = world.reset(seed=2)
+    assert torch.equal(policy.eval_action(obs), learner.eval_action(obs))
+
+
+def test_surgery_between_tasks_that_agree_changes_nothing_but_rounding():
+    world = ToyWorld([nearness(0.4), nearness(0.4)])
+    gradients = []
+    for surgery in ("none", "pcgrad"):
+        learner = MTPPO(world, replace(SMALL, gradient_surgery=surgery, num_minibatches=1), seed=0)
+        learner.iterate()
+        batch, _ = learner._prepare()
+        batch.obs[:, 1:] = 0.5  # the same observation and the same advantages in both tasks
+        batch.obs[:, 0], batch.advantages[:] = 0.0, batch.actions[:, 0]
+        learner._gradients(batch, batch.weights.sum(), learner.policy.actor.log_std.detach().clone())
+        gradients.append(torch.cat([p.grad.flatten() for p in learner.policy.actor.parameters()]))
+    assert gradients[0].norm() > 0
+    assert_close(*gradients)
+
+
+def test_policy_heads_need_a_world_that_shows_the_task():
+    world = ToyWorld([nearness(0.4), nearness(-0.4)])
+    world.num_id_columns = 0
+    with pytest.raises(BidexError, match="policy_heads"):
+        MTPPO(world, replace(SMALL, policy_heads=True), seed=0)
+
+
 def test_without_normalisation_per_task_the_small_task_is_lost():
     world = ToyWorld([nearness(0.4), nearness(-0.4, scale=1000.0)])
     raw = replace(SMALL, per_task_advantages=False, per_task_values=False, clip_apart=False)

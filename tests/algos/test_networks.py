@@ -31,6 +31,18 @@ def test_initial_weights_follow_the_seed_and_leave_the_global_generator_alone():
     assert_close(nets[0].log_std.exp(), torch.full((3,), 0.8))
 
 
+def test_a_head_sees_its_own_task_alone():
+    actor = GaussianActor(5, (8,), 3, 0.8, torch.Generator().manual_seed(0), heads=2)
+    x = torch.cat([torch.randn(4, 3), torch.eye(2).repeat(2, 1)], dim=1)
+    mean, log_std = actor(x), actor.log_std_of(x)
+    with torch.no_grad():
+        actor.mean.head.bias[3:] += 1.0  # the second head's
+        actor.log_std[1] += 1.0
+    assert_close(actor(x) - mean, torch.tensor([0.0, 1.0, 0.0, 1.0])[:, None].expand(4, 3))
+    assert_close(actor.log_std_of(x) - log_std, torch.tensor([0.0, 1.0, 0.0, 1.0])[:, None].expand(4, 3))
+    assert mean.shape == log_std.shape == (4, 3)
+
+
 def test_the_output_layer_stays_float32_under_autocast():
     net = MLP(4, (8,), 2, 1.0, torch.Generator())
     with torch.autocast("cpu", dtype=torch.bfloat16):

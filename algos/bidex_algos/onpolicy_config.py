@@ -1,0 +1,73 @@
+"""What can be set about every on-policy learner; imports no torch, so that a command line can show it at once."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from bidex_algos.choices import Activation, Autocast
+from bidex_meta.errors import BidexError
+
+
+@dataclass(frozen=True)
+class OnPolicyConfig:
+    """Networks, rollouts, statistics; the defaults are the preset ``laptop``."""
+
+    algo: ClassVar[str] = "on-policy"
+    """How the learner calls itself in messages."""
+
+    hidden: tuple[int, ...] = (256, 256, 128)
+    """Widths of the hidden layers, of actor and critic alike."""
+    activation: Activation = "elu"
+    """Non-linearity of the hidden layers."""
+    value_heads: bool = True
+    """Give the critic one output per task instead of one for all."""
+    policy_heads: bool = False
+    """Give the actor an output layer and standard deviations per task instead of one for all; for MT suites, whose
+    observations show the task."""
+    init_std: float = 0.8
+    """Standard deviation of the actions at the start."""
+    std_range: tuple[float, float] = (0.05, 1.5)
+    """Bounds of the standard deviation of the actions."""
+    rollout_steps: int = 8
+    """Steps taken in every row between two updates."""
+    gamma: float = 0.93
+    """Discount per step."""
+    lam: float = 0.95
+    """Trace decay of the advantage estimate."""
+    normalise_observations: bool = True
+    """Give observations zero mean and unit variance by running statistics; the task's one-hot stays as it is."""
+    per_task_values: bool = True
+    """Let the critic predict returns normalised per task by running statistics."""
+    value_horizon: float = 100.0
+    """Iterations after which returns fade from those statistics."""
+    per_task_advantages: bool = True
+    """Normalise advantages within each task instead of over the whole batch."""
+    autocast: Autocast = "auto"
+    """Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX."""
+
+    def __post_init__(self) -> None:
+        """Rejects values that could only fail later.
+
+        Raises:
+            BidexError: A field is out of its range.
+        """
+        self._at_least_one("rollout_steps")
+        self._between("gamma", 0.0, 1.0)
+        self._between("lam", 0.0, 1.0)
+        self._rising("std_range")
+
+    def _at_least_one(self, name: str) -> None:
+        if getattr(self, name) < 1:
+            raise BidexError(f"{self.algo}: {name} must be at least 1, got {getattr(self, name)}.")
+
+    def _between(self, name: str, low: float, high: float) -> None:
+        if not low <= getattr(self, name) <= high:
+            raise BidexError(f"{self.algo}: {name} must lie in [{low:g}, {high:g}], got {getattr(self, name)}.")
+
+    def _positive(self, name: str) -> None:
+        if not getattr(self, name) > 0.0:
+            raise BidexError(f"{self.algo}: {name} must be positive, got {getattr(self, name)}.")
+
+    def _rising(self, name: str) -> None:
+        low, high = getattr(self, name)
+        if not 0.0 < low <= high:
+            raise BidexError(f"{self.algo}: {name} must be two rising positive numbers, got {low} {high}.")

@@ -1,0 +1,125 @@
+import io
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.distributions import Independent, Normal, kl_divergence
+from torch.testing import assert_close
+
+from bidex_algos.mttrpo import MTTRPO, PRESETS, MTTRPOConfig
+from bidex_algos.rollout import collect
+from bidex_meta.errors import BidexError
+from tests.algos.test_mtppo import equal, mean_errors
+from tests.algos.toy import ToyWorld, nearness
+
+SMALL = MTTRPOConfig(hidden=(32, 32), rollout_steps=8, std_range=(0.2, 1.0), fisher_stride=1)
+
+
+def ready(config: MTTRPOConfig, world: ToyWorld) -> MTTRPO:
+    """A learner with a fresh rollout to learn from."""
+    learner = MTTRPO(world, config, seed=0)
+    learner.iterate()
+    assert learner.obs is not None
+    collect(world, learner.rollout, learner.obs, learner._sample, learner._final_value, learner.episodes)
+    return learner
+
+
+def test_a_bandit_is_learned():
+    world = ToyWorld([nearness(0.6)])
+    learner = MTTRPO(world, SMALL, seed=0)
+    metrics = [learner.iterate() for _ in range(40)]
+    assert mean_errors(learner, world, [0.6])[0] < 0.15
+    assert metrics[-1]["Train/success_rate"] > 0.5 > metrics[0]["Train/success_rate"]
+    assert metrics[-1]["Policy/std"] < 0.6  # the standard deviations are trained with the rest
+
+
+@pytest.mark.parametrize("policy_heads", [False, True])
+def test_two_tasks_at_odds_are_learned_though_one_pays_a_thousandfold(policy_heads: bool):
+    world = ToyWorld([nearness(0.4), nearness(-0.4, scale=1000.0)])
+    learner = MTTRPO(world, replace(SMALL, policy_heads=policy_heads), seed=0)
+    for _ in range(60):
+        learner.iterate()
+    assert max(mean_errors(learner, world, [0.4, -0.4])) < 0.2
+
+
+@pytest.mark.parametrize("max_kl", [0.003, 0.03, 0.3])
+@pytest.mark.parametrize("policy_heads", [False, True])
+def test_the_kl_after_the_step_is_kept_and_nearly_used(max_kl: float, policy_heads: bool):
+    learner = ready(replace(SMALL, max_kl=max_kl, policy_heads=policy_heads), ToyWorld([nearness(0.6), nearness(-0.6)]))
+    obs = learner.rollout.obs.flatten(0, 1)
+    before = [part.clone() for part in learner.policy.distribution(obs)]
+    told = learner._update(learner._prepare()[0])["Policy/kl"]
+    after = learner.policy.distribution(obs)
+    p, q = (Independent(Normal(mean, log_std.exp().expand(mean.shape)), 1) for mean, log_std in (before, after))
+    kl = kl_divergence(p, q).mean()
+    assert 0.3 * max_kl < kl <= max_kl * (1 + 1e-5)
+    assert_close(told.float(), kl, rtol=1e-3, atol=1e-6)
+
+
+def test_the_step_raises_the_surrogate():
+    learner = ready(SMALL, ToyWorld([nearness(0.6)]))
+    assert learner._update(learner._prepare()[0])["Loss/surrogate"] < 0
+
+
+def test_a_step_that_the_line_search_refuses_leaves_the_policy_alone():
+    learner = ready(replace(SMALL, accept_ratio=1.0, backtracks=1, max_kl=1.0), ToyWorld([nearness(0.6)]))
+    before = [p.detach().clone() for p in learner.policy.actor.parameters()]
+    told = learner._update(learner._prepare()[0])
+    assert told["Policy/step_share"] == 0.0 and told["Policy/kl"].abs() < 1e-6
+    assert equal(before, [p.detach() for p in learner.policy.actor.parameters()])
+
+
+def test_a_transition_that_broke_physics_teaches_nothing():
+    states = []
+    for garbage in (0.0, 1e8, float("nan")):
+        world = ToyWorld([nearness(0.6), nearness(0.0)], unstable=((2, 5), (3, 40), (7, 0)), garbage=garbage)
+        learner = MTTRPO(world, SMALL, seed=0)
+        assert learner.iterate()["Train/unstable"] == 3
+        states.append(learner.state_dict())
+    assert equal(states[0], states[1]) and equal(states[0], states[2])
+
+
+def test_the_standard_deviation_keeps_its_bounds():
+    learner = MTTRPO(ToyWorld([nearness(0.6)]), replace(SMALL, std_range=(0.79, 0.81)), seed=0)
+    for _ in range(5):
+        learner.iterate()
+    std = learner.policy.actor.log_std.exp()
+    assert std.min() > 0.789 and std.max() < 0.811
+
+
+def test_save_load_resume_is_bit_equal():
+    tasks = [nearness(0.6), nearness(0.0)]
+    unbroken = MTTRPO(ToyWorld(tasks), SMALL, seed=0)
+    for _ in range(3):
+        unbroken.iterate()
+    file = io.BytesIO()
+    torch.save({"learner": unbroken.state_dict(), "env": unbroken.world.state_dict()}, file)
+    file.seek(0)
+    state = torch.load(file, weights_only=True)
+    resumed = MTTRPO(ToyWorld(tasks), SMALL, seed=77)
+    resumed.world.load_state_dict(state["env"])
+    resumed.load_state_dict(state["learner"])
+    for _ in range(3):
+        unbroken.iterate(), resumed.iterate()
+    assert equal(unbroken.state_dict(), resumed.state_dict())
+
+
+def test_the_policy_alone_loads():
+    world = ToyWorld([nearness(0.6), nearness(0.0)])
+    learner = MTTRPO(world, replace(SMALL, policy_heads=True), seed=0)
+    learner.iterate()
+    obs, _ = world.reset(seed=1)
+    policy = MTTRPO.load_policy(learner.state_dict()["policy"])
+    assert torch.equal(policy.eval_action(obs[:5]), learner.eval_action(obs[:5]))
+
+
+def test_config_errors_name_the_field():
+    for field, value in (("cg_iterations", 0), ("max_kl", 0.0), ("backtrack_factor", 1.5), ("gamma", -1.0)):
+        with pytest.raises(BidexError, match=f"mttrpo: {field}"):
+            replace(SMALL, **{field: value})
+
+
+def test_the_paper_preset_has_the_networks_of_table_47_and_a_whole_fisher_matrix():
+    paper = PRESETS["paper"]
+    assert (paper.hidden, paper.rollout_steps, paper.gamma, paper.lam) == ((2048, 1024, 512), 8, 0.96, 0.95)
+    assert (paper.max_kl, paper.cg_iterations, paper.fisher_stride) == (0.01, 10, 1)
