@@ -99,13 +99,18 @@ def collect(
     return obs
 
 
+def may_look(device: torch.device) -> bool:
+    """Whether asking a tensor for its values costs nothing: elsewhere the host would wait for the device."""
+    return device.type == "cpu"
+
+
 def _values_where(cut: Tensor, final_obs: Tensor | None, task_id: Tensor, final_value: FinalValue) -> Tensor:
     """Values (N,) of ``final_obs`` in the rows ``cut``, 0 elsewhere."""
     values = torch.zeros(cut.shape, device=cut.device)
     if final_obs is None:
         return values
-    if cut.device.type != "cpu":
-        # Picking rows would make the host wait for the device; a forward of all rows is cheaper than that.
+    if not may_look(cut.device):
+        # A forward of all rows is cheaper than the wait for which rows there are.
         return torch.where(cut, final_value(final_obs, task_id), values)
     rows = cut.nonzero().squeeze(-1)
     if len(rows):
