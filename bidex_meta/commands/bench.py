@@ -1,4 +1,7 @@
-"""``bidex-meta bench``: flags in, numbers out; what is measured, and how, stands in ``bidex_meta.bench``."""
+"""``bidex-meta bench``: flags in, numbers out.
+
+What is measured, and how, stands in ``bidex_meta.bench``, for a learner in ``bidex_algos.bench``.
+"""
 
 import inspect
 import json
@@ -12,18 +15,18 @@ import tyro
 from bidex_meta.commands.parsing import StepCount, Switch, parse
 from bidex_meta.errors import BidexError, unknown_name
 
-_KINDS = ("world", "scaling", "mixing", "stability", "capacity", "gpu", "kernels")
+_KINDS = ("world", "scaling", "mixing", "stability", "capacity", "gpu", "kernels", "learner")
 
 
 @dataclass(frozen=True)
 class BenchFlags:
-    """Measure speed against bare physics, over threads or against the classes alone, stability, or an accelerator.
+    """Measure speed (against bare physics, the classes alone or rsl-rl's learner), stability, or an accelerator.
 
     Example: bidex-meta bench world --suite MT4 --num-envs 1024 --json
     """
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="|".join(_KINDS))]
-    """world, scaling, mixing, stability, capacity, gpu or kernels."""
+    """world, scaling, mixing, stability, capacity, gpu, kernels, or learner: MT-PPO's update against rsl-rl-lib's."""
     suite: str | None = None
     """Suite to measure: by default world and scaling take MT4, mixing, gpu and kernels MT20, the others every class."""
     task: str | None = None
@@ -34,6 +37,8 @@ class BenchFlags:
     """For gpu: numbers of rows."""
     learning: Switch = False
     """For gpu: measure training with MT-PPO too."""
+    preset: str | None = None
+    """For learner: the preset of MT-PPO, by default laptop."""
     out: Path | None = None
     """For gpu: file that takes each row of the table as it is measured; what is in it is not measured again."""
     num_envs: int | None = None
@@ -41,13 +46,13 @@ class BenchFlags:
     steps: StepCount | None = None
     """Environment steps, per class or repeat."""
     threads: int | None = None
-    """Threads of the physics."""
+    """Threads of the physics, for learner those of torch."""
     device: str | None = None
     """auto, cpu or cuda:N."""
     engine: str | None = None
     """auto, c or warp."""
     seed: int | None = None
-    """Seed of the random actions."""
+    """Seed of the random numbers."""
     json: Switch = False
     """Print JSON."""
 
@@ -57,9 +62,7 @@ def main(arguments: Sequence[str]) -> None:
     flags = parse(BenchFlags, arguments, "bench")
     if flags.what not in _KINDS:
         raise unknown_name("bench", flags.what, _KINDS)
-    from bidex_meta import bench
-
-    measure = getattr(bench, flags.what)
+    measure = _measurement(flags.what)
     asked = {
         name: value
         for name, value in asdict(flags).items()
@@ -79,6 +82,16 @@ def main(arguments: Sequence[str]) -> None:
     from bidex_meta.commands.tables import plain_table, print_table
 
     print_table(plain_table(["measure", "value"], list(_flat(result))))
+
+
+def _measurement(what: str) -> Any:
+    if what == "learner":
+        from bidex_meta.commands.learners import shared
+
+        return shared("bench").learner
+    from bidex_meta import bench
+
+    return getattr(bench, what)
 
 
 def _make_learner(world: Any) -> Any:

@@ -24,7 +24,7 @@ ALGOS: dict[str, str] = {
 
 
 def shared(name: str) -> Any:
-    """A module that all learners share: ``runner`` (the training loop) or ``distributed`` (several processes)."""
+    """No learner's own module: ``runner`` (the training loop), ``distributed`` (processes), ``bench`` (speed)."""
     return importlib.import_module(f"bidex_algos.{name}")
 
 

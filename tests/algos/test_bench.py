@@ -1,0 +1,81 @@
+import json
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bidex_algos import bench
+from bidex_algos.mtppo import PRESETS
+from bidex_meta.cli import main
+
+TINY = replace(PRESETS["laptop"], hidden=(8, 8), rollout_steps=4, num_minibatches=2, epochs=2, autocast="off")
+
+
+def test_bench_learner_prints_both_speeds_and_their_ratio(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("rsl_rl")
+    before = torch.get_rng_state()
+    monkeypatch.setattr(bench, "PRESETS", {"laptop": TINY})
+    assert main(["bench", "learner", "--num-envs", "16", "--threads", "1", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["preset"], found["num_envs"], found["threads"]) == ("laptop", 16, 1)
+    for name in ("defaults", "plain"):
+        row = found[name]
+        assert 0.02 < row["ratio"] < 50.0 and 0.02 < row["update_ratio"] < 50.0
+        for side, rate in row["samples_per_s"].items():
+            # Seconds are rounded to a tenth of a millisecond.
+            assert 64 / rate == pytest.approx(row["seconds"][side], abs=1e-4)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+@pytest.mark.parametrize("value_heads", [True, False])
+def test_both_sides_learn_on_the_same_sizes(value_heads: bool) -> None:
+    pytest.importorskip("rsl_rl")
+    config = replace(TINY, value_heads=value_heads)
+    ours = bench.Ours(bench.Noise(16, 12, 3, 2, seed=0), config, seed=0)
+    theirs = bench.Theirs(bench.Noise(16, 12, 3, 2, seed=0), config)
+    sizes = [sorted(tuple(p.shape) for p in side.parameters() if p.shape[0] > 2) for side in (ours, theirs)]
+    assert sizes[0] == sizes[1]  # but for the critic's outputs: one a task, or one
+    assert len(ours.parameters()) == len(theirs.parameters())
+    for side in (ours, theirs):
+        before = [p.detach().clone() for p in side.parameters()]
+        whole, update = side.seconds()
+        assert 0.0 < update < whole < 60.0
+        for old, new in zip(before, side.parameters(), strict=True):
+            assert not torch.equal(old, new)
+    # Both saw the same.
+    kept, store = ours.learner.rollout, theirs.ppo.storage
+    assert torch.equal(kept.obs, store.observations["all"])
+    assert torch.equal(kept.ended, store.dones.squeeze(-1).bool())
+
+
+def test_noise_ends_rows_and_shows_their_task() -> None:
+    world = bench.Noise(1000, 12, 3, 4, seed=0)
+    obs, reward, terminated, truncated, _ = world.step(torch.zeros(1000, 3))
+    assert torch.equal(obs[:, -4:].argmax(1), world.task_id)
+    assert torch.equal(world.task_id.bincount(), torch.full((4,), 250))
+    assert 0 < terminated.sum() < 20 and 0 < truncated.sum() < 20 and not (terminated & truncated).any()
+    assert reward.std() > 0.9
+
+
+def test_without_rsl_rl_one_line_says_how_to_get_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in [name for name in sys.modules if name.split(".")[0] == "rsl_rl"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "rsl_rl", None)
+    assert main(["bench", "learner", "--num-envs", "16"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "pip install 'bidex-meta[rsl-rl]'" in line
+
+
+@pytest.mark.parametrize(
+    ("flags", "says"), [(["--preset", "laptpo"], "Did you mean 'laptop'"), (["--suite", "MT4"], "takes no --suite")]
+)
+def test_bench_learner_refuses_what_it_does_not_know(
+    flags: list[str], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["bench", "learner", *flags]) == 2
+    assert says in capsys.readouterr().err
