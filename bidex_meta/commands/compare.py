@@ -1,0 +1,114 @@
+"""``bidex-meta compare``: several runs beside each other, intervals over seeds."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from bidex_meta.commands.parsing import Switch, parse
+from bidex_meta.errors import BidexError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from bidex_meta.comparison import Estimate, Group
+
+
+@dataclass(frozen=True)
+class CompareFlags:
+    """Compare evaluated runs; those that differ in the seed alone are one group, measured against the first group.
+
+    Example: bidex-meta compare runs/MT4/mtppo/* runs/MT4/mttrpo/*
+    """
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
+    """Run folders."""
+    json: Switch = False
+    """Print JSON."""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Read, compare, print.
+
+    Raises:
+        BidexError: No run is named, or one is not a run folder or not evaluated.
+    """
+    flags = parse(CompareFlags, arguments, "compare")
+    if not flags.runs:
+        raise BidexError("Name the run folders to compare: bidex-meta compare RUN RUN...")
+    from bidex_meta.commands.tables import plain_table, print_table
+    from bidex_meta.comparison import read_groups
+    from bidex_meta.record import RunFolder
+
+    groups = read_groups([RunFolder.open(path) for path in flags.runs])
+    if flags.json:
+        print(json.dumps([_row(group, groups[0]) for group in groups], indent=2))
+        return
+    print_table(plain_table(["group", "seeds", "steps", "hours", *_MEASURES], [_line(g, groups[0]) for g in groups]))
+    print_table(plain_table(["group", "measure", *groups[0].classes], [row for g in groups for row in _classes(g)]))
+    print("IQM over seeds and classes [95 % bootstrap over seeds]. An interval that holds 0 is no difference.")
+
+
+_MEASURES = ("success, IQM", "score, IQM", "success over the first", "score over the first")
+
+
+def _row(group: "Group", first: "Group") -> dict[str, Any]:
+    from bidex_meta.comparison import iqm
+
+    row: dict[str, Any] = {
+        "group": group.label, "seeds": group.seeds, "steps": group.steps, "hours": round(group.hours, 3)
+    }  # fmt: skip
+    for name, own, other in (("success", group.success, first.success), ("score", group.scores, first.scores)):
+        row[f"{name}_iqm"] = None if own is None else vars(iqm(own))
+        over = _over(own, other)
+        row[f"{name}_over_first"] = None if over is None or group is first else vars(over)
+    row["classes"] = {
+        name: {"success": group.success[:, i].tolist(), "return": group.returns[:, i].tolist()}
+        for i, name in enumerate(group.classes)
+    }
+    return row
+
+
+def _line(group: "Group", first: "Group") -> list[object]:
+    from bidex_meta.comparison import iqm
+
+    cells: list[object] = [group.label, len(group.seeds), f"{group.steps:,}", f"{group.hours:.2f}"]
+    cells.append(_ranged(iqm(group.success), 100.0, " %"))
+    cells.append("–" if group.scores is None else _ranged(iqm(group.scores)))
+    if group is first:
+        return [*cells, "", ""]
+    for own, other, factor, unit in (
+        (group.success, first.success, 100.0, " %"),
+        (group.scores, first.scores, 1.0, ""),
+    ):
+        over = _over(own, other)
+        cells.append("–" if over is None else _ranged(over, factor, unit, sign=True))
+    return cells
+
+
+def _over(own: "np.ndarray | None", other: "np.ndarray | None") -> "Estimate | None":
+    """The difference of interquartile means, where both are known."""
+    from bidex_meta.comparison import iqm_difference
+
+    return None if own is None or other is None else iqm_difference(own, other)
+
+
+def _classes(group: "Group") -> list[list[object]]:
+    """Mean over seeds, and the seeds' range."""
+    rows: list[list[object]] = []
+    for name, values, factor, unit in (("success", group.success, 100.0, " %"), ("return", group.returns, 1.0, "")):
+        cells = [
+            f"{factor * column.mean():.4g}{unit} ({factor * column.min():.4g} to {factor * column.max():.4g})"
+            for column in values.T
+        ]
+        rows.append([group.label, name, *cells])
+    return rows
+
+
+def _ranged(estimate: "Estimate", factor: float = 1.0, unit: str = "", sign: bool = False) -> str:
+    form = "+.1f" if sign else ".1f"
+    ends = "–" if estimate.interval is None else ", ".join(f"{factor * end:{form}}" for end in estimate.interval)
+    return f"{factor * estimate.value:{form}}{unit} \\[{ends}]"

@@ -1,0 +1,97 @@
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bidex_meta.cli import main
+from bidex_meta.comparison import iqm, iqm_difference, read_groups
+from bidex_meta.errors import BidexError
+from bidex_meta.record import RunFolder
+
+
+def run(
+    root: Path, seed: int, successes: dict[str, float], algo: str = "mtppo", task: str | None = None, **learner: Any
+) -> Path:
+    config = {"suite": None if task else "MT4", "task": task, "algo": algo, "seed": seed, "steps": 1000}
+    config |= {"num_envs": 8, "learner": learner}
+    path = root / f"{algo}_{task}_{seed}_{learner}"
+    folder = RunFolder.create(config, path)
+    metrics = [{"step": 500, "Perf/collection_time": 1700.0, "Perf/learning_time": 100.0}, {"step": 1000}]
+    folder.metrics_path.write_text("".join(json.dumps(row) + "\n" for row in metrics))
+    classes = {name: {"success": s, "return": 10 * s, "score": 100 * s} for name, s in successes.items()}
+    (path / "evaluation.json").write_text(json.dumps({"policy": {"classes": classes}}))
+    return path
+
+
+def groups(*paths: Path):
+    return read_groups([RunFolder.open(path) for path in paths])
+
+
+def test_runs_that_differ_in_the_seed_alone_are_one_group(tmp_path: Path):
+    paths = [run(tmp_path, seed, {"A": 0.5, "B": seed / 10}, gamma=0.9) for seed in (2, 1)]
+    other = run(tmp_path, 1, {"A": 0.1, "B": 0.1}, gamma=0.8)
+    first, second = groups(*paths, other)
+    assert (first.label, first.seeds, second.label) == ("mtppo, gamma 0.9", [1, 2], "mtppo, gamma 0.8")
+    assert np.array_equal(first.success, [[0.5, 0.1], [0.5, 0.2]]) and np.array_equal(first.returns, 10 * first.success)
+    assert first.hours == 0.5 and first.steps == 1000
+
+
+def test_runs_of_single_classes_make_one_seed_together(tmp_path: Path):
+    paths = [run(tmp_path, seed, {c: 0.5}, "ppo", task=c) for seed in (0, 1) for c in "AB"]
+    [group] = groups(*paths)
+    assert (group.label, group.classes, group.seeds, group.steps, group.hours) == ("ppo", ["A", "B"], [0, 1], 2000, 1.0)
+
+
+def test_the_interquartile_mean_leaves_out_the_outer_quarters():
+    values = np.array([[0.0, 0.4], [0.6, 100.0]])
+    assert iqm(values).value == pytest.approx(0.5)
+    interval = iqm(values).interval
+    assert interval is not None and interval[0] <= 0.5 <= interval[1]
+    assert iqm(values[:1]).interval is None
+
+
+def test_a_difference_that_seeds_blur_holds_zero_and_a_clear_one_does_not():
+    low, high = np.array([[0.1, 0.2], [0.12, 0.22], [0.1, 0.21]]), np.array([[0.5, 0.6], [0.52, 0.6], [0.5, 0.63]])
+    clear = iqm_difference(high, low).interval
+    assert clear is not None and clear[0] > 0.3
+    blurred = iqm_difference(np.array([[0.0], [0.5], [1.0]]), np.array([[0.1], [0.4], [0.9]])).interval
+    assert blurred is not None and blurred[0] < 0 < blurred[1]
+    assert iqm_difference(high[:1], low).interval is None
+
+
+def test_the_command_prints_tables_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    paths = [str(run(tmp_path, s, {"A": 0.5, "B": 0.2 + s / 10}, algo)) for algo in ("mtppo", "mttrpo") for s in (0, 1)]
+    assert main(["compare", *paths]) == 0
+    out = capsys.readouterr().out
+    assert "mttrpo" in out and "50 % (50 to 50)" in out and "is no difference" in out
+    assert main(["compare", *paths, "--json"]) == 0
+    first, second = json.loads(capsys.readouterr().out)
+    assert first["success_over_first"] is None and second["success_over_first"]["value"] == 0.0
+    assert second["classes"]["B"]["success"] == pytest.approx([0.2, 0.3]) and second["score_iqm"]["value"] > 0
+
+
+def test_a_class_without_a_reference_leaves_the_group_without_a_score(tmp_path: Path):
+    path = run(tmp_path, 0, {"A": 0.5})
+    (path / "evaluation.json").write_text(
+        json.dumps({"classes": {"A": {"success": 0.5, "return": 1.0, "score": None}}})
+    )
+    assert groups(path)[0].scores is None
+
+
+def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    one = run(tmp_path, 0, {"A": 0.5}, gamma=0.9)
+    (tmp_path / "again").mkdir()
+    with pytest.raises(BidexError, match="second run of mtppo with seed 0"):
+        groups(one, run(tmp_path / "again", 0, {"A": 0.5}, gamma=0.9))
+    with pytest.raises(BidexError, match="same classes"):
+        groups(one, run(tmp_path / "again", 1, {"B": 0.5}, gamma=0.9))
+    (one / "evaluation.json").unlink()
+    for words, told in (
+        ([], "Name the run"),
+        ([str(one)], "no evaluation.json"),
+        ([str(tmp_path)], "not a run folder"),
+    ):
+        assert main(["compare", *words]) == 2
+        assert told in capsys.readouterr().err
