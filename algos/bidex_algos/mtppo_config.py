@@ -100,4 +100,24 @@ PRESETS: dict[str, MTPPOConfig] = {
         normalise_observations=False,
     ),
     "laptop": MTPPOConfig(),
+    # Meta-World's multi-task suites: networks, discount, trace, clip and entropy weight are those of the MTPPO that its
+    # authors publish (metaworld-algorithms). A rollout is one time limit in every row instead of their twenty, and the
+    # passes over it are fewer, so that a CPU updates often enough to learn within minutes.
+    "metaworld": MTPPOConfig(
+        hidden=(400, 400, 400),
+        activation="relu",
+        init_std=1.0,
+        std_range=(0.1, 1.5),
+        rollout_steps=500,
+        num_minibatches=8,
+        epochs=8,
+        clip=0.2,
+        gamma=0.99,
+        lam=0.97,
+        learning_rate=5e-4,
+        desired_kl=0.02,
+        critic_learning_rate=1e-3,
+        entropy_weight=5e-3,
+        max_grad_norm=1.0,
+    ),
 }
