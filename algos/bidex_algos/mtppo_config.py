@@ -72,4 +72,21 @@ PRESETS: dict[str, MTPPOConfig] = {
         normalise_observations=False,
     ),
     "laptop": MTPPOConfig(),
+    # Meta-World's multi-task suites: discount, trace and clip are those of the MTPPO that its authors publish
+    # (metaworld-algorithms). A rollout is 100 steps instead of their 10,000 and the networks are small: on MT3 one of
+    # 250 steps (ELU, 8 mini-batches) had learned less after 150 k steps: success 24 against 42 % in training, one seed each.
+    "metaworld": MTPPOConfig(
+        hidden=(256, 256, 128),
+        activation="tanh",
+        init_std=0.8,
+        rollout_steps=100,
+        num_minibatches=4,
+        epochs=5,
+        clip=0.2,
+        gamma=0.99,
+        lam=0.97,
+        learning_rate=5e-4,
+        desired_kl=0.02,
+        std_range=(0.1, 1.5),
+    ),
 }

@@ -8,8 +8,9 @@ from typing import Annotated, Any, cast
 
 import tyro
 
+from bidex_meta.clients import metaworld
 from bidex_meta.commands.parsing import Switch, parse
-from bidex_meta.errors import unknown_name
+from bidex_meta.errors import BidexError, unknown_name
 
 _POLICIES = {"random": "uniform actions", "zero": "zero actions"}
 
@@ -43,6 +44,8 @@ class BaselineFlags:
 def main(arguments: Sequence[str]) -> None:
     """Measure, store, print."""
     flags = parse(BaselineFlags, arguments, "baseline")
+    if metaworld.is_foreign(flags.suite):
+        raise BidexError(f"References are kept of classes of our own, got --suite {flags.suite}. Name another suite.")
     if flags.what == "expert":
         _expert(flags)
     elif flags.what in _POLICIES:

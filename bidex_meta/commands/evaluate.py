@@ -17,8 +17,8 @@ class EvaluateFlags:
 
     run: RunPath
     """Run folder."""
-    episodes: int = 4
-    """Episodes of each task."""
+    episodes: int | None = None
+    """Episodes of each task; None: 4, or 1 where a task fixes its start (metaworld/...)."""
     split: Literal["train", "test"] = "train"
     """Tasks to play: those trained on, or a meta suite's unseen ones."""
     random: Switch = False
@@ -26,7 +26,7 @@ class EvaluateFlags:
     seed: int | None = None
     """Seed of the episodes' starts; None: one that training does not use."""
     num_envs: int | None = None
-    """Rows stepped together, a multiple of the number of tasks; None: one per task."""
+    """Rows stepped together, a multiple of the number of tasks; None: one per task (metaworld/...: 5 per class)."""
     device: str = "auto"
     """auto, cpu or cuda:N."""
     engine: Literal["auto", "c", "warp"] = "auto"
@@ -44,22 +44,20 @@ def main(arguments: Sequence[str]) -> None:
     from bidex_meta.commands import worlds
     from bidex_meta.commands.learners import resolve_device
     from bidex_meta.commands.tables import evaluation_table, print_table
-    from bidex_meta.evaluate import RandomAgent, compare, evaluate
+    from bidex_meta.evaluate import RandomAgent, compare
     from bidex_meta.record import RunFolder
-    from bidex_meta.references import references
 
     folder = RunFolder.open(flags.run)
-    config = {**folder.config(), "device": resolve_device(flags.device), "engine": flags.engine}
+    stored = folder.config()
+    config = {**stored, "device": resolve_device(flags.device, stored["suite"]), "engine": flags.engine}
     torch.set_num_threads(config["threads"])
     policy, step = worlds.load_policy(folder, config["device"])
     world = worlds.evaluation_world(config, flags.split, flags.num_envs)
     seed = worlds.EVALUATION_SEED if flags.seed is None else flags.seed
-    # Both references are of moving bases, as suites have them.
-    known = references() if config["suite"] is not None else {}
-    found = evaluate(policy, world, flags.episodes, seed=seed, references=known)
+    found = worlds.judge(config, policy, world, flags.episodes, seed)
     random = None
     if flags.random:
-        random = evaluate(RandomAgent(world.action_space), world, flags.episodes, seed=seed, references=known)
+        random = worlds.judge(config, RandomAgent(world.action_space), world, flags.episodes, seed)
     world.close()
     if not flags.json:
         title = f"{config['algo']} on {config['suite'] or config['task']}, {flags.split} tasks, {step:,} steps"

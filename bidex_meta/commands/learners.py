@@ -12,6 +12,7 @@ import importlib
 from dataclasses import dataclass
 from typing import Any
 
+from bidex_meta.clients import metaworld
 from bidex_meta.commands.launch import launch
 from bidex_meta.errors import BidexError, unknown_name
 
@@ -56,18 +57,21 @@ def learner_kind(name: str) -> LearnerKind:
     return LearnerKind(name, getattr(module, class_name), dict(module.PRESETS))
 
 
-def choose_preset(kind: LearnerKind, asked: str, device: str) -> tuple[str, str]:
+def choose_preset(kind: LearnerKind, asked: str, device: str, suite: str | None = None) -> tuple[str, str]:
     """The preset's name and, in words, why this one.
 
     Args:
         kind: The learner.
         asked: A preset's name, or ``auto``.
         device: ``cpu``, ``cuda``, ``cuda:0``, ...
+        suite: What it shall train on; None for a task alone.
     """
     if asked != "auto":
         if asked not in kind.presets:
             raise unknown_name("preset", asked, ["auto", *kind.presets])
         return asked, "as asked"
+    if metaworld.is_foreign(suite) and "metaworld" in kind.presets:
+        return "metaworld", "the suite is Meta-World's"
     if device.startswith("cpu"):
         return "laptop", "the device is a CPU"
     if "tuned" in kind.presets:
@@ -75,8 +79,8 @@ def choose_preset(kind: LearnerKind, asked: str, device: str) -> tuple[str, str]
     return "paper", "the device is a GPU"
 
 
-def resolve_device(asked: str) -> str:
-    """``auto`` to ``cuda`` where there is one, else ``cpu``; anything else as it is.
+def resolve_device(asked: str, suite: str | None = None) -> str:
+    """``auto`` to ``cuda`` where there is one and the suite can use it, else ``cpu``; anything else as it is.
 
     Raises:
         BidexError: torch does not know the device, or it is not there (for each of several processes).
@@ -84,7 +88,7 @@ def resolve_device(asked: str) -> str:
     import torch
 
     if asked == "auto":
-        asked = "cuda" if torch.cuda.is_available() else "cpu"
+        asked = "cuda" if torch.cuda.is_available() and not metaworld.is_foreign(suite) else "cpu"
     here = launch()
     if here.count > 1 and asked.startswith("cuda:"):
         raise BidexError(f"Expected device auto, cpu or cuda, since each process takes a GPU of its own; got {asked}.")

@@ -41,10 +41,11 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _suites() -> list[dict[str, Any]]:
+    from bidex_meta.clients import metaworld
     from bidex_meta.suite import load_suite, suite_names
 
     suites = [load_suite(name) for name in suite_names()]
-    return [
+    ours = [
         {
             "name": suite.name,
             "kind": suite.kind,
@@ -53,6 +54,11 @@ def _suites() -> list[dict[str, Any]]:
             "summary": suite.description,
         }
         for suite in suites
+    ]
+    summary = "Meta-World's own environments, to run our learners on (only run and evaluate know them)"
+    return ours + [
+        {"name": name, "kind": "multi-task", "train_classes": list(classes), "test_classes": [], "summary": summary}
+        for name, classes in metaworld.SUITES.items()
     ]
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from bidex_meta.clients import metaworld
 from bidex_meta.commands.parsing import parse
 from bidex_meta.errors import BidexError, unknown_name
 
@@ -77,6 +78,8 @@ def _rows(config: dict[str, Any]) -> int:
     """One row for each slot is enough to see one of them."""
     if config["suite"] is None:
         return 1
+    if metaworld.is_foreign(config["suite"]):
+        raise BidexError(f"Pictures are made of classes of our own, got the suite {config['suite']}. Name another.")
     from bidex_meta.suite import load_suite
 
     return sum(max(len(entry.tasks), 1) for entry in load_suite(config["suite"]).split_classes("train"))

@@ -163,17 +163,14 @@ def _what_is_left(folder: Any, processes: int) -> str:
 def _evaluate(plan: RunPlan, folder: Any, learner: Any) -> None:
     from bidex_meta.commands import worlds
     from bidex_meta.commands.tables import evaluation_table, print_table
-    from bidex_meta.evaluate import RandomAgent, compare, evaluate
+    from bidex_meta.evaluate import RandomAgent, compare
     from bidex_meta.record.atomic import write_json
-    from bidex_meta.references import references
 
-    _say(f"Evaluating: {plan.flags.episodes} episodes of each task, and as many of a random policy.")
-    world = worlds.evaluation_world(plan.config)
-    seed, episodes = worlds.EVALUATION_SEED, plan.flags.episodes
-    # Both references are of moving bases, as suites have them.
-    known = references() if plan.config["suite"] is not None else {}
-    trained = evaluate(learner, world, episodes, seed=seed, references=known)
-    random = evaluate(RandomAgent(world.action_space), world, episodes, seed=seed, references=known)
+    episodes = plan.flags.episodes or worlds.default_episodes(plan.config)
+    _say(f"Evaluating: {episodes} episode{'s' * (episodes > 1)} of each task, and as many of a random policy.")
+    world, seed = worlds.evaluation_world(plan.config), worlds.EVALUATION_SEED
+    trained = worlds.judge(plan.config, learner, world, episodes, seed)
+    random = worlds.judge(plan.config, RandomAgent(world.action_space), world, episodes, seed)
     world.close()
     above = {name: asdict(difference) for name, difference in compare(trained, random).items()}
     found = {"policy": trained.to_json(), "random": random.to_json(), "return_above_random": above}

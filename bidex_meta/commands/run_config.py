@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from bidex_meta.clients import metaworld
 from bidex_meta.commands.launch import launch, resume_command
 from bidex_meta.commands.learners import LearnerKind, choose_preset, learner_kind, resolve_device
 from bidex_meta.commands.parsing import StepCount, Switch, parse, peek
@@ -16,6 +17,8 @@ from bidex_meta.errors import BidexError
 from bidex_meta.record.folder import RunFolder
 
 _ROWS_AND_STEPS = {"cpu": (1024, 20_000_000), "gpu": (8192, 200_000_000)}
+# Meta-World's rows are environments of some 10 MB each; 2 M steps a class is the budget of published results.
+_FOREIGN_ROWS_AND_STEPS = (4, 2_000_000)
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,8 @@ class RunFlags:
     algo: str = "mtppo"
     """Learner (see `bidex-meta list algos`)."""
     preset: str = "auto"
-    """Values of the learner's config that no flag sets; auto: laptop on a CPU, on a GPU tuned or else paper."""
+    """Values of the learner's config that no flag sets; auto: metaworld for a suite of Meta-World's, else laptop on a
+    CPU, on a GPU tuned or else paper."""
     num_envs: int = 0
     """Rows stepped together by each process, over all tasks."""
     steps: StepCount = 0
@@ -52,8 +56,8 @@ class RunFlags:
     """Continue this run from its last checkpoint, with its own config; only --steps may change."""
     evaluate: bool = True
     """Evaluate at the end."""
-    episodes: int = 4
-    """Episodes of each task in that evaluation."""
+    episodes: int | None = None
+    """Episodes of each task in that evaluation; None: 4, or 1 where a task fixes its start (metaworld/...)."""
     print_config: Switch = False
     """Print the resolved config as JSON and stop."""
 
@@ -86,26 +90,38 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     folder = RunFolder.open(Path(resume)) if resume else None
     stored = {"engine": "auto", **folder.config()} if folder else {}  # older runs knew one engine
     kind = learner_kind(peek(arguments, "--algo") or stored.get("algo", RunFlags.algo))
-    device = resolve_device(peek(arguments, "--device") or stored.get("device", RunFlags.device))
-    preset, reason = choose_preset(kind, peek(arguments, "--preset") or stored.get("preset", RunFlags.preset), device)
+    suite = peek(arguments, "--suite") or stored.get("suite")
+    device = resolve_device(peek(arguments, "--device") or stored.get("device", RunFlags.device), suite)
+    asked = peek(arguments, "--preset") or stored.get("preset", RunFlags.preset)
+    preset, reason = choose_preset(kind, asked, device, suite)
     learner_default = kind.presets[preset]
     if folder:
         learner_default = _stored_learner(type(learner_default), stored, folder)
-    flags = parse(*_options(arguments, learner_default, stored, device))
+    flags = parse(*_options(arguments, learner_default, stored, _rows_and_steps(suite, device)))
     config = _resolved(flags, preset, device, stored)
     if folder:
         _refuse_changes(stored, config, folder)
     return RunPlan(flags, kind, flags.learner, config, folder, reason)
 
 
-def _options(arguments: Sequence[str], learner: Any, stored: dict[str, Any], device: str) -> tuple[Any, ...]:
+def _rows_and_steps(suite: str | None, device: str) -> tuple[int, int]:
+    """What ``--num-envs`` and ``--steps`` are where nobody says."""
+    if suite in metaworld.SUITES:
+        rows, steps = (number * len(metaworld.SUITES[suite]) for number in _FOREIGN_ROWS_AND_STEPS)
+        return rows, steps
+    return _ROWS_AND_STEPS["cpu" if device.startswith("cpu") else "gpu"]
+
+
+def _options(
+    arguments: Sequence[str], learner: Any, stored: dict[str, Any], rows_and_steps: tuple[int, int]
+) -> tuple[Any, ...]:
     """The arguments of ``parse``: ``RunFlags`` with a field ``learner``, and the defaults."""
     # The learner's dataclass is known only now, and its fields shall be flags with their help texts.
     options = dataclasses.make_dataclass(
         "RunOptions", [("learner", type(learner), field(default=learner))], bases=(RunFlags,), frozen=True
     )
     options.__doc__ = RunFlags.__doc__
-    rows, steps = _ROWS_AND_STEPS["cpu" if device.startswith("cpu") else "gpu"]
+    rows, steps = rows_and_steps
     names = {entry.name for entry in dataclasses.fields(RunFlags)}
     known = {name: value for name, value in stored.items() if name in names}
     default = options(**{"num_envs": rows, "steps": steps, **known, "learner": learner})

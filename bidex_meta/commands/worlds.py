@@ -2,14 +2,18 @@
 
 from typing import Any
 
+from bidex_meta.clients import metaworld
 from bidex_meta.commands.launch import launch
 from bidex_meta.commands.learners import learner_kind
 from bidex_meta.errors import BidexError, unknown_name
-from bidex_meta.evaluate import Agent
+from bidex_meta.evaluate import Agent, Evaluation
 from bidex_meta.record import RunFolder
 
 EVALUATION_SEED = 1_000_000
 """Seed of the starts in evaluation: not a seed anybody trains with, so that they are new to the policy."""
+
+_FOREIGN_ROWS = 5
+"""Rows of each class in Meta-World's evaluation worlds: its tasks are played in turns, and 5 divides 50."""
 
 
 def check_names(config: dict[str, Any]) -> None:
@@ -18,7 +22,9 @@ def check_names(config: dict[str, Any]) -> None:
     Raises:
         BidexError: With the nearest name.
     """
-    if config["suite"] is not None:
+    if metaworld.is_foreign(config["suite"]):
+        metaworld.class_names(config["suite"])
+    elif config["suite"] is not None:
         from bidex_meta.suite import load_suite
 
         load_suite(config["suite"])
@@ -40,12 +46,42 @@ def evaluation_world(config: dict[str, Any], split: str = "train", rows: int | N
     Args:
         config: The run's config.
         split: ``train`` or ``test``.
-        rows: Rows over all tasks; one per task by default.
+        rows: Rows over all tasks; one per task by default (a few per class where the suite is Meta-World's).
     """
     return _world(config, split, rows, "DISABLED")
 
 
+def judge(config: dict[str, Any], agent: Agent, world: Any, episodes: int | None, seed: int) -> Evaluation:
+    """Evaluate a policy on all tasks of an evaluation world, beside the references of the normalised score.
+
+    Args:
+        config: The run's config.
+        agent: The policy.
+        world: What ``evaluation_world`` made of the config.
+        episodes: Episodes of each task; None takes ``default_episodes``.
+        seed: Of the starts.
+    """
+    episodes = default_episodes(config) if episodes is None else episodes
+    if metaworld.is_foreign(config["suite"]):
+        from bidex_meta.clients.metaworld_world import evaluate_all_tasks
+
+        return evaluate_all_tasks(agent, world, episodes, seed=seed)
+    from bidex_meta.evaluate import evaluate
+    from bidex_meta.references import references
+
+    # Both references are of moving bases, as suites have them.
+    known = references() if config["suite"] is not None else {}
+    return evaluate(agent, world, episodes, seed=seed, references=known)
+
+
+def default_episodes(config: dict[str, Any]) -> int:
+    """Episodes of each task: 4, but 1 where a task fixes its start, so that a policy would only repeat itself."""
+    return 1 if metaworld.is_foreign(config["suite"]) else 4
+
+
 def _world(config: dict[str, Any], split: str, rows: int | None, mode: str) -> Any:
+    if metaworld.is_foreign(config["suite"]):
+        return _foreign_world(config, split, rows, mode)
     from bidex_meta.benchmark import Benchmark, make_task_world
 
     keywords: dict[str, Any] = {
@@ -66,6 +102,19 @@ def _world(config: dict[str, Any], split: str, rows: int | None, mode: str) -> A
         # Rows are split evenly over classes, so that all need as many as the class with the most tasks.
         rows = max((tasks.count(name) for name in set(tasks)), default=1) * len(set(tasks)) or 1
     return benchmark.make_world(split, num_envs=rows, **keywords)
+
+
+def _foreign_world(config: dict[str, Any], split: str, rows: int | None, mode: str) -> Any:
+    suite, device, engine = config["suite"], config["device"], config.get("engine", "auto")
+    if split != "train":
+        raise BidexError(f"{suite} has the split train alone, got {split!r}. Leave --split out.")
+    if not device.startswith("cpu") or engine == "warp":
+        wrong = f"--device {device}" if engine != "warp" else "--engine warp"
+        raise BidexError(f"Meta-World's environments run on the CPU in C MuJoCo, got {wrong}. Add --device cpu.")
+    from bidex_meta.clients.metaworld_world import MetaWorldWorld
+
+    rows = rows or _FOREIGN_ROWS * len(metaworld.class_names(suite))
+    return MetaWorldWorld(suite, rows, seed=config["seed"], autoreset_mode=mode)
 
 
 def load_policy(folder: RunFolder, device: str) -> tuple[Agent, int]:

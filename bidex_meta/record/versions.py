@@ -8,7 +8,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-_PACKAGES = ("bidex-meta", "mujoco", "mujoco-warp", "warp-lang", "torch", "gymnasium", "numpy", "scipy")
+_PACKAGES = ("bidex-meta", "mujoco", "mujoco-warp", "warp-lang", "torch", "gymnasium", "metaworld", "numpy", "scipy")
 
 
 def collect_versions() -> dict[str, Any]:
