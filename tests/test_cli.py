@@ -268,6 +268,23 @@ def test_render_picture_and_film(monkeypatch, toy_worlds, tmp_path, capsys):
 # List and bench.
 
 
+def test_a_single_task_has_its_own_column_of_table_42(capsys):
+    found = {}
+    for task in ("CatchUnderarm", "LiftUnderarm", "StackBlock"):
+        assert main(["run", "--task", task, "--algo", "ppo", "--preset", "paper", "--print-config"]) == 0
+        found[task] = json.loads(capsys.readouterr().out)["learner"]
+    columns = {
+        name: [row[key] for key in ("hidden", "num_minibatches", "epochs", "rollout_steps", "gamma")]
+        for name, row in found.items()
+    }
+    layers = [1024, 1024, 512]
+    assert columns == {
+        "CatchUnderarm": [layers, 4, 5, 8, 0.96],
+        "LiftUnderarm": [layers, 4, 10, 20, 0.96],
+        "StackBlock": [layers, 8, 2, 8, 0.9],
+    }
+
+
 def test_list_suites_and_algos_as_json(capsys):
     assert main(["list", "suites", "--json"]) == 0
     suites = {row["name"]: row for row in json.loads(capsys.readouterr().out)}

@@ -24,9 +24,10 @@ __all__ = ["MTPPO", "PRESETS", "Batch", "MTPPOConfig"]
 
 
 class MTPPO(OnPolicy):
-    """Multi-task PPO on a batched world; arguments and attributes as :class:`~bidex_algos.onpolicy.OnPolicy`.
+    """Multi-task PPO on a batched world.
 
-    Several processes make a mini-batch as many times larger.
+    Arguments and attributes are those of :class:`~bidex_algos.onpolicy.OnPolicy`. Several processes make a mini-batch
+    as many times larger.
 
     Raises:
         BidexError: Fewer samples in a rollout than mini-batches.

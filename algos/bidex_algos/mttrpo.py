@@ -26,7 +26,10 @@ __all__ = ["MTTRPO", "PRESETS", "MTTRPOConfig"]
 
 
 class MTTRPO(OnPolicy):
-    """Multi-task TRPO on a batched world; arguments and attributes as :class:`~bidex_algos.onpolicy.OnPolicy`."""
+    """Multi-task TRPO on a batched world.
+
+    Arguments and attributes are those of :class:`~bidex_algos.onpolicy.OnPolicy`.
+    """
 
     name, remedy = "mttrpo", "lower max_kl or critic_learning_rate"
     config_type = MTTRPOConfig

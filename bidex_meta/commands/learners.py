@@ -18,8 +18,9 @@ from bidex_meta.errors import BidexError, unknown_name
 
 ALGOS: dict[str, str] = {
     "mtppo": "bidex_algos.mtppo:MTPPO",
-    "ppo": "bidex_algos.mtppo:MTPPO",  # of one task it is plain PPO
     "mttrpo": "bidex_algos.mttrpo:MTTRPO",
+    # On a single task they are the plain ones, with presets of their own (bidex_algos.single_task).
+    "ppo": "bidex_algos.mtppo:MTPPO",
     "trpo": "bidex_algos.mttrpo:MTTRPO",
 }
 
@@ -41,8 +42,12 @@ class LearnerKind:
     """Configs by name; all of one dataclass."""
 
 
-def learner_kind(name: str) -> LearnerKind:
+def learner_kind(name: str, task: str | None = None) -> LearnerKind:
     """Load a learner by name.
+
+    Args:
+        name: As in ``ALGOS``.
+        task: The task class it shall learn alone, for which it may have presets of its own.
 
     Raises:
         BidexError: There is none of this name, or its package is not installed.
@@ -54,7 +59,9 @@ def learner_kind(name: str) -> LearnerKind:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
         raise BidexError(f"The algo {name!r} needs {error.name}, which is not installed.") from error
-    return LearnerKind(name, getattr(module, class_name), dict(module.PRESETS))
+    single = importlib.import_module("bidex_algos.single_task")
+    presets = single.PRESETS.get(name, module.PRESETS) | single.OF_TASK.get(name, {}).get(task, {})
+    return LearnerKind(name, getattr(module, class_name), presets)
 
 
 def choose_preset(kind: LearnerKind, asked: str, device: str, suite: str | None = None) -> tuple[str, str]:

@@ -89,7 +89,8 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     resume = peek(arguments, "--resume")
     folder = RunFolder.open(Path(resume)) if resume else None
     stored = {"engine": "auto", **folder.config()} if folder else {}  # older runs knew one engine
-    kind = learner_kind(peek(arguments, "--algo") or stored.get("algo", RunFlags.algo))
+    task = peek(arguments, "--task") or stored.get("task")
+    kind = learner_kind(peek(arguments, "--algo") or stored.get("algo", RunFlags.algo), task)
     suite = peek(arguments, "--suite") or stored.get("suite")
     device = resolve_device(peek(arguments, "--device") or stored.get("device", RunFlags.device), suite)
     asked = peek(arguments, "--preset") or stored.get("preset", RunFlags.preset)
