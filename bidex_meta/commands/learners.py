@@ -18,6 +18,8 @@ from bidex_meta.errors import BidexError, unknown_name
 ALGOS: dict[str, str] = {
     "mtppo": "bidex_algos.mtppo:MTPPO",
     "ppo": "bidex_algos.mtppo:MTPPO",  # of one task it is plain PPO
+    "mtsac": "bidex_algos.mtsac:MTSAC",
+    "sac": "bidex_algos.mtsac:MTSAC",  # of one task it is plain SAC
 }
 
 
