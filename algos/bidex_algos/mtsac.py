@@ -198,8 +198,10 @@ class MTSAC:
 
     def _reward_scale(self) -> Tensor:
         """What rewards of each task are divided by (num_tasks,)."""
-        scale = self.return_stats.std().float()
-        return scale if self.config.per_task_rewards else torch.ones_like(scale)
+        if not self.config.per_task_rewards:
+            return torch.ones_like(self.log_alpha)
+        # Where all returns are about the same, their deviation alone would blow them up.
+        return (self.return_stats.std().square() + (0.1 * self.return_stats.mean).square()).sqrt().float()
 
     # Learning.
 
