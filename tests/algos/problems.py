@@ -82,7 +82,7 @@ class _TimedWorld:
 
 
 class LQR(_TimedWorld):
-    """A state of two turns by 0.3 rad and grows by 2 % a step, two actions push it; reward -(x·x + 0.1 u·u).
+    """A state of two turns by 0.3 rad and shrinks by 5 % a step, two actions push it; reward -(x·x + 0.1 u·u).
 
     Starts are uniform in [-0.5, 0.5]; from there the best actions stay within [-1, 1].
     """
@@ -90,7 +90,7 @@ class LQR(_TimedWorld):
     def __init__(self, rows: int = 32, horizon: int = 25):
         super().__init__(2, 2, rows, horizon)
         cos, sin = np.cos(0.3), np.sin(0.3)
-        self.a, self.b = 1.02 * np.array([[cos, -sin], [sin, cos]]), 0.5 * np.eye(2)
+        self.a, self.b = 0.95 * np.array([[cos, -sin], [sin, cos]]), 0.5 * np.eye(2)
         self.q, self.r = np.eye(2), 0.1 * np.eye(2)
 
     def _start(self) -> Tensor:
