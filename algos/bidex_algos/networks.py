@@ -24,6 +24,7 @@ class MLP(nn.Module):
         output_gain: Gain of the orthogonal output layer (hidden layers: sqrt 2).
         generator: CPU generator of the initial weights; the global one is left alone.
         activation: Name of the non-linearity.
+        layer_norm: Whether to normalise what goes into each non-linearity.
     """
 
     def __init__(
@@ -34,11 +35,15 @@ class MLP(nn.Module):
         output_gain: float,
         generator: torch.Generator,
         activation: Activation = "elu",
+        layer_norm: bool = False,
     ):
         super().__init__()
         layers: list[nn.Module] = []
         for width in hidden:
-            layers += [_linear(inputs, width, math.sqrt(2.0), generator), ACTIVATIONS[activation]()]
+            layers.append(_linear(inputs, width, math.sqrt(2.0), generator))
+            if layer_norm:
+                layers.append(nn.LayerNorm(width))
+            layers.append(ACTIVATIONS[activation]())
             inputs = width
         self.body = nn.Sequential(*layers)
         self.head = _linear(inputs, outputs, output_gain, generator)

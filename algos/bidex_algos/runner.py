@@ -18,6 +18,10 @@ from bidex_algos.rollout import VectorWorld
 from bidex_meta.errors import BidexError
 
 
+# The most of a run's time that may go into checkpoints.
+_SAVING_SHARE = 0.02
+
+
 class Learner(Protocol):
     """What the loop needs of a learner."""
 
@@ -73,7 +77,8 @@ def train(
         world: The world, whose state is saved beside the learner's.
         total_steps: Environment steps in all.
         record: Where metrics and checkpoints go; None in processes other than 0.
-        checkpoint_seconds: Least time between two checkpoints; one more is always saved at the end.
+        checkpoint_seconds: Least time between two checkpoints, and never less than 50 times what the last one took to
+            save: a replay makes them large. 0 saves after every iteration. One more is always saved at the end.
 
     Returns:
         True if a signal ended the training early.
@@ -83,16 +88,19 @@ def train(
     """
     # Of several processes one may be lost at any time, and then nothing more can be saved: so the first iteration is.
     saved_at = time.monotonic() if world_size() == 1 else -math.inf
-    saved_step = learner.env_steps
+    saved_step, pause = learner.env_steps, checkpoint_seconds
     with _stop_requests() as stop:
         while learner.env_steps < total_steps and not any_process(stop.is_set()):
             metrics = learner.iterate()
             if record is not None:
                 record.log(metrics, learner.env_steps)
             # Clocks differ: process 0's decides.
-            if any_process(is_main() and time.monotonic() - saved_at >= checkpoint_seconds):
+            if any_process(is_main() and time.monotonic() - saved_at >= pause):
+                began = time.monotonic()
                 _save(learner, world, record)
                 saved_at, saved_step = time.monotonic(), learner.env_steps
+                if checkpoint_seconds > 0.0:
+                    pause = max(checkpoint_seconds, (saved_at - began) / _SAVING_SHARE)
         if learner.env_steps != saved_step:
             _save(learner, world, record)
         return learner.env_steps < total_steps

@@ -6,7 +6,7 @@ Imports no torch. ``PRESETS`` holds what is meant for any class, ``OF_TASK`` wha
 from dataclasses import replace
 from typing import Any
 
-from bidex_algos import mtppo_config, mttrpo_config
+from bidex_algos import mtppo_config, mtsac_config, mttrpo_config
 
 # Table 42, column "Other Tasks". What it does not name is as in Table 47.
 _PPO = replace(mtppo_config.PRESETS["paper"], hidden=(1024, 1024, 512), gamma=0.96)
@@ -15,11 +15,13 @@ PRESETS: dict[str, dict[str, Any]] = {
     "ppo": {**mtppo_config.PRESETS, "paper": _PPO},
     # There is no table for TRPO: networks of Table 42, the rest as for MT-TRPO.
     "trpo": {**mttrpo_config.PRESETS, "paper": replace(mttrpo_config.PRESETS["paper"], hidden=(1024, 1024, 512))},
+    # The multi-task preset is made of Table 43, SAC's own.
+    "sac": mtsac_config.PRESETS,
 }
 """Presets by learner and name."""
 
 OF_TASK: dict[str, dict[str, dict[str, Any]]] = {
-    # Table 42's own columns. SAC's Table 43 has the same numbers in all of its columns.
+    # Table 42's own columns; SAC's Table 43 has the same numbers in all of its columns.
     "ppo": {
         "LiftUnderarm": {"paper": replace(_PPO, rollout_steps=20, epochs=10)},
         "StackBlock": {"paper": replace(_PPO, num_minibatches=8, epochs=2, gamma=0.9)},

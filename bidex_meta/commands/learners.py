@@ -19,9 +19,11 @@ from bidex_meta.errors import BidexError, unknown_name
 ALGOS: dict[str, str] = {
     "mtppo": "bidex_algos.mtppo:MTPPO",
     "mttrpo": "bidex_algos.mttrpo:MTTRPO",
+    "mtsac": "bidex_algos.mtsac:MTSAC",
     # On a single task they are the plain ones, with presets of their own (bidex_algos.single_task).
     "ppo": "bidex_algos.mtppo:MTPPO",
     "trpo": "bidex_algos.mttrpo:MTTRPO",
+    "sac": "bidex_algos.mtsac:MTSAC",
 }
 
 

@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 import torch
 
+from bidex_algos import runner
 from bidex_algos.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.runner import checkpoint, resume, train
 from tests.algos.toy import ToyWorld, nearness
@@ -50,6 +51,27 @@ def test_checkpoints_come_in_time_and_the_last_is_not_written_twice():
     notes = Notes()
     train(learner, world, total_steps=3 * ITERATION, record=notes, checkpoint_seconds=0.0)
     assert [step for step, _ in notes.saved] == notes.logged
+
+
+def test_saving_takes_no_more_than_a_fiftieth_of_the_time(monkeypatch: pytest.MonkeyPatch):
+    clock = [0.0]
+    monkeypatch.setattr(runner.time, "monotonic", lambda: clock[0])
+    saved: list[float] = []
+
+    class Slow(Notes):
+        """An iteration takes 10 s, a checkpoint 4 s."""
+
+        def log(self, metrics: dict[str, float], step: int) -> None:
+            clock[0] += 10.0
+
+        def save(self, state: dict[str, Any], step: int) -> None:
+            saved.append(clock[0])
+            clock[0] += 4.0
+
+    learner, world = make()
+    train(learner, world, total_steps=70 * ITERATION, record=Slow(), checkpoint_seconds=60.0)
+    # The first after 60 s, the next 200 s after its end, and so on; the last at the end.
+    assert saved == [60.0, 264.0, 468.0, 672.0, 716.0]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -1,0 +1,375 @@
+import io
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
+from torch.testing import assert_close
+
+from bidex_algos.mtsac import MTSAC, PRESETS, MTSACConfig
+from bidex_meta.commands.learners import learner_kind
+from bidex_meta.errors import BidexError
+from tests.algos.problems import LQR, PointMass, discounted_return, one_step_bandit, opposite_bandits
+from tests.algos.ranks import same
+from tests.algos.toy import ToyWorld, nearness
+
+SMALL = MTSACConfig(
+    hidden=(32, 32),
+    replay_steps=200,
+    cut_share=0.3,
+    warmup_steps=4,
+    batch_size=128,
+    critic_layer_norm=False,
+    gamma=0.8,
+    tau=0.05,
+    learning_rate=3e-3,
+    critic_learning_rate=5e-3,
+    autocast="off",
+)
+
+
+def trained(world: Any, config: MTSACConfig, iterations: int) -> MTSAC:
+    learner = MTSAC(world, config, seed=0)
+    for _ in range(iterations):
+        learner.iterate()
+    return learner
+
+
+def mean_errors(learner: MTSAC, targets: list[float]) -> list[float]:
+    """Distance of the squashed mean from each task's target."""
+    obs, _ = learner.world.reset(seed=1)
+    action = learner.eval_action(obs)
+    return [float((action[learner.world.task_id == k] - t).abs().max()) for k, t in enumerate(targets)]
+
+
+# Problems with a known optimum.
+
+
+def test_a_one_step_bandit_is_learned():
+    learner = MTSAC(one_step_bandit(0.6), SMALL, seed=0)
+    metrics = [learner.iterate() for _ in range(10)]
+    assert mean_errors(learner, [0.6])[0] < 0.1
+    assert metrics[-1]["Train/mean_return"] > 0.9 > metrics[0]["Train/mean_return"]
+    assert learner.env_steps == 10 * 8 * 32
+
+
+@pytest.mark.parametrize("heads", [True, False])
+def test_two_tasks_at_odds_are_learned_though_one_pays_a_thousandfold(heads: bool):
+    config = replace(SMALL, policy_heads=heads, value_heads=heads)
+    learner = trained(opposite_bandits(0.5, scale=1000.0), config, 12)
+    assert max(mean_errors(learner, [0.5, -0.5])) < 0.2
+
+
+def test_without_rewards_per_task_the_small_task_is_lost():
+    config = replace(SMALL, per_task_rewards=False)
+    learner = trained(opposite_bandits(0.5, scale=1000.0), config, 12)
+    assert mean_errors(learner, [0.5, -0.5])[0] > 0.2
+
+
+def test_without_the_one_hot_the_two_cannot_be_told_apart():
+    class Blind(ToyWorld):
+        def _observe(self):
+            return super()._observe() * torch.tensor([1.0, 0.0, 0.0])
+
+    learner = trained(Blind([nearness(0.5), nearness(-0.5)]), replace(SMALL, value_heads=False), 12)
+    assert min(mean_errors(learner, [0.5, -0.5])) > 0.3
+
+
+def test_lqr_comes_close_to_the_riccati_optimum():
+    learner = trained(LQR(), replace(SMALL, target_entropy_per_action=-2.0, learning_rate=2e-3), 22)
+    test = LQR(rows=256)
+    best = discounted_return(test, test.best(0.8), 0.8, 40)
+    nothing = discounted_return(test, lambda obs: torch.zeros(len(obs), 2), 0.8, 40)
+    assert nothing < 2.5 * best
+    assert discounted_return(test, learner.eval_action, 0.8, 40) > 1.15 * best
+
+
+def test_a_point_mass_reaches_its_goal():
+    learner = trained(PointMass(), replace(SMALL, target_entropy_per_action=-2.0), 18)
+    test = PointMass(rows=256)
+    best = discounted_return(test, test.best, 0.8, 30)
+    assert discounted_return(test, learner.eval_action, 0.8, 30) > 1.15 * best
+    _, success = test._advance(torch.zeros(256, 2))
+    assert success.float().mean() > 0.9
+
+
+@pytest.mark.parametrize(("terminal", "value"), [(False, 5.0), (True, 1.0)])
+def test_a_time_limit_is_bootstrapped_and_a_true_end_is_not(terminal: bool, value: float):
+    # Reward 1 at each step and gamma 0.8: worth 1 / (1 - 0.8) = 5 where only the clock stops an episode of one step.
+    world = ToyWorld([lambda action: torch.ones(len(action))], horizon=1, terminal=terminal)
+    config = replace(SMALL, cut_share=1.0, init_alpha=1e-6, per_task_rewards=False, tau=0.1)
+    learner = trained(world, config, 12)
+    obs = learner.policy.observations(learner.replay.obs)
+    values = learner.critic(obs, torch.zeros(32, 2), world.task_id)
+    assert_close(values.detach(), torch.full((2, 32), value), rtol=0.05, atol=0)
+
+
+# One update, against an independent computation.
+
+
+def density(learner: MTSAC, obs: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Actions for normalised observations and their log-densities, by torch.distributions in float64."""
+    mean, log_std = (x.detach().double() for x in learner.policy.actor(obs))
+    squashed = Independent(TransformedDistribution(Normal(mean, log_std.exp()), TanhTransform(cache_size=1)), 1)
+    action = torch.tanh(mean + log_std.exp() * noise.double())
+    raw = Normal(mean, log_std.exp()).log_prob(mean + log_std.exp() * noise.double())
+    log_prob = (raw - (1 - action.square()).log()).sum(1)
+    assert_close(squashed.log_prob(action), log_prob, rtol=1e-4, atol=1e-4)
+    return action, log_prob
+
+
+def test_the_critics_target_is_that_of_the_definition():
+    world = ToyWorld([nearness(0.5), nearness(-0.5)], rows=3)
+    config = replace(SMALL, gamma=0.7, batch_per_task=3, init_alpha=0.3, cut_share=1.0)
+    learner = MTSAC(world, config, seed=0)
+    with torch.no_grad():
+        learner.log_alpha[1] = 0.4  # temperatures that differ
+        for weight in learner.target_critic.parameters():
+            weight.add_(0.05 * torch.randn(weight.shape, generator=torch.Generator().manual_seed(3)))
+    learner.return_stats.mean.copy_(torch.tensor([0.0, 10.0]))
+    learner.return_stats.var.copy_(torch.tensor([4.0, 0.0]))
+    first, following, final = torch.randn(3, 6, 3, generator=torch.Generator().manual_seed(1))
+    learner.policy.observations.update(10 * first)
+    reward = torch.arange(6.0) + 1
+    terminated = torch.tensor([False, True, False, False, True, False])
+    truncated = torch.tensor([False, False, True, False, True, True])
+    learner.replay.begin(first)
+    info = {"final_obs": final, "unstable": torch.zeros(6, dtype=torch.bool)}
+    learner.replay.add(torch.zeros(6, 2), reward, terminated, truncated, following, info)
+
+    draw = learner.replay.take(torch.arange(6))
+    generator = torch.Generator()
+    generator.set_state(learner.generator.get_state())
+    target = learner._target(draw, learner.policy.observations(draw.next_obs))
+
+    true_next = torch.where((truncated & ~terminated)[:, None], final, following)
+    obs = learner.policy.observations(true_next)
+    action, log_prob = density(learner, obs, torch.randn(6, 2, generator=generator))
+    q = torch.stack([net(torch.cat([obs, action.float()], 1)) for net in learner.target_critic.nets])
+    q = torch.cat([q[:, :3, 0], q[:, 3:, 1]], 1).amin(0).double()
+    alpha = torch.tensor([0.3] * 3 + [float(torch.tensor(0.4).exp())] * 3)
+    scaled = reward / torch.tensor([2.0] * 3 + [1.0] * 3)
+    expected = scaled + 0.7 * (~terminated) * (q - alpha * log_prob).detach()
+    assert_close(target.double(), expected.double(), rtol=1e-4, atol=1e-4)
+
+
+def test_each_temperature_follows_the_entropy_of_its_own_task():
+    world = opposite_bandits(rows=16)
+    config = replace(SMALL, policy_heads=True, steps_per_iteration=1, updates_per_step=1, warmup_steps=0)
+    learner = MTSAC(world, config, seed=0)
+    with torch.no_grad():
+        # Standard deviations of about 0.02 and 2 on either side of the target entropy of -1 per action.
+        bias = learner.policy.actor.net.head.bias.view(2, 2, 2)
+        bias[0, 1], bias[1, 1] = -3.0, 3.0
+    learner.replay.begin(world.reset(seed=0)[0])
+    learner._step()
+    places = learner.replay.draw(1, 64, learner.generator)[0]
+    weights = learner.replay.weights(places)
+    weights[[3, 70, 71]] = 0.0
+    draw = learner.replay.take(places)
+    generator = torch.Generator()
+    generator.set_state(learner.generator.get_state())
+    torch.randn(128, 2, generator=generator)  # for the critics' target
+    _, log_prob = density(learner, learner.policy.observations(draw.obs), torch.randn(128, 2, generator=generator))
+    before = learner.log_alpha.detach().clone()
+    learner._update(draw, weights, weights.view(2, 64).sum(1))
+    kept = [log_prob[k * 64 : (k + 1) * 64][weights[k * 64 : (k + 1) * 64] > 0] for k in range(2)]
+    gradient = torch.stack([-(x - 2.0).mean() for x in kept])
+    assert learner.log_alpha.grad is not None
+    assert_close(learner.log_alpha.grad.double(), gradient, rtol=1e-3, atol=1e-3)
+    moved = (learner.log_alpha - before).tolist()
+    # Adam's first step has the size of its rate.
+    assert moved == pytest.approx([3e-3, -3e-3], rel=1e-3)
+
+
+@pytest.mark.parametrize("target", [-2.0, 0.2])
+def test_the_policy_comes_to_the_entropy_asked_for(target: float):
+    config = replace(SMALL, target_entropy_per_action=target, alpha_learning_rate=2e-2)
+    learner = MTSAC(one_step_bandit(0.3), config, seed=0)
+    metrics = [learner.iterate() for _ in range(12)][-1]
+    assert metrics["Policy/entropy"] == pytest.approx(2 * target, abs=0.8)
+
+
+def test_actor_and_critics_are_clipped_apart():
+    config = replace(SMALL, warmup_steps=0, steps_per_iteration=1, updates_per_step=1, max_grad_norm=1e-3)
+    learner = trained(one_step_bandit(), config, 1)
+    for net in (learner.critic, learner.policy):
+        gradient = torch.cat([p.grad.flatten() for p in net.parameters() if p.grad is not None])
+        assert_close(gradient.norm(), torch.tensor(1e-3), rtol=1e-3, atol=0)
+
+
+# What must not teach.
+
+
+@pytest.mark.parametrize("garbage", [1e8, float("nan")])
+def test_a_transition_that_broke_physics_teaches_nothing(garbage: float):
+    states = []
+    for bad in (0.0, garbage):
+        broken = ((2, 5), (3, 40), (7, 0))
+        world = ToyWorld([nearness(0.6), nearness(0.0)], unstable=broken, garbage=bad)
+        learner = MTSAC(world, SMALL, seed=0)
+        metrics = learner.iterate()
+        assert metrics["Train/unstable"] == 3 and metrics["Train/weightless"] > 0
+        states.append(learner.state_dict())
+    assert same(*states)
+
+
+def test_uniform_actions_come_first_and_teach_nothing_yet():
+    learner = MTSAC(one_step_bandit(), replace(SMALL, warmup_steps=8, cut_share=1.0), seed=0)
+    before = [p.detach().clone() for p in [*learner.policy.parameters(), *learner.critic.parameters()]]
+    learner.iterate()
+    actions = learner.replay._steps["actions"][:8]
+    assert_close(actions.abs().mean(), torch.tensor(0.5), rtol=0.1, atol=0)
+    assert_close(actions.abs().max(), torch.tensor(1.0), rtol=0.02, atol=0)
+    metrics = learner.iterate()
+    assert "Loss/critic" in metrics
+    after = [*learner.policy.parameters(), *learner.critic.parameters()]
+    assert all((a != b).any() for a, b in zip(before, after, strict=True))
+
+
+def test_rewards_are_scaled_by_the_deviation_of_discounted_returns():
+    learner = MTSAC(ToyWorld([nearness(0.0)], rows=3, horizon=10), replace(SMALL, gamma=0.5), seed=0)
+    rewards = torch.tensor([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], [-1.0, 0.0, 1.0]])
+    ended = torch.tensor([[False, True, False], [False] * 3, [False] * 3])
+    for r, e in zip(rewards, ended, strict=True):
+        learner._note_returns(r, e, torch.ones(3, dtype=torch.bool))
+    returns = torch.tensor([[1.0, 2.0, 3.0], [4.5, 5.0, 7.5], [1.25, 2.5, 4.75]]).double()
+    scale = (returns.var(correction=0) + (0.1 * returns.mean()).square()).sqrt()
+    assert_close(learner._reward_scale().double(), scale[None], rtol=1e-5, atol=0)
+    assert torch.equal(learner.discounted.double(), returns[2])
+
+
+# Checkpoints.
+
+
+@pytest.mark.parametrize(
+    "config", [SMALL, replace(SMALL, replay_steps=20, autocast="on", policy_heads=True, critic_layer_norm=True)]
+)
+def test_save_load_resume_is_bit_equal(config: MTSACConfig):
+    tasks = [nearness(0.6), nearness(0.0)]
+    unbroken = trained(ToyWorld(tasks, rows=8), config, 3)
+    file = io.BytesIO()
+    torch.save({"learner": unbroken.state_dict(), "env": unbroken.world.state_dict()}, file)
+    file.seek(0)
+    state = torch.load(file, weights_only=True)
+    resumed = MTSAC(ToyWorld(tasks, rows=8), config, seed=77)
+    resumed.world.load_state_dict(state["env"])
+    resumed.load_state_dict(state["learner"])
+    for _ in range(3):
+        a, b = unbroken.iterate(), resumed.iterate()
+        assert {k: v for k, v in a.items() if "Perf" not in k} == {k: v for k, v in b.items() if "Perf" not in k}
+    assert same(unbroken.state_dict(), resumed.state_dict())
+
+
+def test_a_saved_state_does_not_change_with_the_learner():
+    learner = trained(one_step_bandit(), SMALL, 1)
+    state, again = learner.state_dict(), learner.state_dict()
+    learner.iterate()
+    assert same(state, again) and not same(state, learner.state_dict())
+
+
+@pytest.mark.parametrize("heads", [True, False])
+def test_the_policy_alone_loads_for_a_world_of_another_size(heads: bool):
+    learner = trained(opposite_bandits(), replace(SMALL, policy_heads=heads), 2)
+    policy = MTSAC.load_policy(learner.state_dict()["policy"])
+    obs = torch.randn(5, 3)
+    assert torch.equal(policy.eval_action(obs), learner.eval_action(obs))
+    assert policy.eval_action(1e3 * obs).abs().max() <= 1.0
+    policy.reset(torch.ones(5, dtype=torch.bool))
+
+
+def test_a_checkpoint_of_another_world_size_is_refused():
+    learner = trained(one_step_bandit(rows=8), SMALL, 1)
+    with pytest.raises(BidexError, match=r"num_envs.*\(200, 8, 2\).*\(200, 9, 2\)"):
+        MTSAC(one_step_bandit(rows=9), SMALL, seed=0).load_state_dict(learner.state_dict())
+
+
+# Bounds and bad input.
+
+
+def test_the_replay_is_cut_to_its_memory_and_says_so(capsys: pytest.CaptureFixture[str]):
+    MTSAC(one_step_bandit(), replace(SMALL, replay_steps=1000), seed=0)
+    assert capsys.readouterr().err == ""
+    learner = MTSAC(one_step_bandit(), replace(SMALL, replay_steps=1000, replay_memory=1e-4), seed=0)
+    line = capsys.readouterr().err
+    steps = learner.replay.steps
+    assert 50 < steps < 200
+    assert line.count("\n") == 1
+    for part in ("1,000 vector steps (32,000 transitions)", "0.0001 GB", f"keeps {steps:,} ({steps * 32:,} tr"):
+        assert part in line
+    with pytest.raises(BidexError, match="replay_memory 1e-06 GB holds not one step of 32 rows"):
+        MTSAC(one_step_bandit(), replace(SMALL, replay_memory=1e-6), seed=0)
+
+
+def test_a_batch_is_split_evenly_over_the_tasks():
+    world = opposite_bandits()
+    assert MTSAC(world, replace(SMALL, batch_size=101), seed=0).batch_per_task == 51
+    assert MTSAC(world, replace(SMALL, batch_per_task=7), seed=0).batch_per_task == 7
+
+
+def test_a_loss_that_is_not_finite_ends_the_training():
+    learner = trained(one_step_bandit(), SMALL, 1)
+    with torch.no_grad():
+        learner.log_alpha.fill_(float("inf"))
+    with pytest.raises(FloatingPointError, match="mtsac: the loss is not finite"):
+        learner.iterate()
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("updates_per_step", 0),
+        ("batch_per_task", 0),
+        ("warmup_steps", -1),
+        ("gamma", 1.0),
+        ("tau", 0.0),
+        ("cut_share", 2.0),
+        ("replay_memory", 0.0),
+        ("init_alpha", 0.0),
+        ("std_range", (1.0, 0.5)),
+        ("init_std", 3.0),
+    ],
+)
+def test_config_errors_name_the_field(field: str, value: Any):
+    with pytest.raises(BidexError, match=f"mtsac: .*{field}"):
+        replace(SMALL, **{field: value})
+
+
+def test_worlds_that_do_not_fit_are_refused():
+    world = opposite_bandits()
+    world.num_id_columns = 0
+    with pytest.raises(BidexError, match="policy_heads needs the one-hot of 2 tasks"):
+        MTSAC(world, replace(SMALL, policy_heads=True), seed=0)
+    world.task_id = torch.zeros_like(world.task_id)
+    with pytest.raises(BidexError, match="task1 has no rows"):
+        MTSAC(world, SMALL, seed=0)
+
+
+def test_the_paper_preset_is_table_43():
+    paper = PRESETS["paper"]
+    assert (paper.hidden, paper.learning_rate, paper.gamma, paper.tau) == ((1024,) * 3, 3e-4, 0.96, 0.01)
+    assert (paper.replay_steps, paper.updates_per_step, paper.batch_per_task) == (5000, 4, 32)
+    assert (paper.init_alpha, paper.max_grad_norm) == (0.2, 1.0)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_runs(preset: str):
+    config = replace(PRESETS[preset], hidden=(16, 16), warmup_steps=1, steps_per_iteration=2, replay_steps=50)
+    metrics = trained(opposite_bandits(), config, 1).iterate()
+    assert {"Loss/critic", "Loss/actor", "Policy/entropy", "Policy/alpha/task0", "Policy/alpha/task1"} <= set(metrics)
+
+
+def test_both_names_lead_here():
+    for name in ("mtsac", "sac"):
+        kind = learner_kind(name)
+        assert kind.make is MTSAC and {"paper", "laptop", "metaworld"} <= set(kind.presets)
+
+
+def test_the_config_is_shown_without_importing_torch():
+    code = "import sys, bidex_algos.mtsac_config as m; assert m.PRESETS; sys.exit('torch' in sys.modules)"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    assert subprocess.run([sys.executable, "-c", code], env=environment).returncode == 0
