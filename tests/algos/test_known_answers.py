@@ -1,0 +1,76 @@
+"""The on-policy learners on problems whose optimum is known: LQR, a point mass, tasks that only the one-hot tells apart."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from bidex_algos.mtppo import MTPPO, MTPPOConfig
+from bidex_algos.mttrpo import MTTRPO, MTTRPOConfig
+from tests.algos.problems import LQR, PointMass, discounted_return, one_step_bandit, opposite_bandits
+from tests.algos.toy import ToyWorld, nearness
+
+GAMMA = 0.8
+SHARED: dict[str, Any] = {"hidden": (32, 32), "rollout_steps": 16, "gamma": GAMMA, "init_std": 0.5, "autocast": "off"}
+PPO = MTPPOConfig(**SHARED, learning_rate=3e-3, learning_rate_range=(1e-4, 5e-3), critic_learning_rate=3e-3)
+TRPO = MTTRPOConfig(**SHARED, fisher_stride=1, damping=0.01, critic_learning_rate=3e-3)
+both = pytest.mark.parametrize(("learner_type", "config"), [(MTPPO, PPO), (MTTRPO, TRPO)], ids=["ppo", "trpo"])
+
+
+def trained(learner_type: Any, world: Any, config: Any, iterations: int) -> Any:
+    learner = learner_type(world, config, seed=0)
+    for _ in range(iterations):
+        learner.iterate()
+    return learner
+
+
+def mean_actions(learner: Any) -> list[float]:
+    """Mean action in each task."""
+    obs, _ = learner.world.reset(seed=1)
+    action = learner.eval_action(obs)
+    return [float(action[learner.world.task_id == k].mean()) for k in range(learner.world.num_tasks)]
+
+
+@both
+def test_a_one_step_bandit(learner_type: Any, config: Any):
+    [mean] = mean_actions(trained(learner_type, one_step_bandit(0.6), config, 25))
+    assert mean == pytest.approx(0.6, abs=0.1)
+
+
+@both
+def test_lqr_comes_close_to_the_riccati_optimum(learner_type: Any, config: Any):
+    learner = trained(learner_type, LQR(rows=64), config, 20)
+    test = LQR(rows=256)
+    best = discounted_return(test, test.best(GAMMA), GAMMA, 40)
+    nothing = discounted_return(test, lambda obs: torch.zeros(len(obs), 2), GAMMA, 40)
+    assert nothing < 2.5 * best
+    assert discounted_return(test, learner.eval_action, GAMMA, 40) > 1.15 * best
+
+
+@both
+def test_a_point_mass_reaches_its_goal(learner_type: Any, config: Any):
+    learner = trained(learner_type, PointMass(rows=64), config, 25)
+    test = PointMass(rows=256)
+    best = discounted_return(test, test.best, GAMMA, 30)
+    assert discounted_return(test, learner.eval_action, GAMMA, 30) > 1.15 * best
+    _, success = test._advance(torch.zeros(256, 2))
+    assert success.float().mean() > 0.9
+
+
+@both
+def test_two_tasks_that_only_the_one_hot_tells_apart(learner_type: Any, config: Any):
+    assert mean_actions(trained(learner_type, opposite_bandits(0.5), config, 30)) == pytest.approx(
+        [0.5, -0.5], abs=0.15
+    )
+
+
+@both
+def test_without_the_one_hot_there_is_nothing_between_the_two(learner_type: Any, config: Any):
+    class Blind(ToyWorld):
+        def _observe(self) -> torch.Tensor:
+            return super()._observe() * torch.tensor([1.0, 0.0, 0.0])
+
+    blind = replace(config, value_heads=False)
+    means = mean_actions(trained(learner_type, Blind([nearness(0.5), nearness(-0.5)]), blind, 30))
+    assert means == pytest.approx([0.0, 0.0], abs=0.25)
