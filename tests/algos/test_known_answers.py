@@ -1,4 +1,4 @@
-"""The on-policy learners on problems whose optimum is known: LQR, a point mass, tasks that only the one-hot tells apart."""
+"""The on-policy learners on problems whose optimum is known: LQR, a point mass, tasks told apart by the one-hot."""
 
 from dataclasses import replace
 from typing import Any
