@@ -17,7 +17,6 @@ from bidex_algos.distributed import any_process, gather, is_main, rank, world_si
 from bidex_algos.rollout import VectorWorld
 from bidex_meta.errors import BidexError
 
-
 # The most of a run's time that may go into checkpoints.
 _SAVING_SHARE = 0.02
 
