@@ -119,7 +119,7 @@ class LQR(_TimedWorld):
 
 
 class PointMass(_TimedWorld):
-    """A point in the plane moves by 0.1 times the action; it loses the distance to a goal that each episode draws.
+    """A point in the plane moves by 0.1 times the action; reward minus its distance to the goal, drawn for the episode.
 
     Position and goal are uniform in [-0.5, 0.5]. The best action goes towards the goal in each coordinate at once, as
     far as it can, whatever the discount. Success: within 0.05 at the end.
