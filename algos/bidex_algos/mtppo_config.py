@@ -74,8 +74,7 @@ PRESETS: dict[str, MTPPOConfig] = {
     "laptop": MTPPOConfig(),
     # Meta-World's multi-task suites: discount, trace and clip are those of the MTPPO that its authors publish
     # (metaworld-algorithms). A rollout is 100 steps instead of their 10,000 and the networks are small: on MT3 one of
-    # 250 steps (ELU, 8 mini-batches) had learned less after 150 k steps: success 24 against 42 % in training, one seed
-    # each.
+    # 250 steps (ELU, 8 mini-batches) had learned less after 150 k steps: 24 against 42 % in training, one seed each.
     "metaworld": MTPPOConfig(
         hidden=(256, 256, 128),
         activation="tanh",
