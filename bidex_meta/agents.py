@@ -1,0 +1,72 @@
+"""What an evaluation asks of an agent. Names and order of calls are Meta-World's, so that an agent serves both."""
+
+from typing import Any, NamedTuple, Protocol
+
+from torch import Tensor
+
+
+class Agent(Protocol):
+    """Whatever can be judged."""
+
+    def eval_action(self, obs: Tensor) -> Tensor:
+        """Actions ``(num_envs, action)`` in [-1, 1] for observations ``(num_envs, observation)``; no exploration."""
+        ...
+
+    def reset(self, env_mask: Tensor) -> None:
+        """A new episode begins in the rows of ``env_mask``, bool ``(num_envs,)``: forget what was known of them."""
+        ...
+
+
+class Timestep(NamedTuple):
+    """One transition of every row, as an adapting agent is told of it.
+
+    The first six are Meta-World's; from its evaluation the others are missing (None).
+    """
+
+    observation: Tensor
+    """Observations the actions were chosen for, ``(num_envs, observation)``."""
+    action: Tensor
+    """What ``adapt_action`` returned, ``(num_envs, action)``."""
+    reward: Tensor
+    """Rewards, ``(num_envs,)``."""
+    terminated: Tensor
+    """Bool ``(num_envs,)``: the episode came to a true end."""
+    truncated: Tensor
+    """Bool ``(num_envs,)``: the episode was cut, by its time limit or since it was long enough to adapt."""
+    aux_policy_outputs: dict[str, Tensor]
+    """What ``adapt_action`` returned beside the actions."""
+    next_observation: Tensor | None = None
+    """Observations the transition led to, of the same episode, ``(num_envs, observation)``."""
+    valid: Tensor | None = None
+    """Bool ``(num_envs,)``: False in rows that are frozen, since their episode is over, or where physics broke."""
+
+
+class MetaLearningAgent(Agent, Protocol):
+    """An agent that adapts to the tasks it is put into.
+
+    The order: ``assign`` (ours alone), ``init``; then for each shot ``reset`` of all rows, ``adapt_action`` and ``step``
+    until every row has played its episodes, ``adapt``; in between and at the end ``reset`` and ``eval_action``.
+    """
+
+    def assign(self, task_of_row: Tensor | None) -> None:
+        """Which rows play the same task: numbers from 0 on, int64 ``(num_envs,)``; they share what they learn.
+
+        None: each row has a task of its own, as in Meta-World's evaluation, which does not call this.
+        """
+        ...
+
+    def init(self) -> None:
+        """Back to what was meta-learned; all adaptation and its data are forgotten."""
+        ...
+
+    def adapt_action(self, obs: Tensor) -> tuple[Tensor, dict[str, Any]]:
+        """Exploring actions ``(num_envs, action)``, and whatever ``step`` shall be given back of the policy's outputs."""
+        ...
+
+    def step(self, timestep: Timestep) -> None:
+        """Takes in one transition of every row."""
+        ...
+
+    def adapt(self) -> None:
+        """Learns from all transitions since the last ``adapt`` or ``init``."""
+        ...
