@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
+from bidex_algos.checks import at_least, rising
 from bidex_algos.onpolicy_config import OnPolicyConfig
 
 
@@ -46,9 +47,8 @@ class MTPPOConfig(OnPolicyConfig):
             BidexError: A field is out of its range.
         """
         super().__post_init__()
-        self._at_least_one("num_minibatches")
-        self._at_least_one("epochs")
-        self._rising("learning_rate_range")
+        at_least(self, 1, "num_minibatches", "epochs")
+        rising(self, "learning_rate_range")
 
 
 PRESETS: dict[str, MTPPOConfig] = {

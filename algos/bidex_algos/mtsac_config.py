@@ -1,7 +1,9 @@
 """What can be set about MT-SAC, and its presets; imports no torch, so that a command line can show it at once."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
+from bidex_algos.checks import at_least, between, positive
 from bidex_algos.choices import Activation, Autocast
 from bidex_meta.errors import BidexError
 
@@ -12,6 +14,9 @@ class MTSACConfig:
 
     A vector step is one step in every row of the world.
     """
+
+    algo: ClassVar[str] = "mtsac"
+    """How the learner calls itself in messages."""
 
     hidden: tuple[int, ...] = (256, 256)
     """Widths of the hidden layers, of actor and critics alike."""
@@ -75,20 +80,14 @@ class MTSACConfig:
         Raises:
             BidexError: A field is out of its range.
         """
-        for name in ("replay_steps", "steps_per_iteration", "updates_per_step", "batch_size", "batch_per_task"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise BidexError(f"mtsac: {name} must be at least 1, got {value}.")
-        if self.warmup_steps < 0:
-            raise BidexError(f"mtsac: warmup_steps must be at least 0, got {self.warmup_steps}.")
+        at_least(self, 1, "replay_steps", "steps_per_iteration", "updates_per_step", "batch_size")
+        if self.batch_per_task is not None:
+            at_least(self, 1, "batch_per_task")
+        at_least(self, 0, "warmup_steps")
         if not 0.0 <= self.gamma < 1.0:
             raise BidexError(f"mtsac: gamma must lie in [0, 1), got {self.gamma}.")
-        for name in ("tau", "cut_share"):
-            if not 0.0 < getattr(self, name) <= 1.0:
-                raise BidexError(f"mtsac: {name} must lie in (0, 1], got {getattr(self, name)}.")
-        for name in ("init_alpha", "replay_memory", "max_grad_norm"):
-            if not getattr(self, name) > 0.0:
-                raise BidexError(f"mtsac: {name} must be positive, got {getattr(self, name)}.")
+        between(self, 0.0, 1.0, "tau", "cut_share")
+        positive(self, "tau", "cut_share", "init_alpha", "replay_memory", "max_grad_norm")
         low, high = self.std_range
         if not 0.0 < low < self.init_std < high:
             raise BidexError(

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
+from bidex_algos.checks import at_least, between, positive
 from bidex_algos.choices import Autocast
 from bidex_algos.onpolicy_config import OnPolicyConfig
 
@@ -45,11 +46,9 @@ class MTTRPOConfig(OnPolicyConfig):
             BidexError: A field is out of its range.
         """
         super().__post_init__()
-        for name in ("cg_iterations", "fisher_stride", "backtracks", "critic_epochs", "num_minibatches"):
-            self._at_least_one(name)
-        self._positive("max_kl")
-        self._between("backtrack_factor", 0.0, 1.0)
-        self._between("accept_ratio", 0.0, 1.0)
+        at_least(self, 1, "cg_iterations", "fisher_stride", "backtracks", "critic_epochs", "num_minibatches")
+        positive(self, "max_kl")
+        between(self, 0.0, 1.0, "backtrack_factor", "accept_ratio")
 
 
 PRESETS: dict[str, MTTRPOConfig] = {

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
+from bidex_algos.checks import at_least, between, rising
 from bidex_algos.choices import Activation, Autocast
-from bidex_meta.errors import BidexError
 
 
 @dataclass(frozen=True)
@@ -50,24 +50,6 @@ class OnPolicyConfig:
         Raises:
             BidexError: A field is out of its range.
         """
-        self._at_least_one("rollout_steps")
-        self._between("gamma", 0.0, 1.0)
-        self._between("lam", 0.0, 1.0)
-        self._rising("std_range")
-
-    def _at_least_one(self, name: str) -> None:
-        if getattr(self, name) < 1:
-            raise BidexError(f"{self.algo}: {name} must be at least 1, got {getattr(self, name)}.")
-
-    def _between(self, name: str, low: float, high: float) -> None:
-        if not low <= getattr(self, name) <= high:
-            raise BidexError(f"{self.algo}: {name} must lie in [{low:g}, {high:g}], got {getattr(self, name)}.")
-
-    def _positive(self, name: str) -> None:
-        if not getattr(self, name) > 0.0:
-            raise BidexError(f"{self.algo}: {name} must be positive, got {getattr(self, name)}.")
-
-    def _rising(self, name: str) -> None:
-        low, high = getattr(self, name)
-        if not 0.0 < low <= high:
-            raise BidexError(f"{self.algo}: {name} must be two rising positive numbers, got {low} {high}.")
+        at_least(self, 1, "rollout_steps")
+        between(self, 0.0, 1.0, "gamma", "lam")
+        rising(self, "std_range")

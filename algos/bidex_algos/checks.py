@@ -1,0 +1,34 @@
+"""Checks of a config's fields, each with one line that names the field; imports no torch."""
+
+from typing import Any
+
+from bidex_meta.errors import BidexError
+
+
+def at_least(config: Any, least: float, *names: str) -> None:
+    """Refuses fields below ``least``."""
+    for name in names:
+        if not getattr(config, name) >= least:
+            raise BidexError(f"{config.algo}: {name} must be at least {least:g}, got {getattr(config, name)}.")
+
+
+def positive(config: Any, *names: str) -> None:
+    """Refuses fields that are not above zero."""
+    for name in names:
+        if not getattr(config, name) > 0.0:
+            raise BidexError(f"{config.algo}: {name} must be positive, got {getattr(config, name)}.")
+
+
+def between(config: Any, low: float, high: float, *names: str) -> None:
+    """Refuses fields outside [low, high]."""
+    for name in names:
+        if not low <= getattr(config, name) <= high:
+            raise BidexError(f"{config.algo}: {name} must lie in [{low:g}, {high:g}], got {getattr(config, name)}.")
+
+
+def rising(config: Any, *names: str) -> None:
+    """Refuses pairs that are not two rising positive numbers."""
+    for name in names:
+        low, high = getattr(config, name)
+        if not 0.0 < low <= high:
+            raise BidexError(f"{config.algo}: {name} must be two rising positive numbers, got {low} {high}.")

@@ -1,0 +1,59 @@
+"""What can be set about every gradient-based meta-learner; imports no torch, so that a command line can show it."""
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+from bidex_algos.checks import at_least, between, positive, rising
+from bidex_algos.choices import Activation
+
+
+@dataclass(frozen=True)
+class MetaConfig:
+    """Policy, sampling and inner steps; the defaults are the preset ``laptop``."""
+
+    algo: ClassVar[str] = "meta"
+    """How the learner calls itself in messages."""
+
+    hidden: tuple[int, ...] = (128, 128)
+    """Widths of the policy's hidden layers."""
+    activation: Activation = "tanh"
+    """Non-linearity of the hidden layers."""
+    init_std: float = 0.8
+    """Standard deviation of the actions at the start; part of what is adapted."""
+    std_range: tuple[float, float] = (0.1, 1.5)
+    """Bounds of the standard deviation of the actions."""
+    tasks_per_class: int = 4
+    """Tasks of each class in a meta-batch, drawn anew for each; fewer where a class has fewer. The class's rows are
+    split over them: that many rollouts has each."""
+    max_adapt_steps: int = 150
+    """Longest episode that is played to adapt."""
+    slice_steps: int | None = None
+    """Adapt on so many steps of running episodes, as Bi-DexHands did, instead of whole ones; None: whole ones."""
+    inner_steps: int = 1
+    """Adaptation steps before the outer objective is measured."""
+    inner_learning_rate: float = 0.1
+    """Size of an adaptation step."""
+    advantage_scale: Literal["std", "variance"] = "std"
+    """What advantages are divided by in each task. The variance, as in garage and Meta-World's baselines, makes the inner
+    step depend on the scale of the rewards."""
+    first_order: bool = False
+    """Leave out the second derivatives of the inner step."""
+    gamma: float = 0.95
+    """Discount per step."""
+    lam: float = 1.0
+    """Trace decay of the advantage estimate."""
+    normalise_observations: bool = True
+    """Give observations zero mean and unit variance by running statistics."""
+
+    def __post_init__(self) -> None:
+        """Rejects values that could only fail later.
+
+        Raises:
+            BidexError: A field is out of its range.
+        """
+        at_least(self, 1, "tasks_per_class", "max_adapt_steps", "inner_steps")
+        if self.slice_steps is not None:
+            at_least(self, 1, "slice_steps")
+        between(self, 0.0, 1.0, "gamma", "lam")
+        positive(self, "inner_learning_rate")
+        rising(self, "std_range")
