@@ -34,8 +34,8 @@ class MetaConfig:
     inner_learning_rate: float = 0.1
     """Size of an adaptation step."""
     advantage_scale: Literal["std", "variance"] = "std"
-    """What advantages are divided by in each task. The variance, as in garage and Meta-World's baselines, makes the inner
-    step depend on the scale of the rewards."""
+    """What advantages are divided by in each task. With the variance, as in garage and Meta-World's baselines, the
+    inner step depends on the scale of the rewards."""
     first_order: bool = False
     """Leave out the second derivatives of the inner step."""
     gamma: float = 0.95
