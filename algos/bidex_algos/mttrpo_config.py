@@ -14,7 +14,7 @@ class MTTRPOConfig(OnPolicyConfig):
 
     algo: ClassVar[str] = "mttrpo"
 
-    max_kl: float = 0.03
+    max_kl: float = 0.1
     """Mean KL of the new policy from the sampling one that an update may not exceed."""
     damping: float = 0.1
     """Added to the diagonal of the Fisher matrix."""

@@ -4,6 +4,8 @@ An entry is ``"module:Class"``. Beside the class the module holds ``PRESETS``: a
 the learner's config dataclass, with at least ``paper`` and ``laptop``. The class offers:
 
 * ``Class(world, config, seed)``, and what ``bidex_algos.runner.Learner`` names;
+* ``autoreset``, if it does not want SAME_STEP: the world's mode, or a function of the learner's config that gives it;
+* ``adapts = True``, if its policy is a ``bidex_meta.agents.MetaLearningAgent``;
 * ``policy_state_dict()`` and ``load_policy(state, device)``, which gives an agent for ``bidex_meta.evaluate`` from the
   entry ``learner.policy`` of a checkpoint.
 """
@@ -20,6 +22,8 @@ ALGOS: dict[str, str] = {
     "mtppo": "bidex_algos.mtppo:MTPPO",
     "mttrpo": "bidex_algos.mttrpo:MTTRPO",
     "mtsac": "bidex_algos.mtsac:MTSAC",
+    "promp": "bidex_algos.promp:ProMP",
+    "maml": "bidex_algos.maml:MAML",
     # On a single task they are the plain ones, with presets of their own (bidex_algos.single_task).
     "ppo": "bidex_algos.mtppo:MTPPO",
     "trpo": "bidex_algos.mttrpo:MTTRPO",

@@ -36,8 +36,10 @@ def check_names(config: dict[str, Any]) -> None:
 
 
 def training_world(config: dict[str, Any]) -> Any:
-    """The world a run trains on."""
-    return _world(config, "train", config["num_envs"], "SAME_STEP")
+    """The world a run trains on; learners that play whole episodes have it wait for all rows (``autoreset``)."""
+    mode = getattr(learner_kind(config["algo"]).make, "autoreset", "SAME_STEP")
+    mode = mode(config["learner"]) if callable(mode) else mode
+    return _world(config, "train", config["num_envs"], mode)
 
 
 def evaluation_world(config: dict[str, Any], split: str = "train", rows: int | None = None) -> Any:

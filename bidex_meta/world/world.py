@@ -367,6 +367,11 @@ class World(VectorEnv):
         return render_row(self, row, width, height, camera)
 
     @property
+    def pools(self) -> list[np.ndarray]:
+        """The tasks that each slot draws from, each (n, size of its variation)."""
+        return [slot.tasks for slot in self.slots]
+
+    @property
     def task_name(self) -> list[str]:
         """Slot name of each row."""
         return [self.task_names[i] for i in self.task_id.tolist()]
