@@ -1,0 +1,267 @@
+"""MAML and ProMP: their gradients, their steps, and what they learn on a family with hidden goals."""
+
+import io
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from bidex_algos.adaptation import weighted_mean
+from bidex_algos.maml import MAML, MAMLConfig
+from bidex_algos.maml import PRESETS as MAML_PRESETS
+from bidex_algos.networks import gaussian_log_prob
+from bidex_algos.promp import PRESETS, ProMP, ProMPConfig
+from bidex_algos.trust_region import flatten, write
+from bidex_meta.agents import Timestep
+from bidex_meta.errors import BidexError
+from tests.algos.families import PointClass, PointGoals, circle
+from tests.algos.ranks import same
+from tests.algos.test_meta_parts import problem
+
+SHARED: dict[str, Any] = {
+    "hidden": (32, 32), "init_std": 0.5, "gamma": 0.99, "tasks_per_class": 8, "normalise_observations": False
+}  # fmt: skip
+PROMP, MAML_TRPO = ProMPConfig(**SHARED), MAMLConfig(**SHARED, max_kl=0.05)
+both = pytest.mark.parametrize(("kind", "config"), [(ProMP, PROMP), (MAML, MAML_TRPO)], ids=["promp", "maml"])
+
+
+def tiny(kind: Any, config: Any, tasks: int = 3) -> tuple[Any, Any]:
+    """A learner whose actor and data are those of ``problem``, in float64."""
+    learner = kind(PointGoals(rows=tasks, classes=(PointClass(count=tasks),)), replace(config, hidden=(5,)), seed=0)
+    actor, batches = problem(tasks=tasks, dtype=torch.float64)
+    learner.policy.actor.double().load_state_dict(actor.state_dict())
+    learner.rows = type(learner.rows)(torch.arange(tasks))
+    return learner, batches
+
+
+def surrogate(learner: Any, batches: Any) -> Tensor:
+    """What the outer step raises, without its KL terms."""
+    return learner._objective(batches)[0]
+
+
+@pytest.mark.parametrize("inner_steps", [1, 2])
+@both
+def test_second_order_gradients_agree_with_finite_differences(kind: Any, config: Any, inner_steps: int):
+    learner, batches = tiny(kind, replace(config, inner_learning_rate=0.3, inner_steps=inner_steps))
+    batches = [batches[0]] * inner_steps + [batches[1]]
+    parameters = list(learner.policy.actor.parameters())
+    gradient = flatten(torch.autograd.grad(surrogate(learner, batches), parameters))
+    start = flatten(parameters).detach().clone()
+    step = 1e-6
+    for i in range(0, len(start), 3):
+        values = []
+        for sign in (1.0, -1.0):
+            moved = start.clone()
+            moved[i] += sign * step
+            write(parameters, moved)
+            values.append(float(surrogate(learner, batches).detach()))
+        write(parameters, start)
+        assert float(gradient[i]) == pytest.approx((values[0] - values[1]) / (2 * step), rel=1e-4, abs=1e-7)
+
+
+@both
+def test_first_order_leaves_the_second_derivatives_out(kind: Any, config: Any):
+    gradients = []
+    for first_order in (False, True):
+        learner, batches = tiny(kind, replace(config, inner_learning_rate=0.3, first_order=first_order))
+        parameters = list(learner.policy.actor.parameters())
+        gradients.append(flatten(torch.autograd.grad(surrogate(learner, batches), parameters)))
+    assert (gradients[0] - gradients[1]).norm() > 1e-3 * gradients[0].norm()
+    # The first-order gradient is that at the adapted parameters, as if they were given.
+    adapter = learner.policy.adapter
+    adapted = {n: p.detach().requires_grad_() for n, p in adapter.adapt(adapter.meta(3), batches[0]).items()}
+    ratio, _ = adapter.ratio_and_kl(adapted, batches[1])
+    if kind is ProMP:
+        low, high = 1.0 - config.clip, 1.0 + config.clip
+        gain = torch.minimum(ratio * batches[1].advantages, ratio.clamp(low, high) * batches[1].advantages)
+    else:
+        gain = ratio * batches[1].advantages
+    slopes = torch.autograd.grad(weighted_mean(gain, batches[1].weights).mean(), list(adapted.values()))
+    assert_close(gradients[1], torch.cat([slope.sum(0).flatten() for slope in slopes]))
+
+
+def test_a_promp_step_without_kl_equals_an_independent_computation():
+    """Layer by layer, task by task, by plain autograd and Adam's first step as its paper writes it."""
+    config = replace(PROMP, kl_weight=0.0, inner_learning_rate=0.2, outer_epochs=1, max_grad_norm=1e9)
+    learner, [before, after] = tiny(ProMP, config)
+    actor = learner.policy.actor
+    start = [p.detach().clone().requires_grad_() for p in actor.parameters()]
+    names = [name for name, _ in actor.named_parameters()]
+    assert names == ["log_std", "mean.body.0.weight", "mean.body.0.bias", "mean.head.weight", "mean.head.bias"]
+
+    def log_prob(p: list[Tensor], obs: Tensor, actions: Tensor) -> Tensor:
+        mean = torch.tanh(obs @ p[1].T + p[2]) @ p[3].T + p[4]
+        return -0.5 * (((actions - mean) / p[0].exp()) ** 2 + 2 * p[0] + np.log(2 * np.pi)).sum(-1)
+
+    total = torch.zeros((), dtype=torch.float64)
+    for k in range(3):
+        old = gaussian_log_prob(before.actions[k], before.old_means[k], before.old_log_stds[k])
+        ratio = torch.exp(log_prob(start, before.obs[k], before.actions[k]) - old)
+        inner = (before.weights[k] * ratio * before.advantages[k]).sum() / before.weights[k].sum()
+        slopes = torch.autograd.grad(inner, start, create_graph=True)
+        adapted = [p + 0.2 * s for p, s in zip(start, slopes, strict=True)]
+        old = gaussian_log_prob(after.actions[k], after.old_means[k], after.old_log_stds[k])
+        ratio = torch.exp(log_prob(adapted, after.obs[k], after.actions[k]) - old)
+        kept = torch.min(ratio * after.advantages[k], ratio.clamp(0.7, 1.3) * after.advantages[k])
+        total = total + (after.weights[k] * kept).sum() / after.weights[k].sum() / 3
+    slopes = torch.autograd.grad(-total, start)
+    expected = [p - 1e-3 * s / (s.abs() + 1e-8) for p, s in zip(start, slopes, strict=True)]
+
+    told = learner._outer([before, after])
+    assert_close(told["Loss/surrogate"], -total.detach())
+    for parameter, value in zip(actor.parameters(), expected, strict=True):
+        assert_close(parameter.detach(), value.detach(), rtol=1e-6, atol=1e-9)
+
+
+def test_the_kl_weight_holds_the_policy_before_adaptation_back():
+    kls = []
+    for weight in (0.0, 10.0):
+        learner = ProMP(PointGoals(rows=32), replace(PROMP, kl_weight=weight, outer_epochs=8), seed=0)
+        kls.append(learner.iterate()["Policy/inner_kl"])
+    assert kls[1] < 0.5 * kls[0]
+
+
+@pytest.mark.parametrize("max_kl", [0.003, 0.03])
+def test_mamls_trust_region_holds_after_adaptation(max_kl: float):
+    learner = MAML(PointGoals(rows=32), replace(MAML_TRPO, max_kl=max_kl), seed=0)
+    told = [learner.iterate() for _ in range(3)]
+    assert all(0.2 * max_kl < t["Policy/outer_kl"] <= max_kl for t in told)
+    assert all(t["Loss/surrogate"] < 0 for t in told)
+
+
+def returns(learner: Any, shots: int = 1) -> list[float]:
+    """Mean return at goals between those of training, before adaptation and after each shot."""
+    world = PointGoals(rows=80)
+    world.set_tasks({"PointGoals": circle(8, first=np.pi / 8)})
+    policy = learner.load_policy(learner.policy_state_dict())
+    policy.assign(world.task_index)
+    found = []
+    for shot in range(shots + 1):
+        found.append(played(world, policy.eval_action, seed=9))
+        obs, _ = world.reset(seed=100 + shot)
+        for _ in range(20):
+            action, aux = policy.adapt_action(obs)
+            following, reward, terminated, truncated, _ = world.step(action)
+            policy.step(Timestep(obs, action, reward, terminated, truncated, aux, following))
+            obs = following
+        policy.adapt()
+    return found
+
+
+def played(world: PointGoals, act: Any, seed: int) -> float:
+    obs, _ = world.reset(seed=seed)
+    total = torch.zeros(world.num_envs)
+    for _ in range(20):
+        obs, reward, *_ = world.step(act(obs))
+        total += reward
+    return float(total.mean())
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@both
+def test_one_inner_step_closes_the_gap_to_a_policy_that_sees_the_goal(kind: Any, config: Any, seed: int):
+    learner = kind(PointGoals(rows=80, seed=seed), config, seed=seed)
+    for _ in range(25 if kind is ProMP else 12):
+        learner.iterate()
+    before, after = returns(learner)
+    seeing = PointGoals(rows=80, goal_visible=True)
+    seeing.set_tasks({"PointGoals": circle(8, first=np.pi / 8)})
+    best = played(seeing, seeing.best, seed=9)
+    assert (after - before) / (best - before) > 0.4
+
+
+@pytest.mark.parametrize("slice_steps", [None, 7])
+@both
+def test_save_load_resume_is_bit_equal(kind: Any, config: Any, slice_steps: int | None):
+    config = replace(
+        config, slice_steps=slice_steps, tasks_per_class=3, max_adapt_steps=30, normalise_observations=True
+    )
+    mode = kind.autoreset({"slice_steps": slice_steps})
+    assert mode == ("DISABLED" if slice_steps is None else "SAME_STEP")
+    unbroken = kind(PointGoals(rows=12, autoreset_mode=mode), config, seed=0)
+    for _ in range(3):
+        unbroken.iterate()
+    file = io.BytesIO()
+    torch.save({"learner": unbroken.state_dict(), "env": unbroken.world.state_dict()}, file)
+    file.seek(0)
+    state = torch.load(file, weights_only=True)
+    resumed = kind(PointGoals(rows=12, autoreset_mode=mode), config, seed=77)
+    resumed.world.load_state_dict(state["env"])
+    resumed.load_state_dict(state["learner"])
+    for _ in range(3):
+        a, b = unbroken.iterate(), resumed.iterate()
+        assert {k: v for k, v in a.items() if "Perf" not in k} == {k: v for k, v in b.items() if "Perf" not in k}
+    assert same(
+        {k: v for k, v in unbroken.state_dict().items() if k != "policy"},
+        {k: v for k, v in resumed.state_dict().items() if k != "policy"},
+    )
+    assert same(unbroken.policy.state_dict(), resumed.policy.state_dict())
+
+
+@both
+def test_broken_physics_and_frozen_rows_teach_nothing(kind: Any, config: Any):
+    states = []
+    for garbage in (0.0, 1e8, float("nan")):
+        classes = (PointClass("Long", steps=20), PointClass("Short", steps=9))
+        world = PointGoals(rows=32, classes=classes, unstable=((2, 5), (30, 20)), garbage=garbage)
+        learner = kind(world, replace(config, tasks_per_class=4, normalise_observations=True), seed=0)
+        learner.iterate()
+        states.append(learner.policy.state_dict())
+    assert same(states[0], states[1]) and same(states[0], states[2])
+
+
+def test_a_meta_batch_draws_tasks_without_repetition_and_splits_rows_over_them():
+    world = PointGoals(rows=24, classes=(PointClass("A", count=8), PointClass("B", count=3)))
+    learner = ProMP(world, replace(PROMP, tasks_per_class=4), seed=0)
+    seen = set()
+    for _ in range(4):
+        learner.iterate()
+        assert [len(pool) for pool in world.pools] == [4, 3]
+        assert all(len(np.unique(pool, axis=0)) == len(pool) for pool in world.pools)
+        assert torch.bincount(learner.rows.task_of_row).tolist() == [3, 3, 3, 3, 4, 4, 4]
+        seen |= {tuple(np.round(goal, 6)) for goal in world.pools[0]}
+    assert len(seen) > 4
+    assert [len(pool) for pool in learner.pools] == [8, 3]
+
+
+def test_before_any_data_an_adapting_policy_is_the_meta_policy_and_init_goes_back_to_it():
+    learner = ProMP(PointGoals(rows=16), PROMP, seed=0)
+    learner.iterate()
+    policy = learner.load_policy(learner.policy_state_dict())
+    obs, _ = learner.world.reset()
+    policy.assign(None)  # a task in each row
+    policy.adapt()
+    assert torch.equal(policy.eval_action(obs), learner.eval_action(obs))
+    action, aux = policy.adapt_action(obs)
+    following, reward, terminated, truncated, _ = learner.world.step(action)
+    policy.step(Timestep(obs, action, reward, terminated, truncated, aux, following))
+    policy.adapt()
+    moved = policy.eval_action(obs)
+    assert not torch.equal(moved, learner.eval_action(obs)) and moved.abs().max() <= 1.0
+    policy.init()
+    assert torch.equal(policy.eval_action(obs), learner.eval_action(obs))
+
+
+def test_bad_input_is_one_line():
+    with pytest.raises(BidexError, match=r"8 tasks.*num_envs of at least 8"):
+        ProMP(PointGoals(rows=4), PROMP, seed=0)
+    for field, value in (("inner_steps", 0), ("gamma", 2.0), ("inner_learning_rate", 0.0), ("std_range", (1.0, 0.5))):
+        with pytest.raises(BidexError, match=f"promp: {field}"):
+            replace(PROMP, **{field: value})
+    with pytest.raises(BidexError, match="maml: backtracks"):
+        replace(MAML_TRPO, backtracks=0)
+    learner = ProMP(PointGoals(rows=8), PROMP, seed=0)
+    with pytest.raises(BidexError, match=r"8 rows.*9"):
+        ProMP(PointGoals(rows=9), PROMP, seed=0).load_state_dict(learner.state_dict())
+
+
+def test_the_paper_presets_are_table_48():
+    for paper in (PRESETS["paper"], MAML_PRESETS["paper"]):
+        assert (paper.hidden, paper.slice_steps, paper.inner_steps) == ((2048, 1024, 512), 8, 1)
+        assert (paper.inner_learning_rate, paper.gamma, paper.lam, paper.init_std) == (3e-4, 0.9, 0.95, 1.0)
+    paper = PRESETS["paper"]
+    assert (paper.outer_epochs, paper.outer_learning_rate, paper.clip, paper.max_grad_norm) == (3, 3e-4, 0.2, 1.0)
