@@ -178,7 +178,7 @@ class MTSAC:
         obs, reward, terminated, truncated, info = self.world.step(actions)
         self.replay.add(actions, reward, terminated, truncated, obs, info)
         broken = info["unstable"] if "unstable" in info else torch.zeros_like(terminated)
-        self._note_returns(reward.masked_fill(broken, 0.0), terminated | truncated | broken, ~broken)
+        self._note_returns(reward, terminated | truncated | broken, ~broken)
         self.policy.observations.update(obs)
         self.episodes.update(info)
         return broken.sum()

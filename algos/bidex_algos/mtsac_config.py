@@ -32,7 +32,7 @@ class MTSACConfig:
     """Standard deviation at the start, before the squashing."""
     std_range: tuple[float, float] = (0.02, 2.0)
     """Its bounds."""
-    replay_steps: int = 2000
+    replay_steps: int = 500
     """Vector steps that the replay keeps, if replay_memory allows."""
     replay_memory: float = 2.0
     """The most that the replay of each process may take, in GB (10^9 bytes)."""
@@ -49,19 +49,19 @@ class MTSACConfig:
     """Transitions of an update, split evenly over the tasks."""
     batch_per_task: int | None = None
     """Take this many of each task instead."""
-    gamma: float = 0.95
+    gamma: float = 0.93
     """Discount per step."""
-    tau: float = 0.005
+    tau: float = 0.02
     """Share of the critics that enters the target critics in each update (1 - Polyak's factor)."""
     learning_rate: float = 3e-4
     """Adam's step size for the actor."""
-    critic_learning_rate: float = 3e-4
+    critic_learning_rate: float = 1e-3
     """Adam's step size for the critics."""
     alpha_learning_rate: float = 3e-3
     """Adam's step size for the logarithms of the temperatures."""
     adam_eps: float = 1e-8
     """What Adam adds to its denominators."""
-    init_alpha: float = 0.01
+    init_alpha: float = 0.001
     """Temperature of every task at the start."""
     target_entropy_per_action: float = -1.0
     """Entropy of the squashed policy that each temperature aims at, for each action; uniform actions have 0.69."""

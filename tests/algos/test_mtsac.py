@@ -28,6 +28,8 @@ SMALL = MTSACConfig(
     tau=0.05,
     learning_rate=3e-3,
     critic_learning_rate=5e-3,
+    alpha_learning_rate=3e-3,
+    init_alpha=0.01,
     autocast="off",
 )
 
