@@ -15,7 +15,7 @@ import tyro
 from bidex_meta.commands.parsing import StepCount, Switch, parse
 from bidex_meta.errors import BidexError, unknown_name
 
-_KINDS = ("world", "scaling", "mixing", "stability", "capacity", "gpu", "kernels", "learner")
+_KINDS = ("world", "scaling", "mixing", "stability", "capacity", "gpu", "kernels", "learner", "adapt")
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,8 @@ class BenchFlags:
     """
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="|".join(_KINDS))]
-    """world, scaling, mixing, stability, capacity, gpu, kernels, or learner: MT-PPO's update against rsl-rl-lib's."""
+    """world, scaling, mixing, stability, capacity, gpu, kernels; learner: MT-PPO's update against rsl-rl-lib's; adapt:
+    all tasks' adaptation at once against a loop over them."""
     suite: str | None = None
     """Suite to measure: by default world and scaling take MT4, mixing, gpu and kernels MT20, the others every class."""
     task: str | None = None
@@ -85,10 +86,10 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _measurement(what: str) -> Any:
-    if what == "learner":
+    if what in ("learner", "adapt"):
         from bidex_meta.commands.learners import shared
 
-        return shared("bench").learner
+        return getattr(shared({"learner": "bench", "adapt": "bench_adapt"}[what]), what)
     from bidex_meta import bench
 
     return getattr(bench, what)

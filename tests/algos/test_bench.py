@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from bidex_algos import bench
+from bidex_algos.bench_adapt import adapt
 from bidex_algos.mtppo import PRESETS
 from bidex_meta.cli import main
 
@@ -79,3 +80,10 @@ def test_bench_learner_refuses_what_it_does_not_know(
 ) -> None:
     assert main(["bench", "learner", *flags]) == 2
     assert says in capsys.readouterr().err
+
+
+def test_adapting_together_gives_what_a_loop_gives():
+    found = adapt(num_tasks=3, rollouts=2, steps=4, repeats=1)
+    for name in ("point", "hands"):
+        assert found[name]["difference"] < 1e-5
+        assert found[name]["whole"]["ratio"] > 0
