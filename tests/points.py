@@ -120,6 +120,9 @@ class PointWorld:
         info = {"success": success, "unstable": unstable, "reward_unscaled": unscaled}
         return self._obs(), 2 * unscaled, terminated.clone(), truncated.clone(), info
 
+    def close(self) -> None:
+        """Nothing is held."""
+
 
 class Still:
     """Does not adapt: one fixed direction; explores by other ones. Keeps what it is told."""

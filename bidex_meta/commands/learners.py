@@ -4,6 +4,9 @@ An entry is ``"module:Class"``. Beside the class the module holds ``PRESETS``: a
 the learner's config dataclass, with at least ``paper`` and ``laptop``. The class offers:
 
 * ``Class(world, config, seed)``, and what ``bidex_algos.runner.Learner`` names;
+* where it adapts to tasks, ``adapts = True``: then ``load_policy`` gives a MetaLearningAgent (``bidex_meta.agents``),
+  which explores by a generator of its own and may say ``rollouts_per_task`` and ``max_adapt_steps``, what the meta-test
+  adapts to; where it trains on a world that does not reset by itself, ``autoreset_mode = "DISABLED"``;
 * ``policy_state_dict()`` and ``load_policy(state, device)``, which gives an agent for ``bidex_meta.evaluate`` from the
   entry ``learner.policy`` of a checkpoint.
 """
@@ -42,6 +45,16 @@ class LearnerKind:
     """The learner's class."""
     presets: dict[str, Any]
     """Configs by name; all of one dataclass."""
+
+    @property
+    def adapts(self) -> bool:
+        """Whether what it learns adapts to tasks, so that it is judged by the meta-test."""
+        return getattr(self.make, "adapts", False)
+
+    @property
+    def autoreset_mode(self) -> str:
+        """Of the world it trains on."""
+        return getattr(self.make, "autoreset_mode", "SAME_STEP")
 
 
 def learner_kind(name: str, task: str | None = None) -> LearnerKind:
