@@ -170,16 +170,29 @@ class Still:
 class Finder(Still):
     """Remembers of each task the place with the best reward, and goes there."""
 
+    def assign(self, task_of_row: Tensor | None) -> None:
+        self._called("assign")
+        self.of_row = torch.zeros(0, dtype=torch.int64) if task_of_row is None else task_of_row
+
     def init(self) -> None:
         super().init()
-        self.best = torch.zeros(int(self.of_row.max()) + 1, 2)
-        self._reward = torch.full((len(self.best),), -torch.inf)
+        self.steps.clear()
+        self.best, self._reward = torch.zeros(0, 2), torch.zeros(0)
+
+    def _know(self, rows: int) -> None:
+        if not len(self.of_row):
+            self.of_row = torch.arange(rows)
+        if not len(self.best):
+            self.best = torch.zeros(int(self.of_row.max()) + 1, 2)
+            self._reward = torch.full((len(self.best),), -torch.inf)
 
     def eval_action(self, obs: Tensor) -> Any:
         super().eval_action(obs)
+        self._know(len(obs))
         return ((self.best[self.of_row] - obs[:, :2]) / SPEED).clamp(-1, 1)
 
     def adapt_action(self, obs: Tensor) -> tuple[Any, dict[str, Any]]:
+        self._know(len(obs))
         # Rows go different ways, and hold them.
         angle = torch.arange(len(obs)) * 2.399
         drift = torch.stack([angle.cos(), angle.sin()], 1)
@@ -188,9 +201,11 @@ class Finder(Still):
     def adapt(self) -> None:
         super().adapt()
         for told in self.steps:
-            assert told.valid is not None and told.next_observation is not None
-            for row in told.valid.nonzero().squeeze(1).tolist():
+            # From Meta-World neither comes: there all rows always play.
+            valid = torch.ones(len(told.reward), dtype=torch.bool) if told.valid is None else told.valid
+            reached = told.observation[:, :2] + SPEED * told.action.clamp(-1, 1)
+            for row in valid.nonzero().squeeze(1).tolist():
                 task = int(self.of_row[row])
                 if told.reward[row] > self._reward[task]:
-                    self._reward[task], self.best[task] = told.reward[row], told.next_observation[row, :2]
+                    self._reward[task], self.best[task] = told.reward[row], reached[row]
         self.steps.clear()
