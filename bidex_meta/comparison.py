@@ -112,10 +112,18 @@ def _read(folder: RunFolder) -> dict[str, Any]:
         "path": folder.path,
         "kind": kind | {f"learner.{name}": value for name, value in config["learner"].items()},
         "seed": config["seed"],
-        "classes": found.get("policy", found)["classes"],
+        "classes": _classes(found),
         "seconds": sum(seconds),
         "steps": config["steps"],
     }
+
+
+def _classes(found: dict[str, Any]) -> dict[str, Any]:
+    """Of a meta-test the classes after adaptation, train and test apart: ML1's splits hold the same class."""
+    if "splits" in found:
+        parts = found["splits"].items()
+        return {f"{name} ({split})": row for split, part in parts for name, row in part["after"]["classes"].items()}
+    return found.get("policy", found)["classes"]
 
 
 def _differing(kinds: list[dict[str, Any]]) -> dict[str, set[str]]:

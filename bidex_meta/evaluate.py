@@ -6,32 +6,21 @@ more often, so easy tasks cannot crowd out hard ones. An episode is a success if
 step; its return is the sum of the unscaled reward.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
 
+from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError
 
 Interval = tuple[float, float]
 """Lower and upper end of a 95 % bootstrap interval."""
 
-_RESAMPLES = 2000
-_BOOTSTRAP_SEED = 0
-
-
-class Agent(Protocol):
-    """Whatever can be judged."""
-
-    def eval_action(self, obs: torch.Tensor) -> torch.Tensor:
-        """Actions ``(num_envs, action)`` in [-1, 1] for observations ``(num_envs, observation)``; no exploration."""
-        ...
-
-    def reset(self, env_mask: torch.Tensor) -> None:
-        """A new episode begins in the rows of ``env_mask``, bool ``(num_envs,)``: forget what was known of them."""
-        ...
+RESAMPLES = 2000
+BOOTSTRAP_SEED = 0
 
 
 class ZeroAgent:
@@ -202,10 +191,21 @@ def evaluate(
     Raises:
         BidexError: The world resets by itself, lacks rows, or ``episodes_per_task`` is not positive.
     """
-    _check(world, episodes_per_task)
+    check_world(world, episodes_per_task)
+    episodes = play_tasks(agent, world, episodes_per_task, seed)
+    return Evaluation(results_by_class(world.task_names, episodes, references), episodes_per_task)
+
+
+def play_tasks(agent: Agent, world: Any, episodes_per_task: int, seed: int | None) -> dict[str, np.ndarray]:
+    """``episodes_per_task`` episodes of every task, as ``evaluate`` plays them.
+
+    Returns:
+        Arrays ``(episodes,)``: ``slot``, ``task`` (index in the slot's pool), ``return``, ``success``, ``length``,
+        ``unstable``. The same world and seed give the same slots, tasks and starts in the same order.
+    """
     obs, _ = world.reset(seed=seed)
     tasks = world.task_index.clone()
-    remaining = _quota(world, tasks, episodes_per_task)
+    remaining = quota(world, episodes_per_task)
     rounds: list[dict[str, torch.Tensor]] = []
     while bool((playing := remaining > 0).any()):
         if rounds:
@@ -214,19 +214,26 @@ def evaluate(
         rounds.append({"row": torch.nonzero(playing).squeeze(1), **_play(agent, world, obs, playing)})
         remaining -= playing.long()
     episodes = {key: torch.cat([played[key] for played in rounds]).cpu().numpy() for key in rounds[0]}
-    slots, task_of_row = world.task_id.cpu().numpy()[episodes["row"]], tasks.cpu().numpy()[episodes["row"]]
+    row = episodes.pop("row")
+    return {"slot": world.task_id.cpu().numpy()[row], "task": tasks.cpu().numpy()[row], **episodes}
+
+
+def results_by_class(
+    names: Sequence[str], episodes: dict[str, np.ndarray], references: Mapping[str, Reference] | None = None
+) -> dict[str, ClassResult]:
+    """Episodes as ``play_tasks`` gives them, by the names of their slots."""
     classes = {}
-    for slot, name in enumerate(world.task_names):
-        own = slots == slot
+    for slot, name in enumerate(names):
+        own = episodes["slot"] == slot
         classes[name] = ClassResult(
             returns=episodes["return"][own],
             successes=episodes["success"][own].astype(np.float64),
             lengths=episodes["length"][own],
-            tasks=task_of_row[own],
+            tasks=episodes["task"][own],
             unstable=int(episodes["unstable"][own].sum()),
             reference=(references or {}).get(name),
         )
-    return Evaluation(classes, episodes_per_task)
+    return classes
 
 
 def compare(a: Evaluation, b: Evaluation) -> dict[str, Difference]:
@@ -281,11 +288,11 @@ def bootstrap_interval(statistic: Callable[..., Any], *samples: np.ndarray) -> I
     result = bootstrap(
         samples,
         statistic,
-        n_resamples=_RESAMPLES,
+        n_resamples=RESAMPLES,
         batch=200,  # bounds memory: all resamples at once would be 2000 times the episodes
         vectorized=True,
         method="percentile",
-        rng=np.random.default_rng(_BOOTSTRAP_SEED),
+        rng=np.random.default_rng(BOOTSTRAP_SEED),
     )
     return float(result.confidence_interval.low), float(result.confidence_interval.high)
 
@@ -302,7 +309,12 @@ def _mean_of_means(*samples: np.ndarray, axis: int = -1) -> Any:
     return sum(np.mean(sample, axis=axis) for sample in samples) / len(samples)
 
 
-def _check(world: Any, episodes_per_task: int) -> None:
+def check_world(world: Any, episodes_per_task: int) -> None:
+    """Refuse what cannot be evaluated on.
+
+    Raises:
+        BidexError: The world resets by itself or its names are not unique, or ``episodes_per_task`` is not positive.
+    """
     if episodes_per_task < 1:
         raise BidexError(f"Episodes per task must be at least 1, not {episodes_per_task}.")
     mode = str(getattr(world.metadata["autoreset_mode"], "name", world.metadata["autoreset_mode"])).upper()
@@ -312,9 +324,14 @@ def _check(world: Any, episodes_per_task: int) -> None:
         raise BidexError(f"Results are kept by name, but the world's names are not unique: {world.task_names}.")
 
 
-def _quota(world: Any, tasks: torch.Tensor, episodes_per_task: int) -> torch.Tensor:
-    """Episodes each row has to play, ``(num_envs,)``: those of a task are split over the rows that play it."""
-    quota = torch.zeros_like(tasks)
+def quota(world: Any, episodes_per_task: int) -> torch.Tensor:
+    """Episodes each row has to play, ``(num_envs,)``: those of a task are split over the rows that play it.
+
+    Raises:
+        BidexError: A task has no row.
+    """
+    tasks = world.task_index
+    shares = torch.zeros_like(tasks)
     for slot, name in enumerate(world.task_names):
         for task in range(world.num_slot_tasks[slot]):
             rows = torch.nonzero((world.task_id == slot) & (tasks == task)).squeeze(1)
@@ -325,9 +342,9 @@ def _quota(world: Any, tasks: torch.Tensor, episodes_per_task: int) -> torch.Ten
                     f"{sum(world.num_slot_tasks)} tasks. Use num_envs={needed}, or several times that."
                 )
             share, extra = divmod(episodes_per_task, len(rows))
-            quota[rows] = share
-            quota[rows[:extra]] += 1
-    return quota
+            shares[rows] = share
+            shares[rows[:extra]] += 1
+    return shares
 
 
 @torch.no_grad()

@@ -3,9 +3,10 @@
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from bidex_meta.commands.parsing import RunPath, Switch, parse
+from bidex_meta.errors import BidexError
 
 
 @dataclass(frozen=True)
@@ -13,20 +14,32 @@ class EvaluateFlags:
     """Success and return of a run's policy (mean action), the same number of episodes for every task.
 
     Example: bidex-meta evaluate runs/MT4/mtppo/2026-11-21_10-00-00_seed0 --random
+
+    What adapts to tasks (maml, promp, rl2, ...) is shown before and after --shots shots, on train and on test tasks.
     """
 
     run: RunPath
     """Run folder."""
     episodes: int | None = None
-    """Episodes of each task; None: 4, or 1 where a task fixes its start (metaworld/...)."""
-    split: Literal["train", "test"] = "train"
-    """Tasks to play: those trained on, or a meta suite's unseen ones."""
+    """Episodes of each task; None: 4, or 1 where a task fixes its start (metaworld/...); for what adapts, as many as
+    --rollouts."""
+    split: Literal["auto", "train", "test", "both"] = "auto"
+    """Tasks to play: those trained on, or a meta suite's unseen ones; auto: train, and both for what adapts."""
+    shots: int | None = None
+    """Adapt so often, one after the other, to --rollouts episodes each; None: 1."""
+    rollouts: int | None = None
+    """Episodes of each task in a shot; None: as the agent was trained, else 10."""
+    tasks: int | None = None
+    """Adapt to the first so many tasks of each class; None: 5."""
+    trials: int | None = None
+    """Adapt to each task so often, each time from the start and to other episodes; None: 1."""
     random: Switch = False
     """Also play a random policy, and show the difference."""
     seed: int | None = None
     """Seed of the episodes' starts; None: one that training does not use."""
     num_envs: int | None = None
-    """Rows stepped together, a multiple of the number of tasks; None: one per task (metaworld/...: 5 per class)."""
+    """Rows stepped together, a multiple of the number of tasks; None: one per task (metaworld/...: 5 per class). For
+    what adapts, at most so many, which bounds memory and not results' meaning; None: 1024."""
     device: str = "auto"
     """auto, cpu or cuda:N."""
     engine: Literal["auto", "c", "warp"] = "auto"
@@ -42,7 +55,7 @@ def main(arguments: Sequence[str]) -> None:
     import torch
 
     from bidex_meta.commands import worlds
-    from bidex_meta.commands.learners import resolve_device
+    from bidex_meta.commands.learners import learner_kind, resolve_device
     from bidex_meta.commands.tables import evaluation_table, print_table
     from bidex_meta.evaluate import RandomAgent, compare
     from bidex_meta.record import RunFolder
@@ -51,8 +64,14 @@ def main(arguments: Sequence[str]) -> None:
     stored = folder.config()
     config = {**stored, "device": resolve_device(flags.device, stored["suite"]), "engine": flags.engine}
     torch.set_num_threads(config["threads"])
+    kind = learner_kind(stored["algo"])
+    if kind.adapts:
+        _meta_test(flags, folder, config)
+        return
+    _refuse_adaptation(flags, stored["algo"])
     policy, step = worlds.load_policy(folder, config["device"])
-    world = worlds.evaluation_world(config, flags.split, flags.num_envs)
+    split = "train" if flags.split == "auto" else flags.split
+    world = worlds.evaluation_world(config, split, flags.num_envs)
     seed = worlds.EVALUATION_SEED if flags.seed is None else flags.seed
     found = worlds.judge(config, policy, world, flags.episodes, seed)
     random = None
@@ -60,11 +79,49 @@ def main(arguments: Sequence[str]) -> None:
         random = worlds.judge(config, RandomAgent(world.action_space), world, flags.episodes, seed)
     world.close()
     if not flags.json:
-        title = f"{config['algo']} on {config['suite'] or config['task']}, {flags.split} tasks, {step:,} steps"
+        title = f"{config['algo']} on {config['suite'] or config['task']}, {split} tasks, {step:,} steps"
         print_table(evaluation_table(title, found, random))
         return
-    result = {"run": str(folder.path), "steps": step, "split": flags.split, "seed": seed, "policy": found.to_json()}
+    result = {"run": str(folder.path), "steps": step, "split": split, "seed": seed, "policy": found.to_json()}
     if random is not None:
         differences = {name: asdict(difference) for name, difference in compare(found, random).items()}
         result |= {"random": random.to_json(), "return_above_random": differences}
+    print(json.dumps(result, indent=2))
+
+
+def _refuse_adaptation(flags: EvaluateFlags, algo: str) -> None:
+    for name in ("shots", "rollouts", "tasks", "trials"):
+        if getattr(flags, name) is not None:
+            raise BidexError(f"{algo} does not adapt to tasks, got --{name} {getattr(flags, name)}. Leave it out.")
+    if flags.split == "both":
+        raise BidexError(f"{algo} does not adapt to tasks: its splits are shown one by one. Use --split train or test.")
+
+
+def _meta_test(flags: EvaluateFlags, folder: Any, config: dict[str, Any]) -> None:
+    import sys
+
+    from bidex_meta.commands import metatest, worlds
+
+    if flags.random:
+        raise BidexError(f"{config['algo']} is compared with itself before adaptation. Leave --random out.")
+    metatest.check_suite(config)
+    known = worlds.splits(config)
+    if flags.split in ("train", "test") and flags.split not in known:
+        raise BidexError(f"{config['suite'] or config['task']} has no {flags.split} tasks. Leave --split out.")
+    splits = [name for name in known if flags.split in ("auto", "both", name)]
+    seed = worlds.EVALUATION_SEED if flags.seed is None else flags.seed
+    numbers = (flags.shots, flags.rollouts, flags.episodes, flags.tasks, flags.trials, flags.num_envs)
+    _, step = worlds.load_policy(folder, config["device"])
+    found = metatest.meta_test(
+        config,
+        lambda: worlds.load_policy(folder, config["device"])[0],
+        metatest.Options(*numbers, seed),
+        splits,
+        lambda text: print(text, file=sys.stderr, flush=True),
+    )
+    if not flags.json:
+        subject = config["suite"] or config["task"]
+        metatest.print_tables(f"{config['algo']} on {subject}, {step:,} steps", found)
+        return
+    result = {"run": str(folder.path), "steps": step, "seed": seed, "splits": metatest.report(found)}
     print(json.dumps(result, indent=2))

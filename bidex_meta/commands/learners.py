@@ -4,8 +4,11 @@ An entry is ``"module:Class"``. Beside the class the module holds ``PRESETS``: a
 the learner's config dataclass, with at least ``paper`` and ``laptop``. The class offers:
 
 * ``Class(world, config, seed)``, and what ``bidex_algos.runner.Learner`` names;
-* ``autoreset``, if it does not want SAME_STEP: the world's mode, or a function of the learner's config that gives it;
-* ``adapts = True``, if its policy is a ``bidex_meta.agents.MetaLearningAgent``;
+* where it adapts to tasks, ``adapts = True``: then ``load_policy`` gives a MetaLearningAgent (``bidex_meta.agents``),
+  which explores by a generator of its own and may say ``rollouts_per_task`` and ``max_adapt_steps``, what the meta-test
+  adapts to;
+* where it does not train in autoreset mode SAME_STEP, ``autoreset``: the mode, or a function of the learner's config
+  that gives it;
 * ``policy_state_dict()`` and ``load_policy(state, device)``, which gives an agent for ``bidex_meta.evaluate`` from the
   entry ``learner.policy`` of a checkpoint.
 """
@@ -46,6 +49,16 @@ class LearnerKind:
     """The learner's class."""
     presets: dict[str, Any]
     """Configs by name; all of one dataclass."""
+
+    @property
+    def adapts(self) -> bool:
+        """Whether what it learns adapts to tasks, so that it is judged by the meta-test."""
+        return getattr(self.make, "adapts", False)
+
+    def autoreset(self, config: dict[str, Any]) -> str:
+        """Mode of the world it trains on, for a config of the learner's."""
+        mode: Any = getattr(self.make, "autoreset", "SAME_STEP")
+        return mode(config) if callable(mode) else mode
 
 
 def learner_kind(name: str, task: str | None = None) -> LearnerKind:

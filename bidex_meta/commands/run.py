@@ -81,6 +81,10 @@ def _read(plan: RunPlan) -> Checkpoint | None:
     from bidex_meta.commands import worlds
 
     worlds.check_names(plan.config)
+    if plan.kind.adapts:
+        from bidex_meta.commands.metatest import check_suite
+
+        check_suite(plan.config)
     return plan.folder.checkpoints.load() if plan.folder else None
 
 
@@ -115,7 +119,7 @@ def _make(plan: RunPlan) -> tuple[Any, Any, Any]:
     from bidex_meta.commands import worlds
     from bidex_meta.record import RunFolder
 
-    world = worlds.training_world(plan.config)
+    world = worlds.training_world(plan.config, plan.kind.autoreset(plan.config["learner"]))
     learner = plan.kind.make(world, plan.learner_config, plan.config["seed"])
     if launch().rank > 0:
         return world, learner, None
@@ -161,6 +165,9 @@ def _what_is_left(folder: Any, processes: int) -> str:
 
 
 def _evaluate(plan: RunPlan, folder: Any, learner: Any) -> None:
+    if plan.kind.adapts:
+        _meta_test(plan, folder, learner)
+        return
     from bidex_meta.commands import worlds
     from bidex_meta.commands.tables import evaluation_table, print_table
     from bidex_meta.evaluate import RandomAgent, compare
@@ -178,6 +185,21 @@ def _evaluate(plan: RunPlan, folder: Any, learner: Any) -> None:
     title = f"{plan.config['algo']} on {plan.config['suite'] or plan.config['task']}, {learner.env_steps:,} steps"
     print_table(evaluation_table(title, trained, random))
     _say(f"Again: bidex-meta evaluate {folder.path}   Curves: bidex-meta plot {folder.path}")
+
+
+def _meta_test(plan: RunPlan, folder: Any, learner: Any) -> None:
+    from bidex_meta.commands import metatest, worlds
+    from bidex_meta.record.atomic import write_json
+
+    state, device = learner.policy_state_dict(), launch().own_device(plan.config["device"])
+    options = metatest.Options(episodes=plan.flags.episodes)
+    splits = worlds.splits(plan.config)
+    found = metatest.meta_test(plan.config, lambda: plan.kind.make.load_policy(state, device), options, splits, _say)
+    report = {"steps": learner.env_steps, "seed": options.seed, "splits": metatest.report(found)}
+    write_json(folder.path / "evaluation.json", report)
+    subject = plan.config["suite"] or plan.config["task"]
+    metatest.print_tables(f"{plan.config['algo']} on {subject}, {learner.env_steps:,} steps", found)
+    _say(f"More: bidex-meta evaluate {folder.path} --shots 3 --tasks 50   See bidex-meta plot --help for curves.")
 
 
 def _say(text: str) -> None:

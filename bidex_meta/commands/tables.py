@@ -1,23 +1,27 @@
 """Results as tables for people."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from rich.console import Console
 from rich.table import Table
 
-from bidex_meta.evaluate import Evaluation, Interval, compare
+from bidex_meta.evaluate import Difference, Evaluation, Interval, compare
+from bidex_meta.gains import Gains
 
 _NONE = "–"
 
 
-def evaluation_table(title: str, policy: Evaluation, random: Evaluation | None = None) -> Table:
+def evaluation_table(
+    title: str, policy: Evaluation, random: Evaluation | None = None, gains: Gains | None = None
+) -> Table:
     """Success, return and score per class; beside a random policy's, where there is one, with the difference.
 
     Args:
         title: Heads the table.
         policy: What was found of the policy.
         random: The same of a random policy on the same tasks.
+        gains: What adaptation gained.
     """
     table = Table(title=title, title_justify="left", caption_justify="left")
     table.caption = "[..] 95 % bootstrap interval over episodes; success: at any step of the episode"
@@ -25,6 +29,11 @@ def evaluation_table(title: str, policy: Evaluation, random: Evaluation | None =
     headers = ["episodes", "length", "success", "return [95 %]", "score"]
     if random is not None:
         headers += ["random success", "random return [95 %]", "return above random [95 %]"]
+    if gains is not None:
+        headers += ["success gained [95 %]", "return gained [95 %]", "score gained [95 %]"]
+        table.caption += (
+            "\ngained: above the same episodes before adaptation; resampled: adaptations, and their episodes"
+        )
     for header in headers:
         table.add_column(header, justify="right")
     differences = compare(policy, random) if random is not None else {}
@@ -37,14 +46,31 @@ def evaluation_table(title: str, policy: Evaluation, random: Evaluation | None =
             other, difference = others["classes"][name], differences[name]
             cells += [_percent(other["success"]), _ranged(other["return"], other["return_interval"])]
             cells += [_ranged(difference.value, difference.interval, sign=True)]
+        if gains is not None:
+            cells += _gained(gains.classes[name])
         table.add_row(*cells)
     for key, label in (("mean", "mean over tasks"), ("iqm", "interquartile mean")):
         success, score = rows["aggregate"]["success"], rows["aggregate"]["score"]
         cells = [label, "", "", _percent(success[key]), "", _score(score[key] if score else None)]
         if others is not None:
             cells += [_percent(others["aggregate"]["success"][key])]
+        if gains is not None and key == "mean":
+            cells += _gained({**gains.aggregate, "return": None})  # returns of different classes have different scales
         table.add_row(*cells, style="dim")
     return table
+
+
+def _gained(measures: Mapping[str, Difference | None]) -> list[str]:
+    success, earned, score = (measures[name] for name in ("success", "return", "score"))
+    percent = _NONE
+    if success is not None:
+        ends = None if success.interval is None else (100 * success.interval[0], 100 * success.interval[1])
+        percent = _ranged(100 * success.value, ends, sign=True, unit=" %")
+    return [
+        percent,
+        "" if earned is None else _ranged(earned.value, earned.interval, sign=True),
+        _NONE if score is None else _ranged(score.value, score.interval, sign=True),
+    ]
 
 
 def plain_table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> Table:
@@ -71,7 +97,7 @@ def _score(value: float | None) -> str:
     return _NONE if value is None else f"{value:.1f}"
 
 
-def _ranged(value: float, interval: Interval | None, sign: bool = False) -> str:
+def _ranged(value: float, interval: Interval | None, sign: bool = False, unit: str = "") -> str:
     form = "+.4g" if sign else ".4g"
     ends = _NONE if interval is None else f"{interval[0]:{form}}, {interval[1]:{form}}"
-    return f"{value:{form}} \\[{ends}]"
+    return f"{value:{form}}{unit} \\[{ends}]"

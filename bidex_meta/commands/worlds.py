@@ -12,6 +12,9 @@ from bidex_meta.record import RunFolder
 EVALUATION_SEED = 1_000_000
 """Seed of the starts in evaluation: not a seed anybody trains with, so that they are new to the policy."""
 
+_TASKS_ALONE = 50
+"""Tasks that are drawn for a class on its own."""
+
 _FOREIGN_ROWS = 5
 """Rows of each class in Meta-World's evaluation worlds: its tasks are played in turns, and 5 divides 50."""
 
@@ -35,10 +38,13 @@ def check_names(config: dict[str, Any]) -> None:
             raise unknown_name("task", config["task"], registry.names())
 
 
-def training_world(config: dict[str, Any]) -> Any:
-    """The world a run trains on; learners that play whole episodes have it wait for all rows (``autoreset``)."""
-    mode = getattr(learner_kind(config["algo"]).make, "autoreset", "SAME_STEP")
-    mode = mode(config["learner"]) if callable(mode) else mode
+def training_world(config: dict[str, Any], mode: str = "SAME_STEP") -> Any:
+    """The world a run trains on.
+
+    Args:
+        config: The run's config.
+        mode: Autoreset mode: what the learner's class says, SAME_STEP where it says nothing.
+    """
     return _world(config, "train", config["num_envs"], mode)
 
 
@@ -51,6 +57,28 @@ def evaluation_world(config: dict[str, Any], split: str = "train", rows: int | N
         rows: Rows over all tasks; one per task by default (a few per class where the suite is Meta-World's).
     """
     return _world(config, split, rows, "DISABLED")
+
+
+def splits(config: dict[str, Any]) -> list[str]:
+    """The splits of a run's suite: ``train``, and ``test`` where there is one."""
+    if config["suite"] is None or metaworld.is_foreign(config["suite"]):
+        return ["train"]
+    from bidex_meta.suite import load_suite
+
+    return list(load_suite(config["suite"]).splits)
+
+
+def task_counts(config: dict[str, Any], split: str) -> list[int]:
+    """Tasks in the pool of each slot of an evaluation world."""
+    if config["suite"] is None:
+        return [_TASKS_ALONE]
+    from bidex_meta.benchmark import Benchmark
+
+    benchmark = Benchmark(config["suite"], seed=config["seed"])
+    names = [task.env_name for task in (benchmark.test_tasks if split == "test" else benchmark.train_tasks)]
+    if benchmark.suite.task_id != "class":
+        return [1] * len(names)
+    return [names.count(name) for name in dict.fromkeys(names)]
 
 
 def judge(config: dict[str, Any], agent: Agent, world: Any, episodes: int | None, seed: int) -> Evaluation:
@@ -96,8 +124,7 @@ def _world(config: dict[str, Any], split: str, rows: int | None, mode: str) -> A
     if config["suite"] is None:
         if split != "train":
             raise BidexError(f"A run on the task {config['task']} alone has no {split} split. Leave --split out.")
-        # 50 tasks are drawn for a class on its own.
-        return make_task_world(config["task"], num_envs=rows or 50, **keywords)
+        return make_task_world(config["task"], num_envs=rows or _TASKS_ALONE, **keywords)
     benchmark = Benchmark(config["suite"], seed=config["seed"])
     if rows is None:
         tasks = [task.env_name for task in (benchmark.test_tasks if split == "test" else benchmark.train_tasks)]

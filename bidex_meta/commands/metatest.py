@@ -1,0 +1,148 @@
+"""The meta-test of a run whose learner adapts: its worlds, its defaults, its tables, its JSON."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from bidex_meta.agents import Agent
+from bidex_meta.clients import metaworld
+from bidex_meta.commands import worlds
+from bidex_meta.errors import BidexError
+
+SHOTS = 1
+"""Shots where nobody says otherwise."""
+TASKS = 5
+"""Tasks of each class, the first of its pool, where nobody says otherwise: all of ML1's, a tenth of ML20's."""
+ROLLOUTS = 10
+"""Episodes of each task in a shot, where neither flags nor the agent say otherwise."""
+ROWS = 1024
+"""Rows stepped together at most, where nobody says otherwise: half a GB."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How much is played; None: the agent's, else the default above."""
+
+    shots: int | None = None
+    """Shots of adaptation."""
+    rollouts: int | None = None
+    """Episodes of each task in a shot."""
+    episodes: int | None = None
+    """Evaluation episodes of each task; None: as many as rollouts, which the same rows play at once."""
+    tasks: int | None = None
+    """Tasks of each class."""
+    trials: int | None = None
+    """Adaptations of each task; None: 1."""
+    num_envs: int | None = None
+    """Rows stepped together at most."""
+    seed: int = worlds.EVALUATION_SEED
+    """Of all starts."""
+
+
+def meta_test(
+    config: dict[str, Any],
+    load: Callable[[], Agent],
+    options: Options,
+    splits: list[str],
+    say: Callable[[str], None] = lambda text: None,
+) -> dict[str, Any]:
+    """The meta-test on some of a run's splits.
+
+    Args:
+        config: The run's config.
+        load: Makes the agent, a MetaLearningAgent; called anew for each split, so that neither depends on the other.
+        options: How much is played.
+        splits: Out of ``worlds.splits``.
+        say: Told what begins.
+
+    Returns:
+        A MetaEvaluation for each split, by its name.
+
+    Raises:
+        BidexError: The suite is Meta-World's, or a number is out of range.
+    """
+    from bidex_meta.metatest import MAX_ADAPT_STEPS, meta_evaluate
+    from bidex_meta.references import references
+
+    check_suite(config)
+    for name in ("rollouts", "episodes", "tasks", "trials", "num_envs"):
+        number = getattr(options, name)
+        if number is not None and number < 1:
+            raise BidexError(f"--{name.replace('_', '-')} must be at least 1, not {number}.")
+    found = {}
+    for split in splits:
+        agent = load()
+        rollouts = options.rollouts or getattr(agent, "rollouts_per_task", ROLLOUTS)
+        counts = worlds.task_counts(config, split)
+        tasks = min(options.tasks or TASKS, max(counts))
+        trials = options.trials or 1
+        rows = rows_for(len(counts), tasks * trials, rollouts, options.num_envs or ROWS)
+        shots = SHOTS if options.shots is None else options.shots
+        episodes = options.episodes or rollouts
+        say(
+            f"Meta-test on {split} tasks: {len(counts)} class{'es' * (len(counts) > 1)}, {tasks} of {max(counts)} "
+            f"tasks each, {shots} shot{'s' * (shots != 1)} of {rollouts} episodes, {episodes} evaluation episodes, "
+            f"{rows} rows."
+        )
+        world = worlds.evaluation_world(config, split, rows)
+        found[split] = meta_evaluate(
+            agent,
+            world,
+            shots,
+            rollouts=rollouts,
+            episodes_per_task=episodes,
+            tasks=tasks,
+            trials=trials,
+            max_adapt_steps=getattr(agent, "max_adapt_steps", MAX_ADAPT_STEPS),
+            seed=options.seed,
+            references=references() if config["suite"] is not None else {},
+            split=split,
+        )
+        world.close()
+    return found
+
+
+def check_suite(config: dict[str, Any]) -> None:
+    """Refuse a suite on which there is no meta-test.
+
+    Raises:
+        BidexError: The suite is Meta-World's.
+    """
+    if metaworld.is_foreign(config["suite"]):
+        raise BidexError(
+            f"{config['algo']} adapts to hidden goals, but {config['suite']} shows them. Name an ML suite."
+        )
+
+
+def rows_for(classes: int, adaptations: int, rollouts: int, limit: int) -> int:
+    """Rows of a world that plays as many adaptations of each class at once as the limit allows.
+
+    Args:
+        classes: Classes of the world.
+        adaptations: Adaptations (tasks times trials) of each class.
+        rollouts: Rows each takes, if there are so many; else it takes several rounds.
+        limit: Rows at most, but never fewer than one for each class.
+    """
+    of_class = max(1, limit // classes)
+    if of_class < rollouts:
+        # A divisor, so that every row plays in every round.
+        return classes * max(number for number in range(1, of_class + 1) if rollouts % number == 0)
+    portions = -(-adaptations // (of_class // rollouts))
+    return classes * -(-adaptations // portions) * rollouts
+
+
+def report(found: dict[str, Any]) -> dict[str, Any]:
+    """All splits, ready for JSON; what ``evaluation.json`` of such a run holds under ``splits``."""
+    return {split: result.to_json() for split, result in found.items()}
+
+
+def print_tables(subject: str, found: dict[str, Any]) -> None:
+    """For each split a table before adaptation and one after, the latter with the gains."""
+    from bidex_meta.commands.tables import evaluation_table, print_table
+
+    for split, result in found.items():
+        shots = len(result.by_shot) - 1
+        print_table(evaluation_table(f"{subject}, {split} tasks, before adaptation", result.before))
+        if shots:
+            title = f"{subject}, {split} tasks, after {shots} shot{'s' * (shots > 1)} of {result.rollouts} episodes"
+            print_table(evaluation_table(title, result.after, gains=result.gains()))

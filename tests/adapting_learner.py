@@ -1,0 +1,51 @@
+"""The least a learner that adapts must be, for the commands' tests: it learns nothing, its policy is a ``Finder``."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from tests.points import Finder
+
+
+@dataclass(frozen=True)
+class Config:
+    """One number."""
+
+    size: int = 1
+    """Of nothing."""
+
+
+PRESETS = {"laptop": Config(), "paper": Config(2)}
+
+
+class Policy(Finder):
+    rollouts_per_task = 4
+    max_adapt_steps = 6
+
+
+class Learner:
+    adapts = True
+    autoreset = "DISABLED"
+    per_process = ()
+
+    def __init__(self, world: Any, config: Config, seed: int):
+        self.mode = world.metadata["autoreset_mode"].name
+        self.rows, self.env_steps = world.num_envs, 0
+
+    def iterate(self) -> dict[str, float]:
+        self.env_steps += self.rows
+        return {}
+
+    def policy_state_dict(self) -> dict[str, Any]:
+        return {"weights": torch.zeros(1)}
+
+    @classmethod
+    def load_policy(cls, state: dict[str, Any], device: str) -> Policy:
+        return Policy()
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"policy": self.policy_state_dict(), "mode": self.mode, "env_steps": self.env_steps}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.env_steps = state["env_steps"]
