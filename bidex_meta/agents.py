@@ -44,8 +44,9 @@ class Timestep(NamedTuple):
 class MetaLearningAgent(Agent, Protocol):
     """An agent that adapts to the tasks it is put into.
 
-    The order: ``assign`` (ours alone), ``init``; then for each shot ``reset`` of all rows, ``adapt_action`` and ``step``
-    until every row has played its episodes, ``adapt``; in between and at the end ``reset`` and ``eval_action``.
+    The order: ``assign`` (ours alone), ``init``; then for each shot ``reset`` of all rows, ``adapt_action`` and
+    ``step`` until every row has played its episodes, ``adapt``; in between and at the end ``reset`` and
+    ``eval_action``.
     """
 
     def assign(self, task_of_row: Tensor | None) -> None:
@@ -60,7 +61,7 @@ class MetaLearningAgent(Agent, Protocol):
         ...
 
     def adapt_action(self, obs: Tensor) -> tuple[Tensor, dict[str, Any]]:
-        """Exploring actions ``(num_envs, action)``, and whatever ``step`` shall be given back of the policy's outputs."""
+        """Exploring actions ``(num_envs, action)``, and what ``step`` shall be given back of the policy's outputs."""
         ...
 
     def step(self, timestep: Timestep) -> None:

@@ -4,6 +4,8 @@ An entry is ``"module:Class"``. Beside the class the module holds ``PRESETS``: a
 the learner's config dataclass, with at least ``paper`` and ``laptop``. The class offers:
 
 * ``Class(world, config, seed)``, and what ``bidex_algos.runner.Learner`` names;
+* where it is not ``SAME_STEP``, the autoreset mode of the world it trains on, as a class attribute ``autoreset``;
+* where its agent is a ``bidex_meta.agents.MetaLearningAgent``, the class attribute ``adapts = True``;
 * ``policy_state_dict()`` and ``load_policy(state, device)``, which gives an agent for ``bidex_meta.evaluate`` from the
   entry ``learner.policy`` of a checkpoint.
 """
@@ -20,6 +22,7 @@ ALGOS: dict[str, str] = {
     "mtppo": "bidex_algos.mtppo:MTPPO",
     "mttrpo": "bidex_algos.mttrpo:MTTRPO",
     "mtsac": "bidex_algos.mtsac:MTSAC",
+    "rl2": "bidex_algos.rl2:RL2",
     # On a single task they are the plain ones, with presets of their own (bidex_algos.single_task).
     "ppo": "bidex_algos.mtppo:MTPPO",
     "trpo": "bidex_algos.mttrpo:MTTRPO",

@@ -36,8 +36,9 @@ def check_names(config: dict[str, Any]) -> None:
 
 
 def training_world(config: dict[str, Any]) -> Any:
-    """The world a run trains on."""
-    return _world(config, "train", config["num_envs"], "SAME_STEP")
+    """The world a run trains on, in the autoreset mode its learner asks for."""
+    mode = getattr(learner_kind(config["algo"]).make, "autoreset", "SAME_STEP")
+    return _world(config, "train", config["num_envs"], mode)
 
 
 def evaluation_world(config: dict[str, Any], split: str = "train", rows: int | None = None) -> Any:
