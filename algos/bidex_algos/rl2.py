@@ -3,7 +3,8 @@
 A trial is a few episodes of one task. The policy reads, beside the observation, its last action, the last reward and
 whether an episode ended, and keeps its memory from one episode of the trial to the next: what it finds out about the
 task in the first it may use in the next. An iteration plays one trial in every row, makes ``epochs`` passes over it in
-shuffled mini-batches of chunks, through which gradients flow back, and starts the next trial without memory.
+shuffled mini-batches of chunks, through which gradients flow back, and starts the next trial without memory. The very
+first trial only measures what statistics are made of.
 ``algos/README.md`` says what is done otherwise, and why.
 """
 
@@ -100,7 +101,7 @@ class RL2:
         self.policy = _make_policy(config, self.shape, init).to(self.device)
         heads = world.num_tasks if config.value_heads else 1
         self.critic = RecurrentNet(
-            self.policy.inputs, config.hidden, config.memory, heads, 1.0, init, config.activation
+            self.policy.inputs, config.hidden, config.memory, heads, 0.01, init, config.activation
         ).to(self.device)
         # The step size is a tensor: adapting it needs no wait for the device.
         self.learning_rate = torch.tensor(config.learning_rate, device=self.device)
@@ -137,11 +138,18 @@ class RL2:
         play(self.world, self.policy, self.trials, obs, self.config.blind_share, self.generator, counts)
         collected = time.perf_counter()
 
-        batch, explained = self._prepare()
-        losses = self._update(batch)
         filled = self.trials.filled()
         valid = self.trials.valid & filled
-        self.policy.update_statistics(self.trials.obs[filled], self.trials.rewards[valid])
+        found = self.trials.obs[filled], self.trials.rewards[valid]
+        if self.trials_played == 0:
+            # The first trial only measures. Statistics of the starts alone, where nothing moves, made the policy see
+            # so much noise that it would have to unlearn most of what it learned from it.
+            self.policy.update_statistics(*found)
+            losses, explained = {}, self._prepare()[1]
+        else:
+            batch, explained = self._prepare()
+            losses = self._update(batch)
+            self.policy.update_statistics(*found)
         steps = int(all_sum(filled.sum()))
         self.env_steps += steps
         self.trials_played += 1
