@@ -25,7 +25,7 @@ def gae(
     next_values: Tensor,
     terminated: Tensor,
     ended: Tensor,
-    gamma: float,
+    gamma: float | Tensor,
     lam: float,
     valid: Tensor | None = None,
 ) -> Tensor:
@@ -37,7 +37,7 @@ def gae(
         next_values: V(s'_t) of the true successor (see :func:`successor_values`), shape (T, N).
         terminated: Bool (T, N): nothing follows, V(s') counts as 0. A time limit is not such an end.
         ended: Bool (T, N): the episode ended here, by either flag.
-        gamma: Discount.
+        gamma: Discount, one for all or one for each transition, (T, N).
         lam: Trace decay.
         valid: Bool (T, N); the advantage of an invalid transition is 0 and nothing flows through it. Default: all.
 

@@ -27,6 +27,7 @@ ALGOS: dict[str, str] = {
     "mtsac": "bidex_algos.mtsac:MTSAC",
     "promp": "bidex_algos.promp:ProMP",
     "maml": "bidex_algos.maml:MAML",
+    "rl2": "bidex_algos.rl2:RL2",
     # On a single task they are the plain ones, with presets of their own (bidex_algos.single_task).
     "ppo": "bidex_algos.mtppo:MTPPO",
     "trpo": "bidex_algos.mttrpo:MTTRPO",
@@ -58,7 +59,7 @@ class LearnerKind:
     def autoreset(self, config: dict[str, Any]) -> str:
         """Mode of the world it trains on, for a config of the learner's."""
         mode: Any = getattr(self.make, "autoreset", "SAME_STEP")
-        return mode(config) if callable(mode) else mode
+        return str(mode(config) if callable(mode) else mode)
 
 
 def learner_kind(name: str, task: str | None = None) -> LearnerKind:

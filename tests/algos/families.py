@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -113,6 +114,7 @@ class PointGoals:
 
     def _set_pools(self, pools: list[np.ndarray]) -> None:
         self.pools = pools
+        self.slots = [SimpleNamespace(name=n, tasks=goals) for n, goals in zip(self.task_names, pools, strict=True)]
         self.num_slot_tasks = [len(goals) for goals in pools]
         self.task_index = self._index_in_slot % torch.tensor(self.num_slot_tasks)[self.task_id]
         chosen = zip(self.task_id.tolist(), self.task_index.tolist(), strict=True)

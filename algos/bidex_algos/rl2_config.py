@@ -1,0 +1,113 @@
+"""What can be set about RL², and its presets; imports no torch, so that a command line can show it at once."""
+
+from dataclasses import dataclass
+
+from bidex_algos.choices import Activation
+from bidex_meta.errors import BidexError
+
+
+@dataclass(frozen=True)
+class RL2Config:
+    """Everything that can be set about RL²; the defaults are the preset ``laptop``."""
+
+    hidden: tuple[int, ...] = (256, 128)
+    """Widths of the encoder's layers, before the memory; of actor and critic alike."""
+    activation: Activation = "elu"
+    """Non-linearity of the encoder."""
+    memory: int = 128
+    """Numbers that a row's memory (GRU) holds; actor and critic have one each."""
+    value_heads: bool = True
+    """Give the critic one output per task class instead of one for all."""
+    init_std: float = 0.8
+    """Standard deviation of the actions at the start."""
+    std_range: tuple[float, float] = (0.05, 1.5)
+    """Bounds of the standard deviation of the actions."""
+    episodes_per_trial: int = 3
+    """Episodes of one task that the memory lasts for: those an evaluation plays to adapt, and one more."""
+    max_adapt_steps: int = 150
+    """Steps after which an episode of a trial is cut, if its class's time limit has not ended it."""
+    blind_share: float = 0.3
+    """Share of the episodes whose rewards the policy is not shown, as it is not in an evaluation."""
+    reward_unit: float = 0.01
+    """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
+    gamma: float = 0.97
+    """Discount per step, over all episodes of a trial."""
+    lam: float = 0.95
+    """Trace decay of the advantage estimate."""
+    chunk: int = 25
+    """Steps that gradients flow back through the memory."""
+    num_minibatches: int = 4
+    """Mini-batches per epoch; each holds shuffled chunks of all rows."""
+    epochs: int = 4
+    """Passes over the trial per update."""
+    clip: float = 0.2
+    """How far the likelihood ratio may leave 1 before it earns nothing more."""
+    learning_rate: float = 3e-4
+    """Adam's step size at the start."""
+    adaptive_learning_rate: bool = True
+    """Divide the step size by 1.5 when the KL exceeds twice desired_kl, multiply it when below half."""
+    desired_kl: float = 0.02
+    """KL of the sampling policy from the current one that the adaptive step size aims at."""
+    learning_rate_range: tuple[float, float] = (1e-5, 3e-3)
+    """Bounds of the adaptive step size."""
+    critic_learning_rate: float | None = 1e-3
+    """A fixed step size for the critic; None makes it follow the actor's."""
+    entropy_weight: float = 0.0
+    """Factor of the entropy bonus."""
+    max_grad_norm: float = 1.0
+    """Gradients longer than this are shortened to it, actor and critic apart."""
+    normalise_observations: bool = True
+    """Give observations zero mean and unit variance by running statistics."""
+    value_horizon: float = 100.0
+    """Iterations after which returns fade from the statistics that the critic's targets are normalised by."""
+
+    def __post_init__(self) -> None:
+        """Rejects values that could only fail later.
+
+        Raises:
+            BidexError: A field is out of its range.
+        """
+        for name in ("memory", "episodes_per_trial", "max_adapt_steps", "chunk", "num_minibatches", "epochs"):
+            if getattr(self, name) < 1:
+                raise BidexError(f"rl2: {name} must be at least 1, got {getattr(self, name)}.")
+        for name in ("gamma", "lam", "blind_share"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise BidexError(f"rl2: {name} must lie in [0, 1], got {getattr(self, name)}.")
+        for name in ("init_std", "reward_unit", "clip", "learning_rate", "max_grad_norm", "value_horizon"):
+            if not getattr(self, name) > 0.0:
+                raise BidexError(f"rl2: {name} must be positive, got {getattr(self, name)}.")
+        if not self.hidden:
+            raise BidexError("rl2: hidden must name at least one layer, got none.")
+        for name in ("std_range", "learning_rate_range"):
+            low, high = getattr(self, name)
+            if not 0.0 < low <= high:
+                raise BidexError(f"rl2: {name} must be two rising positive numbers, got {low} {high}.")
+
+
+PRESETS: dict[str, RL2Config] = {
+    # The appendix has no table for RL². Layers, epochs, mini-batches, clip, gradient norm, step size, discount, trace,
+    # starting noise and KL are Table 48's, ProMP's: its outer loop is PPO too. Its 8 steps a rollout have no
+    # counterpart, since a trial is made of whole episodes. Memory, ten episodes a trial and 250 steps of
+    # backpropagation are those of RL² in Meta-World's baselines (metaworld-algorithms).
+    "paper": RL2Config(
+        hidden=(2048, 1024, 512),
+        memory=256,
+        value_heads=False,
+        init_std=1.0,
+        episodes_per_trial=10,
+        gamma=0.9,
+        lam=0.95,
+        chunk=250,
+        num_minibatches=1,
+        epochs=3,
+        clip=0.2,
+        learning_rate=3e-4,
+        desired_kl=0.016,
+        critic_learning_rate=None,
+        entropy_weight=0.0,
+        max_grad_norm=1.0,
+        normalise_observations=False,
+    ),
+    # A discount closer to 1 than MT-PPO's 0.93: what an episode finds out is paid in the next.
+    "laptop": RL2Config(),
+}

@@ -1,0 +1,452 @@
+import io
+import math
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from bidex_algos.normalise import RunningStats
+from bidex_algos.recurrent import RecurrentNet
+from bidex_algos.rl2 import PRESETS, RL2, RL2Config
+from bidex_algos.rl2_agent import RL2Agent
+from bidex_meta import Benchmark
+from bidex_meta.agents import MetaLearningAgent, Timestep
+from bidex_meta.commands.worlds import training_world
+from bidex_meta.errors import BidexError
+from tests.algos.families import PointClass, PointGoals, circle
+from tests.algos.test_mtppo import equal
+
+SMALL = RL2Config(
+    hidden=(32,), activation="tanh", memory=32, init_std=0.6, episodes_per_trial=2, gamma=0.9, chunk=20,
+    num_minibatches=2, learning_rate=2e-3, learning_rate_range=(3e-4, 3e-3), critic_learning_rate=3e-3,
+)  # fmt: skip
+TINY = replace(SMALL, hidden=(8,), memory=8, chunk=4, episodes_per_trial=3)
+TEN = (PointClass(steps=10, count=16),)
+UNEVEN = (PointClass("Short", steps=3, count=3), PointClass("Long", steps=7, scale=100.0, count=2))
+
+
+def everyone(world: PointGoals) -> Tensor:
+    return torch.ones(world.num_envs, dtype=torch.bool)
+
+
+def evaluated(agent: MetaLearningAgent, world: PointGoals) -> float:
+    """Mean return of one evaluation episode in each row."""
+    obs, _ = world.reset()
+    agent.reset(everyone(world))
+    total = 0.0
+    for _ in range(int(world.max_episode_steps.max())):
+        obs, reward, *_ = world.step(agent.eval_action(obs))
+        total += float(reward.mean())
+    return total
+
+
+def adapted(agent: MetaLearningAgent, world: PointGoals) -> None:
+    """One shot: an exploring episode in each row."""
+    obs, _ = world.reset()
+    agent.reset(everyone(world))
+    over = ~everyone(world)
+    for _ in range(int(world.max_episode_steps.max())):
+        action, aux = agent.adapt_action(obs)
+        following, reward, terminated, truncated, _ = world.step(action)
+        agent.step(Timestep(obs, action, reward, terminated, truncated, aux, following, ~over))
+        obs, over = following, terminated | truncated
+    agent.adapt()
+
+
+def state_of(agent: RL2Agent) -> Tensor:
+    assert agent._learned is not None
+    return agent._learned.state.clone()
+
+
+def test_one_shot_closes_most_of_the_gap_to_a_policy_that_knows_the_goal():
+    learner = RL2(PointGoals(160, classes=TEN), SMALL, seed=0)
+    metrics = [learner.iterate() for _ in range(50)][-1]
+    assert metrics["Train/return_last_episode"] > metrics["Train/return_first_episode"] + 1.5
+
+    # Goals between those of the training.
+    test, shown = PointGoals(80, classes=TEN), PointGoals(80, goal_visible=True, classes=TEN)
+    test.set_tasks({"PointGoals": circle(16, first=0.2)})
+    agent = RL2.load_policy(learner.policy_state_dict())
+    obs, _ = shown.reset()
+    best = 0.0
+    for _ in range(10):
+        obs, reward, *_ = shown.step(shown.best(obs))
+        best += float(reward.mean())
+    before = evaluated(agent, test)
+    assert before == pytest.approx(-10.0, abs=1.0)
+    adapted(agent, test)
+    after = evaluated(agent, test)
+    assert (after - before) / (best - before) > 0.6
+    # The second evaluation learns nothing from the first, and without adaptation all is as before.
+    assert evaluated(agent, test) == pytest.approx(after, abs=0.3)
+    agent.init()
+    assert evaluated(agent, test) == pytest.approx(before, abs=0.3)
+    # A shot at the goals opposite misleads.
+    opposite = PointGoals(80, classes=TEN)
+    opposite.set_tasks({"PointGoals": circle(16, first=0.2 + math.pi)})
+    adapted(agent, opposite)
+    assert evaluated(agent, test) < before - 2.0
+
+
+# Memory.
+
+
+def test_the_chunked_forward_equals_a_loop_by_hand():
+    generator = torch.Generator().manual_seed(0)
+    net = RecurrentNet(5, (6,), 7, 3, 1.0, generator, "tanh")
+    x, state = torch.randn(12, 4, 5, generator=generator), torch.randn(4, 7, generator=generator)
+    weights = [getattr(net.gru, name) for name in ("weight_ih_l0", "weight_hh_l0", "bias_ih_l0", "bias_hh_l0")]
+    h, by_hand = state, []
+    for t in range(12):
+        features = torch.tanh(net.encoder[0](x[t]))
+        a, b = (v.chunk(3, 1) for v in (features @ weights[0].T + weights[2], h @ weights[1].T + weights[3]))
+        r, z = torch.sigmoid(a[0] + b[0]), torch.sigmoid(a[1] + b[1])
+        h = (1 - z) * torch.tanh(a[2] + r * b[2]) + z * h
+        by_hand.append(net.head(torch.cat([features, h], 1)))
+    out, last = net(x, state)
+    assert_close(out, torch.stack(by_hand))
+    assert_close(last, h)
+    parts, between = [], state
+    for k in range(3):
+        part, between = net(x[4 * k : 4 * k + 4], between)
+        parts.append(part)
+    assert_close(torch.cat(parts), out)
+    before = torch.get_rng_state()
+    RecurrentNet(5, (6,), 7, 3, 1.0, generator)
+    assert torch.equal(before, torch.get_rng_state())
+
+
+def test_the_update_sees_what_the_rollout_saw():
+    learner = RL2(PointGoals(6, classes=UNEVEN), replace(TINY, blind_share=0.5), seed=0)
+    learner.iterate()
+    seen: list[tuple[Tensor, Tensor]] = []
+    step, world = learner.policy.step, learner.world
+
+    def spy(obs: Tensor, memory: Any) -> tuple[Tensor, Tensor]:
+        playing = ~world.episodes.finished
+        out = step(obs, memory)
+        seen.append((playing, out[0]))
+        return out
+
+    learner.policy.step = spy  # type: ignore[method-assign]
+    learner._update = lambda batch: {}  # type: ignore[method-assign]
+    learner.policy.update_statistics = lambda obs, rewards: None  # type: ignore[method-assign]
+    learner.iterate()
+    batch, _ = learner._prepare()
+    for row in range(6):
+        played = torch.stack([mean[row] for playing, mean in seen if playing[row]])
+        assert len(played) == learner.trials.lengths[row] == 3 * int(world.max_episode_steps[row])
+        assert_close(batch.old_means[: len(played), row], played)
+
+
+def test_the_memory_lasts_for_a_trial_and_waits_unchanged():
+    learner = RL2(PointGoals(6, classes=UNEVEN), TINY, seed=0)
+    states: list[tuple[Tensor, Tensor, Tensor]] = []
+    step, world = learner.policy.step, learner.world
+
+    def spy(obs: Tensor, memory: Any) -> tuple[Tensor, Tensor]:
+        states.append((memory.state, memory.done, world.episodes.elapsed))
+        return step(obs, memory)
+
+    learner.policy.step = spy  # type: ignore[method-assign]
+    for _ in range(2):
+        states.clear()
+        learner.iterate()
+        assert len(states) == 3 * 7
+        assert not states[0][0].any() and not states[0][1].any()  # zero at the start of a trial
+        for t, (state, done, elapsed) in enumerate(states[1:], 1):
+            assert state.any(1).all()
+            waited = elapsed == states[t - 1][2]
+            assert torch.equal(state[waited], states[t - 1][0][waited])
+            assert done[elapsed == 0].all() and not done[(elapsed > 0) & (elapsed < world.max_episode_steps)].any()
+
+
+def test_rows_of_different_length_are_recorded_without_gaps():
+    learner = RL2(PointGoals(6, classes=UNEVEN), replace(TINY, max_adapt_steps=5), seed=0)
+    metrics = learner.iterate()
+    t = learner.trials
+    assert t.lengths.tolist() == [9, 9, 9, 15, 15, 15]
+    assert learner.env_steps == int(t.lengths.sum()) == 72
+    ends = [t.ended[:16, row].nonzero().flatten().tolist() for row in (0, 3)]
+    assert [e for e in ends[0] if e < 9] == [2, 5, 8] and [e for e in ends[1] if e < 15] == [4, 9, 14]
+    # Cut episodes count too, though the world does not know of them.
+    assert metrics["Train/mean_episode_length"] == pytest.approx(4.0)
+    batch, _ = learner._prepare()
+    assert batch.weights.sum(0).tolist() == t.lengths.tolist()
+    assert not batch.advantages[9:, :3].any()
+    # Positions move by at most 0.2 within an episode, and begin anew near the origin.
+    jumps = (t.obs[1:15, 3, :2] - t.obs[:14, 3, :2]).abs().amax(1)
+    assert (jumps[[0, 1, 2, 3, 5, 6]] <= 0.2001).all() and (t.obs[[0, 5, 10], 3, :2].abs() <= 0.1).all()
+
+
+# Returns.
+
+
+@pytest.mark.parametrize("end_at_goal", [False, True])
+def test_advantages_are_those_of_the_definition(end_at_goal: bool):
+    world = PointGoals(20, classes=(PointClass(steps=6, count=4),), end_at_goal=end_at_goal)
+    world.set_tasks({"PointGoals": circle(4, radius=0.25)})
+    config = replace(TINY, init_std=1.0, num_minibatches=1)
+    learner = RL2(world, config, seed=0)
+    learner._update = lambda batch: {}  # type: ignore[method-assign]
+    learner.iterate()
+    t, g, lam = learner.trials, config.gamma, config.lam
+    learner.return_stats = RunningStats((1,))  # so that the critic's units are those of the reward
+    batch, _ = learner._prepare()
+    spread = learner.return_stats.std().float()
+    returns = batch.targets * spread + learner.return_stats.mean.float()
+    for row in range(20):
+        n = int(t.lengths[row])
+        x = learner.policy.see(t.obs[: n + 1], *(p[: n + 1] for p in t.previous(len(t.obs) - 1)))[:, row]
+        value = learner.critic(x[:, None], torch.zeros(1, 8))[0].flatten().detach()
+        true_end = t.terminated[:n, row]
+        expected, running = torch.zeros(n), 0.0
+        for k in range(n - 1, -1, -1):
+            # An episode that ended truly stands still, unrewarded, until its time limit.
+            discount = g ** (1 + int(t.left[k, row])) if true_end[k] else g
+            follows = 0.0 if k == n - 1 and true_end[k] else value[k + 1]
+            delta = t.rewards[k, row] + discount * follows - value[k]
+            running = delta + (discount * lam * running if k < n - 1 else 0.0)
+            expected[k] = running
+        assert_close(returns[:n, row], expected + value[:n], rtol=1e-4, atol=1e-4)
+    assert bool(t.terminated[t.filled()].any()) == end_at_goal
+
+
+def test_a_transition_that_broke_physics_teaches_nothing():
+    states = []
+    for garbage in (0.0, 1e8, float("nan")):
+        world = PointGoals(6, classes=UNEVEN, unstable=((2, 1), (4, 5), (30, 0)), garbage=garbage)
+        learner = RL2(world, TINY, seed=0)
+        assert learner.iterate()["Train/unstable"] == 2
+        assert not learner.trials.valid[2, 1] and learner.trials.ended[2, 1]
+        learner.iterate()
+        states.append(learner.state_dict())
+    assert equal(states[0], states[1]) and equal(states[0], states[2])
+
+
+# What the policy sees.
+
+
+def test_without_rewards_nothing_that_the_policy_sees_tells_the_task():
+    seen = []
+    for first in (0.0, 1.0):
+        world = PointGoals(8, classes=TEN)
+        world.set_tasks({"PointGoals": circle(8, first)})
+        learner = RL2(world, replace(SMALL, blind_share=1.0), seed=0)
+        learner._update = lambda batch: {}  # type: ignore[method-assign]
+        learner.iterate()
+        t = learner.trials
+        seen.append((learner.policy.see(t.obs[:-1], *t.previous(len(t.obs) - 1)), t.rewards))
+    assert torch.equal(seen[0][0], seen[1][0]) and not torch.equal(seen[0][1], seen[1][1])
+
+
+def test_nor_in_a_world_of_hands():
+    benchmark = Benchmark("ML1-wide", seed=0)
+    seen = []
+    for order in ([0, 1, 2], [2, 0, 1]):
+        world = benchmark.make_world("train", num_envs=3, device="cpu", threads=1, autoreset_mode="DISABLED")
+        world.set_tasks({"CatchUnderarm": world.slots[0].tasks[order]})
+        learner = RL2(world, replace(TINY, blind_share=1.0, max_adapt_steps=4), seed=0)
+        learner._update = lambda batch: {}  # type: ignore[method-assign]
+        learner.iterate()
+        t = learner.trials
+        assert t.lengths.tolist() == [12, 12, 12]
+        seen.append((learner.policy.see(t.obs[:12], *t.previous(12)), t.rewards[:12].clone()))
+        world.close()
+    assert torch.equal(seen[0][0], seen[1][0]) and not torch.equal(seen[0][1], seen[1][1])
+
+
+def test_rewards_are_shown_but_for_blind_episodes():
+    learner = RL2(PointGoals(400, classes=TEN), replace(SMALL, blind_share=0.3), seed=0)
+    learner.iterate()
+    shown = learner.trials.shown[:20].view(2, 10, 400)
+    assert (shown == shown[:, :1]).all()
+    assert 0.6 < float(shown.float().mean()) < 0.8
+    obs = torch.zeros(2, 4)
+    flags = torch.tensor([True, False])
+    x = learner.policy.see(obs, torch.full((2, 2), 3.0), torch.tensor([-1.0, -1.0]), flags, flags)
+    assert x.shape == (2, 4 + 2 + 3)
+    assert x[:, 4:6].eq(1.0).all()  # what the world did, not what was asked for
+    assert x[1, 6:].tolist() == [0.0, 0.0, 0.0] and x[0, 7:].tolist() == [1.0, 1.0] and x[0, 6] != 0.0
+
+
+# Tasks.
+
+
+def test_classes_with_more_tasks_than_rows_take_them_by_turns():
+    world = PointGoals(6, classes=(PointClass("Few", steps=2, count=2), PointClass("Many", steps=2, count=5)))
+    learner, goals = RL2(world, TINY, seed=0), []
+    for _ in range(5):
+        learner.iterate()
+        goals.append(world.goal.clone())
+    few, many = (torch.stack(goals)[:, rows].reshape(-1, 2) for rows in world.slot_rows)
+    assert torch.unique(many, dim=0, return_counts=True)[1].tolist() == [3] * 5
+    assert torch.equal(few[:3], few[3:6])
+
+
+# Checkpoints.
+
+
+def test_save_load_resume_is_bit_equal():
+    def made(seed: int) -> RL2:
+        return RL2(PointGoals(6, classes=(UNEVEN[0], PointClass("Long", steps=7, scale=100.0, count=5))), TINY, seed)
+
+    unbroken = made(0)
+    for _ in range(3):
+        unbroken.iterate()
+    file = io.BytesIO()
+    torch.save({"learner": unbroken.state_dict(), "env": unbroken.world.state_dict()}, file)
+    file.seek(0)
+    state = torch.load(file, weights_only=True)
+    resumed = made(77)
+    resumed.world.load_state_dict(state["env"])
+    resumed.load_state_dict(state["learner"])
+    for _ in range(3):
+        a, b = unbroken.iterate(), resumed.iterate()
+        assert {k: v for k, v in a.items() if "Perf" not in k} == {k: v for k, v in b.items() if "Perf" not in k}
+    assert equal(unbroken.state_dict(), resumed.state_dict())
+
+
+def test_an_evaluation_leaves_the_training_alone():
+    states = []
+    for evaluate in (False, True):
+        learner = RL2(PointGoals(6, classes=UNEVEN), TINY, seed=0)
+        learner.iterate()
+        if evaluate:
+            test = PointGoals(3)
+            adapted(learner, test)
+            evaluated(learner, test)
+        learner.iterate()
+        states.append(learner.state_dict())
+    assert equal(states[0], states[1])
+
+
+def test_a_checkpoint_of_another_world_is_refused():
+    learner = RL2(PointGoals(6), TINY, seed=0)
+    state = learner.state_dict()
+    state["policy"]["shape"]["observations"] = 5
+    with pytest.raises(BidexError, match="observations"):
+        learner.load_state_dict(state)
+
+
+# The agent.
+
+
+def agent_on(world: PointGoals) -> RL2Agent:
+    learner = RL2(PointGoals(8, classes=TEN), SMALL, seed=0)
+    learner.iterate()
+    agent = RL2.load_policy(learner.policy_state_dict())
+    agent.assign(torch.zeros(world.num_envs, dtype=torch.int64))
+    agent.init()
+    return agent
+
+
+def test_evaluation_episodes_start_from_what_adaptation_left():
+    world = PointGoals(4, classes=TEN)
+    agent = agent_on(world)
+    adapted(agent, world)
+    left = state_of(agent)
+    obs = torch.zeros(4, 4)
+    first = []
+    for _ in range(3):
+        agent.reset(everyone(world))
+        first.append(agent.eval_action(obs))
+        assert not torch.equal(agent.eval_action(obs), first[-1])  # the memory goes on within the episode
+    assert torch.equal(first[0], first[1]) and torch.equal(first[0], first[2])
+    assert torch.equal(state_of(agent), left)
+    # A second shot goes on from the first, not from an evaluation.
+    adapted(agent, world)
+    assert not torch.equal(state_of(agent), left)
+    agent.init()
+    agent.reset(everyone(world))
+    assert not state_of(agent).any()
+
+
+def test_reset_of_some_rows_leaves_the_others_in_their_episode():
+    agent = agent_on(PointGoals(4, classes=TEN))
+    obs, mask = torch.ones(4, 4), torch.tensor([True, False, True, False])
+    agent.reset(~mask | mask)
+    first = agent.eval_action(obs)
+    agent.reset(mask)
+    second = agent.eval_action(obs)
+    assert torch.equal(first[mask], second[mask]) and not (first[~mask] == second[~mask]).all(1).any()
+
+
+def test_the_agent_waits_with_rows_whose_episode_is_over():
+    world = PointGoals(6, classes=UNEVEN)
+    agent = agent_on(world)
+    obs, _ = world.reset()
+    agent.reset(everyone(world))
+    over = ~everyone(world)
+    for t in range(7):
+        action, aux = agent.adapt_action(obs)
+        obs, reward, terminated, truncated, _ = world.step(action)
+        before = state_of(agent)
+        agent.step(Timestep(obs, action, reward, terminated, truncated, aux, obs, ~over))
+        over = terminated | truncated
+        same = (state_of(agent) == before).all(1)
+        assert same.tolist() == [t >= 3] * 3 + [False] * 3
+    assert agent._learned is not None and agent._learned.done.all()
+
+
+def test_the_agent_plays_the_trial_that_the_training_played():
+    """Fed with the training's actions and rewards, its memory becomes the training's."""
+    learner = RL2(PointGoals(6, classes=UNEVEN), replace(TINY, blind_share=0.0), seed=0)
+    learner._update = lambda batch: {}  # type: ignore[method-assign]
+    learner.iterate()
+    t, agent = learner.trials, RL2Agent(learner.policy)
+    # Statistics have moved since: what the memory would be by the present ones.
+    previous = t.previous(len(t.obs) - 1)
+    for row in (0, 5):
+        agent.init()
+        n = int(t.lengths[row])
+        x = learner.policy.see(t.obs[:n], *(p[:n] for p in previous))[:, row]
+        _, expected = learner.policy.actor(x[:, None], torch.zeros(1, 8))
+        agent.reset(torch.ones(1, dtype=torch.bool))
+        for k in range(n):
+            _, aux = agent.adapt_action(t.obs[k, row][None])
+            told = (t.obs[k, row], t.actions[k, row], t.rewards[k, row], torch.tensor(False), t.ended[k, row])
+            agent.step(Timestep(*(x[None] for x in told), aux, None, torch.ones(1, dtype=torch.bool)))
+            if t.ended[k, row]:
+                agent.reset(torch.ones(1, dtype=torch.bool))
+        assert_close(state_of(agent), expected.detach())
+
+
+# Bad input.
+
+
+def test_bad_input_is_named():
+    for field, value in (("chunk", 0), ("gamma", 1.5), ("blind_share", -0.1), ("reward_unit", 0.0), ("hidden", ())):
+        with pytest.raises(BidexError, match=field):
+            replace(SMALL, **{field: value})
+    with pytest.raises(BidexError, match="SAME_STEP"):
+        RL2(PointGoals(4, autoreset_mode="SAME_STEP"), SMALL, seed=0)
+    with pytest.raises(BidexError, match="num_envs"):
+        RL2(PointGoals(1), SMALL, seed=0)
+
+
+def test_the_run_makes_the_world_that_the_learner_asks_for():
+    config = {"suite": "ML1-wide", "task": None, "num_envs": 3, "seed": 0, "device": "cpu", "threads": 1}
+    for algo, mode in (("rl2", "DISABLED"), ("mtppo", "SAME_STEP")):
+        world = training_world(config | {"algo": algo})
+        assert world.autoreset_mode.name == mode
+        world.close()
+
+
+def test_the_paper_preset_has_the_numbers_of_table_48():
+    paper = PRESETS["paper"]
+    assert (paper.hidden, paper.num_minibatches, paper.epochs) == ((2048, 1024, 512), 1, 3)
+    assert (paper.clip, paper.max_grad_norm, paper.learning_rate, paper.init_std) == (0.2, 1.0, 3e-4, 1.0)
+    assert (paper.gamma, paper.lam, paper.desired_kl, paper.entropy_weight) == (0.9, 0.95, 0.016, 0.0)
+
+
+def test_the_config_is_shown_without_importing_torch():
+    code = "import sys, bidex_algos.rl2_config as m; assert m.PRESETS; sys.exit('torch' in sys.modules)"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    assert subprocess.run([sys.executable, "-c", code], env=environment).returncode == 0
