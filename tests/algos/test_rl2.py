@@ -17,6 +17,7 @@ from bidex_algos.rl2 import PRESETS, RL2, RL2Config
 from bidex_algos.rl2_agent import RL2Agent
 from bidex_meta import Benchmark
 from bidex_meta.agents import MetaLearningAgent, Timestep
+from bidex_meta.commands.learners import learner_kind
 from bidex_meta.commands.worlds import training_world
 from bidex_meta.errors import BidexError
 from tests.algos.families import PointClass, PointGoals, circle
@@ -433,8 +434,13 @@ def test_bad_input_is_named():
 
 def test_the_run_makes_the_world_that_the_learner_asks_for():
     config = {"suite": "ML1-wide", "task": None, "num_envs": 3, "seed": 0, "device": "cpu", "threads": 1}
-    for algo, mode in (("rl2", "DISABLED"), ("mtppo", "SAME_STEP")):
-        world = training_world(config | {"algo": algo})
+    for algo, learner, mode in (
+        ("rl2", {}, "DISABLED"),
+        ("mtppo", {}, "SAME_STEP"),
+        ("promp", {"slice_steps": None}, "DISABLED"),
+        ("promp", {"slice_steps": 8}, "SAME_STEP"),
+    ):
+        world = training_world(config, learner_kind(algo).autoreset(learner))
         assert world.autoreset_mode.name == mode
         world.close()
 
