@@ -22,7 +22,7 @@ class MetaConfig:
     """Standard deviation of the actions at the start; part of what is adapted."""
     std_range: tuple[float, float] = (0.1, 1.5)
     """Bounds of the standard deviation of the actions."""
-    tasks_per_class: int = 4
+    tasks_per_class: int = 3
     """Tasks of each class in a meta-batch, drawn anew for each; fewer where a class has fewer. The class's rows are
     split over them: that many rollouts has each."""
     max_adapt_steps: int = 150

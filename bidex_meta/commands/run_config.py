@@ -17,6 +17,8 @@ from bidex_meta.errors import BidexError
 from bidex_meta.record.folder import RunFolder
 
 _ROWS_AND_STEPS = {"cpu": (1024, 20_000_000), "gpu": (8192, 200_000_000)}
+# Whole episodes of all rows make one meta-batch: with fewer rows there are more of them.
+_ADAPTING_ROWS_AND_STEPS = (300, 20_000_000)
 # Meta-World's rows are environments of some 10 MB each; 2 M steps a class is the budget of published results.
 _FOREIGN_ROWS_AND_STEPS = (4, 2_000_000)
 
@@ -98,19 +100,21 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     learner_default = kind.presets[preset]
     if folder:
         learner_default = _stored_learner(type(learner_default), stored, folder)
-    flags = parse(*_options(arguments, learner_default, stored, _rows_and_steps(suite, device)))
+    flags = parse(*_options(arguments, learner_default, stored, _rows_and_steps(suite, device, kind)))
     config = _resolved(flags, preset, device, stored)
     if folder:
         _refuse_changes(stored, config, folder)
     return RunPlan(flags, kind, flags.learner, config, folder, reason)
 
 
-def _rows_and_steps(suite: str | None, device: str) -> tuple[int, int]:
+def _rows_and_steps(suite: str | None, device: str, kind: LearnerKind) -> tuple[int, int]:
     """What ``--num-envs`` and ``--steps`` are where nobody says."""
     if suite in metaworld.SUITES:
         rows, steps = (number * len(metaworld.SUITES[suite]) for number in _FOREIGN_ROWS_AND_STEPS)
         return rows, steps
-    return _ROWS_AND_STEPS["cpu" if device.startswith("cpu") else "gpu"]
+    if device.startswith("cpu"):
+        return _ADAPTING_ROWS_AND_STEPS if kind.adapts else _ROWS_AND_STEPS["cpu"]
+    return _ROWS_AND_STEPS["gpu"]
 
 
 def _options(

@@ -11,8 +11,10 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from bidex_algos.adaptation import weighted_mean
+from bidex_algos.linear_baseline import features
 from bidex_algos.maml import MAML, MAMLConfig
 from bidex_algos.maml import PRESETS as MAML_PRESETS
+from bidex_algos.meta_policy import make_meta_policy
 from bidex_algos.networks import gaussian_log_prob
 from bidex_algos.promp import PRESETS, ProMP, ProMPConfig
 from bidex_algos.trust_region import flatten, write
@@ -21,6 +23,7 @@ from bidex_meta.errors import BidexError
 from tests.algos.families import PointClass, PointGoals, circle
 from tests.algos.ranks import same
 from tests.algos.test_meta_parts import problem
+from tests.tasks.test_mask import twins
 
 SHARED: dict[str, Any] = {
     "hidden": (32, 32), "init_std": 0.5, "gamma": 0.99, "tasks_per_class": 8, "normalise_observations": False
@@ -265,3 +268,15 @@ def test_the_paper_presets_are_table_48():
         assert (paper.inner_learning_rate, paper.gamma, paper.lam, paper.init_std) == (3e-4, 0.9, 0.95, 1.0)
     paper = PRESETS["paper"]
     assert (paper.outer_epochs, paper.outer_learning_rate, paper.clip, paper.max_grad_norm) == (3, 3e-4, 0.2, 1.0)
+
+
+@pytest.mark.parametrize(("rule", "equal"), [("masked", True), ("plain", False)])
+def test_rows_in_one_state_with_other_tasks_look_alike_to_policy_and_baseline(rule: str, equal: bool):
+    _, obs, reward = twins("CatchUnderarm", True, rule)
+    assert len(reward.unique()) > 1
+    shape = {"observations": obs.shape[1], "actions": 52, "num_id_columns": 0}
+    policy = make_meta_policy(PROMP, "ratio", shape, torch.Generator().manual_seed(0), seed=0)
+    _, aux = policy.adapt_action(obs)
+    x = features(policy.observations(obs), torch.zeros(len(obs)))
+    assert torch.equal(aux["mean"], aux["mean"][:1].expand_as(aux["mean"])) == equal
+    assert torch.equal(x, x[:1].expand_as(x)) == equal
