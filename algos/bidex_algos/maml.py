@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from bidex_algos.adaptation import TaskBatch, weighted_mean
 from bidex_algos.maml_config import PRESETS, MAMLConfig
 from bidex_algos.meta import MetaLearner, TaskWorld
-from bidex_algos.trust_region import conjugate_gradient, fisher_product, flatten, line_search
+from bidex_algos.trust_region import line_search, natural_step
 
 __all__ = ["MAML", "PRESETS", "MAMLConfig"]
 
@@ -63,11 +63,9 @@ class MAML(MetaLearner):
     def _trust_region(self, batches: list[TaskBatch]) -> dict[str, Tensor]:
         cfg, parameters = self.config, list(self.policy.actor.parameters())
         surrogate, kl = self._objective(batches)
-        gradient = flatten(torch.autograd.grad(surrogate, parameters, retain_graph=True))
-        product = fisher_product(kl, parameters, cfg.damping)
-        direction = conjugate_gradient(product, gradient, cfg.cg_iterations)
-        curvature = direction.dot(product(direction)).clamp_min(1e-12)
-        step = torch.sqrt(2.0 * cfg.max_kl / curvature) * direction
+        step, promised = natural_step(
+            surrogate, kl, parameters, max_kl=cfg.max_kl, damping=cfg.damping, iterations=cfg.cg_iterations
+        )
 
         @torch.no_grad()
         def measure() -> tuple[float, float]:
@@ -78,7 +76,7 @@ class MAML(MetaLearner):
             parameters,
             step,
             measure,
-            expected=float(gradient.dot(step)),
+            expected=promised,
             max_kl=cfg.max_kl,
             accept_ratio=0.0,
             factor=cfg.backtrack_factor,

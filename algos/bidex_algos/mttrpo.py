@@ -20,7 +20,7 @@ from bidex_algos.networks import gaussian_kl, gaussian_log_prob
 from bidex_algos.onpolicy import Batch, OnPolicy
 from bidex_algos.precision import autocast
 from bidex_algos.rollout import VectorWorld
-from bidex_algos.trust_region import conjugate_gradient, fisher_product, flatten, line_search
+from bidex_algos.trust_region import line_search, natural_step
 
 __all__ = ["MTTRPO", "PRESETS", "MTTRPOConfig"]
 
@@ -54,12 +54,14 @@ class MTTRPO(OnPolicy):
         old_log_std = actor.log_std_of(batch.obs).detach().clone()
         weight = batch.weights / all_sum(batch.weights.sum()).clamp_min(1.0)
 
-        surrogate, _ = self._surrogate_and_kl(batch, weight, old_log_std)
-        gradient = all_sum(flatten(torch.autograd.grad(surrogate, parameters)))
-        product = fisher_product(self._kl_from_itself(batch), parameters, cfg.damping)
-        direction = conjugate_gradient(product, gradient, cfg.cg_iterations)
-        curvature = direction.dot(product(direction)).clamp_min(1e-12)
-        step = torch.sqrt(2.0 * cfg.max_kl / curvature) * direction
+        step, promised = natural_step(
+            self._surrogate_and_kl(batch, weight, old_log_std)[0],
+            self._kl_from_itself(batch),
+            parameters,
+            max_kl=cfg.max_kl,
+            damping=cfg.damping,
+            iterations=cfg.cg_iterations,
+        )
 
         @torch.no_grad()
         def measure() -> tuple[float, float]:
@@ -73,7 +75,7 @@ class MTTRPO(OnPolicy):
             parameters,
             step,
             measure,
-            expected=float(gradient.dot(step)),
+            expected=promised,
             max_kl=cfg.max_kl,
             accept_ratio=cfg.accept_ratio,
             factor=cfg.backtrack_factor,

@@ -68,6 +68,30 @@ def fisher_product(kl: Tensor, parameters: Sequence[nn.Parameter], damping: floa
     return product
 
 
+def natural_step(
+    objective: Tensor, kl: Tensor, parameters: Sequence[nn.Parameter], *, max_kl: float, damping: float, iterations: int
+) -> tuple[Tensor, float]:
+    """The step along F^-1 g that has the KL ``max_kl`` to second order, and the rise of the objective it promises.
+
+    Args:
+        objective: This process's part of what shall rise, a scalar with a graph.
+        kl: As for :func:`fisher_product`.
+        parameters: The policy's.
+        max_kl: The KL to use.
+        damping: Added to the diagonal of the Fisher matrix.
+        iterations: Of conjugate gradients.
+
+    Returns:
+        The step (P,) and a number.
+    """
+    gradient = all_sum(flatten(torch.autograd.grad(objective, parameters, retain_graph=True)))
+    product = fisher_product(kl, parameters, damping)
+    direction = conjugate_gradient(product, gradient, iterations)
+    curvature = direction.dot(product(direction)).clamp_min(1e-12)
+    step = torch.sqrt(2.0 * max_kl / curvature) * direction
+    return step, float(gradient.dot(step))
+
+
 def line_search(
     parameters: Sequence[nn.Parameter],
     step: Tensor,

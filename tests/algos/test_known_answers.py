@@ -14,7 +14,7 @@ from tests.algos.toy import ToyWorld, nearness
 GAMMA = 0.8
 SHARED: dict[str, Any] = {"hidden": (32, 32), "rollout_steps": 16, "gamma": GAMMA, "init_std": 0.5, "autocast": "off"}
 PPO = MTPPOConfig(**SHARED, learning_rate=3e-3, learning_rate_range=(1e-4, 5e-3), critic_learning_rate=3e-3)
-TRPO = MTTRPOConfig(**SHARED, fisher_stride=1, damping=0.01, critic_learning_rate=3e-3)
+TRPO = MTTRPOConfig(**SHARED, fisher_stride=1, max_kl=0.03, damping=0.01, critic_learning_rate=3e-3)
 both = pytest.mark.parametrize(("learner_type", "config"), [(MTPPO, PPO), (MTTRPO, TRPO)], ids=["ppo", "trpo"])
 
 

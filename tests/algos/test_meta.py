@@ -1,6 +1,5 @@
 """MAML and ProMP: their gradients, their steps, and what they learn on a family with hidden goals."""
 
-import io
 from dataclasses import replace
 from typing import Any
 
@@ -22,6 +21,7 @@ from bidex_meta.agents import Timestep
 from bidex_meta.errors import BidexError
 from tests.algos.families import PointClass, PointGoals, circle
 from tests.algos.ranks import same
+from tests.algos.resume import resumed
 from tests.algos.test_meta_parts import problem
 from tests.tasks.test_mask import twins
 
@@ -185,24 +185,7 @@ def test_save_load_resume_is_bit_equal(kind: Any, config: Any, slice_steps: int 
     )
     mode = kind.autoreset({"slice_steps": slice_steps})
     assert mode == ("DISABLED" if slice_steps is None else "SAME_STEP")
-    unbroken = kind(PointGoals(rows=12, autoreset_mode=mode), config, seed=0)
-    for _ in range(3):
-        unbroken.iterate()
-    file = io.BytesIO()
-    torch.save({"learner": unbroken.state_dict(), "env": unbroken.world.state_dict()}, file)
-    file.seek(0)
-    state = torch.load(file, weights_only=True)
-    resumed = kind(PointGoals(rows=12, autoreset_mode=mode), config, seed=77)
-    resumed.world.load_state_dict(state["env"])
-    resumed.load_state_dict(state["learner"])
-    for _ in range(3):
-        a, b = unbroken.iterate(), resumed.iterate()
-        assert {k: v for k, v in a.items() if "Perf" not in k} == {k: v for k, v in b.items() if "Perf" not in k}
-    assert same(
-        {k: v for k, v in unbroken.state_dict().items() if k != "policy"},
-        {k: v for k, v in resumed.state_dict().items() if k != "policy"},
-    )
-    assert same(unbroken.policy.state_dict(), resumed.policy.state_dict())
+    resumed(lambda seed: kind(PointGoals(rows=12, autoreset_mode=mode), config, seed))
 
 
 @both

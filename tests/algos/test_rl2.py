@@ -1,4 +1,3 @@
-import io
 import math
 import os
 import subprocess
@@ -21,6 +20,7 @@ from bidex_meta.commands.learners import learner_kind
 from bidex_meta.commands.worlds import training_world
 from bidex_meta.errors import BidexError
 from tests.algos.families import PointClass, PointGoals, circle
+from tests.algos.resume import resumed
 from tests.algos.test_mtppo import equal
 
 SMALL = RL2Config(
@@ -298,20 +298,7 @@ def test_save_load_resume_is_bit_equal():
     def made(seed: int) -> RL2:
         return RL2(PointGoals(6, classes=(UNEVEN[0], PointClass("Long", steps=7, scale=100.0, count=5))), TINY, seed)
 
-    unbroken = made(0)
-    for _ in range(3):
-        unbroken.iterate()
-    file = io.BytesIO()
-    torch.save({"learner": unbroken.state_dict(), "env": unbroken.world.state_dict()}, file)
-    file.seek(0)
-    state = torch.load(file, weights_only=True)
-    resumed = made(77)
-    resumed.world.load_state_dict(state["env"])
-    resumed.load_state_dict(state["learner"])
-    for _ in range(3):
-        a, b = unbroken.iterate(), resumed.iterate()
-        assert {k: v for k, v in a.items() if "Perf" not in k} == {k: v for k, v in b.items() if "Perf" not in k}
-    assert equal(unbroken.state_dict(), resumed.state_dict())
+    resumed(made)
 
 
 def test_an_evaluation_leaves_the_training_alone():
