@@ -60,7 +60,9 @@ class Batch:
 
 
 class RL2(RL2Agent):
-    """RL² on a batched world that keeps each row's task; also an agent, whose memory is not that of the training.
+    """A policy with a memory that adapts to a task while it plays it, on a batched world.
+
+    It is its own agent: evaluated, it has a memory that is not that of the training.
 
     In a run of several processes each has a world and samples of its own, and all have the same networks: statistics
     and gradients are those of the samples of all.
