@@ -26,7 +26,6 @@ from bidex_algos.recurrent import RecurrentNet, RecurrentPolicy
 from bidex_algos.rl2_agent import RL2Agent
 from bidex_algos.rl2_config import PRESETS, RL2Config
 from bidex_algos.trials import Trials, play
-from bidex_meta.agents import Timestep
 from bidex_meta.errors import BidexError
 
 __all__ = ["PRESETS", "RL2", "RL2Config"]
@@ -60,8 +59,10 @@ class Batch:
     """Its row, int64 (S,)."""
 
 
-class RL2:
-    """RL² on a batched world that keeps each row's task.
+class RL2(RL2Agent):
+    """A policy with a memory that adapts to a task while it plays it, on a batched world.
+
+    It is its own agent: evaluated, it has a memory that is not that of the training.
 
     In a run of several processes each has a world and samples of its own, and all have the same networks: statistics
     and gradients are those of the samples of all.
@@ -75,7 +76,7 @@ class RL2:
     Attributes:
         env_steps: Environment steps taken so far, over all rows of all processes; a waiting row takes none.
         per_process: Entries of ``state_dict`` that differ from process to process.
-        policy: Network and statistics; :class:`~bidex_algos.rl2_agent.RL2Agent` makes an agent of it.
+        policy: Network and statistics.
 
     Raises:
         BidexError: A world that resets by itself, or fewer rows than mini-batches.
@@ -90,15 +91,14 @@ class RL2:
     def __init__(self, world: Any, config: RL2Config, seed: int):
         _check(world, config)
         self.world, self.config, self.seed = world, config, seed
-        self.device = torch.device(world.device)
         self.env_steps = self.trials_played = 0
         d, a = int(world.single_observation_space.shape[0]), int(world.single_action_space.shape[0])
         self.shape = {"observations": d, "actions": a, "num_id_columns": int(getattr(world, "num_id_columns", 0))}
 
         # Weights come from a CPU generator, so that a seed means the same network on every device.
         init = torch.Generator().manual_seed(seed)
+        super().__init__(_make_policy(config, self.shape, init).to(world.device), own_seed(seed))
         self.generator = torch.Generator(self.device).manual_seed(own_seed(seed))
-        self.policy = _make_policy(config, self.shape, init).to(self.device)
         heads = world.num_tasks if config.value_heads else 1
         self.critic = RecurrentNet(
             self.policy.inputs, config.hidden, config.memory, heads, 0.01, init, config.activation
@@ -119,7 +119,6 @@ class RL2:
         self.episodes, self.firsts, self.lasts = (EpisodeStatistics(world.task_id, world.task_names) for _ in range(3))
         # The tasks that the world was made with: of them each trial takes as many as there are rows.
         self.pools = _larger_pools(world)
-        self.agent = RL2Agent(self.policy, own_seed(seed))
 
     def iterate(self) -> dict[str, float]:
         """Plays one trial in every row and learns from it.
@@ -336,36 +335,6 @@ class RL2:
         if not math.isfinite(sum(metrics[name] for name in losses)):
             raise FloatingPointError(f"rl2: the loss is not finite after {self.env_steps} steps; lower learning_rate.")
         return metrics
-
-    # The agent, for an evaluation of the learner itself; training has a memory of its own.
-
-    def assign(self, task_of_row: Tensor | None) -> None:
-        """See :class:`~bidex_algos.rl2_agent.RL2Agent`."""
-        self.agent.assign(task_of_row)
-
-    def init(self) -> None:
-        """See :class:`~bidex_algos.rl2_agent.RL2Agent`."""
-        self.agent.init()
-
-    def reset(self, env_mask: Tensor) -> None:
-        """See :class:`~bidex_algos.rl2_agent.RL2Agent`."""
-        self.agent.reset(env_mask)
-
-    def adapt_action(self, obs: Tensor) -> tuple[Tensor, dict[str, Any]]:
-        """See :class:`~bidex_algos.rl2_agent.RL2Agent`."""
-        return self.agent.adapt_action(obs)
-
-    def step(self, timestep: Timestep) -> None:
-        """See :class:`~bidex_algos.rl2_agent.RL2Agent`."""
-        self.agent.step(timestep)
-
-    def adapt(self) -> None:
-        """See :class:`~bidex_algos.rl2_agent.RL2Agent`."""
-        self.agent.adapt()
-
-    def eval_action(self, obs: Tensor) -> Tensor:
-        """See :class:`~bidex_algos.rl2_agent.RL2Agent`."""
-        return self.agent.eval_action(obs)
 
     # Checkpoints.
 

@@ -25,7 +25,7 @@ class RL2Agent:
     def __init__(self, policy: RecurrentPolicy, seed: int = 0):
         self.policy = policy
         self.device = policy.log_std.device
-        self.generator = torch.Generator(self.device).manual_seed(seed)
+        self.noise = torch.Generator(self.device).manual_seed(seed)
         self.init()
 
     def assign(self, task_of_row: Tensor | None) -> None:
@@ -54,7 +54,7 @@ class RL2Agent:
         self._learned = self._memory(self._learned, len(obs))
         mean, self._next_state = self.policy.step(obs, self._learned)
         std = self.policy.log_std.detach().exp().expand_as(mean)
-        noise = torch.randn(mean.shape, generator=self.generator, device=mean.device)
+        noise = torch.randn(mean.shape, generator=self.noise, device=mean.device)
         return (mean + std * noise).clamp(-1.0, 1.0), {"mean": mean, "std": std}
 
     def step(self, timestep: Timestep) -> None:
