@@ -1,0 +1,75 @@
+"""Adam for an actor and its critic, with a step size that follows the KL."""
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor, nn
+
+
+class AdaptiveAdams:
+    """Two optimisers; the actor's step size is divided by 1.5 above twice the desired KL, multiplied below half of it.
+
+    The step size is a tensor: adapting it needs no wait for the device.
+
+    Args:
+        actor: The actor's parameters.
+        critic: The critic's.
+        learning_rate: Step size at the start.
+        critic_learning_rate: A fixed one for the critic; None makes it follow the actor's.
+        desired_kl: What the step size aims at; None leaves it as it is.
+        bounds: Of the actor's step size.
+        device: Where the parameters lie.
+    """
+
+    def __init__(
+        self,
+        actor: Iterable[nn.Parameter],
+        critic: Iterable[nn.Parameter],
+        *,
+        learning_rate: float,
+        critic_learning_rate: float | None,
+        desired_kl: float | None,
+        bounds: tuple[float, float],
+        device: torch.device,
+    ):
+        self.desired_kl, self.bounds = desired_kl, bounds
+        self.rate = torch.tensor(learning_rate, device=device)
+        fixed = critic_learning_rate
+        self.critic_rate = self.rate if fixed is None else torch.tensor(fixed, device=device)
+        self.actor = torch.optim.Adam(actor, lr=self.rate, fused=True)
+        self.critic = torch.optim.Adam(critic, lr=self.critic_rate, fused=True)
+
+    def zero_grad(self) -> None:
+        """Forgets the gradients of both."""
+        self.actor.zero_grad()
+        self.critic.zero_grad()
+
+    def step(self) -> None:
+        """One step of both."""
+        self.actor.step()
+        self.critic.step()
+
+    def follow(self, kl: Tensor) -> None:
+        """Adapts the actor's step size to the KL of its last step, a scalar."""
+        if self.desired_kl is None:
+            return
+        factor = torch.where(kl > 2.0 * self.desired_kl, 1.0 / 1.5, 1.0)
+        factor = torch.where(kl < 0.5 * self.desired_kl, 1.5, factor)
+        self.rate.mul_(factor).clamp_(*self.bounds)
+
+    def state_dict(self) -> dict[str, object]:
+        """Both optimisers and the step size."""
+        return {
+            "actor_adam": self.actor.state_dict(),
+            "critic_adam": self.critic.state_dict(),
+            "learning_rate": self.rate.clone(),
+        }
+
+    def load_state_dict(self, state: dict[str, object]) -> None:
+        """Restores what :meth:`state_dict` gave; other entries are passed over."""
+        self.rate.copy_(state["learning_rate"])  # type: ignore[arg-type]
+        for adam, rate, name in ((self.actor, self.rate, "actor_adam"), (self.critic, self.critic_rate, "critic_adam")):
+            adam.load_state_dict(state[name])  # type: ignore[arg-type]
+            for group in adam.param_groups:
+                # Loading put a copy there; adapting must reach the optimiser.
+                group["lr"] = rate
