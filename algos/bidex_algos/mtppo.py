@@ -17,6 +17,7 @@ from bidex_algos.networks import gaussian_entropy, gaussian_kl, gaussian_log_pro
 from bidex_algos.onpolicy import Batch, OnPolicy
 from bidex_algos.precision import autocast
 from bidex_algos.rollout import VectorWorld
+from bidex_algos.step_size import AdaptiveAdams
 from bidex_algos.surgery import per_task_gradients, project_conflicting
 from bidex_meta.errors import BidexError
 
@@ -45,15 +46,15 @@ class MTPPO(OnPolicy):
                 f"{config.rollout_steps} steps give {samples}. Raise num_envs or lower num_minibatches."
             )
         super().__init__(world, config, seed)
-        # The step size is a tensor: adapting it needs no wait for the device.
-        self.learning_rate = torch.tensor(config.learning_rate, device=self.device)
-        self.critic_learning_rate = (
-            self.learning_rate
-            if config.critic_learning_rate is None
-            else torch.tensor(config.critic_learning_rate, device=self.device)
+        self.adams = AdaptiveAdams(
+            self.policy.actor.parameters(),
+            self.critic.parameters(),
+            learning_rate=config.learning_rate,
+            critic_learning_rate=config.critic_learning_rate,
+            desired_kl=config.desired_kl if config.adaptive_learning_rate else None,
+            bounds=config.learning_rate_range,
+            device=self.device,
         )
-        self.actor_adam = torch.optim.Adam(self.policy.actor.parameters(), lr=self.learning_rate, fused=True)
-        self.critic_adam = torch.optim.Adam(self.critic.parameters(), lr=self.critic_learning_rate, fused=True)
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
         """PPO's update: returns the means over all mini-batches of what it measured."""
@@ -69,20 +70,19 @@ class MTPPO(OnPolicy):
             for number, (index, count) in enumerate(zip(parts, counts, strict=True)):
                 measured.append(self._gradients(batch.select(index), count, old_log_std))
                 # The first mini-batch compares the sampling policy with itself and says nothing about the step.
-                if cfg.adaptive_learning_rate and (epoch, number) != (0, 0):
-                    self._adapt_learning_rate(measured[-1][2])
+                if (epoch, number) != (0, 0):
+                    self.adams.follow(measured[-1][2])
                 actor_weights, critic_weights = list(actor.parameters()), list(self.critic.parameters())
                 for weights in [actor_weights, critic_weights] if cfg.clip_apart else [actor_weights + critic_weights]:
                     nn.utils.clip_grad_norm_(weights, cfg.max_grad_norm)
-                self.actor_adam.step()
-                self.critic_adam.step()
+                self.adams.step()
                 with torch.no_grad():
                     actor.log_std.clamp_(low, high)
         names = ["Loss/surrogate", "Loss/value", "Policy/kl", "Policy/clip_fraction"]
         if cfg.gradient_surgery == "pcgrad":
             names.append("Policy/conflicts")
         means = torch.stack(measured).mean(0)
-        return {**dict(zip(names, means, strict=True)), "Policy/lr": self.learning_rate}
+        return {**dict(zip(names, means, strict=True)), "Policy/lr": self.adams.rate}
 
     def _gradients(self, b: Batch, count: Tensor, old_log_std: Tensor) -> Tensor:
         """Puts the gradients of a mini-batch into the parameters; ``count`` samples are in it, over all processes.
@@ -110,8 +110,7 @@ class MTPPO(OnPolicy):
             outside = (weight * ((ratio - 1.0).abs() > cfg.clip)).sum()
         numbers = [surrogate.detach(), value_loss.detach(), kl, outside]
 
-        self.actor_adam.zero_grad()
-        self.critic_adam.zero_grad()
+        self.adams.zero_grad()
         if cfg.gradient_surgery == "pcgrad":
             numbers.append(self._operate(-earned, b.task_id))
             rest.backward()
@@ -133,30 +132,10 @@ class MTPPO(OnPolicy):
             parameter.grad = part.view_as(parameter) / world_size()
         return apart / world_size()
 
-    def _adapt_learning_rate(self, kl: Tensor) -> None:
-        low, high = self.config.learning_rate_range
-        factor = torch.where(kl > 2.0 * self.config.desired_kl, 1.0 / 1.5, 1.0)
-        factor = torch.where(kl < 0.5 * self.config.desired_kl, 1.5, factor)
-        self.learning_rate.mul_(factor).clamp_(low, high)
-
     # Checkpoints.
 
-    def _optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        return {"actor_adam": self.actor_adam, "critic_adam": self.critic_adam}
+    def _optimiser_state(self) -> dict[str, Any]:
+        return self.adams.state_dict()
 
-    def state_dict(self) -> dict[str, Any]:
-        """A copy of everything but the world, as tensors and plain values (``torch.load(weights_only=True)``)."""
-        return {**super().state_dict(), "learning_rate": self.learning_rate.clone()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`state_dict` gave.
-
-        Raises:
-            BidexError: The checkpoint comes from a world of another size.
-        """
-        super().load_state_dict(state)
-        self.learning_rate.copy_(state["learning_rate"])
-        for adam, rate in ((self.actor_adam, self.learning_rate), (self.critic_adam, self.critic_learning_rate)):
-            for group in adam.param_groups:
-                # Loading put a copy there; adapting must reach the optimiser.
-                group["lr"] = rate
+    def _load_optimisers(self, state: dict[str, Any]) -> None:
+        self.adams.load_state_dict(state)

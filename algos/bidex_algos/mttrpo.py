@@ -10,6 +10,7 @@ One policy reads the task's one-hot in its observation. An update, in the order 
 """
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -39,8 +40,11 @@ class MTTRPO(OnPolicy):
         super().__init__(world, config, seed)
         self.critic_adam = torch.optim.Adam(self.critic.parameters(), lr=config.critic_learning_rate, fused=True)
 
-    def _optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        return {"critic_adam": self.critic_adam}
+    def _optimiser_state(self) -> dict[str, Any]:
+        return {"critic_adam": self.critic_adam.state_dict()}
+
+    def _load_optimisers(self, state: dict[str, Any]) -> None:
+        self.critic_adam.load_state_dict(state["critic_adam"])
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
         """TRPO's update: returns what it measured, among it the KL after the step."""

@@ -111,8 +111,12 @@ class OnPolicy:
         """Learns from a batch; returns scalars to be logged."""
         raise AssertionError("the learner's own")
 
-    def _optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        """The optimisers by the names they have in a checkpoint."""
+    def _optimiser_state(self) -> dict[str, Any]:
+        """The optimisers' part of a checkpoint."""
+        raise AssertionError("the learner's own")
+
+    def _load_optimisers(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`_optimiser_state` gave, from a whole checkpoint."""
         raise AssertionError("the learner's own")
 
     def iterate(self) -> dict[str, float]:
@@ -259,7 +263,7 @@ class OnPolicy:
                 "policy": self.policy_state_dict(),
                 "critic": self.critic.state_dict(),
                 "return_stats": self.return_stats.state_dict(),
-                **{name: optimiser.state_dict() for name, optimiser in self._optimisers().items()},
+                **self._optimiser_state(),
                 "generator": self.generator.get_state(),
                 "episodes": self.episodes.state_dict(),
                 "obs": self.obs,
@@ -283,8 +287,7 @@ class OnPolicy:
         self.policy.load_state_dict(state["policy"]["weights"])
         self.critic.load_state_dict(state["critic"])
         self.return_stats.load_state_dict(state["return_stats"])
-        for name, optimiser in self._optimisers().items():
-            optimiser.load_state_dict(state[name])
+        self._load_optimisers(state)
         self.generator.set_state(state["generator"].cpu())
         self.episodes.load_state_dict(state["episodes"])
         self.obs = None if obs is None else obs.to(self.device, copy=True)

@@ -25,6 +25,7 @@ from bidex_algos.normalise import RunningStats
 from bidex_algos.recurrent import RecurrentNet, RecurrentPolicy
 from bidex_algos.rl2_agent import RL2Agent
 from bidex_algos.rl2_config import PRESETS, RL2Config
+from bidex_algos.step_size import AdaptiveAdams
 from bidex_algos.trials import Trials, play
 from bidex_meta.errors import BidexError
 
@@ -103,13 +104,15 @@ class RL2(RL2Agent):
         self.critic = RecurrentNet(
             self.policy.inputs, config.hidden, config.memory, heads, 0.01, init, config.activation
         ).to(self.device)
-        # The step size is a tensor: adapting it needs no wait for the device.
-        self.learning_rate = torch.tensor(config.learning_rate, device=self.device)
-        fixed = config.critic_learning_rate
-        self.critic_learning_rate = self.learning_rate if fixed is None else torch.tensor(fixed, device=self.device)
-        actor_weights = self.policy.parameters()
-        self.actor_adam = torch.optim.Adam(actor_weights, lr=self.learning_rate, fused=True)
-        self.critic_adam = torch.optim.Adam(self.critic.parameters(), lr=self.critic_learning_rate, fused=True)
+        self.adams = AdaptiveAdams(
+            self.policy.parameters(),
+            self.critic.parameters(),
+            learning_rate=config.learning_rate,
+            critic_learning_rate=config.critic_learning_rate,
+            desired_kl=config.desired_kl if config.adaptive_learning_rate else None,
+            bounds=config.learning_rate_range,
+            device=self.device,
+        )
 
         limits = world.max_episode_steps.clamp_max(config.max_adapt_steps)
         self.trials = Trials(config.episodes_per_trial, limits, d, a, config.chunk)
@@ -267,16 +270,15 @@ class RL2(RL2Agent):
             for number, (index, count) in enumerate(zip(parts, counts, strict=True)):
                 measured.append(self._gradients(b, b.chunk[index], b.row[index], count, old_log_std))
                 # The first mini-batch compares the sampling policy with itself and says nothing about the step.
-                if cfg.adaptive_learning_rate and (epoch, number) != (0, 0):
-                    self._adapt_learning_rate(measured[-1][2])
+                if (epoch, number) != (0, 0):
+                    self.adams.follow(measured[-1][2])
                 for weights in (policy.parameters(), self.critic.parameters()):
                     nn.utils.clip_grad_norm_(weights, cfg.max_grad_norm)
-                self.actor_adam.step()
-                self.critic_adam.step()
+                self.adams.step()
                 with torch.no_grad():
                     policy.log_std.clamp_(low, high)
         names = ["Loss/surrogate", "Loss/value", "Policy/kl", "Policy/clip_fraction"]
-        return {**dict(zip(names, torch.stack(measured).mean(0), strict=True)), "Policy/lr": self.learning_rate}
+        return {**dict(zip(names, torch.stack(measured).mean(0), strict=True)), "Policy/lr": self.adams.rate}
 
     def _gradients(self, b: Batch, chunk: Tensor, row: Tensor, count: Tensor, old_log_std: Tensor) -> Tensor:
         """Puts the gradients of some chunks, (B,) each, into the parameters.
@@ -306,17 +308,10 @@ class RL2(RL2Agent):
         with torch.no_grad():
             kl = (weight * gaussian_kl(take(b.old_means), old_log_std, mean, policy.log_std)).sum()
             outside = (weight * ((ratio - 1.0).abs() > cfg.clip)).sum()
-        self.actor_adam.zero_grad()
-        self.critic_adam.zero_grad()
+        self.adams.zero_grad()
         (surrogate + value_loss - cfg.entropy_weight * entropy).backward()
         numbers = torch.stack([surrogate.detach(), value_loss.detach(), kl, outside])
         return sum_gradients([*policy.parameters(), *self.critic.parameters()], numbers)
-
-    def _adapt_learning_rate(self, kl: Tensor) -> None:
-        low, high = self.config.learning_rate_range
-        factor = torch.where(kl > 2.0 * self.config.desired_kl, 1.0 / 1.5, 1.0)
-        factor = torch.where(kl < 0.5 * self.config.desired_kl, 1.5, factor)
-        self.learning_rate.mul_(factor).clamp_(low, high)
 
     def _metrics(self, losses: dict[str, Tensor], explained: Tensor, broken: Tensor) -> dict[str, float]:
         tensors = dict(losses)
@@ -361,9 +356,7 @@ class RL2(RL2Agent):
                 "policy": self.policy_state_dict(),
                 "critic": self.critic.state_dict(),
                 "return_stats": self.return_stats.state_dict(),
-                "actor_adam": self.actor_adam.state_dict(),
-                "critic_adam": self.critic_adam.state_dict(),
-                "learning_rate": self.learning_rate,
+                **self.adams.state_dict(),
                 "generator": self.generator.get_state(),
                 "episodes": [statistics.state_dict() for statistics in (self.episodes, self.firsts, self.lasts)],
                 "trials_played": self.trials_played,
@@ -385,13 +378,7 @@ class RL2(RL2Agent):
         self.policy.load_state_dict(state["policy"]["weights"])
         self.critic.load_state_dict(state["critic"])
         self.return_stats.load_state_dict(state["return_stats"])
-        self.learning_rate.copy_(state["learning_rate"])
-        self.actor_adam.load_state_dict(state["actor_adam"])
-        self.critic_adam.load_state_dict(state["critic_adam"])
-        for adam, rate in ((self.actor_adam, self.learning_rate), (self.critic_adam, self.critic_learning_rate)):
-            for group in adam.param_groups:
-                # Loading put a copy there; adapting must reach the optimiser.
-                group["lr"] = rate
+        self.adams.load_state_dict(state)
         self.generator.set_state(state["generator"].cpu())
         for statistics, saved in zip((self.episodes, self.firsts, self.lasts), state["episodes"], strict=True):
             statistics.load_state_dict(saved)

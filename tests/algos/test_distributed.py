@@ -42,7 +42,7 @@ def facts(learner: Learner) -> dict[str, torch.Tensor]:
     named = [*learner.policy.named_parameters("policy"), *learner.critic.named_parameters("critic")]
     found = {name: p.detach().clone() for name, p in named}
     if isinstance(learner, MTPPO):
-        found["learning rate"] = learner.learning_rate.clone()
+        found["learning rate"] = learner.adams.rate.clone()
     for name, stats in (("observations", learner.policy.observations.stats), ("returns", learner.return_stats)):
         found |= {f"{name}.{key}": value.clone() for key, value in stats.state_dict().items()}
     return found

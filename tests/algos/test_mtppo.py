@@ -151,14 +151,14 @@ def test_the_step_size_follows_the_kl():
     learner = MTPPO(ToyWorld([nearness(0.6)]), SMALL, seed=0)
     rates = []
     for kl in (2.5 * SMALL.desired_kl, SMALL.desired_kl, 0.1 * SMALL.desired_kl):
-        learner._adapt_learning_rate(torch.tensor(kl))
-        rates.append(float(learner.learning_rate))
+        learner.adams.follow(torch.tensor(kl))
+        rates.append(float(learner.adams.rate))
     assert rates == pytest.approx([2e-4, 2e-4, 3e-4])
     for kl, bound in ((1.0, 1e-5), (0.0, 2e-3)):
         for _ in range(40):
-            learner._adapt_learning_rate(torch.tensor(kl))
-        assert float(learner.learning_rate) == pytest.approx(bound)
-    assert learner.actor_adam.param_groups[0]["lr"] is learner.learning_rate
+            learner.adams.follow(torch.tensor(kl))
+        assert float(learner.adams.rate) == pytest.approx(bound)
+    assert learner.adams.actor.param_groups[0]["lr"] is learner.adams.rate
 
 
 @pytest.mark.parametrize("desired_kl", [1e-6, 1e6])
@@ -181,7 +181,7 @@ def test_the_standard_deviation_keeps_its_bounds():
 @pytest.mark.parametrize("config", [SMALL, replace(SMALL, autocast="on", critic_learning_rate=1e-3)])
 def test_save_load_resume_is_bit_equal(config: MTPPOConfig):
     _, again = resumed(lambda seed: MTPPO(ToyWorld([nearness(0.6), nearness(0.0)]), config, seed))
-    assert float(again.learning_rate) != config.learning_rate
+    assert float(again.adams.rate) != config.learning_rate
 
 
 def test_a_saved_state_does_not_change_with_the_learner():
