@@ -37,7 +37,7 @@ def small(monkeypatch):
 @pytest.fixture
 def run(tmp_path) -> Path:
     path = tmp_path / "r"
-    flags = ["--suite", "ML4", "--algo", "finder", "--num-envs", "12", "--steps", "24", "--threads", "1"]
+    flags = ["--suite", "ML4", "--algo", "finder", "--num-envs", "24", "--steps", "24", "--threads", "1"]
     assert main(["run", *flags, "--device", "cpu", "--run-dir", str(path)]) == 0
     return path
 

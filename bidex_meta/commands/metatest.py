@@ -14,14 +14,16 @@ SHOTS = 1
 TASKS = 5
 """Tasks of each class, the first of its pool, where nobody says otherwise: all of ML1's, a tenth of ML20's."""
 ROLLOUTS = 10
-"""Episodes of each task in a shot, where neither flags nor the agent say otherwise."""
+"""Episodes of each task in a shot, where neither flags nor the run's config say otherwise."""
+MOST_ROLLOUTS = 40
+"""The most that are taken from the run's config: ML1's three tasks may be trained with hundreds."""
 ROWS = 1024
 """Rows stepped together at most, where nobody says otherwise: half a GB."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """How much is played; None: the agent's, else the default above."""
+    """How much is played; None: as the run was trained, else the default above."""
 
     shots: int | None = None
     """Shots of adaptation."""
@@ -70,9 +72,8 @@ def meta_test(
         if number is not None and number < 1:
             raise BidexError(f"--{name.replace('_', '-')} must be at least 1, not {number}.")
     found = {}
+    rollouts = options.rollouts or _trained_rollouts(config)
     for split in splits:
-        agent = load()
-        rollouts = options.rollouts or getattr(agent, "rollouts_per_task", ROLLOUTS)
         counts = worlds.task_counts(config, split)
         tasks = min(options.tasks or TASKS, max(counts))
         trials = options.trials or 1
@@ -86,20 +87,29 @@ def meta_test(
         )
         world = worlds.evaluation_world(config, split, rows)
         found[split] = meta_evaluate(
-            agent,
+            load(),
             world,
             shots,
             rollouts=rollouts,
             episodes_per_task=episodes,
             tasks=tasks,
             trials=trials,
-            max_adapt_steps=getattr(agent, "max_adapt_steps", MAX_ADAPT_STEPS),
+            max_adapt_steps=config["learner"].get("max_adapt_steps", MAX_ADAPT_STEPS),
             seed=options.seed,
             references=references() if config["suite"] is not None else {},
             split=split,
         )
         world.close()
     return found
+
+
+def _trained_rollouts(config: dict[str, Any]) -> int:
+    """Episodes of each task that the run's learner adapted to."""
+    if "tasks_per_class" not in config["learner"]:
+        return ROLLOUTS
+    counts = worlds.task_counts(config, "train")
+    of_class = config["num_envs"] // len(counts)
+    return max(1, min(of_class // min(config["learner"]["tasks_per_class"], max(counts)), MOST_ROLLOUTS))
 
 
 def check_suite(config: dict[str, Any]) -> None:
