@@ -32,7 +32,8 @@ class EvaluateFlags:
     tasks: int | None = None
     """Adapt to the first so many tasks of each class; None: 5."""
     trials: int | None = None
-    """Adapt to each task so often, each time from the start and to other episodes; None: 1."""
+    """Adapt to each task so often, each time from the start and to other episodes; None: once, or
+    as often as makes five adaptations of each class."""
     random: Switch = False
     """Also play a random policy, and show the difference."""
     seed: int | None = None

@@ -34,7 +34,8 @@ class Options:
     tasks: int | None = None
     """Tasks of each class."""
     trials: int | None = None
-    """Adaptations of each task; None: 1."""
+    """Adaptations of each task; None: so many that a class has as many as ``TASKS``, since an interval over the
+    episodes of a single adaptation says nothing of another."""
     num_envs: int | None = None
     """Rows stepped together at most."""
     seed: int = worlds.EVALUATION_SEED
@@ -76,14 +77,15 @@ def meta_test(
     for split in splits:
         counts = worlds.task_counts(config, split)
         tasks = min(options.tasks or TASKS, max(counts))
-        trials = options.trials or 1
+        trials = options.trials or -(-TASKS // tasks)
         rows = rows_for(len(counts), tasks * trials, rollouts, options.num_envs or ROWS)
         shots = SHOTS if options.shots is None else options.shots
         episodes = options.episodes or rollouts
+        often = f", each {trials} times" if trials > 1 else ""
         say(
             f"Meta-test on {split} tasks: {len(counts)} class{'es' * (len(counts) > 1)}, {tasks} of {max(counts)} "
-            f"tasks each, {shots} shot{'s' * (shots != 1)} of {rollouts} episodes, {episodes} evaluation episodes, "
-            f"{rows} rows."
+            f"tasks of each{often}, {shots} shot{'s' * (shots != 1)} of {rollouts} episodes, {episodes} evaluation "
+            f"episodes, {rows} rows."
         )
         world = worlds.evaluation_world(config, split, rows)
         found[split] = meta_evaluate(
