@@ -37,7 +37,7 @@ def small(monkeypatch):
 @pytest.fixture
 def run(tmp_path) -> Path:
     path = tmp_path / "r"
-    flags = ["--suite", "ML4", "--algo", "finder", "--num-envs", "12", "--steps", "24", "--threads", "1"]
+    flags = ["--suite", "ML4", "--algo", "finder", "--num-envs", "24", "--steps", "24", "--threads", "1"]
     assert main(["run", *flags, "--device", "cpu", "--run-dir", str(path)]) == 0
     return path
 
@@ -56,7 +56,7 @@ def test_a_run_ends_with_both_tables_of_both_splits_and_trains_on_the_learners_k
         assert f"{split} tasks, after 1 shot of 4 episodes" in shown.out
         assert all(name in shown.out for name in classes)
     assert "return gained [95 %]" in shown.out
-    assert "5 of 6 tasks each, 1 shot of 4 episodes, 4 evaluation episodes, 40 rows." in shown.err
+    assert "5 of 6 tasks of each, 1 shot of 4 episodes, 4 evaluation episodes, 40 rows." in shown.err
     loaded = RunFolder.open(run).checkpoints.load()
     assert loaded is not None and loaded[0]["learner"]["mode"] == "DISABLED"
     stored = json.loads((run / "evaluation.json").read_text())

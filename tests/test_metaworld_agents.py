@@ -1,5 +1,6 @@
 """Our agents in Meta-World's own evaluation, agents written for it in ours."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 from bidex_meta import Benchmark
 from bidex_meta.clients.metaworld_agent import ForMetaWorld, FromMetaWorld
 from bidex_meta.clients.metaworld_evaluation import MetaWorldEnvs, known_to_metaworld
+from bidex_meta.commands.learners import learner_kind
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluate import ZeroAgent, evaluate
 from bidex_meta.metatest import meta_evaluate
@@ -186,3 +188,20 @@ def test_refusals_name_the_mend():
         MetaWorldEnvs(points(mode="SAME_STEP"))
     with pytest.raises(BidexError, match="sample_tasks"):
         MetaWorldEnvs(points()).call("toggle_sample_tasks_on_reset", True)
+
+
+@pytest.mark.parametrize("algo", ["maml", "promp", "rl2"])
+def test_our_learners_in_both_evaluations(algo):
+    kind = learner_kind(algo)
+    small = {"hidden": (8,), "max_adapt_steps": 20}
+    config = replace(kind.presets["laptop"], **small)
+    place = Benchmark("ML1").make_world("train", 12, device="cpu", autoreset_mode="DISABLED", threads=1)
+    state = kind.make(place, config, seed=0).policy_state_dict()
+    found = meta_evaluate(kind.make.load_policy(state, "cpu"), place, 1, episodes_per_task=1, max_adapt_steps=20)
+    changed = found.after.classes["CatchUnderarm"].returns != found.before.classes["CatchUnderarm"].returns
+    assert found.adapt_steps == [12 * 20] and changed.all()
+    agent, envs = ForMetaWorld(kind.make.load_policy(state, "cpu")), MetaWorldEnvs(place)
+    with known_to_metaworld(envs):
+        keywords: dict[str, Any] = {"num_evals": 1, "adaptation_episodes": 1, "evaluation_episodes": 2}
+        theirs_found = theirs.metalearning_evaluation(agent, envs, **keywords)  # type: ignore[arg-type]
+    assert list(theirs_found[2]) == ["CatchUnderarm"] and np.isfinite(theirs_found[1])

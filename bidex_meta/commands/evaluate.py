@@ -28,11 +28,12 @@ class EvaluateFlags:
     shots: int | None = None
     """Adapt so often, one after the other, to --rollouts episodes each; None: 1."""
     rollouts: int | None = None
-    """Episodes of each task in a shot; None: as the agent was trained, else 10."""
+    """Episodes of each task in a shot; None: as the run was trained, but 40 at most, else 10."""
     tasks: int | None = None
     """Adapt to the first so many tasks of each class; None: 5."""
     trials: int | None = None
-    """Adapt to each task so often, each time from the start and to other episodes; None: 1."""
+    """Adapt to each task so often, each time from the start and to other episodes; None: once, or
+    as often as makes five adaptations of each class."""
     random: Switch = False
     """Also play a random policy, and show the difference."""
     seed: int | None = None

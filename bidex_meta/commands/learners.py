@@ -5,8 +5,9 @@ the learner's config dataclass, with at least ``paper`` and ``laptop``. The clas
 
 * ``Class(world, config, seed)``, and what ``bidex_algos.runner.Learner`` names;
 * where it adapts to tasks, ``adapts = True``: then ``load_policy`` gives a MetaLearningAgent (``bidex_meta.agents``),
-  which explores by a generator of its own and may say ``rollouts_per_task`` and ``max_adapt_steps``, what the meta-test
-  adapts to;
+  which explores by a generator of its own, seeded alike by each ``load_policy``; of its config, if they are there, the
+  meta-test reads ``max_adapt_steps`` (longest episode it adapts to) and ``tasks_per_class`` (of a meta-batch, over
+  which a class's rows are split: as many rollouts has a task);
 * where it does not train in autoreset mode SAME_STEP, ``autoreset``: the mode, or a function of the learner's config
   that gives it;
 * ``policy_state_dict()`` and ``load_policy(state, device)``, which gives an agent for ``bidex_meta.evaluate`` from the

@@ -14,14 +14,16 @@ SHOTS = 1
 TASKS = 5
 """Tasks of each class, the first of its pool, where nobody says otherwise: all of ML1's, a tenth of ML20's."""
 ROLLOUTS = 10
-"""Episodes of each task in a shot, where neither flags nor the agent say otherwise."""
+"""Episodes of each task in a shot, where neither flags nor the run's config say otherwise."""
+MOST_ROLLOUTS = 40
+"""The most that are taken from the run's config: ML1's three tasks may be trained with hundreds."""
 ROWS = 1024
 """Rows stepped together at most, where nobody says otherwise: half a GB."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """How much is played; None: the agent's, else the default above."""
+    """How much is played; None: as the run was trained, else the default above."""
 
     shots: int | None = None
     """Shots of adaptation."""
@@ -32,7 +34,8 @@ class Options:
     tasks: int | None = None
     """Tasks of each class."""
     trials: int | None = None
-    """Adaptations of each task; None: 1."""
+    """Adaptations of each task; None: so many that a class has as many as ``TASKS``, since an interval over the
+    episodes of a single adaptation says nothing of another."""
     num_envs: int | None = None
     """Rows stepped together at most."""
     seed: int = worlds.EVALUATION_SEED
@@ -70,36 +73,45 @@ def meta_test(
         if number is not None and number < 1:
             raise BidexError(f"--{name.replace('_', '-')} must be at least 1, not {number}.")
     found = {}
+    rollouts = options.rollouts or _trained_rollouts(config)
     for split in splits:
-        agent = load()
-        rollouts = options.rollouts or getattr(agent, "rollouts_per_task", ROLLOUTS)
         counts = worlds.task_counts(config, split)
         tasks = min(options.tasks or TASKS, max(counts))
-        trials = options.trials or 1
+        trials = options.trials or -(-TASKS // tasks)
         rows = rows_for(len(counts), tasks * trials, rollouts, options.num_envs or ROWS)
         shots = SHOTS if options.shots is None else options.shots
         episodes = options.episodes or rollouts
+        often = f", each {trials} times" if trials > 1 else ""
         say(
             f"Meta-test on {split} tasks: {len(counts)} class{'es' * (len(counts) > 1)}, {tasks} of {max(counts)} "
-            f"tasks each, {shots} shot{'s' * (shots != 1)} of {rollouts} episodes, {episodes} evaluation episodes, "
-            f"{rows} rows."
+            f"tasks of each{often}, {shots} shot{'s' * (shots != 1)} of {rollouts} episodes, {episodes} evaluation "
+            f"episodes, {rows} rows."
         )
         world = worlds.evaluation_world(config, split, rows)
         found[split] = meta_evaluate(
-            agent,
+            load(),
             world,
             shots,
             rollouts=rollouts,
             episodes_per_task=episodes,
             tasks=tasks,
             trials=trials,
-            max_adapt_steps=getattr(agent, "max_adapt_steps", MAX_ADAPT_STEPS),
+            max_adapt_steps=config["learner"].get("max_adapt_steps", MAX_ADAPT_STEPS),
             seed=options.seed,
             references=references() if config["suite"] is not None else {},
             split=split,
         )
         world.close()
     return found
+
+
+def _trained_rollouts(config: dict[str, Any]) -> int:
+    """Episodes of each task that the run's learner adapted to."""
+    if "tasks_per_class" not in config["learner"]:
+        return ROLLOUTS
+    counts = worlds.task_counts(config, "train")
+    of_class = config["num_envs"] // len(counts)
+    return max(1, min(of_class // min(config["learner"]["tasks_per_class"], max(counts)), MOST_ROLLOUTS))
 
 
 def check_suite(config: dict[str, Any]) -> None:
