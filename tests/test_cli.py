@@ -268,6 +268,20 @@ def test_render_picture_and_film(monkeypatch, toy_worlds, tmp_path, capsys):
 # List and bench.
 
 
+def test_a_single_task_can_be_played_with_moving_bases_as_in_suites(capsys):
+    from bidex_meta.commands.worlds import evaluation_world, has_moving_bases
+
+    for flags, moving in (([], False), (["--base", "moving"], True), (["--base", "fixed"], False)):
+        assert main(["run", "--task", "HandOver", "--algo", "ppo", "--print-config", *flags]) == 0
+        config = json.loads(capsys.readouterr().out)
+        assert has_moving_bases(config) == moving
+        world = evaluation_world(config | {"threads": 1}, rows=50)
+        assert world.single_action_space.shape == ((52,) if moving else (40,))
+        world.close()
+    assert main(["run", "--suite", "MT4", "--base", "moving", "--print-config"]) == 2
+    assert "--base moving goes with --task" in capsys.readouterr().err
+
+
 def test_a_single_task_has_its_own_column_of_table_42(capsys):
     found = {}
     for task in ("CatchUnderarm", "LiftUnderarm", "StackBlock"):

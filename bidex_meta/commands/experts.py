@@ -5,9 +5,9 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
+from bidex_meta.commands.worlds import has_moving_bases
 from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder
-from bidex_meta.tasks import registry
 from bidex_meta.witness.replay import replay
 from bidex_meta.witness.store import load_witness, witness_path
 
@@ -44,7 +44,7 @@ def _of_run(run: Path) -> list[tuple[str, dict[str, Any]]]:
     """What a run's evaluation says of its classes: the mean over all tasks."""
     folder = RunFolder.open(run)
     config, path = folder.config(), folder.path / "evaluation.json"
-    if config["task"] is not None and not registry.get(config["task"]).moving_base:
+    if not has_moving_bases(config):
         raise BidexError(
             f"Expected a run with moving bases, as suites have them, but {run} plays {config['task']} fixed."
         )

@@ -34,6 +34,9 @@ class RunFlags:
     """Suite to train on: a name (see `bidex-meta list suites`) or the path of a TOML file."""
     task: str | None = None
     """Train on this task class alone, instead of a suite."""
+    base: Literal["own", "moving", "fixed"] = "own"
+    """With --task: whether the hands' bases move; own: as the class has it alone. Suites move them, HandOver alone
+    does not."""
     algo: str = "mtppo"
     """Learner (see `bidex-meta list algos`)."""
     preset: str = "auto"
@@ -90,7 +93,8 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     """
     resume = peek(arguments, "--resume")
     folder = RunFolder.open(Path(resume)) if resume else None
-    stored = {"engine": "auto", **folder.config()} if folder else {}  # older runs knew one engine
+    # What older runs did not know.
+    stored = {"engine": "auto", "base": "own", **folder.config()} if folder else {}
     task = peek(arguments, "--task") or stored.get("task")
     kind = learner_kind(peek(arguments, "--algo") or stored.get("algo", RunFlags.algo), task)
     suite = peek(arguments, "--suite") or stored.get("suite")
@@ -136,6 +140,8 @@ def _options(
 def _resolved(flags: Any, preset: str, device: str, stored: dict[str, Any]) -> dict[str, Any]:
     if (flags.suite is None) == (flags.task is None):
         raise BidexError("Name what to train on: either --suite SUITE or --task TASK, for example --suite MT4.")
+    if flags.base != "own" and flags.task is None:
+        raise BidexError(f"--base {flags.base} goes with --task; a suite's file says whether bases move.")
     for name in ("num_envs", "threads", "episodes"):
         value = getattr(flags, name)
         if value is not None and value < 1:
@@ -146,6 +152,7 @@ def _resolved(flags: Any, preset: str, device: str, stored: dict[str, Any]) -> d
     config = {
         "suite": suite,
         "task": flags.task,
+        "base": flags.base,
         "algo": flags.algo,
         "preset": preset,
         "learner": dataclasses.asdict(flags.learner),

@@ -99,9 +99,22 @@ def judge(config: dict[str, Any], agent: Agent, world: Any, episodes: int | None
     from bidex_meta.evaluate import evaluate
     from bidex_meta.references import references
 
-    # Both references are of moving bases, as suites have them.
-    known = references() if config["suite"] is not None else {}
+    known = references() if has_moving_bases(config) else {}
     return evaluate(agent, world, episodes, seed=seed, references=known)
+
+
+def has_moving_bases(config: dict[str, Any]) -> bool:
+    """Whether a run's hands move as those of the suites do, and of the references."""
+    if config["task"] is None:
+        return True
+    from bidex_meta.tasks import registry
+
+    return registry.get(config["task"], _asked_base(config)).moving_base
+
+
+def _asked_base(config: dict[str, Any]) -> bool | None:
+    """Whether bases were asked to move; None: as the class has it."""
+    return {"own": None, "moving": True, "fixed": False}[config.get("base", "own")]
 
 
 def default_episodes(config: dict[str, Any]) -> int:
@@ -124,6 +137,7 @@ def _world(config: dict[str, Any], split: str, rows: int | None, mode: str) -> A
     if config["suite"] is None:
         if split != "train":
             raise BidexError(f"A run on the task {config['task']} alone has no {split} split. Leave --split out.")
+        keywords["moving_base"] = _asked_base(config)
         return make_task_world(config["task"], num_envs=rows or _TASKS_ALONE, **keywords)
     benchmark = Benchmark(config["suite"], seed=config["seed"])
     if rows is None:
