@@ -10,7 +10,6 @@ They differ in the outer step alone. An iteration::
 """
 
 import copy
-import math
 import time
 from dataclasses import asdict
 from typing import Any, ClassVar, Protocol
@@ -23,6 +22,7 @@ from bidex_algos.adaptation import Objective, TaskBatch, detached
 from bidex_algos.distributed import world_size
 from bidex_algos.meta_config import MetaConfig
 from bidex_algos.meta_policy import MetaPolicy, make_meta_policy
+from bidex_algos.reports import as_numbers, check_finite
 from bidex_algos.rollout import VectorWorld
 from bidex_algos.stage import Stage, task_batch
 from bidex_algos.task_rows import TaskRows
@@ -144,7 +144,9 @@ class MetaLearner:
             told |= self._told(outcome, k)
             if k < self.config.inner_steps:
                 params = detached(adapter.adapt(params, batches[-1]))
-        metrics = told | self._finite(self._outer(batches))
+        losses = as_numbers(self._outer(batches))
+        check_finite(losses, losses, self.name, self.env_steps, "lower inner_learning_rate or the outer step")
+        metrics = told | losses
         for stage in stages:
             self._note(stage)
         whole = time.perf_counter() - started
@@ -247,15 +249,6 @@ class MetaLearner:
             told |= {f"{tag}/{name}": mean for name, mean in zip(self.world.task_names, means, strict=True)}
             whole = {"return": "mean_return", "success": "success_rate"}[what]
             told[f"{'Train' if last else 'Before'}/{whole}"] = sum(means) / len(means)
-        return told
-
-    def _finite(self, losses: dict[str, Tensor]) -> dict[str, float]:
-        told = {name: float(value) for name, value in losses.items()}
-        if not math.isfinite(sum(told.values())):
-            raise FloatingPointError(
-                f"{self.name}: the loss is not finite after {self.env_steps} steps; lower inner_learning_rate or the "
-                "outer step."
-            )
         return told
 
     # Checkpoints.

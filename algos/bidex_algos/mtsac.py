@@ -33,6 +33,7 @@ from bidex_algos.networks import MLP
 from bidex_algos.normalise import ObservationNormaliser, RunningStats
 from bidex_algos.precision import autocast, use_bfloat16
 from bidex_algos.replay import Replay, Transitions, replay_bytes, steps_within
+from bidex_algos.reports import as_numbers, check_finite
 from bidex_algos.rollout import VectorWorld
 from bidex_algos.squashed import SquashedActor, SquashedPolicy
 from bidex_meta.errors import BidexError
@@ -290,13 +291,9 @@ class MTSAC:
             tensors |= dict(zip(tags, torch.stack(measured).mean(0), strict=True))
         for name, alpha in zip(names, self.log_alpha.detach().exp(), strict=True):
             tensors[f"Policy/alpha/{name}"] = alpha
-        # One transfer for all of them.
-        numbers = torch.stack([value.double() for value in tensors.values()]).tolist()
-        metrics = self.episodes.metrics() | dict(zip(tensors, numbers, strict=True))
-        if not math.isfinite(metrics.get("Loss/critic", 0.0) + metrics.get("Loss/actor", 0.0)):
-            raise FloatingPointError(
-                f"mtsac: the loss is not finite after {self.env_steps} steps; lower critic_learning_rate."
-            )
+        metrics = self.episodes.metrics() | as_numbers(tensors)
+        losses = ("Loss/critic", "Loss/actor")
+        check_finite(metrics, losses, "mtsac", self.env_steps, "lower critic_learning_rate")
         return metrics
 
     # Checkpoints.

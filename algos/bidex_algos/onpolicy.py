@@ -4,7 +4,6 @@ An iteration collects ``rollout_steps`` steps in every row, makes them a :class:
 """
 
 import copy
-import math
 import time
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
@@ -20,6 +19,7 @@ from bidex_algos.normalise import ObservationNormaliser, RunningStats
 from bidex_algos.onpolicy_config import OnPolicyConfig
 from bidex_algos.policy import GaussianPolicy
 from bidex_algos.precision import autocast, use_bfloat16
+from bidex_algos.reports import as_numbers, check_finite
 from bidex_algos.rollout import Rollout, VectorWorld, collect
 from bidex_meta.errors import BidexError
 
@@ -227,13 +227,8 @@ class OnPolicy:
         tensors["Train/unstable"] = all_sum((~self.rollout.valid).sum())
         for name, value in zip(self.world.task_names, explained, strict=True):
             tensors[f"Value/explained_variance/{name}"] = value
-        # One transfer for all of them.
-        numbers = torch.stack([value.double() for value in tensors.values()]).tolist()
-        metrics = self.episodes.metrics() | dict(zip(tensors, numbers, strict=True))
-        if not math.isfinite(sum(metrics[name] for name in losses)):
-            raise FloatingPointError(
-                f"{self.name}: the loss is not finite after {self.env_steps} steps; {self.remedy}."
-            )
+        metrics = self.episodes.metrics() | as_numbers(tensors)
+        check_finite(metrics, losses, self.name, self.env_steps, self.remedy)
         return metrics
 
     # Checkpoints.

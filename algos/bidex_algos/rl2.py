@@ -23,6 +23,7 @@ from bidex_algos.episodes import EpisodeStatistics
 from bidex_algos.networks import gaussian_entropy, gaussian_kl, gaussian_log_prob
 from bidex_algos.normalise import RunningStats
 from bidex_algos.recurrent import RecurrentNet, RecurrentPolicy
+from bidex_algos.reports import as_numbers, check_finite
 from bidex_algos.rl2_agent import RL2Agent
 from bidex_algos.rl2_config import PRESETS, RL2Config
 from bidex_algos.step_size import AdaptiveAdams
@@ -319,16 +320,13 @@ class RL2(RL2Agent):
         tensors["Train/unstable"] = all_sum(broken.sum())
         for name, value in zip(self.world.task_names, explained, strict=True):
             tensors[f"Value/explained_variance/{name}"] = value
-        # One transfer for all of them.
-        numbers = torch.stack([value.double() for value in tensors.values()]).tolist()
-        metrics = self.episodes.metrics() | dict(zip(tensors, numbers, strict=True))
+        metrics = self.episodes.metrics() | as_numbers(tensors)
         for which, statistics in (("first", self.firsts), ("last", self.lasts)):
             found = statistics.metrics()
             if found:
                 metrics[f"Train/return_{which}_episode"] = found["Train/mean_return"]
                 metrics[f"Train/success_{which}_episode"] = found["Train/success_rate"]
-        if not math.isfinite(sum(metrics[name] for name in losses)):
-            raise FloatingPointError(f"rl2: the loss is not finite after {self.env_steps} steps; lower learning_rate.")
+        check_finite(metrics, losses, "rl2", self.env_steps, "lower learning_rate")
         return metrics
 
     # Checkpoints.
