@@ -11,6 +11,7 @@ They differ in the outer step alone. An iteration::
 
 import copy
 import time
+from abc import ABC, abstractmethod
 from dataclasses import asdict
 from typing import Any, ClassVar, Protocol
 
@@ -44,7 +45,7 @@ class TaskWorld(VectorWorld, Protocol):
         ...
 
 
-class MetaLearner:
+class MetaLearner(ABC):
     """Learns parameters from which one gradient step on a task's own data goes far.
 
     Args:
@@ -109,9 +110,9 @@ class MetaLearner:
 
     # What a learner adds.
 
+    @abstractmethod
     def _outer(self, batches: list[TaskBatch]) -> dict[str, Tensor]:
         """Moves the meta-parameters by what the stages showed; returns scalars to be logged."""
-        raise AssertionError("the learner's own")
 
     def _optimisers(self) -> dict[str, torch.optim.Optimizer]:
         """The optimisers by the names they have in a checkpoint."""
@@ -162,7 +163,8 @@ class MetaLearner:
         return self.policy.actor(self.policy.observations(obs)).detach().clamp(-1.0, 1.0)
 
     def reset(self, env_mask: Tensor) -> None:
-        """Nothing to forget between episodes."""
+        """A new episode begins in the rows of ``env_mask``, bool (N,)."""
+        self.policy.reset(env_mask)
 
     # Sampling.
 

@@ -5,6 +5,7 @@ An iteration collects ``rollout_steps`` steps in every row, makes them a :class:
 
 import copy
 import time
+from abc import ABC, abstractmethod
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
@@ -50,7 +51,7 @@ class Batch:
         return Batch(**{name: value.index_select(0, index) for name, value in vars(self).items()})
 
 
-class OnPolicy:
+class OnPolicy(ABC):
     """A Gaussian policy and a critic that learn from what the policy has just done.
 
     In a run of several processes each has a world and samples of its own, and all have the same networks: statistics
@@ -107,17 +108,17 @@ class OnPolicy:
 
     # What a learner adds.
 
+    @abstractmethod
     def _update(self, batch: Batch) -> dict[str, Tensor]:
         """Learns from a batch; returns scalars to be logged."""
-        raise AssertionError("the learner's own")
 
+    @abstractmethod
     def _optimiser_state(self) -> dict[str, Any]:
         """The optimisers' part of a checkpoint."""
-        raise AssertionError("the learner's own")
 
+    @abstractmethod
     def _load_optimisers(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`_optimiser_state` gave, from a whole checkpoint."""
-        raise AssertionError("the learner's own")
 
     def iterate(self) -> dict[str, float]:
         """Collects one rollout and learns from it.
@@ -154,7 +155,8 @@ class OnPolicy:
         return self.policy.eval_action(obs)
 
     def reset(self, env_mask: Tensor) -> None:
-        """Nothing to forget between episodes."""
+        """A new episode begins in the rows of ``env_mask``, bool (N,)."""
+        self.policy.reset(env_mask)
 
     # The rollout.
 

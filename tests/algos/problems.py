@@ -1,5 +1,6 @@
 """Toy worlds whose optimum is known, for the tests of all learners: bandits, LQR and a point mass."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -25,7 +26,7 @@ def opposite_bandits(target: float = 0.5, scale: float = 1.0, rows: int = 32) ->
     return ToyWorld([nearness(target), nearness(-target, scale)], rows=rows)
 
 
-class _TimedWorld:
+class _TimedWorld(ABC):
     """What LQR and PointMass share: one task, episodes that a time limit alone ends, reset within the step.
 
     Rows begin at different times of their first episode. A subclass gives ``_start`` (states of new episodes (N, s)),
@@ -46,14 +47,14 @@ class _TimedWorld:
         self.elapsed = torch.arange(rows) % horizon
         self.returns = torch.zeros(rows)
 
-    def _start(self) -> Tensor:
-        raise NotImplementedError
+    @abstractmethod
+    def _start(self) -> Tensor: ...
 
-    def _observe(self) -> Tensor:
-        raise NotImplementedError
+    @abstractmethod
+    def _observe(self) -> Tensor: ...
 
-    def _advance(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        raise NotImplementedError
+    @abstractmethod
+    def _advance(self, action: Tensor) -> tuple[Tensor, Tensor]: ...
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
         self.generator.manual_seed(seed or 0)
