@@ -11,7 +11,7 @@ first trial only measures what statistics are made of.
 import copy
 import math
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any, ClassVar
 
 import torch
@@ -27,38 +27,10 @@ from bidex_algos.reports import as_numbers, check_finite
 from bidex_algos.rl2_agent import RL2Agent
 from bidex_algos.rl2_config import PRESETS, RL2Config
 from bidex_algos.step_size import AdaptiveAdams
-from bidex_algos.trials import Trials, play
+from bidex_algos.trials import Batch, Trials, play
 from bidex_meta.errors import BidexError
 
 __all__ = ["PRESETS", "RL2", "RL2Config"]
-
-
-@dataclass
-class Batch:
-    """A trial made ready for the update: T slots (a multiple of the chunk C) of N rows, and its S chunks."""
-
-    actions: Tensor
-    """Sampled actions (T, N, a)."""
-    previous: tuple[Tensor, Tensor, Tensor, Tensor]
-    """What the memory is fed beside the observation; see ``Trials.previous``."""
-    old_means: Tensor
-    """Means of the sampling policy (T, N, a)."""
-    old_log_probs: Tensor
-    """Log-density of the actions under it (T, N)."""
-    advantages: Tensor
-    """Normalised advantages (T, N)."""
-    targets: Tensor
-    """What the critic shall predict, in its own units (T, N)."""
-    weights: Tensor
-    """1, or 0 for slots that teach nothing (T, N)."""
-    actor_states: Tensor
-    """The actor's memory before each chunk (T / C, N, memory)."""
-    critic_states: Tensor
-    """The critic's (T / C, N, memory)."""
-    chunk: Tensor
-    """Number of each chunk that holds a step, int64 (S,)."""
-    row: Tensor
-    """Its row, int64 (S,)."""
 
 
 class RL2(RL2Agent):
