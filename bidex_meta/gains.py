@@ -4,10 +4,10 @@ The episodes are paired: the same task and the same start, so that only the poli
 for each adaptation (a task, or one of several trials of it): all episodes of a group follow the same adaptation and
 share its luck. So the bootstrap resamples the adaptations and, within each, the episodes, which is rather too wide than
 too narrow. With a single adaptation it resamples the episodes alone: its interval says nothing of what another
-adaptation would have given.
+adaptation would have given. Of several runs (seeds) it resamples the runs first.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -64,9 +64,9 @@ def paired_gains(after: Evaluation, before: Evaluation, adaptations: Mapping[str
             if new is None or old is None:
                 classes[name][measure] = None
                 continue
-            grouped = _grouped(new - old, adaptations[name])
-            means.append(float(grouped.mean()))
-            resampled.append(_resampled_means(grouped, generator))
+            of_class = grouped(new - old, adaptations[name])
+            means.append(float(of_class.mean()))
+            resampled.append(_resampled_means(of_class[None], generator))
             classes[name][measure] = _difference(means[-1], resampled[-1])
         if len(means) < len(classes):  # a mean over some of the classes would pass for one over all
             aggregate[measure] = None
@@ -77,21 +77,32 @@ def paired_gains(after: Evaluation, before: Evaluation, adaptations: Mapping[str
     return Gains(classes, aggregate)
 
 
-def _grouped(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
+def grouped(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
     """Values (groups, episodes of each) from values (n,) and the groups they belong to, (n,)."""
     return values[np.argsort(groups, kind="stable")].reshape(len(np.unique(groups)), -1)
 
 
+def difference_over_runs(differences: Sequence[np.ndarray]) -> Difference:
+    """Mean of paired differences of several runs, and its interval over runs, adaptations and episodes.
+
+    Args:
+        differences: For each run (adaptations, episodes of each), the same numbers of both in all.
+    """
+    values = np.stack(differences)
+    return _difference(float(values.mean()), _resampled_means(values, np.random.default_rng(BOOTSTRAP_SEED)))
+
+
 def _resampled_means(values: np.ndarray, generator: np.random.Generator) -> np.ndarray | None:
-    """Means over resampled groups and resampled episodes within them, ``(RESAMPLES,)``; None for a single episode."""
-    groups, episodes = values.shape
-    if groups * episodes < 2:
+    """Means over resampled runs, groups of each and episodes of each, ``(RESAMPLES,)``."""
+    runs, groups, episodes = values.shape
+    if values.size < 2:
         return None
     means = []
     for size in [min(_BATCH, RESAMPLES - first) for first in range(0, RESAMPLES, _BATCH)]:
-        group = generator.integers(groups, size=(size, groups))
-        episode = generator.integers(episodes, size=(size, groups, episodes))
-        means.append(values[group[:, :, None], episode].mean(axis=(1, 2)))
+        run = generator.integers(runs, size=(size, runs, 1, 1))
+        group = generator.integers(groups, size=(size, runs, groups, 1))
+        episode = generator.integers(episodes, size=(size, runs, groups, episodes))
+        means.append(values[run, group, episode].mean(axis=(1, 2, 3)))
     return np.concatenate(means)
 
 

@@ -73,7 +73,7 @@ def meta_test(
         if number is not None and number < 1:
             raise BidexError(f"--{name.replace('_', '-')} must be at least 1, not {number}.")
     found = {}
-    rollouts = options.rollouts or _trained_rollouts(config)
+    rollouts = options.rollouts or trained_rollouts(config)
     for split in splits:
         counts = worlds.task_counts(config, split)
         tasks = min(options.tasks or TASKS, max(counts))
@@ -105,7 +105,7 @@ def meta_test(
     return found
 
 
-def _trained_rollouts(config: dict[str, Any]) -> int:
+def trained_rollouts(config: dict[str, Any]) -> int:
     """Episodes of each task that the run's learner adapted to."""
     if "tasks_per_class" not in config["learner"]:
         return ROLLOUTS

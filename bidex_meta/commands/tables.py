@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -71,6 +72,23 @@ def _gained(measures: Mapping[str, Difference | None]) -> list[str]:
         "" if earned is None else _ranged(earned.value, earned.interval, sign=True),
         _NONE if score is None else _ranged(score.value, score.interval, sign=True),
     ]
+
+
+def control_table(title: str, by_arm: Mapping[str, Mapping[str, Any]]) -> Table:
+    """What ``bidex_meta.control.arms`` found: an arm a row."""
+    table = Table(title=title, title_justify="left", caption_justify="left")
+    table.caption = (
+        "gains: own data above this arm, same starts; [..] 95 % bootstrap interval over runs, adaptations, episodes"
+    )
+    table.add_column("adapted to")
+    for header in ("return", "return of each run", "success", "success gained", "return gained", "score gained"):
+        table.add_column(header, justify="right")
+    labels = {"before": "nothing", "own": "its own data", "foreign": "train tasks' data, mean"}
+    for arm, values in by_arm.items():
+        of_runs = " ".join(f"{value:.4g}" for value in values["runs"])
+        cells = [labels.get(arm, f"data of {arm}"), f"{values['return']:.4g}", of_runs, _percent(values["success"])]
+        table.add_row(*cells, *(_gained(values["own_minus"]) if "own_minus" in values else []))
+    return table
 
 
 def plain_table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> Table:

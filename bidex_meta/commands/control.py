@@ -1,0 +1,170 @@
+"""``bidex-meta control``: is it the task's own data that adaptation learns from?"""
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from bidex_meta.commands.parsing import Switch, parse
+from bidex_meta.errors import BidexError
+
+if TYPE_CHECKING:
+    from bidex_meta.control import Control
+    from bidex_meta.record import RunFolder
+
+
+@dataclass(frozen=True)
+class ControlFlags:
+    """Adapt held-out tasks to their own data and to data of each train task, with common random numbers.
+
+    Example: bidex-meta control runs/ML1-wide/promp/*
+
+    For suites whose classes stand in both splits (ML1, ML1-wide). Several runs are seeds of one experiment.
+    """
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
+    """Run folders that differ in the seed alone."""
+    trials: int = 25
+    """Adaptations of each task, each from the start and to other episodes."""
+    episodes: int = 80
+    """Evaluation episodes after each adaptation."""
+    shots: int = 1
+    """Adapt so often, one after the other."""
+    rollouts: int | None = None
+    """Episodes of each task in a shot; None: as the run was trained, but 40 at most."""
+    num_envs: int = 1024
+    """Rows stepped together at most; bounds memory."""
+    seed: int | None = None
+    """Seed of the episodes' starts; None: one that training does not use."""
+    device: str = "auto"
+    """auto, cpu or cuda:N."""
+    engine: Literal["auto", "c", "warp"] = "auto"
+    """Physics; auto: the one that is fast on the device."""
+    json: Switch = False
+    """Print JSON."""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Play all arms of all runs and print a table of each class, or JSON.
+
+    Raises:
+        BidexError: No run is named, one cannot be used, or they are not seeds of one experiment.
+    """
+    flags = parse(ControlFlags, arguments, "control")
+    if not flags.runs:
+        raise BidexError("Name the run folders: bidex-meta control RUN...")
+    from bidex_meta.control import arms
+    from bidex_meta.record import RunFolder
+
+    folders = [RunFolder.open(path) for path in flags.runs]
+    config = folders[0].config()
+    _check(folders)
+    played = [_play(folder, flags) for folder in folders]
+    classes = played[0].own.classes
+    found = {name: arms(played, name, _train_tasks(config, name)) for name in classes}
+    per_arm = {name: result.episodes * len(played) for name, result in classes.items()}
+    if flags.json:
+        print(json.dumps(_report(folders, flags, per_arm, found), indent=2))
+        return
+    from bidex_meta.commands.tables import control_table, print_table
+
+    for name, by_arm in found.items():
+        title = f"{config['algo']} on {config['suite']}, held-out tasks of {name}, "
+        title += f"{len(played)} run{'s' * (len(played) > 1)}, {per_arm[name]:,} episodes an arm"
+        print_table(control_table(title, by_arm))
+
+
+def _check(folders: "Sequence[RunFolder]") -> None:
+    """All runs adapt, on a suite with the same classes in both splits, and differ in the seed alone."""
+    from bidex_meta.commands import metatest, worlds
+    from bidex_meta.commands.learners import learner_kind
+
+    kinds = []
+    for folder in folders:
+        config = folder.config()
+        if not learner_kind(config["algo"]).adapts:
+            raise BidexError(
+                f"{folder.path}: {config['algo']} does not adapt to tasks. Name runs of maml, promp or rl2."
+            )
+        metatest.check_suite(config)
+        if "test" not in worlds.splits(config):
+            raise BidexError(f"{folder.path}: {config['suite']} has no test tasks. Name runs on ML1 or ML1-wide.")
+        kinds.append({name: config[name] for name in ("algo", "suite", "steps", "num_envs", "learner")})
+    for folder, kind in zip(folders, kinds, strict=True):
+        differing = [name for name in kind if kind[name] != kinds[0][name]]
+        if differing:
+            raise BidexError(
+                f"Expected runs that differ in the seed alone, but {folders[0].path} and {folder.path} differ in "
+                f"{', '.join(differing)}. Name them in separate calls."
+            )
+
+
+def _play(folder: "RunFolder", flags: ControlFlags) -> "Control":
+    """The arms of one run."""
+    import torch
+
+    from bidex_meta.commands import metatest, worlds
+    from bidex_meta.commands.learners import resolve_device
+    from bidex_meta.control import control
+    from bidex_meta.metatest import MAX_ADAPT_STEPS
+    from bidex_meta.references import references
+
+    stored = folder.config()
+    config = {**stored, "device": resolve_device(flags.device, stored["suite"]), "engine": flags.engine}
+    torch.set_num_threads(config["threads"])
+    rollouts = flags.rollouts or metatest.trained_rollouts(config)
+    counts = worlds.task_counts(config, "test")
+    rows = metatest.rows_for(len(counts), max(counts) * flags.trials, rollouts, flags.num_envs)
+    print(f"{folder.path}: {flags.trials} adaptations of each held-out task, {rows} rows.", file=sys.stderr, flush=True)
+    test, train = (worlds.evaluation_world(config, split, rows) for split in ("test", "train"))
+    found = control(
+        lambda: worlds.load_policy(folder, config["device"])[0],
+        test,
+        train,
+        flags.shots,
+        rollouts=rollouts,
+        episodes_per_task=flags.episodes,
+        trials=flags.trials,
+        max_adapt_steps=config["learner"].get("max_adapt_steps", MAX_ADAPT_STEPS),
+        seed=worlds.EVALUATION_SEED if flags.seed is None else flags.seed,
+        references=references(),
+    )
+    test.close()
+    train.close()
+    return found
+
+
+def _train_tasks(config: dict[str, Any], class_name: str) -> list[str]:
+    """Names of a class's train tasks: as the suite file calls them, else their numbers."""
+    from bidex_meta.benchmark import Benchmark
+
+    benchmark = Benchmark(config["suite"], seed=config["seed"])
+    listed = [
+        task.name
+        for entry in benchmark.suite.split_classes("train")
+        if entry.name == class_name
+        for task in entry.tasks
+        if task.split == "train"
+    ]
+    count = sum(task.env_name == class_name for task in benchmark.train_tasks)
+    return listed or [str(number) for number in range(count)]
+
+
+def _report(
+    folders: "Sequence[RunFolder]", flags: ControlFlags, episodes: dict[str, int], found: dict[str, Any]
+) -> dict[str, Any]:
+    def plain(arm: dict[str, Any]) -> dict[str, Any]:
+        gains = arm.get("own_minus", {})
+        return arm | {"own_minus": {name: None if gain is None else asdict(gain) for name, gain in gains.items()}}
+
+    return {
+        "runs": [str(folder.path) for folder in folders],
+        "shots": flags.shots,
+        "trials": flags.trials,
+        "episodes": episodes,
+        "classes": {name: {arm: plain(values) for arm, values in arms.items()} for name, arms in found.items()},
+    }

@@ -1,0 +1,121 @@
+"""Own data against others': the arms, their differences, and the command."""
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from bidex_meta.cli import main
+from bidex_meta.commands import learners, worlds
+from bidex_meta.control import arms, control
+from bidex_meta.errors import BidexError
+from bidex_meta.gains import difference_over_runs
+from bidex_meta.metatest import meta_evaluate
+from tests.points import Finder, PointWorld, Still, ring
+
+NORTH, EAST, WEST = np.array([[0.0, 1.0]]), np.array([[1.0, 0.0]]), np.array([[-1.0, 0.0]])
+PLAYED: Any = {"rollouts": 6, "episodes_per_task": 5, "trials": 3}
+
+
+def world(*goals, rows=18):
+    return PointWorld(rows, {"Near": np.concatenate(goals)})
+
+
+@pytest.mark.parametrize("rows", [18, 6])  # all adaptations at once, and in portions
+def test_only_what_adapts_to_the_task_gains_above_others_data(rows):
+    found = control(Finder, world(NORTH, rows=rows), world(EAST, WEST, rows=rows), seed=4, **PLAYED)
+    assert len(found.foreign) == 2 and len(found.own.classes["Near"].returns) == 3 * 5
+    by_arm = arms([found], "Near", ["east", "west"])
+    assert list(by_arm) == ["before", "own", "foreign", "east", "west"]
+    for arm in ("before", "foreign", "east", "west"):
+        gain = by_arm[arm]["own_minus"]["return"]
+        assert gain.interval[0] > 0 and gain.value == pytest.approx(by_arm["own"]["return"] - by_arm[arm]["return"])
+        assert by_arm[arm]["own_minus"]["score"] is None
+    assert by_arm["foreign"]["return"] == pytest.approx(np.mean([by_arm[arm]["return"] for arm in ("east", "west")]))
+
+
+def test_the_arms_are_those_of_the_meta_test():
+    found = control(Finder, world(NORTH), world(EAST, WEST), seed=4, **PLAYED)
+    own = meta_evaluate(Finder(), world(NORTH), seed=4, **PLAYED)
+    west = meta_evaluate(Finder(), world(NORTH), seed=4, adapt_world=world(WEST), **PLAYED)
+    for ours, theirs in ((found.before, own.before), (found.own, own.after), (found.foreign[1], west.after)):
+        np.testing.assert_array_equal(ours.classes["Near"].returns, theirs.classes["Near"].returns)
+
+
+def test_what_does_not_adapt_gains_exactly_nothing():
+    by_arm = arms([control(Still, world(NORTH), world(EAST, WEST), seed=4, **PLAYED)], "Near", ["east", "west"])
+    for arm in ("before", "foreign", "east", "west"):
+        gain = by_arm[arm]["own_minus"]["return"]
+        assert (gain.value, gain.interval) == (0.0, (0.0, 0.0))
+
+
+def test_splits_with_other_classes_are_refused():
+    other = PointWorld(6, {"Far": EAST})
+    with pytest.raises(BidexError, match="same classes in both splits"):
+        control(Finder, world(NORTH, rows=6), other)
+
+
+def test_the_interval_knows_that_runs_differ():
+    generator = np.random.default_rng(0)
+    alike = [1 + generator.normal(size=(20, 10)) for _ in range(4)]
+    apart = [each + shift for each, shift in zip(alike, (-3, -1, 1, 3), strict=True)]
+    narrow, wide = difference_over_runs(alike), difference_over_runs(apart)
+    assert narrow.value == pytest.approx(wide.value) and narrow.interval and wide.interval
+    assert narrow.interval[0] > 0.7 and narrow.interval[1] < 1.3
+    # Seeds of mean square sqrt(5) around the mean, four of them: a standard error of about 1.1.
+    assert wide.interval[0] < -0.5 and wide.interval[1] > 2.5
+
+
+@pytest.fixture
+def runs(tmp_path, monkeypatch, capsys):
+    def points(config, split, rows, mode):
+        goals = ring(1) if split == "test" else ring(3, 1.0)
+        return PointWorld(rows or 6, {"CatchUnderarm": goals}, mode=mode)
+
+    monkeypatch.setattr(worlds, "_world", points)
+    monkeypatch.setattr(worlds, "task_counts", lambda config, split: [1 if split == "test" else 3])
+    monkeypatch.setitem(learners.ALGOS, "finder", "tests.adapting_learner:Learner")
+    monkeypatch.setattr(PointWorld, "state_dict", dict, raising=False)
+    threads, paths = torch.get_num_threads(), []
+    for seed in ("0", "1"):
+        paths.append(str(tmp_path / seed))
+        flags = ["--suite", "ML1", "--algo", "finder", "--num-envs", "24", "--steps", "24", "--threads", "1"]
+        flags += ["--no-evaluate", "--device", "cpu", "--seed", seed]
+        assert main(["run", *flags, "--run-dir", paths[-1]]) == 0
+    capsys.readouterr()
+    yield paths
+    torch.set_num_threads(threads)
+
+
+def test_the_command_shows_all_arms_of_all_runs(runs, capsys):
+    flags = ["--trials", "3", "--episodes", "4"]
+    assert main(["control", *runs, *flags]) == 0
+    shown = capsys.readouterr().out
+    assert "2 runs, 24 episodes an arm" in shown
+    for label in ("its own data", "train tasks' data, mean", "data of original", "data of left", "data of right"):
+        assert label in shown
+    assert main(["control", *runs, *flags, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["episodes"] == {"CatchUnderarm": 24} and len(found["runs"]) == 2
+    by_arm = found["classes"]["CatchUnderarm"]
+    assert by_arm["before"]["own_minus"]["return"]["interval"][0] > 0 and len(by_arm["own"]["runs"]) == 2
+
+
+def test_runs_that_are_no_seeds_of_one_experiment_are_refused(runs, capsys):
+    from bidex_meta.record import RunFolder
+
+    def refusal(*arguments):
+        assert main(["control", *arguments]) == 2
+        return capsys.readouterr().err
+
+    folder = RunFolder.open(runs[1])
+    config = folder.config()
+    folder.change_config({**config, "steps": 48})
+    assert "differ in steps" in refusal(*runs)
+    folder.change_config({**config, "suite": "MT4"})
+    assert "has no test tasks" in refusal(runs[1])
+    folder.change_config({**config, "algo": "mtppo"})
+    assert "does not adapt" in refusal(runs[1])
+    assert "Name the run folders" in refusal()
