@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.func import functional_call, grad, vmap
 
-from bidex_algos.networks import GaussianActor, gaussian_kl, gaussian_log_prob
+from bidex_algos.networks import GaussianActor, gaussian_kl, gaussian_log_prob, stacked_forward
 
 Params = dict[str, Tensor]
 """Parameters of an actor by name; stacked ones have a first axis of tasks."""
@@ -72,7 +72,7 @@ class Adapter:
 
     def distribution(self, params: Params, obs: Tensor) -> tuple[Tensor, Tensor]:
         """Means (M, B, a) and logarithms of standard deviations (M, a) of all tasks' policies for (M, B, d)."""
-        means = vmap(lambda p, x: functional_call(self.actor, p, (x,)))(params, obs)
+        means = stacked_forward(self.actor.mean, params, "mean.", obs)
         return means, params["log_std"].clamp(*self.log_std_range)
 
     def adapt(self, params: Params, batch: TaskBatch) -> Params:

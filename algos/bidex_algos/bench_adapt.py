@@ -107,7 +107,7 @@ class _Problem:
                 functional_call(self.actor, own, (obs,))
 
     def _adapt_together(self) -> Params:
-        return detached(self.adapter.adapt(self.adapter.meta(self.num_tasks), self.batch))
+        return detached(self.adapter.adapt(detached(self.adapter.meta(self.num_tasks)), self.batch))
 
     def _adapt_in_a_loop(self) -> list[Params]:
         return [self._adapted(TaskBatch(*task)) for task in zip(*self.batch.tensors(), strict=True)]
