@@ -21,6 +21,9 @@ Params = dict[str, Tensor]
 Objective = Literal["likelihood", "ratio"]
 """What the inner step follows: log-likelihood times advantage (MAML), or likelihood ratio times advantage (ProMP)."""
 
+Adapted = Literal["all", "head"]
+"""Which parameters an inner step moves: all, or those of the mean's output layer."""
+
 
 @dataclass
 class TaskBatch:
@@ -53,6 +56,7 @@ class Adapter:
         objective: What the inner step follows.
         std_range: Bounds of the standard deviations, wherever they are used.
         first_order: Whether the outer loop takes the inner gradient for a constant.
+        adapted: Which parameters the inner step moves: all of them, or those of the output layer.
     """
 
     def __init__(
@@ -62,8 +66,10 @@ class Adapter:
         objective: Objective,
         std_range: tuple[float, float],
         first_order: bool = False,
+        adapted: Adapted = "all",
     ):
         self.actor, self.learning_rate, self.objective, self.first_order = actor, learning_rate, objective, first_order
+        self._prefix = "mean.head." if adapted == "head" else ""
         self.log_std_range = math.log(std_range[0]), math.log(std_range[1])
 
     def meta(self, count: int) -> Params:
@@ -77,15 +83,18 @@ class Adapter:
 
     def adapt(self, params: Params, batch: TaskBatch) -> Params:
         """Parameters after one inner step of each task on its own batch."""
-        slopes = vmap(grad(self._loss))(params, *batch.tensors())
+        own = {name: p for name, p in params.items() if name.startswith(self._prefix)}
+        shared = {name: p[0] for name, p in params.items() if name not in own}  # never moved: alike in all tasks
+        tensors = batch.tensors()
+        slopes = vmap(grad(self._loss), in_dims=(0, None, *[0] * len(tensors)))(own, shared, *tensors)
         if self.first_order:
             slopes = {name: slope.detach() for name, slope in slopes.items()}
-        return {name: p - self.learning_rate * slopes[name] for name, p in params.items()}
+        return params | {name: p - self.learning_rate * slopes[name] for name, p in own.items()}
 
-    def _loss(self, params: Params, *tensors: Tensor) -> Tensor:
-        """The inner loss of one task."""
+    def _loss(self, own: Params, shared: Params, *tensors: Tensor) -> Tensor:
+        """The inner loss of one task, by the parameters that move and those that do not."""
         b = TaskBatch(*tensors)
-        log_prob = self._log_prob(params, b)
+        log_prob = self._log_prob(own | shared, b)
         if self.objective == "ratio":
             gain = torch.exp(log_prob - gaussian_log_prob(b.actions, b.old_means, b.old_log_stds)) * b.advantages
         else:

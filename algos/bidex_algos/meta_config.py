@@ -33,6 +33,9 @@ class MetaConfig:
     """Adaptation steps before the outer objective is measured."""
     inner_learning_rate: float = 0.1
     """Size of an adaptation step."""
+    adapted: Literal["all", "head"] = "all"
+    """What an adaptation step moves: all parameters, or the mean's output layer alone (ANIL, Raghu et al. 2020). Its
+    gradient has less noise, so that steps can be longer."""
     advantage_scale: Literal["std", "variance"] = "std"
     """What advantages are divided by in each task. With the variance, as in garage and Meta-World's baselines, the
     inner step depends on the scale of the rewards."""

@@ -37,7 +37,14 @@ class MetaPolicy(nn.Module):
     ):
         super().__init__()
         self.observations, self.actor, self.config = observations, actor, config
-        self.adapter = Adapter(actor, config.inner_learning_rate, objective, config.std_range, config.first_order)
+        self.adapter = Adapter(
+            actor,
+            config.inner_learning_rate,
+            objective,
+            config.std_range,
+            config.first_order,
+            config.adapted,
+        )
         self.seed = seed
         self.generator: torch.Generator | None = None
         self.rows: TaskRows | None = None

@@ -46,10 +46,11 @@ def surrogate(learner: Any, batches: Any) -> Tensor:
     return learner._objective(batches)[0]
 
 
-@pytest.mark.parametrize("inner_steps", [1, 2])
+@pytest.mark.parametrize(("inner_steps", "adapted"), [(1, "all"), (2, "all"), (2, "head")])
 @both
-def test_second_order_gradients_agree_with_finite_differences(kind: Any, config: Any, inner_steps: int):
-    learner, batches = tiny(kind, replace(config, inner_learning_rate=0.3, inner_steps=inner_steps))
+def test_second_order_gradients_agree_with_finite_differences(kind: Any, config: Any, inner_steps: int, adapted: Any):
+    config = replace(config, inner_learning_rate=0.3, inner_steps=inner_steps, adapted=adapted)
+    learner, batches = tiny(kind, config)
     batches = [batches[0]] * inner_steps + [batches[1]]
     parameters = list(learner.policy.actor.parameters())
     gradient = flatten(torch.autograd.grad(surrogate(learner, batches), parameters))

@@ -128,6 +128,17 @@ def one_by_one(actor: GaussianActor, batch: TaskBatch, objective: str, rate: flo
     return found
 
 
+def test_the_head_alone_moves_as_it_does_with_the_rest_and_the_rest_stays():
+    actor, [batch, _] = problem()
+    whole, head = (Adapter(actor, 0.1, "ratio", (0.01, 10.0), adapted=adapted) for adapted in ("all", "head"))
+    start, all_moved, moved = whole.meta(3), whole.adapt(whole.meta(3), batch), head.adapt(head.meta(3), batch)
+    assert list(moved) == list(start)
+    for name, p in moved.items():
+        is_head = name in ("mean.head.weight", "mean.head.bias")
+        assert_close(p, all_moved[name] if is_head else start[name])
+        assert (p - start[name]).abs().max() > 1e-4 or not is_head
+
+
 @pytest.mark.parametrize("objective", ["likelihood", "ratio"])
 def test_adaptation_of_all_tasks_equals_a_loop_over_them(objective: Any):
     actor, batches = problem()
