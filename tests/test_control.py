@@ -119,3 +119,4 @@ def test_runs_that_are_no_seeds_of_one_experiment_are_refused(runs, capsys):
     folder.change_config({**config, "algo": "mtppo"})
     assert "does not adapt" in refusal(runs[1])
     assert "Name the run folders" in refusal()
+    assert "--trials must be at least 1, not 0." in refusal(*runs, "--trials", "0")

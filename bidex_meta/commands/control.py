@@ -57,9 +57,11 @@ def main(arguments: Sequence[str]) -> None:
     flags = parse(ControlFlags, arguments, "control")
     if not flags.runs:
         raise BidexError("Name the run folders: bidex-meta control RUN...")
+    from bidex_meta.commands import metatest
     from bidex_meta.control import arms
     from bidex_meta.record import RunFolder
 
+    metatest.check_numbers(flags, "trials", "episodes", "shots", "rollouts", "num_envs")
     folders = [RunFolder.open(path) for path in flags.runs]
     config = folders[0].config()
     _check(folders)

@@ -68,10 +68,7 @@ def meta_test(
     from bidex_meta.references import references
 
     check_suite(config)
-    for name in ("rollouts", "episodes", "tasks", "trials", "num_envs"):
-        number = getattr(options, name)
-        if number is not None and number < 1:
-            raise BidexError(f"--{name.replace('_', '-')} must be at least 1, not {number}.")
+    check_numbers(options, "rollouts", "episodes", "tasks", "trials", "num_envs")
     found = {}
     rollouts = options.rollouts or trained_rollouts(config)
     for split in splits:
@@ -112,6 +109,18 @@ def trained_rollouts(config: dict[str, Any]) -> int:
     counts = worlds.task_counts(config, "train")
     of_class = config["num_envs"] // len(counts)
     return max(1, min(of_class // min(config["learner"]["tasks_per_class"], max(counts)), MOST_ROLLOUTS))
+
+
+def check_numbers(options: Any, *names: str) -> None:
+    """Refuse fields below 1; None is whatever the default is.
+
+    Raises:
+        BidexError: One is.
+    """
+    for name in names:
+        number = getattr(options, name)
+        if number is not None and number < 1:
+            raise BidexError(f"--{name.replace('_', '-')} must be at least 1, not {number}.")
 
 
 def check_suite(config: dict[str, Any]) -> None:
