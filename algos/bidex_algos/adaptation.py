@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.func import functional_call, grad, vmap
 
+from bidex_algos.choices import Adapted
 from bidex_algos.networks import GaussianActor, gaussian_kl, gaussian_log_prob, stacked_forward
 
 Params = dict[str, Tensor]
@@ -20,9 +21,6 @@ Params = dict[str, Tensor]
 
 Objective = Literal["likelihood", "ratio"]
 """What the inner step follows: log-likelihood times advantage (MAML), or likelihood ratio times advantage (ProMP)."""
-
-Adapted = Literal["all", "head"]
-"""Which parameters an inner step moves: all, or those of the mean's output layer."""
 
 
 @dataclass

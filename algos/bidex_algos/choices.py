@@ -7,3 +7,6 @@ Activation = Literal["elu", "relu", "tanh"]
 
 Autocast = Literal["auto", "on", "off"]
 """Whether hidden layers run in bfloat16; see :mod:`bidex_algos.precision`."""
+
+Adapted = Literal["all", "head"]
+"""Which parameters an adaptation step moves: all, or those of the mean's output layer."""

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from bidex_algos.checks import at_least, between, positive, rising
-from bidex_algos.choices import Activation
+from bidex_algos.choices import Activation, Adapted
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,8 @@ class MetaConfig:
     """Adaptation steps before the outer objective is measured."""
     inner_learning_rate: float = 0.1
     """Size of an adaptation step."""
-    adapted: Literal["all", "head"] = "all"
-    """What an adaptation step moves: all parameters, or the mean's output layer alone (ANIL, Raghu et al. 2020). Its
-    gradient has less noise, so that steps can be longer."""
+    adapted: Adapted = "all"
+    """What an adaptation step moves: all parameters, or the mean's output layer alone (ANIL, Raghu et al. 2020)."""
     advantage_scale: Literal["std", "variance"] = "std"
     """What advantages are divided by in each task. With the variance, as in garage and Meta-World's baselines, the
     inner step depends on the scale of the rewards."""

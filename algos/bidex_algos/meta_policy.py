@@ -95,7 +95,7 @@ class MetaPolicy(nn.Module):
         if len(self.stage) == 0:
             return
         rows = self._rows(self.stage.obs[0])
-        params = detached(self._params(rows))  # no graph back to the meta-parameters, which would cost half the time
+        params = detached(self._params(rows))  # nobody differentiates this step
         log_std = params["log_std"].clamp(*self.adapter.log_std_range)
         batch = task_batch(self.stage, rows, log_std, self.config)
         self.adapted = detached(self.adapter.adapt(params, batch))
