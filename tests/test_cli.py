@@ -215,6 +215,28 @@ def test_resume_without_a_checkpoint_starts_over(toy_worlds, tmp_path):
     assert [row["step"] for row in read_metrics(path / "metrics.jsonl")] == [24, 48]
 
 
+def test_a_run_can_start_from_the_policy_of_another(toy_worlds, tmp_path, capsys):
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert run("--steps", 48, "--run-dir", first, "--no-evaluate") == 0
+    capsys.readouterr()
+    assert run("--start-from", first, "--steps", 24, "--run-dir", second, "--no-evaluate", "--seed", 1) == 0
+    assert f"Starting from the policy of {first} at 48 steps." in capsys.readouterr().err
+    assert RunFolder.open(second).config()["start_from"] == str(first)
+    layers = [final(path)[0]["learner"]["policy"]["weights"]["actor.mean.body.0.weight"] for path in (first, second)]
+    assert 0 < (layers[0] - layers[1]).abs().max() < 0.02  # one update away; fresh weights of seed 1 differ by 1
+    assert main(["run", "--resume", str(second), "--steps", "48", "--no-evaluate"]) == 0
+    assert "Starting from" not in capsys.readouterr().err
+    for flags, expected in (
+        (["--start-from", tmp_path / "none"], "not a run folder"),
+        (["--start-from", first, "--learner.activation", "tanh"], "activation = tanh, got elu"),
+        (["--resume", second, "--start-from", second], "--start-from is"),
+    ):
+        assert run(*flags, "--run-dir", tmp_path / "third") == 2
+        shown = capsys.readouterr().err
+        assert expected in shown and shown.rstrip().count("\n") <= 2
+        assert not (tmp_path / "third").exists()
+
+
 _TRAIN = """
 import functools, sys, time
 import bidex_algos.runner as runner

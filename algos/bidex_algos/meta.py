@@ -219,7 +219,7 @@ class MetaLearner(ABC):
         """Observations to start a stage from."""
         if self.obs is not None and self.config.slice_steps is not None:
             return self.obs
-        first = self.env_steps == 0 and self.obs is None and self.policy.observations.stats.count.max() == 0
+        first = self.env_steps == 0 and self.steps_with_tasks == 0
         obs, _ = self.world.reset(seed=self.seed if first else None)
         self.elapsed = torch.zeros_like(self.elapsed)
         if first:

@@ -8,6 +8,7 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 from bidex_meta.commands.launch import launch, resume_command
@@ -62,7 +63,7 @@ def _run(plan: RunPlan, distributed: Any) -> tuple[Any, Any, bool]:
         f"{config['algo']} on {subject}, {times}{config['num_envs']} rows on {config['device']}, seed {config['seed']}"
     )
     _say(f"Preset {config['preset']}: {plan.preset_reason}.")
-    world, learner, folder = distributed.together(lambda: _make(plan))
+    world, learner, folder = distributed.together(lambda: _make(plan, loaded is None))
     folder = RunFolder(distributed.share(folder and folder.path)[0])
     _say(f"Run folder: {folder.path}")
     waits = distributed.LostProcess("this one was asked to stop and waits for it")
@@ -114,13 +115,17 @@ def _agree(plan: RunPlan, loaded: Checkpoint | None, distributed: Any) -> RunPla
     return replace(plan, config=everyone[0][0])
 
 
-def _make(plan: RunPlan) -> tuple[Any, Any, Any]:
-    """World, learner and, in process 0, the run folder."""
+def _make(plan: RunPlan, fresh: bool) -> tuple[Any, Any, Any]:
+    """World, learner (a fresh one with the weights it shall start from) and, in process 0, the run folder."""
     from bidex_meta.commands import worlds
     from bidex_meta.record import RunFolder
 
     world = worlds.training_world(plan.config, plan.kind.autoreset(plan.config["learner"]))
     learner = plan.kind.make(world, plan.learner_config, plan.config["seed"])
+    if fresh and plan.config["start_from"] is not None:
+        state, step = worlds.checkpoint(RunFolder.open(Path(plan.config["start_from"])))
+        shared("start_from").start_from(learner, state["learner"]["policy"])
+        _say(f"Starting from the policy of {plan.config['start_from']} at {step:,} steps.")
     if launch().rank > 0:
         return world, learner, None
     folder = plan.folder or RunFolder.create(plan.config, plan.flags.run_dir)

@@ -55,6 +55,9 @@ class RunFlags:
     threads: int | None = None
     """Threads of torch and of the physics in each process; None: one per core, shared by the processes of a machine. A
     resumed run keeps its own."""
+    start_from: Path | None = None
+    """Begin with the policy of this run's last checkpoint, network and observation statistics, instead of a fresh
+    one."""
     run_dir: Path | None = None
     """Folder of this run; None: runs/SUITE/ALGO/DATE_seedSEED."""
     resume: Path | None = None
@@ -94,7 +97,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     resume = peek(arguments, "--resume")
     folder = RunFolder.open(Path(resume)) if resume else None
     # What older runs did not know.
-    stored = {"engine": "auto", "base": "own", **folder.config()} if folder else {}
+    stored = {"engine": "auto", "base": "own", "start_from": None, **folder.config()} if folder else {}
     task = peek(arguments, "--task") or stored.get("task")
     kind = learner_kind(peek(arguments, "--algo") or stored.get("algo", RunFlags.algo), task)
     suite = peek(arguments, "--suite") or stored.get("suite")
@@ -133,6 +136,8 @@ def _options(
     rows, steps = rows_and_steps
     names = {entry.name for entry in dataclasses.fields(RunFlags)}
     known = {name: value for name, value in stored.items() if name in names}
+    if known.get("start_from") is not None:
+        known["start_from"] = Path(known["start_from"])
     default = options(**{"num_envs": rows, "steps": steps, **known, "learner": learner})
     return options, arguments, "run", default
 
@@ -153,6 +158,7 @@ def _resolved(flags: Any, preset: str, device: str, stored: dict[str, Any]) -> d
         "suite": suite,
         "task": flags.task,
         "base": flags.base,
+        "start_from": None if flags.start_from is None else str(flags.start_from.expanduser().resolve()),
         "algo": flags.algo,
         "preset": preset,
         "learner": dataclasses.asdict(flags.learner),

@@ -160,14 +160,23 @@ def _foreign_world(config: dict[str, Any], split: str, rows: int | None, mode: s
     return MetaWorldWorld(suite, rows, seed=config["seed"], autoreset_mode=mode)
 
 
+def checkpoint(folder: RunFolder) -> tuple[dict[str, Any], int]:
+    """State and environment steps of a run's newest checkpoint.
+
+    Raises:
+        BidexError: The run has not saved one yet.
+    """
+    loaded = folder.checkpoints.load()
+    if loaded is None:
+        raise BidexError(f"{folder.path} has no checkpoint yet. Train on: bidex-meta run --resume {folder.path}")
+    return loaded
+
+
 def load_policy(folder: RunFolder, device: str) -> tuple[Agent, int]:
     """The policy of a run's newest checkpoint and the environment steps it was trained for.
 
     Raises:
         BidexError: The run has not saved a checkpoint yet.
     """
-    loaded = folder.checkpoints.load()
-    if loaded is None:
-        raise BidexError(f"{folder.path} has no checkpoint yet. Train on: bidex-meta run --resume {folder.path}")
-    state, step = loaded
+    state, step = checkpoint(folder)
     return learner_kind(folder.config()["algo"]).make.load_policy(state["learner"]["policy"], device), step

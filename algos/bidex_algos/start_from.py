@@ -1,0 +1,62 @@
+"""Beginning with what another run has learned, instead of fresh weights.
+
+A meta-learner needs a skill to adapt. Plain policy gradients on all train tasks learn one in fewer steps, since they
+spend none on adaptation.
+"""
+
+from dataclasses import asdict
+from typing import Any, Protocol
+
+from torch import nn
+
+from bidex_meta.errors import BidexError
+
+
+class PolicyLearner(Protocol):
+    """What all learners have."""
+
+    policy: nn.Module
+    """What acts: network and observation statistics."""
+    config: Any
+    """The learner's config."""
+    shape: dict[str, int]
+    """``observations``, ``actions`` and ``num_id_columns`` of its world."""
+
+
+# What decides, beside the shapes of the weights, what they compute.
+_FORM = ("hidden", "activation", "normalise_observations", "observations", "actions", "num_id_columns")
+
+
+def start_from(learner: PolicyLearner, state: dict[str, Any]) -> None:
+    """Gives a fresh learner the network and observation statistics of another's policy, and nothing else.
+
+    Args:
+        learner: The fresh one.
+        state: ``checkpoint["learner"]["policy"]`` of the other.
+
+    Raises:
+        BidexError: Weights of one would not mean the same in the other.
+    """
+    own, given = asdict(learner.config) | learner.shape, state["config"] | state["shape"]
+    for name in _FORM:
+        if name in own and name in given and _plain(own[name]) != _plain(given[name]):
+            flag = f"--learner.{name.replace('_', '-')}"
+            mend = f"Add {flag} as there" if name not in learner.shape else "Name a run on the same observations"
+            raise BidexError(
+                f"Expected a policy to start from with {name} = {_plain(own[name])}, got {_plain(given[name])}. "
+                f"{mend}, or start afresh."
+            )
+    if _shapes(learner.policy.state_dict()) != _shapes(state["weights"]):
+        raise BidexError(
+            "Expected a policy to start from of the same kind (mtppo, mttrpo, promp and maml share one; mtsac and rl2 "
+            "have their own, and policy heads another), got one with other weights. Name another run."
+        )
+    learner.policy.load_state_dict(state["weights"])
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _shapes(weights: dict[str, Any]) -> dict[str, tuple[int, ...]]:
+    return {name: tuple(weight.shape) for name, weight in weights.items()}

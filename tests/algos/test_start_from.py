@@ -1,0 +1,57 @@
+"""Beginning with another run's policy: it acts as that one did, and what does not fit is refused."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bidex_algos.mtppo import MTPPO, MTPPOConfig
+from bidex_algos.mtsac import MTSAC, MTSACConfig
+from bidex_algos.promp import ProMP, ProMPConfig
+from bidex_algos.start_from import start_from
+from bidex_meta.errors import BidexError
+from tests.algos.families import PointGoals
+
+PPO = MTPPOConfig(hidden=(8,), rollout_steps=4, activation="tanh", autocast="off")
+PROMP = ProMPConfig(hidden=(8,), activation="tanh", tasks_per_class=4)
+
+
+def trained():
+    learner = MTPPO(PointGoals(rows=16, autoreset_mode="SAME_STEP"), PPO, seed=3)
+    for _ in range(3):
+        learner.iterate()
+    return learner
+
+
+def test_a_meta_learner_acts_as_the_policy_it_starts_from_and_learns_on():
+    given = trained()
+    learner = ProMP(PointGoals(rows=16), PROMP, seed=0)
+    obs, _ = learner.world.reset(seed=9)
+    assert not torch.allclose(learner.eval_action(obs), given.eval_action(obs))
+    start_from(learner, given.policy_state_dict())
+    assert torch.equal(learner.eval_action(obs), given.eval_action(obs))
+    assert torch.equal(learner.policy.actor.log_std, given.policy.actor.log_std)
+    before = learner.eval_action(obs)
+    learner.iterate()
+    assert not torch.equal(learner.eval_action(obs), before)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"hidden": (9,)}, r"hidden = \[9\], got \[8\]\. Add --learner\.hidden"),
+        ({"activation": "elu"}, "activation = elu, got tanh"),
+        ({"normalise_observations": False}, "normalise_observations = False, got True"),
+    ],
+)
+def test_another_form_is_refused(change, expected):
+    learner = ProMP(PointGoals(rows=16), replace(PROMP, **change), seed=0)
+    with pytest.raises(BidexError, match=expected):
+        start_from(learner, trained().policy_state_dict())
+
+
+def test_another_kind_of_policy_is_refused():
+    config = MTSACConfig(hidden=(8,), activation="tanh", normalise_observations=True, replay_steps=8)
+    learner = MTSAC(PointGoals(rows=16, autoreset_mode="SAME_STEP"), config, seed=0)
+    with pytest.raises(BidexError, match="of the same kind"):
+        start_from(learner, trained().policy_state_dict())
