@@ -108,6 +108,7 @@ def _read(folder: RunFolder) -> dict[str, Any]:
     ]
     subject = config["suite"] or "one class at a time"
     kind = {"algo": config["algo"], "on": subject, "steps": config["steps"], "num_envs": config["num_envs"]}
+    kind["started"] = "afresh" if config.get("start_from") is None else "from another run"  # which: one for each seed
     return {
         "path": folder.path,
         "kind": kind | {f"learner.{name}": value for name, value in config["learner"].items()},

@@ -38,6 +38,16 @@ def test_runs_that_differ_in_the_seed_alone_are_one_group(tmp_path: Path):
     assert first.hours == 0.5 and first.steps == 1000
 
 
+def test_runs_that_start_from_runs_of_their_own_seed_are_one_group(tmp_path: Path):
+    paths = [run(tmp_path, seed, {"A": 0.5}) for seed in (0, 1, 2)]
+    for number, path in enumerate(paths[:2]):
+        folder = RunFolder.open(path)
+        folder.change_config({**folder.config(), "start_from": f"/runs/{number}"})
+    started, fresh = groups(*paths)
+    assert (started.label, started.seeds) == ("mtppo, started from another run", [0, 1])
+    assert (fresh.label, fresh.seeds) == ("mtppo, started afresh", [2])
+
+
 def test_runs_of_single_classes_make_one_seed_together(tmp_path: Path):
     paths = [run(tmp_path, seed, {c: 0.5}, "ppo", task=c) for seed in (0, 1) for c in "AB"]
     [group] = groups(*paths)
