@@ -53,12 +53,12 @@ def control(load: Callable[[], Agent], test_world: Any, train_world: Any, shots:
             f"test: {', '.join(test_world.task_names)}."
         )
     pools = [slot.tasks for slot in train_world.slots]
-    own = meta_evaluate(load(), test_world, shots, **played)
+    own = meta_evaluate(load(), test_world, shots, evaluated=(0, shots), **played)
     foreign = []
     for number in range(max(map(len, pools))):
         sizes = zip(train_world.task_names, pools, test_world.num_slot_tasks, strict=True)
         train_world.set_tasks({name: np.repeat(pool[[number % len(pool)]], n, axis=0) for name, pool, n in sizes})
-        found = meta_evaluate(load(), test_world, shots, adapt_world=train_world, **played)
+        found = meta_evaluate(load(), test_world, shots, adapt_world=train_world, evaluated=(shots,), **played)
         foreign.append(found.after)
     return Control(own.before, own.after, foreign, own.adaptations)
 

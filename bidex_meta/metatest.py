@@ -10,7 +10,7 @@ takes the first episodes that finish of each class instead, of which the easy ta
 """
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -35,7 +35,7 @@ class MetaEvaluation:
     """What ``meta_evaluate`` found."""
 
     by_shot: list[Evaluation]
-    """After 0, 1, ..., K shots: the same episodes in the same order."""
+    """After 0, 1, ..., K shots (or those of them that were asked for): the same episodes in the same order."""
     adaptations: dict[str, np.ndarray]
     """Per class which adaptation (a trial of a task) each of its episodes followed, ``(episodes,)``, numbers from 0."""
     rollouts: int
@@ -51,7 +51,7 @@ class MetaEvaluation:
 
     @property
     def before(self) -> Evaluation:
-        """Without adaptation."""
+        """Without adaptation (or what was asked for first)."""
         return self.by_shot[0]
 
     @property
@@ -68,7 +68,7 @@ class MetaEvaluation:
         by_shot = [found.to_json() for found in self.by_shot]
         return {
             "split": self.split,
-            "shots": len(self.by_shot) - 1,
+            "shots": len(self.adapt_steps),
             "rollouts": self.rollouts,
             "trials": self.trials,
             "max_adapt_steps": self.max_adapt_steps,
@@ -93,6 +93,7 @@ def meta_evaluate(
     seed: int = 0,
     references: Mapping[str, Reference] | None = None,
     adapt_world: Any = None,
+    evaluated: Collection[int] | None = None,
     split: str = "",
 ) -> MetaEvaluation:
     """Evaluate an agent before and after adaptation to each task of a world.
@@ -122,15 +123,19 @@ def meta_evaluate(
         seed: Of all starts; without adaptation, and with all tasks in the world at once, those of ``evaluate``.
         references: Per class name, what the normalised score is measured against.
         adapt_world: Where episodes of adaptation are played, if not on ``world``.
+        evaluated: After how many shots to evaluate (0: before all); None: always.
         split: Kept in the result.
 
     Raises:
         BidexError: A number out of range, a world that cannot be used, or an agent that cannot adapt.
     """
     _check(agent, world, adapt_world, shots, episodes_per_task, max_adapt_steps)
+    kept = [shot for shot in range(shots + 1) if evaluated is None or shot in evaluated]
+    if not kept:
+        raise BidexError(f"Expected evaluated to hold a number from 0 to {shots} shots, got {evaluated}.")
     portions = Portions(world, rollouts, tasks, trials)
     field = world if adapt_world is None else adapt_world
-    found: list[list[dict[str, np.ndarray]]] = [[] for _ in range(shots + 1)]
+    found: dict[int, list[dict[str, np.ndarray]]] = {shot: [] for shot in kept}
     adapt_steps = [0] * shots
     with portions.applied_to([world] if adapt_world is None else [world, adapt_world]) as numbered:
         for number in numbered:
@@ -139,9 +144,11 @@ def meta_evaluate(
                 if shot > 0:
                     starts = _seed(seed, "adaptation", number, shot)
                     adapt_steps[shot - 1] += _adapt(learner, field, portions.rollouts, max_adapt_steps, starts)
-                starts = seed if number == 0 else _seed(seed, "evaluation", number)
-                found[shot].append(portions.labelled(play_tasks(agent, world, episodes_per_task, starts), number))
-    joined = [{key: np.concatenate([part[key] for part in parts]) for key in parts[0]} for parts in found]
+                if shot in found:
+                    starts = seed if number == 0 else _seed(seed, "evaluation", number)
+                    played = play_tasks(agent, world, episodes_per_task, starts)
+                    found[shot].append(portions.labelled(played, number))
+    joined = [{key: np.concatenate([part[key] for part in parts]) for key in parts[0]} for parts in found.values()]
     by_class = [results_by_class(world.task_names, episodes, references) for episodes in joined]
     first = joined[0]
     return MetaEvaluation(

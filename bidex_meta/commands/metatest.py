@@ -162,7 +162,7 @@ def print_tables(subject: str, found: dict[str, Any]) -> None:
     from bidex_meta.commands.tables import evaluation_table, print_table
 
     for split, result in found.items():
-        shots = len(result.by_shot) - 1
+        shots = len(result.adapt_steps)
         print_table(evaluation_table(f"{subject}, {split} tasks, before adaptation", result.before))
         if shots:
             title = f"{subject}, {split} tasks, after {shots} shot{'s' * (shots > 1)} of {result.rollouts} episodes"
