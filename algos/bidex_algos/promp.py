@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from bidex_algos.adaptation import TaskBatch, weighted_mean
 from bidex_algos.meta import MetaLearner, TaskWorld
 from bidex_algos.promp_config import PRESETS, ProMPConfig
+from bidex_algos.step_size import factor_of
 
 __all__ = ["PRESETS", "ProMP", "ProMPConfig"]
 
@@ -42,8 +43,10 @@ class ProMP(MetaLearner):
     def _outer(self, batches: list[TaskBatch]) -> dict[str, Tensor]:
         weights = list(self.policy.actor.parameters())
         measured = []
-        for _ in range(self.config.outer_epochs):
+        for epoch in range(self.config.outer_epochs):
             surrogate, inner_kl, outer_kl = self._objective(batches)
+            if epoch > 0:  # before the first step it is 0 by construction
+                self._follow(outer_kl)
             self.adam.zero_grad()
             (self.config.kl_weight * inner_kl - surrogate).backward()
             norm = nn.utils.clip_grad_norm_(weights, self.config.max_grad_norm)
@@ -51,7 +54,16 @@ class ProMP(MetaLearner):
             measured.append(torch.stack([-surrogate, inner_kl, outer_kl, norm]).detach())
         means = torch.stack(measured).mean(0)
         names = ("Loss/surrogate", "Policy/inner_kl", "Policy/outer_kl", "Policy/gradient_norm")
-        return dict(zip(names, means, strict=True))
+        told = dict(zip(names, means, strict=True))
+        return told | {"Policy/outer_learning_rate": torch.tensor(self.adam.param_groups[0]["lr"], device=self.device)}
+
+    def _follow(self, kl: Tensor) -> None:
+        """Adapts the step size to the KL that the steps so far have made."""
+        if self.config.desired_kl is None:
+            return
+        low, high = self.config.outer_learning_rate_range
+        for group in self.adam.param_groups:
+            group["lr"] = min(max(group["lr"] * float(factor_of(kl.detach(), self.config.desired_kl)), low), high)
 
     def _objective(self, batches: list[TaskBatch]) -> tuple[Tensor, Tensor, Tensor]:
         """Clipped objective, summed KL before adaptation, and KL after it: means over tasks, scalars."""

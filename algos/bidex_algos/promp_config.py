@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from bidex_algos.checks import at_least, positive
+from bidex_algos.checks import at_least, positive, rising
 from bidex_algos.meta_config import MetaConfig
 
 
@@ -16,7 +16,13 @@ class ProMPConfig(MetaConfig):
     outer_epochs: int = 5
     """Steps of the meta-parameters on one meta-batch; each adapts anew."""
     outer_learning_rate: float = 1e-3
-    """Adam's step size for the meta-parameters."""
+    """Adam's step size for the meta-parameters, at the start."""
+    desired_kl: float | None = None
+    """Divide the step size by 1.5 when the KL of the adapted policies from those that sampled exceeds twice this,
+    multiply it when below half; None: leave it. For what is learned already (--start-from) a fixed step may be far too
+    large."""
+    outer_learning_rate_range: tuple[float, float] = (1e-5, 1e-2)
+    """Bounds of the step size where it adapts."""
     clip: float = 0.3
     """How far the likelihood ratio after adaptation may leave 1 before it earns nothing more."""
     kl_weight: float = 5e-4
@@ -34,12 +40,15 @@ class ProMPConfig(MetaConfig):
         at_least(self, 1, "outer_epochs")
         at_least(self, 0, "kl_weight")
         positive(self, "outer_learning_rate", "clip", "max_grad_norm")
+        if self.desired_kl is not None:
+            positive(self, "desired_kl")
+        rising(self, "outer_learning_rate_range")
 
 
 PRESETS: dict[str, ProMPConfig] = {
     # Table 48 of the Bi-DexHands appendix to the letter: eight steps of running episodes, and an inner step of 3e-4,
-    # which moves the weights too little to matter. It names no KL weight: ProMP's own 5e-4. "Desired kl" has no
-    # counterpart.
+    # which moves the weights too little to matter. It names no KL weight: ProMP's own 5e-4. "Desired kl" is read by the
+    # original and used nowhere.
     "paper": ProMPConfig(
         hidden=(2048, 1024, 512),
         activation="elu",

@@ -1,9 +1,15 @@
-"""Adam for an actor and its critic, with a step size that follows the KL."""
+"""Step sizes that follow the KL, and Adam for an actor and its critic with one."""
 
 from collections.abc import Iterable
 
 import torch
 from torch import Tensor, nn
+
+
+def factor_of(kl: Tensor, desired_kl: float) -> Tensor:
+    """What to multiply a step size by: 1 / 1.5 above twice the desired KL, 1.5 below half of it, else 1."""
+    factor = torch.where(kl > 2.0 * desired_kl, 1.0 / 1.5, 1.0)
+    return torch.where(kl < 0.5 * desired_kl, 1.5, factor)
 
 
 class AdaptiveAdams:
@@ -53,9 +59,7 @@ class AdaptiveAdams:
         """Adapts the actor's step size to the KL of its last step, a scalar."""
         if self.desired_kl is None:
             return
-        factor = torch.where(kl > 2.0 * self.desired_kl, 1.0 / 1.5, 1.0)
-        factor = torch.where(kl < 0.5 * self.desired_kl, 1.5, factor)
-        self.rate.mul_(factor).clamp_(*self.bounds)
+        self.rate.mul_(factor_of(kl, self.desired_kl)).clamp_(*self.bounds)
 
     def state_dict(self) -> dict[str, object]:
         """Both optimisers and the step size."""

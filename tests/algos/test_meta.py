@@ -129,6 +129,20 @@ def test_the_kl_weight_holds_the_policy_before_adaptation_back():
     assert kls[1] < 0.5 * kls[0]
 
 
+def test_promps_step_size_follows_the_kl_that_is_asked_for():
+    def iterated(desired: float | None, rate: float) -> list[dict[str, float]]:
+        config = replace(PROMP, desired_kl=desired, outer_learning_rate=rate, outer_epochs=5)
+        learner = ProMP(PointGoals(rows=32), config, seed=0)
+        return [learner.iterate() for _ in range(8)]
+
+    for rate in (1e-2, 1e-5):  # far too large, far too small
+        fixed, adaptive = iterated(None, rate), iterated(0.01, rate)
+        assert not 0.003 < fixed[-1]["Policy/outer_kl"] < 0.03
+        assert 0.003 < adaptive[-1]["Policy/outer_kl"] < 0.03
+        assert fixed[-1]["Policy/outer_learning_rate"] == pytest.approx(rate)
+        assert (adaptive[-1]["Policy/outer_learning_rate"] < rate) == (rate == 1e-2)
+
+
 @pytest.mark.parametrize("max_kl", [0.003, 0.03])
 def test_mamls_trust_region_holds_after_adaptation(max_kl: float):
     learner = MAML(PointGoals(rows=32), replace(MAML_TRPO, max_kl=max_kl), seed=0)
