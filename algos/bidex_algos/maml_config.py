@@ -59,6 +59,14 @@ PRESETS: dict[str, MAMLConfig] = {
         damping=1e-5,
         normalise_observations=False,
     ),
-    "tuned": MAMLConfig(),
+    # As ProMP's.
+    "tuned": MAMLConfig(
+        hidden=(256, 256, 128),
+        activation="elu",
+        std_range=(0.05, 1.5),
+        inner_learning_rate=0.02,
+        gamma=0.93,
+        lam=0.9,
+    ),
     "laptop": MAMLConfig(),
 }

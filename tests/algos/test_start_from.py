@@ -5,8 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from bidex_algos.maml import PRESETS as MAML_PRESETS
 from bidex_algos.mtppo import MTPPO, MTPPOConfig
+from bidex_algos.mtppo import PRESETS as PPO_PRESETS
 from bidex_algos.mtsac import MTSAC, MTSACConfig
+from bidex_algos.promp import PRESETS as PROMP_PRESETS
 from bidex_algos.promp import ProMP, ProMPConfig
 from bidex_algos.start_from import start_from
 from bidex_meta.errors import BidexError
@@ -48,6 +51,13 @@ def test_another_form_is_refused(change, expected):
     learner = ProMP(PointGoals(rows=16), replace(PROMP, **change), seed=0)
     with pytest.raises(BidexError, match=expected):
         start_from(learner, trained().policy_state_dict())
+
+
+@pytest.mark.parametrize("presets", [PROMP_PRESETS, MAML_PRESETS])
+def test_the_tuned_presets_fit_what_mtppo_learns_on_a_laptop(presets):
+    tuned, given = presets["tuned"], PPO_PRESETS["laptop"]
+    for name in ("hidden", "activation", "normalise_observations", "gamma"):
+        assert getattr(tuned, name) == getattr(given, name)
 
 
 def test_another_kind_of_policy_is_refused():
