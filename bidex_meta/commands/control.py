@@ -95,7 +95,9 @@ def _check(folders: "Sequence[RunFolder]") -> None:
         metatest.check_suite(config)
         if "test" not in worlds.splits(config):
             raise BidexError(f"{folder.path}: {config['suite']} has no test tasks. Name runs on ML1 or ML1-wide.")
-        kinds.append({name: config[name] for name in ("algo", "suite", "steps", "num_envs", "learner")})
+        kind = {name: config[name] for name in ("algo", "suite", "steps", "num_envs", "learner")}
+        # Where from is another run for each seed; whether is not.
+        kinds.append(kind | {"start_from": config.get("start_from") is not None})
     for folder, kind in zip(folders, kinds, strict=True):
         differing = [name for name in kind if kind[name] != kinds[0][name]]
         if differing:
