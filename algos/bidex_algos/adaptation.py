@@ -70,6 +70,11 @@ class Adapter:
         self._prefix = "mean.head." if adapted == "head" else ""
         self.log_std_range = math.log(std_range[0]), math.log(std_range[1])
 
+    @torch.no_grad()
+    def project(self) -> None:
+        """Moves the meta-parameters' standard deviations back between their bounds: beyond one no gradient would."""
+        self.actor.log_std.clamp_(*self.log_std_range)
+
     def meta(self, count: int) -> Params:
         """The meta-parameters once per task, a view with their graph."""
         return {name: p.expand(count, *p.shape) for name, p in self.actor.named_parameters()}

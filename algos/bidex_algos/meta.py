@@ -13,7 +13,7 @@ import copy
 import time
 from abc import ABC, abstractmethod
 from dataclasses import asdict
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -23,8 +23,9 @@ from bidex_algos.adaptation import Objective, TaskBatch, detached
 from bidex_algos.distributed import world_size
 from bidex_algos.meta_config import MetaConfig
 from bidex_algos.meta_policy import MetaPolicy, make_meta_policy
+from bidex_algos.normalise import RunningStats
 from bidex_algos.reports import as_numbers, check_finite
-from bidex_algos.rollout import VectorWorld
+from bidex_algos.rollout import VectorWorld, may_look
 from bidex_algos.stage import Stage, task_batch
 from bidex_algos.task_rows import TaskRows
 from bidex_meta.errors import BidexError
@@ -45,6 +46,17 @@ class TaskWorld(VectorWorld, Protocol):
         ...
 
 
+class Outcome(NamedTuple):
+    """What a stage came to."""
+
+    earned: Tensor
+    """Undiscounted, unscaled return of each row (N,)."""
+    success: Tensor
+    """Whether each row succeeded, bool (N,)."""
+    steps: Tensor
+    """Environment steps, int64 (); a row that waits for the others takes none."""
+
+
 class MetaLearner(ABC):
     """Learns parameters from which one gradient step on a task's own data goes far.
 
@@ -54,7 +66,7 @@ class MetaLearner(ABC):
         seed: Of the initial weights, the tasks of each meta-batch, the sampled actions and the world's first reset.
 
     Attributes:
-        env_steps: Environment steps taken so far, over all rows.
+        env_steps: Environment steps taken so far, over all rows; a waiting row takes none.
         policy: The adapting agent that evaluation uses.
 
     Raises:
@@ -130,30 +142,29 @@ class MetaLearner(ABC):
         started = time.perf_counter()
         if self.config.slice_steps is None or self.obs is None or self.steps_with_tasks >= self.config.max_adapt_steps:
             self._draw_tasks()
-        adapter, sampling = self.policy.adapter, 0.0
+        adapter, sampling, steps = self.policy.adapter, 0.0, 0
+        adapter.project()
         params = detached(adapter.meta(self.rows.count))
-        stages: list[Stage] = []
+        seen = RunningStats((self.policy.observations.measured,)).to(self.device)
         batches: list[TaskBatch] = []
         told: dict[str, float] = {}
         for k in range(self.config.inner_steps + 1):
             began = time.perf_counter()
-            stage, outcome = self._sample(params)
+            stage, outcome = self._sample(params, seen)
+            steps += int(outcome.steps)
             sampling += time.perf_counter() - began
             log_std = params["log_std"].clamp(*adapter.log_std_range)
             batches.append(task_batch(stage, self.rows, log_std, self.config))
-            stages.append(stage)
             told |= self._told(outcome, k)
             if k < self.config.inner_steps:
                 params = detached(adapter.adapt(params, batches[-1]))
         losses = as_numbers(self._outer(batches))
         check_finite(losses, losses, self.name, self.env_steps, "lower inner_learning_rate or the outer step")
         metrics = told | losses
-        for stage in stages:
-            self._note(stage)
+        self.policy.observations.merge(seen.mean, seen.var, seen.count)
         whole = time.perf_counter() - started
-        steps = sum(len(stage) for stage in stages) * self.world.num_envs
         self.env_steps += steps
-        metrics["Policy/std"] = float(self.policy.actor.log_std.detach().exp().mean())
+        metrics["Policy/std"] = float(self.policy.actor.log_std.detach().clamp(*adapter.log_std_range).exp().mean())
         metrics["Perf/collection_time"], metrics["Perf/learning_time"] = sampling, whole - sampling
         metrics["Perf/steps_per_second"] = steps / whole
         return metrics
@@ -181,8 +192,8 @@ class MetaLearner(ABC):
         self.obs, self.steps_with_tasks = None, 0
 
     @torch.no_grad()
-    def _sample(self, params: dict[str, Tensor]) -> tuple[Stage, tuple[Tensor, Tensor]]:
-        """A whole episode, or a slice, in every row; and what each row earned and whether it succeeded, (N,)."""
+    def _sample(self, params: dict[str, Tensor], seen: RunningStats) -> tuple[Stage, Outcome]:
+        """A whole episode, or a slice, in every row. Raw observations go into ``seen``: the stage's are clipped."""
         policy, rows, stage = self.policy, self.rows, Stage()
         if self.config.slice_steps is None:
             horizon = min(int(self.world.max_episode_steps.max()), self.config.max_adapt_steps)
@@ -191,19 +202,23 @@ class MetaLearner(ABC):
         obs = self._begin()
         running = torch.ones_like(self.elapsed, dtype=torch.bool)
         earned, success = torch.zeros(len(running), device=self.device), torch.zeros_like(running)
+        steps = torch.zeros_like(self.elapsed[0])
         for t in range(horizon):
-            seen = policy.observations(obs)
-            means, log_std = policy.adapter.distribution(params, rows.by_task(seen))
+            normal = policy.observations(obs)
+            means, log_std = policy.adapter.distribution(params, rows.by_task(normal))
             mean = rows.by_row(means)
             noise = torch.randn(mean.shape, generator=self.generator, device=self.device)
             action = mean + log_std[rows.task_of_row].exp() * noise
+            steps += running.sum()
+            before = obs
             obs, reward, terminated, truncated, info = self.world.step(action)
             broken = info.get("unstable", torch.zeros_like(terminated))
             valid = running & ~broken
+            seen.merge(*_moments(before[:, : policy.observations.measured], valid))
             over = terminated | truncated | broken
             last = torch.full_like(over, self.config.slice_steps is None and t + 1 == horizon)
             stage.add(
-                obs=seen, actions=action, means=mean, rewards=reward.masked_fill(~valid, 0.0), terminated=terminated,
+                obs=normal, actions=action, means=mean, rewards=reward.masked_fill(~valid, 0.0), terminated=terminated,
                 ended=over | last | ~running, valid=valid, elapsed=self.elapsed,
             )  # fmt: skip
             earned += info.get("reward_unscaled", reward).masked_fill(~valid, 0.0)
@@ -211,9 +226,11 @@ class MetaLearner(ABC):
             self.elapsed = (self.elapsed + 1).masked_fill(over, 0)
             if self.config.slice_steps is None:
                 running = running & ~over
+                if may_look(self.device) and not running.any():
+                    break
         self.obs = obs
-        self.steps_with_tasks += horizon
-        return stage, (earned, success)
+        self.steps_with_tasks += len(stage)
+        return stage, Outcome(earned, success, steps)
 
     def _begin(self) -> Tensor:
         """Observations to start a stage from."""
@@ -226,25 +243,15 @@ class MetaLearner(ABC):
             self.policy.observations.update(obs)
         return obs
 
-    def _note(self, stage: Stage) -> None:
-        """Takes what was seen into the statistics of observations; frozen rows show the same again and do not count."""
-        if not self.config.normalise_observations:
-            return
-        shift, scale = self.policy.observations.shift, self.policy.observations.scale
-        seen = stage.stacked("obs")[stage.stacked("valid")]
-        if len(seen):
-            self.policy.observations.update(seen / scale + shift)
-
     # Metrics.
 
-    def _told(self, outcome: tuple[Tensor, Tensor], k: int) -> dict[str, float]:
+    def _told(self, outcome: Outcome, k: int) -> dict[str, float]:
         """Return and success of a stage per class: of the last stage as such, of the first as ``before``."""
         last = k == self.config.inner_steps
         if k > 0 and not last:
             return {}
-        earned, success = outcome
         told: dict[str, float] = {}
-        for what, values in (("return", earned), ("success", success.float())):
+        for what, values in (("return", outcome.earned), ("success", outcome.success.float())):
             sums = torch.zeros(self.world.num_tasks, device=self.device).index_add(0, self.world.task_id, values)
             means = (sums / torch.bincount(self.world.task_id, minlength=self.world.num_tasks)).tolist()
             tag = f"Train/{what}" if last else f"Before/{what}"
@@ -313,3 +320,12 @@ class MetaLearner(ABC):
         self.obs = None if state["obs"] is None else state["obs"].to(self.device, copy=True)
         self.elapsed = state["elapsed"].to(self.device, copy=True)
         self.steps_with_tasks, self.env_steps = int(state["steps_with_tasks"]), int(state["env_steps"])
+
+
+def _moments(x: Tensor, counted: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean, variance and count of each column of (N, d), over the rows of a mask (N,)."""
+    count = counted.sum()
+    x = x.masked_fill(~counted[:, None], 0.0)
+    mean = x.sum(0) / count.clamp_min(1)
+    var = ((x - mean).square() * counted[:, None]).sum(0) / count.clamp_min(1)
+    return mean, var, count

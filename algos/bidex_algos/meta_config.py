@@ -57,5 +57,5 @@ class MetaConfig:
         if self.slice_steps is not None:
             at_least(self, 1, "slice_steps")
         between(self, 0.0, 1.0, "gamma", "lam")
-        positive(self, "inner_learning_rate")
+        positive(self, "inner_learning_rate", "init_std")
         rising(self, "std_range")

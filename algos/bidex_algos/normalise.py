@@ -81,7 +81,14 @@ class ObservationNormaliser(nn.Module):
             return
         flat = obs.reshape(-1, obs.shape[-1])[:, : self.measured]
         var, mean = torch.var_mean(flat, dim=0, correction=0)
-        self.stats.merge(*pool_moments(mean, var, torch.full_like(mean, flat.shape[0], dtype=torch.float64)))
+        self.merge(mean, var, torch.full_like(mean, flat.shape[0], dtype=torch.float64))
+
+    @torch.no_grad()
+    def merge(self, mean: Tensor, var: Tensor, count: Tensor) -> None:
+        """Takes moments of raw observations, of all processes, into the statistics: (measured columns,) each."""
+        if not self.enabled:
+            return
+        self.stats.merge(*pool_moments(mean, var, count))
         self.shift[: self.measured] = self.stats.mean.float()
         # The floor keeps a column that has been constant so far from blowing up noise a thousandfold.
         self.scale[: self.measured] = self.stats.std(floor=3e-3).reciprocal().float()

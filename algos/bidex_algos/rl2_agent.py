@@ -36,7 +36,7 @@ class RL2Agent:
         self._learned: Memory | None = None
         self._playing: Memory | None = None
         self._next_state: Tensor | None = None
-        self._begun = self._over = torch.zeros(0, dtype=torch.bool, device=self.device)
+        self._wait(0)
 
     def reset(self, env_mask: Tensor) -> None:
         """A new episode begins in the rows of ``env_mask``, bool (N,).
@@ -90,5 +90,10 @@ class RL2Agent:
         if memory is not None and len(memory.state) == rows:
             return memory
         if self._learned is None or len(self._learned.state) != rows:
-            self._begun = self._over = torch.zeros(rows, dtype=torch.bool, device=self.device)
+            self._wait(rows)
         return self.policy.fresh_memory(rows)
+
+    def _wait(self, rows: int) -> None:
+        """No row has played yet; each waits for its ``reset``."""
+        self._begun = torch.zeros(rows, dtype=torch.bool, device=self.device)
+        self._over = ~self._begun

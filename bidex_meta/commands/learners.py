@@ -103,7 +103,7 @@ def choose_preset(kind: LearnerKind, asked: str, device: str, suite: str | None 
     if device.startswith("cpu"):
         return "laptop", "the device is a CPU"
     if "tuned" in kind.presets:
-        return "tuned", "the device is a GPU and paper is known not to be best"
+        return "laptop", "paper is known not to be best, and tuned goes on from what another run has learned"
     return "paper", "the device is a GPU"
 
 

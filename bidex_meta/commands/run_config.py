@@ -41,7 +41,7 @@ class RunFlags:
     """Learner (see `bidex-meta list algos`)."""
     preset: str = "auto"
     """Values of the learner's config that no flag sets; auto: metaworld for a suite of Meta-World's, else laptop on a
-    CPU, on a GPU tuned or else paper."""
+    CPU, on a GPU paper (of maml and promp laptop there too)."""
     num_envs: int = 0
     """Rows stepped together by each process, over all tasks."""
     steps: StepCount = 0

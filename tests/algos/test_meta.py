@@ -215,6 +215,49 @@ def test_broken_physics_and_frozen_rows_teach_nothing(kind: Any, config: Any):
     assert same(states[0], states[1]) and same(states[0], states[2])
 
 
+def test_steps_and_statistics_of_observations_are_those_of_what_rows_played():
+    classes = (PointClass("Long", steps=20), PointClass("Short", steps=9))
+    world = PointGoals(rows=16, classes=classes, unstable=((2, 5),), end_at_goal=True)
+    learner = ProMP(world, replace(PROMP, tasks_per_class=4, normalise_observations=True), seed=0)
+    first, _ = world.reset(seed=0)
+    played, reset, step = [first.double()], world.reset, world.step
+    counted: list[int] = []
+    now = first
+
+    def spy_reset(**options: Any) -> Any:
+        nonlocal now
+        now, info = reset(**options)
+        return now, info
+
+    def spy_step(action: Tensor) -> Any:
+        nonlocal now
+        running, before = ~world.episodes.finished, now
+        found = step(action)
+        played.append(before[running & ~found[4]["unstable"]].double())
+        counted.append(int(running.sum()))
+        now = found[0]
+        return found
+
+    world.reset, world.step = spy_reset, spy_step  # type: ignore[method-assign]
+    learner.iterate()
+    assert learner.env_steps == sum(counted) < 2 * 20 * 16
+    seen, stats = torch.cat(played), learner.policy.observations.stats
+    assert ((seen - seen[:16].mean(0)) / seen[:16].std(0)).nan_to_num().abs().max() > 10  # some were clipped
+    assert_close(stats.mean, seen.mean(0), atol=1e-6, rtol=1e-5)
+    assert_close(stats.var, seen.var(0, correction=0), atol=1e-6, rtol=1e-5)
+
+
+@both
+def test_a_standard_deviation_beyond_its_bounds_comes_back(kind: Any, config: Any):
+    config = replace(config, tasks_per_class=4, std_range=(0.3, 0.6))
+    learner = kind(PointGoals(rows=16), config, seed=0)
+    with torch.no_grad():
+        learner.policy.actor.log_std.fill_(2.0)
+    assert learner.iterate()["Policy/std"] <= 0.6 + 1e-6
+    moved = learner.policy.actor.log_std - float(np.log(0.6))
+    assert 1e-5 < moved.abs().max() < 0.1  # put on the bound, and from there by a gradient that is not 0
+
+
 def test_a_meta_batch_draws_tasks_without_repetition_and_splits_rows_over_them():
     world = PointGoals(rows=24, classes=(PointClass("A", count=8), PointClass("B", count=3)))
     learner = ProMP(world, replace(PROMP, tasks_per_class=4), seed=0)
@@ -250,7 +293,7 @@ def test_before_any_data_an_adapting_policy_is_the_meta_policy_and_init_goes_bac
 def test_bad_input_is_one_line():
     with pytest.raises(BidexError, match=r"8 tasks.*num_envs of at least 8"):
         ProMP(PointGoals(rows=4), PROMP, seed=0)
-    for field, value in (("inner_steps", 0), ("gamma", 2.0), ("inner_learning_rate", 0.0), ("std_range", (1.0, 0.5))):
+    for field, value in (("inner_steps", 0), ("gamma", 2.0), ("init_std", 0.0), ("std_range", (1.0, 0.5))):
         with pytest.raises(BidexError, match=f"promp: {field}"):
             replace(PROMP, **{field: value})
     with pytest.raises(BidexError, match="maml: backtracks"):

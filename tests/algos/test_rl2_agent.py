@@ -69,6 +69,17 @@ def test_the_agent_waits_with_rows_whose_episode_is_over():
     assert agent._learned is not None and agent._learned.done.all()
 
 
+def test_rows_that_play_no_episode_learn_nothing():
+    world = PointGoals(4, classes=TEN)
+    agent, some = agent_on(world), torch.tensor([True, False, True, False])
+    obs, _ = world.reset()
+    agent.reset(some)
+    action, aux = agent.adapt_action(obs)
+    obs, reward, terminated, truncated, _ = world.step(action)
+    agent.step(Timestep(obs, action, reward, terminated, truncated, aux, obs, some))
+    assert torch.equal(state_of(agent).any(1), some)
+
+
 def test_the_agent_plays_the_trial_that_the_training_played():
     """Fed with the training's actions and rewards, its memory becomes the training's."""
     learner = RL2(PointGoals(6, classes=UNEVEN), replace(TINY, blind_share=0.0), seed=0)
