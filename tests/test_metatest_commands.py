@@ -8,9 +8,10 @@ import torch
 
 from bidex_meta.cli import main
 from bidex_meta.commands import learners, worlds
-from bidex_meta.commands.metatest import rows_for
+from bidex_meta.commands.metatest import rollouts_of, rows_for
 from bidex_meta.comparison import read_groups
 from bidex_meta.record import RunFolder
+from tests.adapting_learner import Learner
 from tests.points import PointWorld, ring
 
 COUNTS = {"train": {"Near": 6, "Far": 6}, "test": {"Near": 2}}
@@ -134,11 +135,19 @@ def test_what_does_not_adapt_takes_no_shots(run, capsys):
         assert capsys.readouterr().err == expected
 
 
-def test_no_adaptation_on_metaworlds_suites(capsys, tmp_path, monkeypatch):
+@pytest.mark.parametrize("shown", [("--suite", "metaworld/MT3"), ("--suite", "MT4"), ("--task", "Switch")])
+def test_no_adaptation_where_tasks_are_shown(capsys, tmp_path, monkeypatch, shown):
     monkeypatch.chdir(tmp_path)
-    assert main(["run", "--suite", "metaworld/MT3", "--algo", "finder", "--device", "cpu"]) == 2
-    assert "Name an ML suite" in capsys.readouterr().err
+    assert main(["run", *shown, "--algo", "finder", "--device", "cpu"]) == 2
+    assert f"finder adapts to hidden goals, but {shown[1]} shows them. Name an ML suite" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_where_rows_share_nothing_each_plays_one_episode_a_shot(monkeypatch):
+    config = {"algo": "finder", "num_envs": 1024, "learner": {}}
+    assert [rollouts_of(config, asked, 6) for asked in (20, None)] == [20, 10]
+    monkeypatch.setattr(Learner, "adapts_by_row", True, raising=False)
+    assert [rollouts_of(config, asked, 6) for asked in (20, None, 4)] == [6, 6, 4]
 
 
 @pytest.mark.parametrize(

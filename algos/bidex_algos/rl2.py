@@ -59,6 +59,7 @@ class RL2(RL2Agent):
     autoreset: ClassVar[str] = "DISABLED"
     """The mode of the world it trains on."""
     adapts: ClassVar[bool] = True
+    adapts_by_row: ClassVar[bool] = True
     """Whether its agent is a ``MetaLearningAgent``."""
     per_process: ClassVar[tuple[str, ...]] = ("generator", "episodes")
 

@@ -82,10 +82,11 @@ def main(arguments: Sequence[str]) -> None:
 
 def _check(folders: "Sequence[RunFolder]") -> None:
     """All runs adapt, on a suite with the same classes in both splits, and differ in the seed alone."""
-    from bidex_meta.commands import metatest, worlds
+    from bidex_meta.commands import metatest
     from bidex_meta.commands.learners import learner_kind
 
-    kinds = []
+    kinds: list[dict[str, Any]] = []
+    seeds: dict[int, Path] = {}
     for folder in folders:
         config = folder.config()
         if not learner_kind(config["algo"]).adapts:
@@ -93,11 +94,12 @@ def _check(folders: "Sequence[RunFolder]") -> None:
                 f"{folder.path}: {config['algo']} does not adapt to tasks. Name runs of maml, promp or rl2."
             )
         metatest.check_suite(config)
-        if "test" not in worlds.splits(config):
-            raise BidexError(f"{folder.path}: {config['suite']} has no test tasks. Name runs on ML1 or ML1-wide.")
         kind = {name: config[name] for name in ("algo", "suite", "steps", "num_envs", "learner")}
         # Where from is another run for each seed; whether is not.
         kinds.append(kind | {"start_from": config.get("start_from") is not None})
+        if (seed := config["seed"]) in seeds:
+            raise BidexError(f"{folder.path} and {seeds[seed]} both have seed {seed}. Name one run for each seed.")
+        seeds[seed] = folder.path
     for folder, kind in zip(folders, kinds, strict=True):
         differing = [name for name in kind if kind[name] != kinds[0][name]]
         if differing:
@@ -120,8 +122,8 @@ def _play(folder: "RunFolder", flags: ControlFlags) -> "Control":
     stored = folder.config()
     config = {**stored, "device": resolve_device(flags.device, stored["suite"]), "engine": flags.engine}
     torch.set_num_threads(config["threads"])
-    rollouts = flags.rollouts or metatest.trained_rollouts(config)
     counts = worlds.task_counts(config, "test")
+    rollouts = metatest.rollouts_of(config, flags.rollouts, max(1, flags.num_envs // len(counts)))
     rows = metatest.rows_for(len(counts), max(counts) * flags.trials, rollouts, flags.num_envs)
     print(f"{folder.path}: {flags.trials} adaptations of each held-out task, {rows} rows.", file=sys.stderr, flush=True)
     test, train = (worlds.evaluation_world(config, split, rows) for split in ("test", "train"))

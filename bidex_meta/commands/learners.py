@@ -7,7 +7,8 @@ the learner's config dataclass, with at least ``paper`` and ``laptop``. The clas
 * where it adapts to tasks, ``adapts = True``: then ``load_policy`` gives a MetaLearningAgent (``bidex_meta.agents``),
   which explores by a generator of its own, seeded alike by each ``load_policy``; of its config, if they are there, the
   meta-test reads ``max_adapt_steps`` (longest episode it adapts to) and ``tasks_per_class`` (of a meta-batch, over
-  which a class's rows are split: as many rollouts has a task);
+  which a class's rows are split: as many rollouts has a task); ``adapts_by_row = True`` where rows of a task share
+  nothing of what they learn;
 * where it does not train in autoreset mode SAME_STEP, ``autoreset``: the mode, or a function of the learner's config
   that gives it;
 * ``policy_state_dict()`` and ``load_policy(state, device)``, which gives an agent for ``bidex_meta.evaluate`` from the
@@ -56,6 +57,11 @@ class LearnerKind:
     def adapts(self) -> bool:
         """Whether what it learns adapts to tasks, so that it is judged by the meta-test."""
         return getattr(self.make, "adapts", False)
+
+    @property
+    def adapts_by_row(self) -> bool:
+        """Whether each row learns from its own episodes alone, so that rows of a task share nothing."""
+        return getattr(self.make, "adapts_by_row", False)
 
     def autoreset(self, config: dict[str, Any]) -> str:
         """Mode of the world it trains on, for a config of the learner's."""

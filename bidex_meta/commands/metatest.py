@@ -7,7 +7,9 @@ from typing import Any
 from bidex_meta.agents import Agent
 from bidex_meta.clients import metaworld
 from bidex_meta.commands import worlds
+from bidex_meta.commands.learners import learner_kind
 from bidex_meta.errors import BidexError
+from bidex_meta.suite import load_suite
 
 SHOTS = 1
 """Shots where nobody says otherwise."""
@@ -62,7 +64,7 @@ def meta_test(
         A MetaEvaluation for each split, by its name.
 
     Raises:
-        BidexError: The suite is Meta-World's, or a number is out of range.
+        BidexError: The suite shows its tasks, or a number is out of range.
     """
     from bidex_meta.metatest import MAX_ADAPT_STEPS, meta_evaluate
     from bidex_meta.references import references
@@ -70,12 +72,13 @@ def meta_test(
     check_suite(config)
     check_numbers(options, "rollouts", "episodes", "tasks", "trials", "num_envs")
     found = {}
-    rollouts = options.rollouts or trained_rollouts(config)
+    limit = options.num_envs or ROWS
     for split in splits:
         counts = worlds.task_counts(config, split)
+        rollouts = rollouts_of(config, options.rollouts, max(1, limit // len(counts)))
         tasks = min(options.tasks or TASKS, max(counts))
         trials = options.trials or -(-TASKS // tasks)
-        rows = rows_for(len(counts), tasks * trials, rollouts, options.num_envs or ROWS)
+        rows = rows_for(len(counts), tasks * trials, rollouts, limit)
         shots = SHOTS if options.shots is None else options.shots
         episodes = options.episodes or rollouts
         often = f", each {trials} times" if trials > 1 else ""
@@ -95,11 +98,24 @@ def meta_test(
             trials=trials,
             max_adapt_steps=config["learner"].get("max_adapt_steps", MAX_ADAPT_STEPS),
             seed=options.seed,
-            references=references() if config["suite"] is not None else {},
+            references=references(),
             split=split,
         )
         world.close()
     return found
+
+
+def rollouts_of(config: dict[str, Any], asked: int | None, rows: int) -> int:
+    """Episodes of each task in a shot.
+
+    Args:
+        config: The run's config.
+        asked: What the user wants; None: what the run was trained with.
+        rows: Rows that a class has at most. Where each row learns from its own episodes alone it must have no second
+            one in a shot: then there are fewer.
+    """
+    rollouts = asked or trained_rollouts(config)
+    return min(rollouts, rows) if learner_kind(config["algo"]).adapts_by_row else rollouts
 
 
 def trained_rollouts(config: dict[str, Any]) -> int:
@@ -127,11 +143,13 @@ def check_suite(config: dict[str, Any]) -> None:
     """Refuse a suite on which there is no meta-test.
 
     Raises:
-        BidexError: The suite is Meta-World's.
+        BidexError: It shows its tasks: it is Meta-World's, multi-task or a class alone.
     """
-    if metaworld.is_foreign(config["suite"]):
+    suite = config["suite"]
+    if suite is None or metaworld.is_foreign(suite) or load_suite(suite).kind != "meta":
         raise BidexError(
-            f"{config['algo']} adapts to hidden goals, but {config['suite']} shows them. Name an ML suite."
+            f"{config['algo']} adapts to hidden goals, but {suite or config['task']} shows them. Name an ML suite: "
+            "--suite ML1, ML4, ML20, or a file of kind meta."
         )
 
 
