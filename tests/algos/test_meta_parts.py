@@ -39,12 +39,13 @@ def test_the_baseline_is_the_ridge_regression_of_each_task():
     x = features(torch.randn(2, 30, 3, generator=g), torch.arange(30).expand(2, -1))
     returns = torch.randn(2, 30, generator=g)
     weights = (torch.rand(2, 30, generator=g) > 0.3).float()
-    found = fitted(x, returns, weights, ridge=1e-3)
+    found = fitted(x, returns, weights, ridge=0.5)
     for k in range(2):
         kept = weights[k] > 0
         a = x[k][kept].double()
-        damping = 1e-3 * max(float((a * a).sum(0).mean()), 1.0)
-        c = torch.linalg.solve(a.T @ a + damping * torch.eye(10, dtype=a.dtype), a.T @ returns[k][kept].double())
+        per_sample = torch.tensor([0.5 * 10 / len(a)] * 6 + [0.0] * 4, dtype=a.dtype) + 1e-5
+        damping = torch.diag(per_sample * max(float((a * a).sum(0).mean()), 1.0))
+        c = torch.linalg.solve(a.T @ a + damping, a.T @ returns[k][kept].double())
         assert_close(found[k], (x[k].double() @ c).float(), rtol=1e-3, atol=1e-4)
 
 
@@ -55,6 +56,21 @@ def test_the_baseline_knows_time_and_what_has_no_weight_does_not_count():
     returns[0, 5], weights[0, 5] = 1e6, 0.0
     found = fitted(features(obs, t[None]), returns, weights)
     assert_close(found, (40.0 - t)[None], rtol=0, atol=0.2)
+
+
+def test_the_baseline_does_not_remember_what_it_cannot_know():
+    """As many features as samples: what is left must still be the noise, and what can be known must go."""
+    g = torch.Generator().manual_seed(2)
+    obs, noise = torch.randn(1, 400, 200, generator=g), torch.randn(1, 400, generator=g)
+    t = torch.arange(400) % 50
+    returns = 1.5 * obs[..., 0] + 0.1 * t + noise
+
+    def likeness(left: Tensor) -> float:
+        return float(torch.corrcoef(torch.cat([left, noise]))[0, 1])
+
+    x, weights = features(obs, t[None]), torch.ones(1, 400)
+    free, held = (likeness(returns - fitted(x, returns, weights, ridge)) for ridge in (1e-5, 1.0))
+    assert free < 0.2 and held > likeness(returns) + 0.1
 
 
 def stage_of(rewards: Tensor, valid: Tensor, ended: Tensor, d: int = 2) -> Stage:
