@@ -100,7 +100,7 @@ def meta_evaluate(
 
     Rows that play the same task share one adaptation. Where the world has fewer rows than tasks times ``rollouts``, its
     pools of tasks are played in portions (``world.set_tasks``), or a shot takes several rounds; memory is that of the
-    world. The world must be reset afterwards.
+    world and of what the agent keeps of a shot. The world must be reset afterwards.
 
     To tell adaptation to a task from mere further training, let it adapt to data of another one: ``adapt_world`` has
     the same rows and as many tasks in each pool, e.g. for the held-out task of ML1 and the data of its first train task

@@ -20,7 +20,7 @@ ROLLOUTS = 10
 MOST_ROLLOUTS = 40
 """The most that are taken from the run's config: ML1's three tasks may be trained with hundreds."""
 ROWS = 1024
-"""Rows stepped together at most, where nobody says otherwise: half a GB."""
+"""Rows stepped together at most, where nobody says otherwise: half a GB for the world."""
 
 
 @dataclass(frozen=True)

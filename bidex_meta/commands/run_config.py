@@ -65,7 +65,8 @@ class RunFlags:
     evaluate: bool = True
     """Evaluate at the end."""
     episodes: int | None = None
-    """Episodes of each task in that evaluation; None: 4, or 1 where a task fixes its start (metaworld/...)."""
+    """Episodes of each task in that evaluation; None: 4, or 1 where a task fixes its start (metaworld/...); for what
+    adapts, as many as it adapts to."""
     print_config: Switch = False
     """Print the resolved config as JSON and stop."""
 
