@@ -64,6 +64,7 @@ PRESETS: dict[str, MAMLConfig] = {
         hidden=(256, 256, 128),
         activation="elu",
         std_range=(0.05, 1.5),
+        adapted="head",
         inner_learning_rate=0.05,
         gamma=0.93,
         lam=0.9,
