@@ -101,13 +101,24 @@ def _read(folder: RunFolder) -> dict[str, Any]:
             f"--json > {path}"
         )
     config = folder.config()
-    found = json.loads(path.read_text())
+    try:
+        found = json.loads(path.read_text())
+    except json.JSONDecodeError as error:
+        raise BidexError(
+            f"{path} is not JSON ({error}). Write it anew: bidex-meta evaluate {folder.path} --json."
+        ) from None
+    if found.get("steps", config["steps"]) < config["steps"]:
+        raise BidexError(
+            f"{path} is of {found['steps']:,} steps, but the run goes on to {config['steps']:,}. Let it end, or write "
+            f"it anew: bidex-meta evaluate {folder.path} --json > {path}"
+        )
     seconds = [
         row.get("Perf/collection_time", 0.0) + row.get("Perf/learning_time", 0.0)
         for row in read_metrics(folder.metrics_path)
     ]
     subject = config["suite"] or "one class at a time"
     kind = {"algo": config["algo"], "on": subject, "steps": config["steps"], "num_envs": config["num_envs"]}
+    kind["split"] = found.get("split", "train")
     kind["started"] = "afresh" if config.get("start_from") is None else "from another run"  # which: one for each seed
     return {
         "path": folder.path,

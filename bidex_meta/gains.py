@@ -2,9 +2,11 @@
 
 The episodes are paired: the same task and the same start, so that only the policies differ. They come in groups, one
 for each adaptation (a task, or one of several trials of it): all episodes of a group follow the same adaptation and
-share its luck. So the bootstrap resamples the adaptations and, within each, the episodes, which is rather too wide than
-too narrow. With a single adaptation it resamples the episodes alone: its interval says nothing of what another
-adaptation would have given. Of several runs (seeds) it resamples the runs first.
+share its luck. So the bootstrap resamples the adaptations and, within each, the episodes. Of few groups that is too
+narrow: of five adaptations whose luck outweighs that of their ten episodes a nominal 95 % held the truth in 81 to 88 %
+of simulated cases, of three runs in 82 %; where adaptations do not differ it is rather too wide. With a single
+adaptation it resamples the episodes alone: its interval says nothing of what another adaptation would have given. Of
+several runs (seeds) it resamples the runs first.
 """
 
 from collections.abc import Callable, Mapping, Sequence

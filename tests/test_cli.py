@@ -215,6 +215,12 @@ def test_resume_without_a_checkpoint_starts_over(toy_worlds, tmp_path):
     assert [row["step"] for row in read_metrics(path / "metrics.jsonl")] == [24, 48]
 
 
+def test_of_a_flag_given_twice_the_last_one_counts(toy_worlds, tmp_path):
+    assert run("--algo", "mtppo", "--algo", "mttrpo", "--steps", 24, "--run-dir", tmp_path / "r", "--no-evaluate") == 0
+    config = RunFolder.open(tmp_path / "r").config()
+    assert config["algo"] == "mttrpo" and "max_kl" in config["learner"]
+
+
 def test_a_run_can_start_from_the_policy_of_another(toy_worlds, tmp_path, capsys):
     first, second = tmp_path / "first", tmp_path / "second"
     assert run("--steps", 48, "--run-dir", first, "--no-evaluate") == 0

@@ -82,6 +82,31 @@ def test_the_command_prints_tables_and_json(tmp_path: Path, capsys: pytest.Captu
     assert second["classes"]["B"]["success"] == pytest.approx([0.2, 0.3]) and second["score_iqm"]["value"] > 0
 
 
+def test_the_table_shows_each_class_under_its_own_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    first = run(tmp_path, 0, {"B": 0.25, "A": 0.75})
+    second, third = run(tmp_path, 0, {"A": 1.0, "B": 0.5}, "mttrpo"), run(tmp_path, 0, {"C": 1.0}, "mtsac")
+    assert main(["compare", str(first), str(second), str(third)]) == 0
+    table = capsys.readouterr().out
+    lines = [line.split("│") for line in table.splitlines() if "success" in line and "(" in line and "IQM" not in line]
+    shares = [[cell.split("(")[0].strip() for cell in line if "(" in cell or "–" in cell] for line in lines]
+    assert shares == [["25 %", "75 %", "–"], ["50 %", "100 %", "–"], ["–", "–", "100 %"]]
+    assert main(["compare", str(first), str(third), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)[1]["success_over_first"] is None
+
+
+def test_an_evaluation_that_is_torn_or_of_fewer_steps_is_refused(tmp_path: Path):
+    path = run(tmp_path, 0, {"A": 0.5})
+    found = json.loads((path / "evaluation.json").read_text())
+    (path / "evaluation.json").write_text(json.dumps({"steps": 1016, **found}))
+    assert groups(path)[0].steps == 1000
+    (path / "evaluation.json").write_text(json.dumps({"steps": 500, **found}))
+    with pytest.raises(BidexError, match="is of 500 steps, but the run goes on to 1,000"):
+        groups(path)
+    (path / "evaluation.json").write_text("")
+    with pytest.raises(BidexError, match="is not JSON"):
+        groups(path)
+
+
 def test_a_class_without_a_reference_leaves_the_group_without_a_score(tmp_path: Path):
     path = run(tmp_path, 0, {"A": 0.5})
     (path / "evaluation.json").write_text(

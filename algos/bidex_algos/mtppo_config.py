@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from bidex_algos.checks import at_least, rising
+from bidex_algos.checks import at_least, positive, rising
 from bidex_algos.onpolicy_config import OnPolicyConfig
 
 
@@ -49,6 +49,7 @@ class MTPPOConfig(OnPolicyConfig):
         super().__post_init__()
         at_least(self, 1, "num_minibatches", "epochs")
         rising(self, "learning_rate_range")
+        positive(self, "learning_rate", "desired_kl", "clip", "max_grad_norm")
 
 
 PRESETS: dict[str, MTPPOConfig] = {

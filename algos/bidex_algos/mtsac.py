@@ -34,7 +34,7 @@ from bidex_algos.normalise import ObservationNormaliser, RunningStats
 from bidex_algos.precision import autocast, use_bfloat16
 from bidex_algos.replay import Replay, Transitions, replay_bytes, steps_within
 from bidex_algos.reports import as_numbers, check_finite
-from bidex_algos.rollout import VectorWorld
+from bidex_algos.rollout import VectorWorld, check_autoreset
 from bidex_algos.squashed import SquashedActor, SquashedPolicy
 from bidex_meta.errors import BidexError
 
@@ -90,6 +90,7 @@ class MTSAC:
     per_process = ("generator", "episodes", "replay", "discounted")
 
     def __init__(self, world: VectorWorld, config: MTSACConfig, seed: int):
+        check_autoreset(world, "mtsac", "SAME_STEP")
         self.world, self.config, self.seed = world, config, seed
         self.device = torch.device(world.device)
         self.low_precision = use_bfloat16(config.autocast, self.device)

@@ -101,8 +101,11 @@ class MTTRPO(OnPolicy):
 
     def _kl_from_itself(self, batch: Batch) -> Tensor:
         """The part of the mean KL that the Fisher matrix is made of: 0, but with a curvature."""
-        actor, stride = self.policy.actor, self.config.fisher_stride
-        obs, weight = batch.obs[::stride], batch.weights[::stride]
+        actor, rows = self.policy.actor, self.world.num_envs
+        sample = torch.arange(len(batch.obs), device=self.device)
+        # The samples are steps by rows. A later step begins at a later row, else rows between would never be taken.
+        taken = (sample + sample // rows) % self.config.fisher_stride == 0
+        obs, weight = batch.obs[taken].float(), batch.weights[taken]
         mean, log_std = actor(obs), actor.log_std_of(obs)
         kl = gaussian_kl(mean.detach(), log_std.detach(), mean, log_std)
         return (weight / all_sum(weight.sum()).clamp_min(1.0) * kl).sum()

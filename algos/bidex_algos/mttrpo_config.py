@@ -47,7 +47,8 @@ class MTTRPOConfig(OnPolicyConfig):
         """
         super().__post_init__()
         at_least(self, 1, "cg_iterations", "fisher_stride", "backtracks", "critic_epochs", "num_minibatches")
-        positive(self, "max_kl")
+        positive(self, "max_kl", "max_grad_norm")
+        at_least(self, 0, "damping")
         between(self, 0.0, 1.0, "backtrack_factor", "accept_ratio")
 
 

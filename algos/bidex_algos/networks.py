@@ -125,7 +125,8 @@ class GaussianActor(nn.Module):
         if self.heads == 1:
             return out
         heads = out.unflatten(-1, (self.heads, -1))
-        return torch.einsum("...h,...ha->...a", x[..., -self.heads :].to(out.dtype), heads)
+        with torch.autocast(x.device.type, enabled=False):  # like the output layer: means would be rounded
+            return torch.einsum("...h,...ha->...a", x[..., -self.heads :].to(out.dtype), heads)
 
     def log_std_of(self, x: Tensor, log_std: Tensor | None = None) -> Tensor:
         """The rows of ``log_std`` (default: the present ones) that hold for observations (batch, observations).
@@ -134,7 +135,10 @@ class GaussianActor(nn.Module):
             (actions,) with one head, else (batch, actions).
         """
         log_std = self.log_std if log_std is None else log_std
-        return log_std if self.heads == 1 else x[..., -self.heads :].to(log_std.dtype) @ log_std
+        if self.heads == 1:
+            return log_std
+        with torch.autocast(x.device.type, enabled=False):
+            return x[..., -self.heads :].to(log_std.dtype) @ log_std
 
 
 def gaussian_log_prob(action: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ from bidex_algos.onpolicy_config import OnPolicyConfig
 from bidex_algos.policy import GaussianPolicy
 from bidex_algos.precision import autocast, use_bfloat16
 from bidex_algos.reports import as_numbers, check_finite
-from bidex_algos.rollout import Rollout, VectorWorld, collect
+from bidex_algos.rollout import Rollout, VectorWorld, check_autoreset, collect
 from bidex_meta.errors import BidexError
 
 
@@ -80,6 +80,7 @@ class OnPolicy(ABC):
     per_process: ClassVar[tuple[str, ...]] = ("generator", "episodes", "obs")
 
     def __init__(self, world: VectorWorld, config: Any, seed: int):
+        check_autoreset(world, self.name, "SAME_STEP")
         self.world, self.config, self.seed = world, config, seed
         self.device = torch.device(world.device)
         self.low_precision = use_bfloat16(config.autocast, self.device)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from bidex_algos.checks import at_least, between, rising
+from bidex_algos.checks import at_least, between, positive, rising
 from bidex_algos.choices import Activation, Autocast
 
 
@@ -53,3 +53,4 @@ class OnPolicyConfig:
         at_least(self, 1, "rollout_steps")
         between(self, 0.0, 1.0, "gamma", "lam")
         rising(self, "std_range")
+        positive(self, "init_std", "value_horizon")

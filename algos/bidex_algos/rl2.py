@@ -26,6 +26,7 @@ from bidex_algos.recurrent import RecurrentNet, RecurrentPolicy
 from bidex_algos.reports import as_numbers, check_finite
 from bidex_algos.rl2_agent import RL2Agent
 from bidex_algos.rl2_config import PRESETS, RL2Config
+from bidex_algos.rollout import check_autoreset
 from bidex_algos.step_size import AdaptiveAdams
 from bidex_algos.trials import Batch, Trials, play
 from bidex_meta.errors import BidexError
@@ -357,13 +358,7 @@ class RL2(RL2Agent):
 
 
 def _check(world: Any, config: RL2Config) -> None:
-    mode = getattr(world, "metadata", {}).get("autoreset_mode")
-    name = str(getattr(mode, "name", mode))
-    if name != "DISABLED":
-        raise BidexError(
-            f"rl2: trials need a world in autoreset mode DISABLED, but this one is in {name}. Make it with "
-            'autoreset_mode="DISABLED".'
-        )
+    check_autoreset(world, "rl2", "DISABLED")
     if world.num_envs < config.num_minibatches:
         raise BidexError(
             f"rl2: {config.num_minibatches} mini-batches need as many rows, got {world.num_envs}. Raise num_envs or "

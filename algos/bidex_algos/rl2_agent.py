@@ -45,7 +45,7 @@ class RL2Agent:
         they saw in an evaluation episode is forgotten.
         """
         learned = self._memory(self._learned, len(env_mask))
-        self._over = self._over & ~env_mask
+        self._over = ~env_mask
         self._learned = replace(learned, done=learned.done | (env_mask & self._begun))
         self._playing = self._memory(self._playing, len(env_mask)).replaced(env_mask, self._learned)
 

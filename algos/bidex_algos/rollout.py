@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from bidex_algos.episodes import EpisodeStatistics
+from bidex_meta.errors import BidexError
 
 
 class VectorWorld(Protocol):
@@ -97,6 +98,21 @@ def collect(
         episodes.update(info)
     rollout.last_obs.copy_(obs)
     return obs
+
+
+def check_autoreset(world: Any, learner: str, expected: str) -> None:
+    """Refuses a world that says that it resets in another way than the learner needs.
+
+    Raises:
+        BidexError: It is in another autoreset mode.
+    """
+    mode = getattr(world, "metadata", {}).get("autoreset_mode")
+    name = getattr(mode, "name", mode)
+    if name is not None and name != expected:
+        raise BidexError(
+            f"{learner}: needs a world in autoreset mode {expected}, but this one is in {name}. Make it with "
+            f'autoreset_mode="{expected}".'
+        )
 
 
 def may_look(device: torch.device) -> bool:

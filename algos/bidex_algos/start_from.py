@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 from torch import nn
 
+from bidex_algos.squashed import SquashedActor
 from bidex_meta.errors import BidexError
 
 
@@ -24,7 +25,7 @@ class PolicyLearner(Protocol):
 
 
 # What decides, beside the shapes of the weights, what they compute.
-_FORM = ("hidden", "activation", "normalise_observations", "observations", "actions", "num_id_columns")
+_FORM = ("hidden", "activation", "normalise_observations", "reward_unit", "observations", "actions", "num_id_columns")
 
 
 def start_from(learner: PolicyLearner, state: dict[str, Any]) -> None:
@@ -38,20 +39,28 @@ def start_from(learner: PolicyLearner, state: dict[str, Any]) -> None:
         BidexError: Weights of one would not mean the same in the other.
     """
     own, given = asdict(learner.config) | learner.shape, state["config"] | state["shape"]
-    for name in _FORM:
-        if name in own and name in given and _plain(own[name]) != _plain(given[name]):
-            flag = f"--learner.{name.replace('_', '-')}"
-            mend = f"Add {flag} as there" if name not in learner.shape else "Name a run on the same observations"
-            raise BidexError(
-                f"Expected a policy to start from with {name} = {_plain(own[name])}, got {_plain(given[name])}. "
-                f"{mend}, or start afresh."
-            )
+    _agree(own, given, _FORM, learner.shape)
     if _shapes(learner.policy.state_dict()) != _shapes(state["weights"]):
         raise BidexError(
             "Expected a policy to start from of the same kind (mtppo, mttrpo, promp and maml share one; mtsac and rl2 "
             "have their own, and policy heads another), got one with other weights. Name another run."
         )
+    if isinstance(getattr(learner.policy, "actor", None), SquashedActor):
+        # Its network speaks of a place between these bounds; a Gaussian one has its deviation as a weight.
+        _agree(own, given, ("std_range",), learner.shape)
     learner.policy.load_state_dict(state["weights"])
+
+
+def _agree(own: dict[str, Any], given: dict[str, Any], names: tuple[str, ...], shape: dict[str, int]) -> None:
+    """Refuses what is not alike in both, where both know it."""
+    for name in names:
+        if name in own and name in given and _plain(own[name]) != _plain(given[name]):
+            flag = f"--learner.{name.replace('_', '-')}"
+            mend = f"Add {flag} as there" if name not in shape else "Name a run on the same observations"
+            raise BidexError(
+                f"Expected a policy to start from with {name} = {_plain(own[name])}, got {_plain(given[name])}. "
+                f"{mend}, or start afresh."
+            )
 
 
 def _plain(value: Any) -> Any:

@@ -48,7 +48,9 @@ def main(arguments: Sequence[str]) -> None:
         print(json.dumps([_row(group, groups[0]) for group in groups], indent=2))
         return
     print_table(plain_table(["group", "seeds", "steps", "hours", *_MEASURES], [_line(g, groups[0]) for g in groups]))
-    print_table(plain_table(["group", "measure", *groups[0].classes], [row for g in groups for row in _classes(g)]))
+    names = list(dict.fromkeys(name for group in groups for name in group.classes))
+    rows = [row for group in groups for row in _classes(group, names)]
+    print_table(plain_table(["group", "measure", *names], rows))
     print("IQM over seeds and classes [95 % bootstrap over seeds]. An interval that holds 0 is no difference.")
 
 
@@ -63,7 +65,7 @@ def _row(group: "Group", first: "Group") -> dict[str, Any]:
     }  # fmt: skip
     for name, own, other in (("success", group.success, first.success), ("score", group.scores, first.scores)):
         row[f"{name}_iqm"] = None if own is None else vars(iqm(own))
-        over = _over(own, other)
+        over = _over(own, other) if _comparable(group, first) else None
         row[f"{name}_over_first"] = None if over is None or group is first else vars(over)
     row["classes"] = {
         name: {"success": group.success[:, i].tolist(), "return": group.returns[:, i].tolist()}
@@ -84,9 +86,14 @@ def _line(group: "Group", first: "Group") -> list[object]:
         (group.success, first.success, 100.0, " %"),
         (group.scores, first.scores, 1.0, ""),
     ):
-        over = _over(own, other)
+        over = _over(own, other) if _comparable(group, first) else None
         cells.append("–" if over is None else _ranged(over, factor, unit, sign=True))
     return cells
+
+
+def _comparable(group: "Group", first: "Group") -> bool:
+    """Whether both have the same classes: means over different ones have no difference."""
+    return set(group.classes) == set(first.classes)
 
 
 def _over(own: "np.ndarray | None", other: "np.ndarray | None") -> "Estimate | None":
@@ -96,15 +103,15 @@ def _over(own: "np.ndarray | None", other: "np.ndarray | None") -> "Estimate | N
     return None if own is None or other is None else iqm_difference(own, other)
 
 
-def _classes(group: "Group") -> list[list[object]]:
-    """Mean over seeds, and the seeds' range."""
+def _classes(group: "Group", names: Sequence[str]) -> list[list[object]]:
+    """Of each class by name: mean over seeds, and the seeds' range."""
     rows: list[list[object]] = []
     for name, values, factor, unit in (("success", group.success, 100.0, " %"), ("return", group.returns, 1.0, "")):
-        cells = [
-            f"{factor * column.mean():.4g}{unit} ({factor * column.min():.4g} to {factor * column.max():.4g})"
-            for column in values.T
-        ]
-        rows.append([group.label, name, *cells])
+        cells = {
+            of: f"{factor * column.mean():.4g}{unit} ({factor * column.min():.4g} to {factor * column.max():.4g})"
+            for of, column in zip(group.classes, values.T, strict=True)
+        }
+        rows.append([group.label, name, *(cells.get(of, "–") for of in names)])
     return rows
 
 

@@ -128,7 +128,7 @@ def _play(folder: "RunFolder", flags: ControlFlags) -> "Control":
     print(f"{folder.path}: {flags.trials} adaptations of each held-out task, {rows} rows.", file=sys.stderr, flush=True)
     test, train = (worlds.evaluation_world(config, split, rows) for split in ("test", "train"))
     found = control(
-        lambda: worlds.load_policy(folder, config["device"])[0],
+        worlds.policy_loader(folder, config["device"])[0],
         test,
         train,
         flags.shots,

@@ -112,10 +112,10 @@ def _meta_test(flags: EvaluateFlags, folder: Any, config: dict[str, Any]) -> Non
     splits = [name for name in known if flags.split in ("auto", "both", name)]
     seed = worlds.EVALUATION_SEED if flags.seed is None else flags.seed
     numbers = (flags.shots, flags.rollouts, flags.episodes, flags.tasks, flags.trials, flags.num_envs)
-    _, step = worlds.load_policy(folder, config["device"])
+    load, step = worlds.policy_loader(folder, config["device"])
     found = metatest.meta_test(
         config,
-        lambda: worlds.load_policy(folder, config["device"])[0],
+        load,
         metatest.Options(*numbers, seed),
         splits,
         lambda text: print(text, file=sys.stderr, flush=True),

@@ -78,13 +78,17 @@ def parse(options: type[Options], arguments: Sequence[str], command: str, defaul
 
 
 def peek(arguments: Sequence[str], flag: str) -> str | None:
-    """The value of ``flag`` before the real parse, which may need it to know its own defaults; None if not given."""
+    """The value of ``flag`` before the real parse, which may need it to know its own defaults; None if not given.
+
+    Of several the last, as in the real parse.
+    """
+    found = None
     for place, word in enumerate(arguments):
         if word == flag and place + 1 < len(arguments):
-            return arguments[place + 1]
+            found = arguments[place + 1]
         if word.startswith(f"{flag}="):
-            return word.partition("=")[2]
-    return None
+            found = word.partition("=")[2]
+    return found
 
 
 def _refuse(word: str, options: Any, command: str) -> NoReturn:

@@ -185,7 +185,8 @@ def _evaluate(plan: RunPlan, folder: Any, learner: Any) -> None:
     random = worlds.judge(plan.config, RandomAgent(world.action_space), world, episodes, seed)
     world.close()
     above = {name: asdict(difference) for name, difference in compare(trained, random).items()}
-    found = {"policy": trained.to_json(), "random": random.to_json(), "return_above_random": above}
+    found = {"run": str(folder.path), "steps": learner.env_steps, "split": "train", "seed": seed}
+    found |= {"policy": trained.to_json(), "random": random.to_json(), "return_above_random": above}
     write_json(folder.path / "evaluation.json", found)
     title = f"{plan.config['algo']} on {plan.config['suite'] or plan.config['task']}, {learner.env_steps:,} steps"
     print_table(evaluation_table(title, trained, random))

@@ -1,5 +1,6 @@
 """From a run's config to its worlds and policies: the commands' one way to either."""
 
+from collections.abc import Callable
 from typing import Any
 
 from bidex_meta.clients import metaworld
@@ -178,5 +179,18 @@ def load_policy(folder: RunFolder, device: str) -> tuple[Agent, int]:
     Raises:
         BidexError: The run has not saved a checkpoint yet.
     """
+    load, step = policy_loader(folder, device)
+    return load(), step
+
+
+def policy_loader(folder: RunFolder, device: str) -> tuple[Callable[[], Agent], int]:
+    """What makes the policy of a run's newest checkpoint anew, as often as it is asked, and that checkpoint's steps.
+
+    The checkpoint is read once: a run that trains on meanwhile gives no other.
+
+    Raises:
+        BidexError: The run has not saved a checkpoint yet.
+    """
     state, step = checkpoint(folder)
-    return learner_kind(folder.config()["algo"]).make.load_policy(state["learner"]["policy"], device), step
+    make = learner_kind(folder.config()["algo"]).make
+    return lambda: make.load_policy(state["learner"]["policy"], device), step

@@ -80,4 +80,4 @@ class Episodes:
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Puts back what ``state_dict`` gave."""
         for f in fields(self):
-            setattr(self, f.name, state[f.name].clone())
+            setattr(self, f.name, state[f.name].to(getattr(self, f.name).device, copy=True))

@@ -356,8 +356,9 @@ class World(VectorEnv):
         self._set_pools([replace(s, tasks=t.numpy()) for s, t in zip(self.slots, state["tasks"], strict=True)])
         self._seed_rows(int(state["seed"]))
         self.episodes.load_state_dict(state["episodes"])
-        self.task_index, self._action = state["task_index"].clone(), state["action"].clone()
-        self._obs = state["observation"].clone()
+        # Checkpoints are loaded to the CPU, wherever the world lives.
+        names = ("task_index", "action", "observation")
+        self.task_index, self._action, self._obs = (state[n].to(self.device, copy=True) for n in names)
         for part, engine in zip(self.parts, state["engines"], strict=True):
             part.group.engine.load_state_dict(engine)
         self._ready = True

@@ -212,7 +212,13 @@ def test_a_checkpoint_of_another_world_size_is_refused():
 
 
 def test_config_errors_name_the_field():
-    for field, value in (("epochs", 0), ("gamma", 1.5), ("std_range", (1.0, 0.5))):
+    for field, value in (
+        ("epochs", 0),
+        ("gamma", 1.5),
+        ("std_range", (1.0, 0.5)),
+        ("clip", -0.2),
+        ("max_grad_norm", -1.0),
+    ):
         with pytest.raises(BidexError, match=field):
             replace(SMALL, **{field: value})
     with pytest.raises(BidexError, match="num_envs"):

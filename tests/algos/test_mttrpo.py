@@ -61,6 +61,24 @@ def test_the_step_raises_the_surrogate():
     assert learner._update(learner._prepare()[0])["Loss/surrogate"] < 0
 
 
+def test_the_fisher_matrix_is_made_of_samples_of_all_rows():
+    world = ToyWorld([nearness(0.6), nearness(-0.6)], rows=4)
+    learner = ready(replace(SMALL, rollout_steps=8, fisher_stride=4), world)
+    batch, _ = learner._prepare()
+    weights = list(learner.policy.actor.parameters())
+    for row in range(4):  # with weight in this row alone there is still a curvature
+        batch.weights = (torch.arange(len(batch.obs)) % 4 == row).float()
+        slope = torch.autograd.grad(learner._kl_from_itself(batch), weights, create_graph=True, materialize_grads=True)
+        along = sum((s * torch.ones_like(s)).sum() for s in slope)
+        curved = torch.autograd.grad(along, weights, allow_unused=True)
+        assert sum(float(c.abs().sum()) for c in curved if c is not None) > 0
+
+
+def test_it_learns_with_hidden_layers_in_bfloat16():
+    learner = MTTRPO(ToyWorld([nearness(0.6)]), replace(SMALL, autocast="on"), seed=0)
+    assert learner.iterate()["Policy/kl"] <= 0.031
+
+
 def test_a_step_that_the_line_search_refuses_leaves_the_policy_alone():
     learner = ready(replace(SMALL, accept_ratio=1.0, backtracks=1, max_kl=1.0), ToyWorld([nearness(0.6)]))
     before = [p.detach().clone() for p in learner.policy.actor.parameters()]
@@ -101,7 +119,14 @@ def test_the_policy_alone_loads():
 
 
 def test_config_errors_name_the_field():
-    for field, value in (("cg_iterations", 0), ("max_kl", 0.0), ("backtrack_factor", 1.5), ("gamma", -1.0)):
+    for field, value in (
+        ("cg_iterations", 0),
+        ("max_kl", 0.0),
+        ("backtrack_factor", 1.5),
+        ("gamma", -1.0),
+        ("damping", -1.0),
+        ("init_std", 0.0),
+    ):
         with pytest.raises(BidexError, match=f"mttrpo: {field}"):
             replace(SMALL, **{field: value})
 

@@ -20,6 +20,17 @@ def test_gaussian_formulas_agree_with_torch_distributions(seed: int, actions: in
     assert_close(gaussian_entropy(log_p).expand(5), p.entropy())
 
 
+def test_heads_are_chosen_in_float32_under_autocast():
+    actor = GaussianActor(5, (8,), 3, 0.8, torch.Generator().manual_seed(0), heads=2)
+    with torch.no_grad():
+        actor.log_std += torch.linspace(0.0, 1.0, 6).view(2, 3)
+    obs = torch.cat([torch.randn(4, 3), torch.eye(2).repeat(2, 1)], dim=1)
+    expected = actor.log_std_of(obs)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert actor(obs).dtype == torch.float32
+        assert torch.equal(actor.log_std_of(obs), expected)
+
+
 def test_initial_weights_follow_the_seed_and_leave_the_global_generator_alone():
     before = torch.random.get_rng_state()
     nets = [GaussianActor(7, (16, 8), 3, 0.8, torch.Generator().manual_seed(s)) for s in (0, 0, 1)]

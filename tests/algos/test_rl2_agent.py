@@ -78,6 +78,12 @@ def test_rows_that_play_no_episode_learn_nothing():
     obs, reward, terminated, truncated, _ = world.step(action)
     agent.step(Timestep(obs, action, reward, terminated, truncated, aux, obs, some))
     assert torch.equal(state_of(agent).any(1), some)
+    agent.reset(everyone(world))  # an evaluation
+    before = state_of(agent)
+    agent.reset(some)
+    action, aux = agent.adapt_action(obs)
+    agent.step(Timestep(obs, action, reward, terminated, truncated, aux, obs, some))
+    assert torch.equal((state_of(agent) != before).any(1), some)
 
 
 def test_the_agent_plays_the_trial_that_the_training_played():

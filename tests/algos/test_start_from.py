@@ -60,6 +60,15 @@ def test_the_tuned_presets_fit_what_mtppo_learns_on_a_laptop(presets):
         assert getattr(tuned, name) == getattr(given, name)
 
 
+def test_a_squashed_policy_must_have_the_same_bounds():
+    config = MTSACConfig(hidden=(8,), activation="tanh", normalise_observations=True, replay_steps=8)
+    world = PointGoals(rows=16, autoreset_mode="SAME_STEP")
+    state = MTSAC(world, config, seed=0).policy_state_dict()
+    start_from(MTSAC(world, config, seed=1), state)
+    with pytest.raises(BidexError, match=r"std_range = \[0.01, 3.0\], got \[0.02, 2.0\]"):
+        start_from(MTSAC(world, replace(config, std_range=(0.01, 3.0)), seed=1), state)
+
+
 def test_another_kind_of_policy_is_refused():
     config = MTSACConfig(hidden=(8,), activation="tanh", normalise_observations=True, replay_steps=8)
     learner = MTSAC(PointGoals(rows=16, autoreset_mode="SAME_STEP"), config, seed=0)
