@@ -44,6 +44,11 @@ def store(kind: Kind, classes: dict[str, dict[str, Any]], made: dict[str, Any], 
 
 
 def references() -> dict[str, Reference]:
-    """The classes of which both ends are known, and the expert is above random actions: else a score means nothing."""
-    low, high = ({name: row["return"] for name, row in load(kind).items()} for kind in ("random", "expert"))
-    return {name: Reference(low[name], high[name]) for name in low if high.get(name, low[name]) > low[name]}
+    """The classes of which both ends are known, and the expert is above random and zero actions.
+
+    Else a score means nothing.
+    """
+    kinds: tuple[Kind, ...] = ("random", "zero", "expert")
+    low, zero, high = ({name: row["return"] for name, row in load(kind).items()} for kind in kinds)
+    idle = {name: max(low[name], zero.get(name, low[name])) for name in low}
+    return {name: Reference(low[name], high[name]) for name in low if high.get(name, idle[name]) > idle[name]}
