@@ -105,7 +105,7 @@ class MTTRPO(OnPolicy):
         sample = torch.arange(len(batch.obs), device=self.device)
         # The samples are steps by rows. A later step begins at a later row, else rows between would never be taken.
         taken = (sample + sample // rows) % self.config.fisher_stride == 0
-        obs, weight = batch.obs[taken].float(), batch.weights[taken]
+        obs, weight = batch.obs[taken].to(actor.log_std.dtype), batch.weights[taken]
         mean, log_std = actor(obs), actor.log_std_of(obs)
         kl = gaussian_kl(mean.detach(), log_std.detach(), mean, log_std)
         return (weight / all_sum(weight.sum()).clamp_min(1.0) * kl).sum()
