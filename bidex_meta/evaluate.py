@@ -19,8 +19,13 @@ from bidex_meta.errors import BidexError
 Interval = tuple[float, float]
 """Lower and upper end of a 95 % bootstrap interval."""
 
+EVALUATION_SEED = 1_000_000
+"""Seed of the starts in evaluation: not a seed anybody trains with, so that they are new to the policy."""
+
 RESAMPLES = 2000
 BOOTSTRAP_SEED = 0
+MANY_TASKS = 10
+"""From so many tasks on, intervals resample tasks instead of episodes."""
 
 
 class ZeroAgent:
@@ -119,13 +124,22 @@ class ClassResult:
             return None
         return 100 * (self.returns - reference.random) / (reference.expert - reference.random)
 
+    def drawn(self, values: np.ndarray) -> np.ndarray:
+        """``values`` (episodes,) as a bootstrap may resample them: means of tasks; of few tasks as they are.
+
+        Episodes of a task are alike; where a class draws no starts (doors, Switch) a policy's are all the same, and
+        counted singly they would feign precision.
+        """
+        names, task = np.unique(self.tasks, return_inverse=True)
+        return values if len(names) < MANY_TASKS else np.bincount(task, values) / np.bincount(task)
+
     def to_json(self) -> dict[str, Any]:
         """Numbers of this class, ready for JSON."""
         return {
             "success": self.success,
-            "success_interval": bootstrap_interval(_mean, self.successes),
+            "success_interval": bootstrap_interval(_mean, self.drawn(self.successes)),
             "return": self.mean_return,
-            "return_interval": bootstrap_interval(_mean, self.returns),
+            "return_interval": bootstrap_interval(_mean, self.drawn(self.returns)),
             "length": float(self.lengths.mean()),
             "score": self.score,
             "episodes": self.episodes,
@@ -149,8 +163,8 @@ class Evaluation:
             "episodes_per_task": self.episodes_per_task,
             "classes": {name: result.to_json() for name, result in self.classes.items()},
             "aggregate": {
-                "success": aggregate([result.successes for result in self.classes.values()]),
-                "score": aggregate([result.scores for result in self.classes.values()]),
+                "success": aggregate([result.drawn(result.successes) for result in self.classes.values()]),
+                "score": aggregate([_drawn_scores(result) for result in self.classes.values()]),
             },
         }
 
@@ -162,7 +176,7 @@ class Difference:
     value: float
     """Difference of the means."""
     interval: Interval | None
-    """95 % bootstrap interval, both policies' episodes resampled; None with fewer than two episodes."""
+    """95 % bootstrap interval, both policies' tasks (of few tasks: episodes) resampled; None with fewer than two."""
 
     @property
     def excludes_zero(self) -> bool:
@@ -245,7 +259,7 @@ def compare(a: Evaluation, b: Evaluation) -> dict[str, Difference]:
     """
     differences = {}
     for name in (name for name in a.classes if name in b.classes):
-        ours, theirs = a.classes[name].returns, b.classes[name].returns
+        ours, theirs = (result.drawn(result.returns) for result in (a.classes[name], b.classes[name]))
         interval = bootstrap_interval(_mean_difference, ours, theirs)
         differences[name] = Difference(float(ours.mean() - theirs.mean()), interval)
     return differences
@@ -255,8 +269,8 @@ def aggregate(samples: list[np.ndarray | None]) -> dict[str, Any] | None:
     """Mean and interquartile mean over classes of the classes' means, the mean with a bootstrap interval.
 
     Args:
-        samples: One array of episodes per class; None in any of them gives None, since a mean over some of the
-            classes would pass for one over all.
+        samples: One array per class, of tasks or episodes (``ClassResult.drawn``); None in any of them gives None,
+            since a mean over some of the classes would pass for one over all.
     """
     known = [sample for sample in samples if sample is not None]
     if not known or len(known) < len(samples):
@@ -276,7 +290,7 @@ def bootstrap_interval(statistic: Callable[..., Any], *samples: np.ndarray) -> I
 
     Args:
         statistic: Takes the samples and ``axis``, works along it.
-        samples: Arrays ``(episodes,)``.
+        samples: Arrays ``(tasks,)`` or ``(episodes,)``.
 
     Returns:
         Lower and upper end; None where a sample has fewer than two episodes. The same for the same input.
@@ -295,6 +309,11 @@ def bootstrap_interval(statistic: Callable[..., Any], *samples: np.ndarray) -> I
         rng=np.random.default_rng(BOOTSTRAP_SEED),
     )
     return float(result.confidence_interval.low), float(result.confidence_interval.high)
+
+
+def _drawn_scores(result: ClassResult) -> np.ndarray | None:
+    scores = result.scores
+    return None if scores is None else result.drawn(scores)
 
 
 def _mean(sample: np.ndarray, axis: int = -1) -> Any:

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from bidex_meta.agents import Agent, MetaLearningAgent, Timestep
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluate import Evaluation, Reference, check_world, play_tasks, quota, results_by_class
+from bidex_meta.evaluate import EVALUATION_SEED, Evaluation, Reference, check_world, play_tasks, quota, results_by_class
 from bidex_meta.gains import Gains, paired_gains
 from bidex_meta.portions import Portions, task_of_row
 
@@ -90,7 +90,7 @@ def meta_evaluate(
     tasks: int | None = None,
     trials: int = 1,
     max_adapt_steps: int = MAX_ADAPT_STEPS,
-    seed: int = 0,
+    seed: int = EVALUATION_SEED,
     references: Mapping[str, Reference] | None = None,
     adapt_world: Any = None,
     evaluated: Collection[int] | None = None,

@@ -293,6 +293,17 @@ def test_render_picture_and_film(monkeypatch, toy_worlds, tmp_path, capsys):
     assert "Did you mean 'Near'?" in capsys.readouterr().err
 
 
+def test_render_refuses_a_policy_of_other_observations(monkeypatch, toy_worlds, tmp_path, capsys):
+    monkeypatch.setattr(worlds, "check_names", lambda config: None)
+    assert run("--steps", 24, "--run-dir", tmp_path / "a", "--no-evaluate") == 0
+    flags = ["render", "--task", "Near", "--width", "64", "--height", "48", "--policy", str(tmp_path / "a")]
+    capsys.readouterr()
+    assert main([*flags, "--out", str(tmp_path / "a.png"), "--steps", "2"]) == 0
+    monkeypatch.setattr(worlds, "policy_shape", lambda folder: {"observations": 7, "actions": 1})
+    assert main([*flags, "--out", str(tmp_path / "b.png"), "--steps", "2"]) == 2
+    assert "takes 7 observations" in capsys.readouterr().err
+
+
 # List and bench.
 
 

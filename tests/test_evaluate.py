@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluate import (
+    MANY_TASKS,
     ClassResult,
     Evaluation,
     RandomAgent,
@@ -23,7 +24,9 @@ from tests.fakes import STEPS_OF_TASK, Seeker, ToyWorld
 
 def result(returns, reference=None):
     returns = np.asarray(returns, np.float64)
-    return ClassResult(returns, returns > 0, np.ones(len(returns), np.int64), np.zeros(len(returns)), 0, reference)
+    return ClassResult(
+        returns, returns > 0, np.ones(len(returns), np.int64), np.zeros(len(returns), np.int64), 0, reference
+    )
 
 
 def mean(sample, axis=-1):
@@ -120,6 +123,18 @@ def test_bootstrap_interval_holds_the_mean_and_moves_with_it(values, shift):
 
 def test_one_episode_has_no_interval():
     assert bootstrap_interval(mean, np.array([1.0])) is None
+
+
+@pytest.mark.parametrize("tasks", [5, MANY_TASKS, 50])
+def test_episodes_played_over_and_over_feign_no_precision(tasks):
+    """Four equal episodes of every task tell no more than one of each: unless tasks are few."""
+    task = np.tile(np.arange(tasks), 4)
+    once = np.random.default_rng(tasks).normal(3.0, 1.0, tasks)
+    found = ClassResult(once[task], once[task] > 3, np.ones(len(task), np.int64), task, 0)
+    single = ClassResult(once, once > 3, np.ones(tasks, np.int64), np.arange(tasks), 0)
+    same = found.to_json()["return_interval"] == pytest.approx(single.to_json()["return_interval"])
+    assert same == (tasks >= MANY_TASKS)
+    assert found.drawn(found.returns).mean() == pytest.approx(found.mean_return)
 
 
 def test_compare_tells_a_difference_from_noise():

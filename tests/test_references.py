@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from bidex_meta import references
+from bidex_meta import paths, references
 from bidex_meta.cli import main
 from bidex_meta.commands import experts, worlds
 from bidex_meta.errors import BidexError
@@ -103,3 +103,23 @@ def test_the_expert_is_the_best_of_witness_and_runs(
 def test_a_run_on_fixed_bases_is_no_expert_of_a_suite(tmp_path: Path) -> None:
     with pytest.raises(BidexError, match="moving bases"):
         experts.best_known([], [evaluated_run(tmp_path / "a", "HandOver", None, {"HandOver": 30.0})])
+
+
+def test_a_suite_with_fixed_bases_neither_has_nor_makes_references(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    suite = tmp_path / "mine.toml"
+    text = (paths.suites_dir() / "MT1.toml").read_text().replace('base = "moving"', 'base = "alone"')
+    suite.write_text(text.replace("CatchUnderarm", "HandOver"))
+    config = {"suite": str(suite), "task": None}
+    assert worlds.references_of(config) == {}
+    assert worlds.references_of({"suite": "MT1", "task": None}).keys() >= {"CatchUnderarm"}
+    assert main(["baseline", "zero", "--suite", str(suite), "--out", str(tmp_path / "zero.json")]) == 2
+    assert 'base = "moving"' in capsys.readouterr().err and not (tmp_path / "zero.json").exists()
+
+
+def test_a_meta_test_is_no_expert(tmp_path: Path) -> None:
+    run = evaluated_run(tmp_path / "a", None, "ML4", {})
+    (run / "evaluation.json").write_text(json.dumps({"splits": {}}))
+    with pytest.raises(BidexError, match="meta-test"):
+        experts.best_known([], [run])

@@ -72,13 +72,15 @@ def _expert(flags: BaselineFlags) -> None:
 def _measure(flags: BaselineFlags) -> None:
     from bidex_meta import references
     from bidex_meta.commands import worlds
-    from bidex_meta.evaluate import RandomAgent, ZeroAgent, evaluate
+    from bidex_meta.evaluate import EVALUATION_SEED, RandomAgent, ZeroAgent, evaluate
     from bidex_meta.record.versions import collect_versions
 
     config: dict[str, Any] = {"suite": flags.suite, "task": None, "seed": flags.seed, "device": "cpu"}
+    if not worlds.has_moving_bases(config):
+        raise BidexError(f'References are of moving bases, but {flags.suite} has fixed ones. Write base = "moving".')
     world = worlds.evaluation_world({**config, "threads": flags.threads})
     agent = RandomAgent(world.action_space, flags.seed) if flags.what == "random" else ZeroAgent(world.action_space)
-    found = evaluate(agent, world, flags.episodes, seed=worlds.EVALUATION_SEED)
+    found = evaluate(agent, world, flags.episodes, seed=EVALUATION_SEED)
     world.close()
     numbers = {name: result.to_json() for name, result in found.classes.items()}
     made = {"policy": _POLICIES[flags.what], "suite": flags.suite, "seed": flags.seed, "versions": collect_versions()}

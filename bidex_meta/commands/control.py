@@ -116,8 +116,8 @@ def _play(folder: "RunFolder", flags: ControlFlags) -> "Control":
     from bidex_meta.commands import metatest, worlds
     from bidex_meta.commands.learners import resolve_device
     from bidex_meta.control import control
+    from bidex_meta.evaluate import EVALUATION_SEED
     from bidex_meta.metatest import MAX_ADAPT_STEPS
-    from bidex_meta.references import references
 
     stored = folder.config()
     config = {**stored, "device": resolve_device(flags.device, stored["suite"]), "engine": flags.engine}
@@ -136,8 +136,8 @@ def _play(folder: "RunFolder", flags: ControlFlags) -> "Control":
         episodes_per_task=flags.episodes,
         trials=flags.trials,
         max_adapt_steps=config["learner"].get("max_adapt_steps", MAX_ADAPT_STEPS),
-        seed=worlds.EVALUATION_SEED if flags.seed is None else flags.seed,
-        references=references(),
+        seed=EVALUATION_SEED if flags.seed is None else flags.seed,
+        references=worlds.references_of(config),
     )
     test.close()
     train.close()

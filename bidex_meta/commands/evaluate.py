@@ -58,7 +58,7 @@ def main(arguments: Sequence[str]) -> None:
     from bidex_meta.commands import worlds
     from bidex_meta.commands.learners import learner_kind, resolve_device
     from bidex_meta.commands.tables import evaluation_table, print_table
-    from bidex_meta.evaluate import RandomAgent, compare
+    from bidex_meta.evaluate import EVALUATION_SEED, RandomAgent, compare
     from bidex_meta.record import RunFolder
 
     folder = RunFolder.open(flags.run)
@@ -73,7 +73,7 @@ def main(arguments: Sequence[str]) -> None:
     policy, step = worlds.load_policy(folder, config["device"])
     split = "train" if flags.split == "auto" else flags.split
     world = worlds.evaluation_world(config, split, flags.num_envs)
-    seed = worlds.EVALUATION_SEED if flags.seed is None else flags.seed
+    seed = EVALUATION_SEED if flags.seed is None else flags.seed
     found = worlds.judge(config, policy, world, flags.episodes, seed)
     random = None
     if flags.random:
@@ -102,6 +102,7 @@ def _meta_test(flags: EvaluateFlags, folder: Any, config: dict[str, Any]) -> Non
     import sys
 
     from bidex_meta.commands import metatest, worlds
+    from bidex_meta.evaluate import EVALUATION_SEED
 
     if flags.random:
         raise BidexError(f"{config['algo']} is compared with itself before adaptation. Leave --random out.")
@@ -110,7 +111,7 @@ def _meta_test(flags: EvaluateFlags, folder: Any, config: dict[str, Any]) -> Non
     if flags.split in ("train", "test") and flags.split not in known:
         raise BidexError(f"{config['suite'] or config['task']} has no {flags.split} tasks. Leave --split out.")
     splits = [name for name in known if flags.split in ("auto", "both", name)]
-    seed = worlds.EVALUATION_SEED if flags.seed is None else flags.seed
+    seed = EVALUATION_SEED if flags.seed is None else flags.seed
     numbers = (flags.shots, flags.rollouts, flags.episodes, flags.tasks, flags.trials, flags.num_envs)
     load, step = worlds.policy_loader(folder, config["device"])
     found = metatest.meta_test(

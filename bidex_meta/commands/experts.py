@@ -46,13 +46,20 @@ def _of_run(run: Path) -> list[tuple[str, dict[str, Any]]]:
     config, path = folder.config(), folder.path / "evaluation.json"
     if not has_moving_bases(config):
         raise BidexError(
-            f"Expected a run with moving bases, as suites have them, but {run} plays {config['task']} fixed."
+            f"Expected a run with moving bases, as suites have them, but {run} plays "
+            f"{config['task'] or config['suite']} with fixed ones."
         )
     if not path.is_file():
         raise BidexError(
             f"{run} has no evaluation.json. Let the run end, or write one: bidex-meta evaluate {run} --json > {path}"
         )
-    classes = json.loads(path.read_text())["policy"]["classes"]
+    found = json.loads(path.read_text())
+    if "policy" not in found:
+        raise BidexError(
+            f"Expected the evaluation of a policy, but {path} is a meta-test, whose policies are many. Name a run of "
+            "mtppo, mttrpo or mtsac."
+        )
+    classes = found["policy"]["classes"]
     source = (
         f"{config['algo']} on {config['suite'] or config['task']}, {config['steps']:,} steps, seed {config['seed']}"
     )

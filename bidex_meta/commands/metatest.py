@@ -9,6 +9,7 @@ from bidex_meta.clients import metaworld
 from bidex_meta.commands import worlds
 from bidex_meta.commands.learners import learner_kind
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluate import EVALUATION_SEED
 from bidex_meta.suite import load_suite
 
 SHOTS = 1
@@ -40,7 +41,7 @@ class Options:
     episodes of a single adaptation says nothing of another."""
     num_envs: int | None = None
     """Rows stepped together at most."""
-    seed: int = worlds.EVALUATION_SEED
+    seed: int = EVALUATION_SEED
     """Of all starts."""
 
 
@@ -67,7 +68,6 @@ def meta_test(
         BidexError: The suite shows its tasks, or a number is out of range.
     """
     from bidex_meta.metatest import MAX_ADAPT_STEPS, meta_evaluate
-    from bidex_meta.references import references
 
     check_suite(config)
     check_numbers(options, "rollouts", "episodes", "tasks", "trials", "num_envs")
@@ -98,7 +98,7 @@ def meta_test(
             trials=trials,
             max_adapt_steps=config["learner"].get("max_adapt_steps", MAX_ADAPT_STEPS),
             seed=options.seed,
-            references=references(),
+            references=worlds.references_of(config),
             split=split,
         )
         world.close()

@@ -70,7 +70,7 @@ def _config(flags: RenderFlags) -> dict[str, Any]:
         from bidex_meta.record import RunFolder
 
         stored = RunFolder.open(Path(flags.policy)).config()
-        config |= {"suite": flags.suite or stored["suite"]}
+        config |= {"suite": flags.suite or stored["suite"], "base": stored.get("base", "own")}
     return {**config, "device": "cpu", "seed": flags.seed}
 
 
@@ -99,10 +99,20 @@ def _policy(flags: RenderFlags, world: Any, config: dict[str, Any]) -> Any:
         return ZeroAgent(world.action_space)
     if flags.policy == "random":
         return RandomAgent(world.action_space, flags.seed)
-    from bidex_meta.commands.worlds import load_policy
+    from bidex_meta.commands.worlds import load_policy, policy_shape
     from bidex_meta.record import RunFolder
 
-    return load_policy(RunFolder.open(Path(flags.policy)), config["device"])[0]
+    folder = RunFolder.open(Path(flags.policy))
+    policy, shape = load_policy(folder, config["device"])[0], policy_shape(folder)
+    spaces = {"observations": world.single_observation_space, "actions": world.single_action_space}
+    given = {name: space.shape[0] for name, space in spaces.items()}
+    if any(shape.get(name, size) != size for name, size in given.items()):
+        raise BidexError(
+            f"The policy of {flags.policy} takes {shape['observations']} observations and gives {shape['actions']} "
+            f"actions, but here are {given['observations']} and {given['actions']}. Leave --suite out, or name the "
+            "policy's own."
+        )
+    return policy
 
 
 def _episode(flags: RenderFlags, world: Any, policy: Any, row: int, film: bool) -> Iterator[Any]:
@@ -113,6 +123,7 @@ def _episode(flags: RenderFlags, world: Any, policy: Any, row: int, film: bool) 
         return world.render(row=row, width=flags.width, height=flags.height, camera=flags.camera)
 
     obs, _ = world.reset(seed=flags.seed)
+    policy.reset(obs.new_ones(len(obs), dtype=bool))
     for _ in range(steps):
         if film:
             yield look()

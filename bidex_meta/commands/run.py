@@ -175,12 +175,12 @@ def _evaluate(plan: RunPlan, folder: Any, learner: Any) -> None:
         return
     from bidex_meta.commands import worlds
     from bidex_meta.commands.tables import evaluation_table, print_table
-    from bidex_meta.evaluate import RandomAgent, compare
+    from bidex_meta.evaluate import EVALUATION_SEED, RandomAgent, compare
     from bidex_meta.record.atomic import write_json
 
     episodes = plan.flags.episodes or worlds.default_episodes(plan.config)
     _say(f"Evaluating: {episodes} episode{'s' * (episodes > 1)} of each task, and as many of a random policy.")
-    world, seed = worlds.evaluation_world(plan.config), worlds.EVALUATION_SEED
+    world, seed = worlds.evaluation_world(plan.config), EVALUATION_SEED
     trained = worlds.judge(plan.config, learner, world, episodes, seed)
     random = worlds.judge(plan.config, RandomAgent(world.action_space), world, episodes, seed)
     world.close()

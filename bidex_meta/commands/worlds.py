@@ -7,11 +7,8 @@ from bidex_meta.clients import metaworld
 from bidex_meta.commands.launch import launch
 from bidex_meta.commands.learners import learner_kind
 from bidex_meta.errors import BidexError, unknown_name
-from bidex_meta.evaluate import Agent, Evaluation
+from bidex_meta.evaluate import Agent, Evaluation, Reference
 from bidex_meta.record import RunFolder
-
-EVALUATION_SEED = 1_000_000
-"""Seed of the starts in evaluation: not a seed anybody trains with, so that they are new to the policy."""
 
 _TASKS_ALONE = 50
 """Tasks that are drawn for a class on its own."""
@@ -98,19 +95,27 @@ def judge(config: dict[str, Any], agent: Agent, world: Any, episodes: int | None
 
         return evaluate_all_tasks(agent, world, episodes, seed=seed)
     from bidex_meta.evaluate import evaluate
+
+    return evaluate(agent, world, episodes, seed=seed, references=references_of(config))
+
+
+def references_of(config: dict[str, Any]) -> dict[str, Reference]:
+    """The references of the normalised score, of which those of other bases are none."""
     from bidex_meta.references import references
 
-    known = references() if has_moving_bases(config) else {}
-    return evaluate(agent, world, episodes, seed=seed, references=known)
+    return references() if has_moving_bases(config) else {}
 
 
 def has_moving_bases(config: dict[str, Any]) -> bool:
-    """Whether a run's hands move as those of the suites do, and of the references."""
-    if config["task"] is None:
-        return True
+    """Whether a run's hands move as those of the shipped suites do, and of the references."""
     from bidex_meta.tasks import registry
 
-    return registry.get(config["task"], _asked_base(config)).moving_base
+    if config["task"] is not None:
+        return registry.get(config["task"], _asked_base(config)).moving_base
+    from bidex_meta.suite import load_suite
+
+    suite = load_suite(config["suite"])
+    return suite.base == "moving" or all(registry.get(entry.name).moving_base for entry in suite.classes)
 
 
 def _asked_base(config: dict[str, Any]) -> bool | None:
@@ -181,6 +186,11 @@ def load_policy(folder: RunFolder, device: str) -> tuple[Agent, int]:
     """
     load, step = policy_loader(folder, device)
     return load(), step
+
+
+def policy_shape(folder: RunFolder) -> dict[str, int]:
+    """Numbers of ``observations`` and ``actions`` of a run's policy."""
+    return checkpoint(folder)[0]["learner"]["policy"]["shape"]
 
 
 def policy_loader(folder: RunFolder, device: str) -> tuple[Callable[[], Agent], int]:

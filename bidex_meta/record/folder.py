@@ -22,6 +22,9 @@ from bidex_meta.record.atomic import remove_leftovers, write_json
 from bidex_meta.record.checkpoints import Checkpoints
 from bidex_meta.record.versions import collect_versions
 
+_KEYS = ("suite", "task", "algo", "seed")
+"""What every run's config holds."""
+
 
 @dataclass(frozen=True)
 class RunFolder:
@@ -94,12 +97,16 @@ class RunFolder:
         """The resolved config.
 
         Raises:
-            BidexError: ``config.json`` is not valid JSON.
+            BidexError: ``config.json`` is not valid JSON, or not a run's.
         """
         try:
-            return json.loads(self.config_path.read_text())
+            config = json.loads(self.config_path.read_text())
         except json.JSONDecodeError as error:
             raise BidexError(f"{self.config_path} is not valid JSON: {error}.") from None
+        missing = [name for name in _KEYS if not isinstance(config, dict) or name not in config]
+        if missing:
+            raise BidexError(f"{self.config_path} is not a run's config: it lacks {', '.join(missing)}. Name a run.")
+        return config
 
     def change_config(self, config: dict[str, Any]) -> None:
         """Replace ``config.json``, atomically."""

@@ -25,7 +25,7 @@ def plot_learning_curves(metrics_path: Path, out: Path) -> None:
         out: The picture to write; its ending names the format.
 
     Raises:
-        BidexError: matplotlib is missing, or no episode has been logged yet.
+        BidexError: matplotlib is missing or does not know the ending, or no episode has been logged yet.
     """
     make_figure = _figure()
     rows = read_metrics(metrics_path)
@@ -51,8 +51,7 @@ def plot_learning_curves(metrics_path: Path, out: Path) -> None:
                 axis.set_xlabel("environment steps (millions)")
             if place % columns == 0:
                 axis.set_ylabel(label)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out, dpi=120)
+    _save(figure, out)
 
 
 def plot_adaptation(evaluation_path: Path, out: Path) -> None:
@@ -65,16 +64,17 @@ def plot_adaptation(evaluation_path: Path, out: Path) -> None:
         out: The picture to write; its ending names the format.
 
     Raises:
-        BidexError: matplotlib is missing, or the file holds no meta-test.
+        BidexError: matplotlib is missing or does not know the ending, or the file holds no meta-test.
     """
     make_figure = _figure()
     again = f"Write one: bidex-meta evaluate RUN --shots 3 --json > {evaluation_path}"
     if not evaluation_path.is_file():
         raise BidexError(f"There is no {evaluation_path}. {again}")
     try:
-        splits = json.loads(evaluation_path.read_text()).get("splits")
+        found = json.loads(evaluation_path.read_text())
     except ValueError:
         raise BidexError(f"{evaluation_path} is not JSON. {again}") from None
+    splits = found.get("splits") if isinstance(found, dict) else None
     if not splits:
         raise BidexError(f"{evaluation_path} holds no meta-test: its learner does not adapt, or it is older. {again}")
     grids = {split: _grid(len(part["before"]["classes"])) for split, part in splits.items()}
@@ -96,8 +96,7 @@ def plot_adaptation(evaluation_path: Path, out: Path) -> None:
                     axis.set_ylabel(measure)
             axes[row, place % grids[split][0]].set_title(f"{split}: {name}", fontsize=10)
         first += grids[split][1]
-    out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out, dpi=120)
+    _save(figure, out)
 
 
 def _draw_shots(axis: Any, rows: list[dict[str, Any]], measure: str, colour: str | None) -> None:
@@ -120,6 +119,14 @@ def _figure() -> Any:
     except ImportError:
         raise BidexError("Plots need matplotlib: pip install 'bidex-meta[plot]'.") from None
     return Figure
+
+
+def _save(figure: Any, out: Path) -> None:
+    known = figure.canvas.get_supported_filetypes()
+    if out.suffix[1:].lower() not in known:
+        raise BidexError(f"Expected a picture's ending ({', '.join(sorted(known))}), got {out.name!r}. Name it .png.")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(out, dpi=120)
 
 
 def _grid(panels: int) -> tuple[int, int]:

@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
-from bidex_meta.maths import multiply, rotate, xyzw
+from bidex_meta.maths import conjugate, multiply, rotate, xyzw
 from bidex_meta.tasks.base import FAST, TaskClass
-from bidex_meta.tasks.goals import frozen_goal, observe_goal
 from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, place, placed, yaw_quaternion
 from bidex_meta.tasks.reach import reach
@@ -32,15 +31,19 @@ class OpenScissors(TaskClass):
     Observation: Table 30 (428). Reward: equation 14. Success: the hinge within 0.1 rad of the target angle.
     The formula leaves the target angle open: a task freezes it (0 is 34 degrees open; shut, where episodes start, is
     -0.59). The object pose is that of the left hand's half. The goal block is of the half that moves: its handle's
-    point and its orientation at the target angle, the other half lying at the task's start place; the rotation
-    difference is that half's too. Loops are hollow, so that fingers enter them; the original's are filled.
+    point and its orientation at the target angle, with the other half where it is now; the rotation difference is
+    that half's too, so that it shows the missing angle. Were the other half taken at the task's start place, tasks
+    with different angles would share a block. Loops are hollow, so that fingers enter them; the original's are filled.
     """
 
     name = "OpenScissors"
     summary = "Open shears to a given angle with both hands"
     formula = "2 - d_left - d_right + 5 (0.59 - r), r the angle between the hinge and its target"
     solved = "hinge within 0.1 rad of its target"
-    deviations = ("The loops are hollow; the original's are filled.",)
+    deviations = (
+        "The loops are hollow; the original's are filled.",
+        "The goal block moves with the shears.",
+    )
     episode_steps = 150
     right = HandPose((0.55, 0.2, 0.8), PALM_DOWN_AHEAD)
     left = HandPose((0.55, -0.2, 0.8), PALM_DOWN_AHEAD)
@@ -72,17 +75,12 @@ class OpenScissors(TaskClass):
         _SCISSORS.add_to(scene)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """``scissors``: place (n, 3); ``target``: angle (n, 1); ``goal``: pose (n, 7); ``goal_inverse`` (n, 4)."""
+        """``scissors``: place (n, 3); ``target``: angle (n, 1); ``turn``: quaternion (n, 4); ``ghost``: pose (n, 7)."""
         root = variation.new_tensor((*_SCISSORS.position, *_SCISSORS.quaternion)).repeat(len(variation), 1)
         place(root, variation[:, :3])
-        rotation = multiply(xyzw(root[:, 3:]), yaw_quaternion(variation[:, 3]))
-        pivot = root[:, :3] + rotate(xyzw(root[:, 3:]), root.new_tensor(_PIVOT))
-        handle = pivot + rotate(rotation, root.new_tensor(_RIGHT_HANDLE))
-        return {
-            "scissors": variation[:, :3],
-            "target": variation[:, 3:],
-            **frozen_goal(torch.cat((handle, rotation), dim=1)),
-        }
+        turn = yaw_quaternion(variation[:, 3])
+        ghost = _opened(root[:, :3], xyzw(root[:, 3:]), turn)
+        return {"scissors": variation[:, :3], "target": variation[:, 3:], "turn": turn, "ghost": ghost}
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
         """The scissors on the table, shut."""
@@ -91,7 +89,10 @@ class OpenScissors(TaskClass):
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         """The goal blocks."""
-        return observe_goal(state, "scissors/half_quaternion")
+        rotation = state.quaternion("scissors/quaternion")
+        goal = _opened(state["scissors/position"], rotation, state.frozen["turn"])
+        missing = multiply(state.quaternion("scissors/half_quaternion"), conjugate(goal[:, 3:]))
+        return {"goal_pose": goal, "goal_rotation_difference": missing}
 
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
         """Equation 14: ``left`` -d_left, ``right`` -d_right, ``target`` 5 (0.59 - d_target), ``constant`` 2."""
@@ -106,7 +107,20 @@ class OpenScissors(TaskClass):
 
     def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
         """Where the right handle's point shall be."""
-        return [(frozen["goal"], _GHOST)]
+        return [(frozen["ghost"], _GHOST)]
+
+
+def _opened(position: Tensor, rotation: Tensor, turn: Tensor) -> Tensor:
+    """Pose (n, 7) of the right handle's point on the half that moves, opened by ``turn`` from the other half.
+
+    Args:
+        position: Of the left hand's half (n, 3), metres.
+        rotation: Of that half (n, 4), (x, y, z, w).
+        turn: Rotation of the hinge (n, 4), (x, y, z, w).
+    """
+    opened = multiply(rotation, turn)
+    pivot = position + rotate(rotation, position.new_tensor(_PIVOT))
+    return torch.cat((pivot + rotate(opened, position.new_tensor(_RIGHT_HANDLE)), opened), dim=1)
 
 
 def _missing(state: TaskState) -> Tensor:

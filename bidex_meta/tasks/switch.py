@@ -45,7 +45,10 @@ class Switch(TaskClass):
     summary = "Press the buttons of two rocker switches"
     formula = "2 - d_left - d_right + 50 (1.4 - d), d the sum of both buttons' distances to where they are pressed"
     solved = "both rockers past 80 % of their travel"
-    deviations = ("A button's target is its own point at full travel; the original asks for a height it cannot reach.",)
+    deviations = (
+        "A button's target is its own point at full travel; the original asks for a height it cannot reach.",
+        "Tasks shift the housings, but do not turn them.",
+    )
     episode_steps = 125
     right = HandPose((0.55, 0.2, 0.8), PALM_DOWN_AHEAD)
     left = HandPose((0.55, -0.2, 0.8), PALM_DOWN_AHEAD)

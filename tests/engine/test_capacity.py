@@ -24,6 +24,15 @@ def test_room_exceeds_what_was_seen(name: str) -> None:
     assert room.convex <= room.contacts
 
 
+def test_more_water_gets_more_room() -> None:
+    """Against the most that was seen with 125 drops."""
+    few, many = (compile_scene(registry.get("PourWater", True, water=water)).model for water in (12, 125))
+    room = capacity_of([many])
+    assert room.contacts > 255 and room.convex > 129 and room.rows > 282
+    assert capacity_of([few]) == capacity_of([model("PourWater")])
+    assert capacity_of([few, many]) == room
+
+
 def test_a_group_gets_the_largest_room_of_its_classes_and_a_stranger_that_of_all() -> None:
     assert capacity_of([model("CatchUnderarm"), model("HandOver")]) == Capacity(48, 12, 96)
     stranger = mujoco.MjModel.from_xml_string("<mujoco model='ball'><worldbody/></mujoco>")

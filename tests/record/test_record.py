@@ -7,7 +7,7 @@ import pytest
 
 from bidex_meta.errors import BidexError
 from bidex_meta.record import MetricsWriter, Progress, RunFolder, read_metrics
-from bidex_meta.record.plots import plot_learning_curves
+from bidex_meta.record.plots import plot_adaptation, plot_learning_curves
 from bidex_meta.record.video import check_suffix, write_image, write_video
 
 CONFIG = {"suite": "MT4", "task": None, "algo": "mtppo", "seed": 3, "learner": {"hidden": [8]}}
@@ -119,6 +119,27 @@ def test_curves_are_drawn_and_an_empty_run_says_so(tmp_path):
     metrics.write_text("".join(json.dumps(row) + "\n" for row in rows))
     plot_learning_curves(metrics, tmp_path / "new" / "c.png")
     assert (tmp_path / "new" / "c.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_an_ending_that_is_no_pictures_is_one_line(tmp_path):
+    metrics = tmp_path / "metrics.jsonl"
+    metrics.write_text(json.dumps({"step": 1, "time": 1.0, "Train/return/Near": 2.0}) + "\n")
+    with pytest.raises(BidexError, match=r"png.*got 'c\.txt'"):
+        plot_learning_curves(metrics, tmp_path / "c.txt")
+
+
+@pytest.mark.parametrize("text", ["[1]", "{}"])
+def test_a_file_without_a_meta_test_is_one_line(text, tmp_path):
+    (tmp_path / "evaluation.json").write_text(text)
+    with pytest.raises(BidexError, match="holds no meta-test"):
+        plot_adaptation(tmp_path / "evaluation.json", tmp_path / "c.png")
+
+
+@pytest.mark.parametrize("text", ["[]", '{"algo": "mtppo"}'])
+def test_a_config_that_is_no_runs_is_one_line(text, tmp_path):
+    (tmp_path / "config.json").write_text(text)
+    with pytest.raises(BidexError, match=r"lacks .*seed"):
+        RunFolder.open(tmp_path).config()
 
 
 def test_missing_matplotlib_names_the_extra(tmp_path, monkeypatch):

@@ -116,7 +116,7 @@ class OpenScissors(Oracle):
         }
 
     def goals(self, data: mujoco.MjData, task: Task) -> dict[str, Goal]:
-        base, target = start(data, "scissors", task), task["target_angle"]
+        base, target = frame(data, "scissors/object"), task["target_angle"]
         return {"goal": (self.right(base, target), base[1] * about_z(target))}
 
     def judge(self, data: mujoco.MjData, task: Task) -> Judgement:

@@ -57,6 +57,17 @@ def test_tasks_are_told_apart_exactly_where_they_should_be(name: str, moving: bo
         assert differs[enters].all(), np.array(changed)[enters & ~differs]
 
 
+def test_shears_show_the_angle_that_is_missing() -> None:
+    """Two tasks whose opened handle, the shears at their nominal places, lies alike: the angle must tell them apart."""
+    tasks = np.array([[0.00147, -0.01415, -0.15, 0.30], [-0.00147, 0.01415, 0.26, -0.11]])
+    world = world_of("OpenScissors", True, 2, tasks=tasks, observation="plain")
+    world.reset(seed=3)
+    engine = engine_of(world)
+    engine.reset(torch.ones(2, dtype=torch.bool), engine.placement()[:1].repeat(2, 1))
+    obs, reward, *_ = world.step(torch.zeros(2, world.action_size))
+    assert reward[0] != reward[1] and (obs[0] - obs[1]).abs().max() > 0.05
+
+
 @each_case
 def test_what_differs_are_goal_entries(name: str, moving: bool) -> None:
     _, obs, _ = twins(name, moving, "plain")
