@@ -86,6 +86,8 @@ def _read(plan: RunPlan) -> Checkpoint | None:
         from bidex_meta.commands.metatest import check_suite
 
         check_suite(plan.config)
+    if plan.folder is None and plan.config["start_from"] is not None:
+        _policy_to_start_from(plan)  # refused now rather than when the world has been built
     return plan.folder.checkpoints.load() if plan.folder else None
 
 
@@ -123,7 +125,7 @@ def _make(plan: RunPlan, fresh: bool) -> tuple[Any, Any, Any]:
     world = worlds.training_world(plan.config, plan.kind.autoreset(plan.config["learner"]))
     learner = plan.kind.make(world, plan.learner_config, plan.config["seed"])
     if fresh and plan.config["start_from"] is not None:
-        state, step = worlds.checkpoint(RunFolder.open(Path(plan.config["start_from"])))
+        state, step = _policy_to_start_from(plan)
         shared("start_from").start_from(learner, state["learner"]["policy"])
         _say(f"Starting from the policy of {plan.config['start_from']} at {step:,} steps.")
     if launch().rank > 0:
@@ -132,6 +134,13 @@ def _make(plan: RunPlan, fresh: bool) -> tuple[Any, Any, Any]:
     if folder.config() != plan.config:
         folder.change_config(plan.config)  # a resumed run with more steps
     return world, learner, folder
+
+
+def _policy_to_start_from(plan: RunPlan) -> Checkpoint:
+    from bidex_meta.commands import worlds
+    from bidex_meta.record import RunFolder
+
+    return worlds.checkpoint(RunFolder.open(Path(plan.config["start_from"])))
 
 
 def _train(plan: RunPlan, folder: Any, world: Any, learner: Any, loaded: Checkpoint | None) -> bool:
