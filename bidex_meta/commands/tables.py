@@ -25,7 +25,7 @@ def evaluation_table(
         gains: What adaptation gained.
     """
     table = Table(title=title, title_justify="left", caption_justify="left")
-    table.caption = "[..] 95 % bootstrap interval over episodes; success: at any step of the episode"
+    table.caption = "[..] 95 % bootstrap interval over tasks (of few: episodes); success: at any step of the episode"
     table.add_column("task")
     headers = ["episodes", "length", "success", "return [95 %]", "score"]
     if random is not None:
