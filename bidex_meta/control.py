@@ -33,7 +33,15 @@ class Control:
     """Per class which adaptation each episode followed, ``(episodes,)``, as in ``MetaEvaluation``."""
 
 
-def control(load: Callable[[], Agent], test_world: Any, train_world: Any, shots: int = 1, **played: Any) -> Control:
+def control(
+    load: Callable[[], Agent],
+    test_world: Any,
+    train_world: Any,
+    shots: int = 1,
+    *,
+    say: Callable[[str], None] = lambda line: None,
+    **played: Any,
+) -> Control:
     """Play all arms.
 
     Args:
@@ -41,6 +49,7 @@ def control(load: Callable[[], Agent], test_world: Any, train_world: Any, shots:
         test_world: The held-out tasks, in autoreset mode DISABLED.
         train_world: The train tasks of the same classes, with as many rows. Its pools are replaced.
         shots: How often each arm adapts.
+        say: Told the mean returns of each arm when it has been played, which may take minutes.
         played: ``rollouts``, ``episodes_per_task``, ``trials``, ``max_adapt_steps``, ``seed`` and ``references`` of
             ``meta_evaluate``.
 
@@ -54,13 +63,19 @@ def control(load: Callable[[], Agent], test_world: Any, train_world: Any, shots:
         )
     pools = [slot.tasks for slot in train_world.slots]
     own = meta_evaluate(load(), test_world, shots, evaluated=(0, shots), **played)
+    say(f"before: {_returns(own.before)}; adapted to own data: {_returns(own.after)}")
     foreign = []
     for number in range(max(map(len, pools))):
         sizes = zip(train_world.task_names, pools, test_world.num_slot_tasks, strict=True)
         train_world.set_tasks({name: np.repeat(pool[[number % len(pool)]], n, axis=0) for name, pool, n in sizes})
         found = meta_evaluate(load(), test_world, shots, adapt_world=train_world, evaluated=(shots,), **played)
         foreign.append(found.after)
+        say(f"adapted to data of train task {number + 1} of {max(map(len, pools))}: {_returns(found.after)}")
     return Control(own.before, own.after, foreign, own.adaptations)
+
+
+def _returns(found: Evaluation) -> str:
+    return ", ".join(f"{name} {result.mean_return:.4g}" for name, result in found.classes.items())
 
 
 def arms(runs: Sequence[Control], class_name: str, names: Sequence[str]) -> dict[str, dict[str, Any]]:

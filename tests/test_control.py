@@ -27,7 +27,13 @@ def world(*goals, rows=18):
 
 @pytest.mark.parametrize("rows", [18, 6])  # all adaptations at once, and in portions
 def test_only_what_adapts_to_the_task_gains_above_others_data(rows):
-    found = control(Finder, world(NORTH, rows=rows), world(EAST, WEST, rows=rows), seed=4, **PLAYED)
+    said = []
+    found = control(Finder, world(NORTH, rows=rows), world(EAST, WEST, rows=rows), seed=4, say=said.append, **PLAYED)
+    assert (
+        len(said) == 3
+        and said[0].startswith("before: Near -")
+        and said[2].startswith("adapted to data of train task 2")
+    )
     assert len(found.foreign) == 2 and len(found.own.classes["Near"].returns) == 3 * 5
     by_arm = arms([found], "Near", ["east", "west"])
     assert list(by_arm) == ["before", "own", "foreign", "east", "west"]

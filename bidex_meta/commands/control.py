@@ -125,13 +125,14 @@ def _play(folder: "RunFolder", flags: ControlFlags) -> "Control":
     counts = worlds.task_counts(config, "test")
     rollouts = metatest.rollouts_of(config, flags.rollouts, max(1, flags.num_envs // len(counts)))
     rows = metatest.rows_for(len(counts), max(counts) * flags.trials, rollouts, flags.num_envs)
-    print(f"{folder.path}: {flags.trials} adaptations of each held-out task, {rows} rows.", file=sys.stderr, flush=True)
+    _say(f"{folder.path}: {flags.trials} adaptations of each held-out task, {rows} rows.")
     test, train = (worlds.evaluation_world(config, split, rows) for split in ("test", "train"))
     found = control(
         worlds.policy_loader(folder, config["device"])[0],
         test,
         train,
         flags.shots,
+        say=_say,
         rollouts=rollouts,
         episodes_per_task=flags.episodes,
         trials=flags.trials,
@@ -142,6 +143,10 @@ def _play(folder: "RunFolder", flags: ControlFlags) -> "Control":
     test.close()
     train.close()
     return found
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
 
 
 def _train_tasks(config: dict[str, Any], class_name: str) -> list[str]:
