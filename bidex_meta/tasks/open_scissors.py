@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
-from bidex_meta.maths import conjugate, multiply, rotate, xyzw
+from bidex_meta.maths import conjugate, constant, multiply, rotate, xyzw
 from bidex_meta.tasks.base import FAST, TaskClass
 from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, place, placed, yaw_quaternion
@@ -119,8 +119,8 @@ def _opened(position: Tensor, rotation: Tensor, turn: Tensor) -> Tensor:
         turn: Rotation of the hinge (n, 4), (x, y, z, w).
     """
     opened = multiply(rotation, turn)
-    pivot = position + rotate(rotation, position.new_tensor(_PIVOT))
-    return torch.cat((pivot + rotate(opened, position.new_tensor(_RIGHT_HANDLE)), opened), dim=1)
+    pivot = position + rotate(rotation, constant(_PIVOT, position))
+    return torch.cat((pivot + rotate(opened, constant(_RIGHT_HANDLE, position)), opened), dim=1)
 
 
 def _missing(state: TaskState) -> Tensor:
