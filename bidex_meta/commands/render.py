@@ -99,11 +99,12 @@ def _policy(flags: RenderFlags, world: Any, config: dict[str, Any]) -> Any:
         return ZeroAgent(world.action_space)
     if flags.policy == "random":
         return RandomAgent(world.action_space, flags.seed)
-    from bidex_meta.commands.worlds import load_policy, policy_shape
+    from bidex_meta.commands.worlds import checkpoint, policy_of, policy_shape
     from bidex_meta.record import RunFolder
 
     folder = RunFolder.open(Path(flags.policy))
-    policy, shape = load_policy(folder, config["device"])[0], policy_shape(folder)
+    state, _ = checkpoint(folder)
+    shape = policy_shape(state)
     spaces = {"observations": world.single_observation_space, "actions": world.single_action_space}
     given = {name: space.shape[0] for name, space in spaces.items()}
     if any(shape.get(name, size) != size for name, size in given.items()):
@@ -112,7 +113,7 @@ def _policy(flags: RenderFlags, world: Any, config: dict[str, Any]) -> Any:
             f"actions, but here are {given['observations']} and {given['actions']}. Leave --suite out, or name the "
             "policy's own."
         )
-    return policy
+    return policy_of(folder, state, config["device"])
 
 
 def _episode(flags: RenderFlags, world: Any, policy: Any, row: int, film: bool) -> Iterator[Any]:

@@ -80,6 +80,7 @@ def _run(plan: RunPlan, distributed: Any) -> tuple[Any, Any, bool]:
 
 def _read(plan: RunPlan) -> Checkpoint | None:
     from bidex_meta.commands import worlds
+    from bidex_meta.record import RunFolder
 
     worlds.check_names(plan.config)
     if plan.kind.adapts:
@@ -87,7 +88,9 @@ def _read(plan: RunPlan) -> Checkpoint | None:
 
         check_suite(plan.config)
     if plan.folder is None and plan.config["start_from"] is not None:
-        _policy_to_start_from(plan)  # refused now rather than when the world has been built
+        start = RunFolder.open(Path(plan.config["start_from"]))
+        if start.checkpoints.newest_step() is None:
+            worlds.checkpoint(start)  # refuses it now rather than when the world has been built
     return plan.folder.checkpoints.load() if plan.folder else None
 
 
@@ -125,7 +128,7 @@ def _make(plan: RunPlan, fresh: bool) -> tuple[Any, Any, Any]:
     world = worlds.training_world(plan.config, plan.kind.autoreset(plan.config["learner"]))
     learner = plan.kind.make(world, plan.learner_config, plan.config["seed"])
     if fresh and plan.config["start_from"] is not None:
-        state, step = _policy_to_start_from(plan)
+        state, step = worlds.checkpoint(RunFolder.open(Path(plan.config["start_from"])))
         shared("start_from").start_from(learner, state["learner"]["policy"])
         _say(f"Starting from the policy of {plan.config['start_from']} at {step:,} steps.")
     if launch().rank > 0:
@@ -134,13 +137,6 @@ def _make(plan: RunPlan, fresh: bool) -> tuple[Any, Any, Any]:
     if folder.config() != plan.config:
         folder.change_config(plan.config)  # a resumed run with more steps
     return world, learner, folder
-
-
-def _policy_to_start_from(plan: RunPlan) -> Checkpoint:
-    from bidex_meta.commands import worlds
-    from bidex_meta.record import RunFolder
-
-    return worlds.checkpoint(RunFolder.open(Path(plan.config["start_from"])))
 
 
 def _train(plan: RunPlan, folder: Any, world: Any, learner: Any, loaded: Checkpoint | None) -> bool:

@@ -188,9 +188,14 @@ def load_policy(folder: RunFolder, device: str) -> tuple[Agent, int]:
     return load(), step
 
 
-def policy_shape(folder: RunFolder) -> dict[str, int]:
-    """Numbers of ``observations`` and ``actions`` of a run's policy."""
-    return checkpoint(folder)[0]["learner"]["policy"]["shape"]
+def policy_shape(state: dict[str, Any]) -> dict[str, int]:
+    """Numbers of ``observations`` and ``actions`` of the policy in a run's ``checkpoint``."""
+    return state["learner"]["policy"]["shape"]
+
+
+def policy_of(folder: RunFolder, state: dict[str, Any], device: str) -> Agent:
+    """The policy in a run's ``checkpoint``."""
+    return learner_kind(folder.config()["algo"]).make.load_policy(state["learner"]["policy"], device)
 
 
 def policy_loader(folder: RunFolder, device: str) -> tuple[Callable[[], Agent], int]:
@@ -202,5 +207,4 @@ def policy_loader(folder: RunFolder, device: str) -> tuple[Callable[[], Agent], 
         BidexError: The run has not saved a checkpoint yet.
     """
     state, step = checkpoint(folder)
-    make = learner_kind(folder.config()["algo"]).make
-    return lambda: make.load_policy(state["learner"]["policy"], device), step
+    return lambda: policy_of(folder, state, device), step
