@@ -31,7 +31,7 @@ def features(obs: Tensor, elapsed: Tensor) -> Tensor:
     return torch.cat([bounded, bounded.square(), t, t.square(), t**3, torch.ones_like(t)], dim=-1)
 
 
-def fitted(x: Tensor, returns: Tensor, weights: Tensor, ridge: float = 1.0) -> Tensor:
+def fitted(obs: Tensor, elapsed: Tensor, returns: Tensor, weights: Tensor, ridge: float = 1.0) -> Tensor:
     """Predictions of the returns they are fitted to, by ridge regression in each task.
 
     Coefficients of observations are held back by ``ridge`` times features per sample, relative to the mean of the
@@ -42,7 +42,8 @@ def fitted(x: Tensor, returns: Tensor, weights: Tensor, ridge: float = 1.0) -> T
     0.63 and 0.62, and with 1 by 0.78, 0.76 and 0.77.
 
     Args:
-        x: Features (tasks, B, f).
+        obs: Normalised observations (tasks, B, d).
+        elapsed: Steps since the episode began (tasks, B).
         returns: What to predict (tasks, B).
         weights: 1, or 0 for what does not count (tasks, B).
         ridge: How strongly coefficients are held back.
@@ -50,12 +51,14 @@ def fitted(x: Tensor, returns: Tensor, weights: Tensor, ridge: float = 1.0) -> T
     Returns:
         (tasks, B), in the type of ``returns``.
     """
-    predicted = [_one(*task, ridge) for task in zip(x, returns, weights, strict=True)]
+    # Task by task: the features of all tasks at once, and their Gram matrices, take more memory and more time.
+    tasks = zip(obs, elapsed, returns, weights, strict=True)
+    predicted = [_one(features(o, t), r, w, ridge) for o, t, r, w in tasks]
     return torch.stack(predicted).to(returns.dtype)
 
 
 def _one(x: Tensor, returns: Tensor, weights: Tensor, ridge: float) -> Tensor:
-    # Task by task, since all Gram matrices at once take more memory and no less time.
+    """Predictions (B,) of one task from its features (B, f), float64."""
     weighted = x * weights[:, None]
     gram = (weighted.T @ x).double()
     diagonal = gram.diagonal()

@@ -55,7 +55,7 @@ class MLP(nn.Module):
             return self.head(features.to(self.head.weight.dtype))
 
 
-def stacked_forward(network: MLP, params: Mapping[str, Tensor], prefix: str, x: Tensor) -> Tensor:
+def stacked_forward(network: MLP, params: Mapping[str, Tensor], prefix: str, x: Tensor, own: str = "") -> Tensor:
     """The outputs of M networks of one form on a batch each: (M, B, inputs) to (M, B, outputs).
 
     The same as ``vmap`` of ``functional_call``, and 1.5 to 1.8 times as fast for 40 tasks of 20 rows on one core.
@@ -65,10 +65,14 @@ def stacked_forward(network: MLP, params: Mapping[str, Tensor], prefix: str, x: 
         params: Stacked parameters, (M, ...) each, by their names in an enclosing module.
         prefix: What these names begin with.
         x: Inputs.
+        own: What the names of those parameters begin with that differ between the networks; of the others the first
+            network's serve all.
     """
 
     def linear(name: str, x: Tensor) -> Tensor:
         weight, bias = params[f"{prefix}{name}.weight"], params[f"{prefix}{name}.bias"]
+        if not f"{prefix}{name}.".startswith(own):
+            return nn.functional.linear(x, weight[0], bias[0])
         return torch.baddbmm(bias[:, None], x, weight.transpose(1, 2))
 
     for name, layer in network.body.named_children():

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from bidex_algos.adaptation import TaskBatch
 from bidex_algos.advantages import gae, normalise_per_task, successor_values, task_moments
-from bidex_algos.linear_baseline import features, fitted
+from bidex_algos.linear_baseline import fitted
 from bidex_algos.meta_config import MetaConfig
 from bidex_algos.task_rows import TaskRows
 
@@ -45,6 +45,10 @@ class Stage:
         """A field of all steps (T, N, ...)."""
         return torch.stack(getattr(self, name))
 
+    def by_task(self, name: str, rows: TaskRows) -> Tensor:
+        """A field of all steps by task (M, T * R, ...); rearranged step by step, so that nothing large is copied."""
+        return torch.stack([rows.by_task(x) for x in getattr(self, name)], dim=1).flatten(1, 2)
+
 
 @torch.no_grad()
 def task_batch(stage: Stage, rows: TaskRows, log_std: Tensor, config: MetaConfig) -> TaskBatch:
@@ -60,7 +64,7 @@ def task_batch(stage: Stage, rows: TaskRows, log_std: Tensor, config: MetaConfig
         config: Discount, trace, scale.
     """
     rewards, terminated, ended, valid = (stage.stacked(n) for n in ("rewards", "terminated", "ended", "valid"))
-    obs = stage.stacked("obs")
+    obs, elapsed = stage.by_task("obs", rows), stage.by_task("elapsed", rows)
     nothing = torch.zeros_like(rewards)
 
     def advantages(values: Tensor, lam: float) -> Tensor:
@@ -69,17 +73,16 @@ def task_batch(stage: Stage, rows: TaskRows, log_std: Tensor, config: MetaConfig
 
     weights = rows.steps_by_task(valid.float()) * rows.weight.repeat(1, len(stage))
     returns = advantages(nothing, 1.0)
-    x = rows.steps_by_task(features(obs, stage.stacked("elapsed")))
-    values = rows.steps_by_row(fitted(x, rows.steps_by_task(returns), weights), len(stage))
+    values = rows.steps_by_row(fitted(obs, elapsed, rows.steps_by_task(returns), weights), len(stage))
     gained = advantages(values, config.lam)
     scaled = normalise_per_task(gained, rows.task_of_row, rows.count, valid)
     if config.advantage_scale == "variance":
         _, variance, _ = task_moments(gained, rows.task_of_row, rows.count, valid)
         scaled = scaled / (variance.sqrt() + 1e-8)[rows.task_of_row]
     return TaskBatch(
-        obs=rows.steps_by_task(obs),
-        actions=rows.steps_by_task(stage.stacked("actions")),
-        old_means=rows.steps_by_task(stage.stacked("means")),
+        obs=obs,
+        actions=stage.by_task("actions", rows),
+        old_means=stage.by_task("means", rows),
         old_log_stds=log_std.detach(),
         advantages=rows.steps_by_task(scaled),
         weights=weights,

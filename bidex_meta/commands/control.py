@@ -111,17 +111,16 @@ def _check(folders: "Sequence[RunFolder]") -> None:
 
 def _play(folder: "RunFolder", flags: ControlFlags) -> "Control":
     """The arms of one run."""
-    import torch
-
     from bidex_meta.commands import metatest, worlds
     from bidex_meta.commands.learners import resolve_device
     from bidex_meta.control import control
     from bidex_meta.evaluate import EVALUATION_SEED
     from bidex_meta.metatest import MAX_ADAPT_STEPS
+    from bidex_meta.world.threads import set_up_torch
 
     stored = folder.config()
     config = {**stored, "device": resolve_device(flags.device, stored["suite"]), "engine": flags.engine}
-    torch.set_num_threads(config["threads"])
+    set_up_torch(config["threads"])
     counts = worlds.task_counts(config, "test")
     rollouts = metatest.rollouts_of(config, flags.rollouts, max(1, flags.num_envs // len(counts)))
     rows = metatest.rows_for(len(counts), max(counts) * flags.trials, rollouts, flags.num_envs)

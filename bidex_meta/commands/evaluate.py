@@ -53,18 +53,17 @@ def main(arguments: Sequence[str]) -> None:
     """Evaluate the newest checkpoint and print a table or JSON."""
     flags = parse(EvaluateFlags, arguments, "evaluate")
 
-    import torch
-
     from bidex_meta.commands import worlds
     from bidex_meta.commands.learners import learner_kind, resolve_device
     from bidex_meta.commands.tables import evaluation_table, print_table
     from bidex_meta.evaluate import EVALUATION_SEED, RandomAgent, compare
     from bidex_meta.record import RunFolder
+    from bidex_meta.world.threads import set_up_torch
 
     folder = RunFolder.open(flags.run)
     stored = folder.config()
     config = {**stored, "device": resolve_device(flags.device, stored["suite"]), "engine": flags.engine}
-    torch.set_num_threads(config["threads"])
+    set_up_torch(config["threads"])
     kind = learner_kind(stored["algo"])
     if kind.adapts:
         _meta_test(flags, folder, config)

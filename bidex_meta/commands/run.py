@@ -49,15 +49,14 @@ def main(arguments: Sequence[str]) -> None:
 
 def _run(plan: RunPlan, distributed: Any) -> tuple[Any, Any, bool]:
     """What all processes do: the run folder, the trained learner, and whether a signal ended it early."""
-    import torch
-
     from bidex_meta.record import RunFolder
+    from bidex_meta.world.threads import set_up_torch
 
     loaded = distributed.together(lambda: _read(plan))
     plan = _agree(plan, loaded, distributed)
     config, count = plan.config, launch().count
     # Sums depend on how torch splits them over threads: a resumed run must use the number it began with.
-    torch.set_num_threads(config["threads"])
+    set_up_torch(config["threads"])
     subject, times = config["suite"] or config["task"], f"{count} x " if count > 1 else ""
     _say(
         f"{config['algo']} on {subject}, {times}{config['num_envs']} rows on {config['device']}, seed {config['seed']}"

@@ -1,4 +1,4 @@
-"""Torch's threads during the world's own small operations."""
+"""How torch uses the machine: its threads, and the memory it gave back."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,3 +19,19 @@ def one_torch_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+def set_up_torch(threads: int) -> None:
+    """Gives torch this many threads, and the process the memory habits of one that learns."""
+    torch.set_num_threads(threads)
+    keep_freed_memory()
+
+
+def keep_freed_memory() -> None:
+    """Lets glibc keep up to 64 MB that were freed, for the next tensors; without effect where there is no glibc.
+
+    It returns to the system what is free beyond twice the largest block it has seen freed, blocks above 32 MB apart.
+    Where tensors are small that is little, and every step then waits for pages to come back: an inner step of the
+    meta-learners took up to twice as long, an update of MT-PPO 3 % longer.
+    """
+    torch.empty(8_000_000)

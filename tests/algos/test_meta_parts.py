@@ -36,10 +36,11 @@ def test_rows_by_task_and_back(sizes: list[int], seed: int):
 
 def test_the_baseline_is_the_ridge_regression_of_each_task():
     g = torch.Generator().manual_seed(0)
-    x = features(torch.randn(2, 30, 3, generator=g), torch.arange(30).expand(2, -1))
+    obs, elapsed = torch.randn(2, 30, 3, generator=g), torch.arange(30).expand(2, -1)
+    x = features(obs, elapsed)
     returns = torch.randn(2, 30, generator=g)
     weights = (torch.rand(2, 30, generator=g) > 0.3).float()
-    found = fitted(x, returns, weights, ridge=0.5)
+    found = fitted(obs, elapsed, returns, weights, ridge=0.5)
     for k in range(2):
         kept = weights[k] > 0
         a = x[k][kept].double()
@@ -54,7 +55,7 @@ def test_the_baseline_knows_time_and_what_has_no_weight_does_not_count():
     obs, returns = torch.zeros(1, 40, 2), (40.0 - t)[None].clone()
     weights = torch.ones(1, 40)
     returns[0, 5], weights[0, 5] = 1e6, 0.0
-    found = fitted(features(obs, t[None]), returns, weights)
+    found = fitted(obs, t[None], returns, weights)
     assert_close(found, (40.0 - t)[None], rtol=0, atol=0.2)
 
 
@@ -68,8 +69,8 @@ def test_the_baseline_does_not_remember_what_it_cannot_know():
     def likeness(left: Tensor) -> float:
         return float(torch.corrcoef(torch.cat([left, noise]))[0, 1])
 
-    x, weights = features(obs, t[None]), torch.ones(1, 400)
-    free, held = (likeness(returns - fitted(x, returns, weights, ridge)) for ridge in (1e-5, 1.0))
+    weights = torch.ones(1, 400)
+    free, held = (likeness(returns - fitted(obs, t[None], returns, weights, ridge)) for ridge in (1e-5, 1.0))
     assert free < 0.2 and held > likeness(returns) + 0.1
 
 
