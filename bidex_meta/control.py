@@ -31,6 +31,8 @@ class Control:
     """Adapted to data of each train task."""
     adaptations: dict[str, np.ndarray]
     """Per class which adaptation each episode followed, ``(episodes,)``, as in ``MetaEvaluation``."""
+    rollouts: int
+    """Episodes of each task in a shot."""
 
 
 def control(
@@ -71,7 +73,7 @@ def control(
         found = meta_evaluate(load(), test_world, shots, adapt_world=train_world, evaluated=(shots,), **played)
         foreign.append(found.after)
         say(f"adapted to data of train task {number + 1} of {max(map(len, pools))}: {_returns(found.after)}")
-    return Control(own.before, own.after, foreign, own.adaptations)
+    return Control(own.before, own.after, foreign, own.adaptations, own.rollouts)
 
 
 def _returns(found: Evaluation) -> str:

@@ -118,6 +118,7 @@ def test_the_command_shows_all_arms_of_all_runs(runs, capsys):
     assert main(["control", *runs, *flags, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["episodes"] == {"CatchUnderarm": 24} and len(found["runs"]) == 2
+    assert (found["shots"], found["trials"]) == (1, 3) and found["rollouts"] > 0
     by_arm = found["classes"]["CatchUnderarm"]
     assert by_arm["before"]["own_minus"]["return"]["interval"][0] > 0 and len(by_arm["own"]["runs"]) == 2
 

@@ -70,7 +70,7 @@ def main(arguments: Sequence[str]) -> None:
     found = {name: arms(played, name, _train_tasks(config, name)) for name in classes}
     per_arm = {name: result.episodes * len(played) for name, result in classes.items()}
     if flags.json:
-        print(json.dumps(_report(folders, flags, per_arm, found), indent=2))
+        print(json.dumps(_report(folders, flags, played[0].rollouts, per_arm, found), indent=2))
         return
     from bidex_meta.commands.tables import control_table, print_table
 
@@ -165,7 +165,7 @@ def _train_tasks(config: dict[str, Any], class_name: str) -> list[str]:
 
 
 def _report(
-    folders: "Sequence[RunFolder]", flags: ControlFlags, episodes: dict[str, int], found: dict[str, Any]
+    folders: "Sequence[RunFolder]", flags: ControlFlags, rollouts: int, episodes: dict[str, int], found: dict[str, Any]
 ) -> dict[str, Any]:
     def plain(arm: dict[str, Any]) -> dict[str, Any]:
         gains = arm.get("own_minus", {})
@@ -174,6 +174,7 @@ def _report(
     return {
         "runs": [str(folder.path) for folder in folders],
         "shots": flags.shots,
+        "rollouts": rollouts,
         "trials": flags.trials,
         "episodes": episodes,
         "classes": {name: {arm: plain(values) for arm, values in arms.items()} for name, arms in found.items()},
