@@ -65,7 +65,7 @@ class _Problem:
 
     def __init__(self, num_tasks: int, rollouts: int, steps: int, observations: int, actions: int, seed: int):
         g = torch.Generator().manual_seed(seed)
-        self.steps, self.num_tasks = steps, num_tasks
+        self.num_tasks = num_tasks
         self.actor = GaussianActor(observations, _CONFIG.hidden, actions, _CONFIG.init_std, g, _CONFIG.activation)
         self.adapter = Adapter(self.actor, _CONFIG.inner_learning_rate, "ratio", _CONFIG.std_range)
         self.rows = TaskRows(torch.arange(num_tasks).repeat_interleave(rollouts))
