@@ -92,6 +92,12 @@ def rotation_angle(q: Tensor) -> Tensor:
     return 2.0 * torch.atan2(norm(q[..., :3]), q[..., 3].abs())
 
 
+def uprightness(q: Tensor) -> Tensor:
+    """Cosine of the angle between a body's own z axis and the vertical, from (x, y, z, w). Shape (..., 4) to (...)."""
+    x, y, _, _ = q.unbind(-1)
+    return 1.0 - 2.0 * (x * x + y * y)
+
+
 def roll_pitch_yaw(q: Tensor) -> Tensor:
     """Roll, pitch, yaw (rad) of R = Rz(yaw) Ry(pitch) Rx(roll), in (-pi, pi]. Shape (..., 4) to (..., 3)."""
     x, y, z, w = q.unbind(-1)

@@ -9,19 +9,27 @@ from bidex_meta.hands.poses import HandPose
 SIDES = ("right", "left")
 """Both hands are the same right-hand model; the order is that of every table."""
 
-RIGHT, LEFT, OBJECT, FIXTURE = 1, 2, 4, 8
+RIGHT, LEFT, OBJECT, FIXTURE, INNER = 1, 2, 4, 8, 16
 """Contact bits. Geoms of one hand never meet by bits (its 18 listed pairs do); every other two kinds do,
-save fixtures among themselves."""
-_COLLIDES = {RIGHT: 0, LEFT: RIGHT, OBJECT: RIGHT | LEFT | OBJECT, FIXTURE: RIGHT | LEFT | OBJECT}
+save fixtures among themselves. INNER is what an object's file calls a geom that no table can meet before another of the
+object does, so that tables need not look for it."""
+_COLLIDES = {
+    RIGHT: 0,
+    LEFT: RIGHT,
+    OBJECT: RIGHT | LEFT | OBJECT,
+    FIXTURE: RIGHT | LEFT | OBJECT,
+    INNER: RIGHT | LEFT | OBJECT | INNER,
+}
 _TIP_COLOUR = {"right": (0.20, 0.45, 0.75, 1.0), "left": (0.80, 0.32, 0.22, 1.0)}
 
 
 def set_contact_bits(geoms: "list[mujoco.MjsGeom]", kind: int) -> None:
-    """Gives geoms the bits of RIGHT, LEFT, OBJECT or FIXTURE."""
+    """Gives geoms the bits of RIGHT, LEFT, OBJECT or FIXTURE; INNER ones stay what they are."""
     for geom in geoms:
         if geom.contype == 0:  # there to be seen only
             continue
-        geom.contype, geom.conaffinity = kind, _COLLIDES[kind]
+        own = INNER if geom.contype == INNER else kind
+        geom.contype, geom.conaffinity = own, _COLLIDES[own]
 
 
 def add_hands(scene: mujoco.MjSpec, right: HandPose, left: HandPose, moving: bool) -> None:

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
 from bidex_meta.tasks.base import FAST, TaskClass
-from bidex_meta.tasks.bucket import inside_bucket
+from bidex_meta.tasks.bucket import inside_bucket, stands
 from bidex_meta.tasks.layout import Block, Layout, both_hands, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, place_all, placed
 from bidex_meta.tasks.reach import apart, reach
@@ -20,7 +20,8 @@ class GraspAndPlace(TaskClass):
 
     Table 1 x 1 m, 60 cm high. Observation: the sheet's (425). Reward: the sheet's formula with hand-point distances,
     exp(-10 d_right) + exp(-10 d_left) + 2 exp(-10 d), d from the bucket's origin to the block's centre. Success: the
-    block's centre is inside the bucket (the original asks for d < 20 cm, which a block beside the bucket meets).
+    block's centre is inside the bucket, between floor and rim, and the bucket within 45 degrees of upright (the
+    original asks for d < 20 cm, which a block beside the bucket meets).
 
     A task shifts and turns bucket and block. Both start on the table; the sheet's start inside it. Bucket
     pose and bucket link have one orientation here, so entries 401-404 and 414-417 are equal.
@@ -29,8 +30,10 @@ class GraspAndPlace(TaskClass):
     name = "GraspAndPlace"
     summary = "Put a block into a bucket"
     formula = "exp(-10 d_left) + exp(-10 d_right) + 2 exp(-10 d), d between bucket and block"
-    solved = "the block's centre is inside the bucket"
-    deviations = ("Success asks that the block be in the bucket, the original that it be within 20 cm of it.",)
+    solved = "the block's centre is inside the bucket, which is within 45 degrees of upright"
+    deviations = (
+        "Success asks that the block be in the upright bucket, the original that it be within 20 cm of the bucket.",
+    )
     episode_steps = 500
     right = HandPose((0.55, 0.2, 0.8), PALM_DOWN_AHEAD)
     left = HandPose((0.55, -0.2, 0.8), PALM_DOWN_AHEAD)
@@ -88,6 +91,6 @@ class GraspAndPlace(TaskClass):
         }
 
     def success(self, state: TaskState) -> Tensor:
-        """The block's centre is inside the bucket."""
-        block = state["block/position"][:, None]
-        return inside_bucket(block, state["bucket/position"], state.quaternion("bucket/quaternion"))[:, 0]
+        """The block's centre is inside the bucket, which is within 45 degrees of upright."""
+        block, turn = state["block/position"][:, None], state.quaternion("bucket/quaternion")
+        return inside_bucket(block, state["bucket/position"], turn)[:, 0] & stands(turn)

@@ -1,12 +1,14 @@
 """LiftUnderarm: appendix A.2.6, sheet 4.6."""
 
+import math
+
 import mujoco
 import torch
 from torch import Tensor
 
 from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
-from bidex_meta.maths import norm
-from bidex_meta.tasks.base import FIRM, TaskClass
+from bidex_meta.maths import norm, uprightness
+from bidex_meta.tasks.base import FAST, TaskClass
 from bidex_meta.tasks.goals import frozen_goal, observe_goal
 from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, place, placed, yaw_quaternion
@@ -19,13 +21,15 @@ _START = (0.0, -0.6, 0.465)
 _GOAL_SHIFT = 0.05
 _GOAL_HEIGHT = (0.25, 0.45)
 _SUCCESS_DISTANCE = 0.05
+_SUCCESS_TILT = math.radians(30.0)
 _SEMI_AXES = (0.12, 0.12, 0.06)
 
 
 class LiftUnderarm(TaskClass):
     """Lift a pot off a table by its two grips.
 
-    Observation: Table 18 (428). Reward: equation 6. Success: the pot's origin within 5 cm of the goal.
+    Observation: Table 18 (428). Reward: equation 6. Success: the pot's origin within 5 cm of the goal,
+    the pot within 30 degrees of upright.
 
     Decided here: the goal lies 25 to 45 cm above the task's own start place and up to 5 cm beside it, and has the
     start's orientation, yaw included. The pot starts at rest on the table; at the sheet's height it would start 1.5 cm
@@ -36,8 +40,9 @@ class LiftUnderarm(TaskClass):
     name = "LiftUnderarm"
     summary = "Lift a pot off a table by its two grips"
     formula = "0.2 - d_left - d_right + 3 (0.985 - d), d from the pot to its goal"
-    solved = "pot within 5 cm of its goal"
+    solved = "pot within 5 cm of its goal and within 30 degrees of upright"
     deviations = (
+        "Success asks for an upright pot too; reward and the original's success count its place alone.",
         "The pot's inertia follows from its shape (3 kg, lid 1 kg); the original's is far too large for the size.",
     )
     episode_steps = 500
@@ -46,7 +51,7 @@ class LiftUnderarm(TaskClass):
     transition_scale = 0.25
     orientation_scale = 1.0
     start_draws = DRAWS
-    solver = FIRM
+    solver = FAST
     camera_target = (0.0, -0.6, 0.55)
     camera_distance = 1.5
 
@@ -99,8 +104,9 @@ class LiftUnderarm(TaskClass):
         }
 
     def success(self, state: TaskState) -> Tensor:
-        """The pot within 5 cm of its goal."""
-        return self._distance(state) < _SUCCESS_DISTANCE
+        """The pot within 5 cm of its goal and within 30 degrees of upright."""
+        upright = uprightness(state.quaternion("object/quaternion")) > math.cos(_SUCCESS_TILT)
+        return (self._distance(state) < _SUCCESS_DISTANCE) & upright
 
     def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
         """The goal, as large as the pot's wall."""

@@ -6,7 +6,7 @@ import mujoco
 from torch import Tensor
 
 from bidex_meta.tasks import eggs
-from bidex_meta.tasks.base import TaskClass
+from bidex_meta.tasks.base import LIGHT, TaskClass
 from bidex_meta.tasks.goals import frozen_goal, observe_goal
 from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks
 from bidex_meta.tasks.scene import SceneObject
@@ -37,6 +37,7 @@ class OneEgg(TaskClass):
     alpha: ClassVar[float] = 50.0
     floor: ClassVar[float]
     start_draws: ClassVar[int] = eggs.JOINT_DRAWS + 5
+    solver = LIGHT
 
     @property
     def variation_space(self) -> VariationSpace:

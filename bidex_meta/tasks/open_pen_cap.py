@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
 from bidex_meta.maths import rotate, xyzw
-from bidex_meta.tasks.base import FAST, TaskClass
+from bidex_meta.tasks.base import THIN, TaskClass
 from bidex_meta.tasks.goals import frozen_goal, observe_goal
 from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, place, placed
@@ -45,7 +45,7 @@ class OpenPenCap(TaskClass):
     transition_scale = 0.5
     orientation_scale = 0.1
     start_draws = DRAWS
-    solver = replace(FAST, integrator=mujoco.mjtIntegrator.mjINT_IMPLICIT)
+    solver = replace(THIN, integrator=mujoco.mjtIntegrator.mjINT_IMPLICIT)
     camera_target = (0.12, 0.0, 0.66)
 
     @property

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
 from bidex_meta.maths import conjugate, constant, multiply, rotate, xyzw
-from bidex_meta.tasks.base import FAST, TaskClass
+from bidex_meta.tasks.base import THIN, TaskClass
 from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, place, placed, yaw_quaternion
 from bidex_meta.tasks.reach import reach
@@ -50,7 +50,7 @@ class OpenScissors(TaskClass):
     transition_scale = 0.5
     orientation_scale = 0.1
     start_draws = DRAWS
-    solver = FAST
+    solver = THIN
     camera_target = (0.08, 0.0, 0.66)
 
     @property

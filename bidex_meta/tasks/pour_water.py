@@ -8,12 +8,12 @@ from torch import Tensor
 
 from bidex_meta.errors import BidexError
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
-from bidex_meta.maths import conjugate, multiply, quaternion_from_rpy, rotate, xyzw
-from bidex_meta.tasks.base import FAST, TaskClass
-from bidex_meta.tasks.bucket import inside_bucket
+from bidex_meta.maths import conjugate, multiply, norm, quaternion_from_rpy, rotate, xyzw
+from bidex_meta.tasks.base import THIN, TaskClass
+from bidex_meta.tasks.bucket import FLOOR, MOUTH, inside_bucket, stands
 from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, place_all, placed, yaw_quaternion
-from bidex_meta.tasks.reach import apart, reach
+from bidex_meta.tasks.reach import reach
 from bidex_meta.tasks.scene import SceneObject, add_table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace, join
@@ -22,6 +22,9 @@ _KETTLE = SceneObject("kettle", "kettle", (0.0, 0.0, 0.478), (0.0, 0.0, 0.5 * ma
 _BUCKET = SceneObject("bucket", "bucket", (0.0, -0.3, 0.457))
 _POUR_TILT = math.radians(40.0)
 """Tilt of the goal's orientation, rad; water leaves at less (assets/objects/kettle.xml)."""
+_SINK, _DEEPEST = 5.0, 0.2
+"""How far the goal sinks for each metre that the bucket is lifted, and how far below the mouth of a standing one at
+most, metres."""
 _WATER = 12
 """Drops by default: the physics shall stay well within three times the cost of HandOver."""
 _SIDE, _SPACING, _RISE = 5, 0.012, 0.011
@@ -36,10 +39,17 @@ class PourWater(TaskClass):
     """Pour water from a kettle, held by the right hand, into a bucket, held by the left.
 
     Table 0.5 x 1 m, 40 cm high. Observation: Table 40 (428). Reward: equation 19; the kettle's point is its handle, the
-    bucket's its origin, the goal a point on the bucket's axis 1 cm below the rim, which moves with the bucket. The
-    upright kettle on the table holds its spout 5 cm above that, so the goal asks for a tilt (or for a lifted bucket).
-    Success: at least a third of the drops are inside the bucket; the original compares the spout with a point below the
-    bucket's bottom. The goal's orientation is the kettle's at the task's start, tilted by 40 degrees towards the spout.
+    bucket's its origin. Success: at least a third of the drops are inside the bucket and it is within 45 degrees of
+    upright; the original compares the spout with a point below the bucket's bottom.
+
+    The goal of a bucket that stands on the table is the point on its axis 1 cm below the rim. It moves with the bucket,
+    but sinks by 5 cm for each that the bucket's floor is lifted, to 20 cm below its height on the table at most. A goal
+    fixed to the bucket would not ask for pouring: spout and goal meet as well when the kettle stands upright and the
+    bucket is lifted and tipped under it, since a distance does not tell which of the two is tilted. This goal is never
+    higher than the standing bucket's, 5.6 cm below the spout of an upright kettle on the table, and a bucket that is
+    lifted or tipped takes it under the table. What is left is to tilt the kettle over the bucket's rim: below 30
+    degrees, where no water leaves, the spout stays 3 cm off, at 40 degrees 2 cm; from 60 degrees on it gets there. The
+    goal's orientation is the kettle's at the task's start, tilted by 40 degrees towards the spout.
 
     A task shifts and turns kettle and bucket, and the water with the kettle. Water is drops of 5 mm radius without
     friction, which no observation shows: twelve by default, 1.4 times the physics of HandOver; the paper's 30 take 2.4
@@ -50,10 +60,12 @@ class PourWater(TaskClass):
     name = "PourWater"
     summary = "Pour water from a kettle into a bucket"
     formula = (
-        "1 - d_left - d_right + 2 (0.5 - d), d from the spout to a point 1 cm below the middle of the bucket's rim"
+        "1 - d_left - d_right + 2 (0.5 - d), d from the spout to a point 1 cm below the middle of the rim of a bucket "
+        "that stands"
     )
-    solved = "a third of the water is in the bucket"
+    solved = "a third of the water is in the bucket, which is within 45 degrees of upright"
     deviations = (
+        "The goal sinks by 5 cm for each that the bucket is lifted: else the bucket would be tipped under the kettle.",
         "Success counts water, the original the distance of the spout and a point below the bucket's bottom.",
         "Twelve drops without friction by default, the paper's 30 on demand.",
         "The kettle weighs 1.5 kg and has a high floor and an open trough as spout.",
@@ -64,7 +76,7 @@ class PourWater(TaskClass):
     transition_scale = 0.5
     orientation_scale = 0.1
     start_draws = 2 * DRAWS
-    solver = FAST
+    solver = THIN
     camera_target = (0.1, -0.05, 0.5)
     camera_distance = 1.4
 
@@ -139,7 +151,7 @@ class PourWater(TaskClass):
         """The goal blocks."""
         frozen = state.frozen
         return {
-            "goal_pose": torch.cat((state["bucket/mouth_position"], frozen["goal_rotation"]), dim=1),
+            "goal_pose": torch.cat((_goal(state), frozen["goal_rotation"]), dim=1),
             "goal_rotation_difference": multiply(
                 state.quaternion("kettle/quaternion"), frozen["goal_rotation_inverse"]
             ),
@@ -152,11 +164,25 @@ class PourWater(TaskClass):
             "constant": torch.ones_like(left),
             "left": -left,
             "right": -right,
-            "target": 2.0 * (0.5 - apart(state, "kettle/spout_position", "bucket/mouth_position")),
+            "target": 2.0 * (0.5 - norm(state["kettle/spout_position"] - _goal(state))),
         }
 
     def success(self, state: TaskState) -> Tensor:
-        """At least a third of the drops are inside the bucket."""
+        """At least a third of the drops are inside the bucket, which is within 45 degrees of upright."""
         drops = torch.stack([state[f"water{i}/position"] for i in range(self.water)], dim=1)
-        inside = inside_bucket(drops, state["bucket/position"], state.quaternion("bucket/quaternion"))
-        return 3 * inside.sum(dim=1) >= self.water
+        turn = state.quaternion("bucket/quaternion")
+        inside = inside_bucket(drops, state["bucket/position"], turn)
+        return (3 * inside.sum(dim=1) >= self.water) & stands(turn)
+
+
+def _goal(state: TaskState) -> Tensor:
+    """Where the spout shall be, world, metres, shape (n, 3): the class's docstring says why it sinks."""
+    return state.once("goal", lambda: _sunk(state["bucket/position"], state["bucket/mouth_position"]))
+
+
+def _sunk(bucket: Tensor, mouth: Tensor) -> Tensor:
+    """The goal from the bucket's origin and the point of its axis just below its rim, each (n, 3), world, metres."""
+    x, y, height = mouth.unbind(1)
+    floor = bucket[:, 2] + FLOOR / MOUTH * (height - bucket[:, 2])
+    lift = (floor - (_BUCKET.position[2] + FLOOR)).clamp(min=0.0)
+    return torch.stack((x, y, height - torch.minimum(_SINK * lift, lift + _DEEPEST)), dim=1)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
-from bidex_meta.maths import multiply, rotation_angle, xyzw
+from bidex_meta.maths import multiply, norm, rotation_angle, xyzw
 from bidex_meta.tasks.base import FIRM, TaskClass
 from bidex_meta.tasks.goals import frozen_goal, observe_goal, rotation_difference
 from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
@@ -19,23 +19,29 @@ from bidex_meta.tasks.variation import VariationSpace, component, join
 
 _CUP = SceneObject("cup", "cup", (0.0, 0.0, 0.6845), (0.0, 0.0, 0.5 * math.pi))
 _SUCCESS_ANGLE = 0.25 * math.pi
+_SUCCESS_DISTANCE = 0.2
+"""The cup stays within this of where the task puts it, metres."""
 _GHOST = (0.1, 0.012, 0.012)
 
 
 class SwingCup(TaskClass):
     """Turn a two-handled cup about the vertical, each hand at its ear.
 
-    Observation: Table 28 (428). Reward: equation 13. Success: the cup within 45 degrees of its goal.
+    Observation: Table 28 (428). Reward: equation 13. Success: the cup within 45 degrees of its goal and within
+    20 cm of where the task puts it, so that one on the floor is none.
     The goal's turn is counted from the nominal start (yaw 90 degrees), without the task's own start turn: it lies at
     least 72 degrees away, so no start is a success. The original's goal, half a turn away, is one end of the range.
-    Goal position is the task's start position; reward and success do not read it.
+    Goal position is the task's start position; the reward does not read it.
     """
 
     name = "SwingCup"
     summary = "Turn a two-handled cup with both hands"
     formula = "-1 - d_left - d_right + 5 / (r + 0.1), r the angle between the cup and its goal"
-    solved = "cup within 45 degrees of its goal"
-    deviations = ("Goals lie 90 to 180 degrees from the nominal start; the original's is half a turn away.",)
+    solved = "cup within 45 degrees of its goal and within 20 cm of its start"
+    deviations = (
+        "Goals lie 90 to 180 degrees from the nominal start; the original's is half a turn away.",
+        "Success asks that the cup stay near its start; reward and the original's success count its turn alone.",
+    )
     episode_steps = 300
     right = HandPose((0.35, 0.2, 0.8), PALM_LEFT_AHEAD)
     left = HandPose((0.35, -0.2, 0.8), PALM_RIGHT_AHEAD)
@@ -90,8 +96,9 @@ class SwingCup(TaskClass):
         return {"left": -left, "right": -right, "target": target, "constant": torch.full_like(left, -1.0)}
 
     def success(self, state: TaskState) -> Tensor:
-        """The cup within 45 degrees of its goal."""
-        return _angle(state) < _SUCCESS_ANGLE
+        """The cup within 45 degrees of its goal and within 20 cm of where the task puts it."""
+        moved = norm(state["cup/position"] - state.frozen["goal"][:, :3])
+        return (_angle(state) < _SUCCESS_ANGLE) & (moved < _SUCCESS_DISTANCE)
 
     def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
         """The line of the ears at the goal."""

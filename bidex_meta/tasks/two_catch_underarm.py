@@ -5,7 +5,7 @@ from torch import Tensor
 
 from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
 from bidex_meta.tasks import eggs
-from bidex_meta.tasks.base import TaskClass
+from bidex_meta.tasks.base import LIGHT, TaskClass
 from bidex_meta.tasks.goals import frozen_goal, observe_goal
 from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks
 from bidex_meta.tasks.scene import SceneObject
@@ -36,6 +36,7 @@ class TwoCatchUnderarm(TaskClass):
     transition_scale = 0.05
     orientation_scale = 0.5
     start_draws = eggs.JOINT_DRAWS + 5
+    solver = LIGHT
 
     @property
     def variation_space(self) -> VariationSpace:

@@ -25,8 +25,13 @@ class Replay:
     """Index of its first successful step."""
     succeeded: int
     """Shifted starts that succeed."""
-    deepest: float
-    """Deepest contact from the unshifted start, metres: what passes through nothing stays below a few millimetres."""
+    depths: torch.Tensor
+    """Deepest contact after each step from each start, metres, shape (steps, 1 + shifted starts)."""
+
+    @property
+    def deepest(self) -> float:
+        """Deepest contact from the unshifted start, metres: what passes through nothing stays below some millimetres."""
+        return float(self.depths[:, 0].max())
 
     @property
     def found(self) -> bool:
@@ -55,10 +60,12 @@ def replay(name: str, witness: Witness, threads: int | None = None) -> Replay:
     simulator = Simulator(name, 1 + SHIFTED, threads)
     simulator.load(simulator.starts(SHIFTED))
     actions = torch.from_numpy(witness.actions)
-    depths: list[float] = []
+    depths: list[list[float]] = []
+    everyone = range(simulator.num)
     repeated = actions[:, None].expand(-1, simulator.num, -1)
-    trace = simulator.play(repeated, lambda: depths.append(simulator.contact_depth(0)))
+    trace = simulator.play(repeated, lambda: depths.append([simulator.contact_depth(i) for i in everyone]))
     simulator.close()
     steps = trace.success[:, 0].nonzero().flatten().tolist()
     won = trace.success.any(dim=0)
-    return Replay(float(trace.rewards[:, 0].sum()), steps[0] if steps else None, int(won[1:].sum()), max(depths))
+    first = steps[0] if steps else None
+    return Replay(float(trace.rewards[:, 0].sum()), first, int(won[1:].sum()), torch.tensor(depths))

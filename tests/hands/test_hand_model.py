@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from bidex_meta.hands.hand import CENTRE_OF_MASS, hand, hand_spec
-from bidex_meta.hands.pair import SIDES, add_hands, damp_bases
+from bidex_meta.hands.pair import INNER, SIDES, add_hands, damp_bases
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import build_spec, compile_scene
@@ -37,8 +37,20 @@ def test_counts_and_mass(model: mujoco.MjModel) -> None:
     assert {int(model.geom(name).type[0]) for name in solid} == {int(kind) for kind in capsules_and_boxes}
 
 
-def test_all_but_the_base_float(model: mujoco.MjModel) -> None:
-    assert all(model.body_gravcomp[2:] == 1.0)
+@pytest.mark.parametrize("name", ["CatchUnderarm", "SwingCup", "PourWater"])
+def test_the_hands_float_and_all_else_falls(name: str) -> None:
+    """Gravity as it acts on every degree of freedom at rest: nothing on the hands, m g on whatever is free."""
+    model = compile_scene(registry.get(name)).model
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    pull = data.qfrc_passive - data.qfrc_bias  # at rest: gravity compensation and gravity
+    of_hand = np.array([model.joint(j).name.startswith(("right/", "left/")) for j in model.dof_jntid])
+    np.testing.assert_allclose(pull[of_hand], 0.0, atol=1e-3)
+    free = [j for j in range(model.njnt) if model.joint(j).name.endswith("/free") and not of_hand[model.jnt_dofadr[j]]]
+    for joint in free:
+        mass = model.body_subtreemass[model.jnt_bodyid[joint]]
+        np.testing.assert_allclose(pull[model.jnt_dofadr[joint] :][:3], (0.0, 0.0, -9.81 * mass), rtol=1e-6, atol=1e-9)
+    assert free
 
 
 def test_centre_of_mass(model: mujoco.MjModel) -> None:
@@ -107,7 +119,6 @@ def test_eggs(name: str) -> None:
     for egg in eggs:
         assert egg.size.tolist() == [0.03, 0.03, 0.04] and egg.condim[0] == 4
         assert model.body(egg.bodyid[0]).mass[0] == pytest.approx(0.0754, abs=1e-4)
-        assert model.body_gravcomp[egg.bodyid[0]] == 0.0
 
 
 @pytest.mark.parametrize("moving", [False, True])
@@ -190,8 +201,9 @@ def test_a_middle_joint_tops_out_where_its_distal_ends() -> None:
         assert middle == pytest.approx(1.50, abs=0.02), finger
         assert distal == pytest.approx(1.571, abs=0.03), finger
     path = np.array(heights)
-    # On the way the tendon leaves +-0.001 m, that is 0.14 rad at the distal joint, and a little softness.
-    assert np.abs(path[:, 1] - path[:, 0] * 0.00805 / 0.00705).max() < 0.001 / 0.00705 + 0.06
+    # On the way the tendon leaves +-0.001 m, that is 0.14 rad at the distal joint, and a little softness: 0.08 rad in
+    # a step of 1/120 s (0.06 in 1/240 s).
+    assert np.abs(path[:, 1] - path[:, 0] * 0.00805 / 0.00705).max() < 0.001 / 0.00705 + 0.09
     assert float(data.joint("left/FFJ1").qpos[0]) == pytest.approx(0.0, abs=0.02)
 
 
@@ -201,7 +213,10 @@ def kind(geom: str) -> str:
 
 @pytest.mark.parametrize("name", registry.names())
 def test_contact_bits(name: str) -> None:
-    """Hand and hand, hand and object, all and floor may meet; a hand with itself only in its listed pairs."""
+    """Hand and hand, hand and object, all and floor may meet; a hand with itself only in its listed pairs.
+
+    Geoms inside an object's outline need not meet what stands.
+    """
     model = compile_scene(registry.get(name)).model
     solid = [model.geom(i) for i in range(model.ngeom) if model.geom_contype[i] or model.geom_conaffinity[i]]
     kinds = {kind(geom.name) for geom in solid}
@@ -213,7 +228,8 @@ def test_contact_bits(name: str) -> None:
             meets = bool((a.contype[0] & b.conaffinity[0]) | (b.contype[0] & a.conaffinity[0]))
             same_hand = kind(a.name) == kind(b.name) and kind(a.name) in SIDES
             both_stand = {kind(a.name), kind(b.name)} == {"floor", "table"}
-            assert meets == (not same_hand and not both_stand), (a.name, b.name)
+            inner = INNER in (a.contype[0], b.contype[0]) and {kind(a.name), kind(b.name)} & {"floor", "table"}
+            assert meets == (not same_hand and not both_stand and not inner), (a.name, b.name)
     assert model.npair == 2 * 18
 
 

@@ -6,7 +6,22 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tests.tasks.oracle import Goal, Judgement, Oracle, Task, at, frame, length, linear, pose, reach, shifted, start
+from tests.tasks.oracle import (
+    Goal,
+    Judgement,
+    Oracle,
+    Task,
+    at,
+    frame,
+    length,
+    linear,
+    pose,
+    reach,
+    shifted,
+    some_tilt,
+    start,
+    tilt,
+)
 
 FLOOR, RIM = -0.0529, 0.0445
 """Heights of the bucket's lower and upper end in its frame, metres (sheet 5.10)."""
@@ -15,7 +30,11 @@ WALL = 0.004
 UNSURE = 0.007
 """Whatever lies this near to wall, floor or rim may count either way, metres: their thickness is the project's own."""
 MOUTH = (0.0, 0.0, RIM - 0.01)
-"""Where the spout shall be: on the bucket's axis, 1 cm below its rim."""
+"""Where the spout shall be of a standing bucket: on its axis, 1 cm below its rim."""
+BOTTOM = (0.0, 0.0, -0.049)
+"""The middle of the bucket's floor."""
+STANDING = 0.457 + BOTTOM[2]
+"""Height of that point when the bucket stands on its table, metres."""
 
 
 def inside(data: mujoco.MjData, point: np.ndarray) -> tuple[bool, bool]:
@@ -25,6 +44,11 @@ def inside(data: mujoco.MjData, point: np.ndarray) -> tuple[bool, bool]:
     radius = 0.0298 + (0.0569 - 0.0298) * (z - FLOOR) / (RIM - FLOOR) - WALL
     depth = min(radius - np.hypot(x, y), z - FLOOR, RIM - z)
     return depth > UNSURE, depth > -UNSURE
+
+
+def kept(data: mujoco.MjData) -> float:
+    """How far the bucket is from the tilt of 45 degrees beyond which nothing counts as in it, rad."""
+    return np.pi / 4 - tilt(frame(data, "bucket/object")[1])
 
 
 class PushBlock(Oracle):
@@ -81,7 +105,7 @@ class StackBlock(Oracle):
 
 
 class PourWater(Oracle):
-    """Equation 19. Success: at least a third of the water in the bucket."""
+    """Equation 19. Success: at least a third of the water in the bucket, which is upright."""
 
     body_of_goal: ClassVar = {"goal": "kettle/object"}
     spout, handle = (-0.2, 0.0, 0.07), (0.15, 0.0, 0.0)
@@ -93,9 +117,11 @@ class PourWater(Oracle):
         }
 
     def goals(self, data: mujoco.MjData, task: Task) -> dict[str, Goal]:
-        """The mouth of the bucket; the kettle's start tilted by 40 degrees about its y, spout down."""
-        tilt = Rotation.from_rotvec([0.0, -np.deg2rad(40.0), 0.0])
-        return {"goal": (at(data, "bucket/object", MOUTH), start(data, "kettle", task)[1] * tilt)}
+        """The mouth of the standing bucket, lower if it is lifted; the kettle's start, its spout 40 degrees down."""
+        lift = max(0.0, at(data, "bucket/object", BOTTOM)[2] - STANDING)
+        mouth = at(data, "bucket/object", MOUTH)
+        down = Rotation.from_rotvec([0.0, -np.deg2rad(40.0), 0.0])
+        return {"goal": (shifted(mouth, 0, 0, -min(5 * lift, lift + 0.2)), start(data, "kettle", task)[1] * down)}
 
     @staticmethod
     def water(data: mujoco.MjData) -> list[str]:
@@ -109,21 +135,23 @@ class PourWater(Oracle):
         terms = linear(data, bucket, handle, (0.5 - d_target) * 2, 1.0)
         drops = [inside(data, data.body(f"{drop}/object").xpos) for drop in self.water(data)]
         surely, perhaps = (3 * sum(found) >= len(drops) for found in zip(*drops, strict=True))
-        return Judgement(terms, surely, False, 0.0 if surely != perhaps else 1.0)
+        upright = kept(data)
+        return Judgement(terms, surely and upright > 0, False, 0.0 if surely != perhaps else abs(upright))
 
     def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """Some of the drops in the middle of the bucket, which stands where the task puts it."""
+        """Some of the drops in the middle of the bucket, which is somewhat lifted and tipped."""
         position, turn = start(data, "bucket", task)
+        position, turn = shifted(position, 0, 0, rng.choice((0.0, 0.06))), some_tilt(rng, 1.2) * turn
         drops = self.water(data)
         parts = {"bucket": pose(position, turn)}
         for i, drop in enumerate(drops[: rng.integers(0, len(drops) + 1)]):
-            place = shifted(position, 0.012 * (i % 3 - 1), 0, 0.012 * (i // 3) - 0.02)
+            place = position + turn.apply((0.012 * (i % 3 - 1), 0, 0.012 * (i // 3) - 0.02))
             parts |= {f"{drop}/{axis}": place[k : k + 1] for k, axis in enumerate("xyz")}
         return parts
 
 
 class GraspAndPlace(Oracle):
-    """Sheet 4.21 with one hand point a hand. Success: the block's centre in the bucket."""
+    """Sheet 4.21 with one hand point a hand. Success: the block's centre in the bucket, which is upright."""
 
     def points(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
         return {f"{name} position": data.body(f"{name}/object").xpos.copy() for name in ("bucket", "block")}
@@ -137,10 +165,12 @@ class GraspAndPlace(Oracle):
             "target": 2 * float(np.exp(-10 * length(bucket - block))),
         }
         surely, perhaps = inside(data, block)
-        return Judgement(terms, surely, False, 0.0 if surely != perhaps else 1.0)
+        upright = kept(data)
+        return Judgement(terms, surely and upright > 0, False, 0.0 if surely != perhaps else abs(upright))
 
     def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
         """The block over the middle of the bucket, or beside it."""
         position, turn = start(data, "bucket", task)
-        beside = (0.12, 0, 0) if rng.random() < 0.5 else (0, 0, rng.uniform(0.01, 0.025))
-        return {"bucket": pose(position, turn), "block": pose(shifted(position, *beside), turn)}
+        turn = some_tilt(rng, 1.2) * turn
+        beside = (0.12, 0, 0) if rng.random() < 0.3 else (0, 0, rng.uniform(0.01, 0.025))
+        return {"bucket": pose(position, turn), "block": pose(position + turn.apply(beside), turn)}

@@ -46,7 +46,10 @@ class Door(Oracle):
         d_target = length(left - right)
         terms = linear(data, left, right, 2 * d_target if self.opens else 2 * (1 - d_target), 0.2)
         if self.opens:
-            return Judgement(terms, d_target > 0.5, False, abs(d_target - 0.5))
+            middle = data.body("object/object").xpos[1]
+            of_right, of_left = right[1] - middle, middle - left[1]
+            edges = (of_right + of_left - 0.5, of_right - 0.1, of_left - 0.1)
+            return Judgement(terms, min(edges) > 0, False, min(abs(edge) for edge in edges))
         ajar = [angle(data, f"object/hinge{i}") - 0.05 * np.pi for i in (1, 2)]
         return Judgement(terms, max(ajar) < 0, False, min(abs(edge) for edge in ajar))
 

@@ -91,13 +91,14 @@ class ReOrientation(Oracle):
         goals = self.goals(data, task)
         (d_1, r_1), (d_2, r_2) = (_errors(data, body, goals[goal]) for goal, body in self.body_of_goal.items())
         terms = {"left": -10 * d_1, "right": -10 * d_2, "target": -1.5 * (r_1 + r_2)}
-        return Judgement(terms, r_1 < 0.2 and r_2 < 0.2, False, min(abs(r_1 - 0.2), abs(r_2 - 0.2)))
+        edges = (r_1 - 0.2, r_2 - 0.2, d_1 - 0.1, d_2 - 0.1)
+        return Judgement(terms, max(edges) < 0, False, min(abs(edge) for edge in edges))
 
     def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """Both cubes in the air, turned a little off their goals."""
+        """Both cubes in the air, turned and moved a little off their goals."""
         return {
             goal.replace("goal", "object"): pose(
-                shifted(centre, 0, 0, 0.1), Rotation.from_rotvec(rng.normal(size=3) * 0.1) * turn
+                shifted(centre, 0, 0, rng.uniform(0.06, 0.11)), Rotation.from_rotvec(rng.normal(size=3) * 0.1) * turn
             )
             for goal, (centre, turn) in self.goals(data, task).items()
         }

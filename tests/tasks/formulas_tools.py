@@ -21,7 +21,9 @@ from tests.tasks.oracle import (
     reach,
     rotation_distance,
     shifted,
+    some_tilt,
     start,
+    tilt,
 )
 
 
@@ -43,13 +45,15 @@ class LiftUnderarm(Oracle):
 
     def judge(self, data: mujoco.MjData, task: Task) -> Judgement:
         right, left = self.points(data).values()
-        d_target = length(data.body("object/object").xpos - self.goals(data, task)["goal"][0])
+        position, turn = frame(data, "object/object")
+        d_target = length(position - self.goals(data, task)["goal"][0])
         terms = linear(data, left, right, 3 * (0.985 - d_target), 0.2)
-        return Judgement(terms, d_target < 0.05, False, abs(d_target - 0.05))
+        edges = (d_target - 0.05, tilt(turn) - np.pi / 6)
+        return Judgement(terms, max(edges) < 0, False, min(abs(edge) for edge in edges))
 
     def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
         centre, turn = self.goals(data, task)["goal"]
-        return {"object": pose(centre + rng.uniform(-0.04, 0.04, 3), turn)}
+        return {"object": pose(centre + rng.uniform(-0.035, 0.035, 3), some_tilt(rng, 1.0) * turn)}
 
 
 class BottleCap(Oracle):
@@ -75,6 +79,7 @@ class SwingCup(Oracle):
 
     body_of_goal: ClassVar = {"goal": "cup/object"}
     entering: ClassVar = {"yaw_change"}
+    deciding: ClassVar = {"cup_x", "cup_y"}
 
     def points(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
         return {
@@ -87,14 +92,16 @@ class SwingCup(Oracle):
 
     def judge(self, data: mujoco.MjData, task: Task) -> Judgement:
         right, left = self.points(data).values()
-        d_r = rotation_distance(frame(data, "cup/object")[1], self.goals(data, task)["goal"][1])
+        (position, turn), (place, goal) = frame(data, "cup/object"), self.goals(data, task)["goal"]
+        d_r = rotation_distance(turn, goal)
         terms = linear(data, left, right, 1 / (abs(d_r) + 0.1) * 5, -1.0)
-        return Judgement(terms, d_r < np.pi / 4, False, abs(d_r - np.pi / 4))
+        edges = (d_r - np.pi / 4, length(position - place) - 0.2)
+        return Judgement(terms, max(edges) < 0, False, min(abs(edge) for edge in edges))
 
     def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
         centre, turn = self.goals(data, task)["goal"]
         turn = about_z(rng.uniform(-1.2, 1.2)) * Rotation.from_rotvec(0.1 * rng.normal(size=3)) * turn
-        return {"cup": pose(shifted(centre, 0, 0, 0.1), turn)}
+        return {"cup": pose(shifted(centre, *rng.uniform(-0.17, 0.17, 2), 0.1), turn)}
 
 
 class OpenScissors(Oracle):

@@ -32,11 +32,13 @@ class Oracle:
 
     Attributes:
         body_of_goal: Goal, as the tables name it, to the body whose orientation is compared with it.
-        entering: Components of a variation that enter reward or success of a given state (None: all of them).
+        entering: Components of a variation that enter the reward of a given state (None: all of them).
+        deciding: Components that enter its success alone.
     """
 
     body_of_goal: Mapping[str, str] = MappingProxyType({})
     entering: frozenset[str] | set[str] | None = frozenset()
+    deciding: frozenset[str] | set[str] = frozenset()
 
     def judge(self, data: mujoco.MjData, task: Task) -> Judgement:
         """Reward terms, success and end in a state."""
@@ -106,6 +108,17 @@ def hand_point(data: mujoco.MjData, side: str) -> np.ndarray:
 def shifted(position: np.ndarray, x: float, y: float, z: float) -> np.ndarray:
     """A position moved along the world's axes."""
     return position + np.array((x, y, z))
+
+
+def tilt(turn: Rotation) -> float:
+    """Angle between a body's own z axis and the vertical, rad."""
+    return float(np.arccos(np.clip(turn.apply((0.0, 0.0, 1.0))[2], -1.0, 1.0)))
+
+
+def some_tilt(rng: np.random.Generator, widest: float) -> Rotation:
+    """A turn by up to an angle (rad) about a random horizontal axis."""
+    direction, size = rng.uniform(-np.pi, np.pi), rng.uniform(0, widest)
+    return Rotation.from_rotvec(size * np.array((np.cos(direction), np.sin(direction), 0.0)))
 
 
 def length(vector: np.ndarray) -> float:

@@ -6,8 +6,10 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from bidex_meta.hands.pair import INNER
+from bidex_meta.tasks import registry
 from bidex_meta.tasks.pour_water import PourWater
-from bidex_meta.tasks.scene import Scene
+from bidex_meta.tasks.scene import Scene, compile_scene
 from bidex_meta.world import World
 from tests.hands import sheet
 from tests.tasks.formulas import FORMULAS
@@ -229,3 +231,32 @@ def test_a_block_counts_as_placed_in_the_bucket_alone() -> None:
     assert solved[0] and not solved[1] and not solved[3]
     first, _ = dofs_of(scene, "block")
     assert np.abs(engine.qvel[0, first : first + 3].numpy()).max() < 0.05
+
+
+def test_inner_geoms_lie_within_the_outline_of_the_others() -> None:
+    """What tables need not look for must not be the first to meet one: no direction shows an inner geom outside."""
+    model = compile_scene(registry.get("OpenScissors")).model
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    solid = [g for g in range(model.ngeom) if model.geom(g).name.startswith("scissors/") and model.geom_contype[g]]
+    inner = [g for g in solid if model.geom_contype[g] == INNER]
+    assert inner and len(inner) < len(solid)
+    rng = np.random.default_rng(0)
+    for body in {model.geom_bodyid[g] for g in inner}:
+        own = [g for g in solid if model.geom_bodyid[g] == body]
+        for direction in rng.normal(size=(200, 3)):
+            reach = {g: _reach(model, data, g, direction / np.linalg.norm(direction)) for g in own}
+            outline = max(value for g, value in reach.items() if g not in inner)
+            # A blade's heel is 6 mm broader than the blade, and the arm's end at the pivot is the other half's too.
+            assert max(reach[g] for g in own if g in inner) < outline + 0.0075
+
+
+def _reach(model: mujoco.MjModel, data: mujoco.MjData, geom: int, direction: np.ndarray) -> float:
+    """How far a capsule or box goes in a direction, metres."""
+    local = data.geom_xmat[geom].reshape(3, 3).T @ direction
+    size = model.geom_size[geom]
+    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        extent = size[0] + size[1] * abs(local[2])
+    else:
+        extent = float(np.abs(local) @ size)
+    return float(data.geom_xpos[geom] @ direction + extent)
