@@ -1,8 +1,10 @@
 """What ``bidex-meta bench`` measures."""
 
+from bidex_meta.bench.against import world_against
 from bidex_meta.bench.capacity import capacity
 from bidex_meta.bench.gpu import gpu, kernels
+from bidex_meta.bench.others import field
 from bidex_meta.bench.physics import stability
 from bidex_meta.bench.speed import mixing, scaling, world
 
-__all__ = ["capacity", "gpu", "kernels", "mixing", "scaling", "stability", "world"]
+__all__ = ["capacity", "field", "gpu", "kernels", "mixing", "scaling", "stability", "world", "world_against"]

@@ -15,19 +15,19 @@ import tyro
 from bidex_meta.commands.parsing import StepCount, Switch, parse
 from bidex_meta.errors import BidexError, unknown_name
 
-_KINDS = ("world", "scaling", "mixing", "stability", "capacity", "gpu", "kernels", "learner", "adapt")
+_KINDS = ("world", "scaling", "mixing", "field", "stability", "capacity", "gpu", "kernels", "learner", "adapt")
 
 
 @dataclass(frozen=True)
 class BenchFlags:
-    """Measure speed (against bare physics, the classes alone or rsl-rl's learner), stability, or an accelerator.
+    """Measure speed (against bare physics, another commit, the classes alone, others), stability, or an accelerator.
 
     Example: bidex-meta bench world --suite MT4 --num-envs 1024 --json
     """
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="|".join(_KINDS))]
-    """world, scaling, mixing, stability, capacity, gpu, kernels; learner: MT-PPO's update against rsl-rl-lib's; adapt:
-    all tasks' adaptation at once against a loop over them."""
+    """world, scaling, mixing, stability, capacity, gpu, kernels; field: beside Meta-World and gymnasium-robotics;
+    learner: MT-PPO's update against rsl-rl-lib's; adapt: all tasks' adaptation at once against a loop over them."""
     suite: str | None = None
     """Suite to measure: by default world and scaling take MT4, mixing, gpu and kernels MT20, the others every class."""
     task: str | None = None
@@ -40,12 +40,19 @@ class BenchFlags:
     """For gpu: measure training with MT-PPO too."""
     preset: str | None = None
     """For learner: the preset of MT-PPO, by default laptop."""
+    against: str | None = None
+    """For world: measure beside other code in turns: a commit, a folder with a checkout, or what --out took of it."""
+    classes: Switch = False
+    """For world --against: each class of the suite alone too, with a quarter of the rows."""
     out: Path | None = None
-    """For gpu: file that takes each row of the table as it is measured; what is in it is not measured again."""
+    """For gpu and world --against: file that takes each row of the table as it is measured; what is in it already,
+    gpu does not measure again."""
     num_envs: int | None = None
     """Rows stepped together; for this and the flags below None leaves the measurement its default."""
     steps: StepCount | None = None
     """Environment steps, per class or repeat."""
+    repeats: int | None = None
+    """Interleaved repeats; medians are reported."""
     threads: int | None = None
     """Threads of the physics, for learner those of torch."""
     device: str | None = None
@@ -63,11 +70,13 @@ def main(arguments: Sequence[str]) -> None:
     flags = parse(BenchFlags, arguments, "bench")
     if flags.what not in _KINDS:
         raise unknown_name("bench", flags.what, _KINDS)
-    measure = _measurement(flags.what)
+    if 0 in (flags.steps, flags.num_envs) or (flags.repeats is not None and flags.repeats < 1):
+        raise BidexError(f"bench {flags.what}: expected --steps, --num-envs and --repeats of 1 or more.")
+    measure = _measurement("world_against" if flags.what == "world" and flags.against is not None else flags.what)
     asked = {
         name: value
         for name, value in asdict(flags).items()
-        if name not in ("what", "json", "learning") and value is not None
+        if name not in ("what", "json", "learning") and value is not None and value is not False
     }
     if flags.learning:
         asked["make_learner"] = _make_learner
@@ -82,7 +91,10 @@ def main(arguments: Sequence[str]) -> None:
         return
     from bidex_meta.commands.tables import plain_table, print_table
 
+    table = result.pop("table", None)
     print_table(plain_table(["measure", "value"], list(_flat(result))))
+    if table:
+        print_table(plain_table(list(table[0]), [list(row.values()) for row in table]))
 
 
 def _measurement(what: str) -> Any:

@@ -1,0 +1,150 @@
+"""``bench world --against``: the speed of this code's worlds beside that of another commit, side by side in one run.
+
+Speeds on a shared machine drift by more than a change gains, so numbers of two runs say little. Here a process for each
+side holds the same world; they take turns, a repeat each, and what counts is the ratio of a pair of repeats.
+"""
+
+import contextlib
+import json
+import os
+import statistics
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from bidex_meta.bench.checkout import HERE, checkout, commit_name, recorded
+from bidex_meta.benchmark import Benchmark
+from bidex_meta.engine.cpu import default_threads
+from bidex_meta.errors import BidexError
+from bidex_meta.record.atomic import write_json
+from bidex_meta.record.versions import git_state
+
+_ROWS_OF_A_SUITE_OVER_A_CLASS = 4
+
+
+def world_against(
+    against: str,
+    suite: str = "MT4",
+    num_envs: int = 1024,
+    steps: int = 40,
+    repeats: int = 7,
+    classes: bool = False,
+    threads: int | None = None,
+    seed: int = 0,
+    out: Path | None = None,
+) -> dict[str, Any]:
+    """Speed of a suite's world, and of its classes alone, beside that of other code on the same interpreter.
+
+    Args:
+        against: A commit of the git checkout that this code runs from, a folder with a checkout, or what ``out`` of an
+            earlier run took: that run's commit is measured again, and its ratios stand beside the new ones.
+        suite: A suite that both know, each by its own file.
+        num_envs: Rows of the suite's world; a class alone has a quarter of them.
+        steps: Control steps of each repeat, after as many to warm up.
+        repeats: Pairs of repeats; medians are reported.
+        classes: Measure each class of the suite alone too, as the suite has it.
+        threads: Engine threads; None takes all CPUs.
+        seed: Seed of worlds and actions.
+        out: File that takes the result.
+
+    Returns:
+        ``old`` and ``new`` (git commit, and whether anything was changed since), the settings, and ``table``: for the
+        suite and each class ``old`` and ``new`` (env-steps/s), their ``ratio`` (above 1: this code is faster), the
+        ``least`` and ``most`` of the pairs, the ratio of ``cpu`` seconds a step, which other work on the machine sways
+        less, and each side's ``physics``, "time step × substeps" of its engine batches.
+
+    Raises:
+        BidexError: No such commit or folder, an unknown suite, too few rows, or no folder for ``out``.
+    """
+    Benchmark(suite, seed=seed)  # a misspelt suite is told before anything is unpacked
+    if out is not None and not out.resolve().parent.is_dir():
+        raise BidexError(f"--out {out}: expected a file in a folder that exists, {out.resolve().parent} does not.")
+    against, then = recorded(against)
+    setting = {"suite": suite, "num_envs": num_envs, "threads": threads or default_threads(), "steps": steps}
+    with checkout(against) as folder, _Worker(folder) as old, _Worker(HERE) as new:
+        result: dict[str, Any] = {
+            "old": git_state(folder / "bidex_meta") or {"commit": commit_name(against), "dirty": False},
+            "new": git_state(HERE / "bidex_meta"),
+            **setting,
+            "table": [],
+        }
+        common = set(old.ask("classes", checkout=str(folder), suite=suite, seed=seed))
+        alone = [name for name in new.ask("classes", checkout=str(HERE), suite=suite, seed=seed) if name in common]
+        for task in [None, *(alone if classes else [])]:
+            rows = num_envs if task is None else max(1, num_envs // _ROWS_OF_A_SUITE_OVER_A_CLASS)
+            world = {"suite": suite, "task": task, "num_envs": rows, "threads": threads, "seed": seed}
+            row = {"what": task or suite, "rows": rows, **_pairs(old, new, world, steps, repeats)}
+            result["table"].append(row | ({"ratio then": then.get(row["what"])} if then else {}))
+            if out is not None:
+                write_json(out, result)
+    return result
+
+
+def _pairs(old: "_Worker", new: "_Worker", world: dict[str, Any], steps: int, repeats: int) -> dict[str, Any]:
+    """One row of the table: both sides' speeds of one world, repeat after repeat."""
+    physics = {worker: worker.ask("build", **world) for worker in (old, new)}
+    walls: dict[_Worker, list[float]] = {old: [], new: []}
+    cpus: dict[_Worker, list[float]] = {old: [], new: []}
+    for repeat in range(repeats + 1):
+        for worker in (old, new) if repeat % 2 else (new, old):  # neither is always the one that finds a warm machine
+            took = worker.ask("step", steps=steps, seed=repeat)
+            if repeat:  # the first one warms up
+                walls[worker].append(took["wall"])
+                cpus[worker].append(took["cpu"])
+    done = world["num_envs"] * steps
+    ratios = _ratios(walls[old], walls[new])
+    return {
+        "old": round(done / statistics.median(walls[old])),
+        "new": round(done / statistics.median(walls[new])),
+        "ratio": round(statistics.median(ratios), 4),
+        "least": round(min(ratios), 4),
+        "most": round(max(ratios), 4),
+        "cpu": round(statistics.median(_ratios(cpus[old], cpus[new])), 4),
+        "old physics": _told(physics[old]),
+        "new physics": _told(physics[new]),
+    }
+
+
+def _ratios(old: list[float], new: list[float]) -> list[float]:
+    return [a / b for a, b in zip(old, new, strict=True)]
+
+
+def _told(batches: list[tuple[float, int]]) -> str:
+    """E.g. "1/240 s × 4"; of several engine batches each kind once."""
+    return ", ".join(dict.fromkeys(f"1/{1.0 / time_step:.4g} s × {substeps}" for time_step, substeps in batches))
+
+
+class _Worker:
+    """A process that steps the worlds of one checkout, asked over pipes; it ends with the block."""
+
+    def __init__(self, checkout: Path) -> None:
+        self._checkout = checkout
+        path = [str(checkout), str(checkout / "algos"), os.environ.get("PYTHONPATH", "")]
+        # -P: the script's own folder stays off the path, or its neighbours here would pass for modules.
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", str(Path(__file__).with_name("stepper.py"))],
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, path))},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def __enter__(self) -> "_Worker":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+    def ask(self, name: str, **given: Any) -> Any:
+        """What the worker's method of this name answers."""
+        assert self._process.stdin is not None and self._process.stdout is not None
+        with contextlib.suppress(BrokenPipeError):  # a worker that has died is told of below
+            self._process.stdin.write(json.dumps([name, given]) + "\n")
+            self._process.stdin.flush()
+        line = self._process.stdout.readline()
+        found = json.loads(line) if line else {"error": f"its process ended (code {self._process.wait()})"}
+        if "error" in found:
+            raise BidexError(f"bench world --against: the code in {self._checkout} cannot {name}: {found['error']}")
+        return found["answer"]

@@ -1,0 +1,134 @@
+"""``bench field``: the speed of our worlds beside what others offer, side by side on one core."""
+
+import importlib
+import math
+import statistics
+import time
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import VectorEnv
+
+from bidex_meta.benchmark import Benchmark
+from bidex_meta.clients.metaworld_world import MetaWorldWorld
+from bidex_meta.engine.cpu import default_threads
+from bidex_meta.tasks.base import CONTROL_RATE
+
+_METAWORLD_ROWS = 10
+_HANDS = ("HandReach-v3", "HandManipulateEgg-v1")
+"""Of gymnasium-robotics: one Shadow Hand of 20 actions, alone, and with an egg in it."""
+_HAND_ROWS = 4
+_SUITES = ("MT4", "MT20")
+_INSTALL = "pip install gymnasium-robotics"
+
+
+def field(num_envs: int = 1024, steps: int = 10_000, repeats: int = 7, seed: int = 0) -> dict[str, Any]:
+    """Speed under random actions, resets included: Meta-World's MT10, gymnasium-robotics' hand, and our MT4 and MT20.
+
+    Everything runs in one process on one thread; pin it to a core (``taskset -c 0``). The tasks differ, and so does the
+    time that a step stands for: hence the columns beside the speed.
+
+    Args:
+        num_envs: Rows of MT4 and MT20. Meta-World's vector environment has ten, and so has ours of it.
+        steps: Environment steps (of one row) of each repeat, after as many to warm up.
+        repeats: Interleaved repeats; medians are reported.
+        seed: Seed of environments and actions.
+
+    Returns:
+        ``cpus`` that the process may use, what was ``skipped`` and how to install it, and ``table``: rows, actions, a
+        model's degrees of freedom (least-most over the classes), seconds of physics in a step, ``env_steps_per_s``, the
+        same over CPU seconds (which other work on the core sways less), seconds of physics simulated in a second, and
+        the ratio of env-steps/s to Meta-World's own vector environment.
+    """
+    rng, skipped = np.random.default_rng(seed), {}
+    entries = [*_metaworld(seed), *_robot_hands(skipped), *_ours(num_envs, seed)]
+    for _, vector, _, _ in entries:
+        vector.reset(seed=seed)
+    speeds: list[list[Speed]] = [[] for _ in entries]
+    for repeat in range(repeats + 1):
+        for (_, vector, _, _), found in zip(entries, speeds, strict=True):
+            speed = _speed(vector, steps, rng)
+            if repeat:  # the first one warms up
+                found.append(speed)
+    table = [_row(entry, found, speeds[0]) for entry, found in zip(entries, speeds, strict=True)]
+    for _, vector, _, _ in entries:
+        vector.close()
+    return {"cpus": default_threads(), "skipped": skipped, "table": table}
+
+
+Entry = tuple[str, VectorEnv, float, list[int]]
+"""Name, environment, seconds of physics in a step, degrees of freedom of its models."""
+Speed = tuple[float, float]
+"""Environment steps per second of the clock, and of the process's CPU time."""
+
+
+def _metaworld(seed: int) -> Iterator[Entry]:
+    ours = MetaWorldWorld("metaworld/MT10", _METAWORLD_ROWS, seed=seed)  # which mends Meta-World for both
+    theirs: Any = gymnasium.make_vec("Meta-World/MT10", vector_strategy="sync", seed=seed)
+    singles = [env.unwrapped for env in theirs.envs]
+    dofs = [single.model.nv for single in singles]
+    yield "Meta-World MT10, its vector environment", theirs, singles[0].dt, dofs
+    yield "Meta-World MT10, through ours", ours, singles[0].dt, dofs
+
+
+def _robot_hands(skipped: dict[str, str]) -> Iterator[Entry]:
+    try:
+        robotics = importlib.import_module("gymnasium_robotics")
+    except ModuleNotFoundError as error:
+        skipped["gymnasium-robotics"] = f"{error.name} is not installed: {_INSTALL}"
+        return
+    _mend(importlib.import_module("gymnasium_robotics.utils.mujoco_utils"))
+    gymnasium.register_envs(robotics)
+    for name in _HANDS:
+        vector: Any = gymnasium.make_vec(name, num_envs=_HAND_ROWS, vectorization_mode="sync")
+        single = vector.envs[0].unwrapped
+        yield f"gymnasium-robotics {name}", vector, single.dt, [single.model.nv]
+
+
+def _mend(utils: Any) -> None:
+    """Lets gymnasium-robotics 1.4.2 run on MuJoCo 3.12 and later.
+
+    It asks whether a joint's type, a NumPy number, is in a tuple of MuJoCo's names for them. Since 3.12 such a name no
+    longer equals a NumPy number, and no hand could be made. Here its module finds plain numbers under these names.
+    """
+    mujoco = utils.mujoco
+    plain = SimpleNamespace(**{name: int(kind) for name, kind in mujoco.mjtJoint.__members__.items()})
+    utils.mujoco = SimpleNamespace(**{**vars(mujoco), "mjtJoint": plain})
+
+
+def _ours(num_envs: int, seed: int) -> Iterator[Entry]:
+    for suite in _SUITES:
+        made = Benchmark(suite, seed=seed).make_world("train", device="cpu", num_envs=num_envs, threads=1)
+        dofs = [member.scene.model.nv for part in made.parts for member in part.group.members]
+        yield f"bidex-meta {suite}", made, 1.0 / CONTROL_RATE, dofs
+
+
+def _speed(vector: VectorEnv, steps: int, rng: np.random.Generator) -> Speed:
+    """How fast uniform actions are stepped."""
+    shape = math.ceil(steps / vector.num_envs), vector.num_envs, *(vector.single_action_space.shape or ())
+    actions = rng.uniform(-1.0, 1.0, shape).astype(np.float32)
+    wall, cpu = time.perf_counter(), time.process_time()
+    for action in actions:
+        vector.step(action)
+    done = shape[0] * shape[1]
+    return done / (time.perf_counter() - wall), done / (time.process_time() - cpu)
+
+
+def _row(entry: Entry, speeds: list[Speed], first: list[Speed]) -> dict[str, Any]:
+    name, vector, seconds, dofs = entry
+    least, most = min(dofs), max(dofs)
+    wall, cpu = (statistics.median(column) for column in zip(*speeds, strict=True))
+    return {
+        "what": name,
+        "rows": vector.num_envs,
+        "actions": math.prod(vector.single_action_space.shape or ()),
+        "dofs": str(least) if least == most else f"{least}-{most}",
+        "physics_s_per_step": round(seconds, 4),
+        "env_steps_per_s": round(wall),
+        "env_steps_per_cpu_s": round(cpu),
+        "physics_s_per_s": round(wall * seconds, 1),
+        "ratio": round(statistics.median(a / b for (a, _), (b, _) in zip(speeds, first, strict=True)), 3),
+    }

@@ -1,0 +1,96 @@
+"""The worker of ``bench world --against``: steps the worlds of whatever checkout stands first on its path.
+
+It is started by its own file name and finds another commit's ``bidex_meta`` under that name, so it may use only what
+commit e0e28c4 has too. A command is a line of JSON on stdin, its answer a line of JSON on stdout.
+"""
+
+import json
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+
+class Stepper:
+    """Builds one world at a time and steps it."""
+
+    def __init__(self) -> None:
+        self._world: Any = None
+
+    def classes(self, checkout: str, suite: str, seed: int) -> list[str]:
+        """Names of the train classes of a suite, as the code under ``checkout`` has them."""
+        import bidex_meta
+
+        found = Path(bidex_meta.__file__).resolve().parents[1]
+        if found != Path(checkout).resolve():
+            raise RuntimeError(f"expected bidex_meta of {checkout}, but Python imports that of {found}")
+        return list(bidex_meta.Benchmark(suite, seed=seed).train_classes)
+
+    def build(self, suite: str, task: str | None, num_envs: int, threads: int | None, seed: int) -> list[Any]:
+        """Makes and resets the world of a suite, or of one of its classes as the suite has it.
+
+        Returns:
+            Time step (seconds) and substeps of each engine batch; empty where the code keeps them elsewhere.
+        """
+        from bidex_meta import Benchmark
+        from bidex_meta.world import World
+
+        if self._world is not None:
+            self._world.close()
+        benchmark = Benchmark(suite, seed=seed)
+        if task is None:
+            self._world = benchmark.make_world("train", device="cpu", num_envs=num_envs, threads=threads)
+        else:
+            self._world = World([_slot(benchmark, task)], num_envs, seed=seed, threads=threads)
+        self._world.reset(seed=seed)
+        try:
+            parts = [(part.group.members[0].scene.model, part.substeps) for part in self._world.parts]
+            return [[float(model.opt.timestep), int(substeps)] for model, substeps in parts]
+        except AttributeError:
+            return []
+
+    def step(self, steps: int, seed: int) -> dict[str, float]:
+        """Steps all rows under uniform actions, once more than it measures.
+
+        Returns:
+            ``wall`` and ``cpu`` (of all threads), seconds.
+        """
+        import torch
+
+        generator = torch.Generator().manual_seed(seed)
+        shape = steps + 1, self._world.num_envs, *self._world.single_action_space.shape
+        first, *actions = 2.0 * torch.rand(shape, generator=generator) - 1.0
+        self._world.step(first)  # the other side's turn has left the caches cold
+        wall, cpu = time.perf_counter(), time.process_time()
+        for action in actions:
+            self._world.step(action)
+        return {"wall": time.perf_counter() - wall, "cpu": time.process_time() - cpu}
+
+
+def _slot(benchmark: Any, task: str) -> Any:
+    import numpy as np
+
+    from bidex_meta.world import Slot
+
+    variations = [one.variation for one in benchmark.train_tasks if one.env_name == task]
+    return Slot(task, benchmark.train_classes[task], np.stack(variations))
+
+
+def main() -> None:
+    """Answers commands until stdin ends."""
+    # Whatever a library prints must not stand between the answers.
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    stepper = Stepper()
+    for line in sys.stdin:
+        name, given = json.loads(line)
+        try:
+            answer = {"answer": getattr(stepper, name)(**given)}
+        except Exception as error:
+            answer = {"error": " ".join(str(error).split()) or type(error).__name__}
+        print(json.dumps(answer), file=answers, flush=True)
+
+
+if __name__ == "__main__":
+    main()
