@@ -10,7 +10,7 @@ import numpy as np
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluate import Interval, bootstrap_interval
 from bidex_meta.record.folder import RunFolder
-from bidex_meta.record.metrics import read_metrics
+from bidex_meta.record.metrics import read_metrics, training_seconds
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Group:
     steps: int
     """Environment steps of a seed, over all its runs."""
     hours: float
-    """Mean time of a seed's training, over all its runs: rollouts and updates, without evaluation."""
+    """Mean time of a seed's training, over all its runs, without evaluation."""
 
 
 @dataclass(frozen=True)
@@ -107,17 +107,18 @@ def _read(folder: RunFolder) -> dict[str, Any]:
         raise BidexError(
             f"{path} is not JSON ({error}). Write it anew: bidex-meta evaluate {folder.path} --json."
         ) from None
-    if found.get("steps", config["steps"]) < config["steps"]:
+    minutes, rows = config.get("minutes"), read_metrics(folder.metrics_path)
+    # Where time ends a run, its last line tells how far it came.
+    goal = config["steps"] if minutes is None else max((row["step"] for row in rows), default=0)
+    steps = found.get("steps", goal)
+    if steps < goal:
         raise BidexError(
-            f"{path} is of {found['steps']:,} steps, but the run goes on to {config['steps']:,}. Let it end, or write "
+            f"{path} is of {steps:,} steps, but the run goes on to {goal:,}. Let it end, or write "
             f"it anew: bidex-meta evaluate {folder.path} --json > {path}"
         )
-    seconds = [
-        row.get("Perf/collection_time", 0.0) + row.get("Perf/learning_time", 0.0)
-        for row in read_metrics(folder.metrics_path)
-    ]
     subject = config["suite"] or "one class at a time"
     kind = {"algo": config["algo"], "on": subject, "steps": config["steps"], "num_envs": config["num_envs"]}
+    kind["minutes"] = minutes
     kind["split"] = found.get("split", "train")
     kind["started"] = "afresh" if config.get("start_from") is None else "from another run"  # which: one for each seed
     return {
@@ -125,8 +126,8 @@ def _read(folder: RunFolder) -> dict[str, Any]:
         "kind": kind | {f"learner.{name}": value for name, value in config["learner"].items()},
         "seed": config["seed"],
         "classes": _classes(found),
-        "seconds": sum(seconds),
-        "steps": config["steps"],
+        "seconds": training_seconds(rows),
+        "steps": goal,
     }
 
 

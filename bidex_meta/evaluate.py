@@ -3,7 +3,8 @@
 The protocol: the world keeps each row on one task of its slot and does not reset by itself (autoreset DISABLED). Every
 task is played ``episodes_per_task`` times, whole episodes, by the mean action; a task that ends early is not played
 more often, so easy tasks cannot crowd out hard ones. An episode is a success if ``info["success"]`` was true at any
-step; its return is the sum of the unscaled reward.
+step; its return is the sum of the unscaled reward. An episode in which the physics broke is no success and counts with
+the return of random actions, or its own if that is lower (``bidex_meta.scores``).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -15,6 +16,7 @@ import torch
 
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError
+from bidex_meta.scores import Reference, counted_returns
 
 Interval = tuple[float, float]
 """Lower and upper end of a 95 % bootstrap interval."""
@@ -69,23 +71,13 @@ class RandomAgent:
 
 
 @dataclass(frozen=True)
-class Reference:
-    """What a class's return is measured against for the normalised score."""
-
-    random: float
-    """Mean return of uniform actions."""
-    expert: float
-    """Mean return of the best known policy."""
-
-
-@dataclass(frozen=True)
 class ClassResult:
     """The episodes of one class; arrays of shape ``(episodes,)``, in the order they were played."""
 
     returns: np.ndarray
-    """Sum of the unscaled reward, float64."""
+    """Sum of the unscaled reward, float64; of broken episodes what they count with."""
     successes: np.ndarray
-    """Success at any step, float64 0 or 1."""
+    """Success at any step, float64 0 or 1; 0 of broken episodes."""
     lengths: np.ndarray
     """Steps, int64."""
     tasks: np.ndarray
@@ -93,7 +85,7 @@ class ClassResult:
     unstable: int
     """Episodes that ended because the physics broke."""
     reference: Reference | None = None
-    """References of the normalised score, where both are known."""
+    """What the normalised score and broken episodes are measured against, where it is known."""
 
     @property
     def episodes(self) -> int:
@@ -112,17 +104,17 @@ class ClassResult:
 
     @property
     def score(self) -> float | None:
-        """100 · (R − R_random) / (R_expert − R_random); None where a reference is missing."""
+        """100 · (R − R_floor) / (R_expert − R_floor), the floor the better of random and zero actions.
+
+        None where a reference is missing.
+        """
         scores = self.scores
         return None if scores is None else float(scores.mean())
 
     @property
     def scores(self) -> np.ndarray | None:
         """The normalised score of every episode, ``(episodes,)``."""
-        reference = self.reference
-        if reference is None or reference.expert == reference.random:
-            return None
-        return 100 * (self.returns - reference.random) / (reference.expert - reference.random)
+        return None if self.reference is None else self.reference.scores(self.returns)
 
     def drawn(self, values: np.ndarray) -> np.ndarray:
         """``values`` (episodes,) as a bootstrap may resample them: means of tasks; of few tasks as they are.
@@ -200,7 +192,7 @@ def evaluate(
             its episodes.
         episodes_per_task: Episodes of each task.
         seed: Passed to the world's reset; None keeps the world's own.
-        references: Per class name, what the normalised score is measured against.
+        references: Per class name, what the normalised score and broken episodes are measured against.
 
     Raises:
         BidexError: The world resets by itself, lacks rows, or ``episodes_per_task`` is not positive.
@@ -233,19 +225,34 @@ def play_tasks(agent: Agent, world: Any, episodes_per_task: int, seed: int | Non
 
 
 def results_by_class(
-    names: Sequence[str], episodes: dict[str, np.ndarray], references: Mapping[str, Reference] | None = None
+    names: Sequence[str],
+    episodes: dict[str, np.ndarray],
+    references: Mapping[str, Reference] | None = None,
+    compared: Sequence[dict[str, np.ndarray]] = (),
 ) -> dict[str, ClassResult]:
-    """Episodes as ``play_tasks`` gives them, by the names of their slots."""
+    """Episodes by the names of their slots, broken ones as they count.
+
+    Args:
+        names: Of the slots.
+        episodes: As ``play_tasks`` gives them.
+        references: By name.
+        compared: Episodes of the policies that this one is compared with: where there is no reference, a broken episode
+            counts with the worst finished one of all of them.
+    """
     classes = {}
     for slot, name in enumerate(names):
-        own = episodes["slot"] == slot
+        own = {key: values[episodes["slot"] == slot] for key, values in episodes.items()}
+        finished = [
+            each["return"][(each["slot"] == slot) & ~each["unstable"].astype(bool)] for each in (episodes, *compared)
+        ]
+        broken, reference = own["unstable"].astype(bool), (references or {}).get(name)
         classes[name] = ClassResult(
-            returns=episodes["return"][own],
-            successes=episodes["success"][own].astype(np.float64),
-            lengths=episodes["length"][own],
-            tasks=episodes["task"][own],
-            unstable=int(episodes["unstable"][own].sum()),
-            reference=(references or {}).get(name),
+            returns=counted_returns(own["return"], broken, reference, np.concatenate(finished)),
+            successes=(own["success"] & ~broken).astype(np.float64),
+            lengths=own["length"],
+            tasks=own["task"],
+            unstable=int(broken.sum()),
+            reference=reference,
         )
     return classes
 

@@ -9,6 +9,7 @@ from bidex_meta.benchmark import make_task_world
 from bidex_meta.record import video
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
+from bidex_meta.tasks.hidden import hidden
 from bidex_meta.tasks.variation import VariationSpace
 from bidex_meta.witness.replay import frames
 from bidex_meta.witness.store import Witness, load_witness, witness_path
@@ -21,7 +22,9 @@ _HEAD = """# The task classes
 Written by `bidex-meta gallery`; change the classes, not this page. Pictures show the start of the first task; green is
 a goal. Sizes are those of moving bases. d is a distance in metres, r an angle in radians; *left* and *right* are the
 distances of a hand's point (8 cm along the palm, 2 cm out of it) to its point on the object. Variations are drawn
-uniformly and frozen by a task. Random: mean return and success of uniform actions. Witness: recorded actions that solve
+uniformly and frozen by a task. ML mask: what of a variation reward or success depends on in a given state and only
+masked entries tell, so that a meta suite hides it; where it is nothing, a class asks of a meta-learner no more than of
+any other. Random: mean return and success of uniform actions. Witness: recorded actions that solve
 the first task; the strip shows them at the start, a third and two thirds of the way to the first success, at the first
 success and at the end of the episode.
 """
@@ -83,6 +86,7 @@ def _section(task: TaskClass, random: dict | None) -> str:
         ("reward", f"`{task.formula}`"),
         ("success", task.solved),
         ("variation", _variation(task.variation_space)),
+        ("ML mask", _mask(task)),
         ("deviations", " ".join(task.deviations) or "none"),
     ]
     if random is not None:
@@ -91,6 +95,15 @@ def _section(task: TaskClass, random: dict | None) -> str:
     table = "\n".join(f"| {key} | {value} |" for key, value in rows)
     strip = f"![{task.name}, witness]({_image(task.name, 'witness')})\n" if witness_path(task.name).is_file() else ""
     return f"## {task.name}\n\n{task.summary}.\n\n{pictures}\n\n| | |\n|---|---|\n{table}\n\n{strip}"
+
+
+def _mask(task: TaskClass) -> str:
+    """What the mask of meta suites hides, in words."""
+    found = hidden(task)
+    parts = [", ".join(found.reward)] if found.reward else []
+    if found.success:
+        parts.append(f"of success alone {', '.join(found.success)}")
+    return f"hides {'; '.join(parts)}" if parts else "hides nothing that reward or success uses"
 
 
 def _witness(name: str) -> str:

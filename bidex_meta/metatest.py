@@ -20,9 +20,10 @@ from torch import Tensor
 
 from bidex_meta.agents import Agent, MetaLearningAgent, Timestep
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluate import EVALUATION_SEED, Evaluation, Reference, check_world, play_tasks, quota, results_by_class
+from bidex_meta.evaluate import EVALUATION_SEED, Evaluation, check_world, play_tasks, quota, results_by_class
 from bidex_meta.gains import Gains, paired_gains
 from bidex_meta.portions import Portions, task_of_row
+from bidex_meta.scores import Reference
 
 MAX_ADAPT_STEPS = 150
 """Steps after which an episode is long enough to adapt to, where nobody says otherwise."""
@@ -121,7 +122,7 @@ def meta_evaluate(
         trials: How often each task is adapted to, from the start and with other episodes.
         max_adapt_steps: Episodes of adaptation are cut (``truncated``) after so many steps.
         seed: Of all starts; without adaptation, and with all tasks in the world at once, those of ``evaluate``.
-        references: Per class name, what the normalised score is measured against.
+        references: Per class name, what the normalised score and broken episodes are measured against.
         adapt_world: Where episodes of adaptation are played, if not on ``world``.
         evaluated: After how many shots to evaluate (0: before all); None: always.
         split: Kept in the result.
@@ -149,7 +150,7 @@ def meta_evaluate(
                     played = play_tasks(agent, world, episodes_per_task, starts)
                     found[shot].append(portions.labelled(played, number))
     joined = [{key: np.concatenate([part[key] for part in parts]) for key in parts[0]} for parts in found.values()]
-    by_class = [results_by_class(world.task_names, episodes, references) for episodes in joined]
+    by_class = [results_by_class(world.task_names, episodes, references, joined) for episodes in joined]
     first = joined[0]
     return MetaEvaluation(
         by_shot=[Evaluation(classes, episodes_per_task) for classes in by_class],

@@ -1,16 +1,18 @@
-"""The two ends of the normalised score: per class the return of random actions and that of the best known policy.
+"""The two ends of the normalised score: per class what a policy that has learned nothing gets, and the best known one.
 
-They hold for classes with moving bases, as every suite has them. Files under ``assets/references/``: ``random.json``,
-which ``bidex-meta baseline random`` measures, and ``expert.json``; ``zero.json`` tells what doing nothing gives.
+They hold for classes with moving bases, as every suite has them. Files under ``assets/references/``: ``random.json``
+and ``zero.json``, the returns of random actions and of doing nothing, the better of which is the score's zero, and
+``expert.json``; ``bidex-meta baseline`` measures all three.
 """
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 from bidex_meta import paths
-from bidex_meta.evaluate import Reference
 from bidex_meta.record.atomic import write_json
+from bidex_meta.scores import Reference
 
 Kind = Literal["random", "zero", "expert"]
 
@@ -44,11 +46,14 @@ def store(kind: Kind, classes: dict[str, dict[str, Any]], made: dict[str, Any], 
 
 
 def references() -> dict[str, Reference]:
-    """The classes of which both ends are known, and the expert is above random and zero actions.
+    """What is known of every class whose return of random actions is known.
 
-    Else a score means nothing.
+    An expert that is not above random and zero actions is left out: a score would mean nothing.
     """
     kinds: tuple[Kind, ...] = ("random", "zero", "expert")
-    low, zero, high = ({name: row["return"] for name, row in load(kind).items()} for kind in kinds)
-    idle = {name: max(low[name], zero.get(name, low[name])) for name in low}
-    return {name: Reference(low[name], high[name]) for name in low if high.get(name, idle[name]) > idle[name]}
+    random, zero, expert = ({name: row["return"] for name, row in load(kind).items()} for kind in kinds)
+    found = {}
+    for name in random:
+        known = Reference(random[name], expert.get(name), zero.get(name))
+        found[name] = known if known.expert is not None and known.expert > known.floor else replace(known, expert=None)
+    return found

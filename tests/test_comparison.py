@@ -107,6 +107,19 @@ def test_an_evaluation_that_is_torn_or_of_fewer_steps_is_refused(tmp_path: Path)
         groups(path)
 
 
+def test_a_run_that_time_ended_is_of_the_steps_it_made(tmp_path: Path):
+    path = run(tmp_path, 0, {"A": 0.5})
+    folder = RunFolder.open(path)
+    folder.change_config({**folder.config(), "steps": 10**9, "minutes": 4.0})
+    found = json.loads((path / "evaluation.json").read_text())
+    (path / "evaluation.json").write_text(json.dumps({"steps": 1000, **found}))
+    [group] = groups(path)
+    assert (group.steps, group.hours) == (1000, 0.5)
+    (path / "evaluation.json").write_text(json.dumps({"steps": 500, **found}))
+    with pytest.raises(BidexError, match="is of 500 steps, but the run goes on to 1,000"):
+        groups(path)
+
+
 def test_a_class_without_a_reference_leaves_the_group_without_a_score(tmp_path: Path):
     path = run(tmp_path, 0, {"A": 0.5})
     (path / "evaluation.json").write_text(

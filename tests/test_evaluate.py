@@ -12,13 +12,13 @@ from bidex_meta.evaluate import (
     ClassResult,
     Evaluation,
     RandomAgent,
-    Reference,
     ZeroAgent,
     aggregate,
     bootstrap_interval,
     compare,
     evaluate,
 )
+from bidex_meta.scores import Reference
 from tests.fakes import STEPS_OF_TASK, Seeker, ToyWorld
 
 

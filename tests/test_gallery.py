@@ -22,7 +22,16 @@ def test_every_class_has_a_section_with_all_that_a_newcomer_asks() -> None:
     for name, section in found.items():
         task = registry.get(name, True)
         assert section.startswith(f"\n{task.summary}.\n")
-        for fact in ("observation, action", "episode", "reward", "success", "variation", "deviations", "witness"):
+        for fact in (
+            "observation, action",
+            "episode",
+            "reward",
+            "success",
+            "variation",
+            "ML mask",
+            "deviations",
+            "witness",
+        ):
             assert len(re.findall(rf"^\| {fact} \| \S.* \|$", section, flags=re.M)) == 1, (name, fact)
         assert f"| {task.episode_steps} steps |" in section
         assert all(f"{component} " in section for component in task.variation_space.names)
@@ -32,6 +41,12 @@ def test_sizes_are_those_of_the_tables() -> None:
     for name, section in sections().items():
         observation, action = SIZES[name, True]
         assert f"| observation, action | {observation}, {action} |" in section, name
+
+
+def test_ten_classes_hide_nothing_that_matters() -> None:
+    lines = [re.findall(r"^\| ML mask \| (.*) \|$", section, flags=re.M) for section in sections().values()]
+    assert sum(line == ["hides nothing that reward or success uses"] for line in lines) == 10
+    assert "| ML mask | hides yaw_change; of success alone cup_x, cup_y |" in sections()["SwingCup"]
 
 
 def test_pictures_are_written_where_the_page_looks_for_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

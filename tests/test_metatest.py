@@ -6,9 +6,10 @@ import torch
 
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluate import ClassResult, Evaluation, RandomAgent, Reference, evaluate
+from bidex_meta.evaluate import ClassResult, Evaluation, RandomAgent, evaluate
 from bidex_meta.gains import paired_gains
 from bidex_meta.metatest import meta_evaluate
+from bidex_meta.scores import Reference
 from tests.fakes import ToyWorld
 from tests.points import Finder, PointWorld, Still, ring
 

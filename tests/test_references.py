@@ -7,7 +7,7 @@ from bidex_meta import paths, references
 from bidex_meta.cli import main
 from bidex_meta.commands import experts, worlds
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluate import Reference
+from bidex_meta.scores import Reference
 from bidex_meta.witness.replay import Replay
 from tests.fakes import ToyWorld
 
@@ -35,16 +35,18 @@ def test_a_score_needs_both_ends_and_an_expert_above_random_actions(folder: Path
     low = {"HandOver": {"return": 0.4}, "Switch": {"return": 9.0}, "PushBlock": {"return": 5.0}}
     references.store("random", low, {})
     references.store("expert", {"HandOver": {"return": 30.0}, "PushBlock": {"return": 4.0}}, {})
-    found = references.references()
-    assert list(found) == ["HandOver"]
-    assert (found["HandOver"].random, found["HandOver"].expert) == (0.4, 30.0)
+    assert references.references() == {
+        "HandOver": Reference(0.4, 30.0),
+        "Switch": Reference(9.0),
+        "PushBlock": Reference(5.0),
+    }
 
 
 def test_an_expert_that_doing_nothing_beats_gives_no_score(folder: Path) -> None:
     returns: dict[references.Kind, float] = {"random": 1.0, "zero": 3.0, "expert": 2.0}
     for kind, value in returns.items():
         references.store(kind, {"A": {"return": value}, "B": {"return": value + (kind == "expert") * 2}}, {})
-    assert references.references() == {"B": Reference(1.0, 4.0)}
+    assert references.references() == {"A": Reference(1.0, None, 3.0), "B": Reference(1.0, 4.0, 3.0)}
 
 
 @pytest.mark.parametrize("what", ["random", "zero"])

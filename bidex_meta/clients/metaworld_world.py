@@ -5,7 +5,6 @@ here wrote. Rows are stepped one after the other, since each is an environment o
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,7 @@ from bidex_meta.clients.metaworld import (
     make_tasks,
 )
 from bidex_meta.errors import BidexError, unknown_name
-from bidex_meta.evaluate import Agent, ClassResult, Evaluation, evaluate
+from bidex_meta.evaluate import Agent, Evaluation, check_world, play_tasks, results_by_class
 from bidex_meta.world.actions import clean
 from bidex_meta.world.autoreset import checked_mode, reset_mask
 from bidex_meta.world.episodes import Episodes
@@ -298,26 +297,13 @@ def evaluate_all_tasks(
         episodes_per_task: Episodes of each task.
         seed: Passed to the world's resets.
     """
+    check_world(world, episodes_per_task)
     at_once = min(rows.stop - rows.start for rows in world.slot_rows)
-    parts: list[dict[str, ClassResult]] = []
+    parts: list[dict[str, np.ndarray]] = []
     for first in range(0, TASKS_PER_CLASS, at_once):
         pool = range(first, min(first + at_once, TASKS_PER_CLASS))
         world.set_tasks({name: pool for name in world.task_names})
-        found = evaluate(agent, world, episodes_per_task, seed=seed).classes
-        parts.append({name: replace(result, tasks=result.tasks + first) for name, result in found.items()})
-    return Evaluation({name: _joined([part[name] for part in parts]) for name in world.task_names}, episodes_per_task)
-
-
-def _joined(parts: Sequence[ClassResult]) -> ClassResult:
-    """The episodes of several evaluations of one class."""
-
-    def all_of(name: str) -> np.ndarray:
-        return np.concatenate([getattr(part, name) for part in parts])
-
-    return ClassResult(
-        returns=all_of("returns"),
-        successes=all_of("successes"),
-        lengths=all_of("lengths"),
-        tasks=all_of("tasks"),
-        unstable=sum(part.unstable for part in parts),
-    )
+        played = play_tasks(agent, world, episodes_per_task, seed)
+        parts.append(played | {"task": played["task"] + first})
+    episodes = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    return Evaluation(results_by_class(world.task_names, episodes), episodes_per_task)

@@ -20,6 +20,9 @@ class BaselineFlags:
     """Store the two ends of the normalised score: what a policy that has learned nothing gets, and the best known one.
 
     Example: bidex-meta baseline random --suite MT20
+
+    The better of random and zero actions scores 0, the expert 100. An episode in which the physics breaks counts here
+    with the worst finished one of its class, elsewhere with what is stored of random actions.
     """
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="random|zero|expert")]

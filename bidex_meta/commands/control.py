@@ -95,6 +95,7 @@ def _check(folders: "Sequence[RunFolder]") -> None:
             )
         metatest.check_suite(config)
         kind = {name: config[name] for name in ("algo", "suite", "steps", "num_envs", "learner")}
+        kind["minutes"] = config.get("minutes")
         # Where from is another run for each seed; whether is not.
         kinds.append(kind | {"start_from": config.get("start_from") is not None})
         if (seed := config["seed"]) in seeds:

@@ -11,6 +11,10 @@ from bidex_meta.evaluate import Difference, Evaluation, Interval, compare
 from bidex_meta.gains import Gains
 
 _NONE = "–"
+_BROKEN = (
+    "unstable: the physics broke; no success, and the return of random actions, or its own if lower (where that is "
+    "unknown: of the worst finished episode)"
+)
 
 
 def evaluation_table(
@@ -37,6 +41,8 @@ def evaluation_table(
         )
     for header in headers:
         table.add_column(header, justify="right")
+    if any(result.unstable for result in policy.classes.values()):
+        table.caption += f"\n{_BROKEN}"
     differences = compare(policy, random) if random is not None else {}
     rows, others = policy.to_json(), random.to_json() if random is not None else None
     for name, row in rows["classes"].items():

@@ -7,8 +7,9 @@ from bidex_meta.clients import metaworld
 from bidex_meta.commands.launch import launch
 from bidex_meta.commands.learners import learner_kind
 from bidex_meta.errors import BidexError, unknown_name
-from bidex_meta.evaluate import Agent, Evaluation, Reference
+from bidex_meta.evaluate import Agent, Evaluation
 from bidex_meta.record import RunFolder
+from bidex_meta.scores import Reference
 
 _TASKS_ALONE = 50
 """Tasks that are drawn for a class on its own."""
@@ -100,7 +101,7 @@ def judge(config: dict[str, Any], agent: Agent, world: Any, episodes: int | None
 
 
 def references_of(config: dict[str, Any]) -> dict[str, Reference]:
-    """The references of the normalised score, of which those of other bases are none."""
+    """The references of the normalised score and of broken episodes, of which those of other bases are none."""
     from bidex_meta.references import references
 
     return references() if has_moving_bases(config) else {}

@@ -309,6 +309,7 @@ def test_the_paper_presets_are_table_48():
         assert (paper.inner_learning_rate, paper.gamma, paper.lam, paper.init_std) == (3e-4, 0.9, 0.95, 1.0)
     paper = PRESETS["paper"]
     assert (paper.outer_epochs, paper.outer_learning_rate, paper.clip, paper.max_grad_norm) == (3, 3e-4, 0.2, 1.0)
+    assert paper.desired_kl == 0.016
 
 
 @pytest.mark.parametrize(("rule", "equal"), [("masked", True), ("plain", False)])

@@ -1,0 +1,130 @@
+"""What broken episodes count for, and what doing nothing, doing anything and breaking physics score."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from bidex_meta import references
+from bidex_meta.commands.tables import evaluation_table
+from bidex_meta.evaluate import Evaluation, RandomAgent, ZeroAgent, evaluate, results_by_class
+from bidex_meta.metatest import meta_evaluate
+from bidex_meta.scores import Reference, counted_returns
+from bidex_meta.tasks import registry
+from tests.points import Finder, PointWorld, Still, ring
+from tests.tasks.worlds import mixed_world
+
+
+class Breaker:
+    """Does nothing for some steps of every episode, then emits NaN."""
+
+    def __init__(self, after: int) -> None:
+        self.after, self.steps = after, 0
+
+    def eval_action(self, obs: Tensor) -> Tensor:
+        self.steps += 1
+        return torch.full((len(obs), 52), math.nan if self.steps > self.after else 0.0)
+
+    def reset(self, env_mask: Tensor) -> None:
+        self.steps = 0
+
+
+@pytest.fixture(scope="module", params=[0, 3])
+def broken(request: pytest.FixtureRequest) -> Evaluation:
+    """All classes, in every episode of which an agent breaks a row, at once or after some steps."""
+    world = mixed_world(4)
+    return evaluate(Breaker(request.param), world, 1, seed=0, references=references.references())
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_an_agent_that_breaks_physics_gets_nothing_for_it(name: str, broken: Evaluation) -> None:
+    found, known = broken.classes[name], references.references()[name]
+    assert found.unstable == found.episodes == 4 and found.lengths.max() <= 4
+    assert found.success == 0.0 and found.mean_return <= known.random
+    assert found.score is None or found.score <= 1.0
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_an_agent_that_knows_nothing_scores_nothing(name: str) -> None:
+    """Random actions and no actions at all, by the returns that are stored of them."""
+    known = references.references()[name]
+    for kind in ("random", "zero"):
+        scores = known.scores(np.array([references.load(kind)[name]["return"]]))
+        assert scores is None or scores[0] <= 1.0
+    assert known.expert is None or known.scores(np.array([known.expert])) == pytest.approx(100.0)
+
+
+def test_the_zero_of_the_score_is_the_better_of_random_and_zero_actions() -> None:
+    assert Reference(1.0, 11.0).scores(np.array([1.0, 6.0])) == pytest.approx([0.0, 50.0])
+    assert Reference(1.0, 11.0, 6.0).scores(np.array([1.0, 6.0, 11.0])) == pytest.approx([-100.0, 0.0, 100.0])
+    assert Reference(1.0, 11.0, -5.0).floor == 1.0
+    assert Reference(1.0, 5.0, 6.0).scores(np.array([5.0])) is None
+    assert Reference(1.0).scores(np.array([5.0])) is None
+
+
+def test_broken_episodes_count_with_the_random_return_or_their_own_if_lower() -> None:
+    returns, broken = np.array([5.0, 0.0, -9.0, 7.0]), np.array([False, True, True, True])
+    counted = counted_returns(returns, broken, Reference(-4.0, 10.0, 3.0), np.array([5.0]))
+    assert counted.tolist() == [5.0, -4.0, -9.0, -4.0]
+
+
+def test_without_a_reference_they_count_with_the_worst_finished_episode() -> None:
+    returns, broken = np.array([5.0, 2.0, 9.0, 1.0]), np.array([False, False, True, True])
+    assert counted_returns(returns, broken, None, returns[~broken]).tolist() == [5.0, 2.0, 2.0, 1.0]
+    assert counted_returns(returns, np.ones(4, bool), None, np.zeros(0)).tolist() == returns.tolist()
+
+
+def rows(breaks: tuple[int, ...]) -> PointWorld:
+    return PointWorld(10, {"Near": ring(5), "Far": 2 * ring(5)}, breaks=breaks, noise=0.0)
+
+
+def test_rows_that_break_change_no_other_episode_and_are_counted() -> None:
+    known = {"Near": Reference(-100.0, 0.0)}
+    whole = evaluate(Still(), rows(()), 1, references=known)
+    found = evaluate(Still(), rows((1, 7)), 1, references=known)
+    near, far = found.classes["Near"], found.classes["Far"]
+    assert near.returns[1] == -100.0 and near.lengths[1] == 2
+    finished = whole.classes["Far"].returns[np.arange(5) != 2]
+    assert far.returns[2] == finished.min()
+    for name, row in (("Near", 1), ("Far", 2)):
+        rest = np.arange(5) != row
+        assert np.array_equal(found.classes[name].returns[rest], whole.classes[name].returns[rest])
+    told = found.to_json()["classes"]
+    assert (told["Near"]["unstable"], told["Far"]["unstable"]) == (1, 1)
+    json.dumps(told, allow_nan=False)
+    assert "physics broke" in str(evaluation_table("", found).caption)
+    assert "physics broke" not in str(evaluation_table("", whole).caption)
+
+
+def test_a_success_before_the_break_is_none() -> None:
+    episodes = {
+        "slot": np.zeros(2, int),
+        "task": np.arange(2),
+        "return": np.array([3.0, 4.0]),
+        "success": np.array([True, True]),
+        "length": np.array([9, 4]),
+        "unstable": np.array([False, True]),
+    }
+    found = results_by_class(["A"], episodes)["A"]
+    assert found.successes.tolist() == [1.0, 0.0] and found.returns.tolist() == [3.0, 3.0] and found.unstable == 1
+
+
+def test_a_meta_test_counts_broken_episodes_alike_in_every_shot() -> None:
+    """Without a reference the worst finished episode of all shots, so that breaking later gains nothing."""
+    found = meta_evaluate(Finder(), rows((0, 5)), 1, rollouts=1, episodes_per_task=1)
+    for name in ("Near", "Far"):
+        shots = [shot.classes[name] for shot in found.by_shot]
+        worst = min(shot.returns[1:].min() for shot in shots)
+        assert [shot.returns[0] for shot in shots] == [worst, worst]
+        assert [shot.unstable for shot in shots] == [1, 1]
+
+
+def test_a_baseline_has_no_reference_yet() -> None:
+    """Its broken episodes count with its worst finished one, else the reference would be better for each of them."""
+    for agent in (RandomAgent, ZeroAgent):
+        world = rows((3,))
+        found = evaluate(agent(world.action_space), world, 2).classes["Near"]
+        assert found.unstable == 2 and (found.returns[found.tasks == 3] == found.returns.min()).all()
