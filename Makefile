@@ -1,7 +1,7 @@
 # The three things a person does here: make run, make test, make format.
 # Needs Python 3.11 to 3.13 and nothing else; everything goes into .venv.
 
-STEPS ?= 1000000
+MINUTES ?= 4
 
 # The first interpreter that is new enough; `make run PYTHON=/path/to/python3.12` chooses one by hand.
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11 python; do \
@@ -17,7 +17,7 @@ SOURCES := bidex_meta algos tests
 .DELETE_ON_ERROR:
 
 help:
-	@echo "make run       train MT-PPO on MT4 for STEPS=$(STEPS) environment steps and evaluate it"
+	@echo "make run       train MT-PPO on MT4 for MINUTES=$(MINUTES) and evaluate it beside a random policy"
 	@echo "make test      format, lint, types, tests (what CI runs)"
 	@echo "make test-all  the same with the slow tests"
 	@echo "make test-parity  compare both engines on every class (what CI runs too)"
@@ -26,7 +26,7 @@ help:
 	@echo "make clean     remove .venv, caches and built files (never runs/)"
 
 run: .venv/.installed
-	$(BIN)/bidex-meta run --suite MT4 --algo mtppo --steps $(STEPS)
+	$(BIN)/bidex-meta run --suite MT4 --algo mtppo --minutes $(MINUTES) --episodes 1
 
 test: lint
 	$(BIN)/python -m pytest -q -n 2 --dist loadgroup

@@ -93,6 +93,11 @@ def test_help_of_run_names_every_field_of_the_learner(capsys):
         ("run --suite MT4 --num-envs many", "--num-envs"),
         ("run --suite MT4 --num-envs 0", "at least 1"),
         ("run --suite MT4 --steps 2.5", "2e7"),
+        ("run --suite MT4 --minutes 0", "--minutes must be a number above 0, such as 4 or 0.5, not 0."),
+        ("run --suite MT4 --minutes -1.5", "not -1.5"),
+        ("run --suite MT4 --minutes nan", "not nan"),
+        ("run --suite MT4 --minutes inf", "not inf"),
+        ("run --suite MT4 --minutes four", "four"),
         ("run --suite MT4 --learner.gamma 7", "gamma must lie in [0, 1]"),
         ("run --suite MT4 --algo mtpo", "Did you mean 'mtppo'?"),
         ("run --suite MT4 --preset lap", "Did you mean 'laptop'?"),
@@ -193,6 +198,36 @@ def test_a_resumed_run_equals_an_unbroken_one(toy_worlds, tmp_path):
     assert RunFolder.open(tmp_path / "parts").config()["steps"] == 240
 
 
+@pytest.mark.parametrize("algo", ["mtppo", "mttrpo", "mtsac"])
+def test_minutes_end_a_run_and_count_over_its_resumes(algo, toy_worlds, tmp_path, capsys):
+    path = tmp_path / "r"
+    flags = ["--suite", "MT4", "--num-envs", 6, "--threads", 1, "--device", "cpu", "--learner.hidden", 8]
+    flags += ["--algo", algo, "--run-dir", path, "--episodes", 1]
+    assert main(["run", *map(str, flags), "--minutes", "1e-6"]) == 0
+    captured = capsys.readouterr()
+    [line] = read_metrics(path / "metrics.jsonl")
+    assert f"The 1e-06 minutes are up after {line['step']:,} steps." in captured.err
+    assert "random return" in captured.out
+    assert (RunFolder.open(path).config()["minutes"], final(path)[1]) == (1e-6, line["step"])
+    # They are up: there is only the evaluation left.
+    assert main(["run", "--resume", str(path)]) == 0
+    assert "random return" in capsys.readouterr().out
+    assert len(read_metrics(path / "metrics.jsonl")) == 1
+    # Steps come first, and the time goes on from where it was.
+    goal = str(3 * line["step"])
+    assert main(["run", "--resume", str(path), "--minutes", "1e6", "--steps", goal, "--no-evaluate"]) == 0
+    assert RunFolder.open(path).config()["minutes"] == 1e6
+    times = [row["Perf/training_time"] for row in read_metrics(path / "metrics.jsonl")]
+    assert len(times) == 3 and times[0] == line["Perf/training_time"] and times == sorted(times)
+    # What the run took on another day is known from its metrics.
+    rows = read_metrics(path / "metrics.jsonl")
+    rows[-1]["Perf/training_time"] = 7200.0
+    (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    more = ["--steps", str(10 * line["step"]), "--no-evaluate"]
+    assert main(["run", "--resume", str(path), "--minutes", "119", *more]) == 0
+    assert len(read_metrics(path / "metrics.jsonl")) == 3
+
+
 def test_resume_refuses_a_changed_config_and_takes_the_same_one(toy_worlds, tmp_path, capsys):
     path = tmp_path / "r"
     assert run("--steps", 24, "--run-dir", path, "--no-evaluate", "--seed", 4) == 0
@@ -261,11 +296,11 @@ sys.exit(main(sys.argv[1:]))
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_a_killed_run_resumes_to_the_same_end(number, toy_worlds, tmp_path):
-    path, steps = tmp_path / "killed", 9600
+    path, steps = tmp_path / "killed", 10_000_000
     command = [sys.executable, "-c", _TRAIN, "run", *SMALL, "--steps", str(steps), "--run-dir", str(path)]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 300
     while not list(path.glob("checkpoints/step_*.pt")) and time.monotonic() < deadline and process.poll() is None:
         time.sleep(0.01)
     process.send_signal(number)

@@ -66,7 +66,7 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
     path = tmp_path_factory.mktemp("killed") / "run"
     line = [sys.executable, "-c", _OFTEN, "run", *SMALL, "--steps", "10000000", "--run-dir", str(path)]
     process = subprocess.Popen(line, env=environment(), cwd=path.parent, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 100
+    deadline = time.monotonic() + 500
     while process.poll() is None and time.monotonic() < deadline:
         if any(int(file.stem[5:]) >= 20 * ITERATION for file in path.glob("checkpoints/step_*.pt")):
             break

@@ -1,5 +1,6 @@
 """`torchrun --nproc-per-node 2 -m bidex_meta.cli run` on real physics, as small as it goes."""
 
+import contextlib
 import json
 import os
 import signal
@@ -13,6 +14,7 @@ from typing import Any
 import pytest
 import torch
 
+from bidex_algos.distributed import TIMEOUT
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder, read_metrics
@@ -53,7 +55,7 @@ def start(folder: Path, *arguments: object) -> subprocess.Popen[str]:
 
 def finish(process: subprocess.Popen[str]) -> tuple[int, list[str]]:
     """Exit code, and what our processes (hardly torchrun) said."""
-    _, errors = process.communicate(timeout=100)
+    _, errors = process.communicate(timeout=500)
     lines = errors.splitlines()
     return process.returncode, [line for line in lines if line and ("torch" not in line or "--resume" in line)]
 
@@ -63,13 +65,16 @@ def workers(process: subprocess.Popen[str]) -> dict[int, int]:
     listed = subprocess.run(["ps", "-o", "pid=", "--ppid", str(process.pid)], capture_output=True, text=True).stdout
     found = {}
     for pid in listed.split():
-        names = Path(f"/proc/{pid}/environ").read_text().split("\0")
+        try:
+            names = Path(f"/proc/{pid}/environ").read_text().split("\0")
+        except (FileNotFoundError, ProcessLookupError):
+            continue  # it has ended meanwhile
         found |= {int(name.removeprefix("RANK=")): int(pid) for name in names if name.startswith("RANK=")}
     return found
 
 
 def wait_for_iterations(process: subprocess.Popen[str], path: Path, count: int) -> None:
-    deadline = time.monotonic() + 90
+    deadline = time.monotonic() + 500
     while process.poll() is None and time.monotonic() < deadline:
         if any(int(file.stem[5:]) >= count * ITERATION for file in path.glob("checkpoints/step_*.pt")):
             return
@@ -102,7 +107,6 @@ def test_two_processes_train_mt4_and_end_with_equal_networks(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize("victim", [0, 1])
 def test_a_killed_process_ends_the_run_which_then_resumes_bit_for_bit(victim: int, tmp_path: Path) -> None:
     process = start(tmp_path, *SMALL, "--steps", 10_000_000, "--run-dir", "r")
@@ -110,7 +114,9 @@ def test_a_killed_process_ends_the_run_which_then_resumes_bit_for_bit(victim: in
     os.kill(workers(process)[victim], signal.SIGKILL)
     killed = time.monotonic()
     code, said = finish(process)
-    assert code == 1 and time.monotonic() - killed < 20
+    assert code == 1
+    # Seconds on a quiet machine; in any case long before a collective operation gives up by itself.
+    assert time.monotonic() - killed < TIMEOUT.total_seconds() / 3
     [message] = [line for line in said if line.startswith("bidex-meta: ")]
     assert message.startswith(f"bidex-meta: process {victim} of 2 is gone or stuck")
     _, stopped = final(tmp_path / "r")
@@ -132,8 +138,11 @@ def test_a_stuck_process_is_named_when_the_run_is_asked_to_stop(tmp_path: Path) 
     os.kill(stuck, signal.SIGSTOP)
     time.sleep(1.0)
     process.send_signal(signal.SIGINT)
-    time.sleep(20.0)
-    os.kill(stuck, signal.SIGKILL)
+    # It says so before torchrun, which kills 30 s after it asked, would end it without a word.
+    while process.poll() is None and 0 in workers(process):
+        time.sleep(0.1)
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(stuck, signal.SIGKILL)
     code, said = finish(process)
     [message] = [line for line in said if line.startswith("bidex-meta: ")]
     assert code != 0 and "process 1 of 2 is gone or stuck (this one was asked to stop" in message

@@ -13,6 +13,8 @@ _LISTEN_SECONDS = 3.0
 # torchrun kills 30 s after it asked.
 _STOP_SECONDS = 12.0
 _END_SECONDS = 10.0
+# A beat and a look at the others take three; more only where the store no longer answers.
+_JOIN_SECONDS = 10.0
 
 
 class Attendance(threading.Thread):
@@ -59,8 +61,9 @@ class Attendance(threading.Thread):
             return []  # the store is gone too
 
     def close(self) -> None:
-        """No longer takes part."""
+        """No longer takes part; returns when the thread has ended (or waits for a store that no longer answers)."""
         self._closed.set()
+        self.join(_JOIN_SECONDS)
         if threading.current_thread() is threading.main_thread():
             signal.set_wakeup_fd(-1)
 

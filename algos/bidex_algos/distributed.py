@@ -4,6 +4,7 @@ Each process steps a world of its own. In a process on its own every function he
 for bit, and nothing is sent.
 """
 
+import atexit
 import hashlib
 import io
 import os
@@ -72,6 +73,7 @@ def init_from_environment() -> None:
     if torch.cuda.is_available():
         backend = "cpu:gloo,cuda:nccl"
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count())
+    atexit.register(_leave)
     with _collective():
         store, number, count = next(rendezvous("env://", timeout=TIMEOUT))
         dist.init_process_group(backend, store=store, rank=number, world_size=count, timeout=TIMEOUT)
@@ -80,14 +82,31 @@ def init_from_environment() -> None:
 
 def shut_down() -> None:
     """Parts from the other processes once all have come here; each is on its own from then on."""
-    global _attendance
     if _joined():
         with _collective():
             dist.barrier()
+        _end_threads()
         dist.destroy_process_group()
+
+
+def _end_threads() -> None:
+    global _attendance
     if _attendance is not None:
         _attendance.close()
-    _attendance = None
+        _attendance = None
+
+
+def _leave() -> None:
+    """Ends what still runs beside the main thread, in a process that ends without :func:`shut_down`.
+
+    A thread that asks for the interpreter when it has gone (the attendance, back from the store; gloo's own, dropping
+    its last tensor) is unwound through C++ that may not throw, and the whole process aborts: "terminate called without
+    an active exception".
+    """
+    _end_threads()
+    # With NCCL this might wait for a process that is lost.
+    if _joined() and not torch.cuda.is_available():
+        dist.destroy_process_group()
 
 
 def report_loss() -> list[int] | None:

@@ -65,9 +65,15 @@ def train(
     *,
     total_steps: int,
     record: Record | None,
+    total_seconds: float = math.inf,
+    spent_seconds: float = 0.0,
     checkpoint_seconds: float = 60.0,
 ) -> bool:
-    """Trains until ``total_steps`` environment steps are done, counting those of a resumed run.
+    """Trains until ``total_steps`` environment steps are done or ``total_seconds`` are up, whichever comes first.
+
+    Both count what a resumed run had done before. The time is that from the first world step to the end of an
+    iteration, checkpoints included: the iteration in which it is up is the last one, and there is at least one.
+    Metrics get it as ``Perf/training_time``.
 
     SIGINT or SIGTERM, in any process, finishes the current iteration, saves and returns; a second one acts at once.
 
@@ -76,6 +82,8 @@ def train(
         world: The world, whose state is saved beside the learner's.
         total_steps: Environment steps in all.
         record: Where metrics and checkpoints go; None in processes other than 0.
+        total_seconds: Training time in all.
+        spent_seconds: Training time of a resumed run before.
         checkpoint_seconds: Least time between two checkpoints, and never less than 50 times what the last one took to
             save: a replay makes them large. 0 saves after every iteration. One more is always saved at the end.
 
@@ -88,12 +96,21 @@ def train(
     # Of several processes one may be lost at any time, and then nothing more can be saved: so the first iteration is.
     saved_at = time.monotonic() if world_size() == 1 else -math.inf
     saved_step, pause = learner.env_steps, checkpoint_seconds
+    began_at, stopped = time.monotonic() - spent_seconds, False
+
+    def over() -> bool:
+        if learner.env_steps == 0 or total_seconds == math.inf:
+            return learner.env_steps >= total_steps
+        # Clocks differ: process 0's decides.
+        late = any_process(is_main() and time.monotonic() - began_at >= total_seconds)
+        return late or learner.env_steps >= total_steps
+
     with _stop_requests() as stop:
-        while learner.env_steps < total_steps and not any_process(stop.is_set()):
+        while not over() and not (stopped := any_process(stop.is_set())):
             metrics = learner.iterate()
+            metrics["Perf/training_time"] = time.monotonic() - began_at
             if record is not None:
                 record.log(metrics, learner.env_steps)
-            # Clocks differ: process 0's decides.
             if any_process(is_main() and time.monotonic() - saved_at >= pause):
                 began = time.monotonic()
                 _save(learner, world, record)
@@ -102,7 +119,7 @@ def train(
                     pause = max(checkpoint_seconds, (saved_at - began) / _SAVING_SHARE)
         if learner.env_steps != saved_step:
             _save(learner, world, record)
-        return learner.env_steps < total_steps
+        return stopped
 
 
 def _save(learner: Learner, world: VectorWorld, record: Record | None) -> None:

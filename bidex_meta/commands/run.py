@@ -5,6 +5,7 @@ Of several processes (torchrun) each has a world and a learner; process 0 alone 
 
 import contextlib
 import json
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -40,6 +41,8 @@ def main(arguments: Sequence[str]) -> None:
     except distributed.LostProcess as loss:
         _say_loss(loss, distributed)
         raise SystemExit(1) from None
+    if not stopped and learner.env_steps < plan.config["steps"]:
+        _say(f"The {plan.config['minutes']:g} minutes are up after {learner.env_steps:,} steps.")
     if stopped:
         command = resume_command(folder.path, launch().count)
         _say(f"Stopped after {learner.env_steps:,} steps and saved. Continue: {command}")
@@ -134,13 +137,13 @@ def _make(plan: RunPlan, fresh: bool) -> tuple[Any, Any, Any]:
         return world, learner, None
     folder = plan.folder or RunFolder.create(plan.config, plan.flags.run_dir)
     if folder.config() != plan.config:
-        folder.change_config(plan.config)  # a resumed run with more steps
+        folder.change_config(plan.config)  # a resumed run with more steps or minutes
     return world, learner, folder
 
 
 def _train(plan: RunPlan, folder: Any, world: Any, learner: Any, loaded: Checkpoint | None) -> bool:
     """Train to the end; True if a signal ended it early."""
-    from bidex_meta.record import Recorder
+    from bidex_meta.record import Recorder, read_metrics, training_seconds
 
     runner = shared("runner")
     resume_step = None
@@ -151,9 +154,17 @@ def _train(plan: RunPlan, folder: Any, world: Any, learner: Any, loaded: Checkpo
     elif plan.folder is not None:
         resume_step = 0  # killed before its first checkpoint: the same seed takes it there again
         _say("No checkpoint yet: starting from the beginning.")
-    recorder = Recorder(folder, plan.config["steps"], resume_step) if launch().rank == 0 else contextlib.nullcontext()
+    budget = _budget(plan.config)
+    spent = training_seconds([row for row in read_metrics(folder.metrics_path) if row["step"] <= (resume_step or 0)])
+    recorder = Recorder(folder, **budget, resume_step=resume_step) if launch().rank == 0 else contextlib.nullcontext()
     with recorder as record:
-        return runner.train(learner, world, total_steps=plan.config["steps"], record=record)
+        return runner.train(learner, world, **budget, spent_seconds=spent, record=record)
+
+
+def _budget(config: dict[str, Any]) -> dict[str, Any]:
+    """When training ends: whichever of the two comes first."""
+    minutes = math.inf if config["minutes"] is None else config["minutes"]
+    return {"total_steps": config["steps"], "total_seconds": 60.0 * minutes}
 
 
 def _say_loss(loss: Exception, distributed: Any, folder: Any = None) -> None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import os
 import sys
 from collections.abc import Sequence
@@ -46,6 +47,9 @@ class RunFlags:
     """Rows stepped together by each process, over all tasks."""
     steps: StepCount = 0
     """Environment steps to train for, over all rows of all processes; 2e7 is understood."""
+    minutes: float | None = None
+    """Minutes to train for, counted from the first step of the world and without the evaluation; training ends with
+    whichever is up first, these or --steps. None: as long as --steps take."""
     seed: int = 0
     """Seed of tasks, starts and learner."""
     device: str = "auto"
@@ -61,7 +65,8 @@ class RunFlags:
     run_dir: Path | None = None
     """Folder of this run; None: runs/SUITE/ALGO/DATE_seedSEED."""
     resume: Path | None = None
-    """Continue this run from its last checkpoint, with its own config; only --steps may change."""
+    """Continue this run from its last checkpoint, with its own config; only --steps and --minutes may change, which
+    count what it has done already."""
     evaluate: bool = True
     """Evaluate at the end."""
     episodes: int | None = None
@@ -98,7 +103,8 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     resume = peek(arguments, "--resume")
     folder = RunFolder.open(Path(resume)) if resume else None
     # What older runs did not know.
-    stored = {"engine": "auto", "base": "own", "start_from": None, **folder.config()} if folder else {}
+    older = {"engine": "auto", "base": "own", "start_from": None, "minutes": None}
+    stored = {**older, **folder.config()} if folder else {}
     task = peek(arguments, "--task") or stored.get("task")
     kind = learner_kind(peek(arguments, "--algo") or stored.get("algo", RunFlags.algo), task)
     suite = peek(arguments, "--suite") or stored.get("suite")
@@ -152,6 +158,8 @@ def _resolved(flags: Any, preset: str, device: str, stored: dict[str, Any]) -> d
         value = getattr(flags, name)
         if value is not None and value < 1:
             raise BidexError(f"--{name.replace('_', '-')} must be at least 1, not {value}.")
+    if flags.minutes is not None and not 0.0 < flags.minutes < math.inf:
+        raise BidexError(f"--minutes must be a number above 0, such as 4 or 0.5, not {flags.minutes:g}.")
     suite = flags.suite
     if suite is not None and suite.endswith(".toml"):
         suite = str(Path(suite).expanduser().resolve())  # a run may be resumed from another folder
@@ -165,6 +173,7 @@ def _resolved(flags: Any, preset: str, device: str, stored: dict[str, Any]) -> d
         "learner": dataclasses.asdict(flags.learner),
         "num_envs": flags.num_envs,
         "steps": flags.steps,
+        "minutes": flags.minutes,
         "processes": launch().count,
         "seed": flags.seed,
         "device": device,
@@ -198,7 +207,7 @@ def _refuse_changes(stored: dict[str, Any], config: dict[str, Any], folder: RunF
             f"Continue: {resume_command(folder.path, before['processes'])}"
         )
     for name in sorted(before.keys() | after.keys()):
-        if name != "steps" and before.get(name) != after.get(name):
+        if name not in ("steps", "minutes") and before.get(name) != after.get(name):
             flag = "--" + name.replace("_", "-")
             raise BidexError(
                 f"{flag} is {before.get(name)} in {folder.path}, not {after.get(name)}: "

@@ -3,7 +3,7 @@
 import json
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +68,17 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
         except json.JSONDecodeError:
             break  # lines are only ever appended: what follows a torn one was never completed
     return rows
+
+
+def training_seconds(rows: Sequence[Mapping[str, Any]]) -> float:
+    """Wall time of the training, in seconds and over all resumes, that the lines of a ``metrics.jsonl`` tell of.
+
+    Of runs that did not yet log it: the time of the iterations alone, without that of checkpoints.
+    """
+    logged = [row["Perf/training_time"] for row in rows if "Perf/training_time" in row]
+    parts = ("Perf/collection_time", "Perf/learning_time")
+    unlogged = [row.get(part, 0.0) for row in rows if "Perf/training_time" not in row for part in parts]
+    return max(logged, default=sum(unlogged))
 
 
 def drop_after(path: Path, step: int) -> None:

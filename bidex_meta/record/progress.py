@@ -1,5 +1,6 @@
 """How training goes, on stderr: a live table in a terminal, a plain line every few seconds elsewhere."""
 
+import math
 import sys
 import time
 from collections.abc import Mapping
@@ -19,13 +20,16 @@ class Progress:
 
     Args:
         total_steps: Environment steps of the whole run.
+        total_seconds: Training time of the whole run; what is up comes from the metric ``Perf/training_time``.
         start_step: Where this process begins (a resumed run); its speed counts from there.
         stream: Where to write; stderr by default, so that stdout keeps to results.
     """
 
-    def __init__(self, total_steps: int, start_step: int = 0, stream: TextIO | None = None):
+    def __init__(
+        self, total_steps: int, total_seconds: float = math.inf, start_step: int = 0, stream: TextIO | None = None
+    ):
         self._console = Console(file=stream or sys.stderr)
-        self._total = total_steps
+        self._total, self._total_seconds = total_steps, total_seconds
         self._start_step = start_step
         self._start_time = time.monotonic()
         self._last_line = -float("inf")
@@ -48,7 +52,7 @@ class Progress:
         self._shown.update({tag: value for tag, value in metrics.items() if value == value})
         if self._live is not None:
             self._live.update(self._table(step), refresh=True)
-        elif time.monotonic() - self._last_line >= _PLAIN_SECONDS or step >= self._total:
+        elif time.monotonic() - self._last_line >= _PLAIN_SECONDS or self._seconds_left(step) <= 0.0:
             self._last_line = time.monotonic()
             self._console.print(self._line(step), soft_wrap=True, highlight=False, markup=False)
 
@@ -78,10 +82,18 @@ class Progress:
         return table
 
     def _speed(self, step: int) -> str:
-        elapsed = max(time.monotonic() - self._start_time, 1e-9)
-        rate = (step - self._start_step) / elapsed
-        left = _duration((self._total - step) / rate) if rate > 0 else "?"
-        return f"{step:,} / {self._total:,} steps  {rate:,.0f} steps/s  {left} left"
+        seconds = self._seconds_left(step)
+        left = _duration(seconds) if seconds < math.inf else "?"
+        return f"{step:,} / {self._total:,} steps  {self._rate(step):,.0f} steps/s  {left} left"
+
+    def _rate(self, step: int) -> float:
+        return (step - self._start_step) / max(time.monotonic() - self._start_time, 1e-9)
+
+    def _seconds_left(self, step: int) -> float:
+        """Until the steps are done or the time is up, whichever comes first."""
+        steps, rate = self._total - step, self._rate(step)
+        by_steps = 0.0 if steps <= 0 else steps / rate if rate > 0 else math.inf
+        return min(by_steps, self._total_seconds - self._shown.get("Perf/training_time", 0.0))
 
     def _overall(self) -> list[str]:
         mean_return, success = self._shown.get("Train/mean_return"), self._shown.get("Train/success_rate")

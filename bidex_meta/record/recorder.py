@@ -1,5 +1,6 @@
 """The one object a training loop writes to: metrics, checkpoints and progress behind ``log`` and ``save``."""
 
+import math
 from collections.abc import Mapping
 from types import TracebackType
 from typing import Any
@@ -15,13 +16,16 @@ class Recorder:
     Args:
         folder: The run folder.
         total_steps: Environment steps of the whole run, for the progress display.
+        total_seconds: Training time of the whole run, for the same.
         resume_step: Step of the checkpoint the run continues from; None for a new run.
     """
 
-    def __init__(self, folder: RunFolder, total_steps: int, resume_step: int | None = None):
+    def __init__(
+        self, folder: RunFolder, total_steps: int, total_seconds: float = math.inf, resume_step: int | None = None
+    ):
         self._checkpoints = folder.checkpoints
         self._metrics = MetricsWriter(folder.path, resume_step)
-        self._progress = Progress(total_steps, start_step=resume_step or 0)
+        self._progress = Progress(total_steps, total_seconds, start_step=resume_step or 0)
 
     def log(self, metrics: Mapping[str, float], step: int) -> None:
         """Write metrics and renew the progress display.

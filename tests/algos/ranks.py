@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import signal
 import socket
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,18 @@ import torch
 
 from bidex_algos import distributed
 
+# A deadlock shall fail, not last; a busy machine shall do neither.
+_DEADLOCK_SECONDS = 500
+
 
 def in_two_processes(function: Callable[[int], Any], folder: Path) -> list[Any]:
     """What ``function(rank)`` returns in each; it joins the other itself."""
+    assert exit_codes(function, folder) == [0, 0]
+    return [torch.load(folder / f"{rank}.pt", weights_only=False) for rank in range(2)]
+
+
+def exit_codes(function: Callable[[int], Any], folder: Path) -> list[int | None]:
+    """How two processes end that call ``function(rank)``, which joins the other itself."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -25,17 +35,17 @@ def in_two_processes(function: Callable[[int], Any], folder: Path) -> list[Any]:
         process.start()
     for process in processes:
         process.join()
-    assert [process.exitcode for process in processes] == [0, 0]
-    return [torch.load(folder / f"{rank}.pt", weights_only=False) for rank in range(2)]
+    return [process.exitcode for process in processes]
 
 
 def _one(function: Callable[[int], Any], rank: int, port: int, folder: Path) -> None:
     torch.set_num_threads(1)
-    signal.alarm(100)  # a deadlock shall fail, not last
+    signal.alarm(_DEADLOCK_SECONDS)
     places = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": 2, "LOCAL_WORLD_SIZE": 2, "MASTER_PORT": port}
     os.environ.update({name: str(value) for name, value in places.items()}, MASTER_ADDR="127.0.0.1")
     result = function(rank)
     distributed.shut_down()
+    assert threading.enumerate() == [threading.main_thread()]
     torch.save(result, folder / f"{rank}.pt")
 
 

@@ -10,13 +10,13 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from bidex_algos import distributed
+from bidex_algos import attendance, distributed
 from bidex_algos.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.mttrpo import MTTRPO, MTTRPOConfig
 from bidex_algos.rollout import collect
 from bidex_algos.runner import checkpoint, resume, train
 from bidex_meta.errors import BidexError
-from tests.algos.ranks import in_two_processes, same
+from tests.algos.ranks import exit_codes, in_two_processes, same
 from tests.algos.toy import ToyWorld, nearness
 
 CONFIG = MTPPOConfig(hidden=(32, 32), rollout_steps=8, learning_rate_range=(1e-5, 2e-3), autocast="off")
@@ -128,6 +128,17 @@ def stopping(rank: int) -> tuple[bool, int, list[int]]:
     return stopped, learner.env_steps, [step for step, _ in notes.saved]
 
 
+def out_of_time(rank: int) -> list[tuple[bool, int]]:
+    """No time but for the first iteration, in process 0 and then in process 1 alone."""
+    found = []
+    for late in range(2):
+        learner, world = make(rank)
+        seconds = 1e-6 if rank == late else 1e9
+        keywords = {"total_steps": 3 * ITERATION, "total_seconds": seconds, "record": Notes()}
+        found.append((train(learner, world, **keywords), learner.env_steps))
+    return found
+
+
 def bad_input(rank: int) -> str:
     """What is raised where process 1 alone meets bad input."""
 
@@ -149,7 +160,7 @@ def everything(rank: int) -> dict[str, Any]:
     distributed.init_from_environment()
     found: dict[Any, Any] = {name: in_two() for name, in_two in updates.items()}
     found |= {"training": training(rank), "stopping": stopping(rank), "bad_input": bad_input(rank)}
-    found["seed"] = distributed.own_seed(7)
+    found |= {"late": out_of_time(rank), "seed": distributed.own_seed(7)}
     found["together"] = distributed.together(lambda: rank + 10)
     return found
 
@@ -220,9 +231,26 @@ def test_a_signal_to_one_stops_both_after_the_same_iteration(found):
     assert found[1]["stopping"] == (True, 2 * ITERATION, [])
 
 
+def test_the_time_of_process_0_ends_both_after_the_same_iteration(found):
+    assert [here["late"] for here in found] == [[(False, ITERATION), (False, 3 * ITERATION)]] * 2
+
+
 def test_bad_input_in_one_ends_both_and_is_said_once(found):
     assert [here["bad_input"] for here in found] == ["SystemExit(2)", "BidexError('no such thing')"]
     assert [here["together"] for here in found] == [10, 11]
+
+
+def leave(rank: int) -> None:
+    """Ends as after bad input, with the other threads as busy as they can be."""
+    attendance._BEAT_SECONDS = 0.0
+    distributed.init_from_environment()
+    for _ in range(20):
+        distributed.share(torch.ones(1000))
+    raise SystemExit(2)
+
+
+def test_a_process_that_leaves_without_a_word_ends_with_its_own_exit_code(tmp_path):
+    assert exit_codes(leave, tmp_path) == [2, 2]
 
 
 def test_seeds_differ_and_the_first_process_keeps_the_runs_own(found):

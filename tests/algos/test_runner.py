@@ -8,6 +8,7 @@ import torch
 from bidex_algos import runner
 from bidex_algos.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.runner import checkpoint, resume, train
+from tests.algos.ranks import same
 from tests.algos.toy import ToyWorld, nearness
 
 CONFIG = MTPPOConfig(hidden=(8,), rollout_steps=4, autocast="off")
@@ -44,6 +45,43 @@ def test_training_ends_at_the_budget_and_saves_the_end():
     assert [step for step, _ in notes.saved] == [3 * ITERATION]
     assert train(learner, world, total_steps=ITERATION, record=notes) is False
     assert len(notes.logged) == 3 and len(notes.saved) == 1
+
+
+def test_training_ends_with_the_iteration_in_which_the_time_is_up(monkeypatch: pytest.MonkeyPatch):
+    clock = [1000.0]
+    monkeypatch.setattr(runner.time, "monotonic", lambda: clock[0])
+
+    class Timed(Notes):
+        """An iteration takes 10 s."""
+
+        def __init__(self):
+            super().__init__()
+            self.times: list[float] = []
+
+        def log(self, metrics: dict[str, float], step: int) -> None:
+            super().log(metrics, step)
+            self.times.append(metrics["Perf/training_time"])
+            clock[0] += 10.0
+
+    learner, world = make()
+    notes = Timed()
+    assert train(learner, world, total_steps=100 * ITERATION, total_seconds=25.0, record=notes) is False
+    assert notes.times == [0.0, 10.0, 20.0]
+    assert [step for step, _ in notes.saved] == [3 * ITERATION]
+    resumed = {"spent_seconds": 30.0, "record": notes}
+    train(learner, world, total_steps=100 * ITERATION, total_seconds=25.0, **resumed)
+    assert len(notes.times) == 3
+    train(learner, world, total_steps=100 * ITERATION, total_seconds=45.0, **resumed)
+    assert notes.times[3:] == [30.0, 40.0]
+    train(learner, world, total_steps=6 * ITERATION, total_seconds=1e9, **resumed)
+    assert len(notes.times) == 6  # the steps came first
+
+
+def test_the_time_changes_nothing_of_what_is_learned():
+    (plain, world), (timed, timed_world) = make(), make()
+    train(plain, world, total_steps=3 * ITERATION, record=None)
+    train(timed, timed_world, total_steps=3 * ITERATION, total_seconds=1e9, record=None)
+    assert same(checkpoint(plain, world), checkpoint(timed, timed_world))
 
 
 def test_checkpoints_come_in_time_and_the_last_is_not_written_twice():

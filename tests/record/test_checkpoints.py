@@ -91,16 +91,16 @@ for step in range(1, 10**9):
 
 
 def test_sigkill_while_writing_leaves_a_readable_checkpoint(tmp_path):
+    checkpoints = Checkpoints(tmp_path)
     writer = subprocess.Popen([sys.executable, "-c", _WRITER, str(tmp_path)])
     try:
-        deadline = time.monotonic() + 60
-        while not (tmp_path / "step_5.pt").exists() and time.monotonic() < deadline:
+        deadline = time.monotonic() + 300
+        while (checkpoints.newest_step() or 0) < 5 and time.monotonic() < deadline:
             time.sleep(0.001)
     finally:
         writer.send_signal(signal.SIGKILL)
         writer.wait()
     (tmp_path / ".last.pt.abc.tmp").write_bytes(b"half a file")  # what dying inside a write leaves
-    checkpoints = Checkpoints(tmp_path)
     loaded = checkpoints.load()
     assert loaded is not None
     assert loaded[1] >= 4

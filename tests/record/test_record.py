@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from bidex_meta.errors import BidexError
-from bidex_meta.record import MetricsWriter, Progress, RunFolder, read_metrics
+from bidex_meta.record import MetricsWriter, Progress, RunFolder, read_metrics, training_seconds
+from bidex_meta.record import progress as progress_module
 from bidex_meta.record.plots import plot_adaptation, plot_learning_curves
 from bidex_meta.record.video import check_suffix, write_image, write_video
 
@@ -79,18 +80,44 @@ def test_a_value_that_is_not_finite_stays_valid_json(tmp_path):
     assert (row["Loss/value"], row["Loss/policy"], row["ok"]) == (None, None, 1.0)
 
 
-def test_progress_without_a_terminal_is_one_plain_line(monkeypatch):
+@pytest.fixture
+def rare_lines(monkeypatch):
+    """However slow the machine, no second line is due."""
+    monkeypatch.setattr(progress_module, "_PLAIN_SECONDS", math.inf)
+
+
+def test_progress_without_a_terminal_is_one_plain_line(rare_lines):
     stream = io.StringIO()
     progress = Progress(1000, start_step=500, stream=stream)
     progress.start()
     metrics = {"Train/mean_return": 3.25, "Train/success_rate": 0.5, "Train/success/HandOver": 0.25}
     progress.update(metrics, 600)
-    progress.update(metrics, 700)  # within the same five seconds
+    progress.update(metrics, 700)
     progress.close()
     lines = stream.getvalue().splitlines()
     assert len(lines) == 1
     for part in ("600 / 1,000 steps", "steps/s", "left", "return 3.25", "success 50.0 %", "HandOver 25.0 %"):
         assert part in lines[0]
+
+
+def test_time_left_is_that_of_what_ends_first(rare_lines):
+    stream = io.StringIO()
+    progress = Progress(10**9, total_seconds=300.0, stream=stream)
+    progress.start()
+    progress.update({"Perf/training_time": 60.0}, 10)
+    progress.update({"Perf/training_time": 120.0}, 20)
+    progress.update({"Perf/training_time": 301.0}, 30)
+    progress.close()
+    first, last = stream.getvalue().splitlines()
+    assert "10 / 1,000,000,000 steps" in first and "4:00 left" in first
+    assert "30 / 1,000,000,000 steps" in last and "0:00 left" in last
+
+
+def test_training_time_is_counted_over_resumes_and_known_of_older_runs():
+    older = [{"step": 1, "Perf/collection_time": 3.0, "Perf/learning_time": 1.0}, {"step": 2}]
+    assert training_seconds([]) == 0.0
+    assert training_seconds(older) == 4.0
+    assert training_seconds([*older, {"step": 3, "Perf/training_time": 6.0}]) == 6.0
 
 
 def test_progress_in_a_terminal_is_a_table(monkeypatch):
