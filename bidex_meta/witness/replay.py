@@ -30,7 +30,7 @@ class Replay:
 
     @property
     def deepest(self) -> float:
-        """Deepest contact from the unshifted start, metres: what passes through nothing stays below some millimetres."""
+        """Deepest contact from the unshifted start, metres: small unless something was passed through."""
         return float(self.depths[:, 0].max())
 
     @property
