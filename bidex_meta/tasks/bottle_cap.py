@@ -1,7 +1,6 @@
 """BottleCap: appendix A.2.9, sheet 4.12."""
 
 import math
-from dataclasses import replace
 
 import mujoco
 import torch
@@ -10,7 +9,7 @@ from torch import Tensor
 from bidex_meta.hands.hand import hand
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.maths import constant, dot, indices
-from bidex_meta.tasks.base import FAST, TaskClass
+from bidex_meta.tasks.base import FIRM, TaskClass
 from bidex_meta.tasks.layout import Layout, both_hands, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, SHIFT, TURN, place
 from bidex_meta.tasks.reach import apart, reach
@@ -59,7 +58,7 @@ class BottleCap(TaskClass):
     transition_scale = 0.1
     orientation_scale = 0.1
     start_draws = DRAWS
-    solver = replace(FAST, cone=mujoco.mjtCone.mjCONE_PYRAMIDAL)
+    solver = FIRM
     camera_target = (0.0, -0.62, 0.52)
 
     @property

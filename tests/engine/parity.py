@@ -16,8 +16,9 @@ from bidex_meta.world.part import Part
 from tests.tasks.worlds import slot
 
 GROUPS = (
-    ("HandOver", "CatchUnderarm", "CatchOver2Underarm", "CatchAbreast"),
+    ("HandOver", "CatchUnderarm", "CatchOver2Underarm"),
     ("TwoCatchUnderarm",),
+    ("CatchAbreast",),
     ("LiftUnderarm",),
     ("DoorOpenOutward", "DoorOpenInward", "DoorCloseOutward", "DoorCloseInward"),
     ("BottleCap",),

@@ -12,7 +12,7 @@ from bidex_meta.tasks.scene import Scene, build_spec, compile_scene
 from bidex_meta.world.groups import build_groups, split_rows
 from tests.tasks.worlds import CASES, MOVING, slot
 
-ONE_EGG = {("HandOver", True), ("CatchUnderarm", True), ("CatchOver2Underarm", True), ("CatchAbreast", True)}
+ONE_EGG = {("HandOver", True), ("CatchUnderarm", True), ("CatchOver2Underarm", True)}
 DOORS = {case for case in CASES if case[0].startswith("Door")}
 SUBSTEPS = 4
 

@@ -18,7 +18,7 @@ from tests.engine.test_cpu import BREAKAGES, same
 from tests.tasks.worlds import Lens
 
 SUBSTEPS, ROWS = 2, 4
-NAMES = ("HandOver", "CatchUnderarm", "CatchOver2Underarm", "CatchAbreast")
+NAMES = ("HandOver", "CatchUnderarm", "CatchOver2Underarm", "CatchUnderarm")
 # A cold cache compiles for a minute and more, and one test process shall do it, not all (--dist loadgroup).
 pytestmark = [pytest.mark.timeout(900), pytest.mark.xdist_group("warp")]
 
