@@ -36,12 +36,12 @@ def test_bent_fingers_are_those_of_the_joint_table(hands: Puppets) -> None:
 
 
 def test_a_class_without_a_script_is_refused() -> None:
-    with pytest.raises(BidexError, match="GraspAndPlace, StackBlock"):
+    with pytest.raises(BidexError, match="GraspAndPlace, LiftUnderarm, PourWater, StackBlock"):
         script_of("HandOver")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["StackBlock", "GraspAndPlace"])
+@pytest.mark.parametrize("name", ["StackBlock", "GraspAndPlace", "LiftUnderarm", "PourWater"])
 def test_a_script_gives_the_stored_witness_again(name: str) -> None:
     hands = Puppets(name)
     script_of(name)(hands)

@@ -7,14 +7,15 @@ not depend on one of them. The actions are recorded; played again they need no s
 import torch
 from torch import Tensor
 
-from bidex_meta.hands.hand import FORCE_PER_SCALE, LINEAR_DAMPING, hand
+from bidex_meta.hands.hand import ANGULAR_DAMPING, FORCE_PER_SCALE, LINEAR_DAMPING, TORQUE_PER_SCALE, hand
 from bidex_meta.hands.pair import SIDES
+from bidex_meta.maths import conjugate, multiply, quaternion_from_rpy, rotate, xyzw
 from bidex_meta.witness.planner import quantised, rest_action
 from bidex_meta.witness.simulator import Simulator
 
 _COPIES, _SEED = 16, 7
 _GAIN = 8.0
-"""Speed of a hand over its distance to where it is led, 1/s."""
+"""Speed of a hand over its distance to where it is led, and of its turn over its angle to how it is held, 1/s."""
 _KNUCKLES, _MIDDLES = ("FFJ2", "MFJ2", "RFJ2", "LFJ2"), ("FFJ1", "MFJ1", "RFJ1", "LFJ1")
 
 Point = tuple[float, float, float]
@@ -43,6 +44,9 @@ class Puppets:
         self.episode_steps = self._simulator.episode_steps
         self._rest = rest_action(self._simulator.action_size)
         self._full_speed = FORCE_PER_SCALE * self._simulator.task.transition_scale / LINEAR_DAMPING[0]
+        self._full_torque = TORQUE_PER_SCALE * self._simulator.task.orientation_scale
+        self._held: dict[str, Tensor] = {}
+        self._first = {side: self.where(f"{side}/mount_quaternion") for side in SIDES}
         half = self._simulator.action_size // 2
         self._joints = len(hand().control_low)
         self._fingers = {side: self._rest[i * half :][: self._joints] for i, side in enumerate(SIDES)}
@@ -63,18 +67,26 @@ class Puppets:
         """Where a hand's point is, metres, (3,)."""
         return self.where(f"{side}/hand_point_position")
 
-    def bend(self, side: str, knuckles: float, middles: float) -> None:
-        """Bends the four fingers of a hand, rad."""
+    def bend(self, side: str, knuckles: float, middles: float, **others: float) -> None:
+        """Bends the four fingers of a hand, and sets other joints by their names (the rest is 0), rad."""
         low, high = (torch.as_tensor(x).float() for x in (hand().control_low, hand().control_high))
         angles = torch.zeros(self._joints)
         names = [hand().joints[i] for i in hand().actuated]
-        for joints, angle in ((_KNUCKLES, knuckles), (_MIDDLES, middles)):
-            for joint in joints:
-                angles[names.index(joint)] = angle
+        bent = {**dict.fromkeys(_KNUCKLES, knuckles), **dict.fromkeys(_MIDDLES, middles), **others}
+        for joint, angle in bent.items():
+            angles[names.index(joint)] = angle
         self._fingers[side] = (2.0 * (angles - low) / (high - low) - 1.0).clamp(-1.0, 1.0)
 
+    def hold(self, side: str, roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> None:
+        """Holds a hand from now on as it stood at the start, turned about the world's axes, rad.
+
+        A hand that was never held is turned by whatever it touches.
+        """
+        turn = torch.tensor(quaternion_from_rpy((roll, pitch, yaw)), dtype=torch.float64)
+        self._held[side] = multiply(xyzw(turn), xyzw(self._first[side]))
+
     def lead(self, right: Point, left: Point, steps: int = 1, speed: float = 0.6) -> None:
-        """Leads the hands' points towards two points for some control steps, without turning the hands.
+        """Leads the hands' points towards two points for some control steps.
 
         Args:
             right: World, metres.
@@ -89,12 +101,20 @@ class Puppets:
                 way *= min(1.0, speed / (float(way.norm()) + 1e-9))
                 action[i * half :][: self._joints] = self._fingers[side]
                 action[i * half + self._joints :][:3] = (way / self._full_speed).float().clamp(-1.0, 1.0)
+                action[i * half + self._joints :][3:6] = self._torque(side).float()
             action = quantised(action)
             trace = self._simulator.play(action.expand(1, _COPIES, -1))
             self.actions.append(action)
             self.rewards.append(float(trace.rewards[0, 0]))
             self.success.append(bool(trace.success[0, 0]))
 
-    def over(self) -> bool:
-        """Whether the episode's time is up."""
-        return len(self.actions) >= self.episode_steps
+    def _torque(self, side: str) -> Tensor:
+        """The actions (3,) that turn a hand towards how it is held, or leave it alone if it is not."""
+        if side not in self._held:
+            return torch.zeros(3)
+        mean = self.where(f"{side}/mount_quaternion")
+        now = xyzw(mean / mean.norm())
+        error = multiply(self._held[side], conjugate(now))
+        way = 2.0 * error[:3] * error[3].sign()  # rad, for small angles
+        torque = rotate(now, rotate(conjugate(now), way) * torch.tensor(ANGULAR_DAMPING, dtype=torch.float64))
+        return (_GAIN * torque / self._full_torque).clamp(-1.0, 1.0)

@@ -1,9 +1,11 @@
 """Scripts for the classes that are solved by a sequence the planner does not find on the printed reward.
 
 GraspAndPlace: the reward for the block's nearness is flat where the block starts, and a push pays only after the hand
-has followed. StackBlock: both blocks beside each other at the target pay almost as much as the stack.
+has followed. StackBlock: both blocks beside each other at the target pay almost as much as the stack. LiftUnderarm: a
+pot that is thrown to its goal pays before one that is lifted there. PourWater: water itself is not paid.
 """
 
+import math
 from collections.abc import Callable
 
 from torch import Tensor
@@ -13,6 +15,16 @@ from bidex_meta.witness.puppets import Point, Puppets
 
 _FINGERS = 0.085
 """From a hand's point to the tips of its bent fingers, metres."""
+_DOWN = 0.2
+"""Bend of the wrist that brings straight fingers below the forearm, rad."""
+_BACK = 0.698
+"""How far a wrist bends back, rad."""
+_REACH, _GRIP_HEIGHT = 0.1755 + 0.085, 0.068
+"""Where a hand's point is if its fingertips carry a grip of the pot: from the pot's origin, metres."""
+_TROUGH, _POUR = math.radians(59.0), math.radians(50.0)
+"""Turn that lays the left fingers on the underside of the kettle's trough; the kettle's tilt when it pours, rad."""
+_PRESS = 0.0015
+"""How far inside what a hand presses it is led, metres: about 6 N."""
 
 
 def script_of(name: str) -> Callable[[Puppets], None]:
@@ -21,43 +33,107 @@ def script_of(name: str) -> Callable[[Puppets], None]:
     Raises:
         BidexError: It has none.
     """
-    scripts = {"GraspAndPlace": grasp_and_place, "StackBlock": stack_block}
+    scripts = {
+        "GraspAndPlace": grasp_and_place,
+        "LiftUnderarm": lift_underarm,
+        "PourWater": pour_water,
+        "StackBlock": stack_block,
+    }
     if name not in scripts:
         raise BidexError(f"Expected a class with a script ({', '.join(scripts)}), got {name}; leave --script out.")
     return scripts[name]
 
 
 def grasp_and_place(hands: Puppets) -> None:
-    """The right hand tips the bucket towards the block and holds it, the left hand pushes the block in."""
-    bucket, block = hands.where("bucket/position"), hands.where("block/position")
-    away = _from(block, 0.0, -0.14, 0.635)
-    hands.lead(_from(bucket, -0.02, 0.13, 0.75), _from(block, 0.0, -0.14, 0.75), 30, speed=1.0)
-    hands.lead(_from(bucket, -0.02, 0.12, 0.685), away, 20)
-    for i in range(6):
-        hands.lead(_from(bucket, -0.02, 0.11 - 0.025 * i, 0.69), away, 5)
-    hands.lead(_from(bucket, -0.02, 0.10, 0.72), _from(block, 0.0, -0.13, 0.635), 15)
-
-    bucket = hands.where("bucket/position")  # it lies now, its mouth towards the block
-    behind = _from(bucket, 0.0, 0.09, 0.650)
-    hands.lead(_from(bucket, 0.0, 0.14, 0.72), _from(block, 0.0, -0.11, 0.635), 12)
-    near = _from(block, 0.0, -0.10, 0.632)
-    hands.lead(_from(bucket, 0.0, 0.14, 0.655), near, 12)
-    hands.lead(_from(bucket, 0.0, 0.105, 0.655), near, 12, speed=0.2)
-
-    x, y = (float(value) for value in hands.at("left")[:2])
-    while not hands.over():
-        block, mouth = hands.where("block/position"), hands.where("bucket/mouth_position")
-        x += max(-0.0015, min(0.0015, 0.1 * float(mouth[0] - block[0])))
-        y += 0.0018 if _depth_left(hands) > 0.015 else 0.0  # slowly: a block that slides is nowhere twice
-        hands.lead(behind, (x, y, 0.634), speed=0.3)
+    """Both hands clamp the block between the right forefinger and the left little finger, and drop it in the bucket."""
+    block, bucket = hands.where("block/position"), hands.where("bucket/position")
+    hands.bend("right", 0.0, 0.0, THJ3=0.5, THJ1=-0.5, THJ0=-1.5, WRJ0=_DOWN)  # its thumb out of the way
+    hands.bend("left", 0.0, 0.0, WRJ0=_DOWN)
+    hands.hold("right", yaw=0.15)
+    hands.hold("left", yaw=-0.15)
+    x, y = float(block[0]) + 0.075, float(block[1])
+    low, high = 0.642, 0.775
+    hands.lead((x, y + 0.11, high), (x, y - 0.11, high), 30)
+    hands.lead((x, y + 0.11, low), (x, y - 0.11, low), 30, speed=0.4)
+    hands.lead((x, y + 0.08, low), (x, y - 0.08, low), 20, speed=0.2)
+    for _ in range(30):
+        _clamp(hands, x, y, low)
+    for i in range(40):
+        _clamp(hands, x, y, low + (high - low) * (i + 1) / 40)
+    way = (bucket - hands.where("block/position"))[:2] / 80
+    for i in range(90):
+        x, y = (x + float(way[0]), y + float(way[1])) if i < 80 else (x, y)
+        _clamp(hands, x, y, high)
+    hands.lead((x, y + 0.11, high), (x, y - 0.11, high), hands.episode_steps, speed=0.2)
 
 
-def _depth_left(hands: Puppets) -> float:
-    """How far the block still is from the bucket's origin along its axis, metres, in the copy where it is farthest."""
-    sensors = ("bucket/position", "block/position", "bucket/mouth_position")
-    bucket, block, mouth = (hands.everywhere(sensor) for sensor in sensors)
-    axis = (mouth - bucket) / (mouth - bucket).norm(dim=1, keepdim=True)
-    return float(((block - bucket) * axis).sum(dim=1).max())
+def _clamp(hands: Puppets, x: float, y: float, height: float) -> None:
+    """Presses the hands together, whatever lies between them, and leads their middle in y."""
+    right, left = float(hands.at("right")[1]), float(hands.at("left")[1])
+    way = y - 0.5 * (right + left)
+    hands.lead((x, right + way - _PRESS, height), (x, left + way + _PRESS, height))
+
+
+def lift_underarm(hands: Puppets) -> None:
+    """The hands go under the pot's grips, bent back as far as their wrists allow, and lift the pot to its goal."""
+    pot = hands.where("object/position")
+    out = (hands.where("object/right_handle_position") - pot) / 0.15  # from the pot to the right grip, of length 1
+    yaw = math.atan2(-float(out[0]), float(out[1]))
+    for side, sign in (("right", -1.0), ("left", 1.0)):
+        hands.bend(side, 0.0, 0.0, WRJ0=-_BACK)  # against the joint's limit: a wrist's motor is weaker than the pot
+        hands.hold(side, roll=sign * (_BACK + 0.1), yaw=yaw)
+    out[2] = 0.0
+
+    def under(middle: Tensor, height: float, steps: int, speed: float, reach: float = _REACH) -> None:
+        right, left = middle + reach * out, middle - reach * out
+        hands.lead(_from(right, 0.0, 0.0, height), _from(left, 0.0, 0.0, height), steps, speed)
+
+    height = float(pot[2]) + _GRIP_HEIGHT
+    under(pot, height - 0.06, 25, 0.6, reach=_REACH + 0.1)
+    under(pot, height - 0.04, 30, 0.3)
+    under(pot, height, 30, 0.1)
+    way = hands.frozen("goal")[:3] - pot
+    for i in range(150):
+        share = (i + 1) / 150
+        under(pot + share * way, height + share * float(way[2]), 1, 0.6)
+    under(pot + way, height + float(way[2]), hands.episode_steps, 0.6)
+
+
+def pour_water(hands: Puppets) -> None:
+    """The right hand grips the handle, the left goes under the spout; they lift the kettle and tilt it."""
+    kettle, bucket = hands.where("kettle/position"), hands.where("bucket/position")
+    back = hands.where("kettle/handle_position") - kettle  # from spout to handle
+    back = back / back.norm()
+
+    def grip(origin: Tensor, tilt: float = 0.0, aside: float = 0.0, loose: float = -0.003, steps: int = 1) -> None:
+        """Leads the hands to where they hold a kettle at this place, or ``loose`` metres off it, ``aside`` in x."""
+
+        def at(x: float, along: float, up: float) -> Point:
+            flat = along * math.cos(tilt) - up * math.sin(tilt)
+            rise = along * math.sin(tilt) + up * math.cos(tilt)
+            return _from(origin + flat * back, x + aside, 0.0, float(origin[2]) + rise)
+
+        hands.hold("right", roll=tilt)
+        hands.hold("left", roll=_TROUGH + tilt)
+        hands.lead(at(-0.005, 0.159 + 0.2 * loose, -0.004), at(0.065, -0.153, 0.030 - loose), steps, speed=1.0)
+
+    hands.bend("right", 0.0, 0.0)
+    hands.bend("left", 0.0, 0.0, THJ4=1.047, THJ3=1.222)  # its thumb across the palm, off the kettle's wall
+    grip(kettle, aside=0.15, loose=0.025, steps=26)
+    grip(kettle, loose=0.025, steps=17)
+    hands.bend("right", 1.2, 1.5)
+    grip(kettle, steps=17)
+
+    sine, cosine = math.sin(_POUR), math.cos(_POUR)
+    lip = -0.2 * cosine - 0.053 * sine, 0.053 * cosine - 0.2 * sine  # of a tilted kettle, along ``back`` and up
+    way = bucket + (0.07 - lip[0]) * back - kettle
+    way[2] += 0.098 - lip[1]
+    for i in range(34):
+        share = (i + 1) / 34
+        there = kettle + share * way
+        there[2] = kettle[2] + min(1.0, 1.3 * share) * way[2]  # up first: the left hand must clear the bucket's rim
+        grip(there, share * _POUR)
+    grip(kettle + way, _POUR, steps=hands.episode_steps)
 
 
 def stack_block(hands: Puppets) -> None:
