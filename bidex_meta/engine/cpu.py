@@ -72,9 +72,10 @@ class CpuEngine:
 
     def unstable(self) -> Tensor:
         """Which simulations broke since their last reset. Shape (num,), bool."""
-        bad = torch.from_numpy((self.batch.warning[:, _BAD, 1] > 0).any(axis=1))
+        told = self.batch.warning[:, :, 1]
+        bad = told.take(_BAD, axis=1).any(axis=1) if told.any() else np.zeros(self.num, dtype=bool)
         # One non-finite addend makes the sum non-finite.
-        return bad | self._failed | ~self.sensordata.sum(dim=1).isfinite()
+        return torch.from_numpy(bad) | self._failed | ~self.sensordata.sum(dim=1).isfinite()
 
     def warnings(self) -> Tensor:
         """How many of MuJoCo's warnings each simulation has told since its last reset. Shape (num,), int64."""

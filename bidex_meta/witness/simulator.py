@@ -10,6 +10,7 @@ from torch import Tensor
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import unknown_name
 from bidex_meta.world import Slot, World
+from bidex_meta.world.part import judge
 
 SUITE, SEED = "MT20", 0
 """Witnesses are about task 0 of each class of this suite and seed."""
@@ -101,9 +102,11 @@ class Simulator:
         alive = torch.ones(self.num, dtype=torch.bool)
         rewards, success = [], []
         for action in actions:
-            self._part.step(action, None)
-            transition = self._part.transition(list(self._part.states(self._world.task_index)))
-            alive &= ~transition.unstable
+            self._part.control(action)
+            self._part.advance(None)
+            (_, _, state), *_ = self._part.states(self._world.task_index)
+            transition = judge(self._part.group.members[0].scene.task, state)
+            alive &= ~self._part.unstable()
             rewards.append(torch.where(alive, transition.reward, 0.0))
             success.append(alive & transition.success)
             alive &= ~transition.failed

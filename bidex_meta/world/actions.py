@@ -14,8 +14,9 @@ def clean(action: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         The actions with non-finite numbers replaced by 0, shape (n, a), and which rows held one, shape (n,), bool.
     """
-    finite = action.isfinite()
-    return torch.where(finite, action, torch.zeros_like(action)).clamp(-1.0, 1.0), ~finite.all(dim=1)
+    # Zero times a number is zero unless it is infinite or none.
+    broken = (0.0 * action).sum(dim=1) != 0.0
+    return action.nan_to_num(0.0, 0.0, 0.0).clamp_(-1.0, 1.0), broken
 
 
 class Controls:

@@ -43,6 +43,8 @@ class Observer:
                 self._scale[where] = block.scale
             if block.name.endswith("joint_position"):
                 self._scale[where], self._offset[where] = 2.0 / span, -middle / span
+        # Fresh memory for every step would cost more than what is written to it.
+        self._sensors = torch.empty(len(start_mounts), scene.model.nsensordata, device=device)
         self._start_inverse = conjugate(start_mounts)
         self._mounts = torch.cat([_indices(scene, f"{side}/mount_quaternion") for side in SIDES]).to(device)
         self._actions = [self.layout.range(f"{side}_action") for side in SIDES]
@@ -61,7 +63,8 @@ class Observer:
         Returns:
             Shape (n, width), float32.
         """
-        values = torch.index_select(sensors.float(), 1, self._source, out=out).mul_(self._scale).add_(self._offset)
+        floats = self._sensors[: len(sensors)].copy_(sensors)
+        values = torch.index_select(floats, 1, self._source, out=out).mul_(self._scale).add_(self._offset)
         share = action.shape[1] // len(SIDES)
         for i, where in enumerate(self._actions):
             values[:, where] = action[:, i * share : (i + 1) * share]

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.maths import xyzw
-from bidex_meta.tasks.base import CONTROL_RATE
+from bidex_meta.tasks.base import CONTROL_RATE, TaskClass
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.world.actions import Controls
 from bidex_meta.world.groups import Group, Member, Slot
@@ -16,21 +16,27 @@ from bidex_meta.world.observations import Observer, Rule, clip
 
 @dataclass(frozen=True)
 class Transition:
-    """What a step did to a part's rows, before it is scaled or cleaned.
+    """What a step did to rows of one class, before it is scaled or cleaned.
 
     Attributes:
-        terms: Reward terms by name, each (num,); 0 where a class has no such term.
-        reward: Their sum, shape (num,).
-        success: Shape (num,), bool.
-        failed: Shape (num,), bool.
-        unstable: Shape (num,), bool.
+        terms: Reward terms by name, each (n,).
+        reward: Their sum, shape (n,).
+        success: Shape (n,), bool.
+        failed: Shape (n,), bool.
     """
 
     terms: dict[str, Tensor]
     reward: Tensor
     success: Tensor
     failed: Tensor
-    unstable: Tensor
+
+
+def judge(task: TaskClass, state: TaskState) -> Transition:
+    """Reward, success and ends of the step just made."""
+    terms = task.reward_terms(state)
+    values = list(terms.values())
+    reward = torch.stack(values).sum(dim=0) if len(values) > 1 else values[0]
+    return Transition(terms, reward, task.success(state), task.failed(state))
 
 
 class Part:
@@ -88,10 +94,13 @@ class Part:
         """Writes the actions of the part's rows, shape (num, a), into the engine."""
         self._controls.write(action)
 
-    def step(self, action: Tensor, active: Tensor | None) -> None:
-        """Applies actions, shape (num, a), and advances all rows, or those of the mask, by one control step."""
-        self.control(action)
+    def advance(self, active: Tensor | None) -> None:
+        """Advances all rows, or those of the mask, by one control step."""
         self._engine.step(self.substeps, active)
+
+    def unstable(self) -> Tensor:
+        """Which rows broke since their last reset. Shape (num,), bool."""
+        return self._engine.unstable()
 
     def states(self, task_index: Tensor, rows: Tensor | None = None) -> Iterator[tuple[Member, slice, TaskState]]:
         """The members that have rows here, the rows' place among the chosen ones, and their state.
@@ -114,23 +123,6 @@ class Part:
             first, last = torch.searchsorted(rows, bounds).tolist()
             if last > first:
                 yield i, member, slice(first, last), rows[first:last]
-
-    def transition(self, states: list[tuple[Member, slice, TaskState]]) -> Transition:
-        """Reward, success and ends of the step just made, for all rows."""
-        num, sensors = self._engine.num, self._engine.sensordata
-        terms: dict[str, Tensor] = {}
-        reward = sensors.new_empty(num)
-        success, failed = torch.empty(2, num, dtype=torch.bool, device=sensors.device).unbind()
-        for member, where, state in states:
-            task = member.scene.task
-            named = task.reward_terms(state)
-            for name, value in named.items():
-                terms.setdefault(name, sensors.new_zeros(num))[where] = value
-            reward[where] = (
-                torch.stack(list(named.values())).sum(dim=0) if len(named) > 1 else next(iter(named.values()))
-            )
-            success[where], failed[where] = task.success(state), task.failed(state)
-        return Transition(terms, reward, success, failed, self._engine.unstable())
 
     def observe(
         self,

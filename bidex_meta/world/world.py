@@ -1,7 +1,7 @@
 """The batched world: all rows of a suite, stepped together.
 
-The way of one observation: ``Part.step`` (engine) -> ``sensordata`` -> ``Observer`` (gather, scale) ->
-``TaskClass.observe`` (goal blocks) -> ``World._observe`` (padding, task id) -> the learner's network.
+The way of one observation: ``Part.advance`` (engine) -> ``sensordata`` -> ``Observer`` (gather, scale) ->
+``TaskClass.observe`` (goal blocks) -> ``World._with_id`` (padding, task id) -> the learner's network.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ from bidex_meta.world.autoreset import checked_mode, reset_mask
 from bidex_meta.world.episodes import Episodes
 from bidex_meta.world.groups import Slot, build_groups, split_rows
 from bidex_meta.world.observations import Rule
-from bidex_meta.world.part import Part, Transition
+from bidex_meta.world.part import Part, judge
 from bidex_meta.world.random import row_keys
 from bidex_meta.world.rendering import render_row
 from bidex_meta.world.starts import Starts
@@ -270,7 +270,9 @@ class World(VectorEnv):
         active = ~self.episodes.finished
         self._action = torch.where(active[:, None], action, self._action) if disabled else action
         for part in self.parts:
-            part.step(part.group.take(self._action), part.group.take(active) if disabled else None)
+            part.control(part.group.take(self._action))
+        for part in self.parts:  # not after its own controls: an engine's step empties the caches
+            part.advance(part.group.take(active) if disabled else None)
         return self._finish(active, broken & active)
 
     def _finish(self, active: Tensor, broken: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
@@ -320,16 +322,19 @@ class World(VectorEnv):
         for part in self.parts:
             group = part.group
             states = list(part.states(group.take(self.task_index)))
-            made: Transition = part.transition(states)
-            where = group.rows if group.span is None else group.span
-            reward[where] = made.reward.float()
-            for name, value in made.terms.items():
-                terms.setdefault(name, torch.zeros(n, device=self.device))[where] = value.float()
-            success[where], failed[where], unstable[where] = made.success, made.failed, made.unstable
             out = None if group.span is None else obs[group.span]
             values = self._with_id(part.observe(states, group.take(self._action), out=out), group.rows)
-            if out is None:
-                obs[group.rows] = values
+            broke = part.unstable()
+            for member, where, state in states:
+                # Rows of a member follow each other in the world too: slices are cheaper than lists of rows.
+                rows = member.world_rows
+                made = judge(member.scene.task, state)
+                reward[rows], success[rows], failed[rows] = made.reward, made.success, made.failed
+                unstable[rows] = broke[where]
+                for name, value in made.terms.items():
+                    terms.setdefault(name, torch.zeros(n, device=self.device))[rows] = value
+                if out is None:
+                    obs[rows] = values[where]
         return reward, success, failed, unstable | broken, terms, obs
 
     def state_dict(self) -> dict[str, Any]:
