@@ -203,10 +203,24 @@ def test_steadying_keeps_an_episode_that_nothing_betters(monkeypatch: pytest.Mon
 
     monkeypatch.setattr(steady, "mutants", no_changes)
     actions = load_witness("Switch").actions[:20]
-    told: list[int] = []
-    found = steady.steadied("Switch", actions, rounds=1, threads=1, report=lambda solved, _: told.append(solved))
+    told: list[tuple[int, float]] = []
+    found = steady.steadied("Switch", actions, 1, threads=1, report=lambda solved, _, deep: told.append((solved, deep)))
     np.testing.assert_array_equal(found, actions)
-    assert told == [10], "the witness succeeds at its seventh step, from any shifted start"
+    assert told == [(10, 0.0)], "the witness succeeds at its seventh step, from any shifted start, and softly"
+
+
+def test_steadying_prefers_soft_blows(monkeypatch: pytest.MonkeyPatch) -> None:
+    def one_change(elites: torch.Tensor, count: int, *_: object) -> torch.Tensor:
+        changed = elites[:1].repeat(count, 1, 1)
+        changed[1, :, 20] += 0.05  # the right base is pushed a little along x
+        return changed
+
+    monkeypatch.setattr(steady, "mutants", one_change)
+    # Rows of all but the changed sequence are told to be deep.
+    monkeypatch.setattr(Simulator, "contact_depth", lambda self, row: 0.001 if row % 12 == 1 else 0.02)
+    actions = load_witness("Switch").actions[:20]
+    found = steady.steadied("Switch", actions, 1, threads=1)
+    assert (found != actions).any(axis=0).nonzero()[0].tolist() == [20]
 
 
 def test_steady_needs_an_episode(capsys: pytest.CaptureFixture[str]) -> None:

@@ -166,8 +166,8 @@ def _steady(name: str, flags: WitnessFlags) -> None:
         raise BidexError("witness: --steady makes an episode safer; give it with --improve FILE.")
     earlier, seed = load_witness(name, flags.improve), flags.planner.seed
 
-    def report(solved: int, total: float) -> None:
-        print(f"{name}: {solved} of 10 shifted starts, mean return {total:.3f}", flush=True)
+    def report(solved: int, total: float, deep: float) -> None:
+        print(f"{name}: {solved} of 10 shifted starts, mean return {total:.3f}, deep states {deep:.1f}", flush=True)
 
     actions = steadied(name, earlier.actions, flags.steady, seed, flags.threads, report)
     trace = Simulator(name, 1, flags.threads).play(torch.from_numpy(actions)[:, None])

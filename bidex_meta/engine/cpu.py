@@ -55,6 +55,8 @@ class CpuEngine:
         self.sensordata = self._bind("sensordata")
         self._mocap = [self._state[name] for name in ("mocap_pos", "mocap_quat") if name in self._state]
         self._failed = torch.zeros(self.num, dtype=torch.bool)
+        self._models, self._model_of = list(models), list(rows)
+        self._probe: mujoco.MjData | None = None
 
     def _bind(self, name: str) -> Tensor:
         with warnings.catch_warnings():  # torch warns that outputs of the batch are read-only; nothing here writes them
@@ -123,8 +125,17 @@ class CpuEngine:
 
     def contact_depth(self, row: int) -> float:
         """Deepest penetration among a simulation's contacts, metres, 0 without contact."""
-        distances = self.data(row).contact.dist
-        return float(max(0.0, -np.min(distances))) if len(distances) else 0.0
+        model = self._models[self._model_of[row]]
+        if self._probe is None:  # the batch's copies of model and data would take ten times as long
+            self._probe = mujoco.MjData(model)
+        data = self._probe
+        data.qpos[:] = self.qpos[row].numpy()
+        if self._mocap:
+            data.mocap_pos[:], data.mocap_quat[:] = (value[row].numpy() for value in self._mocap)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_collision(model, data)
+        return float(max(0.0, -data.contact.dist.min())) if data.ncon else 0.0
 
 
 def _silent(message: str) -> None:

@@ -29,12 +29,14 @@ class Solver:
     """How much stiffer friction is than the normal force: what is held creeps the less."""
     time_step: float = 1.0 / 120.0
     """Seconds: a whole number to a control step. Contacts and limits are as stiff as it allows."""
+    most_condim: int = 4
+    """Dimensions of a contact at most: 4 with torsional friction (of the files' eggs and fingertips), 3 without."""
 
 
-LIGHT = Solver(cone=mujoco.mjtCone.mjCONE_PYRAMIDAL, impratio=3.0)
+LIGHT = Solver(cone=mujoco.mjtCone.mjCONE_PYRAMIDAL, impratio=3.0, time_step=1.0 / 180.0, most_condim=3)
 """For eggs, held for a second: what creeps by a millimetre a second does no harm."""
-LIGHT_FAST = replace(LIGHT, time_step=1.0 / 180.0)
-"""For an egg and a fast base: in 1/120 s a hand at full speed is 24 mm further and knocks the egg away."""
+GENTLE = replace(LIGHT, time_step=1.0 / 120.0)
+"""For an egg that is thrown across a narrow gap, so that nothing is fast."""
 FIRM = Solver(100, 50)
 """For light bodies between hands and table: with the common caps the solver stops early and kicks them."""
 FAST = Solver(100, 50, time_step=1.0 / 180.0)

@@ -6,7 +6,6 @@ from torch import Tensor
 
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.maths import constant, norm
-from bidex_meta.tasks.base import LIGHT_FAST
 from bidex_meta.tasks.one_egg import OneEgg
 from bidex_meta.tasks.state import TaskState
 
@@ -33,7 +32,6 @@ class CatchAbreast(OneEgg):
     position_noise = 0.0
     joint_noise = 0.0
     floor = 0.2
-    solver = LIGHT_FAST
     camera_target = (-0.25, -0.85, 0.5)
     camera_distance = 1.4
 

@@ -1,6 +1,7 @@
 """HandOver: appendix A.2.1, sheet 4.1."""
 
 from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
+from bidex_meta.tasks.base import GENTLE
 from bidex_meta.tasks.one_egg import OneEgg
 
 
@@ -25,3 +26,4 @@ class HandOver(OneEgg):
     position_noise = 0.01
     joint_noise = 0.2
     floor = 0.2
+    solver = GENTLE

@@ -164,6 +164,8 @@ def build_spec(task: "TaskClass") -> mujoco.MjSpec:
     add_hands(spec, task.right, task.left, task.moving_base)
     task.add_objects(spec)
     _let_objects_fall(spec)
+    for geom in spec.geoms:
+        geom.condim = min(geom.condim, task.solver.most_condim)
     return spec
 
 

@@ -16,9 +16,9 @@ from bidex_meta.world.part import Part
 from tests.tasks.worlds import slot
 
 GROUPS = (
-    ("HandOver", "CatchUnderarm", "CatchOver2Underarm"),
+    ("HandOver",),
+    ("CatchUnderarm", "CatchOver2Underarm", "CatchAbreast"),
     ("TwoCatchUnderarm",),
-    ("CatchAbreast",),
     ("LiftUnderarm",),
     ("DoorOpenOutward", "DoorOpenInward", "DoorCloseOutward", "DoorCloseInward"),
     ("BottleCap",),
