@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from bidex_meta.tasks.base import TaskClass
     from bidex_meta.tasks.variation import VariationSpace
     from bidex_meta.world import Slot, World
+from bidex_meta.world.threads import keep_freed_memory
 
 TaskSampling = Literal["uniform", "fixed"]
 
@@ -268,6 +269,7 @@ def _make_world(
     if not isinstance(num_envs, int | np.integer) or isinstance(num_envs, bool) or num_envs < len(slots):
         names = ", ".join(slot.name for slot in slots)
         raise BidexError(f"num_envs: expected at least {len(slots)}, a row each for {names}; got {num_envs!r}.")
+    keep_freed_memory()
     return World(
         slots,
         int(num_envs),

@@ -143,8 +143,7 @@ def _stages(made: World, steps: int) -> dict[str, float]:
         action = torch.rand(made.num_envs, made.action_size, generator=generator, device=made.device) * 2.0 - 1.0
         marks = [_now(made.device)]
         for part in made.parts:
-            part.control(part.group.take(action))
-            part.advance(None)
+            part.step(part.group.take(action), None)
         marks.append(_now(made.device))
         made._collect(nobody)
         marks.append(_now(made.device))

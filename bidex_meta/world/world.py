@@ -139,8 +139,8 @@ class World(VectorEnv):
 
     def _seed_rows(self, seed: int) -> None:
         self.seed = int(seed)
-        pairs = zip(self.slots, self.slot_rows, strict=True)
-        keys = torch.cat([row_keys(seed, s.name, rows.stop - rows.start, self.device) for s, rows in pairs])
+        counts = zip(self.slots, self.slot_rows, strict=True)
+        keys = torch.cat([row_keys(seed, s.name, rows.stop - rows.start, self.device) for s, rows in counts])
         draws = max(slot.task_class.start_draws for slot in self.slots)
         self._starts = Starts(self.parts, keys, draws, self._pool_size if self._uniform_tasks else None)
         self.episodes = Episodes.fresh(self.num_envs, self.device)
@@ -271,7 +271,7 @@ class World(VectorEnv):
         self._action = torch.where(active[:, None], action, self._action) if disabled else action
         for part in self.parts:
             part.control(part.group.take(self._action))
-        for part in self.parts:  # not after its own controls: an engine's step empties the caches
+        for part in self.parts:  # apart from the controls: an engine's step empties the caches
             part.advance(part.group.take(active) if disabled else None)
         return self._finish(active, broken & active)
 
@@ -315,8 +315,7 @@ class World(VectorEnv):
     def _collect(self, broken: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Tensor], Tensor]:
         """Reward, success, failed, unstable, reward terms and observations of all rows after a step."""
         n = self.num_envs
-        reward = torch.empty(n, device=self.device)
-        obs = torch.empty(n, self.observation_size, device=self.device)
+        reward, obs = (torch.empty(*shape, device=self.device) for shape in ((n,), (n, self.observation_size)))
         success, failed, unstable = torch.zeros(3, n, dtype=torch.bool, device=self.device).unbind()
         terms: dict[str, Tensor] = {}
         for part in self.parts:
@@ -326,9 +325,7 @@ class World(VectorEnv):
             values = self._with_id(part.observe(states, group.take(self._action), out=out), group.rows)
             broke = part.unstable()
             for member, where, state in states:
-                # Rows of a member follow each other in the world too: slices are cheaper than lists of rows.
-                rows = member.world_rows
-                made = judge(member.scene.task, state)
+                rows, made = member.world_rows, judge(member.scene.task, state)
                 reward[rows], success[rows], failed[rows] = made.reward, made.success, made.failed
                 unstable[rows] = broke[where]
                 for name, value in made.terms.items():
