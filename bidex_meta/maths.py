@@ -113,7 +113,7 @@ def roll_pitch_yaw(q: Tensor) -> Tensor:
 
 
 def random_orientation(u0: Tensor, u1: Tensor) -> Tensor:
-    """The paper's random orientation: a turn by pi u0 about x times a turn by pi u1 about y (sheet 3.3).
+    """A random orientation: a turn by pi u0 about x times a turn by pi u1 about y (docs/figures.md, start noise).
 
     Args:
         u0: Draws in [-1, 1], shape (n,).

@@ -112,7 +112,7 @@ def test_roll_pitch_yaw_survives_a_vertical_pitch() -> None:
 
 @given(hnp.arrays(np.float64, (5, 2), elements=unit))
 def test_random_orientation(u: np.ndarray) -> None:
-    """Sheet 3.3: turn by pi u0 about x, on the left, times turn by pi u1 about y."""
+    """Turn by pi u0 about x, on the left, times turn by pi u1 about y (docs/figures.md, start noise)."""
     found = maths.random_orientation(*torch.from_numpy(u).unbind(1))
     assert found.dtype == torch.float64
     x, y = (Rotation.from_rotvec(np.pi * u[:, [i]] * np.eye(3)[i]) for i in (0, 1))

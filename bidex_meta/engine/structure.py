@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-# Numbers that mujoco_warp keeps per world (its 4.0 Model; the spec's engine sheet, section 1.1); the C engine takes a
+# Numbers that mujoco_warp 4.0 keeps per world (arrays of its Model with a first dimension "*"); the C engine takes a
 # whole model per simulation and is freer, but both engines shall group alike.
 _PER_WORLD_FIELDS = """
     qpos0 qpos_spring

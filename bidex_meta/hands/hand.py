@@ -11,17 +11,19 @@ from bidex_meta import paths
 FINGERS = ("ff", "mf", "rf", "lf", "th")
 """Fingers in the order of Table 7."""
 CENTRE_OF_MASS = (0.0016, 0.0081, 0.2917)
-"""The hand's centre of mass in the mount frame at zero pose, metres (sheet 1.3): where a moving base is driven."""
+"""The hand's centre of mass in the mount frame at zero pose, metres: where a moving base is driven
+(docs/figures.md, base)."""
 LINEAR_DAMPING = (501.0, 501.0, 501.0)
 """Damping of a moving base, N s/m: 5.011 kg times the original's 100 per second."""
 ANGULAR_DAMPING = (2.60, 2.65, 1.12)
-"""Damping of a moving base about its own axes, N m s/rad: the hand's inertia times 100 per second (sheet 1.3)."""
+"""Damping of a moving base about its own axes, N m s/rad: the hand's inertia times 100 per second
+(docs/figures.md, base)."""
 FORCE_PER_SCALE = 100_000.0 / 60.0
-"""Newton per unit of action and of a class's translation scale (sheet 1.3)."""
+"""Newton per unit of action and of a class's translation scale (docs/figures.md, base)."""
 TORQUE_PER_SCALE = 1_000.0 / 60.0
 """Newton metre per unit of action and of a class's orientation scale."""
 DISTAL_PER_MIDDLE = 0.00805 / 0.00705
-"""Distal over middle joint angle when the coupling tendon is at rest (sheet 2.4)."""
+"""Distal over middle joint angle when the coupling tendon is at rest (docs/figures.md, hand joints)."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Where a hand starts: position and orientation of its mount in the world (sheet 2.1 and section 4)."""
+"""Where a hand starts: its mount's position and orientation in the world (docs/figures.md, start poses)."""
 
 import math
 from dataclasses import dataclass
@@ -9,12 +9,12 @@ MOUNT_QUATERNION = (0.0, 0.0, -math.sqrt(0.5), math.sqrt(0.5))
 """Orientation (w, x, y, z) of the mount for an unrotated actor: fingers to world -y, palm up, thumb to -x."""
 
 PALM_UP_AWAY = (0.0, 0.0, 0.0)
-"""Pose A of the sheet, roll pitch yaw: fingers to -y, palm up."""
+"""Pose A of docs/figures.md, roll pitch yaw: fingers to -y, palm up."""
 PALM_UP_BACK = (0.0, 0.0, math.pi)
 """Pose B: fingers to +y, palm up; faces a hand in pose A."""
 
 PALM_LEFT_AHEAD = (math.pi, 0.5 * math.pi, 0.5 * math.pi)
-"""Pose C: fingers to -x, palm to -y, thumb up: a right hand that faces a left one (the sheet's 1.57 made exact)."""
+"""Pose C: fingers to -x, palm to -y, thumb up: a right hand that faces a left one (the original's 1.57 made exact)."""
 PALM_RIGHT_AHEAD = (math.pi, -0.5 * math.pi, 0.5 * math.pi)
 """Pose D: fingers to -x, palm to +y, thumb down."""
 PALM_DOWN_AHEAD = (math.pi, 0.0, 0.5 * math.pi)

@@ -1,4 +1,4 @@
-"""Joint angles at the start of an episode, and room for the object that lies on the hand (design.md section 4)."""
+"""Joint angles at the start of an episode, and room for what lies on the hand (docs/figures.md, start noise)."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -10,20 +10,22 @@ from bidex_meta.hands.hand import DISTAL_PER_MIDDLE, hand
 from bidex_meta.maths import constant, dot, norm
 
 _WRIST = (0.0, 0.01, 0.256)
-"""Wrist origin in the mount frame, metres; the palm lies 0.034 further along the turned z (sheet 2.2)."""
+"""Wrist origin in the mount frame, metres; the palm lies 0.034 further along the turned z (docs/figures.md,
+hand frames)."""
 _PALM_OFFSET = 0.034
 _PALM_HALF_THICKNESS = 0.0111
 _ROOTS = ((0.033, 0.095), (0.011, 0.099), (-0.011, 0.095), (-0.034, 0.088))
-"""x and z of the four fingers' roots in the palm frame, metres, index to little finger (sheet 2.2)."""
+"""x and z of the four fingers' roots in the palm frame, metres, index to little finger (the same place)."""
 _CUP_LIFT, _CUP_TILT = 0.039, 0.571
-"""Metres of root height and radians of bend that a radian of LFJ4 gives the little finger (its axis, sheet 2.3)."""
+"""Metres of root height and radians of bend that a radian of LFJ4 gives the little finger (docs/figures.md, hand
+joints)."""
 _METACARPAL = ((-0.0335, 0.019, 0.040), (-0.0335, 0.033, 0.068))
 """Ends of the little finger's metacarpal in the palm frame: x and z in metres, between them the height that a radian of
-LFJ4 gives (sheet 2.3, 2.5)."""
+LFJ4 gives its outer edge (docs/figures.md, hand joints and hand geoms)."""
 _METACARPAL_RADIUS = 0.0111
 _LENGTHS = (0.045, 0.025, 0.024)
 _RADII = (0.01, 0.00805, 0.00705)
-"""Length and radius of proximal, middle and distal capsules, metres (sheet 2.5)."""
+"""Length and radius of proximal, middle and distal capsules, metres (docs/figures.md, hand geoms)."""
 _SLACK = 0.002
 """Overlap left at a start, metres: contacts carry the object from the first step; 5 mm would be allowed."""
 _MAX_CROSSING = 0.1

@@ -44,7 +44,7 @@ FAST = Solver(100, 50, time_step=1.0 / 180.0)
 THIN = Solver(100, 50, time_step=1.0 / 240.0)
 """For fast bases that press things as thin as a finger on a table."""
 CONTROL_RATE = 60
-"""Control steps per second of every class (sheet 1.1)."""
+"""Control steps per second of every class (docs/figures.md, control)."""
 
 
 class TaskClass(ABC):
@@ -62,7 +62,7 @@ class TaskClass(ABC):
         episode_steps: Time limit, control steps.
         right: Start pose of the right hand.
         left: Start pose of the left hand.
-        transition_scale: Scale of the base forces (sheet 1.3).
+        transition_scale: Scale of the base forces (docs/figures.md, base).
         orientation_scale: Scale of the base torques.
         start_draws: How many uniform numbers the start of an episode takes.
         moving_base: Whether the hands' bases are driven (52 actions) or fixed (40).

@@ -1,4 +1,4 @@
-"""BottleCap: appendix A.2.9, sheet 4.12."""
+"""BottleCap: appendix A.2.9; docs/figures.md, classes."""
 
 import math
 
@@ -29,7 +29,7 @@ _BOTTLE = SceneObject(
 _AHEAD_RANGE = 0.01
 _OPENED = 0.03
 _THUMB = {"THJ4": -1.04, "THJ3": 1.2, "THJ0": -1.57}
-"""Joint angles at the start other than 0, rad (sheet 6)."""
+"""Joint angles at the start other than 0, rad (docs/figures.md, start noise)."""
 
 
 class BottleCap(TaskClass):

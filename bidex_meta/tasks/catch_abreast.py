@@ -1,4 +1,4 @@
-"""CatchAbreast: appendix A.2.5, sheet 4.5."""
+"""CatchAbreast: appendix A.2.5; docs/figures.md, classes."""
 
 import math
 

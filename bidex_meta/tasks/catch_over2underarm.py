@@ -1,4 +1,4 @@
-"""CatchOver2Underarm: appendix A.2.3, sheet 4.3."""
+"""CatchOver2Underarm: appendix A.2.3; docs/figures.md, classes."""
 
 import math
 
@@ -16,7 +16,8 @@ class CatchOver2Underarm(OneEgg):
     """Throw an egg from an upright hand down to an upturned palm.
 
     Observation: Table 12 (422). Reward: equation 3 with alpha 20. Deviation: the egg starts at z 1.03, not 1.0, where
-    it would stick in the fingertips (design.md section 4). The episode also fails when a mount is 0.1 m off its start.
+    it would stick in the fingertips (docs/figures.md, decisions). The episode also fails when a mount is 0.1 m off its
+    start.
     """
 
     name = "CatchOver2Underarm"

@@ -1,4 +1,4 @@
-"""CatchUnderarm: appendix A.2.2, sheet 4.2."""
+"""CatchUnderarm: appendix A.2.2; docs/figures.md, classes."""
 
 from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
 from bidex_meta.tasks.one_egg import OneEgg

@@ -1,4 +1,4 @@
-"""The four door classes: appendix A.2.7 and A.2.8, sheet 4.7."""
+"""The four door classes: appendix A.2.7 and A.2.8; docs/figures.md, classes."""
 
 import math
 from typing import ClassVar

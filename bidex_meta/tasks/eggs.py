@@ -10,7 +10,7 @@ from bidex_meta.tasks.goals import rotation_difference
 from bidex_meta.tasks.state import TaskState
 
 RADIUS, HALF_LENGTH = 0.03, 0.04
-"""Short and long semi-axis of the egg, metres (sheet 5.1)."""
+"""Short and long semi-axis of the egg, metres (docs/figures.md, objects)."""
 SEMI_AXES = (RADIUS, RADIUS, HALF_LENGTH)
 JOINT_DRAWS = 24
 SUCCESS_DISTANCE = 0.03
@@ -25,7 +25,7 @@ def goal_pose(position: Tensor, draws: Tensor) -> Tensor:
 
 
 def start_hands(draws: Tensor, noise: float, qpos: dict[str, Tensor]) -> None:
-    """Gives both hands the same noisy joint angles (sheet 3.2). Draws in [-1, 1], shape (n, 24)."""
+    """Gives both hands the same noisy joint angles (docs/figures.md, start noise). Draws in [-1, 1], shape (n, 24)."""
     joints = noisy_joints(draws, noise)
     qpos["right/joints"].copy_(joints)
     qpos["left/joints"].copy_(joints)

@@ -1,4 +1,4 @@
-"""GraspAndPlace: sheet 4.21 (the appendix has a picture of it and no section)."""
+"""GraspAndPlace: docs/figures.md, classes (the appendix has a picture of it and no section)."""
 
 import mujoco
 import torch
@@ -18,12 +18,12 @@ from bidex_meta.tasks.variation import VariationSpace, join
 class GraspAndPlace(TaskClass):
     """Put a block into a bucket: the left hand takes the block, the right hand the bucket.
 
-    Table 1 x 1 m, 60 cm high. Observation: the sheet's (425). Reward: the sheet's formula with hand-point distances,
+    Table 1 x 1 m, 60 cm high. Observation: the original's (425). Reward: its formula with hand-point distances,
     exp(-10 d_right) + exp(-10 d_left) + 2 exp(-10 d), d from the bucket's origin to the block's centre. Success: the
     block's centre is inside the bucket, between floor and rim, and the bucket within 45 degrees of upright (the
     original asks for d < 20 cm, which a block beside the bucket meets).
 
-    A task shifts and turns bucket and block. Both start on the table; the sheet's start inside it. Bucket
+    A task shifts and turns bucket and block. Both start on the table; the original's start inside it. Bucket
     pose and bucket link have one orientation here, so entries 401-404 and 414-417 are equal.
     """
 
@@ -51,7 +51,7 @@ class GraspAndPlace(TaskClass):
 
     @property
     def layout(self) -> Layout:
-        """The sheet's 425 entries."""
+        """The original's 425 entries (docs/figures.md, observation)."""
         turn = "quaternion (x, y, z, w), world frame"
         return Layout(
             (

@@ -1,4 +1,4 @@
-"""HandOver: appendix A.2.1, sheet 4.1."""
+"""HandOver: appendix A.2.1; docs/figures.md, classes."""
 
 from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
 from bidex_meta.tasks.base import GENTLE
@@ -18,7 +18,7 @@ class HandOver(OneEgg):
     moves_by_default = False
     right = HandPose((0.0, 0.0, 0.5), PALM_UP_AWAY)
     left = HandPose((0.0, -1.0, 0.5), PALM_UP_BACK)
-    # With a moving base the figures of CatchUnderarm hold (design.md section 4); the original gives none.
+    # With a moving base the figures of CatchUnderarm hold (docs/figures.md, decisions); the original gives none.
     transition_scale = 0.05
     orientation_scale = 0.5
     egg_start = (0.0, -0.39, 0.54)

@@ -8,11 +8,11 @@ from bidex_meta.hands.hand import FINGERS, hand
 from bidex_meta.hands.pair import SIDES
 
 VELOCITY_SCALE = 0.2
-"""Scale of joint velocities and of objects' angular velocities (sheet 1.5)."""
+"""Scale of joint velocities and of objects' angular velocities (docs/figures.md, observation)."""
 FORCE_SCALE = 10.0
-"""Scale of joint forces and of fingertip forces and torques (sheet 1.5)."""
+"""Scale of joint forces and of fingertip forces and torques (docs/figures.md, observation)."""
 CLIP = 5.0
-"""Every entry is clipped to +-5 after its scale (sheet 1.2)."""
+"""Every entry is clipped to +-5 after its scale (docs/figures.md, control)."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def hand_blocks(side: str, moving: bool) -> tuple[Block, ...]:
             30,
             tuple(f"{tip}_{kind}" for tip in tips for kind in ("force", "torque")),
             FORCE_SCALE,
-            description="per distal body: force (10 N), torque (10 N m) at its origin, body frame, own weight included",
+            description="per distal body: force (10 N), torque (10 N m) at its origin, body frame, no weight",
         ),
     ]
     if moving:

@@ -1,4 +1,4 @@
-"""LiftUnderarm: appendix A.2.6, sheet 4.6."""
+"""LiftUnderarm: appendix A.2.6; docs/figures.md, classes."""
 
 import math
 
@@ -32,9 +32,9 @@ class LiftUnderarm(TaskClass):
     the pot within 30 degrees of upright.
 
     Decided here: the goal lies 25 to 45 cm above the task's own start place and up to 5 cm beside it, and has the
-    start's orientation, yaw included. The pot starts at rest on the table; at the sheet's height it would start 1.5 cm
-    inside. Its inertia follows from its hollow shape, since the sheet's figure is far too large for the size. Friction:
-    3 where the table takes part, 2 between wall and hand.
+    start's orientation, yaw included. The pot starts at rest on the table; at the original's height it would start
+    1.5 cm inside. Its inertia follows from its hollow shape, since the original's figure is far too large for the size.
+    Friction: 3 where the table takes part, 2 between wall and hand.
     """
 
     name = "LiftUnderarm"

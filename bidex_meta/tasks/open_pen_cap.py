@@ -1,4 +1,4 @@
-"""OpenPenCap: appendix A.2.14, sheet 4.17."""
+"""OpenPenCap: appendix A.2.14; docs/figures.md, classes."""
 
 import math
 from dataclasses import replace

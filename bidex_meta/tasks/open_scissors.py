@@ -1,4 +1,4 @@
-"""OpenScissors: appendix A.2.12, sheet 4.15."""
+"""OpenScissors: appendix A.2.12; docs/figures.md, classes."""
 
 import math
 
@@ -21,7 +21,8 @@ _SHUT = -0.59
 """Hinge angle at the start, rad."""
 _TOLERANCE = 0.1
 _PIVOT, _RIGHT_HANDLE = (-0.0034, 0.0698, 0.0), (0.1, -0.2, 0.0)
-"""The pivot on the left hand's half, and the right handle's point from there on the other half, metres (sheet 5.6)."""
+"""The pivot on the left hand's half, and the right handle's point from there on the other half, metres
+(docs/figures.md, objects)."""
 _GHOST = (0.02, 0.02, 0.01)
 
 

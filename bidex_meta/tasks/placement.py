@@ -13,7 +13,7 @@ from bidex_meta.maths import constant, multiply, wxyz, xyzw
 from bidex_meta.tasks.variation import VariationSpace
 
 SHIFT = 0.03
-"""Half width of a task's shift along x and y, metres (design.md section 4)."""
+"""Half width of a task's shift along x and y, metres (docs/figures.md, decisions)."""
 TURN = 0.2617993877991494
 """Half width of a task's turn, radians: 15 degrees."""
 JITTER = 0.005

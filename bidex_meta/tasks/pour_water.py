@@ -1,4 +1,4 @@
-"""PourWater: appendix A.2.17, sheet 4.20."""
+"""PourWater: appendix A.2.17; docs/figures.md, classes."""
 
 import math
 
@@ -53,8 +53,8 @@ class PourWater(TaskClass):
 
     A task shifts and turns kettle and bucket, and the water with the kettle. Water is drops of 5 mm radius without
     friction, which no observation shows: twelve by default, 1.4 times the physics of HandOver; the paper's 30 take 2.4
-    times. The kettle has about the sheet's outline, a high floor and an open trough as spout, so that drops run out at
-    less than the goal's tilt. It weighs 1.5 kg; the sheet's 2.46 kg are those of the full body.
+    times. The kettle has about the original's outline, a high floor and an open trough as spout, so that drops run out
+    at less than the goal's tilt. It weighs 1.5 kg; the original's 2.46 kg are those of the full body.
     """
 
     name = "PourWater"

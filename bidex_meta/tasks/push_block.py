@@ -1,4 +1,4 @@
-"""PushBlock: appendix A.2.10, sheet 4.13."""
+"""PushBlock: appendix A.2.10; docs/figures.md, classes."""
 
 import mujoco
 import torch
@@ -19,7 +19,7 @@ _GOALS = {"block1": (-0.2, -0.2, 0.625), "block2": (-0.2, 0.2, 0.625)}
 _SUCCESS_DISTANCE = 0.1
 """Each block within this distance of its goal, metres."""
 _TABLE_FRICTION = 0.75
-"""Mean of the sheet's 0.5 and of 1 for hands and blocks."""
+"""Mean of the original's 0.5 and of 1 for hands and blocks (docs/figures.md, friction)."""
 
 
 class PushBlock(TaskClass):
@@ -29,7 +29,7 @@ class PushBlock(TaskClass):
     starts vary: a task shifts and turns each block. Reward: equation 12 with d_target the sum of both blocks'
     distances. Success: both blocks within 10 cm of their goals.
 
-    Block 1 is the one on the left hand's side (-y). The sheet lets the blocks start inside the table; here they lie on
+    Block 1 is the one on the left hand's side (-y). The original's blocks start inside the table; here they lie on
     it. Its half success for the left block alone is left out.
     """
 

@@ -1,4 +1,4 @@
-"""ReOrientation: appendix A.2.13, sheet 4.16."""
+"""ReOrientation: appendix A.2.13; docs/figures.md, classes."""
 
 import mujoco
 import torch
@@ -34,7 +34,7 @@ class ReOrientation(TaskClass):
     and within 10 cm of their places, so that dropped ones are none.
 
     Reward: -10 (d_1 + d_2) - 1.5 (r_1 + r_2). The paper adds the rotations, which would reward larger ones; here they
-    are subtracted. Object 1 lies on the left hand (-y), as the formula's pairing asks; the sheet's object 1 lies on the
+    are subtracted. Object 1 lies on the left hand (-y), as the formula's pairing asks; the original's lies on the
     right. Bases move as the appendix says (52 actions); its scales are those of CatchUnderarm. The goal is one for an
     episode: nothing is drawn anew when it is reached, and no episode ends early, since the reward is negative.
 

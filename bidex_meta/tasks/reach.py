@@ -9,7 +9,7 @@ from bidex_meta.tasks.state import TaskState
 def reach(state: TaskState, side: str, point: str) -> Tensor:
     """Distance (m) from a hand to a point, shape (n,).
 
-    The hand's point is the palm's origin + 8 cm along the fingers + 2 cm out of the palm (sheet 2.7).
+    The hand's point is the palm's origin + 8 cm along the fingers + 2 cm out of the palm (docs/figures.md, hand point).
 
     Args:
         state: A transition.

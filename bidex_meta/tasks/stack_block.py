@@ -1,4 +1,4 @@
-"""StackBlock: appendix A.2.16, sheet 4.19."""
+"""StackBlock: appendix A.2.16; docs/figures.md, classes."""
 
 import mujoco
 import torch
@@ -24,9 +24,9 @@ _SUCCESS_DISTANCE = 0.03
 _SUCCESS_HEIGHT = 0.01
 """Block 1 is on block 2 when its centre is one edge higher, give or take this, metres."""
 _BLOCK_FRICTION = 0.375
-"""Mean of the sheet's 0.25 for blocks and 0.5 for hands."""
+"""Mean of the original's 0.25 for blocks and 0.5 for hands (docs/figures.md, friction)."""
 _TABLE_FRICTION = 0.225
-"""Mean of the sheet's 0.25 for blocks and 0.2 for the table."""
+"""Mean of the original's 0.25 for blocks and 0.2 for the table."""
 
 
 class StackBlock(TaskClass):
@@ -38,8 +38,8 @@ class StackBlock(TaskClass):
     1 cm, and within 3 cm above its middle.
 
     A task shifts and turns both blocks and shifts the targets by up to 3 cm along x and y. Frictions are the means of
-    the sheet's figures; of four kinds of contact, two differ from them: block on block has 0.375 instead of 0.25, hand
-    on table 0.225 instead of 0.35.
+    the original's figures; of four kinds of contact, two differ from them: block on block has 0.375 instead of 0.25,
+    hand on table 0.225 instead of 0.35.
     """
 
     name = "StackBlock"

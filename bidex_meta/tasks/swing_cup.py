@@ -1,4 +1,4 @@
-"""SwingCup: appendix A.2.11, sheet 4.14."""
+"""SwingCup: appendix A.2.11; docs/figures.md, classes."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Switch: appendix A.2.15, sheet 4.18."""
+"""Switch: appendix A.2.15; docs/figures.md, classes."""
 
 import math
 

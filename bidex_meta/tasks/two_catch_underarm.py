@@ -1,4 +1,4 @@
-"""TwoCatchUnderarm: appendix A.2.4, sheet 4.4."""
+"""TwoCatchUnderarm: appendix A.2.4; docs/figures.md, classes."""
 
 import mujoco
 from torch import Tensor
@@ -22,7 +22,7 @@ class TwoCatchUnderarm(TaskClass):
     """Throw two eggs at once, each to the other hand.
 
     Observation: Table 14 (446). Reward: equation 4. Both goals share one orientation, both eggs one start noise and
-    orientation (sheet 4.4). Success: each egg within 3 cm of its goal, both in the same step.
+    orientation (docs/figures.md, start noise). Success: each egg within 3 cm of its goal, both in the same step.
     """
 
     name = "TwoCatchUnderarm"

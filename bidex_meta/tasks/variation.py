@@ -62,5 +62,5 @@ def box(prefix: str, centre: tuple[float, float, float], half: float) -> Variati
 
 
 def orientation(prefix: str) -> VariationSpace:
-    """The two draws of the paper's random orientation (sheet 3.3): ``<prefix>_u0``, ``_u1`` in [-1, 1]."""
+    """The two draws of a random orientation (docs/figures.md, start noise): ``<prefix>_u0``, ``_u1`` in [-1, 1]."""
     return VariationSpace((f"{prefix}_u0", f"{prefix}_u1"), (-1.0, -1.0), (1.0, 1.0))

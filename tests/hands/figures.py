@@ -1,4 +1,4 @@
-"""The sheet's tables of the hand (spec sections 2.3 to 2.7), typed once more: what the model is held against."""
+"""Tables of the original's hand and start poses (docs/figures.md), typed apart: what the model is held against."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -60,9 +60,8 @@ PAIRS = {
     )
 }
 
-# Collision geoms (2.5) but the forearm's, a mesh there: position in the body, size, condim; capsules (radius, half
-# length)
-# along the body's z (the wrist's along its x), boxes by half sizes.
+# Collision geoms but the forearm's, a mesh there: position in the body, size, condim; capsules (radius, half length)
+# along the body's z (the wrist's along its y), boxes by half sizes.
 GEOMS = {
     "wrist": ((0, 0, 0), (0.015, 0.01), 3),
     "palm0": ((0.011, 0, 0.038), (0.032, 0.0111, 0.049), 3),
@@ -85,7 +84,7 @@ TIPS = ("ffdistal", "mfdistal", "rfdistal", "lfdistal", "thdistal")
 CENTRE_OF_MASS = (0.0016, 0.0081, 0.2917)
 LINEAR_DAMPING, ANGULAR_DAMPING = 501.0, (2.60, 2.65, 1.12)
 
-# Actor at the origin, unrotated (2.7); metres, world.
+# Actor at the origin, unrotated; metres, world.
 ZERO_POSE = {
     "forearm": (0.0, 0.0, -0.01),
     "wrist": (0.0, -0.256, -0.01),
@@ -99,7 +98,7 @@ ZERO_POSE = {
 }
 """Fingers: reward fingertip points, the distal origin and 2 cm along its z."""
 
-# Pose tables of section 4: actor roll, pitch, yaw and the mount's world quaternion (w, x, y, z); then per class.
+# Start poses: actor roll, pitch, yaw and the mount's world quaternion (w, x, y, z); then per class.
 MOUNTS = {
     "A": ((0, 0, 0), (0, 0, -0.7071, 0.7071)),
     "B": ((0, 0, np.pi), (0.7071, -0.7071, 0, 0)),
@@ -127,7 +126,7 @@ CLASS_MOUNTS = {
     "DoorOpenInward": _DOORS,
     "DoorCloseOutward": _DOORS,
     "DoorCloseInward": (((0.9, 0.5, 0.6), _C), ((0.9, -0.5, 0.6), _D)),
-    # The two poses of sheet 4.12, exchanged (design.md section 4): the left hand is the one over the cap.
+    # The original's two poses, exchanged (docs/figures.md, decisions): the left hand is the one over the cap.
     "BottleCap": (
         ((0, -0.25, 0.45), (0.298, 0.298, -0.6413, 0.6413)),
         ((0, -1.05, 0.5), (0, 0, 0.5102, 0.8601)),
@@ -142,7 +141,7 @@ CLASS_MOUNTS = {
     "PourWater": (((0.55, 0.2, 0.6), _C), ((0.55, -0.2, 0.6), _D)),
     "GraspAndPlace": _PALMS_DOWN,
 }
-# class: transition and orientation scale (1.4).
+# class: transition and orientation scale.
 SCALES = {
     "HandOver": (0.05, 0.5),
     "CatchUnderarm": (0.05, 0.5),
@@ -165,7 +164,7 @@ SCALES = {
     "PourWater": (0.5, 0.1),
     "GraspAndPlace": (0.5, 0.1),
 }
-# class: start angles (section 6) of the joints that do not start at zero, both hands.
+# class: start angles of the joints that do not start at zero, both hands.
 DEFAULT_JOINTS = {"BottleCap": {"THJ4": -1.04, "THJ3": 1.2, "THJ0": -1.57}}
 
 

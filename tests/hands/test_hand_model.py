@@ -1,4 +1,4 @@
-"""The hand against the sheet's section 2."""
+"""The hand against the original's figures (docs/figures.md)."""
 
 import mujoco
 import numpy as np
@@ -9,7 +9,7 @@ from bidex_meta.hands.pair import INNER, SIDES, add_hands, damp_bases
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import build_spec, compile_scene
-from tests.hands import sheet
+from tests.hands import figures
 
 
 @pytest.fixture(scope="module")
@@ -58,28 +58,28 @@ def test_centre_of_mass(model: mujoco.MjModel) -> None:
     mujoco.mj_forward(model, data)
     np.testing.assert_allclose(data.body("mount").xmat.reshape(3, 3), np.eye(3), atol=1e-12)
     centre = data.subtree_com[model.body("mount").id] - data.body("mount").xpos
-    np.testing.assert_allclose(centre, sheet.CENTRE_OF_MASS, atol=1e-4)
+    np.testing.assert_allclose(centre, figures.CENTRE_OF_MASS, atol=1e-4)
     np.testing.assert_allclose(data.body("base").xpos - data.body("mount").xpos, CENTRE_OF_MASS, atol=1e-12)
 
 
 def test_joint_tables(model: mujoco.MjModel) -> None:
     known = hand()
-    assert list(known.joints) == sheet.NAMES
-    np.testing.assert_array_equal(known.low, sheet.LOW)
-    np.testing.assert_array_equal(known.high, sheet.HIGH)
-    assert known.actuated.tolist() == sheet.ACTUATED
-    np.testing.assert_array_equal(known.control_low, sheet.LOW[sheet.ACTUATED])
-    np.testing.assert_array_equal(known.control_high, sheet.HIGH[sheet.ACTUATED])
+    assert list(known.joints) == figures.NAMES
+    np.testing.assert_array_equal(known.low, figures.LOW)
+    np.testing.assert_array_equal(known.high, figures.HIGH)
+    assert known.actuated.tolist() == figures.ACTUATED
+    np.testing.assert_array_equal(known.control_low, figures.LOW[figures.ACTUATED])
+    np.testing.assert_array_equal(known.control_high, figures.HIGH[figures.ACTUATED])
     assert known.index("WRJ1", "FFJ0", "THJ0") == [0, 5, 23]
-    for i, (name, low, high, damping, armature, *_) in enumerate(sheet.JOINTS):
+    for i, (name, low, high, damping, armature, *_) in enumerate(figures.JOINTS):
         joint = model.joint(name)
         assert (joint.id, joint.range.tolist(), joint.limited[0]) == (i, [low, high], 1), name
         assert (joint.damping[0], joint.armature[0]) == (damping, armature), name
 
 
 def test_actuators(model: mujoco.MjModel) -> None:
-    rows = [joint for joint in sheet.JOINTS if joint[5]]
-    assert [sheet.NAMES.index(joint[0]) for joint in rows] == sheet.ACTUATED
+    rows = [joint for joint in figures.JOINTS if joint[5]]
+    assert [figures.NAMES.index(joint[0]) for joint in rows] == figures.ACTUATED
     for i, (name, low, high, *_, kp, effort) in enumerate(rows):
         actuator = model.actuator(i)
         assert model.joint(actuator.trnid[0]).name == name
@@ -93,14 +93,14 @@ def test_self_collision_pairs(model: mujoco.MjModel) -> None:
         frozenset(model.geom(g).name.removeprefix("C_") for g in pair)
         for pair in zip(model.pair_geom1, model.pair_geom2, strict=True)
     ]
-    assert len(named) == 18 and set(named) == sheet.PAIRS
+    assert len(named) == 18 and set(named) == figures.PAIRS
     assert set(model.pair_dim) == {1}
 
 
 def test_collision_geoms(model: mujoco.MjModel) -> None:
     solid = {model.geom(i).name: model.geom(i) for i in range(model.ngeom) if model.geom_contype[i]}
-    assert set(solid) == {f"C_{name}" for name in [*sheet.GEOMS, "forearm"]}
-    for name, (position, size, condim) in sheet.GEOMS.items():
+    assert set(solid) == {f"C_{name}" for name in [*figures.GEOMS, "forearm"]}
+    for name, (position, size, condim) in figures.GEOMS.items():
         geom = solid[f"C_{name}"]
         np.testing.assert_allclose(geom.pos, position, atol=1e-9, err_msg=name)
         np.testing.assert_allclose(geom.size[: len(size)], size, err_msg=name)
@@ -112,7 +112,7 @@ def test_collision_geoms(model: mujoco.MjModel) -> None:
 
 @pytest.mark.parametrize("name", registry.names()[:5])
 def test_eggs(name: str) -> None:
-    """Sheet 5.1: semi-axes 3, 3 and 4 cm, 500 kg per cubic metre; and no torsional friction, at the tips neither."""
+    """Semi-axes 3, 3 and 4 cm, 500 kg per cubic metre; and no torsional friction, at the tips neither."""
     model = compile_scene(registry.get(name)).model
     eggs = [model.geom(i) for i in range(model.ngeom) if model.geom(i).type[0] == mujoco.mjtGeom.mjGEOM_ELLIPSOID]
     assert len(eggs) == (2 if name == "TwoCatchUnderarm" else 1)
@@ -127,21 +127,21 @@ def test_zero_pose_kinematics(moving: bool) -> None:
     model = pair_model(moving)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    for name, expected in sheet.ZERO_POSE.items():
+    for name, expected in figures.ZERO_POSE.items():
         if name == "hand_point":
             found = data.site("right/hand_point").xpos
         else:
             body = data.body(f"right/{name}")
-            found = body.xpos + (0.02 * body.xmat.reshape(3, 3)[:, 2] if name in sheet.TIPS else 0.0)
+            found = body.xpos + (0.02 * body.xmat.reshape(3, 3)[:, 2] if name in figures.TIPS else 0.0)
         np.testing.assert_allclose(found, expected, atol=6e-4, err_msg=name)
     palm = data.body("right/palm").xmat.reshape(3, 3)
     np.testing.assert_allclose(palm, np.array([[-1, 0, 0], [0, 0, -1], [0, -1, 0]]), atol=1e-9)
 
 
-@pytest.mark.parametrize("pose", sheet.MOUNTS)
+@pytest.mark.parametrize("pose", figures.MOUNTS)
 def test_mount_quaternions_of_the_named_poses(pose: str) -> None:
-    rpy, expected = sheet.MOUNTS[pose]
-    assert sheet.same_orientation(HandPose((0, 0, 0), rpy).quaternion, expected, 2e-3)
+    rpy, expected = figures.MOUNTS[pose]
+    assert figures.same_orientation(HandPose((0, 0, 0), rpy).quaternion, expected, 2e-3)
 
 
 @pytest.mark.parametrize("name", registry.names())
@@ -150,13 +150,13 @@ def test_mounts_of_the_classes(name: str, moving: bool) -> None:
     model = compile_scene(registry.get(name, moving)).model
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    for side, (position, quaternion) in zip(SIDES, sheet.CLASS_MOUNTS[name], strict=True):
+    for side, (position, quaternion) in zip(SIDES, figures.CLASS_MOUNTS[name], strict=True):
         mount = data.body(f"{side}/mount")
         np.testing.assert_allclose(mount.xpos, position, atol=1e-9, err_msg=side)
-        assert sheet.same_orientation(mount.xquat, quaternion, 2e-3), (side, mount.xquat)
+        assert figures.same_orientation(mount.xquat, quaternion, 2e-3), (side, mount.xquat)
 
 
-def test_upright_and_tilted_hands_look_where_the_sheet_says() -> None:
+def test_upright_and_tilted_hands_look_where_the_originals_do() -> None:
     def palm_axes(name: str, side: str) -> tuple[np.ndarray, np.ndarray, mujoco.MjData]:
         model = compile_scene(registry.get(name)).model
         data = mujoco.MjData(model)
@@ -175,11 +175,11 @@ def test_upright_and_tilted_hands_look_where_the_sheet_says() -> None:
 
 
 @pytest.mark.parametrize("name", registry.names())
-def test_moving_bases_are_damped_as_the_sheet_says(name: str) -> None:
+def test_moving_bases_are_damped_as_the_originals(name: str) -> None:
     model = compile_scene(registry.get(name, True)).model
     for side in SIDES:
         first = model.joint(f"{side}/free").dofadr[0]
-        expected = (*(sheet.LINEAR_DAMPING,) * 3, *sheet.ANGULAR_DAMPING)
+        expected = (*(figures.LINEAR_DAMPING,) * 3, *figures.ANGULAR_DAMPING)
         np.testing.assert_allclose(model.dof_damping[first : first + 6], expected)
     assert compile_scene(registry.get(name, False)).model.nv == model.nv - 12
 
@@ -248,14 +248,14 @@ def test_contacts_of_random_hands_are_among_the_pairs() -> None:
     for _ in range(200):
         for side in SIDES:
             first = model.joint(f"{side}/WRJ1").qposadr[0]
-            data.qpos[first : first + 24] = rng.uniform(sheet.LOW, sheet.HIGH)
+            data.qpos[first : first + 24] = rng.uniform(figures.LOW, figures.HIGH)
         mujoco.mj_fwdPosition(model, data)
         for contact in data.contact:
             a, b = (model.geom(int(g)).name for g in contact.geom)
             if kind(a) == kind(b):
                 met.add(frozenset(n.split("/C_")[1] for n in (a, b)))
                 assert contact.dim == 1, (a, b)
-    assert met and met <= sheet.PAIRS
+    assert met and met <= figures.PAIRS
 
 
 def test_the_three_kinds_really_meet() -> None:

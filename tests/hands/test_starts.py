@@ -13,10 +13,10 @@ from bidex_meta.hands.starts import make_room, noisy_joints
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.eggs import HALF_LENGTH, RADIUS
 from bidex_meta.tasks.scene import Scene, compile_scene
-from tests.hands import sheet
+from tests.hands import figures
 
-SIDE, BASE, MIDDLE, DISTAL = ([sheet.NAMES.index(f"{f}J{k}") for f in ("FF", "MF", "RF", "LF")] for k in (3, 2, 1, 0))
-CUP = sheet.NAMES.index("LFJ4")
+SIDE, BASE, MIDDLE, DISTAL = ([figures.NAMES.index(f"{f}J{k}") for f in ("FF", "MF", "RF", "LF")] for k in (3, 2, 1, 0))
+CUP = figures.NAMES.index("LFJ4")
 FLEXED = [*BASE, *MIDDLE, *DISTAL, CUP]
 
 draws = hnp.arrays(np.float64, (3, 24), elements=st.floats(-1.0, 1.0))
@@ -26,13 +26,13 @@ scales = st.floats(0.0, 1.0)
 @given(draws, scales)
 def test_noise_stays_inside_the_limits(u: np.ndarray, scale: float) -> None:
     joints = noisy_joints(torch.from_numpy(u), scale).numpy()
-    assert (joints >= sheet.LOW).all() and (joints <= sheet.HIGH).all()
+    assert (joints >= figures.LOW).all() and (joints <= figures.HIGH).all()
 
 
 @given(draws, scales)
 def test_noise_is_the_clipped_share_of_each_range(u: np.ndarray, scale: float) -> None:
     joints = noisy_joints(torch.from_numpy(u), scale).numpy()
-    expected = np.clip(scale * (sheet.HIGH - sheet.LOW) * u, sheet.LOW, sheet.HIGH)
+    expected = np.clip(scale * (figures.HIGH - figures.LOW) * u, figures.LOW, figures.HIGH)
     free = [i for i in range(24) if i not in (*SIDE, *DISTAL)]
     np.testing.assert_allclose(joints[:, free], expected[:, free], atol=1e-12)
     distal = np.minimum(joints[:, MIDDLE] * 0.00805 / 0.00705, 1.571)

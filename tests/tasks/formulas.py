@@ -29,4 +29,4 @@ FORMULAS: dict[str, Oracle] = {
     "GraspAndPlace": GraspAndPlace(),
 }
 FAILING = {"HandOver", "CatchUnderarm", "CatchOver2Underarm", "TwoCatchUnderarm", "CatchAbreast"}
-"""Classes that end other than by time: their rewards are positive throughout (design.md section 4)."""
+"""Classes that end other than by time: their rewards are positive throughout (docs/figures.md, decisions)."""

@@ -1,4 +1,4 @@
-"""The classes with cubes, a bucket and water: equations 12, 18 and 19 of the appendix, and sheet 4.21."""
+"""The classes with cubes, a bucket and water: equations 12, 18 and 19 of the appendix, and docs/figures.md, classes."""
 
 from typing import ClassVar
 
@@ -24,7 +24,7 @@ from tests.tasks.oracle import (
 )
 
 FLOOR, RIM = -0.0529, 0.0445
-"""Heights of the bucket's lower and upper end in its frame, metres (sheet 5.10)."""
+"""Heights of the bucket's lower and upper end in its frame, metres (docs/figures.md, objects)."""
 WALL = 0.004
 """How far the middle of the bucket's wall may lie inside its outer face, metres."""
 UNSURE = 0.007
@@ -73,7 +73,7 @@ class PushBlock(Oracle):
 
 
 class StackBlock(Oracle):
-    """Equation 18. Block 1 comes to lie on block 2 (design.md section 4)."""
+    """Equation 18. Block 1 comes to lie on block 2 (docs/figures.md, decisions)."""
 
     body_of_goal: ClassVar = {"goal": "block1/object"}
     entering: ClassVar = {"target_x", "target_y"}
@@ -151,7 +151,10 @@ class PourWater(Oracle):
 
 
 class GraspAndPlace(Oracle):
-    """Sheet 4.21 with one hand point a hand. Success: the block's centre in the bucket, which is upright."""
+    """The original's formula with one hand point a hand (docs/figures.md, classes).
+
+    Success: the block's centre in the bucket, which is upright.
+    """
 
     def points(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
         return {f"{name} position": data.body(f"{name}/object").xpos.copy() for name in ("bucket", "block")}

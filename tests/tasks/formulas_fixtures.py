@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 from tests.tasks.oracle import Goal, Judgement, Oracle, Task, about_z, angle, frame, length, linear, nominal, shifted
 
 TRAVEL = 0.5585
-"""A switch's hinge at full travel, rad (sheet 5.8)."""
+"""A switch's hinge at full travel, rad (docs/figures.md, objects)."""
 
 
 class Door(Oracle):
-    """Equations 7 to 10. Handles between the panel and the pulls that face the hands (sheet 4.7, 5.3)."""
+    """Equations 7 to 10. Handles between the panel and the pulls that face the hands (docs/figures.md, objects)."""
 
     body_of_goal: ClassVar = {"goal": "object/object"}
 
@@ -61,8 +61,8 @@ class Door(Oracle):
 class Switch(Oracle):
     """Equation 17. A button's target is its own point at full travel of the hinge, the housing where the task puts it.
 
-    The shape is the project's own (the original's point cannot reach its goal, sheet 4.18), so hinge and point are
-    taken from the model.
+    The shape is the project's own (the original's point cannot reach its goal: docs/figures.md, classes), so hinge and
+    point are taken from the model.
     """
 
     body_of_goal: ClassVar = {"goal": "switch1/rocker"}

@@ -77,7 +77,7 @@ class Eggs(Oracle):
 
 
 class ReOrientation(Oracle):
-    """Equation 15, its angle term subtracted (design.md section 4); object 1 on the left hand."""
+    """Equation 15, its angle term subtracted (docs/figures.md, decisions); object 1 on the left hand."""
 
     entering = None
     body_of_goal: ClassVar = {"goal1": "object1/object", "goal2": "object2/object"}

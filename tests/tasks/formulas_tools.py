@@ -105,7 +105,7 @@ class SwingCup(Oracle):
 
 
 class OpenScissors(Oracle):
-    """Equation 14. The right handle moves with the half that turns about the pivot (sheet 4.15, 5.6)."""
+    """Equation 14. The right handle moves with the half that turns about the pivot (docs/figures.md, objects)."""
 
     body_of_goal: ClassVar = {"goal": "scissors/half"}
     entering: ClassVar = {"target_angle"}
@@ -137,7 +137,7 @@ class OpenScissors(Oracle):
 
 
 class OpenPenCap(Oracle):
-    """Equation 16. The cap slides off along the pen's -z (sheet 5.7)."""
+    """Equation 16. The cap slides off along the pen's -z (docs/figures.md, objects)."""
 
     body_of_goal: ClassVar = {"goal": "pen/object"}
 

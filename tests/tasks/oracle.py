@@ -1,8 +1,8 @@
 """What the printed formulas are told with: MuJoCo's own frames and joints, in float64 with NumPy and SciPy.
 
 Nothing here or in the ``formulas_*`` modules imports the project. ``data`` is MuJoCo's own; a task is the dict of the
-numbers that it froze, by component name. Points on objects stand where the sheet's section 4 puts them in the frame of
-the object's root body.
+numbers that it froze, by component name. Points on objects stand where the original puts them in the frame of the
+object's root body (docs/figures.md, classes and objects).
 """
 
 from collections.abc import Mapping
@@ -90,18 +90,18 @@ def about_z(yaw: float) -> Rotation:
 
 
 def goal_rotation(u0: float, u1: float) -> Rotation:
-    """A turn by pi u0 about x, on the left, times one by pi u1 about y (sheet 3.3)."""
+    """A turn by pi u0 about x, on the left, times one by pi u1 about y (docs/figures.md, start noise)."""
     return Rotation.from_rotvec([np.pi * u0, 0, 0]) * Rotation.from_rotvec([0, np.pi * u1, 0])
 
 
 def rotation_distance(a: Rotation, b: Rotation) -> float:
-    """2 arcsin(min(1, |vec(a b*)|)) (sheet 3.4)."""
+    """2 arcsin(min(1, |vec(a b*)|)) (A.2.1; docs/figures.md, observation)."""
     difference = (a * b.inv()).as_quat()
     return 2.0 * float(np.arcsin(min(1.0, float(np.linalg.norm(difference[:3])))))
 
 
 def hand_point(data: mujoco.MjData, side: str) -> np.ndarray:
-    """The palm's origin + 8 cm along its z - 2 cm along its y (sheet 2.7)."""
+    """The palm's origin + 8 cm along its z - 2 cm along its y (docs/figures.md, hand point)."""
     return at(data, f"{side}/palm", (0.0, -0.02, 0.08))
 
 

@@ -22,7 +22,7 @@ TABLE_7: list[Row] = [
     (369, 371, "left base rotation"),
     (372, 397, "left actions"),
 ]
-# "The observation of the dual hands is compared to Table 7 of reduced 24 dimensions": no base, 20 actions (sheet 3.6).
+# "The observation of the dual hands is compared to Table 7 of reduced 24 dimensions": no base, 20 actions (A.2.1).
 TABLE_7_FIXED: list[Row] = [
     (0, 23, "right dof position"),
     (24, 47, "right dof velocity"),
@@ -163,8 +163,8 @@ TABLE_40: list[Row] = [
     (422, 424, "kettle handle position"),
     (425, 427, "bucket position"),
 ]
-# The appendix has no table for GraspAndPlace; these are the rows of sheet 4.21.
-SHEET_421: list[Row] = [
+# The appendix has no table for GraspAndPlace; these are the rows of the original's code.
+GRASP_AND_PLACE: list[Row] = [
     *TABLE_7,
     (398, 404, "bucket pose"),
     (405, 407, "bucket linear velocity"),
@@ -174,7 +174,7 @@ SHEET_421: list[Row] = [
     (418, 420, "block position"),
     (421, 424, "block quaternion"),
 ]
-# Tables 12 and 16 print the rows of Table 10; with a moving base HandOver has them too (design.md section 4).
+# Tables 12 and 16 print the rows of Table 10; with a moving base HandOver has them too (docs/figures.md, decisions).
 TABLES: dict[tuple[str, bool], list[Row]] = {
     ("HandOver", False): TABLE_8,
     ("HandOver", True): TABLE_10,
@@ -196,7 +196,7 @@ TABLES: dict[tuple[str, bool], list[Row]] = {
     ("Switch", True): TABLE_36,
     ("StackBlock", True): TABLE_38,
     ("PourWater", True): TABLE_40,
-    ("GraspAndPlace", True): SHEET_421,
+    ("GraspAndPlace", True): GRASP_AND_PLACE,
 }
 SIZES = {
     ("HandOver", False): (398, 40),
@@ -245,7 +245,7 @@ EPISODE_STEPS = {
     "PourWater": 125,
     "GraspAndPlace": 500,
 }
-"""Time limits in control steps (sheet 1.4)."""
+"""Time limits in control steps, the original's."""
 
 _FLAT, _AHEAD = (0.0, 0.0, 0.0), (0.0, 0.0, 0.5 * pi)
 PLACES: dict[str, dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]]] = {
@@ -270,8 +270,8 @@ PLACES: dict[str, dict[str, tuple[tuple[float, float, float], tuple[float, float
     "PourWater": {"kettle": ((0, 0, 0.474), _AHEAD), "bucket": ((0, -0.3, 0.453), _FLAT)},
     "GraspAndPlace": {"bucket": ((0, 0.2, 0.653), _FLAT), "block": ((0, -0.2, 0.625), _FLAT)},
 }
-"""Nominal start of every object: position (world, metres; resting on its table, sheet 9) and roll, pitch, yaw. Object 1
-is the one on the left hand's side (-y); CatchOver2Underarm's egg is raised to 1.03 (design.md section 4)."""
+"""Nominal start of every object: position (world, metres; resting on its table) and roll, pitch, yaw. Object 1
+is the one on the left hand's side (-y); CatchOver2Underarm's egg is raised to 1.03 (docs/figures.md, decisions)."""
 
 _WORDS = {
     "dof position": "joint_position",

@@ -1,11 +1,11 @@
-"""Actions: position targets, and forces that move a base without turning it (sheet 1.2, 1.3; design.md section 4)."""
+"""Actions: position targets, and forces that move a base without turning it (docs/figures.md, control, base)."""
 
 import numpy as np
 import torch
 
 from bidex_meta.hands.pair import SIDES
 from bidex_meta.world import World
-from tests.hands import sheet
+from tests.hands import figures
 from tests.tasks.worlds import (
     MOVING,
     each_case,
@@ -21,13 +21,13 @@ from tests.tasks.worlds import (
 )
 
 FORCE, TORQUE = 1666.67, 16.667
-"""Newton and newton metre per unit of scale (sheet 1.3)."""
+"""Newton and newton metre per unit of scale (docs/figures.md, base)."""
 HALF_SECOND = 30
 
 
 def held() -> np.ndarray:
     """Joint actions whose targets are the start angles, zero. Shape (20,)."""
-    low, high = sheet.LOW[sheet.ACTUATED], sheet.HIGH[sheet.ACTUATED]
+    low, high = figures.LOW[figures.ACTUATED], figures.HIGH[figures.ACTUATED]
     return -(high + low) / (high - low)
 
 
@@ -64,7 +64,7 @@ def free_bases(name: str, actions: np.ndarray) -> tuple[World, np.ndarray, np.nd
 def turned(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Angle between the orientations of all rows and hands, rad."""
     return (
-        sheet.rotation(after[..., 3:].reshape(-1, 4)) * sheet.rotation(before[..., 3:].reshape(-1, 4)).inv()
+        figures.rotation(after[..., 3:].reshape(-1, 4)) * figures.rotation(before[..., 3:].reshape(-1, 4)).inv()
     ).magnitude()
 
 
@@ -73,7 +73,7 @@ def test_a_full_force_moves_a_base_and_does_not_turn_it(name: str) -> None:
     axes = np.concatenate((np.eye(6)[:3], -np.eye(6)[:3]))
     world, before, after = free_bases(name, axes)
     assert turned(before, after).max() < 0.05
-    force = FORCE * sheet.SCALES[name][0]
+    force = FORCE * figures.SCALES[name][0]
     engine, scene = engine_of(world), scene_of(world)
     for side in SIDES:
         first = scene.model.joint(f"{side}/free").dofadr[0]
@@ -93,16 +93,16 @@ def test_a_held_base_stays(name: str) -> None:
 
 
 @each_moving
-def test_a_torque_turns_a_base_at_the_sheets_rate(name: str) -> None:
+def test_a_torque_turns_a_base_at_the_rate_of_its_damping(name: str) -> None:
     """Along each of the hand's own axes, as large as the world-frame actions allow: torque / (2.60, 2.65, 1.12)."""
     for i in range(2):
-        axes = sheet.rotation(sheet.CLASS_MOUNTS[name][i][1]).as_matrix().T
+        axes = figures.rotation(figures.CLASS_MOUNTS[name][i][1]).as_matrix().T
         actions = axes / np.abs(axes).max(axis=1, keepdims=True)
         world, before, after = free_bases(name, np.concatenate((np.zeros((3, 3)), actions), axis=1))
         first = scene_of(world).model.joint(f"{SIDES[i]}/free").dofadr[0]
         rate = engine_of(world).qvel[:, first + 3 : first + 6].numpy()
-        torque = TORQUE * sheet.SCALES[name][1] * np.linalg.norm(actions, axis=1)
-        expected = np.diag(torque / np.array(sheet.ANGULAR_DAMPING))
+        torque = TORQUE * figures.SCALES[name][1] * np.linalg.norm(actions, axis=1)
+        expected = np.diag(torque / np.array(figures.ANGULAR_DAMPING))
         np.testing.assert_allclose(np.diag(rate), np.diag(expected), rtol=0.05)
         off_axis = np.abs(rate - np.diag(np.diag(rate))).max(axis=1)
         assert (off_axis < 0.1 * np.diag(expected)).all(), rate
@@ -119,23 +119,23 @@ def test_actions_become_targets_and_wrenches_exactly(name: str, moving: bool) ->
     action[0], action[1] = 1.0, -1.0
     world.parts[0].control(action)
     check_controls(name, engine.ctrl.numpy(), engine.xfrc_applied.numpy(), action.numpy(), model)
-    np.testing.assert_allclose(engine.ctrl[0].numpy(), np.tile(sheet.HIGH[sheet.ACTUATED], 2), atol=1e-12)
-    np.testing.assert_allclose(engine.ctrl[1].numpy(), np.tile(sheet.LOW[sheet.ACTUATED], 2), atol=1e-12)
+    np.testing.assert_allclose(engine.ctrl[0].numpy(), np.tile(figures.HIGH[figures.ACTUATED], 2), atol=1e-12)
+    np.testing.assert_allclose(engine.ctrl[1].numpy(), np.tile(figures.LOW[figures.ACTUATED], 2), atol=1e-12)
 
 
 def check_controls(name: str, ctrl: np.ndarray, wrench: np.ndarray, action: np.ndarray, model) -> None:
-    low, high = sheet.LOW[sheet.ACTUATED], sheet.HIGH[sheet.ACTUATED]
+    low, high = figures.LOW[figures.ACTUATED], figures.HIGH[figures.ACTUATED]
     share = action.shape[1] // 2
     expected = np.zeros_like(wrench)
     for i, side in enumerate(SIDES):
         hand = action[:, i * share : (i + 1) * share]
         names = [model.actuator(k).name for k in range(20 * i, 20 * i + 20)]
-        assert names == [f"{side}/A_{sheet.NAMES[k]}" for k in sheet.ACTUATED]
+        assert names == [f"{side}/A_{figures.NAMES[k]}" for k in figures.ACTUATED]
         np.testing.assert_allclose(
             ctrl[:, 20 * i : 20 * i + 20], low + (hand[:, :20] + 1) / 2 * (high - low), atol=1e-12
         )
         if share == 26:
-            transition, orientation = sheet.SCALES[name]
+            transition, orientation = figures.SCALES[name]
             body = model.body(f"{side}/base").id
             expected[:, body, :3] = hand[:, 20:23] * 100_000 / 60 * transition
             expected[:, body, 3:] = hand[:, 23:26] * 1_000 / 60 * orientation

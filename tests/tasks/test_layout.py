@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from bidex_meta.hands.pair import SIDES
 from bidex_meta.tasks import registry
 from bidex_meta.world import World
-from tests.hands import sheet
+from tests.hands import figures
 from tests.tasks.formulas import FORMULAS
 from tests.tasks.oracle import Goal, frame
 from tests.tasks.tables import SIZES, TABLES, block_name
@@ -91,7 +91,7 @@ def test_a_joint_at_its_limit_reads_one(worlds: dict[tuple[str, bool], World], n
     world, where = started(worlds, name, moving), places(name, moving)
     engine, scene = engine_of(world), scene_of(world)
     for side in SIDES:
-        for row, angles in enumerate((sheet.LOW, sheet.HIGH, 0.5 * (sheet.LOW + sheet.HIGH))):
+        for row, angles in enumerate((figures.LOW, figures.HIGH, 0.5 * (figures.LOW + figures.HIGH))):
             engine.qpos[row, scene.qpos[f"{side}/joints"]] = torch.from_numpy(angles)
     obs = observe(world)
     for side in SIDES:
@@ -108,7 +108,7 @@ def test_one_joint_moves_one_entry(worlds: dict[tuple[str, bool], World], name: 
     nominal = observe(world)
     for i, side in ((0, "right"), (5, "left"), (14, "right"), (23, "left")):
         engine.qpos[:] = start
-        engine.qpos[0, scene.qpos[f"{side}/joints"].start + i] = sheet.HIGH[i] or sheet.LOW[i]
+        engine.qpos[0, scene.qpos[f"{side}/joints"].start + i] = figures.HIGH[i] or figures.LOW[i]
         obs = observe(world)
         entries = np.concatenate(
             [np.arange(p.start, p.stop) for what, p in where.items() if what.endswith("dof position")]
@@ -203,7 +203,7 @@ def test_base_entries(worlds: dict[tuple[str, bool], World], name: str) -> None:
     world, where = started(worlds, name, True), places(name, True)
     engine, scene = engine_of(world), scene_of(world)
     obs = observe(world)
-    for side, (position, _) in zip(SIDES, sheet.CLASS_MOUNTS[name], strict=True):
+    for side, (position, _) in zip(SIDES, figures.CLASS_MOUNTS[name], strict=True):
         np.testing.assert_allclose(obs[:, where[f"{side} base position"]], np.tile(position, (3, 1)), atol=1e-6)
         np.testing.assert_allclose(obs[:, where[f"{side} base rotation"]], 0.0, atol=1e-6)
     turns = np.array(
@@ -212,15 +212,15 @@ def test_base_entries(worlds: dict[tuple[str, bool], World], name: str) -> None:
     moved = np.array((0.2, -0.1, 0.4))
     for i, side in enumerate(SIDES):
         place = scene.qpos[f"{side}/base"]
-        start = sheet.rotation(scene.start_qpos[place][3:])
+        start = figures.rotation(scene.start_qpos[place][3:])
         for row in range(3):
             turned = Rotation.from_euler("xyz", turns[i, row]) * start
-            mount = np.array(sheet.CLASS_MOUNTS[name][i][0]) + moved
-            base = mount + turned.apply(sheet.CENTRE_OF_MASS)
+            mount = np.array(figures.CLASS_MOUNTS[name][i][0]) + moved
+            base = mount + turned.apply(figures.CENTRE_OF_MASS)
             engine.qpos[row, place] = torch.from_numpy(np.concatenate((base, turned.as_quat(scalar_first=True))))
     obs = observe(world)
     for i, side in enumerate(SIDES):
-        mount = np.array(sheet.CLASS_MOUNTS[name][i][0]) + moved
+        mount = np.array(figures.CLASS_MOUNTS[name][i][0]) + moved
         np.testing.assert_allclose(obs[:, where[f"{side} base position"]], np.tile(mount, (3, 1)), atol=1e-6)
         np.testing.assert_allclose(obs[:, where[f"{side} base rotation"]], turns[i], atol=1e-6)
 
@@ -248,8 +248,8 @@ def replay(world: World, row: int, actions: torch.Tensor) -> tuple[mujoco.MjData
     """The row's episode in plain C MuJoCo: data forwarded at the end, and data as the last substep left it."""
     scene, model = scene_of(world), scene_of(world).model
     data = Lens(model).look(engine_of(world).placement()[row])
-    low, high = sheet.LOW[sheet.ACTUATED], sheet.HIGH[sheet.ACTUATED]
-    transition, orientation = sheet.SCALES[scene.task.name]
+    low, high = figures.LOW[figures.ACTUATED], figures.HIGH[figures.ACTUATED]
+    transition, orientation = figures.SCALES[scene.task.name]
     for action in actions[:, row].double().numpy():
         for i, side in enumerate(SIDES):
             mine = action[i * len(action) // 2 : (i + 1) * len(action) // 2]
@@ -287,12 +287,12 @@ def motion(
 def expected(
     world: World, row: int, what: str, data: mujoco.MjData, last: mujoco.MjData, action: np.ndarray
 ) -> np.ndarray:
-    """What the table's words ask for, scaled by sheet 1.5."""
+    """What the table's words ask for, scaled (docs/figures.md, observation)."""
     scene, model = scene_of(world), scene_of(world).model
     subject, _, rest = what.partition(" ")
-    joints = [model.joint(f"{subject}/{j}") for j in sheet.NAMES] if subject in SIDES else []
+    joints = [model.joint(f"{subject}/{j}") for j in figures.NAMES] if subject in SIDES else []
     dofs = [joint.dofadr[0] for joint in joints]
-    tips = [f"{subject}/{tip}" for tip in sheet.TIPS]
+    tips = [f"{subject}/{tip}" for tip in figures.TIPS]
     oracle = FORMULAS[scene.task.name]
     goal, points = oracle.goals(data, task_of(world, row)), oracle.points(data)
     body = RECORDED.get(subject, f"{subject}/object")
@@ -300,7 +300,9 @@ def expected(
         return points[what]
     match rest:
         case "dof position":
-            return (2 * data.qpos[[j.qposadr[0] for j in joints]] - sheet.HIGH - sheet.LOW) / (sheet.HIGH - sheet.LOW)
+            return (2 * data.qpos[[j.qposadr[0] for j in joints]] - figures.HIGH - figures.LOW) / (
+                figures.HIGH - figures.LOW
+            )
         case "dof velocity":
             return 0.2 * data.qvel[dofs]
         case "dof force":
@@ -315,7 +317,7 @@ def expected(
         case "base rotation":
             begin = mujoco.MjData(model)
             mujoco.mj_kinematics(model, begin)
-            now, then = (sheet.rotation(d.body(f"{subject}/mount").xquat) for d in (data, begin))
+            now, then = (figures.rotation(d.body(f"{subject}/mount").xquat) for d in (data, begin))
             return (now * then.inv()).as_euler("xyz")
         case "actions":
             return np.split(action, 2)[SIDES.index(subject)]
@@ -356,10 +358,10 @@ def test_forces_are_those_of_the_model(worlds: dict[tuple[str, bool], World], na
     world, where = started(worlds, name, moving), places(name, moving)
     for _ in range(2):
         obs, *_ = world.step(torch.ones(3, world.action_size))
-    efforts = np.array([joint[7] for joint in sheet.JOINTS])
+    efforts = np.array([joint[7] for joint in figures.JOINTS])
     for side in SIDES:
         force = obs[:, where[f"{side} dof force"]].numpy()
         assert (np.abs(force) <= 10 * efforts + 1e-5).all()
         assert (force[:, [5, 9, 13, 18]] == 0).all()
-        assert (np.abs(force[:, sheet.ACTUATED]) > 0).mean() > 0.9
+        assert (np.abs(force[:, figures.ACTUATED]) > 0).mean() > 0.9
         assert (obs[:, where[f"{side} fingertip force, torque"]].abs().sum(dim=1) > 0).all()

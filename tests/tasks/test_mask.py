@@ -1,4 +1,4 @@
-"""The mask means something: goals are told in multi-task worlds and hidden in meta ones (design.md section 4)."""
+"""The mask means something: goals are told in multi-task worlds, hidden in meta ones (docs/figures.md, decisions)."""
 
 import numpy as np
 import pytest

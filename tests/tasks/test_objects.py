@@ -11,7 +11,7 @@ from bidex_meta.tasks import registry
 from bidex_meta.tasks.pour_water import PourWater
 from bidex_meta.tasks.scene import Scene, compile_scene
 from bidex_meta.world import World
-from tests.hands import sheet
+from tests.hands import figures
 from tests.tasks.formulas import FORMULAS
 from tests.tasks.formulas_fixtures import TRAVEL
 from tests.tasks.oracle import at, frame, pose, shifted
@@ -86,7 +86,7 @@ def test_objects_rest_where_they_start(name: str) -> None:
         first, _ = dofs_of(scene, body)
         assert np.abs(engine.qvel[:, first : first + 3].numpy()).max() < 0.05, body
         for old, new in zip(before[:, scene.qpos[body]], engine.qpos[:, scene.qpos[body]].numpy(), strict=True):
-            turned = sheet.rotation(new[3:]) * sheet.rotation(old[3:]).inv()
+            turned = figures.rotation(new[3:]) * figures.rotation(old[3:]).inv()
             assert turned.magnitude() < 0.03, body
     for joint in joints_of(scene):
         moved = engine.qpos[:, scene.qpos[joint]].numpy() - before[:, scene.qpos[joint]]

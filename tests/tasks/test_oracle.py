@@ -1,16 +1,19 @@
-"""The tests' own formulas against the figures that sheet section 4 derives: points, distances, hands and objects."""
+"""The tests' own formulas against figures derived from the original's files: points, distances, hands, objects.
+
+How: docs/figures.md, classes.
+"""
 
 import numpy as np
 import pytest
 
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import compile_scene
-from tests.hands import sheet
+from tests.hands import figures
 from tests.tasks.formulas import FORMULAS
 from tests.tasks.oracle import hand_point
 from tests.tasks.worlds import Lens
 
-# hinge angle: left handle, right handle (sheet 4.7).
+# hinge angle: left handle, right handle.
 OUTWARD = {
     0.0: ((0.034, -0.030, 0.683), (0.032, 0.037, 0.683)),
     0.4: ((-0.121, -0.046, 0.683), (-0.124, 0.052, 0.683)),
@@ -23,7 +26,7 @@ INWARD = {
     1.0: ((0.355, -0.243, 0.717), (0.358, 0.250, 0.717)),
     1.57: ((0.396, -0.460, 0.717), (0.399, 0.466, 0.717)),
 }
-# class: object, its start position in the sheet, and what the sheet derives there: d_left and d_right where it is told
+# class: object, its start position in the original, and what follows there: d_left and d_right where that is known
 # (BottleCap: hands exchanged), and the points of the tables.
 STARTS = {
     "LiftUnderarm": ("object", (0, -0.6, 0.45), (0.139, 0.139), {}),
@@ -73,7 +76,7 @@ def test_handles_of_doors(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", STARTS)
-def test_points_and_hand_distances_at_the_sheets_starts(name: str) -> None:
+def test_points_and_hand_distances_at_the_originals_starts(name: str) -> None:
     body, position, distances, points = STARTS[name]
     scene = compile_scene(registry.get(name, True))
     start = scene.start_qpos.copy()
@@ -90,9 +93,9 @@ def test_points_and_hand_distances_at_the_sheets_starts(name: str) -> None:
 
 
 def test_hand_points() -> None:
-    """Sheet 4.12 tells two in the world; the hands are exchanged here."""
+    """Two in the world (docs/figures.md, start poses); the hands are exchanged here."""
     scene = compile_scene(registry.get("BottleCap", True))
     data = Lens(scene.model).look(scene.start_qpos)
     np.testing.assert_allclose(hand_point(data, "left"), (0, -0.7205, 0.6686), atol=1.5e-3)
     np.testing.assert_allclose(hand_point(data, "right"), (0.0076, -0.62, 0.4564), atol=1.5e-3)
-    assert sheet.DEFAULT_JOINTS.keys() == {"BottleCap"}
+    assert figures.DEFAULT_JOINTS.keys() == {"BottleCap"}

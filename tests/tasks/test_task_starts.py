@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from bidex_meta.hands.pair import SIDES
 from bidex_meta.tasks import registry
-from tests.hands import sheet
+from tests.hands import figures
 from tests.tasks.formulas import FORMULAS
 from tests.tasks.oracle import Task, frame, nominal, shifted
 from tests.tasks.oracle import start as start_of
@@ -125,13 +125,13 @@ def test_joints_start_inside_their_limits_and_alike_in_both_hands(qpos: np.ndarr
     places = scene(name, moving).qpos
     noise = NOISE.get(name, (0.0, 0.0))[1]
     usual = np.zeros(24)
-    for joint, value in sheet.DEFAULT_JOINTS.get(name, {}).items():
-        usual[sheet.NAMES.index(joint)] = value
+    for joint, value in figures.DEFAULT_JOINTS.get(name, {}).items():
+        usual[figures.NAMES.index(joint)] = value
     right, left = (qpos[:, places[f"{side}/joints"]] for side in SIDES)
     for joints in (right, left):
-        assert (joints >= sheet.LOW).all() and (joints <= sheet.HIGH).all()
-        reach = noise * (sheet.HIGH - sheet.LOW) + 1e-6
-        coupled = [sheet.NAMES.index(f"{finger}J0") for finger in ("FF", "MF", "RF", "LF")]
+        assert (joints >= figures.LOW).all() and (joints <= figures.HIGH).all()
+        reach = noise * (figures.HIGH - figures.LOW) + 1e-6
+        coupled = [figures.NAMES.index(f"{finger}J0") for finger in ("FF", "MF", "RF", "LF")]
         reach[coupled] *= 0.00805 / 0.00705
         assert (np.abs(joints - usual) <= reach).all()
         middle = joints[:, [c - 1 for c in coupled]]
@@ -141,7 +141,7 @@ def test_joints_start_inside_their_limits_and_alike_in_both_hands(qpos: np.ndarr
     different = np.abs(right - left) > 1e-6
     assert ((np.abs(right) < 1e-12) | (np.abs(left) < 1e-12))[different].all(), "a hand differs only by opened fingers"
     # Wrist, thumb and side joints are never opened.
-    never_opened = [i for i, j in enumerate(sheet.NAMES) if j[:2] in ("WR", "TH") or (j[3] == "3" and j[:2] != "TH")]
+    never_opened = [i for i, j in enumerate(figures.NAMES) if j[:2] in ("WR", "TH") or (j[3] == "3" and j[:2] != "TH")]
     assert len(never_opened) == 11
     assert not different[:, never_opened].any()
 
@@ -160,11 +160,11 @@ def test_thrown_objects_start_near_their_places_in_any_orientation(qpos: np.ndar
         assert shift[:, 0].std() >= 0.4 * noise
         turns.append(pose[:, 3:])
     for other in turns[1:]:
-        np.testing.assert_array_equal(turns[0], other, err_msg="both objects share one orientation (sheet 4.4, 4.16)")
+        np.testing.assert_array_equal(turns[0], other, err_msg="both objects share one orientation")
 
 
 @pytest.mark.parametrize("name", MOVING)
-def test_scenes_put_objects_where_the_sheet_does(name: str) -> None:
+def test_scenes_put_objects_at_their_nominal_starts(name: str) -> None:
     """Give or take the height at which contact margins hold them; BottleCap's bottle is moved off palm and thumb."""
     found = scene(name, True)
     data = Lens(found.model).look(found.start_qpos)

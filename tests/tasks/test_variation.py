@@ -26,12 +26,12 @@ def around(prefix: str, *centre: float, half: float) -> dict[str, tuple[float, f
 
 
 def placed(*names: str) -> dict[str, tuple[float, float]]:
-    """What a task freezes of objects on a table (design.md section 4): 3 cm along x and y, 15 degrees."""
+    """What a task freezes of objects on a table (docs/figures.md, decisions): 3 cm along x and y, 15 degrees."""
     return {k: v for name in names for k, v in (*around(name, 0, 0, half=0.03).items(), (f"{name}_yaw", (-TURN, TURN)))}
 
 
 def goal(name: str, *centres: tuple[float, float, float]) -> dict[str, tuple[float, float]]:
-    """Goals of sheet 4.1 to 4.5 give or take 3 cm and, once for all, the two draws of their orientation."""
+    """The original's goals (docs/figures.md, classes) give or take 3 cm, and the two draws of their one orientation."""
     names = [name] if len(centres) == 1 else [f"{name}{i}" for i in (1, 2)]
     positions = [around(prefix, *centre, half=0.03) for prefix, centre in zip(names, centres, strict=True)]
     return {k: v for ends in positions for k, v in ends.items()} | ORIENTATION
@@ -40,7 +40,7 @@ def goal(name: str, *centres: tuple[float, float, float]) -> dict[str, tuple[flo
 ORIENTATION = {"goal_u0": (-1.0, 1.0), "goal_u1": (-1.0, 1.0)}
 OPENING = {"base_y": (-0.05, 0.05), "start_angle": (0.0, 0.15)}
 CLOSING = {"base_y": (-0.05, 0.05), "start_angle": (1.3, 1.57)}
-# class: components and their ends (design.md section 4), metres and radians.
+# class: components and their ends (docs/figures.md, decisions), metres and radians.
 SPACES = {
     "HandOver": goal("goal", (0, -0.64, 0.54)),
     "CatchUnderarm": goal("goal", (0, -0.79, 0.54)),
@@ -83,7 +83,7 @@ def test_samples_lie_inside_and_fill_the_box(name: str, moving: bool) -> None:
 
 
 @each_case
-def test_a_task_freezes_what_the_design_says(name: str, moving: bool) -> None:
+def test_a_task_freezes_its_documented_ranges(name: str, moving: bool) -> None:
     space = registry.get(name, moving).variation_space
     found = dict(zip(space.names, zip(space.low, space.high, strict=True), strict=True))
     assert len(found) == space.size == len(SPACES[name]) > 0
