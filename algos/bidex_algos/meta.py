@@ -134,7 +134,7 @@ class MetaLearner(ABC):
         """One meta-batch: samples, adapts, learns.
 
         Returns:
-            Metrics under TensorBoard-like tags; ``algos/README.md`` explains each.
+            Metrics under TensorBoard-like tags; ``docs/learners/`` explains each.
 
         Raises:
             FloatingPointError: The loss is no longer finite.

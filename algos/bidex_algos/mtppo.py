@@ -2,7 +2,7 @@
 
 One policy reads the task's one-hot in its observation. An iteration collects ``rollout_steps`` steps in every row, then
 makes ``epochs`` passes over them in shuffled mini-batches. What is done differently from Bi-DexHands' MTPPO, and why,
-stands in ``algos/README.md``.
+stands in ``docs/learners/mtppo.md``.
 """
 
 import math

@@ -12,7 +12,7 @@ For each vector step of the world::
 The target entropy H is ``target_entropy_per_action`` times the number of actions: Haarnoja's -dim(A) by default. One
 temperature for all would be set by their mean entropy: a task that is solved and one that still explores need
 different ones ("disentangled alphas"). The loss of log alpha is linear in log alpha rather than in alpha, so that its
-gradient is the gap in entropy whatever alpha is. Deviations stand in ``algos/README.md``.
+gradient is the gap in entropy whatever alpha is. Deviations stand in ``docs/learners/mtsac.md``.
 """
 
 import copy
@@ -135,7 +135,7 @@ class MTSAC:
         """Some vector steps, each followed by its updates.
 
         Returns:
-            Metrics under TensorBoard-like tags; ``algos/README.md`` explains each.
+            Metrics under TensorBoard-like tags; ``docs/learners/`` explains each.
 
         Raises:
             FloatingPointError: The loss is no longer finite.

@@ -125,7 +125,7 @@ class OnPolicy(ABC):
         """Collects one rollout and learns from it.
 
         Returns:
-            Metrics under TensorBoard-like tags; ``algos/README.md`` explains each.
+            Metrics under TensorBoard-like tags; ``docs/learners/`` explains each.
 
         Raises:
             FloatingPointError: The loss is no longer finite.

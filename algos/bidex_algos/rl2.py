@@ -5,7 +5,7 @@ whether an episode ended, and keeps its memory from one episode of the trial to 
 task in the first it may use in the next. An iteration plays one trial in every row, makes ``epochs`` passes over it in
 shuffled mini-batches of chunks, through which gradients flow back, and starts the next trial without memory. The very
 first trial only measures what statistics are made of.
-``algos/README.md`` says what is done otherwise, and why.
+``docs/learners/rl2.md`` says what is done otherwise, and why.
 """
 
 import copy
@@ -102,7 +102,7 @@ class RL2(RL2Agent):
         """Plays one trial in every row and learns from it.
 
         Returns:
-            Metrics under TensorBoard-like tags; ``algos/README.md`` explains each.
+            Metrics under TensorBoard-like tags; ``docs/learners/`` explains each.
 
         Raises:
             FloatingPointError: The loss is no longer finite.
