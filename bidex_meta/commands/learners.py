@@ -1,7 +1,8 @@
 """The learners by name: the only place in ``bidex_meta`` that names any.
 
-An entry is ``"module:Class"``. Beside the class the module holds ``PRESETS``: a dict from preset name to an instance of
-the learner's config dataclass, with at least ``paper`` and ``laptop``. The class offers:
+An entry is ``"module:Class"``; a name of that form is one too, so that a learner from elsewhere needs no entry.
+Beside the class the module holds ``PRESETS``: a dict from preset name to an instance of the learner's config dataclass;
+``auto`` takes ``laptop`` on a CPU and ``paper`` on a GPU, or the first where one of them is missing. The class offers:
 
 * ``Class(world, config, seed)``, and what ``bidex_algos.runner.Learner`` names;
 * where it adapts to tasks, ``adapts = True``: then ``load_policy`` gives a MetaLearningAgent (``bidex_meta.agents``),
@@ -15,7 +16,10 @@ the learner's config dataclass, with at least ``paper`` and ``laptop``. The clas
   entry ``learner.policy`` of a checkpoint.
 """
 
+import dataclasses
 import importlib
+import os
+import sys
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,6 +40,8 @@ ALGOS: dict[str, str] = {
     "sac": "bidex_algos.mtsac:MTSAC",
 }
 
+_NEEDED = ("iterate", "state_dict", "load_state_dict", "policy_state_dict", "load_policy", "per_process")
+
 
 def shared(name: str) -> Any:
     """No learner's own module: ``runner`` (the training loop), ``distributed`` (processes), ``bench`` (speed)."""
@@ -47,7 +53,7 @@ class LearnerKind:
     """A learner and its presets."""
 
     name: str
-    """Name in ``ALGOS``."""
+    """Name in ``ALGOS``, or ``package.module:Class``."""
     make: Any
     """The learner's class."""
     presets: dict[str, Any]
@@ -73,12 +79,14 @@ def learner_kind(name: str, task: str | None = None) -> LearnerKind:
     """Load a learner by name.
 
     Args:
-        name: As in ``ALGOS``.
+        name: As in ``ALGOS``, or ``package.module:Class``.
         task: The task class it shall learn alone, for which it may have presets of its own.
 
     Raises:
-        BidexError: There is none of this name, or its package is not installed.
+        BidexError: There is none of this name, its package is not installed, or it is no learner.
     """
+    if ":" in name:
+        return _from_elsewhere(name)
     if name not in ALGOS:
         raise unknown_name("algo", name, ALGOS)
     module_name, _, class_name = ALGOS[name].partition(":")
@@ -89,6 +97,32 @@ def learner_kind(name: str, task: str | None = None) -> LearnerKind:
     single = importlib.import_module("bidex_algos.single_task")
     presets = single.PRESETS.get(name, module.PRESETS) | single.OF_TASK.get(name, {}).get(task, {})
     return LearnerKind(name, getattr(module, class_name), presets)
+
+
+def _from_elsewhere(name: str) -> LearnerKind:
+    """The learner ``package.module:Class``, of an installed package or of the working folder."""
+    module_name, _, class_name = name.partition(":")
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # a console script does not look there by itself
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        raise BidexError(
+            f"--algo {name}: expected a module that can be imported, but there is no {error.name}. Install its "
+            "package, or start in the folder that holds it."
+        ) from error
+    presets, make = getattr(module, "PRESETS", None), getattr(module, class_name, None)
+    if not isinstance(make, type):
+        raise BidexError(f"--algo {name}: expected a class {class_name} in {module.__file__}, found none.")
+    if not isinstance(presets, dict) or not presets or not all(map(dataclasses.is_dataclass, presets.values())):
+        raise BidexError(
+            f"--algo {name}: expected PRESETS in {module.__file__}, a dict from a preset's name to an instance of the "
+            f"learner's config dataclass, found {presets!r}."
+        )
+    missing = [needed for needed in _NEEDED if not hasattr(make, needed)]
+    if missing:
+        raise BidexError(f"--algo {name}: expected {class_name} to have {', '.join(_NEEDED)}; {missing[0]} is missing.")
+    return LearnerKind(name, make, presets)
 
 
 def choose_preset(kind: LearnerKind, asked: str, device: str, suite: str | None = None) -> tuple[str, str]:
@@ -106,6 +140,8 @@ def choose_preset(kind: LearnerKind, asked: str, device: str, suite: str | None 
         return asked, "as asked"
     if metaworld.is_foreign(suite) and "metaworld" in kind.presets:
         return "metaworld", "the suite is Meta-World's"
+    if not {"laptop", "paper"} <= kind.presets.keys():
+        return next(iter(kind.presets)), "it is the learner's first"
     if device.startswith("cpu"):
         return "laptop", "the device is a CPU"
     if "tuned" in kind.presets:

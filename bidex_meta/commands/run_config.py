@@ -39,7 +39,7 @@ class RunFlags:
     """With --task: whether the hands' bases move; own: as the class has it alone. Suites move them, HandOver alone
     does not."""
     algo: str = "mtppo"
-    """Learner (see `bidex-meta list algos`)."""
+    """Learner (see `bidex-meta list algos`), or package.module:Class of your own (CONTRIBUTING.md)."""
     preset: str = "auto"
     """Values of the learner's config that no flag sets; auto: metaworld for a suite of Meta-World's, else laptop on a
     CPU, on a GPU paper (of maml and promp laptop there too)."""

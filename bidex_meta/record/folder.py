@@ -117,7 +117,8 @@ class RunFolder:
 def _new_folder(config: dict[str, Any], root: Path) -> Path:
     subject = Path(str(config.get("suite") or config.get("task"))).stem  # a suite may be a path to a TOML file
     now = datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S")
-    base = root / subject / str(config["algo"]) / f"{now}_seed{config['seed']}"
+    algo = str(config["algo"]).rpartition(":")[2]  # of package.module:Class the class
+    base = root / subject / algo / f"{now}_seed{config['seed']}"
     base.parent.mkdir(parents=True, exist_ok=True)
     path, count = base, 1
     while True:
