@@ -1,7 +1,7 @@
 # The three things a person does here: make run, make test, make format.
 # Needs Python 3.11 to 3.13 and nothing else; everything goes into .venv.
 
-MINUTES ?= 4
+MINUTES ?= 4.6
 
 # The first interpreter that is new enough; `make run PYTHON=/path/to/python3.12` chooses one by hand.
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11 python; do \
