@@ -73,11 +73,17 @@ class Starts:
             [qpos[rows, at[rows]] for qpos, rows, at in zip(self._qpos, chosen, places, strict=True)],
         )
 
-    def _take_masked(self, number: Tensor, task_index: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """The same for all rows, without a look at any number: a row begins at most one episode a call."""
+    def look_ahead(self, number: Tensor, task_index: Tensor) -> None:
+        """Comes before each ``take`` of a masked engine, with the same numbers and tasks: draws when it is time.
+
+        A row begins at most one episode a call, so counting calls does instead of a look at any number.
+        """
         if self._takes % _AHEAD == 0:
             self._draw_all(number, task_index)
         self._takes += 1
+
+    def _take_masked(self, number: Tensor, task_index: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """The same for all rows, without a look at any number."""
         place = (number - self._first)[:, None]
         starts = []
         for part, qpos in zip(self._parts, self._qpos, strict=True):
@@ -101,7 +107,7 @@ class Starts:
 
     def _draw_all(self, number: Tensor, task_index: Tensor) -> None:
         """Fills the bank of all rows."""
-        self._first = number.clone()
+        self._first.copy_(number)
         rows = torch.arange(len(number), device=number.device)
         for part, qpos in zip(self._parts, self._qpos, strict=True):
             mine = part.group.take(rows)

@@ -5,7 +5,8 @@ The way of one observation: ``Part.advance`` (engine) -> ``sensordata`` -> ``Obs
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,18 +21,25 @@ from bidex_meta.errors import BidexError
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.layout import CLIP
 from bidex_meta.world import actions
+from bidex_meta.world.attributes import RowAttributes
 from bidex_meta.world.autoreset import checked_mode, reset_mask
 from bidex_meta.world.episodes import Episodes
 from bidex_meta.world.groups import Slot, build_groups, split_rows
 from bidex_meta.world.observations import Rule
-from bidex_meta.world.part import Part, judge
+from bidex_meta.world.overlap import SideBySide
+from bidex_meta.world.part import Part
 from bidex_meta.world.random import row_keys
+from bidex_meta.world.recording import Recorder, Work, cuda_graph, fresh
 from bidex_meta.world.rendering import render_row
 from bidex_meta.world.starts import Starts
 from bidex_meta.world.threads import one_torch_thread
+from bidex_meta.world.transitions import collect
+
+_STATE = ("_action", "_obs", "task_index")
+"""What a step changes beside the episodes' counters."""
 
 
-class World(VectorEnv):
+class World(RowAttributes, VectorEnv):
     """Every task of a suite in one Gymnasium vector environment of torch tensors.
 
     Arrays are fresh tensors on ``device``; NumPy actions are accepted. Rows of a slot are contiguous. Positions and
@@ -105,6 +113,9 @@ class World(VectorEnv):
         self._make_spaces(observation, pad_to)
         self.parts = [Part(g, self.slots, observation, self.observation_size, num_envs) for g in groups]
         self._masked = groups[0].engine.masked
+        self._side_by_side = SideBySide(len(groups), self.device)
+        captured = self.device.type == "cuda" and self.autoreset_mode == AutoresetMode.SAME_STEP
+        self._recorder = Recorder(self._state, self._put_state, cuda_graph) if captured else None
         self.episodes = Episodes.fresh(num_envs, self.device)
         counted = [torch.arange(rows.stop - rows.start, device=self.device) for rows in self.slot_rows]
         self._index_in_slot = torch.cat(counted)
@@ -144,6 +155,8 @@ class World(VectorEnv):
         draws = max(slot.task_class.start_draws for slot in self.slots)
         self._starts = Starts(self.parts, keys, draws, self._pool_size if self._uniform_tasks else None)
         self.episodes = Episodes.fresh(self.num_envs, self.device)
+        if self._recorder is not None:  # recordings hold the starts and the pools
+            self._recorder.forget()
 
     def set_tasks(self, pools: dict[str, np.ndarray]) -> None:
         """Replaces the pools of tasks of some slots; row j of a slot plays task j mod n from the next full reset on.
@@ -200,25 +213,45 @@ class World(VectorEnv):
             self._begin(mask, stagger)
         return self._obs.clone(), {}
 
+    def _run(self, name: str, work: Work, *inputs: Tensor) -> Any:
+        """A stretch of a step that looks at no number: replayed on CUDA, plainly run elsewhere."""
+        return work(*inputs) if self._recorder is None else self._recorder.run(name, work, *inputs)
+
+    def _state(self) -> dict[str, Tensor]:
+        counters = {f.name: getattr(self.episodes, f.name) for f in fields(self.episodes)}
+        return counters | {name: getattr(self, name) for name in _STATE}
+
+    def _put_state(self, state: dict[str, Tensor]) -> None:
+        for name, value in state.items():
+            setattr(self if name in _STATE else self.episodes, name, value)
+
     def _begin(self, mask: Tensor, stagger: bool) -> None:
         """Starts new episodes in the rows of a mask and refreshes their observations."""
+        if self._masked:
+            self._starts.look_ahead(self.episodes.number + 1, self.task_index)
+        starts = self._run(f"begin, staggered {stagger}", partial(self._draw, stagger), mask)
+        chosen = [part.group.take(mask) for part in self.parts]
+        if self._masked:
+            jobs = zip(self.parts, chosen, starts, strict=True)
+            self._side_by_side.run([partial(part.group.engine.reset, rows, start) for part, rows, start in jobs])
+            self._run("refresh", self._refresh_masked, mask)
+            return
+        for part, where, start in zip(self.parts, chosen, starts, strict=True):
+            rows = where.nonzero().squeeze(1)
+            if len(rows):
+                part.group.engine.reset(where, start)
+                self._refresh(part, rows)
+
+    def _draw(self, stagger: bool, mask: Tensor) -> list[Tensor]:
+        """Counts new episodes in the rows of a mask; where they start, by part."""
         # The number counts for all rows: starts of the others may be drawn in the same go.
-        task_index, share, qpos = self._starts.take(mask, self.episodes.number + 1, self.task_index)
+        task_index, share, starts = self._starts.take(mask, self.episodes.number + 1, self.task_index)
         self.episodes.number = self.episodes.number + mask
         self.task_index = torch.where(mask, task_index, self.task_index)
         elapsed = (share * self.max_episode_steps).long() if stagger else torch.zeros_like(self.episodes.elapsed)
         self.episodes.begin(mask, elapsed)
         self._action = torch.where(mask[:, None], 0.0, self._action)
-        for part, start in zip(self.parts, qpos, strict=True):
-            chosen = part.group.take(mask)
-            if self._masked:
-                part.group.engine.reset(chosen, start)
-                self._refresh_masked(part, chosen)
-                continue
-            rows = chosen.nonzero().squeeze(1)
-            if len(rows):
-                part.group.engine.reset(chosen, start)
-                self._refresh(part, rows)
+        return starts
 
     def _refresh(self, part: Part, rows: Tensor) -> None:
         """Writes the observations of some of a part's rows."""
@@ -226,12 +259,14 @@ class World(VectorEnv):
         states = list(part.states(part.group.take(self.task_index), rows))
         self._obs[world_rows] = self._with_id(part.observe(states, self._action[world_rows], rows), world_rows)
 
-    def _refresh_masked(self, part: Part, mask: Tensor) -> None:
-        """Writes the observations of a mask of a part's rows, with shapes that do not depend on the mask."""
-        group = part.group
-        states = list(part.states(group.take(self.task_index)))
-        new = self._with_id(part.observe(states, group.take(self._action)), group.rows)
-        self._obs[group.rows] = torch.where(mask[:, None], new, group.take(self._obs))
+    def _refresh_masked(self, mask: Tensor) -> None:
+        """Writes the observations of a mask of rows, with shapes that do not depend on the mask."""
+        new = torch.empty_like(self._obs)
+        for part in self.parts:
+            group = part.group
+            states = list(part.states(group.take(self.task_index)))
+            new[group.rows] = self._with_id(part.observe(states, group.take(self._action)), group.rows)
+        self._obs = torch.where(mask[:, None], new, self._obs)
 
     def _with_id(self, obs: Tensor, world_rows: Tensor) -> Tensor:
         """Writes the one-hot task id into observations of the given rows."""
@@ -265,24 +300,40 @@ class World(VectorEnv):
             return self._advance(action)
 
     def _advance(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
-        action, broken = actions.clean(action)
+        active, broken = self._run("control", self._control, action)
         disabled = self.autoreset_mode == AutoresetMode.DISABLED
+        self.step_engines(active if disabled else None)  # apart from the controls: it empties the caches
+        made = self._run("finish", self._finish, active, broken)
+        reward, terminated, truncated, info = made if self._recorder is None else fresh(made)
+        ended = info["_final_obs"]
+        if not disabled and (self._masked or ended.any()):
+            self._begin(ended, stagger=False)
+        return self._obs.clone(), reward, terminated, truncated, info
+
+    def step_engines(self, active: Tensor | None = None) -> None:
+        """Physics alone: all rows, or those of a mask (num_envs,), go on for a control step under their controls."""
+        rows = [None if active is None else part.group.take(active) for part in self.parts]
+        self._side_by_side.run([partial(part.advance, of) for part, of in zip(self.parts, rows, strict=True)])
+
+    def _control(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Writes actions into the engines; which rows are active, and which of them got a non-finite number."""
+        action, broken = actions.clean(action)
         active = ~self.episodes.finished
+        disabled = self.autoreset_mode == AutoresetMode.DISABLED
         self._action = torch.where(active[:, None], action, self._action) if disabled else action
         for part in self.parts:
             part.control(part.group.take(self._action))
-        for part in self.parts:  # apart from the controls: an engine's step empties the caches
-            part.advance(part.group.take(active) if disabled else None)
-        return self._finish(active, broken & active)
+        return active, broken & active
 
-    def _finish(self, active: Tensor, broken: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
-        """Turns the engines' new state into what ``step`` returns, and starts new episodes."""
-        reward, success, failed, unstable, terms, obs = self._collect(broken)
-        unscaled = torch.where(active & ~unstable, reward, 0.0)
+    def _finish(self, active: Tensor, broken: Tensor) -> tuple[Tensor, Tensor, Tensor, dict[str, Any]]:
+        """Turns the engines' new state into what ``step`` returns before new episodes start."""
+        made = collect(self.parts, self.task_index, self._action, self.observation_size, self._with_id)
+        success, obs, unstable = made.success, made.obs, made.unstable | broken
+        unscaled = torch.where(active & ~unstable, made.reward, 0.0)
         reward = unscaled * self._scale
         episodes = self.episodes
         episodes.add(active, reward, unscaled, success & ~unstable)
-        terminated = failed & ~unstable & active | episodes.terminated
+        terminated = made.failed & ~unstable & active | episodes.terminated
         late = (episodes.elapsed >= self.max_episode_steps) & ~terminated
         truncated = (late | unstable) & active | episodes.truncated
         ended = (terminated | truncated) & active
@@ -294,7 +345,7 @@ class World(VectorEnv):
         info: dict[str, Any] = {
             "success": success & ~unstable,
             "unstable": broken,
-            "reward_terms": {n: torch.where(active & ~unstable, t, 0.0) for n, t in terms.items()},
+            "reward_terms": {n: torch.where(active & ~unstable, t, 0.0) for n, t in made.terms.items()},
             "reward_unscaled": unscaled,
             "final_obs": obs,
             "_final_obs": ended,
@@ -304,35 +355,10 @@ class World(VectorEnv):
         info["final_info"] = {k: info[k] for k in ("success", "unstable", "reward_unscaled", "episode")}
         info["_final_info"] = ended
         self._obs = obs.clone()
-        if self.autoreset_mode == AutoresetMode.SAME_STEP:
-            if self._masked or ended.any():
-                self._begin(ended, stagger=False)
-        else:
+        if self.autoreset_mode == AutoresetMode.DISABLED:
             episodes.terminated, episodes.truncated = terminated.clone(), truncated.clone()
             episodes.finished = episodes.finished | ended
-        return self._obs.clone(), reward, terminated, truncated, info
-
-    def _collect(self, broken: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Tensor], Tensor]:
-        """Reward, success, failed, unstable, reward terms and observations of all rows after a step."""
-        n = self.num_envs
-        reward, obs = (torch.empty(*shape, device=self.device) for shape in ((n,), (n, self.observation_size)))
-        success, failed, unstable = torch.zeros(3, n, dtype=torch.bool, device=self.device).unbind()
-        terms: dict[str, Tensor] = {}
-        for part in self.parts:
-            group = part.group
-            states = list(part.states(group.take(self.task_index)))
-            out = None if group.span is None else obs[group.span]
-            values = self._with_id(part.observe(states, group.take(self._action), out=out), group.rows)
-            broke = part.unstable()
-            for member, where, state in states:
-                rows, made = member.world_rows, judge(member.scene.task, state)
-                reward[rows], success[rows], failed[rows] = made.reward, made.success, made.failed
-                unstable[rows] = broke[where]
-                for name, value in made.terms.items():
-                    terms.setdefault(name, torch.zeros(n, device=self.device))[rows] = value
-                if out is None:
-                    obs[rows] = values[where]
-        return reward, success, failed, unstable | broken, terms, obs
+        return reward, terminated, truncated, info
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that decides the future of the world: tensors and numbers, copied."""
@@ -373,28 +399,6 @@ class World(VectorEnv):
     def pools(self) -> list[np.ndarray]:
         """The tasks that each slot draws from, each (n, size of its variation)."""
         return [slot.tasks for slot in self.slots]
-
-    @property
-    def task_name(self) -> list[str]:
-        """Slot name of each row."""
-        return [self.task_names[i] for i in self.task_id.tolist()]
-
-    def get_attr(self, name: str) -> tuple[Any, ...]:
-        """An attribute for each row: its own entry of a per-row attribute, else the world's value."""
-        value = getattr(self, name)
-        per_row = name == "task_name" or (isinstance(value, Tensor) and value.shape[:1] == (self.num_envs,))
-        return tuple(value) if per_row else (value,) * self.num_envs
-
-    def set_attr(self, name: str, values: Any) -> None:
-        """Sets an attribute of the world."""
-        setattr(self, name, values)
-
-    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Calls a method of the world (or reads an attribute) and returns the result for each row."""
-        value = getattr(self, name)
-        if not callable(value):
-            return self.get_attr(name)
-        return (value(*args, **kwargs),) * self.num_envs
 
     def close_extras(self, **kwargs: Any) -> None:
         """Nothing is held outside memory."""

@@ -30,7 +30,7 @@ def test_collecting_and_learning_look_at_no_number(masked, monkeypatch: pytest.M
 
 
 @pytest.mark.gpu
-def test_an_iteration_waits_as_often_with_four_times_the_steps():
+def test_an_iteration_waits_no_more_often_with_four_times_the_steps():
     waits = []
     for steps in (4, 16):
         world = Benchmark("MT4").make_world("train", num_envs=64, device="cuda:0", seed=0)
@@ -45,4 +45,4 @@ def test_an_iteration_waits_as_often_with_four_times_the_steps():
             finally:
                 torch.cuda.set_sync_debug_mode("default")
         waits.append(sum("synchronizing" in str(w.message) for w in found))
-    assert waits[0] == waits[1] <= 4
+    assert waits[1] <= waits[0] <= 4, waits

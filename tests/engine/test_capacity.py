@@ -34,6 +34,6 @@ def test_more_water_gets_more_room() -> None:
 
 
 def test_a_group_gets_the_largest_room_of_its_classes_and_a_stranger_that_of_all() -> None:
-    assert capacity_of([model("CatchUnderarm"), model("HandOver")]) == Capacity(48, 12, 96)
+    assert capacity_of([model("CatchUnderarm"), model("HandOver")]) == Capacity(48, 12, 80)
     stranger = mujoco.MjModel.from_xml_string("<mujoco model='ball'><worldbody/></mujoco>")
-    assert capacity_of([stranger]) == Capacity(112, 24, 272)
+    assert capacity_of([stranger]) == Capacity(112, 30, 208)

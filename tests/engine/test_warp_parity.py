@@ -20,7 +20,7 @@ WIDER = {
     # Two eggs roll on fingers from the start; an egg's contact normals differ by 1e-4 to 1e-3 rad in single precision.
     "TwoCatchUnderarm": {"position": 4e-3, "quaternion": 2e-2, "velocity": 6e-2},
     # Falling cubes meet fingers; the reward is steep where an angle is small (C rounded to single precision: 7e-3).
-    "ReOrientation": {"quaternion": 2e-3, "reward": 6e-2},
+    "ReOrientation": {"quaternion": 4e-3, "reward": 6e-2},
     # A bottle in a hand that grips at random (C rounded to single precision: 3.5e-2).
     "BottleCap": {"quaternion": 2.5e-3},
     # Two blocks dropped on a table; the reward is steep near the target.
