@@ -1,6 +1,6 @@
 """Engines side by side: on CUDA each has a stream of its own, so that small batches fill the device together."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 
@@ -18,14 +18,16 @@ class SideBySide:
         several = device.type == "cuda" and jobs > 1
         self._streams = [torch.cuda.Stream(device) for _ in range(jobs)] if several else []
 
-    def run(self, jobs: Sequence[Callable[[], None]]) -> None:
-        """Does the jobs; what comes after in the caller's stream waits for them all, and they for what came before.
+    def run(self, jobs: Sequence[Callable[[], None]]) -> Iterator[int]:
+        """Does the jobs; gives their numbers, in order, as each is done. To be used up.
 
-        What they read must live until this returns.
+        On CUDA what comes after in the caller's stream waits for them all, and they for what came before. What they
+        read must live until this ends.
         """
         if not self._streams:
-            for job in jobs:
+            for number, job in enumerate(jobs):
                 job()
+                yield number
             return
         caller = torch.cuda.current_stream()
         for stream, job in zip(self._streams, jobs, strict=True):
@@ -34,3 +36,4 @@ class SideBySide:
                 job()
         for stream in self._streams:
             caller.wait_stream(stream)
+        yield from range(len(jobs))

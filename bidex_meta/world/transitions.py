@@ -1,6 +1,6 @@
 """What a step did to all rows of a world, gathered from its parts."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import torch
@@ -31,12 +31,12 @@ class Transitions:
 
 
 def collect(
-    parts: Sequence[Part], task_index: Tensor, action: Tensor, width: int, with_id: Callable[[Tensor, Tensor], Tensor]
+    parts: Iterable[Part], task_index: Tensor, action: Tensor, width: int, with_id: Callable[[Tensor, Tensor], Tensor]
 ) -> Transitions:
     """Judges and observes all rows after a step.
 
     Args:
-        parts: The world's parts.
+        parts: The world's parts; each is asked for when its turn comes.
         task_index: Task of each row, shape (n,).
         action: Actions of the step, shape (n, a).
         width: Entries of an observation.

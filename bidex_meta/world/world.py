@@ -4,7 +4,7 @@ The way of one observation: ``Part.advance`` (engine) -> ``sensordata`` -> ``Obs
 ``TaskClass.observe`` (goal blocks) -> ``World._with_id`` (padding, task id) -> the learner's network.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import fields, replace
 from functools import partial
 from typing import Any
@@ -231,16 +231,15 @@ class World(RowAttributes, VectorEnv):
             self._starts.look_ahead(self.episodes.number + 1, self.task_index)
         starts = self._run(f"begin, staggered {stagger}", partial(self._draw, stagger), mask)
         chosen = [part.group.take(mask) for part in self.parts]
+        jobs = [partial(p.group.engine.reset, c, s) for p, c, s in zip(self.parts, chosen, starts, strict=True)]
         if self._masked:
-            jobs = zip(self.parts, chosen, starts, strict=True)
-            self._side_by_side.run([partial(part.group.engine.reset, rows, start) for part, rows, start in jobs])
+            list(self._side_by_side.run(jobs))
             self._run("refresh", self._refresh_masked, mask)
             return
-        for part, where, start in zip(self.parts, chosen, starts, strict=True):
-            rows = where.nonzero().squeeze(1)
-            if len(rows):
-                part.group.engine.reset(where, start)
-                self._refresh(part, rows)
+        begun = [(i, rows) for i, c in enumerate(chosen) if len(rows := c.nonzero().squeeze(1))]
+        for k in self._side_by_side.run([jobs[i] for i, _ in begun]):
+            i, rows = begun[k]
+            self._refresh(self.parts[i], rows)
 
     def _draw(self, stagger: bool, mask: Tensor) -> list[Tensor]:
         """Counts new episodes in the rows of a mask; where they start, by part."""
@@ -302,18 +301,26 @@ class World(RowAttributes, VectorEnv):
     def _advance(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         active, broken = self._run("control", self._control, action)
         disabled = self.autoreset_mode == AutoresetMode.DISABLED
-        self.step_engines(active if disabled else None)  # apart from the controls: it empties the caches
-        made = self._run("finish", self._finish, active, broken)
+        stepped = self.step_engines(active if disabled else None)
+        if self._masked:
+            parts = list(stepped)
+            made = self._run("finish", partial(self._finish, parts), active, broken)
+        else:
+            made = self._finish(stepped, active, broken)
         reward, terminated, truncated, info = made if self._recorder is None else fresh(made)
         ended = info["_final_obs"]
         if not disabled and (self._masked or ended.any()):
             self._begin(ended, stagger=False)
         return self._obs.clone(), reward, terminated, truncated, info
 
-    def step_engines(self, active: Tensor | None = None) -> None:
-        """Physics alone: all rows, or those of a mask (num_envs,), go on for a control step under their controls."""
+    def step_engines(self, active: Tensor | None = None) -> Iterator[Part]:
+        """Physics alone: all rows, or those of a mask (num_envs,), go on for a control step under their controls.
+
+        Gives the parts as they are done; to be used up.
+        """
         rows = [None if active is None else part.group.take(active) for part in self.parts]
-        self._side_by_side.run([partial(part.advance, of) for part, of in zip(self.parts, rows, strict=True)])
+        jobs = [partial(part.advance, of) for part, of in zip(self.parts, rows, strict=True)]
+        return (self.parts[i] for i in self._side_by_side.run(jobs))
 
     def _control(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """Writes actions into the engines; which rows are active, and which of them got a non-finite number."""
@@ -325,9 +332,11 @@ class World(RowAttributes, VectorEnv):
             part.control(part.group.take(self._action))
         return active, broken & active
 
-    def _finish(self, active: Tensor, broken: Tensor) -> tuple[Tensor, Tensor, Tensor, dict[str, Any]]:
+    def _finish(
+        self, parts: Iterable[Part], active: Tensor, broken: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, dict[str, Any]]:
         """Turns the engines' new state into what ``step`` returns before new episodes start."""
-        made = collect(self.parts, self.task_index, self._action, self.observation_size, self._with_id)
+        made = collect(parts, self.task_index, self._action, self.observation_size, self._with_id)
         success, obs, unstable = made.success, made.obs, made.unstable | broken
         unscaled = torch.where(active & ~unstable, made.reward, 0.0)
         reward = unscaled * self._scale
