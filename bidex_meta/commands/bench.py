@@ -1,6 +1,6 @@
 """``bidex-meta bench``: flags in, numbers out.
 
-What is measured, and how, stands in ``bidex_meta.bench``, for a learner in ``bidex_algos.bench``.
+What is measured, and how, stands in ``bidex_meta.bench``, for a learner in ``bidex_algos.bench.learner``.
 """
 
 import inspect

@@ -12,7 +12,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from bidex_meta.commands.launch import launch, resume_command
+from bidex_meta.train.launch import launch, resume_command
 from bidex_meta.commands.learners import shared
 from bidex_meta.commands.run_config import RunPlan, plan_run
 from bidex_meta.errors import BidexError
@@ -190,7 +190,9 @@ def _evaluate(plan: RunPlan, folder: Any, learner: Any) -> None:
         return
     from bidex_meta.commands import worlds
     from bidex_meta.commands.tables import evaluation_table, print_table
-    from bidex_meta.evaluate import EVALUATION_SEED, RandomAgent, compare
+    from bidex_meta.evaluation.play import EVALUATION_SEED
+    from bidex_meta.evaluation.results import compare
+    from bidex_meta.evaluation.untrained import RandomAgent
     from bidex_meta.record.atomic import write_json
 
     episodes = plan.flags.episodes or worlds.default_episodes(plan.config)

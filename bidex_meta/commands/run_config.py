@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from bidex_meta.clients import metaworld
-from bidex_meta.commands.launch import launch, resume_command
+from bidex_meta.train.launch import launch, resume_command
 from bidex_meta.commands.learners import LearnerKind, choose_preset, learner_kind, resolve_device
 from bidex_meta.commands.parsing import StepCount, Switch, parse, peek
 from bidex_meta.errors import BidexError
