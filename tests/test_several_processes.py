@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 import torch
 
-from bidex_meta.train.distributed import TIMEOUT
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder, read_metrics
+from bidex_meta.train.distributed import TIMEOUT
 from tests.algos.ranks import same
 
 SMALL = ["--suite", "MT4", "--num-envs", "4", "--threads", "1", "--device", "cpu", "--seed", "3", "--no-evaluate"]

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from bidex_algos.offpolicy import mtsac_config
-from bidex_algos.onpolicy.base import mtppo_config, mttrpo_config
+from bidex_algos.onpolicy import mtppo_config, mttrpo_config
 
 # Table 42, column "Other Tasks". What it does not name is as in Table 47.
 _PPO = replace(mtppo_config.PRESETS["paper"], hidden=(1024, 1024, 512), gamma=0.96)

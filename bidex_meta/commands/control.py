@@ -115,8 +115,8 @@ def _play(folder: "RunFolder", flags: ControlFlags) -> "Control":
     from bidex_meta.commands import metatest, worlds
     from bidex_meta.commands.learners import resolve_device
     from bidex_meta.evaluation.control_arms import control
-    from bidex_meta.evaluation.play import EVALUATION_SEED
     from bidex_meta.evaluation.meta_test import MAX_ADAPT_STEPS
+    from bidex_meta.evaluation.play import EVALUATION_SEED
     from bidex_meta.world.threads import set_up_torch
 
     stored = folder.config()

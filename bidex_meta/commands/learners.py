@@ -12,8 +12,8 @@ Beside the class the module holds ``PRESETS``: a dict from preset name to an ins
   nothing of what they learn;
 * where it does not train in autoreset mode SAME_STEP, ``autoreset``: the mode, or a function of the learner's config
   that gives it;
-* ``policy_state_dict()`` and ``load_policy(state, device)``, which gives an agent for ``bidex_meta.evaluation.play`` from the
-  entry ``learner.policy`` of a checkpoint.
+* ``policy_state_dict()`` and ``load_policy(state, device)``, which gives an agent for ``bidex_meta.evaluation.play`` from
+  the entry ``learner.policy`` of a checkpoint.
 """
 
 import dataclasses
@@ -24,8 +24,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from bidex_meta.clients import metaworld
-from bidex_meta.train.launch import launch
 from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.train.launch import launch
 
 ALGOS: dict[str, str] = {
     "mtppo": "bidex_algos.onpolicy.mtppo:MTPPO",
@@ -44,7 +44,7 @@ _NEEDED = ("iterate", "state_dict", "load_state_dict", "policy_state_dict", "loa
 
 
 def shared(name: str) -> Any:
-    """No learner's own module: ``runner`` (the training loop), ``distributed`` (processes), ``bench`` (speed)."""
+    """No learner's own module: ``start_from`` (another run's policy), ``bench.learner`` and ``bench.adapt`` (speed)."""
     return importlib.import_module(f"bidex_algos.{name}")
 
 

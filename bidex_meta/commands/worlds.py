@@ -3,14 +3,14 @@
 from collections.abc import Callable
 from typing import Any
 
+from bidex_meta.agents import Agent
 from bidex_meta.clients import metaworld
-from bidex_meta.train.launch import launch
 from bidex_meta.commands.learners import learner_kind
 from bidex_meta.errors import BidexError, unknown_name
-from bidex_meta.agents import Agent
 from bidex_meta.evaluation.results import Evaluation
-from bidex_meta.record import RunFolder
 from bidex_meta.evaluation.scores import Reference
+from bidex_meta.record import RunFolder
+from bidex_meta.train.launch import launch
 
 _TASKS_ALONE = 50
 """Tasks that are drawn for a class on its own."""

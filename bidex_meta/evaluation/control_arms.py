@@ -14,9 +14,9 @@ import numpy as np
 
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.results import ClassResult, Difference, Evaluation
 from bidex_meta.evaluation.gains import MEASURES, difference_over_runs, grouped
 from bidex_meta.evaluation.meta_test import meta_evaluate
+from bidex_meta.evaluation.results import ClassResult, Difference, Evaluation
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """The meta-test: what does adaptation gain, from the meta-learned parameters, after 0, 1, ..., K shots?
 
-The protocol. From what was meta-learned (``agent.init()``) the agent is evaluated as by ``bidex_meta.evaluation.play``; then,
-``shots`` times, it plays ``rollouts`` whole exploring episodes of each task, adapts, and is evaluated again. Every
+The protocol. From what was meta-learned (``agent.init()``) the agent is evaluated as by ``bidex_meta.evaluation.play``;
+then, ``shots`` times, it plays ``rollouts`` whole exploring episodes of each task, adapts, and is evaluated again. Every
 evaluation plays the same episodes (tasks and starts): what differs between two shots is the policy alone, and an agent
 that does not change gains exactly 0. Starts of adaptation are others than those of evaluation, and others in each shot.
 
@@ -20,10 +20,10 @@ from torch import Tensor
 
 from bidex_meta.agents import Agent, MetaLearningAgent, Timestep
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.play import EVALUATION_SEED, check_world, play_tasks, quota
-from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.evaluation.gains import Gains, paired_gains
+from bidex_meta.evaluation.play import EVALUATION_SEED, check_world, play_tasks, quota
 from bidex_meta.evaluation.portions import Portions, task_of_row
+from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.evaluation.scores import Reference
 
 MAX_ADAPT_STEPS = 150

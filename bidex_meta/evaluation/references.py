@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from bidex_meta import paths
-from bidex_meta.record.atomic import write_json
 from bidex_meta.evaluation.scores import Reference
+from bidex_meta.record.atomic import write_json
 
 Kind = Literal["random", "zero", "expert"]
 

@@ -19,8 +19,8 @@ import torch.distributed as dist
 from torch import Tensor, nn
 from torch.distributed.rendezvous import rendezvous
 
-from bidex_meta.train.attendance import Attendance, end_patiently
 from bidex_meta.errors import BidexError
+from bidex_meta.train.attendance import Attendance, end_patiently
 
 # How long one process may wait for another. A dead one closes its sockets and is noticed at once; this is for a machine
 # that no longer answers, and must exceed what process 0 needs to write a checkpoint.

@@ -1,7 +1,7 @@
 """The training loop every learner runs in: iterate, report, save; and stop cleanly when asked to.
 
-In a run of several processes (:mod:`bidex_meta.train.distributed`) all make the same iterations and stop together; process 0
-writes for all.
+In a run of several processes (:mod:`bidex_meta.train.distributed`) all make the same iterations and stop together;
+process 0 writes for all.
 """
 
 import math
@@ -13,12 +13,23 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any, Protocol
 
-from bidex_meta.train.distributed import any_process, gather, is_main, rank, world_size
-from bidex_algos.experience.rollout import VectorWorld
 from bidex_meta.errors import BidexError
+from bidex_meta.train.distributed import any_process, gather, is_main, rank, world_size
 
 # The most of a run's time that may go into checkpoints.
 _SAVING_SHARE = 0.02
+
+
+class Resumable(Protocol):
+    """What the loop needs of a world: its state."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that is needed to continue bit for bit."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` gave."""
+        ...
 
 
 class Learner(Protocol):
@@ -61,7 +72,7 @@ class Record(Protocol):
 
 def train(
     learner: Learner,
-    world: VectorWorld,
+    world: Resumable,
     *,
     total_steps: int,
     record: Record | None,
@@ -122,13 +133,13 @@ def train(
         return stopped
 
 
-def _save(learner: Learner, world: VectorWorld, record: Record | None) -> None:
+def _save(learner: Learner, world: Resumable, record: Record | None) -> None:
     state = checkpoint(learner, world)
     if record is not None and state is not None:
         record.save(state, learner.env_steps)
 
 
-def checkpoint(learner: Learner, world: VectorWorld) -> dict[str, Any] | None:
+def checkpoint(learner: Learner, world: Resumable) -> dict[str, Any] | None:
     """The state of a run: ``{"learner": ..., "env": ...}``, tensors and plain values only.
 
     Of several processes all must call it. Process 0 gets its own state with, under ``others``, what differs in each of
@@ -142,7 +153,7 @@ def checkpoint(learner: Learner, world: VectorWorld) -> dict[str, Any] | None:
     return None if parts is None else {**state, "others": parts[1:]}
 
 
-def resume(learner: Learner, world: VectorWorld, state: dict[str, Any]) -> None:
+def resume(learner: Learner, world: Resumable, state: dict[str, Any]) -> None:
     """Restores what :func:`checkpoint` gave; training then continues bit for bit (CPU, same number of threads).
 
     Raises:

@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from bidex_algos.onpolicy.mtppo import MTPPO, PRESETS, MTPPOConfig
-from bidex_algos.nets.networks import gaussian_log_prob
 from bidex_algos.experience.rollout import collect
+from bidex_algos.nets.networks import gaussian_log_prob
+from bidex_algos.onpolicy.mtppo import MTPPO, PRESETS, MTPPOConfig
 from bidex_meta.errors import BidexError
 from tests.algos.resume import resumed
 from tests.algos.toy import ToyWorld, nearness

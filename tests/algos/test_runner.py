@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 import torch
 
-from bidex_meta.train import runner
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
+from bidex_meta.train import runner
 from bidex_meta.train.runner import checkpoint, resume, train
 from tests.algos.ranks import same
 from tests.algos.toy import ToyWorld, nearness

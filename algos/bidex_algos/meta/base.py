@@ -19,16 +19,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bidex_algos.experience.rollout import VectorWorld, may_look
 from bidex_algos.meta.adaptation import Objective, TaskBatch, detached
-from bidex_meta.train.distributed import world_size
 from bidex_algos.meta.config import MetaConfig
 from bidex_algos.meta.meta_policy import MetaPolicy, make_meta_policy
-from bidex_algos.nets.normalise import RunningStats
-from bidex_algos.reports import as_numbers, check_finite
-from bidex_algos.experience.rollout import VectorWorld, may_look
 from bidex_algos.meta.stage import Stage, task_batch
 from bidex_algos.meta.task_rows import TaskRows
+from bidex_algos.nets.normalise import RunningStats
+from bidex_algos.reports import as_numbers, check_finite
 from bidex_meta.errors import BidexError
+from bidex_meta.train.distributed import world_size
 
 
 class TaskWorld(VectorWorld, Protocol):

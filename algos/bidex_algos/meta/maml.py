@@ -13,10 +13,10 @@ theta_K depends on theta through the inner steps; ``first_order`` leaves their d
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.meta.adaptation import TaskBatch, weighted_mean
-from bidex_algos.meta.maml_config import PRESETS, MAMLConfig
-from bidex_algos.meta.base import MetaLearner, TaskWorld
 from bidex_algos.gradients.trust_region import line_search, natural_step
+from bidex_algos.meta.adaptation import TaskBatch, weighted_mean
+from bidex_algos.meta.base import MetaLearner, TaskWorld
+from bidex_algos.meta.maml_config import PRESETS, MAMLConfig
 
 __all__ = ["MAML", "PRESETS", "MAMLConfig"]
 

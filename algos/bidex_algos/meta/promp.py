@@ -15,10 +15,10 @@ the data that adaptation needs (their section 4).
 import torch
 from torch import Tensor, nn
 
+from bidex_algos.gradients.step_size import factor_of
 from bidex_algos.meta.adaptation import TaskBatch, weighted_mean
 from bidex_algos.meta.base import MetaLearner, TaskWorld
 from bidex_algos.meta.promp_config import PRESETS, ProMPConfig
-from bidex_algos.gradients.step_size import factor_of
 
 __all__ = ["PRESETS", "ProMP", "ProMPConfig"]
 

@@ -18,18 +18,18 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.experience.advantages import explained_variance, gae, normalise_per_task, task_moments
-from bidex_meta.train.distributed import all_sum, broadcast, own_seed, rank, sum_gradients, world_size
 from bidex_algos.experience.episodes import EpisodeStatistics
+from bidex_algos.experience.rollout import check_autoreset
+from bidex_algos.gradients.step_size import AdaptiveAdams
+from bidex_algos.meta.rl2_agent import RL2Agent
+from bidex_algos.meta.rl2_config import PRESETS, RL2Config
+from bidex_algos.meta.trials import Batch, Trials, play
 from bidex_algos.nets.networks import gaussian_entropy, gaussian_kl, gaussian_log_prob
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.recurrent import RecurrentNet, RecurrentPolicy
 from bidex_algos.reports import as_numbers, check_finite
-from bidex_algos.meta.rl2_agent import RL2Agent
-from bidex_algos.meta.rl2_config import PRESETS, RL2Config
-from bidex_algos.experience.rollout import check_autoreset
-from bidex_algos.gradients.step_size import AdaptiveAdams
-from bidex_algos.meta.trials import Batch, Trials, play
 from bidex_meta.errors import BidexError
+from bidex_meta.train.distributed import all_sum, broadcast, own_seed, rank, sum_gradients, world_size
 
 __all__ = ["PRESETS", "RL2", "RL2Config"]
 

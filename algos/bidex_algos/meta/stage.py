@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from bidex_algos.meta.adaptation import TaskBatch
 from bidex_algos.experience.advantages import gae, normalise_per_task, successor_values, task_moments
-from bidex_algos.meta.linear_baseline import fitted
+from bidex_algos.meta.adaptation import TaskBatch
 from bidex_algos.meta.config import MetaConfig
+from bidex_algos.meta.linear_baseline import fitted
 from bidex_algos.meta.task_rows import TaskRows
 
 

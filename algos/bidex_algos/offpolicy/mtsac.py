@@ -26,17 +26,17 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.experience.advantages import task_moments
-from bidex_meta.train.distributed import all_sum, broadcast, is_main, own_seed, sum_gradients, world_size
 from bidex_algos.experience.episodes import EpisodeStatistics
-from bidex_algos.offpolicy.mtsac_config import PRESETS, MTSACConfig
+from bidex_algos.experience.replay import Replay, Transitions, replay_bytes, steps_within
+from bidex_algos.experience.rollout import VectorWorld, check_autoreset
 from bidex_algos.nets.networks import MLP
 from bidex_algos.nets.normalise import ObservationNormaliser, RunningStats
 from bidex_algos.nets.precision import autocast, use_bfloat16
-from bidex_algos.experience.replay import Replay, Transitions, replay_bytes, steps_within
-from bidex_algos.reports import as_numbers, check_finite
-from bidex_algos.experience.rollout import VectorWorld, check_autoreset
 from bidex_algos.nets.squashed import SquashedActor, SquashedPolicy
+from bidex_algos.offpolicy.mtsac_config import PRESETS, MTSACConfig
+from bidex_algos.reports import as_numbers, check_finite
 from bidex_meta.errors import BidexError
+from bidex_meta.train.distributed import all_sum, broadcast, is_main, own_seed, sum_gradients, world_size
 
 __all__ = ["MTSAC", "PRESETS", "MTSACConfig", "TwinCritic"]
 

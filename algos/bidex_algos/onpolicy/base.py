@@ -12,17 +12,23 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from bidex_algos.experience.advantages import explained_variance, gae, normalise_per_task, successor_values, task_moments
-from bidex_meta.train.distributed import all_sum, broadcast, own_seed, world_size
+from bidex_algos.experience.advantages import (
+    explained_variance,
+    gae,
+    normalise_per_task,
+    successor_values,
+    task_moments,
+)
 from bidex_algos.experience.episodes import EpisodeStatistics
+from bidex_algos.experience.rollout import Rollout, VectorWorld, check_autoreset, collect
 from bidex_algos.nets.networks import MLP, GaussianActor, gaussian_log_prob
 from bidex_algos.nets.normalise import ObservationNormaliser, RunningStats
-from bidex_algos.onpolicy.config import OnPolicyConfig
 from bidex_algos.nets.policy import GaussianPolicy
 from bidex_algos.nets.precision import autocast, use_bfloat16
+from bidex_algos.onpolicy.config import OnPolicyConfig
 from bidex_algos.reports import as_numbers, check_finite
-from bidex_algos.experience.rollout import Rollout, VectorWorld, check_autoreset, collect
 from bidex_meta.errors import BidexError
+from bidex_meta.train.distributed import all_sum, broadcast, own_seed, world_size
 
 
 @dataclass

@@ -11,15 +11,15 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from bidex_meta.train.distributed import all_sum, sum_gradients, world_size
-from bidex_algos.onpolicy.mtppo_config import PRESETS, MTPPOConfig
-from bidex_algos.nets.networks import gaussian_entropy, gaussian_kl, gaussian_log_prob
-from bidex_algos.onpolicy.base import Batch, OnPolicy
-from bidex_algos.nets.precision import autocast
 from bidex_algos.experience.rollout import VectorWorld
 from bidex_algos.gradients.step_size import AdaptiveAdams
 from bidex_algos.gradients.surgery import per_task_gradients, project_conflicting
+from bidex_algos.nets.networks import gaussian_entropy, gaussian_kl, gaussian_log_prob
+from bidex_algos.nets.precision import autocast
+from bidex_algos.onpolicy.base import Batch, OnPolicy
+from bidex_algos.onpolicy.mtppo_config import PRESETS, MTPPOConfig
 from bidex_meta.errors import BidexError
+from bidex_meta.train.distributed import all_sum, sum_gradients, world_size
 
 __all__ = ["MTPPO", "PRESETS", "Batch", "MTPPOConfig"]
 
@@ -27,8 +27,8 @@ __all__ = ["MTPPO", "PRESETS", "Batch", "MTPPOConfig"]
 class MTPPO(OnPolicy):
     """Multi-task PPO on a batched world.
 
-    Arguments and attributes are those of :class:`~bidex_algos.onpolicy.base.OnPolicy`. Several processes make a mini-batch
-    as many times larger.
+    Arguments and attributes are those of :class:`~bidex_algos.onpolicy.base.OnPolicy`. Several processes make a
+    mini-batch as many times larger.
 
     Raises:
         BidexError: Fewer samples in a rollout than mini-batches.

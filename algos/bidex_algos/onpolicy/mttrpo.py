@@ -15,13 +15,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from bidex_meta.train.distributed import all_sum, sum_gradients
-from bidex_algos.onpolicy.mttrpo_config import PRESETS, MTTRPOConfig
-from bidex_algos.nets.networks import gaussian_kl, gaussian_log_prob
-from bidex_algos.onpolicy.base import Batch, OnPolicy
-from bidex_algos.nets.precision import autocast
 from bidex_algos.experience.rollout import VectorWorld
 from bidex_algos.gradients.trust_region import line_search, natural_step
+from bidex_algos.nets.networks import gaussian_kl, gaussian_log_prob
+from bidex_algos.nets.precision import autocast
+from bidex_algos.onpolicy.base import Batch, OnPolicy
+from bidex_algos.onpolicy.mttrpo_config import PRESETS, MTTRPOConfig
+from bidex_meta.train.distributed import all_sum, sum_gradients
 
 __all__ = ["MTTRPO", "PRESETS", "MTTRPOConfig"]
 
