@@ -12,8 +12,8 @@ Beside the class the module holds ``PRESETS``: a dict from preset name to an ins
   nothing of what they learn;
 * where it does not train in autoreset mode SAME_STEP, ``autoreset``: the mode, or a function of the learner's config
   that gives it;
-* ``policy_state_dict()`` and ``load_policy(state, device)``, which gives an agent for ``bidex_meta.evaluation.play`` from
-  the entry ``learner.policy`` of a checkpoint.
+* ``policy_state_dict()`` and ``load_policy(state, device)``, which gives an agent for ``bidex_meta.evaluation.play``
+  from the entry ``learner.policy`` of a checkpoint.
 """
 
 import dataclasses

@@ -1,9 +1,10 @@
 """The meta-test: what does adaptation gain, from the meta-learned parameters, after 0, 1, ..., K shots?
 
 The protocol. From what was meta-learned (``agent.init()``) the agent is evaluated as by ``bidex_meta.evaluation.play``;
-then, ``shots`` times, it plays ``rollouts`` whole exploring episodes of each task, adapts, and is evaluated again. Every
-evaluation plays the same episodes (tasks and starts): what differs between two shots is the policy alone, and an agent
-that does not change gains exactly 0. Starts of adaptation are others than those of evaluation, and others in each shot.
+then, ``shots`` times, it plays ``rollouts`` whole exploring episodes of each task, adapts, and is evaluated again.
+Every evaluation plays the same episodes (tasks and starts): what differs between two shots is the policy alone, and an
+agent that does not change gains exactly 0. Starts of adaptation are others than those of evaluation, and others in each
+shot.
 
 Every (class, task) is played equally often, however early its episodes end. Meta-World's ``metalearning_evaluation``
 takes the first episodes that finish of each class instead, of which the easy tasks' are most.

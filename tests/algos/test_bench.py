@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bidex_algos.bench.adapt import adapt
 from bidex_algos.bench import learner as bench
+from bidex_algos.bench.adapt import adapt
 from bidex_algos.onpolicy.mtppo import PRESETS
 from bidex_meta.cli import main
 
