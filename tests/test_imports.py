@@ -1,6 +1,7 @@
 """Imports run one way: each room only from rooms above it in ``ORDER``; read from the source, lazy imports too."""
 
 import ast
+import re
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -118,3 +119,15 @@ def test_one_table_alone_names_learners() -> None:
 def test_a_name_means_one_module() -> None:
     leaves = [name.rpartition(".")[2] for name, tree in modules().items() if not is_package(name)]
     assert {leaf for leaf in leaves if leaves.count(leaf) > 1} == TWICE
+
+
+def test_pages_name_modules_that_are_there() -> None:
+    root = Path(__file__).parents[1]
+    pages = [*root.glob("*.md"), *root.glob("docs/**/*.md"), *root.glob("algos/*.md")]
+    named = {
+        (page.name, path)
+        for page in pages
+        for path in re.findall(r"\b(?:bidex_meta|algos/bidex_algos)/[\w/]+\.(?:py|md)\b", page.read_text())
+    }
+    assert len(named) > 30
+    assert not [(page, path) for page, path in sorted(named) if not (root / path).is_file()]
