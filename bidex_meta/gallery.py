@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bidex_meta import references
 from bidex_meta.benchmark import make_task_world
+from bidex_meta.evaluation import references
 from bidex_meta.record import video
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass

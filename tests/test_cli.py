@@ -75,7 +75,7 @@ def test_each_help_opens_with_a_sentence_and_an_example(command, capsys):
 def test_help_of_run_names_every_field_of_the_learner(capsys):
     from dataclasses import fields
 
-    from bidex_algos.mtppo import MTPPOConfig
+    from bidex_algos.onpolicy.mtppo import MTPPOConfig
 
     with pytest.raises(SystemExit):
         main(["run", "--help"])
@@ -280,7 +280,7 @@ def test_a_run_can_start_from_the_policy_of_another(toy_worlds, tmp_path, capsys
 
 _TRAIN = """
 import functools, sys, time
-import bidex_algos.runner as runner
+import bidex_meta.train.runner as runner
 from bidex_meta.cli import main
 from bidex_meta.commands import worlds
 from tests.fakes import ToyWorld

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from bidex_meta.cli import main
-from bidex_meta.comparison import iqm, iqm_difference, read_groups
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.comparison import iqm, iqm_difference, read_groups
 from bidex_meta.record import RunFolder
 
 

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from bidex_meta import metatest
 from bidex_meta.cli import main
 from bidex_meta.commands import learners, worlds
-from bidex_meta.control import arms, control
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluate import play_tasks
-from bidex_meta.gains import difference_over_runs
-from bidex_meta.metatest import meta_evaluate
+from bidex_meta.evaluation import meta_test as metatest
+from bidex_meta.evaluation.control_arms import arms, control
+from bidex_meta.evaluation.gains import difference_over_runs
+from bidex_meta.evaluation.meta_test import meta_evaluate
+from bidex_meta.evaluation.play import play_tasks
 from tests.points import Finder, PointWorld, Still, ring
 
 NORTH, EAST, WEST = np.array([[0.0, 1.0]]), np.array([[1.0, 0.0]]), np.array([[-1.0, 0.0]])

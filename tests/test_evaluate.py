@@ -7,18 +7,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluate import (
-    MANY_TASKS,
-    ClassResult,
-    Evaluation,
-    RandomAgent,
-    ZeroAgent,
-    aggregate,
-    bootstrap_interval,
-    compare,
-    evaluate,
-)
-from bidex_meta.scores import Reference
+from bidex_meta.evaluation.play import evaluate
+from bidex_meta.evaluation.results import MANY_TASKS, ClassResult, Evaluation, compare
+from bidex_meta.evaluation.scores import Reference
+from bidex_meta.evaluation.statistics import aggregate, bootstrap_interval
+from bidex_meta.evaluation.untrained import RandomAgent, ZeroAgent
 from tests.fakes import STEPS_OF_TASK, Seeker, ToyWorld
 
 

@@ -9,7 +9,7 @@ import torch
 from bidex_meta.cli import main
 from bidex_meta.commands import learners, worlds
 from bidex_meta.commands.metatest import rollouts_of, rows_for
-from bidex_meta.comparison import read_groups
+from bidex_meta.evaluation.comparison import read_groups
 from bidex_meta.record import RunFolder
 from tests.adapting_learner import Learner
 from tests.points import PointWorld, ring

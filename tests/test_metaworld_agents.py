@@ -14,8 +14,9 @@ from bidex_meta.clients.metaworld_agent import ForMetaWorld, FromMetaWorld
 from bidex_meta.clients.metaworld_evaluation import MetaWorldEnvs, known_to_metaworld
 from bidex_meta.commands.learners import learner_kind
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluate import ZeroAgent, evaluate
-from bidex_meta.metatest import meta_evaluate
+from bidex_meta.evaluation.meta_test import meta_evaluate
+from bidex_meta.evaluation.play import evaluate
+from bidex_meta.evaluation.untrained import ZeroAgent
 from tests.points import SPEED, Finder, PointWorld, Still, ring
 
 

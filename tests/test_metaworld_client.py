@@ -14,13 +14,14 @@ from metaworld.env_dict import MT10_V3
 from metaworld.policies import ENV_POLICY_MAP
 from torch import Tensor
 
-from bidex_algos.mtppo import MTPPO, PRESETS, MTPPOConfig
+from bidex_algos.onpolicy.mtppo import MTPPO, PRESETS, MTPPOConfig
 from bidex_meta.cli import main
 from bidex_meta.clients import metaworld as client
 from bidex_meta.clients import metaworld_world
 from bidex_meta.clients.metaworld_world import MetaWorldWorld, evaluate_all_tasks
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluate import RandomAgent, evaluate
+from bidex_meta.evaluation.play import evaluate
+from bidex_meta.evaluation.untrained import RandomAgent
 from bidex_meta.record import RunFolder
 from tests.world.play import assert_same, number_of_ends, play
 

@@ -3,11 +3,12 @@ from pathlib import Path
 
 import pytest
 
-from bidex_meta import paths, references
+from bidex_meta import paths
 from bidex_meta.cli import main
 from bidex_meta.commands import experts, worlds
 from bidex_meta.errors import BidexError
-from bidex_meta.scores import Reference
+from bidex_meta.evaluation import references
+from bidex_meta.evaluation.scores import Reference
 from bidex_meta.witness.replay import Replay
 from tests.fakes import ToyWorld
 

@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 import torch
 
-from bidex_algos.distributed import TIMEOUT
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder, read_metrics
+from bidex_meta.train.distributed import TIMEOUT
 from tests.algos.ranks import same
 
 SMALL = ["--suite", "MT4", "--num-envs", "4", "--threads", "1", "--device", "cpu", "--seed", "3", "--no-evaluate"]
@@ -29,7 +29,7 @@ ROOT = Path(__file__).parents[1]
 _SCRIPT = """
 import os, sys
 import torch
-import bidex_algos.runner as runner
+import bidex_meta.train.runner as runner
 from bidex_meta.cli import main
 train = runner.train
 def often(learner, world, **keywords):
@@ -185,7 +185,7 @@ def test_a_run_of_two_processes_is_not_resumed_by_one(tmp_path: Path, capsys: py
 
 def test_each_process_takes_its_share_of_threads_and_a_gpu_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     from bidex_meta.commands import run_config
-    from bidex_meta.commands.launch import launch, resume_command
+    from bidex_meta.train.launch import launch, resume_command
 
     places = {"RANK": 5, "WORLD_SIZE": 8, "LOCAL_RANK": 1, "LOCAL_WORLD_SIZE": 4, "MASTER_ADDR": "a"}
     for name, value in places.items():

@@ -6,7 +6,7 @@ Activation = Literal["elu", "relu", "tanh"]
 """Non-linearity of hidden layers."""
 
 Autocast = Literal["auto", "on", "off"]
-"""Whether hidden layers run in bfloat16; see :mod:`bidex_algos.precision`."""
+"""Whether hidden layers run in bfloat16; see :mod:`bidex_algos.nets.precision`."""
 
 Adapted = Literal["all", "head"]
 """Which parameters an adaptation step moves: all, or those of the mean's output layer."""

@@ -6,7 +6,8 @@ Imports no torch. ``PRESETS`` holds what is meant for any class, ``OF_TASK`` wha
 from dataclasses import replace
 from typing import Any
 
-from bidex_algos import mtppo_config, mtsac_config, mttrpo_config
+from bidex_algos.offpolicy import mtsac_config
+from bidex_algos.onpolicy import mtppo_config, mttrpo_config
 
 # Table 42, column "Other Tasks". What it does not name is as in Table 47.
 _PPO = replace(mtppo_config.PRESETS["paper"], hidden=(1024, 1024, 512), gamma=0.96)

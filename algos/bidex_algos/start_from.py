@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from torch import nn
 
-from bidex_algos.squashed import SquashedActor
+from bidex_algos.nets.squashed import SquashedActor
 from bidex_meta.errors import BidexError
 
 

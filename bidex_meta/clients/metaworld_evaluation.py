@@ -6,7 +6,8 @@
         metalearning_evaluation(ForMetaWorld(agent), envs, num_evals=1, adaptation_episodes=10)
 
 A check that both protocols fit, not our score: with several rows of a name Meta-World counts the first episodes that
-finish, and success ends them, so easy tasks crowd out hard ones. ``bidex_meta.metatest`` plays each task equally often.
+finish, and success ends them, so easy tasks crowd out hard ones. ``bidex_meta.evaluation.meta_test`` plays each task
+equally often.
 """
 
 from collections.abc import Iterator

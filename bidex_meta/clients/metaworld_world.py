@@ -14,6 +14,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
+from bidex_meta.agents import Agent
 from bidex_meta.clients.metaworld import (
     ACTION_SIZE,
     EPISODE_STEPS,
@@ -24,7 +25,8 @@ from bidex_meta.clients.metaworld import (
     make_tasks,
 )
 from bidex_meta.errors import BidexError, unknown_name
-from bidex_meta.evaluate import Agent, Evaluation, check_world, play_tasks, results_by_class
+from bidex_meta.evaluation.play import check_world, play_tasks
+from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.world.actions import clean
 from bidex_meta.world.autoreset import checked_mode, reset_mask
 from bidex_meta.world.episodes import Episodes

@@ -58,10 +58,10 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _expert(flags: BaselineFlags) -> None:
-    from bidex_meta import references
     from bidex_meta.benchmark import Benchmark
     from bidex_meta.commands.experts import best_known
     from bidex_meta.commands.tables import plain_table, print_table
+    from bidex_meta.evaluation import references
     from bidex_meta.record.versions import collect_versions
 
     known = best_known(Benchmark(flags.suite).train_classes, flags.runs, flags.threads)
@@ -73,9 +73,10 @@ def _expert(flags: BaselineFlags) -> None:
 
 
 def _measure(flags: BaselineFlags) -> None:
-    from bidex_meta import references
     from bidex_meta.commands import worlds
-    from bidex_meta.evaluate import EVALUATION_SEED, RandomAgent, ZeroAgent, evaluate
+    from bidex_meta.evaluation import references
+    from bidex_meta.evaluation.play import EVALUATION_SEED, evaluate
+    from bidex_meta.evaluation.untrained import RandomAgent, ZeroAgent
     from bidex_meta.record.versions import collect_versions
 
     config: dict[str, Any] = {"suite": flags.suite, "task": None, "seed": flags.seed, "device": "cpu"}

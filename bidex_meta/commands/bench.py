@@ -101,7 +101,7 @@ def _measurement(what: str) -> Any:
     if what in ("learner", "adapt"):
         from bidex_meta.commands.learners import shared
 
-        return getattr(shared({"learner": "bench", "adapt": "bench_adapt"}[what]), what)
+        return getattr(shared(f"bench.{what}"), what)
     from bidex_meta import bench
 
     return getattr(bench, what)

@@ -14,7 +14,7 @@ from bidex_meta.errors import BidexError
 if TYPE_CHECKING:
     import numpy as np
 
-    from bidex_meta.comparison import Estimate, Group
+    from bidex_meta.evaluation.comparison import Estimate, Group
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def main(arguments: Sequence[str]) -> None:
     if not flags.runs:
         raise BidexError("Name the run folders to compare: bidex-meta compare RUN RUN...")
     from bidex_meta.commands.tables import plain_table, print_table
-    from bidex_meta.comparison import read_groups
+    from bidex_meta.evaluation.comparison import read_groups
     from bidex_meta.record import RunFolder
 
     groups = read_groups([RunFolder.open(path) for path in flags.runs])
@@ -58,7 +58,7 @@ _MEASURES = ("success, IQM", "score, IQM", "success over the first", "score over
 
 
 def _row(group: "Group", first: "Group") -> dict[str, Any]:
-    from bidex_meta.comparison import iqm
+    from bidex_meta.evaluation.comparison import iqm
 
     row: dict[str, Any] = {
         "group": group.label, "seeds": group.seeds, "steps": group.steps, "hours": round(group.hours, 3)
@@ -75,7 +75,7 @@ def _row(group: "Group", first: "Group") -> dict[str, Any]:
 
 
 def _line(group: "Group", first: "Group") -> list[object]:
-    from bidex_meta.comparison import iqm
+    from bidex_meta.evaluation.comparison import iqm
 
     cells: list[object] = [group.label, len(group.seeds), f"{group.steps:,}", f"{group.hours:.2f}"]
     cells.append(_ranged(iqm(group.success), 100.0, " %"))
@@ -98,7 +98,7 @@ def _comparable(group: "Group", first: "Group") -> bool:
 
 def _over(own: "np.ndarray | None", other: "np.ndarray | None") -> "Estimate | None":
     """The difference of interquartile means, where both are known."""
-    from bidex_meta.comparison import iqm_difference
+    from bidex_meta.evaluation.comparison import iqm_difference
 
     return None if own is None or other is None else iqm_difference(own, other)
 

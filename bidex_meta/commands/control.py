@@ -13,7 +13,7 @@ from bidex_meta.commands.parsing import Switch, parse
 from bidex_meta.errors import BidexError
 
 if TYPE_CHECKING:
-    from bidex_meta.control import Control
+    from bidex_meta.evaluation.control_arms import Control
     from bidex_meta.record import RunFolder
 
 
@@ -58,7 +58,7 @@ def main(arguments: Sequence[str]) -> None:
     if not flags.runs:
         raise BidexError("Name the run folders: bidex-meta control RUN...")
     from bidex_meta.commands import metatest
-    from bidex_meta.control import arms
+    from bidex_meta.evaluation.control_arms import arms
     from bidex_meta.record import RunFolder
 
     metatest.check_numbers(flags, "trials", "episodes", "shots", "rollouts", "num_envs")
@@ -114,9 +114,9 @@ def _play(folder: "RunFolder", flags: ControlFlags) -> "Control":
     """The arms of one run."""
     from bidex_meta.commands import metatest, worlds
     from bidex_meta.commands.learners import resolve_device
-    from bidex_meta.control import control
-    from bidex_meta.evaluate import EVALUATION_SEED
-    from bidex_meta.metatest import MAX_ADAPT_STEPS
+    from bidex_meta.evaluation.control_arms import control
+    from bidex_meta.evaluation.meta_test import MAX_ADAPT_STEPS
+    from bidex_meta.evaluation.play import EVALUATION_SEED
     from bidex_meta.world.threads import set_up_torch
 
     stored = folder.config()

@@ -56,7 +56,9 @@ def main(arguments: Sequence[str]) -> None:
     from bidex_meta.commands import worlds
     from bidex_meta.commands.learners import learner_kind, resolve_device
     from bidex_meta.commands.tables import evaluation_table, print_table
-    from bidex_meta.evaluate import EVALUATION_SEED, RandomAgent, compare
+    from bidex_meta.evaluation.play import EVALUATION_SEED
+    from bidex_meta.evaluation.results import compare
+    from bidex_meta.evaluation.untrained import RandomAgent
     from bidex_meta.record import RunFolder
     from bidex_meta.world.threads import set_up_torch
 
@@ -101,7 +103,7 @@ def _meta_test(flags: EvaluateFlags, folder: Any, config: dict[str, Any]) -> Non
     import sys
 
     from bidex_meta.commands import metatest, worlds
-    from bidex_meta.evaluate import EVALUATION_SEED
+    from bidex_meta.evaluation.play import EVALUATION_SEED
 
     if flags.random:
         raise BidexError(f"{config['algo']} is compared with itself before adaptation. Leave --random out.")

@@ -4,7 +4,7 @@ An entry is ``"module:Class"``; a name of that form is one too, so that a learne
 Beside the class the module holds ``PRESETS``: a dict from preset name to an instance of the learner's config dataclass;
 ``auto`` takes ``laptop`` on a CPU and ``paper`` on a GPU, or the first where one of them is missing. The class offers:
 
-* ``Class(world, config, seed)``, and what ``bidex_algos.runner.Learner`` names;
+* ``Class(world, config, seed)``, and what ``bidex_meta.train.runner.Learner`` names;
 * where it adapts to tasks, ``adapts = True``: then ``load_policy`` gives a MetaLearningAgent (``bidex_meta.agents``),
   which explores by a generator of its own, seeded alike by each ``load_policy``; of its config, if they are there, the
   meta-test reads ``max_adapt_steps`` (longest episode it adapts to) and ``tasks_per_class`` (of a meta-batch, over
@@ -12,8 +12,8 @@ Beside the class the module holds ``PRESETS``: a dict from preset name to an ins
   nothing of what they learn;
 * where it does not train in autoreset mode SAME_STEP, ``autoreset``: the mode, or a function of the learner's config
   that gives it;
-* ``policy_state_dict()`` and ``load_policy(state, device)``, which gives an agent for ``bidex_meta.evaluate`` from the
-  entry ``learner.policy`` of a checkpoint.
+* ``policy_state_dict()`` and ``load_policy(state, device)``, which gives an agent for ``bidex_meta.evaluation.play``
+  from the entry ``learner.policy`` of a checkpoint.
 """
 
 import dataclasses
@@ -24,27 +24,27 @@ from dataclasses import dataclass
 from typing import Any
 
 from bidex_meta.clients import metaworld
-from bidex_meta.commands.launch import launch
 from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.train.launch import launch
 
 ALGOS: dict[str, str] = {
-    "mtppo": "bidex_algos.mtppo:MTPPO",
-    "mttrpo": "bidex_algos.mttrpo:MTTRPO",
-    "mtsac": "bidex_algos.mtsac:MTSAC",
-    "promp": "bidex_algos.promp:ProMP",
-    "maml": "bidex_algos.maml:MAML",
-    "rl2": "bidex_algos.rl2:RL2",
+    "mtppo": "bidex_algos.onpolicy.mtppo:MTPPO",
+    "mttrpo": "bidex_algos.onpolicy.mttrpo:MTTRPO",
+    "mtsac": "bidex_algos.offpolicy.mtsac:MTSAC",
+    "promp": "bidex_algos.meta.promp:ProMP",
+    "maml": "bidex_algos.meta.maml:MAML",
+    "rl2": "bidex_algos.meta.rl2:RL2",
     # On a single task they are the plain ones, with presets of their own (bidex_algos.single_task).
-    "ppo": "bidex_algos.mtppo:MTPPO",
-    "trpo": "bidex_algos.mttrpo:MTTRPO",
-    "sac": "bidex_algos.mtsac:MTSAC",
+    "ppo": "bidex_algos.onpolicy.mtppo:MTPPO",
+    "trpo": "bidex_algos.onpolicy.mttrpo:MTTRPO",
+    "sac": "bidex_algos.offpolicy.mtsac:MTSAC",
 }
 
 _NEEDED = ("iterate", "state_dict", "load_state_dict", "policy_state_dict", "load_policy", "per_process")
 
 
 def shared(name: str) -> Any:
-    """No learner's own module: ``runner`` (the training loop), ``distributed`` (processes), ``bench`` (speed)."""
+    """No learner's own module: ``start_from`` (another run's policy), ``bench.learner`` and ``bench.adapt`` (speed)."""
     return importlib.import_module(f"bidex_algos.{name}")
 
 

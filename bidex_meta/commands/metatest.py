@@ -9,7 +9,7 @@ from bidex_meta.clients import metaworld
 from bidex_meta.commands import worlds
 from bidex_meta.commands.learners import learner_kind
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluate import EVALUATION_SEED
+from bidex_meta.evaluation.play import EVALUATION_SEED
 from bidex_meta.suite import load_suite
 
 SHOTS = 1
@@ -67,7 +67,7 @@ def meta_test(
     Raises:
         BidexError: The suite shows its tasks, or a number is out of range.
     """
-    from bidex_meta.metatest import MAX_ADAPT_STEPS, meta_evaluate
+    from bidex_meta.evaluation.meta_test import MAX_ADAPT_STEPS, meta_evaluate
 
     check_suite(config)
     check_numbers(options, "rollouts", "episodes", "tasks", "trials", "num_envs")

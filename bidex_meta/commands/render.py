@@ -93,7 +93,7 @@ def _row(world: Any, task: str, suite: str | None) -> int:
 
 
 def _policy(flags: RenderFlags, world: Any, config: dict[str, Any]) -> Any:
-    from bidex_meta.evaluate import RandomAgent, ZeroAgent
+    from bidex_meta.evaluation.untrained import RandomAgent, ZeroAgent
 
     if flags.policy == "zero":
         return ZeroAgent(world.action_space)

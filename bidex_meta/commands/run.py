@@ -12,10 +12,10 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from bidex_meta.commands.launch import launch, resume_command
 from bidex_meta.commands.learners import shared
 from bidex_meta.commands.run_config import RunPlan, plan_run
 from bidex_meta.errors import BidexError
+from bidex_meta.train.launch import launch, resume_command
 
 Checkpoint = tuple[dict[str, Any], int]
 """State and environment steps."""
@@ -28,7 +28,8 @@ def main(arguments: Sequence[str]) -> None:
         BidexError: Bad input. Nothing has been written then.
         SystemExit: Another process was lost (exit code 1), or has said what is wrong with the input (2).
     """
-    distributed = shared("distributed")
+    from bidex_meta.train import distributed
+
     try:
         distributed.init_from_environment()
         plan = distributed.together(lambda: plan_run(arguments))
@@ -144,12 +145,12 @@ def _make(plan: RunPlan, fresh: bool) -> tuple[Any, Any, Any]:
 def _train(plan: RunPlan, folder: Any, world: Any, learner: Any, loaded: Checkpoint | None) -> bool:
     """Train to the end; True if a signal ended it early."""
     from bidex_meta.record import Recorder, read_metrics, training_seconds
+    from bidex_meta.train import distributed, runner
 
-    runner = shared("runner")
     resume_step = None
     if loaded is not None:
         state, resume_step = loaded
-        shared("distributed").together(lambda: runner.resume(learner, world, state))
+        distributed.together(lambda: runner.resume(learner, world, state))
         _say(f"Continuing at {resume_step:,} steps.")
     elif plan.folder is not None:
         resume_step = 0  # killed before its first checkpoint: the same seed takes it there again
@@ -190,7 +191,9 @@ def _evaluate(plan: RunPlan, folder: Any, learner: Any) -> None:
         return
     from bidex_meta.commands import worlds
     from bidex_meta.commands.tables import evaluation_table, print_table
-    from bidex_meta.evaluate import EVALUATION_SEED, RandomAgent, compare
+    from bidex_meta.evaluation.play import EVALUATION_SEED
+    from bidex_meta.evaluation.results import compare
+    from bidex_meta.evaluation.untrained import RandomAgent
     from bidex_meta.record.atomic import write_json
 
     episodes = plan.flags.episodes or worlds.default_episodes(plan.config)

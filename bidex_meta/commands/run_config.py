@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from bidex_meta.clients import metaworld
-from bidex_meta.commands.launch import launch, resume_command
 from bidex_meta.commands.learners import LearnerKind, choose_preset, learner_kind, resolve_device
 from bidex_meta.commands.parsing import StepCount, Switch, parse, peek
 from bidex_meta.errors import BidexError
 from bidex_meta.record.folder import RunFolder
+from bidex_meta.train.launch import launch, resume_command
 
 _ROWS_AND_STEPS = {"cpu": (1024, 20_000_000), "gpu": (8192, 200_000_000)}
 # Whole episodes of all rows make one meta-batch: with fewer rows there are more of them.

@@ -7,8 +7,9 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from bidex_meta.evaluate import Difference, Evaluation, Interval, compare
-from bidex_meta.gains import Gains
+from bidex_meta.evaluation.gains import Gains
+from bidex_meta.evaluation.results import Difference, Evaluation, compare
+from bidex_meta.evaluation.statistics import Interval
 
 _NONE = "–"
 _BROKEN = (
@@ -81,7 +82,7 @@ def _gained(measures: Mapping[str, Difference | None]) -> list[str]:
 
 
 def control_table(title: str, by_arm: Mapping[str, Mapping[str, Any]]) -> Table:
-    """What ``bidex_meta.control.arms`` found: an arm a row."""
+    """What ``bidex_meta.evaluation.control_arms.arms`` found: an arm a row."""
     table = Table(title=title, title_justify="left", caption_justify="left")
     table.caption = (
         "gains: own data above this arm, same starts; [..] 95 % bootstrap interval over runs, adaptations, episodes"

@@ -3,13 +3,14 @@
 from collections.abc import Callable
 from typing import Any
 
+from bidex_meta.agents import Agent
 from bidex_meta.clients import metaworld
-from bidex_meta.commands.launch import launch
 from bidex_meta.commands.learners import learner_kind
 from bidex_meta.errors import BidexError, unknown_name
-from bidex_meta.evaluate import Agent, Evaluation
+from bidex_meta.evaluation.results import Evaluation
+from bidex_meta.evaluation.scores import Reference
 from bidex_meta.record import RunFolder
-from bidex_meta.scores import Reference
+from bidex_meta.train.launch import launch
 
 _TASKS_ALONE = 50
 """Tasks that are drawn for a class on its own."""
@@ -95,14 +96,14 @@ def judge(config: dict[str, Any], agent: Agent, world: Any, episodes: int | None
         from bidex_meta.clients.metaworld_world import evaluate_all_tasks
 
         return evaluate_all_tasks(agent, world, episodes, seed=seed)
-    from bidex_meta.evaluate import evaluate
+    from bidex_meta.evaluation.play import evaluate
 
     return evaluate(agent, world, episodes, seed=seed, references=references_of(config))
 
 
 def references_of(config: dict[str, Any]) -> dict[str, Reference]:
     """The references of the normalised score and of broken episodes, of which those of other bases are none."""
-    from bidex_meta.references import references
+    from bidex_meta.evaluation.references import references
 
     return references() if has_moving_bases(config) else {}
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from bidex_algos import distributed
+from bidex_meta.train import distributed
 
 # A deadlock shall fail, not last; a busy machine shall do neither.
 _DEADLOCK_SECONDS = 500

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bidex_algos import bench
-from bidex_algos.bench_adapt import adapt
-from bidex_algos.mtppo import PRESETS
+from bidex_algos.bench import learner as bench
+from bidex_algos.bench.adapt import adapt
+from bidex_algos.onpolicy.mtppo import PRESETS
 from bidex_meta.cli import main
 
 TINY = replace(PRESETS["laptop"], hidden=(8, 8), rollout_steps=4, num_minibatches=2, epochs=2, autocast="off")

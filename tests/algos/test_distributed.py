@@ -10,12 +10,12 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from bidex_algos import attendance, distributed
-from bidex_algos.mtppo import MTPPO, MTPPOConfig
-from bidex_algos.mttrpo import MTTRPO, MTTRPOConfig
-from bidex_algos.rollout import collect
-from bidex_algos.runner import checkpoint, resume, train
+from bidex_algos.experience.rollout import collect
+from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
+from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig
 from bidex_meta.errors import BidexError
+from bidex_meta.train import attendance, distributed
+from bidex_meta.train.runner import checkpoint, resume, train
 from tests.algos.ranks import exit_codes, in_two_processes, same
 from tests.algos.toy import ToyWorld, nearness
 

@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 import torch
 
-from bidex_algos.mtppo import MTPPO, MTPPOConfig
-from bidex_algos.mttrpo import MTTRPO, MTTRPOConfig
+from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
+from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig
 from tests.algos.problems import LQR, PointMass, discounted_return, one_step_bandit, opposite_bandits
 from tests.algos.toy import ToyWorld, nearness
 

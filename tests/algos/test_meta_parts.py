@@ -10,12 +10,12 @@ from torch import Tensor
 from torch.func import functional_call
 from torch.testing import assert_close
 
-from bidex_algos.adaptation import Adapter, TaskBatch
-from bidex_algos.linear_baseline import features, fitted
-from bidex_algos.meta_config import MetaConfig
-from bidex_algos.networks import GaussianActor, gaussian_log_prob
-from bidex_algos.stage import Stage, task_batch
-from bidex_algos.task_rows import TaskRows
+from bidex_algos.meta.adaptation import Adapter, TaskBatch
+from bidex_algos.meta.config import MetaConfig
+from bidex_algos.meta.linear_baseline import features, fitted
+from bidex_algos.meta.stage import Stage, task_batch
+from bidex_algos.meta.task_rows import TaskRows
+from bidex_algos.nets.networks import GaussianActor, gaussian_log_prob
 
 
 @settings(max_examples=40, deadline=None)

@@ -9,7 +9,7 @@ import torch
 from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
 from torch.testing import assert_close
 
-from bidex_algos.mtsac import MTSAC, PRESETS, MTSACConfig
+from bidex_algos.offpolicy.mtsac import MTSAC, PRESETS, MTSACConfig
 from bidex_meta.commands.learners import learner_kind
 from bidex_meta.errors import BidexError
 from tests.algos.problems import LQR, PointMass, discounted_return, one_step_bandit, opposite_bandits
@@ -360,6 +360,6 @@ def test_both_names_lead_here():
 
 
 def test_the_config_is_shown_without_importing_torch():
-    code = "import sys, bidex_algos.mtsac_config as m; assert m.PRESETS; sys.exit('torch' in sys.modules)"
+    code = "import sys, bidex_algos.offpolicy.mtsac_config as m; assert m.PRESETS; sys.exit('torch' in sys.modules)"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     assert subprocess.run([sys.executable, "-c", code], env=environment).returncode == 0

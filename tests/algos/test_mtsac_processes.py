@@ -6,9 +6,10 @@ from typing import Any
 import pytest
 import torch
 
-from bidex_algos import distributed, mtsac
-from bidex_algos.mtsac import MTSAC, MTSACConfig
-from bidex_algos.runner import checkpoint, resume
+from bidex_algos.offpolicy import mtsac
+from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
+from bidex_meta.train import distributed
+from bidex_meta.train.runner import checkpoint, resume
 from tests.algos.problems import opposite_bandits
 from tests.algos.ranks import in_two_processes, same
 

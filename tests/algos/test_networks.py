@@ -4,8 +4,8 @@ from hypothesis import strategies as st
 from torch.distributions import Independent, Normal, kl_divergence
 from torch.testing import assert_close
 
-from bidex_algos.networks import MLP, GaussianActor, gaussian_entropy, gaussian_kl, gaussian_log_prob
-from bidex_algos.normalise import ObservationNormaliser, RunningStats
+from bidex_algos.nets.networks import MLP, GaussianActor, gaussian_entropy, gaussian_kl, gaussian_log_prob
+from bidex_algos.nets.normalise import ObservationNormaliser, RunningStats
 
 
 @settings(max_examples=30, deadline=None)

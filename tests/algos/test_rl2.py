@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from bidex_algos.normalise import RunningStats
-from bidex_algos.recurrent import RecurrentNet
-from bidex_algos.rl2 import PRESETS, RL2, RL2Config
-from bidex_algos.rl2_agent import RL2Agent
+from bidex_algos.meta.rl2 import PRESETS, RL2, RL2Config
+from bidex_algos.meta.rl2_agent import RL2Agent
+from bidex_algos.nets.normalise import RunningStats
+from bidex_algos.nets.recurrent import RecurrentNet
 from bidex_meta import Benchmark
 from bidex_meta.agents import MetaLearningAgent, Timestep
 from bidex_meta.commands.learners import learner_kind
@@ -357,6 +357,6 @@ def test_the_paper_preset_has_the_numbers_of_table_48():
 
 
 def test_the_config_is_shown_without_importing_torch():
-    code = "import sys, bidex_algos.rl2_config as m; assert m.PRESETS; sys.exit('torch' in sys.modules)"
+    code = "import sys, bidex_algos.meta.rl2_config as m; assert m.PRESETS; sys.exit('torch' in sys.modules)"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     assert subprocess.run([sys.executable, "-c", code], env=environment).returncode == 0

@@ -5,9 +5,10 @@ from typing import Any
 import pytest
 import torch
 
-from bidex_algos import distributed, rl2
-from bidex_algos.rl2 import RL2, RL2Config
-from bidex_algos.runner import checkpoint, resume
+from bidex_algos.meta import rl2
+from bidex_algos.meta.rl2 import RL2, RL2Config
+from bidex_meta.train import distributed
+from bidex_meta.train.runner import checkpoint, resume
 from tests.algos.families import PointClass, PointGoals
 from tests.algos.ranks import in_two_processes, same
 

@@ -5,9 +5,9 @@ from typing import Any
 import pytest
 import torch
 
-from bidex_algos import runner
-from bidex_algos.mtppo import MTPPO, MTPPOConfig
-from bidex_algos.runner import checkpoint, resume, train
+from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
+from bidex_meta.train import runner
+from bidex_meta.train.runner import checkpoint, resume, train
 from tests.algos.ranks import same
 from tests.algos.toy import ToyWorld, nearness
 

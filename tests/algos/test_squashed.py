@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
 from torch.testing import assert_close
 
-from bidex_algos.squashed import SquashedActor, sample_squashed, squashed_log_prob
+from bidex_algos.nets.squashed import SquashedActor, sample_squashed, squashed_log_prob
 
 
 def actor(heads: int = 1, init_std: float = 0.5, std_range: tuple[float, float] = (0.02, 2.0)) -> SquashedActor:

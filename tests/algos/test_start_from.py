@@ -5,12 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bidex_algos.maml import PRESETS as MAML_PRESETS
-from bidex_algos.mtppo import MTPPO, MTPPOConfig
-from bidex_algos.mtppo import PRESETS as PPO_PRESETS
-from bidex_algos.mtsac import MTSAC, MTSACConfig
-from bidex_algos.promp import PRESETS as PROMP_PRESETS
-from bidex_algos.promp import ProMP, ProMPConfig
+from bidex_algos.meta.maml import PRESETS as MAML_PRESETS
+from bidex_algos.meta.promp import PRESETS as PROMP_PRESETS
+from bidex_algos.meta.promp import ProMP, ProMPConfig
+from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
+from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
+from bidex_algos.onpolicy.mtppo import PRESETS as PPO_PRESETS
 from bidex_algos.start_from import start_from
 from bidex_meta.errors import BidexError
 from tests.algos.families import PointGoals

@@ -5,8 +5,8 @@ from hypothesis import given, settings
 from torch import Tensor, nn
 from torch.testing import assert_close
 
-from bidex_algos.networks import GaussianActor, gaussian_kl
-from bidex_algos.trust_region import conjugate_gradient, fisher_product, flatten, line_search, write
+from bidex_algos.gradients.trust_region import conjugate_gradient, fisher_product, flatten, line_search, write
+from bidex_algos.nets.networks import GaussianActor, gaussian_kl
 
 
 @settings(max_examples=25, deadline=None)

@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bidex_algos import rollout
-from bidex_algos.mtppo import MTPPO, MTPPOConfig
+from bidex_algos.experience import rollout
+from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_meta import Benchmark
 from tests.world.play import suite_world
 from tests.world.test_masked import masked, no_looks

@@ -1,0 +1,1 @@
+"""Speed of the learners' parts (``bidex-meta bench``)."""

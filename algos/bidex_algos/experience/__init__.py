@@ -1,0 +1,1 @@
+"""What worlds gave: rollouts, a replay, episodes in numbers, advantages."""

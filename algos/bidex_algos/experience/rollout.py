@@ -1,0 +1,134 @@
+"""A stretch of transitions of all rows, and the loop that collects it; shared by the on-policy learners."""
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from bidex_algos.experience.episodes import EpisodeStatistics
+from bidex_meta.errors import BidexError
+
+
+class VectorWorld(Protocol):
+    """What a learner may touch of a world: a batched environment that resets finished rows within the step."""
+
+    single_observation_space: Any
+    single_action_space: Any
+    num_envs: int
+    device: torch.device
+    num_tasks: int
+    task_id: Tensor
+    task_names: list[str]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
+        """Starts new episodes in all rows: observations (N, d) and info."""
+        ...
+
+    def step(self, actions: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+        """Observations (N, d), rewards (N,), terminated (N,), truncated (N,), info."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that is needed to continue bit for bit."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` gave."""
+        ...
+
+
+Sampler = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""Raw observations (N, d) to a sampled action and the mean action, both (N, a) and not clamped."""
+
+FinalValue = Callable[[Tensor, Tensor], Tensor]
+"""Raw observations (n, d) and task ids (n,) to values (n,), in units of reward."""
+
+
+class Rollout:
+    """Transitions of T steps in N rows, preallocated on the device and overwritten by each :func:`collect`.
+
+    Attributes:
+        obs: Raw observations before each step, (T, N, d).
+        actions: Sampled actions, not clamped, (T, N, a).
+        means: Mean actions of the sampling policy, (T, N, a).
+        rewards: (T, N); 0 where not valid.
+        terminated: Bool (T, N), the episode came to a true end.
+        ended: Bool (T, N), terminated, truncated or not valid.
+        valid: Bool (T, N), False where physics broke: such a transition teaches nothing.
+        final_values: Value of the last observation of episodes cut by a time limit, 0 elsewhere, (T, N).
+        last_obs: Raw observations after the last step, (N, d).
+    """
+
+    def __init__(self, steps: int, num_envs: int, observations: int, actions: int, device: torch.device):
+        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+            return torch.zeros(*shape, dtype=dtype, device=device)
+
+        self.steps = steps
+        self.obs = zeros(steps, num_envs, observations)
+        self.actions = zeros(steps, num_envs, actions)
+        self.means = zeros(steps, num_envs, actions)
+        self.rewards = zeros(steps, num_envs)
+        self.terminated = zeros(steps, num_envs, dtype=torch.bool)
+        self.ended = zeros(steps, num_envs, dtype=torch.bool)
+        self.valid = zeros(steps, num_envs, dtype=torch.bool)
+        self.final_values = zeros(steps, num_envs)
+        self.last_obs = zeros(num_envs, observations)
+
+
+@torch.no_grad()
+def collect(
+    world: VectorWorld,
+    rollout: Rollout,
+    obs: Tensor,
+    sample: Sampler,
+    final_value: FinalValue,
+    episodes: EpisodeStatistics,
+) -> Tensor:
+    """Fills ``rollout`` from ``world``, starting at the observations ``obs``; returns those to continue from."""
+    for t in range(rollout.steps):
+        action, mean = sample(obs)
+        rollout.obs[t], rollout.actions[t], rollout.means[t] = obs, action, mean
+        obs, reward, terminated, truncated, info = world.step(action)
+        valid = ~info["unstable"] if "unstable" in info else torch.ones_like(terminated)
+        rollout.rewards[t] = reward.masked_fill(~valid, 0.0)
+        rollout.terminated[t], rollout.ended[t], rollout.valid[t] = terminated, terminated | truncated | ~valid, valid
+        cut = truncated & ~terminated & valid
+        rollout.final_values[t] = _values_where(cut, info.get("final_obs"), world.task_id, final_value)
+        episodes.update(info)
+    rollout.last_obs.copy_(obs)
+    return obs
+
+
+def check_autoreset(world: Any, learner: str, expected: str) -> None:
+    """Refuses a world that says that it resets in another way than the learner needs.
+
+    Raises:
+        BidexError: It is in another autoreset mode.
+    """
+    mode = getattr(world, "metadata", {}).get("autoreset_mode")
+    name = getattr(mode, "name", mode)
+    if name is not None and name != expected:
+        raise BidexError(
+            f"{learner}: needs a world in autoreset mode {expected}, but this one is in {name}. Make it with "
+            f'autoreset_mode="{expected}".'
+        )
+
+
+def may_look(device: torch.device) -> bool:
+    """Whether asking a tensor for its values costs nothing: elsewhere the host would wait for the device."""
+    return device.type == "cpu"
+
+
+def _values_where(cut: Tensor, final_obs: Tensor | None, task_id: Tensor, final_value: FinalValue) -> Tensor:
+    """Values (N,) of ``final_obs`` in the rows ``cut``, 0 elsewhere."""
+    values = torch.zeros(cut.shape, device=cut.device)
+    if final_obs is None:
+        return values
+    if not may_look(cut.device):
+        # A forward of all rows is cheaper than the wait for which rows there are.
+        return torch.where(cut, final_value(final_obs, task_id), values)
+    rows = cut.nonzero().squeeze(-1)
+    if len(rows):
+        values[rows] = final_value(final_obs[rows], task_id[rows])
+    return values

@@ -1,0 +1,1 @@
+"""What is done to gradients and steps; knows no world and no learner."""

@@ -1,0 +1,1 @@
+"""Learners that learn to adapt to a task."""

@@ -1,0 +1,146 @@
+"""The inner loop of MAML and ProMP: one gradient step on a task's own data, for all tasks at once.
+
+Every task has parameters of its own, stacked along a first axis. Forward passes are batched over it, and one gradient
+by ``torch.func`` holds those of all tasks. Adapted parameters keep their graph back to the meta-parameters, which is
+what the outer loops differentiate.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.func import grad
+
+from bidex_algos.choices import Adapted
+from bidex_algos.nets.networks import GaussianActor, gaussian_kl, gaussian_log_prob, stacked_forward
+
+Params = dict[str, Tensor]
+"""Parameters of an actor by name; stacked ones have a first axis of tasks."""
+
+Objective = Literal["likelihood", "ratio"]
+"""What the inner step follows: log-likelihood times advantage (MAML), or likelihood ratio times advantage (ProMP)."""
+
+_TRANSITIONS_AT_ONCE = 8_192
+"""What a CPU's caches hold of layers 64-64: of 40 tasks with 2,000 each, four at a time take two thirds of the time
+that all take."""
+
+
+@dataclass
+class TaskBatch:
+    """What was sampled in one stage of adaptation, by task: B transitions of each of M tasks."""
+
+    obs: Tensor
+    """Normalised observations (M, B, d)."""
+    actions: Tensor
+    """Sampled actions (M, B, a)."""
+    old_means: Tensor
+    """Means of the policies that sampled (M, B, a)."""
+    old_log_stds: Tensor
+    """Logarithms of their standard deviations (M, a)."""
+    advantages: Tensor
+    """Normalised within each task (M, B)."""
+    weights: Tensor
+    """1, or 0 for what teaches nothing: after an episode's end, or where physics broke (M, B)."""
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        """The fields, in order."""
+        return tuple(vars(self).values())
+
+
+class Adapter:
+    """Gradient steps on parameters of an actor.
+
+    Args:
+        actor: Gives the functional form; its own parameters are the meta-parameters.
+        learning_rate: Size of an inner step.
+        objective: What the inner step follows.
+        std_range: Bounds of the standard deviations, wherever they are used.
+        first_order: Whether the outer loop takes the inner gradient for a constant.
+        adapted: Which parameters the inner step moves: all of them, or those of the output layer.
+    """
+
+    def __init__(
+        self,
+        actor: GaussianActor,
+        learning_rate: float,
+        objective: Objective,
+        std_range: tuple[float, float],
+        first_order: bool = False,
+        adapted: Adapted = "all",
+    ):
+        self.actor, self.learning_rate, self.objective, self.first_order = actor, learning_rate, objective, first_order
+        self._prefix = "mean.head." if adapted == "head" else ""
+        self.log_std_range = math.log(std_range[0]), math.log(std_range[1])
+
+    @torch.no_grad()
+    def project(self) -> None:
+        """Moves the meta-parameters' standard deviations back between their bounds: beyond one no gradient would."""
+        self.actor.log_std.clamp_(*self.log_std_range)
+
+    def meta(self, count: int) -> Params:
+        """The meta-parameters once per task, a view with their graph."""
+        return {name: p.expand(count, *p.shape) for name, p in self.actor.named_parameters()}
+
+    def distribution(self, params: Params, obs: Tensor) -> tuple[Tensor, Tensor]:
+        """Means (M, B, a) and logarithms of standard deviations (M, a) of all tasks' policies for (M, B, d)."""
+        means = stacked_forward(self.actor.mean, params, "mean.", obs, own=self._prefix)
+        return means, params["log_std"].clamp(*self.log_std_range)
+
+    def adapt(self, params: Params, batch: TaskBatch) -> Params:
+        """Parameters after one inner step of each task on its own batch."""
+        own = [name for name in params if name.startswith(self._prefix)]
+        parts = [self._slopes(*part, own) for part in _parts(params, batch)]
+        slopes = {name: torch.cat([part[name] for part in parts]) for name in own}
+        if self.first_order:
+            slopes = {name: slope.detach() for name, slope in slopes.items()}
+        return params | {name: params[name] - self.learning_rate * slopes[name] for name in own}
+
+    def _slopes(self, params: Params, batch: TaskBatch, own: list[str]) -> Params:
+        """Gradients of the tasks' inner losses by the parameters named; no task's loss knows another's parameters."""
+
+        def loss(moved: Params) -> Tensor:
+            log_prob = self._log_prob(params | moved, batch)
+            if self.objective == "ratio":
+                gain = torch.exp(log_prob - _old_log_prob(batch)) * batch.advantages
+            else:
+                gain = log_prob * batch.advantages
+            return -weighted_mean(gain, batch.weights).sum()
+
+        return grad(loss)({name: params[name] for name in own})
+
+    def _log_prob(self, params: Params, b: TaskBatch) -> Tensor:
+        means, log_stds = self.distribution(params, b.obs)
+        return gaussian_log_prob(b.actions, means, log_stds[:, None])
+
+    def ratio_and_kl(self, params: Params, batch: TaskBatch) -> tuple[Tensor, Tensor]:
+        """Likelihood ratios of each transition (M, B), and the mean KL from the policies that sampled (M,)."""
+        means, log_stds = self.distribution(params, batch.obs)
+        log_prob = gaussian_log_prob(batch.actions, means, log_stds[:, None])
+        kl = gaussian_kl(batch.old_means, batch.old_log_stds[:, None], means, log_stds[:, None])
+        return torch.exp(log_prob - _old_log_prob(batch)), weighted_mean(kl, batch.weights)
+
+
+def _old_log_prob(b: TaskBatch) -> Tensor:
+    return gaussian_log_prob(b.actions, b.old_means, b.old_log_stds[:, None])
+
+
+def _parts(params: Params, batch: TaskBatch) -> Iterator[tuple[Params, TaskBatch]]:
+    """Tasks to be differentiated together: on a CPU as many as its caches hold, elsewhere all."""
+    tasks, transitions = batch.weights.shape
+    size = max(1, _TRANSITIONS_AT_ONCE // transitions) if batch.obs.device.type == "cpu" else tasks
+    for k in range(0, tasks, size):
+        part = slice(k, k + size)
+        yield {name: p[part] for name, p in params.items()}, TaskBatch(*(x[part] for x in batch.tensors()))
+
+
+def weighted_mean(x: Tensor, weights: Tensor) -> Tensor:
+    """Mean over the last axis of what has weight; 0 where nothing has."""
+    return (weights * x).sum(-1) / weights.sum(-1).clamp_min(1.0)
+
+
+def detached(params: Params) -> Params:
+    """The same numbers without their graph."""
+    return {name: p.detach() for name, p in params.items()}

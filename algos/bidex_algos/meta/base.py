@@ -1,0 +1,331 @@
+"""What the gradient-based meta-learners share: meta-batches of tasks, stages of adaptation, checkpoints.
+
+They differ in the outer step alone. An iteration::
+
+    draw tasks; every task starts from the meta-parameters
+    for each stage k = 0 ... inner_steps:
+        every row plays one episode by its task's parameters          D_k
+        theta_k+1 = theta_k + inner_learning_rate * gradient on D_k   (not after the last)
+    outer step of the meta-parameters on D_0 ... D_K
+"""
+
+import copy
+import time
+from abc import ABC, abstractmethod
+from dataclasses import asdict
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bidex_algos.experience.rollout import VectorWorld, may_look
+from bidex_algos.meta.adaptation import Objective, TaskBatch, detached
+from bidex_algos.meta.config import MetaConfig
+from bidex_algos.meta.meta_policy import MetaPolicy, make_meta_policy
+from bidex_algos.meta.stage import Stage, task_batch
+from bidex_algos.meta.task_rows import TaskRows
+from bidex_algos.nets.normalise import RunningStats
+from bidex_algos.reports import as_numbers, check_finite
+from bidex_meta.errors import BidexError
+from bidex_meta.train.distributed import world_size
+
+
+class TaskWorld(VectorWorld, Protocol):
+    """A world whose rows keep their tasks until they are given others."""
+
+    pools: list[np.ndarray]
+    """Variations of each class, (n, size of a variation)."""
+    task_index: Tensor
+    """Which variation of its class each row plays, int64 (N,)."""
+    max_episode_steps: Tensor
+    """Time limit of each row, (N,)."""
+
+    def set_tasks(self, pools: dict[str, np.ndarray]) -> None:
+        """Gives classes other variations; row j of a class plays variation j mod n from the next full reset on."""
+        ...
+
+
+class Outcome(NamedTuple):
+    """What a stage came to."""
+
+    earned: Tensor
+    """Undiscounted, unscaled return of each row (N,)."""
+    success: Tensor
+    """Whether each row succeeded, bool (N,)."""
+    steps: Tensor
+    """Environment steps, int64 (); a row that waits for the others takes none."""
+
+
+class MetaLearner(ABC):
+    """Learns parameters from which one gradient step on a task's own data goes far.
+
+    Args:
+        world: A world with hidden goals whose rows keep their tasks, in autoreset mode :meth:`autoreset`.
+        config: The learner's config.
+        seed: Of the initial weights, the tasks of each meta-batch, the sampled actions and the world's first reset.
+
+    Attributes:
+        env_steps: Environment steps taken so far, over all rows; a waiting row takes none.
+        policy: The adapting agent that evaluation uses.
+
+    Raises:
+        BidexError: Several processes, or a class with fewer rows than it has tasks in a meta-batch.
+    """
+
+    name: ClassVar[str]
+    """How the learner calls itself in messages."""
+    objective: ClassVar[Objective]
+    """What its inner step follows."""
+    config_type: ClassVar[type[MetaConfig]]
+    """Its config."""
+    adapts: ClassVar[bool] = True
+    """Its policy adapts to a task: evaluation measures before and after."""
+    per_process: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self, world: TaskWorld, config: Any, seed: int):
+        if world_size() > 1:
+            raise BidexError(f"{self.name}: learns in one process, got {world_size()}. Start it without torchrun.")
+        self.world, self.config, self.seed = world, config, seed
+        self.device = torch.device(world.device)
+        self.env_steps = 0
+        self.obs: Tensor | None = None
+        self.elapsed = torch.zeros(world.num_envs, dtype=torch.int64, device=self.device)
+        self.steps_with_tasks = 0
+        # What can be drawn from; the world's own pools will be those of a meta-batch.
+        self.pools = [pool.copy() for pool in world.pools]
+        self._check_rows()
+        d, a = int(world.single_observation_space.shape[0]), int(world.single_action_space.shape[0])
+        num_id_columns = int(getattr(world, "num_id_columns", 0))
+        self.shape = {"observations": d, "actions": a, "num_id_columns": num_id_columns}
+        # Weights come from a CPU generator, so that a seed means the same network on every device.
+        init = torch.Generator().manual_seed(seed)
+        self.tasks_generator = torch.Generator().manual_seed(seed)
+        self.generator = torch.Generator(self.device).manual_seed(seed)
+        self.policy = make_meta_policy(config, self.objective, self.shape, init, seed).to(self.device)
+        self.rows = TaskRows(world.task_id)
+
+    @staticmethod
+    def autoreset(config: dict[str, Any]) -> str:
+        """The world's mode: whole episodes wait for each other, slices of them go on."""
+        return "DISABLED" if config["slice_steps"] is None else "SAME_STEP"
+
+    def _check_rows(self) -> None:
+        rows = torch.bincount(self.world.task_id, minlength=self.world.num_tasks).tolist()
+        for name, count, pool in zip(self.world.task_names, rows, self.pools, strict=True):
+            tasks = min(self.config.tasks_per_class, len(pool))
+            if count < tasks:
+                raise BidexError(
+                    f"{self.name}: {name} has {count} rows for {tasks} tasks of a meta-batch. Use num_envs of at least "
+                    f"{tasks * self.world.num_tasks}, or lower tasks_per_class."
+                )
+
+    # What a learner adds.
+
+    @abstractmethod
+    def _outer(self, batches: list[TaskBatch]) -> dict[str, Tensor]:
+        """Moves the meta-parameters by what the stages showed; returns scalars to be logged."""
+
+    def _optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        """The optimisers by the names they have in a checkpoint."""
+        return {}
+
+    def iterate(self) -> dict[str, float]:
+        """One meta-batch: samples, adapts, learns.
+
+        Returns:
+            Metrics under TensorBoard-like tags; ``docs/learners/`` explains each.
+
+        Raises:
+            FloatingPointError: The loss is no longer finite.
+        """
+        started = time.perf_counter()
+        if self.config.slice_steps is None or self.obs is None or self.steps_with_tasks >= self.config.max_adapt_steps:
+            self._draw_tasks()
+        adapter, sampling, steps = self.policy.adapter, 0.0, 0
+        adapter.project()
+        params = detached(adapter.meta(self.rows.count))
+        seen = RunningStats((self.policy.observations.measured,)).to(self.device)
+        batches: list[TaskBatch] = []
+        told: dict[str, float] = {}
+        for k in range(self.config.inner_steps + 1):
+            began = time.perf_counter()
+            stage, outcome = self._sample(params, seen)
+            steps += int(outcome.steps)
+            sampling += time.perf_counter() - began
+            log_std = params["log_std"].clamp(*adapter.log_std_range)
+            batches.append(task_batch(stage, self.rows, log_std, self.config))
+            told |= self._told(outcome, k)
+            if k < self.config.inner_steps:
+                params = detached(adapter.adapt(params, batches[-1]))
+        losses = as_numbers(self._outer(batches))
+        check_finite(losses, losses, self.name, self.env_steps, "lower inner_learning_rate or the outer step")
+        metrics = told | losses
+        self.policy.observations.merge(seen.mean, seen.var, seen.count)
+        whole = time.perf_counter() - started
+        self.env_steps += steps
+        metrics["Policy/std"] = float(self.policy.actor.log_std.detach().clamp(*adapter.log_std_range).exp().mean())
+        metrics["Perf/collection_time"], metrics["Perf/learning_time"] = sampling, whole - sampling
+        metrics["Perf/steps_per_second"] = steps / whole
+        return metrics
+
+    def eval_action(self, obs: Tensor) -> Tensor:
+        """Mean action before any adaptation, for raw observations (N, d), clamped to [-1, 1]: (N, a)."""
+        return self.policy.actor(self.policy.observations(obs)).detach().clamp(-1.0, 1.0)
+
+    def reset(self, env_mask: Tensor) -> None:
+        """A new episode begins in the rows of ``env_mask``, bool (N,)."""
+        self.policy.reset(env_mask)
+
+    # Sampling.
+
+    def _draw_tasks(self) -> None:
+        """New tasks for every class, without repetition, and new episodes."""
+        chosen = {}
+        for name, pool in zip(self.world.task_names, self.pools, strict=True):
+            order = torch.randperm(len(pool), generator=self.tasks_generator)[: self.config.tasks_per_class]
+            chosen[name] = pool[order.numpy()]
+        self.world.set_tasks(chosen)
+        sizes = torch.tensor([len(tasks) for tasks in chosen.values()], device=self.device)
+        first = sizes.cumsum(0) - sizes
+        self.rows = TaskRows(first[self.world.task_id] + self.world.task_index)
+        self.obs, self.steps_with_tasks = None, 0
+
+    @torch.no_grad()
+    def _sample(self, params: dict[str, Tensor], seen: RunningStats) -> tuple[Stage, Outcome]:
+        """A whole episode, or a slice, in every row. Raw observations go into ``seen``: the stage's are clipped."""
+        policy, rows, stage = self.policy, self.rows, Stage()
+        if self.config.slice_steps is None:
+            horizon = min(int(self.world.max_episode_steps.max()), self.config.max_adapt_steps)
+        else:
+            horizon = self.config.slice_steps
+        obs = self._begin()
+        running = torch.ones_like(self.elapsed, dtype=torch.bool)
+        earned, success = torch.zeros(len(running), device=self.device), torch.zeros_like(running)
+        steps = torch.zeros_like(self.elapsed[0])
+        for t in range(horizon):
+            normal = policy.observations(obs)
+            means, log_std = policy.adapter.distribution(params, rows.by_task(normal))
+            mean = rows.by_row(means)
+            noise = torch.randn(mean.shape, generator=self.generator, device=self.device)
+            action = mean + log_std[rows.task_of_row].exp() * noise
+            steps += running.sum()
+            before = obs
+            obs, reward, terminated, truncated, info = self.world.step(action)
+            broken = info.get("unstable", torch.zeros_like(terminated))
+            valid = running & ~broken
+            seen.merge(*_moments(before[:, : policy.observations.measured], valid))
+            over = terminated | truncated | broken
+            last = torch.full_like(over, self.config.slice_steps is None and t + 1 == horizon)
+            stage.add(
+                obs=normal, actions=action, means=mean, rewards=reward.masked_fill(~valid, 0.0), terminated=terminated,
+                ended=over | last | ~running, valid=valid, elapsed=self.elapsed,
+            )  # fmt: skip
+            earned += info.get("reward_unscaled", reward).masked_fill(~valid, 0.0)
+            success |= info["success"] & valid if "success" in info else False
+            self.elapsed = (self.elapsed + 1).masked_fill(over, 0)
+            if self.config.slice_steps is None:
+                running = running & ~over
+                if may_look(self.device) and not running.any():
+                    break
+        self.obs = obs
+        self.steps_with_tasks += len(stage)
+        return stage, Outcome(earned, success, steps)
+
+    def _begin(self) -> Tensor:
+        """Observations to start a stage from."""
+        if self.obs is not None and self.config.slice_steps is not None:
+            return self.obs
+        first = self.env_steps == 0 and self.steps_with_tasks == 0
+        obs, _ = self.world.reset(seed=self.seed if first else None)
+        self.elapsed = torch.zeros_like(self.elapsed)
+        if first:
+            self.policy.observations.update(obs)
+        return obs
+
+    # Metrics.
+
+    def _told(self, outcome: Outcome, k: int) -> dict[str, float]:
+        """Return and success of a stage per class: of the last stage as such, of the first as ``before``."""
+        last = k == self.config.inner_steps
+        if k > 0 and not last:
+            return {}
+        told: dict[str, float] = {}
+        for what, values in (("return", outcome.earned), ("success", outcome.success.float())):
+            sums = torch.zeros(self.world.num_tasks, device=self.device).index_add(0, self.world.task_id, values)
+            means = (sums / torch.bincount(self.world.task_id, minlength=self.world.num_tasks)).tolist()
+            tag = f"Train/{what}" if last else f"Before/{what}"
+            told |= {f"{tag}/{name}": mean for name, mean in zip(self.world.task_names, means, strict=True)}
+            whole = {"return": "mean_return", "success": "success_rate"}[what]
+            told[f"{'Train' if last else 'Before'}/{whole}"] = sum(means) / len(means)
+        return told
+
+    # Checkpoints.
+
+    def policy_state_dict(self) -> dict[str, Any]:
+        """What :meth:`load_policy` needs: network, observation statistics, sizes and config."""
+        return {
+            "config": asdict(self.config),
+            "shape": dict(self.shape),
+            "weights": self.policy.state_dict(),
+            "seed": self.seed,
+        }
+
+    @classmethod
+    def load_policy(cls, state: dict[str, Any], device: str | torch.device = "cpu") -> MetaPolicy:
+        """The adapting agent of a checkpoint, for a world of any number of rows.
+
+        Args:
+            state: ``checkpoint["learner"]["policy"]``.
+            device: Where to run it.
+        """
+        config, init = cls.config_type(**state["config"]), torch.Generator().manual_seed(0)
+        policy = make_meta_policy(config, cls.objective, state["shape"], init, state["seed"]).to(device)
+        policy.load_state_dict(state["weights"])
+        return policy
+
+    def state_dict(self) -> dict[str, Any]:
+        """A copy of everything but the world, as tensors and plain values (``torch.load(weights_only=True)``)."""
+        return copy.deepcopy(
+            {
+                "policy": self.policy_state_dict(),
+                **{name: optimiser.state_dict() for name, optimiser in self._optimisers().items()},
+                "generator": self.generator.get_state(),
+                "tasks_generator": self.tasks_generator.get_state(),
+                "rows": self.rows.task_of_row,
+                "obs": self.obs,
+                "elapsed": self.elapsed,
+                "steps_with_tasks": self.steps_with_tasks,
+                "env_steps": self.env_steps,
+            }
+        )
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` gave.
+
+        Raises:
+            BidexError: The checkpoint comes from a world of another size.
+        """
+        if len(state["elapsed"]) != self.world.num_envs:
+            raise BidexError(
+                f"{self.name}: the checkpoint's world had {len(state['elapsed'])} rows, this one has "
+                f"{self.world.num_envs}. Resume with the run's own suite and num_envs."
+            )
+        self.policy.load_state_dict(state["policy"]["weights"])
+        for name, optimiser in self._optimisers().items():
+            optimiser.load_state_dict(state[name])
+        self.generator.set_state(state["generator"].cpu())
+        self.tasks_generator.set_state(state["tasks_generator"].cpu())
+        self.rows = TaskRows(state["rows"].to(self.device))
+        self.obs = None if state["obs"] is None else state["obs"].to(self.device, copy=True)
+        self.elapsed = state["elapsed"].to(self.device, copy=True)
+        self.steps_with_tasks, self.env_steps = int(state["steps_with_tasks"]), int(state["env_steps"])
+
+
+def _moments(x: Tensor, counted: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean, variance and count of each column of (N, d), over the rows of a mask (N,)."""
+    count = counted.sum()
+    x = x.masked_fill(~counted[:, None], 0.0)
+    mean = x.sum(0) / count.clamp_min(1)
+    var = ((x - mean).square() * counted[:, None]).sum(0) / count.clamp_min(1)
+    return mean, var, count

@@ -1,0 +1,1 @@
+"""Networks: actors and critics, memories, running statistics, and the agents made of them."""

@@ -1,0 +1,94 @@
+"""Running statistics: of observations, and of returns per task."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from bidex_meta.train.distributed import pool_moments
+
+
+class RunningStats(nn.Module):
+    """Mean and variance of a stream, merged batch by batch (Chan et al.), element by element.
+
+    Kept in float64: the count outgrows what float32 can add to.
+
+    Args:
+        shape: Shape of the statistics, e.g. ``(columns,)`` or ``(num_tasks,)``.
+        max_count: The count never grows beyond this, so that older batches fade; infinite = they never do.
+    """
+
+    def __init__(self, shape: tuple[int, ...], max_count: float = math.inf):
+        super().__init__()
+        self.max_count = max_count
+        self.mean: Tensor
+        self.var: Tensor
+        self.count: Tensor
+        self.register_buffer("mean", torch.zeros(shape, dtype=torch.float64))
+        self.register_buffer("var", torch.ones(shape, dtype=torch.float64))
+        self.register_buffer("count", torch.zeros(shape, dtype=torch.float64))
+
+    def merge(self, mean: Tensor, var: Tensor, count: Tensor | float) -> None:
+        """Merges a batch's mean, (biased) variance and count; elements whose count is 0 stay as they are."""
+        count = torch.as_tensor(count, dtype=torch.float64, device=self.mean.device).expand_as(self.count)
+        total = self.count + count
+        share = torch.where(count > 0, count / total.clamp_min(1.0), torch.zeros_like(total))
+        delta = mean.double() - self.mean
+        self.var.lerp_(var.double(), share).add_(share * (1.0 - share) * delta.square())
+        self.mean.add_(share * delta)
+        self.count.copy_(total.clamp_max(self.max_count))
+
+    def std(self, floor: float = 1e-4) -> Tensor:
+        """Standard deviation, at least ``floor``, float64."""
+        return (self.var + floor**2).sqrt()
+
+
+class ObservationNormaliser(nn.Module):
+    """Observations to zero mean and unit variance, clipped; trailing task-id columns pass through unchanged.
+
+    Statistics change only in :meth:`update`, so the observations of a rollout look the same to the sampling policy and
+    to the update.
+
+    Args:
+        columns: Width of the observation.
+        num_id_columns: How many trailing columns hold the one-hot task id.
+        enabled: False makes this the identity.
+        clip: Bound of the normalised values.
+    """
+
+    def __init__(self, columns: int, num_id_columns: int = 0, enabled: bool = True, clip: float = 10.0):
+        super().__init__()
+        self.enabled = enabled
+        self.clip = clip
+        self.measured = columns - num_id_columns
+        self.stats = RunningStats((self.measured,))
+        # float32 copies of what forward needs, refreshed by update.
+        self.shift: Tensor
+        self.scale: Tensor
+        self.register_buffer("shift", torch.zeros(columns))
+        self.register_buffer("scale", torch.ones(columns))
+
+    def forward(self, obs: Tensor) -> Tensor:
+        """Normalises (..., columns), float32."""
+        if not self.enabled:
+            return obs
+        return ((obs - self.shift) * self.scale).clamp_(-self.clip, self.clip)
+
+    @torch.no_grad()
+    def update(self, obs: Tensor) -> None:
+        """Takes (..., columns) raw observations, of all processes, into the statistics."""
+        if not self.enabled:
+            return
+        flat = obs.reshape(-1, obs.shape[-1])[:, : self.measured]
+        var, mean = torch.var_mean(flat, dim=0, correction=0)
+        self.merge(mean, var, torch.full_like(mean, flat.shape[0], dtype=torch.float64))
+
+    @torch.no_grad()
+    def merge(self, mean: Tensor, var: Tensor, count: Tensor) -> None:
+        """Takes moments of raw observations, of all processes, into the statistics: (measured columns,) each."""
+        if not self.enabled:
+            return
+        self.stats.merge(*pool_moments(mean, var, count))
+        self.shift[: self.measured] = self.stats.mean.float()
+        # The floor keeps a column that has been constant so far from blowing up noise a thousandfold.
+        self.scale[: self.measured] = self.stats.std(floor=3e-3).reciprocal().float()

@@ -1,0 +1,179 @@
+"""Networks with a memory: encoder, GRU, output; and a Gaussian policy that remembers what it did and what it earned."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor, nn
+
+from bidex_algos.choices import Activation
+from bidex_algos.nets.networks import ACTIVATIONS, MLP
+from bidex_algos.nets.normalise import ObservationNormaliser
+
+
+class RecurrentNet(nn.Module):
+    """An encoder, a GRU on its features, and a linear output of both, so that a reflex need not pass the memory.
+
+    All in float32: a memory would carry the rounding of bfloat16 through hundreds of steps.
+
+    Args:
+        inputs: Width of the input.
+        hidden: Widths of the encoder's layers.
+        memory: Width of the GRU's state.
+        outputs: Width of the output.
+        output_gain: Gain of the orthogonal output layer.
+        generator: CPU generator of the initial weights; the global one is left alone.
+        activation: Name of the encoder's non-linearity.
+    """
+
+    def __init__(
+        self,
+        inputs: int,
+        hidden: Sequence[int],
+        memory: int,
+        outputs: int,
+        output_gain: float,
+        generator: torch.Generator,
+        activation: Activation = "elu",
+    ):
+        super().__init__()
+        last = MLP(inputs, hidden[:-1], hidden[-1], math.sqrt(2.0), generator, activation)
+        self.encoder = nn.Sequential(last, ACTIVATIONS[activation]())
+        # Made without memory first: the default initialisation would draw from the global generator.
+        self.gru = nn.GRU(hidden[-1], memory, device="meta").to_empty(device="cpu")
+        for name, weight in self.gru.named_parameters():
+            if "bias" in name:
+                nn.init.zeros_(weight)
+                continue
+            for gate in weight.data.chunk(3):
+                nn.init.orthogonal_(gate, generator=generator)
+        self.head = MLP(hidden[-1] + memory, (), outputs, output_gain, generator)
+
+    def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Steps of a sequence, one after the other.
+
+        Args:
+            x: Inputs (T, B, inputs).
+            state: The memory before the first step, (B, memory).
+
+        Returns:
+            Outputs (T, B, outputs) and the memory after the last step, (B, memory).
+        """
+        features = self.encoder(x)
+        remembered, last = self.gru(features, state[None].contiguous())
+        return self.head(torch.cat([features, remembered], dim=-1)), last[0]
+
+
+@dataclass
+class Memory:
+    """What each row brings along from the step before. A fresh one is all zeros: nothing has happened yet.
+
+    Attributes:
+        state: The GRU's state, (N, memory).
+        action: The action, (N, a); what of it exceeds [-1, 1] was not done.
+        reward: The reward, (N,).
+        known: Whether the policy is shown that reward, bool (N,).
+        done: Whether that step ended an episode, bool (N,).
+    """
+
+    state: Tensor
+    action: Tensor
+    reward: Tensor
+    known: Tensor
+    done: Tensor
+
+    @classmethod
+    def fresh(cls, rows: int, memory: int, actions: int, device: torch.device) -> "Memory":
+        """The memory at the start of a trial."""
+        flags = torch.zeros(2, rows, dtype=torch.bool, device=device)
+        state, action = (torch.zeros(rows, width, device=device) for width in (memory, actions))
+        return cls(state, action, torch.zeros(rows, device=device), flags[0], flags[1])
+
+    def replaced(self, mask: Tensor, other: "Memory") -> "Memory":
+        """The same with the rows of ``mask``, bool (N,), from another one."""
+        pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+        return Memory(*(torch.where(mask if a.dim() == 1 else mask[:, None], b, a) for a, b in pairs))
+
+
+class RecurrentPolicy(nn.Module):
+    """A Gaussian policy whose memory is fed with observation, last action, last reward and end of episode.
+
+    Rewards of task classes differ by orders of magnitude, and a class met in a meta-test has never been seen: no scale
+    of its own is known, nor which class a row plays. One rule serves all: asinh(reward / unit), which is linear below
+    the unit and tells ratios apart above it, normalised by the mean and deviation it had in training.
+
+    Args:
+        observations: Width of the raw observation.
+        num_id_columns: How many of its trailing columns hold a one-hot task id.
+        actions: Number of actions.
+        hidden: Widths of the encoder's layers.
+        memory: Width of the memory.
+        init_std: Standard deviation of the actions at the start.
+        reward_unit: The unit.
+        normalise_observations: Whether observations are normalised.
+        generator: CPU generator of the initial weights.
+        activation: Name of the encoder's non-linearity.
+
+    Attributes:
+        inputs: Width of what the networks see.
+        log_std: Logarithms of the standard deviations, (a,).
+    """
+
+    def __init__(
+        self,
+        observations: int,
+        num_id_columns: int,
+        actions: int,
+        hidden: Sequence[int],
+        memory: int,
+        init_std: float,
+        reward_unit: float,
+        normalise_observations: bool,
+        generator: torch.Generator,
+        activation: Activation,
+    ):
+        super().__init__()
+        self.num_actions, self.memory, self.reward_unit = actions, memory, reward_unit
+        self.inputs = observations + actions + 3
+        self.observations = ObservationNormaliser(observations, num_id_columns, normalise_observations)
+        self.rewards = ObservationNormaliser(1)
+        self.actor = RecurrentNet(self.inputs, hidden, memory, actions, 0.01, generator, activation)
+        self.log_std = nn.Parameter(torch.full((actions,), math.log(init_std)))
+
+    def see(self, obs: Tensor, action: Tensor, reward: Tensor, known: Tensor, done: Tensor) -> Tensor:
+        """What the networks see: normalised observation, last action, last reward or 0, whether it is known, end.
+
+        Args:
+            obs: Raw observations (..., d).
+            action: Last actions (..., a).
+            reward: Last rewards (...).
+            known: Whether the rewards are shown, bool (...).
+            done: Whether the last step ended an episode, bool (...).
+
+        Returns:
+            Shape (..., inputs).
+        """
+        earned = torch.where(known, self.rewards(self._compressed(reward)).squeeze(-1), 0.0)
+        last = torch.stack([earned, known.float(), done.float()], dim=-1)
+        return torch.cat([self.observations(obs), action.clamp(-1.0, 1.0), last], dim=-1)
+
+    @torch.no_grad()
+    def step(self, obs: Tensor, memory: Memory) -> tuple[Tensor, Tensor]:
+        """Mean actions (N, a), not clamped, and the GRU's next state (N, memory), for raw observations (N, d)."""
+        x = self.see(obs, memory.action, memory.reward, memory.known, memory.done)
+        mean, state = self.actor(x[None], memory.state)
+        return mean[0], state
+
+    def fresh_memory(self, rows: int) -> Memory:
+        """The memory at the start of a trial of so many rows."""
+        return Memory.fresh(rows, self.memory, self.num_actions, self.log_std.device)
+
+    @torch.no_grad()
+    def update_statistics(self, obs: Tensor, rewards: Tensor) -> None:
+        """Takes raw observations (B, d) and rewards (B',) of all processes into the running statistics."""
+        self.observations.update(obs)
+        self.rewards.update(self._compressed(rewards))
+
+    def _compressed(self, reward: Tensor) -> Tensor:
+        return torch.asinh(reward / self.reward_unit)[..., None]

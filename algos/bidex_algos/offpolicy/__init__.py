@@ -1,0 +1,1 @@
+"""Learners that learn from a replay."""

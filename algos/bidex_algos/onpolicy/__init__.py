@@ -1,0 +1,1 @@
+"""Learners that learn from what the present policy has just played."""

@@ -1,0 +1,141 @@
+"""MT-PPO: proximal policy optimisation (Schulman et al. 2017) on all tasks of a world at once.
+
+One policy reads the task's one-hot in its observation. An iteration collects ``rollout_steps`` steps in every row, then
+makes ``epochs`` passes over them in shuffled mini-batches. What is done differently from Bi-DexHands' MTPPO, and why,
+stands in ``docs/learners/mtppo.md``.
+"""
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from bidex_algos.experience.rollout import VectorWorld
+from bidex_algos.gradients.step_size import AdaptiveAdams
+from bidex_algos.gradients.surgery import per_task_gradients, project_conflicting
+from bidex_algos.nets.networks import gaussian_entropy, gaussian_kl, gaussian_log_prob
+from bidex_algos.nets.precision import autocast
+from bidex_algos.onpolicy.base import Batch, OnPolicy
+from bidex_algos.onpolicy.mtppo_config import PRESETS, MTPPOConfig
+from bidex_meta.errors import BidexError
+from bidex_meta.train.distributed import all_sum, sum_gradients, world_size
+
+__all__ = ["MTPPO", "PRESETS", "Batch", "MTPPOConfig"]
+
+
+class MTPPO(OnPolicy):
+    """Multi-task PPO on a batched world.
+
+    Arguments and attributes are those of :class:`~bidex_algos.onpolicy.base.OnPolicy`. Several processes make a
+    mini-batch as many times larger.
+
+    Raises:
+        BidexError: Fewer samples in a rollout than mini-batches.
+    """
+
+    name, remedy = "mtppo", "lower learning_rate"
+    config_type = MTPPOConfig
+    config: MTPPOConfig
+
+    def __init__(self, world: VectorWorld, config: MTPPOConfig, seed: int):
+        samples = config.rollout_steps * world.num_envs
+        if samples < config.num_minibatches:
+            raise BidexError(
+                f"mtppo: {config.num_minibatches} mini-batches need as many samples, but {world.num_envs} rows x "
+                f"{config.rollout_steps} steps give {samples}. Raise num_envs or lower num_minibatches."
+            )
+        super().__init__(world, config, seed)
+        self.adams = AdaptiveAdams(
+            self.policy.actor.parameters(),
+            self.critic.parameters(),
+            learning_rate=config.learning_rate,
+            critic_learning_rate=config.critic_learning_rate,
+            desired_kl=config.desired_kl if config.adaptive_learning_rate else None,
+            bounds=config.learning_rate_range,
+            device=self.device,
+        )
+
+    def _update(self, batch: Batch) -> dict[str, Tensor]:
+        """PPO's update: returns the means over all mini-batches of what it measured."""
+        cfg, actor = self.config, self.policy.actor
+        old_log_std = actor.log_std.detach().clone()
+        low, high = (math.log(std) for std in cfg.std_range)
+        measured: list[Tensor] = []
+        for epoch in range(cfg.epochs):
+            order = torch.randperm(len(batch.obs), generator=self.generator, device=self.device)
+            parts = order.chunk(cfg.num_minibatches)
+            # Divided by the samples of all processes, losses and gradients become means by being summed over them.
+            counts = all_sum(torch.stack([batch.weights[index].sum() for index in parts])).clamp_min(1.0)
+            for number, (index, count) in enumerate(zip(parts, counts, strict=True)):
+                measured.append(self._gradients(batch.select(index), count, old_log_std))
+                # The first mini-batch compares the sampling policy with itself and says nothing about the step.
+                if (epoch, number) != (0, 0):
+                    self.adams.follow(measured[-1][2])
+                actor_weights, critic_weights = list(actor.parameters()), list(self.critic.parameters())
+                for weights in [actor_weights, critic_weights] if cfg.clip_apart else [actor_weights + critic_weights]:
+                    nn.utils.clip_grad_norm_(weights, cfg.max_grad_norm)
+                self.adams.step()
+                with torch.no_grad():
+                    actor.log_std.clamp_(low, high)
+        names = ["Loss/surrogate", "Loss/value", "Policy/kl", "Policy/clip_fraction"]
+        if cfg.gradient_surgery == "pcgrad":
+            names.append("Policy/conflicts")
+        means = torch.stack(measured).mean(0)
+        return {**dict(zip(names, means, strict=True)), "Policy/lr": self.adams.rate}
+
+    def _gradients(self, b: Batch, count: Tensor, old_log_std: Tensor) -> Tensor:
+        """Puts the gradients of a mini-batch into the parameters; ``count`` samples are in it, over all processes.
+
+        Returns:
+            Surrogate loss, value loss, KL, share of clipped ratios and, with surgery, of conflicts: (4,) or (5,).
+        """
+        cfg, actor = self.config, self.policy.actor
+        weight = b.weights / count
+        with autocast(self.device, self.low_precision):
+            mean = actor(b.obs)
+        log_std = actor.log_std_of(b.obs)
+        values = self._critic(b.obs, b.task_id)
+
+        ratio = torch.exp(gaussian_log_prob(b.actions, mean, log_std) - b.old_log_probs)
+        clipped = ratio.clamp(1.0 - cfg.clip, 1.0 + cfg.clip)
+        earned = weight * torch.minimum(ratio * b.advantages, clipped * b.advantages)
+        surrogate = -earned.sum()
+        value_loss = (weight * (values - b.targets).square()).sum()
+        entropy = (weight * gaussian_entropy(log_std)).sum()
+        rest = cfg.value_loss_weight * value_loss - cfg.entropy_weight * entropy
+
+        with torch.no_grad():
+            kl = (weight * gaussian_kl(b.old_means, actor.log_std_of(b.obs, old_log_std), mean, log_std)).sum()
+            outside = (weight * ((ratio - 1.0).abs() > cfg.clip)).sum()
+        numbers = [surrogate.detach(), value_loss.detach(), kl, outside]
+
+        self.adams.zero_grad()
+        if cfg.gradient_surgery == "pcgrad":
+            numbers.append(self._operate(-earned, b.task_id))
+            rest.backward()
+        else:
+            (surrogate + rest).backward()
+        return sum_gradients([*actor.parameters(), *self.critic.parameters()], torch.stack(numbers))
+
+    def _operate(self, losses: Tensor, task_id: Tensor) -> Tensor:
+        """Puts the actor's gradient of the summed ``losses`` (B,), after surgery between tasks, into its parameters.
+
+        Returns:
+            The share of pairs of tasks in conflict, divided by the processes that will sum it.
+        """
+        weights = list(self.policy.actor.parameters())
+        per_task = losses.new_zeros(self.world.num_tasks).index_add(0, task_id, losses)
+        gradient, apart = project_conflicting(all_sum(per_task_gradients(per_task, weights)))
+        for parameter, part in zip(weights, gradient.split([p.numel() for p in weights]), strict=True):
+            # All processes have the whole of it, and sum it.
+            parameter.grad = part.view_as(parameter) / world_size()
+        return apart / world_size()
+
+    # Checkpoints.
+
+    def _optimiser_state(self) -> dict[str, Any]:
+        return self.adams.state_dict()
+
+    def _load_optimisers(self, state: dict[str, Any]) -> None:
+        self.adams.load_state_dict(state)

@@ -1,0 +1,186 @@
+"""Several runs beside each other: groups that differ in nothing but the seed, with intervals over seeds."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.statistics import Interval, bootstrap_interval
+from bidex_meta.record.folder import RunFolder
+from bidex_meta.record.metrics import read_metrics, training_seconds
+
+
+@dataclass(frozen=True)
+class Group:
+    """Runs that differ in nothing but the seed; single-task runs of several classes are one group."""
+
+    label: str
+    """The algo, and what tells the group from others of that algo."""
+    seeds: list[int]
+    """In rising order; rows of the arrays below."""
+    classes: list[str]
+    """Columns of the arrays below."""
+    success: np.ndarray
+    """Success rate, (seeds, classes)."""
+    returns: np.ndarray
+    """Mean return, (seeds, classes)."""
+    scores: np.ndarray | None
+    """Normalised score, (seeds, classes); None where a class has no reference."""
+    steps: int
+    """Environment steps of a seed, over all its runs."""
+    hours: float
+    """Mean time of a seed's training, over all its runs, without evaluation."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its uncertainty over seeds."""
+
+    value: float
+    """The number."""
+    interval: Interval | None
+    """95 % bootstrap interval, seeds resampled; None with a single one."""
+
+
+def read_groups(folders: Sequence[RunFolder]) -> list[Group]:
+    """Runs, with their ``evaluation.json``, by group, in the order they are named.
+
+    Raises:
+        BidexError: A run is not evaluated, two are the same, or a group's seeds do not cover the same classes.
+    """
+    runs = [_read(folder) for folder in folders]
+    kinds: dict[str, list[dict[str, Any]]] = {}
+    for run in runs:
+        kinds.setdefault(json.dumps(run["kind"], sort_keys=True), []).append(run)
+    differing = _differing([members[0]["kind"] for members in kinds.values()])
+    return [_group(members, differing) for members in kinds.values()]
+
+
+def iqm(values: np.ndarray) -> Estimate:
+    """Interquartile mean over seeds and classes (seeds, classes), and its interval over seeds."""
+    return Estimate(_iqm(values), _interval(lambda rows: _iqm(values[rows]), len(values)))
+
+
+def iqm_difference(a: np.ndarray, b: np.ndarray) -> Estimate:
+    """Interquartile mean of ``a`` minus that of ``b``, each (seeds, classes), seeds of both resampled."""
+    value = _iqm(a) - _iqm(b)
+    if min(len(a), len(b)) < 2:
+        return Estimate(value, None)
+    interval = bootstrap_interval(
+        lambda i, j, axis: _along(i, j, lambda p, q: _iqm(a[p]) - _iqm(b[q])), np.arange(len(a)), np.arange(len(b))
+    )
+    return Estimate(value, interval)
+
+
+def _iqm(values: np.ndarray) -> float:
+    from scipy.stats import trim_mean
+
+    return float(trim_mean(values.ravel(), 0.25))
+
+
+def _interval(statistic: Any, seeds: int) -> Interval | None:
+    """All classes of a seed are resampled together: they come from one run."""
+    return bootstrap_interval(lambda rows, axis: _along(rows, rows, lambda p, _: statistic(p)), np.arange(seeds))
+
+
+def _along(i: np.ndarray, j: np.ndarray, statistic: Any) -> Any:
+    """``statistic`` of the last axes of two arrays of resampled rows (..., seeds)."""
+    if i.ndim == 1:
+        return statistic(i.astype(int), j.astype(int))
+    return np.array([statistic(p.astype(int), q.astype(int)) for p, q in zip(i, j, strict=True)])
+
+
+def _read(folder: RunFolder) -> dict[str, Any]:
+    path = folder.path / "evaluation.json"
+    if not path.is_file():
+        raise BidexError(
+            f"{folder.path} has no evaluation.json. Let the run end, or write one: bidex-meta evaluate {folder.path} "
+            f"--json > {path}"
+        )
+    config = folder.config()
+    try:
+        found = json.loads(path.read_text())
+    except json.JSONDecodeError as error:
+        raise BidexError(
+            f"{path} is not JSON ({error}). Write it anew: bidex-meta evaluate {folder.path} --json."
+        ) from None
+    minutes, rows = config.get("minutes"), read_metrics(folder.metrics_path)
+    # Where time ends a run, its last line tells how far it came.
+    goal = config["steps"] if minutes is None else max((row["step"] for row in rows), default=0)
+    steps = found.get("steps", goal)
+    if steps < goal:
+        raise BidexError(
+            f"{path} is of {steps:,} steps, but the run goes on to {goal:,}. Let it end, or write "
+            f"it anew: bidex-meta evaluate {folder.path} --json > {path}"
+        )
+    subject = config["suite"] or "one class at a time"
+    kind = {"algo": config["algo"], "on": subject, "steps": config["steps"], "num_envs": config["num_envs"]}
+    kind["minutes"] = minutes
+    kind["split"] = found.get("split", "train")
+    kind["started"] = "afresh" if config.get("start_from") is None else "from another run"  # which: one for each seed
+    return {
+        "path": folder.path,
+        "kind": kind | {f"learner.{name}": value for name, value in config["learner"].items()},
+        "seed": config["seed"],
+        "classes": _classes(found),
+        "seconds": training_seconds(rows),
+        "steps": goal,
+    }
+
+
+def _classes(found: dict[str, Any]) -> dict[str, Any]:
+    """Of a meta-test the classes after adaptation, train and test apart: ML1's splits hold the same class."""
+    if "splits" in found:
+        parts = found["splits"].items()
+        return {f"{name} ({split})": row for split, part in parts for name, row in part["after"]["classes"].items()}
+    return found.get("policy", found)["classes"]
+
+
+def _differing(kinds: list[dict[str, Any]]) -> dict[str, set[str]]:
+    """For each algo the entries in which its groups differ."""
+    found: dict[str, set[str]] = {}
+    for kind in kinds:
+        same = [other for other in kinds if other["algo"] == kind["algo"]]
+        found[kind["algo"]] = {
+            name for other in same for name in kind.keys() | other.keys() if kind.get(name) != other.get(name)
+        }
+    return found
+
+
+def _group(members: list[dict[str, Any]], differing: dict[str, set[str]]) -> Group:
+    kind = members[0]["kind"]
+    told = [f"{name.removeprefix('learner.')} {kind.get(name)}" for name in sorted(differing[kind["algo"]])]
+    label = ", ".join([kind["algo"], *told])
+    rows: dict[int, dict[str, Any]] = {}
+    for run in members:
+        row = rows.setdefault(run["seed"], {"classes": {}, "seconds": 0.0, "steps": 0})
+        twice = row["classes"].keys() & run["classes"].keys()
+        if twice:
+            raise BidexError(f"{run['path']} is the second run of {label} with seed {run['seed']} on {min(twice)}.")
+        row["classes"] |= run["classes"]
+        row["seconds"], row["steps"] = row["seconds"] + run["seconds"], row["steps"] + run["steps"]
+    seeds, classes = sorted(rows), list(rows[members[0]["seed"]]["classes"])
+    for seed in seeds:
+        if set(rows[seed]["classes"]) != set(classes):
+            raise BidexError(
+                f"Expected the same classes from every seed of {label}, but seed {seeds[0]} has {', '.join(classes)} "
+                f"and seed {seed} {', '.join(rows[seed]['classes'])}. Leave out what is not complete."
+            )
+
+    def table(name: str) -> np.ndarray:
+        return np.array([[rows[seed]["classes"][c][name] for c in classes] for seed in seeds], dtype=float)
+
+    scores = table("score")
+    return Group(
+        label=label,
+        seeds=seeds,
+        classes=classes,
+        success=table("success"),
+        returns=table("return"),
+        scores=None if np.isnan(scores).any() else scores,
+        steps=rows[seeds[0]]["steps"],
+        hours=float(np.mean([rows[seed]["seconds"] for seed in seeds])) / 3600.0,
+    )

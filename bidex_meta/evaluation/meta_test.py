@@ -1,0 +1,249 @@
+"""The meta-test: what does adaptation gain, from the meta-learned parameters, after 0, 1, ..., K shots?
+
+The protocol. From what was meta-learned (``agent.init()``) the agent is evaluated as by ``bidex_meta.evaluation.play``;
+then, ``shots`` times, it plays ``rollouts`` whole exploring episodes of each task, adapts, and is evaluated again.
+Every evaluation plays the same episodes (tasks and starts): what differs between two shots is the policy alone, and an
+agent that does not change gains exactly 0. Starts of adaptation are others than those of evaluation, and others in each
+shot.
+
+Every (class, task) is played equally often, however early its episodes end. Meta-World's ``metalearning_evaluation``
+takes the first episodes that finish of each class instead, of which the easy tasks' are most.
+"""
+
+import hashlib
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bidex_meta.agents import Agent, MetaLearningAgent, Timestep
+from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.gains import Gains, paired_gains
+from bidex_meta.evaluation.play import EVALUATION_SEED, check_world, play_tasks, quota
+from bidex_meta.evaluation.portions import Portions, task_of_row
+from bidex_meta.evaluation.results import Evaluation, results_by_class
+from bidex_meta.evaluation.scores import Reference
+
+MAX_ADAPT_STEPS = 150
+"""Steps after which an episode is long enough to adapt to, where nobody says otherwise."""
+
+_ADAPTS = ("init", "adapt_action", "step", "adapt")
+
+
+@dataclass(frozen=True)
+class MetaEvaluation:
+    """What ``meta_evaluate`` found."""
+
+    by_shot: list[Evaluation]
+    """After 0, 1, ..., K shots (or those of them that were asked for): the same episodes in the same order."""
+    adaptations: dict[str, np.ndarray]
+    """Per class which adaptation (a trial of a task) each of its episodes followed, ``(episodes,)``, numbers from 0."""
+    rollouts: int
+    """Episodes of each task that a shot adapted to."""
+    trials: int
+    """Adaptations of each task, each from the start."""
+    max_adapt_steps: int
+    """Longest episode of adaptation."""
+    adapt_steps: list[int]
+    """Transitions that each shot adapted to, over all tasks."""
+    split: str = ""
+    """Which tasks these are, in the caller's word."""
+
+    @property
+    def before(self) -> Evaluation:
+        """Without adaptation (or what was asked for first)."""
+        return self.by_shot[0]
+
+    @property
+    def after(self) -> Evaluation:
+        """After all shots."""
+        return self.by_shot[-1]
+
+    def gains(self, shot: int = -1) -> Gains:
+        """What the evaluation after some shot is above that without adaptation; the last shot by default."""
+        return paired_gains(self.by_shot[shot], self.before, self.adaptations)
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything but the single episodes, ready for JSON."""
+        by_shot = [found.to_json() for found in self.by_shot]
+        return {
+            "split": self.split,
+            "shots": len(self.adapt_steps),
+            "rollouts": self.rollouts,
+            "trials": self.trials,
+            "max_adapt_steps": self.max_adapt_steps,
+            "adapt_steps": self.adapt_steps,
+            "before": by_shot[0],
+            "after": by_shot[-1],
+            "gain": self.gains().to_json(),
+            "by_shot": by_shot,
+        }
+
+
+def meta_evaluate(
+    agent: Agent,
+    world: Any,
+    shots: int = 1,
+    *,
+    rollouts: int | None = None,
+    episodes_per_task: int = 4,
+    tasks: int | None = None,
+    trials: int = 1,
+    max_adapt_steps: int = MAX_ADAPT_STEPS,
+    seed: int = EVALUATION_SEED,
+    references: Mapping[str, Reference] | None = None,
+    adapt_world: Any = None,
+    evaluated: Collection[int] | None = None,
+    split: str = "",
+) -> MetaEvaluation:
+    """Evaluate an agent before and after adaptation to each task of a world.
+
+    Rows that play the same task share one adaptation. Where the world has fewer rows than tasks times ``rollouts``, its
+    pools of tasks are played in portions (``world.set_tasks``), or a shot takes several rounds; memory is that of the
+    world and of what the agent keeps of a shot. The world must be reset afterwards.
+
+    To tell adaptation to a task from mere further training, let it adapt to data of another one: ``adapt_world`` has
+    the same rows and as many tasks in each pool, e.g. for the held-out task of ML1 and the data of its first train task
+
+        test, other = ml1.make_world("test", 40, autoreset_mode="DISABLED"), ml1.make_world(...)  # alike
+        other.set_tasks({"CatchUnderarm": ml1.train_tasks[0].variation[None]})
+        own, foreign = (meta_evaluate(agent, test, 1, adapt_world=w, seed=7) for w in (None, other))
+
+    All starts, of evaluation and adaptation, are then the same in both arms.
+
+    Args:
+        agent: A MetaLearningAgent; any Agent if ``shots`` is 0. Its ``assign``, if it has one, is told the tasks.
+        world: A world in autoreset mode DISABLED whose rows keep their tasks.
+        shots: How often it adapts, one after the other.
+        rollouts: Episodes of each task in a shot; None: one in each row that plays it.
+        episodes_per_task: Evaluation episodes of each task, after each trial.
+        tasks: Only the first so many of each pool; None takes all.
+        trials: How often each task is adapted to, from the start and with other episodes.
+        max_adapt_steps: Episodes of adaptation are cut (``truncated``) after so many steps.
+        seed: Of all starts; without adaptation, and with all tasks in the world at once, those of ``evaluate``.
+        references: Per class name, what the normalised score and broken episodes are measured against.
+        adapt_world: Where episodes of adaptation are played, if not on ``world``.
+        evaluated: After how many shots to evaluate (0: before all); None: always.
+        split: Kept in the result.
+
+    Raises:
+        BidexError: A number out of range, a world that cannot be used, or an agent that cannot adapt.
+    """
+    _check(agent, world, adapt_world, shots, episodes_per_task, max_adapt_steps)
+    kept = [shot for shot in range(shots + 1) if evaluated is None or shot in evaluated]
+    if not kept:
+        raise BidexError(f"Expected evaluated to hold a number from 0 to {shots} shots, got {evaluated}.")
+    portions = Portions(world, rollouts, tasks, trials)
+    field = world if adapt_world is None else adapt_world
+    found: dict[int, list[dict[str, np.ndarray]]] = {shot: [] for shot in kept}
+    adapt_steps = [0] * shots
+    with portions.applied_to([world] if adapt_world is None else [world, adapt_world]) as numbered:
+        for number in numbered:
+            learner = _begin(agent, world, field)
+            for shot in range(shots + 1):
+                if shot > 0:
+                    starts = _seed(seed, "adaptation", number, shot)
+                    adapt_steps[shot - 1] += _adapt(learner, field, portions.rollouts, max_adapt_steps, starts)
+                if shot in found:
+                    starts = seed if number == 0 else _seed(seed, "evaluation", number)
+                    played = play_tasks(agent, world, episodes_per_task, starts)
+                    found[shot].append(portions.labelled(played, number))
+    joined = [{key: np.concatenate([part[key] for part in parts]) for key in parts[0]} for parts in found.values()]
+    by_class = [results_by_class(world.task_names, episodes, references, joined) for episodes in joined]
+    first = joined[0]
+    return MetaEvaluation(
+        by_shot=[Evaluation(classes, episodes_per_task) for classes in by_class],
+        adaptations={name: first["adaptation"][first["slot"] == i] for i, name in enumerate(world.task_names)},
+        rollouts=portions.rollouts,
+        trials=trials,
+        max_adapt_steps=max_adapt_steps,
+        adapt_steps=adapt_steps,
+        split=split,
+    )
+
+
+def _seed(seed: int, *key: object) -> int:
+    """Another seed for each key, so that no two of them, nor those of a neighbouring seed, share their starts."""
+    digest = hashlib.sha256("/".join(map(str, ("meta-test", seed, *key))).encode()).digest()
+    return int.from_bytes(digest[:4], "little")
+
+
+def _begin(agent: Agent, world: Any, field: Any) -> MetaLearningAgent:
+    """The agent as it was meta-learned, told which rows share a task."""
+    shared = task_of_row(world)
+    if not torch.equal(shared, task_of_row(field)):
+        raise BidexError(
+            "Expected adapt_world to have as many rows and tasks of each class as world, so that each task has data to "
+            "adapt to; they differ. Give both the same num_envs and pools of one length (set_tasks)."
+        )
+    learner = cast(MetaLearningAgent, agent)
+    for method, arguments in (("assign", (shared,)), ("init", ())):
+        if hasattr(agent, method):  # a plain agent has neither, one written for Meta-World no assign
+            getattr(agent, method)(*arguments)
+    return learner
+
+
+def _adapt(agent: MetaLearningAgent, world: Any, rollouts: int, max_steps: int, seed: int) -> int:
+    """One shot: ``rollouts`` exploring episodes of each task, then ``adapt``.
+
+    Returns:
+        Transitions that were valid.
+    """
+    obs, _ = world.reset(seed=seed)
+    remaining, first, steps = quota(world, rollouts), True, 0
+    while bool((playing := remaining > 0).any()):
+        if not first:
+            obs, _ = world.reset(options={"reset_mask": playing})
+        agent.reset(playing)
+        steps += _explore(agent, world, obs, playing, max_steps)
+        remaining, first = remaining - playing.long(), False
+    with torch.enable_grad():  # whatever the caller is in: to adapt is to learn
+        agent.adapt()
+    return steps
+
+
+@torch.no_grad()
+def _explore(agent: MetaLearningAgent, world: Any, obs: Tensor, playing: Tensor, max_steps: int) -> int:
+    """One exploring episode in each row of ``playing``, told to the agent; its valid transitions, over all rows."""
+    limit = world.max_episode_steps.clamp(max=max_steps)
+    running, steps = playing.clone(), torch.zeros((), dtype=torch.int64, device=playing.device)
+    for step in range(1, int(limit[playing].max()) + 1):
+        action, outputs = agent.adapt_action(obs)
+        action = torch.as_tensor(action, device=obs.device)
+        new, reward, terminated, truncated, info = world.step(action)
+        valid = running & ~info.get("unstable", torch.zeros_like(running))
+        # The world goes on with rows that were cut here; nobody looks at them until their next reset.
+        truncated = truncated | ((limit <= step) & ~terminated)
+        agent.step(Timestep(obs, action, reward, terminated, truncated, outputs, new, valid))
+        steps += valid.sum()
+        running = running & ~(terminated | truncated)
+        obs = new
+        if not bool(running.any()):
+            break
+    return int(steps)
+
+
+def _check(agent: Any, world: Any, adapt_world: Any, shots: int, episodes_per_task: int, max_steps: int) -> None:
+    if shots < 0:
+        raise BidexError(f"Shots must be 0 or more, not {shots}.")
+    if max_steps < 1:
+        raise BidexError(f"Steps of an episode of adaptation must be at least 1, not {max_steps}.")
+    lacking = [name for name in _ADAPTS if not callable(getattr(agent, name, None))]
+    if shots and lacking:
+        raise BidexError(
+            f"Expected an agent that adapts (bidex_meta.agents.MetaLearningAgent), but {type(agent).__name__} has no "
+            f"{', '.join(lacking)}. Give such an agent, or shots=0."
+        )
+    for each in [world] if adapt_world is None else [world, adapt_world]:
+        check_world(each, episodes_per_task)
+    if adapt_world is not None:
+        sizes = [
+            (w.num_envs, w.single_observation_space.shape, w.single_action_space.shape) for w in (world, adapt_world)
+        ]
+        if sizes[0] != sizes[1]:
+            raise BidexError(
+                f"Expected adapt_world with rows, observations and actions as world's, {sizes[0]}, got {sizes[1]}."
+            )

@@ -1,0 +1,131 @@
+"""How good is a policy: success and return per class, over a fixed number of episodes of every task.
+
+The protocol: the world keeps each row on one task of its slot and does not reset by itself (autoreset DISABLED). Every
+task is played ``episodes_per_task`` times, whole episodes, by the mean action; a task that ends early is not played
+more often, so easy tasks cannot crowd out hard ones. An episode is a success if ``info["success"]`` was true at any
+step; its return is the sum of the unscaled reward. An episode in which the physics broke is no success and counts with
+the return of random actions, or its own if that is lower (``bidex_meta.evaluation.scores``).
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+from bidex_meta.agents import Agent
+from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.results import Evaluation, results_by_class
+from bidex_meta.evaluation.scores import Reference
+
+EVALUATION_SEED = 1_000_000
+"""Seed of the starts in evaluation: not a seed anybody trains with, so that they are new to the policy."""
+
+
+def evaluate(
+    agent: Agent,
+    world: Any,
+    episodes_per_task: int = 4,
+    *,
+    seed: int | None = None,
+    references: Mapping[str, Reference] | None = None,
+) -> Evaluation:
+    """Play every task of ``world`` ``episodes_per_task`` times and report per class.
+
+    Args:
+        agent: The policy.
+        world: A world in autoreset mode DISABLED with at least one row for each task. Rows that share a task share
+            its episodes.
+        episodes_per_task: Episodes of each task.
+        seed: Passed to the world's reset; None keeps the world's own.
+        references: Per class name, what the normalised score and broken episodes are measured against.
+
+    Raises:
+        BidexError: The world resets by itself, lacks rows, or ``episodes_per_task`` is not positive.
+    """
+    check_world(world, episodes_per_task)
+    episodes = play_tasks(agent, world, episodes_per_task, seed)
+    return Evaluation(results_by_class(world.task_names, episodes, references), episodes_per_task)
+
+
+def play_tasks(agent: Agent, world: Any, episodes_per_task: int, seed: int | None) -> dict[str, np.ndarray]:
+    """``episodes_per_task`` episodes of every task, as ``evaluate`` plays them.
+
+    Returns:
+        Arrays ``(episodes,)``: ``slot``, ``task`` (index in the slot's pool), ``return``, ``success``, ``length``,
+        ``unstable``. The same world and seed give the same slots, tasks and starts in the same order.
+    """
+    obs, _ = world.reset(seed=seed)
+    tasks = world.task_index.clone()
+    remaining = quota(world, episodes_per_task)
+    rounds: list[dict[str, torch.Tensor]] = []
+    while bool((playing := remaining > 0).any()):
+        if rounds:
+            obs, _ = world.reset(options={"reset_mask": playing})
+        agent.reset(playing)
+        rounds.append({"row": torch.nonzero(playing).squeeze(1), **_play(agent, world, obs, playing)})
+        remaining -= playing.long()
+    episodes = {key: torch.cat([played[key] for played in rounds]).cpu().numpy() for key in rounds[0]}
+    row = episodes.pop("row")
+    return {"slot": world.task_id.cpu().numpy()[row], "task": tasks.cpu().numpy()[row], **episodes}
+
+
+def check_world(world: Any, episodes_per_task: int) -> None:
+    """Refuse what cannot be evaluated on.
+
+    Raises:
+        BidexError: The world resets by itself or its names are not unique, or ``episodes_per_task`` is not positive.
+    """
+    if episodes_per_task < 1:
+        raise BidexError(f"Episodes per task must be at least 1, not {episodes_per_task}.")
+    mode = str(getattr(world.metadata["autoreset_mode"], "name", world.metadata["autoreset_mode"])).upper()
+    if mode != "DISABLED":
+        raise BidexError(f"Evaluation needs a world in autoreset mode DISABLED, but this one is in {mode}.")
+    if len(set(world.task_names)) != len(world.task_names):
+        raise BidexError(f"Results are kept by name, but the world's names are not unique: {world.task_names}.")
+
+
+def quota(world: Any, episodes_per_task: int) -> torch.Tensor:
+    """Episodes each row has to play, ``(num_envs,)``: those of a task are split over the rows that play it.
+
+    Raises:
+        BidexError: A task has no row.
+    """
+    tasks = world.task_index
+    shares = torch.zeros_like(tasks)
+    for slot, name in enumerate(world.task_names):
+        for task in range(world.num_slot_tasks[slot]):
+            rows = torch.nonzero((world.task_id == slot) & (tasks == task)).squeeze(1)
+            if len(rows) == 0:
+                needed = max(world.num_slot_tasks) * world.num_tasks
+                raise BidexError(
+                    f"No row plays task {task} of {name}: {world.num_envs} rows are too few for "
+                    f"{sum(world.num_slot_tasks)} tasks. Use num_envs={needed}, or several times that."
+                )
+            share, extra = divmod(episodes_per_task, len(rows))
+            shares[rows] = share
+            shares[rows[:extra]] += 1
+    return shares
+
+
+@torch.no_grad()
+def _play(agent: Agent, world: Any, obs: torch.Tensor, playing: torch.Tensor) -> dict[str, torch.Tensor]:
+    """One episode in each row of ``playing``; its return, success, length, unstable, each ``(rows that played,)``."""
+    running = playing.clone()
+    returns = torch.zeros(world.num_envs, dtype=torch.float64, device=running.device)
+    lengths = torch.zeros(world.num_envs, dtype=torch.int64, device=running.device)
+    success, unstable = torch.zeros_like(running), torch.zeros_like(running)
+    for _ in range(int(world.max_episode_steps.max())):
+        obs, reward, terminated, truncated, info = world.step(agent.eval_action(obs))
+        gained = info.get("reward_unscaled", reward).double()
+        returns += torch.where(running, gained, torch.zeros_like(gained))
+        lengths += running
+        success |= running & info["success"]
+        unstable |= running & info.get("unstable", torch.zeros_like(running))
+        running &= ~(terminated | truncated)
+        if not bool(running.any()):
+            break
+    else:
+        raise RuntimeError(f"{int(running.sum())} rows did not end within their time limit; the world is at fault.")
+    played = {"return": returns, "success": success, "length": lengths, "unstable": unstable}
+    return {key: value[playing] for key, value in played.items()}

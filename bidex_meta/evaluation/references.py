@@ -1,0 +1,59 @@
+"""The two ends of the normalised score: per class what a policy that has learned nothing gets, and the best known one.
+
+They hold for classes with moving bases, as every suite has them. Files under ``assets/references/``: ``random.json``
+and ``zero.json``, the returns of random actions and of doing nothing, the better of which is the score's zero, and
+``expert.json``; ``bidex-meta baseline`` measures all three.
+"""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+from bidex_meta import paths
+from bidex_meta.evaluation.scores import Reference
+from bidex_meta.record.atomic import write_json
+
+Kind = Literal["random", "zero", "expert"]
+
+
+def reference_path(kind: Kind) -> Path:
+    """Where the references of a kind lie."""
+    return paths.assets_dir() / "references" / f"{kind}.json"
+
+
+def load(kind: Kind) -> dict[str, dict[str, Any]]:
+    """What is known of each class by its name, e.g. ``{"return": 0.49, "source": ...}``; empty without a file."""
+    path = reference_path(kind)
+    return json.loads(path.read_text())["classes"] if path.is_file() else {}
+
+
+def store(kind: Kind, classes: dict[str, dict[str, Any]], made: dict[str, Any], path: Path | None = None) -> Path:
+    """Writes references: those of other classes stay.
+
+    Args:
+        kind: Which end.
+        classes: Per class ``return`` and whatever else was measured.
+        made: How they were measured; kept with each of these classes.
+        path: The file; the installation's own by default.
+    """
+    path = path or reference_path(kind)
+    known = json.loads(path.read_text())["classes"] if path.is_file() else {}
+    known |= {name: {**numbers, "made": made} for name, numbers in classes.items()}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, {"classes": dict(sorted(known.items()))})
+    return path
+
+
+def references() -> dict[str, Reference]:
+    """What is known of every class whose return of random actions is known.
+
+    An expert that is not above random and zero actions is left out: a score would mean nothing.
+    """
+    kinds: tuple[Kind, ...] = ("random", "zero", "expert")
+    random, zero, expert = ({name: row["return"] for name, row in load(kind).items()} for kind in kinds)
+    found = {}
+    for name in random:
+        known = Reference(random[name], expert.get(name), zero.get(name))
+        found[name] = known if known.expert is not None and known.expert > known.floor else replace(known, expert=None)
+    return found

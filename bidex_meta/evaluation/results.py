@@ -1,0 +1,172 @@
+"""What an evaluation found: per class the episodes, and numbers made of them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bidex_meta.evaluation.scores import Reference, counted_returns
+from bidex_meta.evaluation.statistics import Interval, aggregate, bootstrap_interval, mean, mean_difference
+
+MANY_TASKS = 10
+"""From so many tasks on, intervals resample tasks instead of episodes."""
+
+
+@dataclass(frozen=True)
+class ClassResult:
+    """The episodes of one class; arrays of shape ``(episodes,)``, in the order they were played."""
+
+    returns: np.ndarray
+    """Sum of the unscaled reward, float64; of broken episodes what they count with."""
+    successes: np.ndarray
+    """Success at any step, float64 0 or 1; 0 of broken episodes."""
+    lengths: np.ndarray
+    """Steps, int64."""
+    tasks: np.ndarray
+    """Index of the played task in the class's pool, int64."""
+    unstable: int
+    """Episodes that ended because the physics broke."""
+    reference: Reference | None = None
+    """What the normalised score and broken episodes are measured against, where it is known."""
+
+    @property
+    def episodes(self) -> int:
+        """How many episodes were played."""
+        return len(self.returns)
+
+    @property
+    def success(self) -> float:
+        """Success rate in [0, 1]."""
+        return float(self.successes.mean())
+
+    @property
+    def mean_return(self) -> float:
+        """Mean return."""
+        return float(self.returns.mean())
+
+    @property
+    def score(self) -> float | None:
+        """100 · (R − R_floor) / (R_expert − R_floor), the floor the better of random and zero actions.
+
+        None where a reference is missing.
+        """
+        scores = self.scores
+        return None if scores is None else float(scores.mean())
+
+    @property
+    def scores(self) -> np.ndarray | None:
+        """The normalised score of every episode, ``(episodes,)``."""
+        return None if self.reference is None else self.reference.scores(self.returns)
+
+    def drawn(self, values: np.ndarray) -> np.ndarray:
+        """``values`` (episodes,) as a bootstrap may resample them: means of tasks; of few tasks as they are.
+
+        Episodes of a task are alike; where a class draws no starts (doors, Switch) a policy's are all the same, and
+        counted singly they would feign precision.
+        """
+        names, task = np.unique(self.tasks, return_inverse=True)
+        return values if len(names) < MANY_TASKS else np.bincount(task, values) / np.bincount(task)
+
+    def to_json(self) -> dict[str, Any]:
+        """Numbers of this class, ready for JSON."""
+        return {
+            "success": self.success,
+            "success_interval": bootstrap_interval(mean, self.drawn(self.successes)),
+            "return": self.mean_return,
+            "return_interval": bootstrap_interval(mean, self.drawn(self.returns)),
+            "length": float(self.lengths.mean()),
+            "score": self.score,
+            "episodes": self.episodes,
+            "tasks": len(np.unique(self.tasks)),
+            "unstable": self.unstable,
+        }
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What ``evaluate`` found."""
+
+    classes: dict[str, ClassResult]
+    """Per class, by name, in the world's order of slots."""
+    episodes_per_task: int
+    """Episodes of every task."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything but the single episodes, ready for JSON."""
+        return {
+            "episodes_per_task": self.episodes_per_task,
+            "classes": {name: result.to_json() for name, result in self.classes.items()},
+            "aggregate": {
+                "success": aggregate([result.drawn(result.successes) for result in self.classes.values()]),
+                "score": aggregate([_drawn_scores(result) for result in self.classes.values()]),
+            },
+        }
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Mean return of one policy above another's, in one class."""
+
+    value: float
+    """Difference of the means."""
+    interval: Interval | None
+    """95 % bootstrap interval, both policies' tasks (of few tasks: episodes) resampled; None with fewer than two."""
+
+    @property
+    def excludes_zero(self) -> bool:
+        """Whether the interval lies on one side of zero."""
+        return self.interval is not None and (self.interval[0] > 0 or self.interval[1] < 0)
+
+
+def results_by_class(
+    names: Sequence[str],
+    episodes: dict[str, np.ndarray],
+    references: Mapping[str, Reference] | None = None,
+    compared: Sequence[dict[str, np.ndarray]] = (),
+) -> dict[str, ClassResult]:
+    """Episodes by the names of their slots, broken ones as they count.
+
+    Args:
+        names: Of the slots.
+        episodes: As ``play_tasks`` gives them.
+        references: By name.
+        compared: Episodes of the policies that this one is compared with: where there is no reference, a broken episode
+            counts with the worst finished one of all of them.
+    """
+    classes = {}
+    for slot, name in enumerate(names):
+        own = {key: values[episodes["slot"] == slot] for key, values in episodes.items()}
+        finished = [
+            each["return"][(each["slot"] == slot) & ~each["unstable"].astype(bool)] for each in (episodes, *compared)
+        ]
+        broken, reference = own["unstable"].astype(bool), (references or {}).get(name)
+        classes[name] = ClassResult(
+            returns=counted_returns(own["return"], broken, reference, np.concatenate(finished)),
+            successes=(own["success"] & ~broken).astype(np.float64),
+            lengths=own["length"],
+            tasks=own["task"],
+            unstable=int(broken.sum()),
+            reference=reference,
+        )
+    return classes
+
+
+def compare(a: Evaluation, b: Evaluation) -> dict[str, Difference]:
+    """Mean return of ``a`` minus that of ``b`` for every class both have, with a bootstrap interval.
+
+    Args:
+        a: For example the trained policy.
+        b: For example a random one, over the same tasks.
+    """
+    differences = {}
+    for name in (name for name in a.classes if name in b.classes):
+        ours, theirs = (result.drawn(result.returns) for result in (a.classes[name], b.classes[name]))
+        interval = bootstrap_interval(mean_difference, ours, theirs)
+        differences[name] = Difference(float(ours.mean() - theirs.mean()), interval)
+    return differences
+
+
+def _drawn_scores(result: ClassResult) -> np.ndarray | None:
+    scores = result.scores
+    return None if scores is None else result.drawn(scores)

@@ -1,0 +1,72 @@
+"""Means with bootstrap intervals."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+Interval = tuple[float, float]
+"""Lower and upper end of a 95 % bootstrap interval."""
+
+RESAMPLES = 2000
+BOOTSTRAP_SEED = 0
+
+
+def aggregate(samples: list[np.ndarray | None]) -> dict[str, Any] | None:
+    """Mean and interquartile mean over classes of the classes' means, the mean with a bootstrap interval.
+
+    Args:
+        samples: One array per class, of tasks or episodes (``ClassResult.drawn``); None in any of them gives None,
+            since a mean over some of the classes would pass for one over all.
+    """
+    known = [sample for sample in samples if sample is not None]
+    if not known or len(known) < len(samples):
+        return None
+    from scipy.stats import trim_mean
+
+    means = np.array([sample.mean() for sample in known])
+    return {
+        "mean": float(means.mean()),
+        "interval": bootstrap_interval(_mean_of_means, *known),
+        "iqm": float(trim_mean(means, 0.25)),
+    }
+
+
+def bootstrap_interval(statistic: Callable[..., Any], *samples: np.ndarray) -> Interval | None:
+    """The 95 % percentile bootstrap interval of ``statistic``, each sample resampled by itself.
+
+    Args:
+        statistic: Takes the samples and ``axis``, works along it.
+        samples: Arrays ``(tasks,)`` or ``(episodes,)``.
+
+    Returns:
+        Lower and upper end; None where a sample has fewer than two episodes. The same for the same input.
+    """
+    if min(len(sample) for sample in samples) < 2:
+        return None
+    from scipy.stats import bootstrap
+
+    result = bootstrap(
+        samples,
+        statistic,
+        n_resamples=RESAMPLES,
+        batch=200,  # bounds memory: all resamples at once would be 2000 times the episodes
+        vectorized=True,
+        method="percentile",
+        rng=np.random.default_rng(BOOTSTRAP_SEED),
+    )
+    return float(result.confidence_interval.low), float(result.confidence_interval.high)
+
+
+def mean(sample: np.ndarray, axis: int = -1) -> Any:
+    """The mean along ``axis``, as a statistic of ``bootstrap_interval``."""
+    return np.mean(sample, axis=axis)
+
+
+def mean_difference(a: np.ndarray, b: np.ndarray, axis: int = -1) -> Any:
+    """The mean of ``a`` minus that of ``b`` along ``axis``, likewise."""
+    return np.mean(a, axis=axis) - np.mean(b, axis=axis)
+
+
+def _mean_of_means(*samples: np.ndarray, axis: int = -1) -> Any:
+    return sum(np.mean(sample, axis=axis) for sample in samples) / len(samples)

@@ -1,0 +1,229 @@
+"""One run in several processes: what they sum, share and agree on. torchrun starts them, torch.distributed joins them.
+
+Each process steps a world of its own. In a process on its own every function here gives back what it was given, bit
+for bit, and nothing is sent.
+"""
+
+import atexit
+import hashlib
+import io
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from datetime import timedelta
+from typing import Any, TypeVar
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+from torch.distributed.rendezvous import rendezvous
+
+from bidex_meta.errors import BidexError
+from bidex_meta.train.attendance import Attendance, end_patiently
+
+# How long one process may wait for another. A dead one closes its sockets and is noticed at once; this is for a machine
+# that no longer answers, and must exceed what process 0 needs to write a checkpoint.
+TIMEOUT = timedelta(minutes=5)
+
+Value = TypeVar("Value")
+_attendance: Attendance | None = None
+
+
+class LostProcess(RuntimeError):
+    """A process of the run did not take part in a collective operation: it is dead, stuck or cut off."""
+
+
+def rank() -> int:
+    """Number of this process, from 0."""
+    return dist.get_rank() if _joined() else 0
+
+
+def world_size() -> int:
+    """Number of processes."""
+    return dist.get_world_size() if _joined() else 1
+
+
+def is_main() -> bool:
+    """Whether this is process 0, which alone writes and speaks."""
+    return rank() == 0
+
+
+def own_seed(seed: int) -> int:
+    """A seed for what shall differ between processes (starts, sampled actions): ``seed`` itself in process 0."""
+    if is_main():
+        return seed
+    # 32 bits: torch's CPU generator reads no more, so that seed + (rank << 32) would be the same in all processes.
+    return int.from_bytes(hashlib.sha256(f"{seed}/{rank()}".encode()).digest()[:4], "little")
+
+
+def init_from_environment() -> None:
+    """Joins the processes that torchrun announces in the environment; does nothing in a process on its own.
+
+    Tensors on the CPU travel by gloo, those on CUDA devices by NCCL.
+
+    Raises:
+        LostProcess: Some of them did not come.
+    """
+    global _attendance
+    if "MASTER_ADDR" not in os.environ or int(os.environ.get("WORLD_SIZE", "1")) == 1 or _joined():
+        return
+    end_patiently()
+    backend = "gloo"
+    if torch.cuda.is_available():
+        backend = "cpu:gloo,cuda:nccl"
+        torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count())
+    atexit.register(_leave)
+    with _collective():
+        store, number, count = next(rendezvous("env://", timeout=TIMEOUT))
+        dist.init_process_group(backend, store=store, rank=number, world_size=count, timeout=TIMEOUT)
+        _attendance = Attendance(store, number, count)
+
+
+def shut_down() -> None:
+    """Parts from the other processes once all have come here; each is on its own from then on."""
+    if _joined():
+        with _collective():
+            dist.barrier()
+        _end_threads()
+        dist.destroy_process_group()
+
+
+def _end_threads() -> None:
+    global _attendance
+    if _attendance is not None:
+        _attendance.close()
+        _attendance = None
+
+
+def _leave() -> None:
+    """Ends what still runs beside the main thread, in a process that ends without :func:`shut_down`.
+
+    A thread that asks for the interpreter when it has gone (the attendance, back from the store; gloo's own, dropping
+    its last tensor) is unwound through C++ that may not throw, and the whole process aborts: "terminate called without
+    an active exception".
+    """
+    _end_threads()
+    # With NCCL this might wait for a process that is lost.
+    if _joined() and not torch.cuda.is_available():
+        dist.destroy_process_group()
+
+
+def report_loss() -> list[int] | None:
+    """Which processes are missing, after a :class:`LostProcess`; None where another process says so."""
+    return [] if _attendance is None else _attendance.report()
+
+
+def on_loss(function: Callable[[], None]) -> None:
+    """Has ``function`` called before a process ends that cannot stop when asked, since it waits for a lost one."""
+    if _attendance is not None:
+        _attendance.on_loss = function
+
+
+def all_sum(x: Tensor) -> Tensor:
+    """Sum of ``x`` (any shape, the same in all processes) over the processes."""
+    if world_size() == 1:
+        return x
+    total = x.detach().clone()
+    with _collective():
+        dist.all_reduce(total)
+    return total
+
+
+def pool_moments(mean: Tensor, var: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean, biased variance and count of all processes' samples from those of each; three tensors of one shape."""
+    if world_size() == 1:
+        return mean, var, count
+    n, m, v = count.double(), mean.double(), var.double()
+    total, weighted = all_sum(torch.stack([n, n * m]))
+    pooled = weighted / total.clamp_min(1.0)
+    spread = all_sum(n * (v + (m - pooled).square())) / total.clamp_min(1.0)
+    return pooled.to(mean.dtype), spread.to(var.dtype), total.to(count.dtype)
+
+
+def sum_gradients(parameters: Sequence[nn.Parameter], numbers: Tensor) -> Tensor:
+    """Sums the gradients over the processes, in place, and returns the sum of ``numbers`` (n,), in one operation.
+
+    For the gradient of a mean over all samples, each process divides its loss by the samples of all.
+    """
+    if world_size() == 1:
+        return numbers
+    gradients = [p.grad for p in parameters if p.grad is not None]
+    flat = all_sum(torch.cat([g.flatten() for g in gradients] + [numbers]))
+    parts = flat.split([g.numel() for g in gradients] + [len(numbers)])
+    for gradient, part in zip(gradients, parts, strict=False):
+        gradient.copy_(part.view_as(gradient))
+    return parts[-1]
+
+
+@torch.no_grad()
+def broadcast(tensors: Iterable[Tensor]) -> None:
+    """Overwrites tensors with those of process 0."""
+    if world_size() > 1:
+        with _collective():
+            for tensor in tensors:
+                dist.broadcast(tensor.data, 0)
+
+
+def any_process(flag: bool) -> bool:
+    """Whether ``flag`` is true in at least one process."""
+    return bool(all_sum(torch.tensor(int(flag))) > 0)
+
+
+def share(value: Value) -> list[Value]:
+    """The values of all processes, in all processes: small ones, that pickle can copy."""
+    if world_size() == 1:
+        return [value]
+    values: list[Any] = [None] * world_size()
+    with _collective():
+        dist.all_gather_object(values, value)
+    return values
+
+
+def gather(state: dict[str, Any]) -> list[dict[str, Any]] | None:
+    """The states of all processes, in process 0, tensors on the CPU; None in the others."""
+    if world_size() == 1:
+        return [state]
+    data = io.BytesIO()
+    if not is_main():
+        torch.save(state, data)
+    found: list[Any] | None = [None] * world_size() if is_main() else None
+    with _collective():
+        dist.gather_object(data.getvalue(), found)
+    if found is None:
+        return None
+    return [state] + [torch.load(io.BytesIO(part), map_location="cpu", weights_only=True) for part in found[1:]]
+
+
+def together(function: Callable[[], Value]) -> Value:
+    """``function()``, where bad input in any process ends all of them and only the first of those concerned says so.
+
+    Raises:
+        BidexError: In the first process that met one.
+        SystemExit: In the others.
+    """
+    error, value = None, None
+    try:
+        value = function()
+    except BidexError as caught:
+        error = caught
+    failed = [i for i, met in enumerate(share(error is not None)) if met]
+    if error is not None and rank() == failed[0]:
+        raise error
+    if failed:
+        raise SystemExit(2)
+    return value  # type: ignore[return-value]
+
+
+def _joined() -> bool:
+    return dist.is_available() and dist.is_initialized()
+
+
+@contextmanager
+def _collective() -> Iterator[None]:
+    try:
+        yield
+    except RuntimeError as error:
+        # gloo says "[its/own/file.cc:1] Connection closed by peer [address]. What may be the cause. ..."
+        reason = re.sub(r"^\[[^]]*\] ", "", (str(error).splitlines() or [""])[0])
+        raise LostProcess(reason.split(". ")[0]) from error

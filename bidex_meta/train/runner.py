@@ -1,0 +1,194 @@
+"""The training loop every learner runs in: iterate, report, save; and stop cleanly when asked to.
+
+In a run of several processes (:mod:`bidex_meta.train.distributed`) all make the same iterations and stop together;
+process 0 writes for all.
+"""
+
+import math
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any, Protocol
+
+from bidex_meta.errors import BidexError
+from bidex_meta.train.distributed import any_process, gather, is_main, rank, world_size
+
+# The most of a run's time that may go into checkpoints.
+_SAVING_SHARE = 0.02
+
+
+class Resumable(Protocol):
+    """What the loop needs of a world: its state."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that is needed to continue bit for bit."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` gave."""
+        ...
+
+
+class Learner(Protocol):
+    """What the loop needs of a learner."""
+
+    @property
+    def env_steps(self) -> int:
+        """Environment steps taken so far, over all rows of all processes."""
+        ...
+
+    @property
+    def per_process(self) -> tuple[str, ...]:
+        """Entries of ``state_dict`` that differ from process to process; the others are the same in all."""
+        ...
+
+    def iterate(self) -> dict[str, float]:
+        """One rollout and one update; flat metrics."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that is needed to continue bit for bit, beside the world's own state."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` gave."""
+        ...
+
+
+class Record(Protocol):
+    """Where metrics and checkpoints go."""
+
+    def log(self, metrics: dict[str, float], step: int) -> None:
+        """Takes the metrics of one iteration that ended at environment step ``step``."""
+        ...
+
+    def save(self, state: dict[str, Any], step: int) -> None:
+        """Writes a checkpoint, atomically."""
+        ...
+
+
+def train(
+    learner: Learner,
+    world: Resumable,
+    *,
+    total_steps: int,
+    record: Record | None,
+    total_seconds: float = math.inf,
+    spent_seconds: float = 0.0,
+    checkpoint_seconds: float = 60.0,
+) -> bool:
+    """Trains until ``total_steps`` environment steps are done or ``total_seconds`` are up, whichever comes first.
+
+    Both count what a resumed run had done before. The time is that from the first world step to the end of an
+    iteration, checkpoints included: the iteration in which it is up is the last one, and there is at least one.
+    Metrics get it as ``Perf/training_time``.
+
+    SIGINT or SIGTERM, in any process, finishes the current iteration, saves and returns; a second one acts at once.
+
+    Args:
+        learner: The learner, already made on ``world``.
+        world: The world, whose state is saved beside the learner's.
+        total_steps: Environment steps in all.
+        record: Where metrics and checkpoints go; None in processes other than 0.
+        total_seconds: Training time in all.
+        spent_seconds: Training time of a resumed run before.
+        checkpoint_seconds: Least time between two checkpoints, and never less than 50 times what the last one took to
+            save: a replay makes them large. 0 saves after every iteration. One more is always saved at the end.
+
+    Returns:
+        True if a signal ended the training early.
+
+    Raises:
+        LostProcess: Another process is gone. What was saved stays as it is.
+    """
+    # Of several processes one may be lost at any time, and then nothing more can be saved: so the first iteration is.
+    saved_at = time.monotonic() if world_size() == 1 else -math.inf
+    saved_step, pause = learner.env_steps, checkpoint_seconds
+    began_at, stopped = time.monotonic() - spent_seconds, False
+
+    def over() -> bool:
+        if learner.env_steps == 0 or total_seconds == math.inf:
+            return learner.env_steps >= total_steps
+        # Clocks differ: process 0's decides.
+        late = any_process(is_main() and time.monotonic() - began_at >= total_seconds)
+        return late or learner.env_steps >= total_steps
+
+    with _stop_requests() as stop:
+        while not over() and not (stopped := any_process(stop.is_set())):
+            metrics = learner.iterate()
+            metrics["Perf/training_time"] = time.monotonic() - began_at
+            if record is not None:
+                record.log(metrics, learner.env_steps)
+            if any_process(is_main() and time.monotonic() - saved_at >= pause):
+                began = time.monotonic()
+                _save(learner, world, record)
+                saved_at, saved_step = time.monotonic(), learner.env_steps
+                if checkpoint_seconds > 0.0:
+                    pause = max(checkpoint_seconds, (saved_at - began) / _SAVING_SHARE)
+        if learner.env_steps != saved_step:
+            _save(learner, world, record)
+        return stopped
+
+
+def _save(learner: Learner, world: Resumable, record: Record | None) -> None:
+    state = checkpoint(learner, world)
+    if record is not None and state is not None:
+        record.save(state, learner.env_steps)
+
+
+def checkpoint(learner: Learner, world: Resumable) -> dict[str, Any] | None:
+    """The state of a run: ``{"learner": ..., "env": ...}``, tensors and plain values only.
+
+    Of several processes all must call it. Process 0 gets its own state with, under ``others``, what differs in each of
+    the others; they get None.
+    """
+    state = {"learner": learner.state_dict(), "env": world.state_dict()}
+    if world_size() == 1:
+        return state
+    own = {"learner": {name: state["learner"][name] for name in learner.per_process}, "env": state["env"]}
+    parts = gather(own)
+    return None if parts is None else {**state, "others": parts[1:]}
+
+
+def resume(learner: Learner, world: Resumable, state: dict[str, Any]) -> None:
+    """Restores what :func:`checkpoint` gave; training then continues bit for bit (CPU, same number of threads).
+
+    Raises:
+        BidexError: The checkpoint is of another number of processes.
+    """
+    parts = [state, *state.get("others", [])]
+    if len(parts) != world_size():
+        raise BidexError(f"The checkpoint is of {len(parts)} processes, but here are {world_size()}. Start as many.")
+    mine = parts[rank()]
+    world.load_state_dict(mine["env"])
+    learner.load_state_dict({**state["learner"], **mine["learner"]})
+
+
+@contextmanager
+def _stop_requests() -> Iterator[threading.Event]:
+    """Turns the first SIGINT or SIGTERM into a set event; puts the old handlers back then and on leaving."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        # Python lets only the main thread set handlers; elsewhere signals stay the caller's business.
+        yield stop
+        return
+    # None stands for a handler that was not set from Python and cannot be put back.
+    old = {number: signal.getsignal(number) or signal.SIG_DFL for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def restore() -> None:
+        for number, handler in old.items():
+            signal.signal(number, handler)
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        stop.set()
+        restore()
+
+    for number in old:
+        signal.signal(number, on_signal)
+    try:
+        yield stop
+    finally:
+        restore()

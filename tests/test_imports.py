@@ -1,0 +1,133 @@
+"""Imports run one way: each room only from rooms above it in ``ORDER``; read from the source, lazy imports too."""
+
+import ast
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+import bidex_algos
+import bidex_meta
+
+PACKAGES = {package.__name__: Path(next(iter(package.__path__))) for package in (bidex_meta, bidex_algos)}
+
+ORDER = (
+    ("errors",),
+    ("paths", "maths", "agents"),
+    ("engine", "record", "hands", "suite"),
+    ("tasks",),
+    ("world",),
+    ("evaluation", "benchmark", "train"),
+    ("registration",),
+    ("bidex_meta",),  # the package's own names
+    ("clients", "witness"),
+    ("bench", "gallery"),  # both replay witnesses; bench measures clients too
+    ("bidex_algos.checks", "bidex_algos.choices", "bidex_algos.reports"),
+    ("bidex_algos.gradients", "bidex_algos.experience"),
+    ("bidex_algos.nets",),
+    ("bidex_algos.onpolicy", "bidex_algos.offpolicy", "bidex_algos.meta"),
+    ("bidex_algos.single_task", "bidex_algos.start_from", "bidex_algos.bench"),
+    ("bidex_algos",),
+    ("commands",),
+    ("cli",),
+)
+"""A room imports from earlier lines only, not from its own neighbours; a module outside rooms counts as one."""
+
+LEVEL = {room: level for level, rooms in enumerate(ORDER) for room in rooms}
+
+MUTUAL = {
+    ("bidex_meta.world.rendering", "bidex_meta.world.world"),  # rendering names World in an annotation only
+}
+"""Modules that import each other all the same."""
+
+TWICE = {"base", "config", "capacity", "episodes", "gallery", "replay", "starts"}
+"""Names of several modules. ``base`` and ``config`` are a room's own; the others are older than this rule."""
+
+
+def _name(package: str, path: Path) -> str:
+    parts = path.relative_to(PACKAGES[package]).with_suffix("").parts
+    return ".".join([package, *parts]).removesuffix(".__init__")
+
+
+@cache
+def modules() -> dict[str, ast.Module]:
+    """Every module by its full name."""
+    return {
+        _name(package, path): ast.parse(path.read_text())
+        for package, folder in PACKAGES.items()
+        for path in sorted(folder.rglob("*.py"))
+    }
+
+
+def imported(tree: ast.Module) -> Iterator[str]:
+    """Our modules that a module imports anywhere, functions and annotations included."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0 and node.module, "relative import: write the full name"
+            whole = [f"{node.module}.{alias.name}" for alias in node.names]
+            names = [name if name in modules() else node.module for name in whole]
+        else:
+            continue
+        yield from (name for name in names if name.partition(".")[0] in PACKAGES)
+
+
+def is_package(module: str) -> bool:
+    return any(name.startswith(f"{module}.") for name in modules())
+
+
+def room(module: str) -> str:
+    """The room of a module: ``world``, ``bidex_algos.nets``."""
+    package, *rest = module.split(".")
+    if not rest:
+        return package
+    return rest[0] if package == "bidex_meta" else f"{package}.{rest[0]}"
+
+
+@pytest.mark.parametrize("module", modules())
+def test_imports_come_from_earlier_rooms(module: str) -> None:
+    own = room(module)
+    assert own in LEVEL, f"{own} is a new room: give it a place in ORDER, and in docs/architecture.md"
+    wrong = {name for name in imported(modules()[module]) if room(name) != own and LEVEL[room(name)] >= LEVEL[own]}
+    assert not wrong, f"{module} imports {sorted(wrong)}, of no earlier room"
+
+
+def test_no_module_imports_itself_through_others() -> None:
+    graph = {name: set(imported(tree)) - {name} for name, tree in modules().items()}
+    for one, other in MUTUAL:
+        assert other in graph[one] and one in graph[other], f"{one} and {other} no longer are: take them out of MUTUAL"
+        graph[one].discard(other)
+    while free := {name for name, needed in graph.items() if not needed & graph.keys()}:
+        graph = {name: needed for name, needed in graph.items() if name not in free}
+    assert not graph, f"a cycle among {sorted(graph)}"
+
+
+def test_one_table_alone_names_learners() -> None:
+    """An import by string would pass the other tests."""
+    naming = set()
+    for module, tree in modules().items():
+        texts = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}  # docstrings
+        strings = [node for node in ast.walk(tree) if isinstance(node, ast.Constant) and id(node) not in texts]
+        if any(isinstance(node.value, str) and "bidex_algos" in node.value for node in strings):
+            naming.add(module)
+    assert naming == {"bidex_meta.commands.learners"}
+
+
+def test_a_name_means_one_module() -> None:
+    leaves = [name.rpartition(".")[2] for name, tree in modules().items() if not is_package(name)]
+    assert {leaf for leaf in leaves if leaves.count(leaf) > 1} == TWICE
+
+
+def test_pages_name_modules_that_are_there() -> None:
+    root = Path(__file__).parents[1]
+    pages = [*root.glob("*.md"), *root.glob("docs/**/*.md"), *root.glob("algos/*.md")]
+    named = {
+        (page.name, path)
+        for page in pages
+        for path in re.findall(r"\b(?:bidex_meta|algos/bidex_algos)/[\w/]+\.(?:py|md)\b", page.read_text())
+    }
+    assert len(named) > 30
+    assert not [(page, path) for page, path in sorted(named) if not (root / path).is_file()]
