@@ -18,7 +18,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.record.folder import RunFolder
 from bidex_meta.sources import Source
 
-_EXAMPLE = "MT4"
+_EXAMPLE = "MT4"  # a suite whose defaults `run --help` shows
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     older = {"engine": "auto", "base": "own", "start_from": None, "minutes": None}
     stored = {**older, **folder.config()} if folder else {}
     suite, task = (peek(arguments, f"--{name}") or stored.get(name) for name in ("suite", "task"))
-    # `run --help` may name neither, and shows the defaults of an example; without --help _resolved asks for one.
+    # Where neither is named, `run --help` still has defaults to show; without --help _resolved refuses it.
     source = Source.open({"suite": suite or (None if task else _EXAMPLE), "task": task})
     kind = learner_kind(peek(arguments, "--algo") or stored.get("algo", RunFlags.algo), task)
     device = resolve_device(peek(arguments, "--device") or stored.get("device", RunFlags.device), source.on_gpu)
