@@ -10,6 +10,7 @@ import tyro
 
 from bidex_meta.commands.parsing import Switch, parse
 from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.sources import Source
 
 _POLICIES = {"random": "uniform actions", "zero": "zero actions"}
 
@@ -59,7 +60,6 @@ def _expert(flags: BaselineFlags) -> None:
     from bidex_meta.commands.experts import best_known
     from bidex_meta.commands.tables import plain_table, print_table
     from bidex_meta.record.versions import collect_versions
-    from bidex_meta.sources import Source
 
     known = best_known(Source.open({"suite": flags.suite}).task_classes(), flags.runs, flags.threads)
     references.store("expert", known, {"versions": collect_versions()}, flags.out)
@@ -73,7 +73,6 @@ def _measure(flags: BaselineFlags) -> None:
     from bidex_meta import references
     from bidex_meta.evaluate import EVALUATION_SEED, RandomAgent, ZeroAgent, evaluate
     from bidex_meta.record.versions import collect_versions
-    from bidex_meta.sources import Source
 
     source = Source.open({"suite": flags.suite, "seed": flags.seed, "threads": flags.threads})
     if not source.moving_bases:

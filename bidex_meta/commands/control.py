@@ -11,6 +11,7 @@ import tyro
 
 from bidex_meta.commands.parsing import Switch, parse
 from bidex_meta.errors import BidexError
+from bidex_meta.sources import Source
 
 if TYPE_CHECKING:
     from bidex_meta.control import Control
@@ -60,7 +61,6 @@ def main(arguments: Sequence[str]) -> None:
     from bidex_meta.commands import metatest
     from bidex_meta.control import arms
     from bidex_meta.record import RunFolder
-    from bidex_meta.sources import Source
 
     metatest.check_numbers(flags, "trials", "episodes", "shots", "rollouts", "num_envs")
     folders = [RunFolder.open(path) for path in flags.runs]
@@ -87,7 +87,6 @@ def _check(folders: "Sequence[RunFolder]") -> None:
     """All runs adapt, on a suite with the same classes in both splits, and differ in the seed alone."""
     from bidex_meta.commands import metatest
     from bidex_meta.commands.learners import learner_kind
-    from bidex_meta.sources import Source
 
     kinds: list[dict[str, Any]] = []
     seeds: dict[int, Path] = {}
@@ -122,7 +121,6 @@ def _play(folder: "RunFolder", flags: ControlFlags) -> "Control":
     from bidex_meta.control import control
     from bidex_meta.evaluate import EVALUATION_SEED
     from bidex_meta.metatest import MAX_ADAPT_STEPS
-    from bidex_meta.sources import Source
     from bidex_meta.world.threads import set_up_torch
 
     config = folder.config()

@@ -3,13 +3,11 @@
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from bidex_meta.commands.parsing import RunPath, Switch, parse
 from bidex_meta.errors import BidexError
-
-if TYPE_CHECKING:
-    from bidex_meta.sources import Source
+from bidex_meta.sources import Source
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,6 @@ def main(arguments: Sequence[str]) -> None:
     from bidex_meta.commands.tables import evaluation_table, print_table
     from bidex_meta.evaluate import EVALUATION_SEED, RandomAgent, compare
     from bidex_meta.record import RunFolder
-    from bidex_meta.sources import Source
     from bidex_meta.world.threads import set_up_torch
 
     folder = RunFolder.open(flags.run)
@@ -103,7 +100,7 @@ def _refuse_adaptation(flags: EvaluateFlags, algo: str) -> None:
         raise BidexError(f"{algo} does not adapt to tasks: its splits are shown one by one. Use --split train or test.")
 
 
-def _meta_test(flags: EvaluateFlags, folder: Any, config: dict[str, Any], source: "Source") -> None:
+def _meta_test(flags: EvaluateFlags, folder: Any, config: dict[str, Any], source: Source) -> None:
     import sys
 
     from bidex_meta.commands import metatest

@@ -7,6 +7,7 @@ from typing import Any
 
 from bidex_meta.commands.parsing import parse
 from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.sources import Source
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,6 @@ def main(arguments: Sequence[str]) -> None:
     suffix = video.check_suffix(flags.out)
     if suffix == ".mp4" and (flags.width % 2 or flags.height % 2):
         raise BidexError(f"A film needs an even width and height, not {flags.width} x {flags.height}.")
-    from bidex_meta.sources import Source
 
     source = Source.open(_config(flags))
     if flags.task not in source.task_classes():
