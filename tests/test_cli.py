@@ -10,21 +10,24 @@ import pytest
 import torch
 
 from bidex_meta.cli import main
-from bidex_meta.commands import COMMANDS, worlds
+from bidex_meta.commands import COMMANDS, policies
 from bidex_meta.record import RunFolder, read_metrics
+from bidex_meta.sources import Source
+from bidex_meta.sources.own import OwnSuite, SingleClass
+from bidex_meta.tasks import registry
 from tests.fakes import ToyWorld
 
 SMALL = ["--suite", "MT4", "--num-envs", "6", "--threads", "1", "--device", "cpu"]
 SMALL += ["--learner.hidden", "8", "--learner.rollout-steps", "4", "--learner.num-minibatches", "2"]
 
 
-def toy(config, split, rows, mode):
-    return ToyWorld(rows or 6, mode, config["seed"])
+def toy(source, split="train", rows=None, mode="DISABLED"):
+    return ToyWorld(rows or 6, mode, source.seed)
 
 
 @pytest.fixture
 def toy_worlds(monkeypatch):
-    monkeypatch.setattr(worlds, "_world", toy)
+    monkeypatch.setattr(OwnSuite, "world", toy)
     threads = torch.get_num_threads()
     yield
     torch.set_num_threads(threads)
@@ -282,13 +285,13 @@ _TRAIN = """
 import functools, sys, time
 import bidex_meta.train.runner as runner
 from bidex_meta.cli import main
-from bidex_meta.commands import worlds
+from bidex_meta.sources.own import OwnSuite
 from tests.fakes import ToyWorld
 class Slow(ToyWorld):
     def step(self, action):
         time.sleep(0.002)
         return super().step(action)
-worlds._world = lambda config, split, rows, mode: Slow(rows or 6, mode, config["seed"])
+OwnSuite.world = lambda source, split="train", rows=None, mode="DISABLED": Slow(rows or 6, mode, source.seed)
 runner.train = functools.partial(runner.train, checkpoint_seconds=0.0)
 sys.exit(main(sys.argv[1:]))
 """
@@ -316,8 +319,15 @@ def test_a_killed_run_resumes_to_the_same_end(number, toy_worlds, tmp_path):
     assert same(final(path), final(tmp_path / "whole"))
 
 
-def test_render_picture_and_film(monkeypatch, toy_worlds, tmp_path, capsys):
-    monkeypatch.setattr(worlds, "check_names", lambda config: None)
+@pytest.fixture
+def toy_class(monkeypatch, toy_worlds):
+    """The first class of ``ToyWorld`` on its own."""
+    monkeypatch.setattr(registry, "names", lambda: ["Near"])
+    monkeypatch.setattr(SingleClass, "world", toy)
+    monkeypatch.setattr(SingleClass, "task_classes", lambda source: {source.name: None})
+
+
+def test_render_picture_and_film(toy_class, tmp_path, capsys):
     flags = ["render", "--task", "Near", "--width", "64", "--height", "48", "--policy", "random"]
     assert main([*flags, "--out", str(tmp_path / "a.png"), "--steps", "2"]) == 0
     assert capsys.readouterr().out == f"{tmp_path / 'a.png'}\n"
@@ -328,13 +338,14 @@ def test_render_picture_and_film(monkeypatch, toy_worlds, tmp_path, capsys):
     assert "Did you mean 'Near'?" in capsys.readouterr().err
 
 
-def test_render_refuses_a_policy_of_other_observations(monkeypatch, toy_worlds, tmp_path, capsys):
-    monkeypatch.setattr(worlds, "check_names", lambda config: None)
+def test_render_refuses_a_policy_of_other_observations(monkeypatch, toy_class, tmp_path, capsys):
+    monkeypatch.setattr(OwnSuite, "task_classes", lambda source: {"Near": None})
+    monkeypatch.setattr(OwnSuite, "tasks", lambda source, split: {"Near": ["0"]})
     assert run("--steps", 24, "--run-dir", tmp_path / "a", "--no-evaluate") == 0
     flags = ["render", "--task", "Near", "--width", "64", "--height", "48", "--policy", str(tmp_path / "a")]
     capsys.readouterr()
     assert main([*flags, "--out", str(tmp_path / "a.png"), "--steps", "2"]) == 0
-    monkeypatch.setattr(worlds, "policy_shape", lambda folder: {"observations": 7, "actions": 1})
+    monkeypatch.setattr(policies, "policy_shape", lambda folder: {"observations": 7, "actions": 1})
     assert main([*flags, "--out", str(tmp_path / "b.png"), "--steps", "2"]) == 2
     assert "takes 7 observations" in capsys.readouterr().err
 
@@ -343,13 +354,12 @@ def test_render_refuses_a_policy_of_other_observations(monkeypatch, toy_worlds, 
 
 
 def test_a_single_task_can_be_played_with_moving_bases_as_in_suites(capsys):
-    from bidex_meta.commands.worlds import evaluation_world, has_moving_bases
-
     for flags, moving in (([], False), (["--base", "moving"], True), (["--base", "fixed"], False)):
         assert main(["run", "--task", "HandOver", "--algo", "ppo", "--print-config", *flags]) == 0
         config = json.loads(capsys.readouterr().out)
-        assert has_moving_bases(config) == moving
-        world = evaluation_world(config | {"threads": 1}, rows=50)
+        source = Source.open(config | {"threads": 1})
+        assert source.moving_bases == moving
+        world = source.world()
         assert world.single_action_space.shape == ((52,) if moving else (40,))
         world.close()
     assert main(["run", "--suite", "MT4", "--base", "moving", "--print-config"]) == 2

@@ -8,13 +8,14 @@ import pytest
 import torch
 
 from bidex_meta.cli import main
-from bidex_meta.commands import learners, worlds
+from bidex_meta.commands import learners
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import meta_test as metatest
 from bidex_meta.evaluation.control_arms import arms, control
 from bidex_meta.evaluation.gains import difference_over_runs
 from bidex_meta.evaluation.meta_test import meta_evaluate
 from bidex_meta.evaluation.play import play_tasks
+from bidex_meta.sources.own import OwnSuite
 from tests.points import Finder, PointWorld, Still, ring
 
 NORTH, EAST, WEST = np.array([[0.0, 1.0]]), np.array([[1.0, 0.0]]), np.array([[-1.0, 0.0]])
@@ -89,12 +90,11 @@ def test_the_interval_knows_that_runs_differ():
 
 @pytest.fixture
 def runs(tmp_path, monkeypatch, capsys):
-    def points(config, split, rows, mode):
+    def points(source, split="train", rows=None, mode="DISABLED"):
         goals = ring(1) if split == "test" else ring(3, 1.0)
         return PointWorld(rows or 6, {"CatchUnderarm": goals}, mode=mode)
 
-    monkeypatch.setattr(worlds, "_world", points)
-    monkeypatch.setattr(worlds, "task_counts", lambda config, split: [1 if split == "test" else 3])
+    monkeypatch.setattr(OwnSuite, "world", points)
     monkeypatch.setitem(learners.ALGOS, "finder", "tests.adapting_learner:Learner")
     monkeypatch.setattr(PointWorld, "state_dict", dict, raising=False)
     threads, paths = torch.get_num_threads(), []

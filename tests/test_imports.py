@@ -23,6 +23,7 @@ ORDER = (
     ("registration",),
     ("bidex_meta",),  # the package's own names
     ("clients", "witness"),
+    ("sources",),
     ("bench", "gallery"),  # both replay witnesses; bench measures clients too
     ("bidex_algos.checks", "bidex_algos.choices", "bidex_algos.reports"),
     ("bidex_algos.gradients", "bidex_algos.experience"),
@@ -38,6 +39,9 @@ ORDER = (
 LEVEL = {room: level for level, rooms in enumerate(ORDER) for room in rooms}
 
 MUTUAL = {
+    # Source.open chooses among its kinds
+    ("bidex_meta.sources.base", "bidex_meta.sources.own"),
+    ("bidex_meta.sources.base", "bidex_meta.sources.metaworld_suite"),
     ("bidex_meta.world.rendering", "bidex_meta.world.world"),  # rendering names World in an annotation only
 }
 """Modules that import each other all the same."""

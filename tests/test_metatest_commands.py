@@ -7,17 +7,19 @@ import pytest
 import torch
 
 from bidex_meta.cli import main
-from bidex_meta.commands import learners, worlds
+from bidex_meta.commands import learners
 from bidex_meta.commands.metatest import rollouts_of, rows_for
 from bidex_meta.evaluation.comparison import read_groups
 from bidex_meta.record import RunFolder
+from bidex_meta.sources import Source
+from bidex_meta.sources.own import OwnSuite
 from tests.adapting_learner import Learner
 from tests.points import PointWorld, ring
 
 COUNTS = {"train": {"Near": 6, "Far": 6}, "test": {"Near": 2}}
 
 
-def points(config, split, rows, mode):
+def points(source, split="train", rows=None, mode="DISABLED"):
     pools = {name: ring(count, split == "test") for name, count in COUNTS[split].items()}
     place = PointWorld(rows or 12, pools, mode=mode)
     place.state_dict = dict  # type: ignore[attr-defined]
@@ -27,8 +29,9 @@ def points(config, split, rows, mode):
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    monkeypatch.setattr(worlds, "_world", points)
-    monkeypatch.setattr(worlds, "task_counts", lambda config, split: list(COUNTS[split].values()))
+    monkeypatch.setattr(OwnSuite, "world", points)
+    pools = {split: {name: [""] * count for name, count in counts.items()} for split, counts in COUNTS.items()}
+    monkeypatch.setattr(OwnSuite, "tasks", lambda source, split: pools[split])
     monkeypatch.setitem(learners.ALGOS, "finder", "tests.adapting_learner:Learner")
     threads = torch.get_num_threads()
     yield
@@ -144,10 +147,11 @@ def test_no_adaptation_where_tasks_are_shown(capsys, tmp_path, monkeypatch, show
 
 
 def test_where_rows_share_nothing_each_plays_one_episode_a_shot(monkeypatch):
-    config = {"algo": "finder", "num_envs": 1024, "learner": {}}
-    assert [rollouts_of(config, asked, 6) for asked in (20, None)] == [20, 10]
+    config = {"suite": "ML4", "algo": "finder", "num_envs": 1024, "learner": {}}
+    source = Source.open(config)
+    assert [rollouts_of(source, config, asked, 6) for asked in (20, None)] == [20, 10]
     monkeypatch.setattr(Learner, "adapts_by_row", True, raising=False)
-    assert [rollouts_of(config, asked, 6) for asked in (20, None, 4)] == [6, 6, 4]
+    assert [rollouts_of(source, config, asked, 6) for asked in (20, None, 4)] == [6, 6, 4]
 
 
 @pytest.mark.parametrize(

@@ -5,10 +5,12 @@ import pytest
 
 from bidex_meta import paths
 from bidex_meta.cli import main
-from bidex_meta.commands import experts, worlds
+from bidex_meta.commands import experts
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import references
 from bidex_meta.evaluation.scores import Reference
+from bidex_meta.sources import Source
+from bidex_meta.sources.own import OwnSuite
 from bidex_meta.witness.replay import Replay
 from tests.fakes import ToyWorld
 
@@ -54,7 +56,7 @@ def test_an_expert_that_doing_nothing_beats_gives_no_score(folder: Path) -> None
 def test_baseline_measures_every_class_and_stores_what_it_printed(
     what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worlds, "_world", lambda config, split, rows, mode: ToyWorld(rows or 6, mode, config["seed"]))
+    monkeypatch.setattr(OwnSuite, "world", lambda source: ToyWorld(6, "DISABLED", source.seed))
     out = tmp_path / "random.json"
     arguments = ["baseline", what, "--suite", "MT4", "--episodes", "1", "--out", str(out), "--json"]
     assert main(arguments) == 0
@@ -114,9 +116,8 @@ def test_a_suite_with_fixed_bases_neither_has_nor_makes_references(
     suite = tmp_path / "mine.toml"
     text = (paths.suites_dir() / "MT1.toml").read_text().replace('base = "moving"', 'base = "alone"')
     suite.write_text(text.replace("CatchUnderarm", "HandOver"))
-    config = {"suite": str(suite), "task": None}
-    assert worlds.references_of(config) == {}
-    assert worlds.references_of({"suite": "MT1", "task": None}).keys() >= {"CatchUnderarm"}
+    assert Source.open({"suite": str(suite)}).references() == {}
+    assert Source.open({"suite": "MT1"}).references().keys() >= {"CatchUnderarm"}
     assert main(["baseline", "zero", "--suite", str(suite), "--out", str(tmp_path / "zero.json")]) == 2
     assert 'base = "moving"' in capsys.readouterr().err and not (tmp_path / "zero.json").exists()
 

@@ -40,11 +40,6 @@ _WELD = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 5.0)
 _BROKEN = ("BADQPOS", "BADQVEL", "BADQACC", "CONTACTFULL", "CNSTRFULL")
 
 
-def is_foreign(suite: str | None) -> bool:
-    """Whether a suite's name is one of Meta-World's (``metaworld/...``, and not the path of a file)."""
-    return suite is not None and suite.startswith(PREFIX) and not suite.endswith(".toml")
-
-
 def class_names(suite: str) -> tuple[str, ...]:
     """The classes of a suite.
 

@@ -4,13 +4,13 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, cast
 
 import tyro
 
-from bidex_meta.clients import metaworld
 from bidex_meta.commands.parsing import Switch, parse
 from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.sources import Source
 
 _POLICIES = {"random": "uniform actions", "zero": "zero actions"}
 
@@ -47,8 +47,6 @@ class BaselineFlags:
 def main(arguments: Sequence[str]) -> None:
     """Measure, store, print."""
     flags = parse(BaselineFlags, arguments, "baseline")
-    if metaworld.is_foreign(flags.suite):
-        raise BidexError(f"References are kept of classes of our own, got --suite {flags.suite}. Name another suite.")
     if flags.what == "expert":
         _expert(flags)
     elif flags.what in _POLICIES:
@@ -58,13 +56,12 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _expert(flags: BaselineFlags) -> None:
-    from bidex_meta.benchmark import Benchmark
     from bidex_meta.commands.experts import best_known
     from bidex_meta.commands.tables import plain_table, print_table
     from bidex_meta.evaluation import references
     from bidex_meta.record.versions import collect_versions
 
-    known = best_known(Benchmark(flags.suite).train_classes, flags.runs, flags.threads)
+    known = best_known(Source.open({"suite": flags.suite}).task_classes(), flags.runs, flags.threads)
     references.store("expert", known, {"versions": collect_versions()}, flags.out)
     if flags.json:
         print(json.dumps(known, indent=2))
@@ -73,16 +70,15 @@ def _expert(flags: BaselineFlags) -> None:
 
 
 def _measure(flags: BaselineFlags) -> None:
-    from bidex_meta.commands import worlds
     from bidex_meta.evaluation import references
     from bidex_meta.evaluation.play import EVALUATION_SEED, evaluate
     from bidex_meta.evaluation.untrained import RandomAgent, ZeroAgent
     from bidex_meta.record.versions import collect_versions
 
-    config: dict[str, Any] = {"suite": flags.suite, "task": None, "seed": flags.seed, "device": "cpu"}
-    if not worlds.has_moving_bases(config):
+    source = Source.open({"suite": flags.suite, "seed": flags.seed, "threads": flags.threads})
+    if not source.moving_bases:
         raise BidexError(f'References are of moving bases, but {flags.suite} has fixed ones. Write base = "moving".')
-    world = worlds.evaluation_world({**config, "threads": flags.threads})
+    world = source.world()
     agent = RandomAgent(world.action_space, flags.seed) if flags.what == "random" else ZeroAgent(world.action_space)
     found = evaluate(agent, world, flags.episodes, seed=EVALUATION_SEED)
     world.close()

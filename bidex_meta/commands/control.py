@@ -11,6 +11,7 @@ import tyro
 
 from bidex_meta.commands.parsing import Switch, parse
 from bidex_meta.errors import BidexError
+from bidex_meta.sources import Source
 
 if TYPE_CHECKING:
     from bidex_meta.evaluation.control_arms import Control
@@ -64,10 +65,12 @@ def main(arguments: Sequence[str]) -> None:
     metatest.check_numbers(flags, "trials", "episodes", "shots", "rollouts", "num_envs")
     folders = [RunFolder.open(path) for path in flags.runs]
     config = folders[0].config()
+    source = Source.open(config)
     _check(folders)
     played = [_play(folder, flags) for folder in folders]
     classes = played[0].own.classes
-    found = {name: arms(played, name, _train_tasks(config, name)) for name in classes}
+    tasks = source.tasks("train")
+    found = {name: arms(played, name, tasks[name]) for name in classes}
     per_arm = {name: result.episodes * len(played) for name, result in classes.items()}
     if flags.json:
         print(json.dumps(_report(folders, flags, played[0].rollouts, per_arm, found), indent=2))
@@ -75,7 +78,7 @@ def main(arguments: Sequence[str]) -> None:
     from bidex_meta.commands.tables import control_table, print_table
 
     for name, by_arm in found.items():
-        title = f"{config['algo']} on {config['suite']}, held-out tasks of {name}, "
+        title = f"{config['algo']} on {source.name}, held-out tasks of {name}, "
         title += f"{len(played)} run{'s' * (len(played) > 1)}, {per_arm[name]:,} episodes an arm"
         print_table(control_table(title, by_arm))
 
@@ -93,7 +96,7 @@ def _check(folders: "Sequence[RunFolder]") -> None:
             raise BidexError(
                 f"{folder.path}: {config['algo']} does not adapt to tasks. Name runs of maml, promp or rl2."
             )
-        metatest.check_suite(config)
+        metatest.check_source(Source.open(config), config["algo"])
         kind = {name: config[name] for name in ("algo", "suite", "steps", "num_envs", "learner")}
         kind["minutes"] = config.get("minutes")
         # Where from is another run for each seed; whether is not.
@@ -112,23 +115,25 @@ def _check(folders: "Sequence[RunFolder]") -> None:
 
 def _play(folder: "RunFolder", flags: ControlFlags) -> "Control":
     """The arms of one run."""
-    from bidex_meta.commands import metatest, worlds
+    from bidex_meta.commands import metatest
     from bidex_meta.commands.learners import resolve_device
+    from bidex_meta.commands.policies import policy_loader
     from bidex_meta.evaluation.control_arms import control
     from bidex_meta.evaluation.meta_test import MAX_ADAPT_STEPS
     from bidex_meta.evaluation.play import EVALUATION_SEED
     from bidex_meta.world.threads import set_up_torch
 
-    stored = folder.config()
-    config = {**stored, "device": resolve_device(flags.device, stored["suite"]), "engine": flags.engine}
+    config = folder.config()
+    device = resolve_device(flags.device, Source.open(config).on_gpu)
+    source = Source.open({**config, "device": device, "engine": flags.engine})
     set_up_torch(config["threads"])
-    counts = worlds.task_counts(config, "test")
-    rollouts = metatest.rollouts_of(config, flags.rollouts, max(1, flags.num_envs // len(counts)))
+    counts = [len(pool) for pool in source.tasks("test").values()]
+    rollouts = metatest.rollouts_of(source, config, flags.rollouts, max(1, flags.num_envs // len(counts)))
     rows = metatest.rows_for(len(counts), max(counts) * flags.trials, rollouts, flags.num_envs)
     _say(f"{folder.path}: {flags.trials} adaptations of each held-out task, {rows} rows.")
-    test, train = (worlds.evaluation_world(config, split, rows) for split in ("test", "train"))
+    test, train = (source.world(split, rows) for split in ("test", "train"))
     found = control(
-        worlds.policy_loader(folder, config["device"])[0],
+        policy_loader(folder, device)[0],
         test,
         train,
         flags.shots,
@@ -138,7 +143,7 @@ def _play(folder: "RunFolder", flags: ControlFlags) -> "Control":
         trials=flags.trials,
         max_adapt_steps=config["learner"].get("max_adapt_steps", MAX_ADAPT_STEPS),
         seed=EVALUATION_SEED if flags.seed is None else flags.seed,
-        references=worlds.references_of(config),
+        references=source.references(),
     )
     test.close()
     train.close()
@@ -147,22 +152,6 @@ def _play(folder: "RunFolder", flags: ControlFlags) -> "Control":
 
 def _say(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
-
-
-def _train_tasks(config: dict[str, Any], class_name: str) -> list[str]:
-    """Names of a class's train tasks: as the suite file calls them, else their numbers."""
-    from bidex_meta.benchmark import Benchmark
-
-    benchmark = Benchmark(config["suite"], seed=config["seed"])
-    listed = [
-        task.name
-        for entry in benchmark.suite.split_classes("train")
-        if entry.name == class_name
-        for task in entry.tasks
-        if task.split == "train"
-    ]
-    count = sum(task.env_name == class_name for task in benchmark.train_tasks)
-    return listed or [str(number) for number in range(count)]
 
 
 def _report(

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from bidex_meta.commands.parsing import RunPath, Switch, parse
 from bidex_meta.errors import BidexError
+from bidex_meta.sources import Source
 
 
 @dataclass(frozen=True)
@@ -53,8 +54,8 @@ def main(arguments: Sequence[str]) -> None:
     """Evaluate the newest checkpoint and print a table or JSON."""
     flags = parse(EvaluateFlags, arguments, "evaluate")
 
-    from bidex_meta.commands import worlds
     from bidex_meta.commands.learners import learner_kind, resolve_device
+    from bidex_meta.commands.policies import load_policy
     from bidex_meta.commands.tables import evaluation_table, print_table
     from bidex_meta.evaluation.play import EVALUATION_SEED
     from bidex_meta.evaluation.results import compare
@@ -64,24 +65,26 @@ def main(arguments: Sequence[str]) -> None:
 
     folder = RunFolder.open(flags.run)
     stored = folder.config()
-    config = {**stored, "device": resolve_device(flags.device, stored["suite"]), "engine": flags.engine}
+    device = resolve_device(flags.device, Source.open(stored).on_gpu)
+    config = {**stored, "device": device, "engine": flags.engine}
+    source = Source.open(config)
     set_up_torch(config["threads"])
     kind = learner_kind(stored["algo"])
     if kind.adapts:
-        _meta_test(flags, folder, config)
+        _meta_test(flags, folder, config, source)
         return
     _refuse_adaptation(flags, stored["algo"])
-    policy, step = worlds.load_policy(folder, config["device"])
+    policy, step = load_policy(folder, device)
     split = "train" if flags.split == "auto" else flags.split
-    world = worlds.evaluation_world(config, split, flags.num_envs)
+    world = source.world(split, flags.num_envs)
     seed = EVALUATION_SEED if flags.seed is None else flags.seed
-    found = worlds.judge(config, policy, world, flags.episodes, seed)
+    found = source.judge(policy, world, flags.episodes, seed)
     random = None
     if flags.random:
-        random = worlds.judge(config, RandomAgent(world.action_space), world, flags.episodes, seed)
+        random = source.judge(RandomAgent(world.action_space), world, flags.episodes, seed)
     world.close()
     if not flags.json:
-        title = f"{config['algo']} on {config['suite'] or config['task']}, {split} tasks, {step:,} steps"
+        title = f"{config['algo']} on {source.name}, {split} tasks, {step:,} steps"
         print_table(evaluation_table(title, found, random))
         return
     result = {"run": str(folder.path), "steps": step, "split": split, "seed": seed, "policy": found.to_json()}
@@ -99,23 +102,25 @@ def _refuse_adaptation(flags: EvaluateFlags, algo: str) -> None:
         raise BidexError(f"{algo} does not adapt to tasks: its splits are shown one by one. Use --split train or test.")
 
 
-def _meta_test(flags: EvaluateFlags, folder: Any, config: dict[str, Any]) -> None:
+def _meta_test(flags: EvaluateFlags, folder: Any, config: dict[str, Any], source: Source) -> None:
     import sys
 
-    from bidex_meta.commands import metatest, worlds
+    from bidex_meta.commands import metatest
+    from bidex_meta.commands.policies import policy_loader
     from bidex_meta.evaluation.play import EVALUATION_SEED
 
     if flags.random:
         raise BidexError(f"{config['algo']} is compared with itself before adaptation. Leave --random out.")
-    metatest.check_suite(config)
-    known = worlds.splits(config)
+    metatest.check_source(source, config["algo"])
+    known = source.splits
     if flags.split in ("train", "test") and flags.split not in known:
-        raise BidexError(f"{config['suite'] or config['task']} has no {flags.split} tasks. Leave --split out.")
+        raise BidexError(f"{source.name} has no {flags.split} tasks. Leave --split out.")
     splits = [name for name in known if flags.split in ("auto", "both", name)]
     seed = EVALUATION_SEED if flags.seed is None else flags.seed
     numbers = (flags.shots, flags.rollouts, flags.episodes, flags.tasks, flags.trials, flags.num_envs)
-    load, step = worlds.policy_loader(folder, config["device"])
+    load, step = policy_loader(folder, config["device"])
     found = metatest.meta_test(
+        source,
         config,
         load,
         metatest.Options(*numbers, seed),
@@ -123,8 +128,7 @@ def _meta_test(flags: EvaluateFlags, folder: Any, config: dict[str, Any]) -> Non
         lambda text: print(text, file=sys.stderr, flush=True),
     )
     if not flags.json:
-        subject = config["suite"] or config["task"]
-        metatest.print_tables(f"{config['algo']} on {subject}, {step:,} steps", found)
+        metatest.print_tables(f"{config['algo']} on {source.name}, {step:,} steps", found)
         return
     result = {"run": str(folder.path), "steps": step, "seed": seed, "splits": metatest.report(found)}
     print(json.dumps(result, indent=2))

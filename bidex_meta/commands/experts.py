@@ -5,9 +5,9 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
-from bidex_meta.commands.worlds import has_moving_bases
 from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder
+from bidex_meta.sources import Source
 from bidex_meta.witness.replay import replay
 from bidex_meta.witness.store import load_witness, witness_path
 
@@ -44,10 +44,10 @@ def _of_run(run: Path) -> list[tuple[str, dict[str, Any]]]:
     """What a run's evaluation says of its classes: the mean over all tasks."""
     folder = RunFolder.open(run)
     config, path = folder.config(), folder.path / "evaluation.json"
-    if not has_moving_bases(config):
+    source = Source.open(config)
+    if not source.moving_bases:
         raise BidexError(
-            f"Expected a run with moving bases, as suites have them, but {run} plays "
-            f"{config['task'] or config['suite']} with fixed ones."
+            f"Expected a run with moving bases, as suites have them, but {run} plays {source.name} with fixed ones."
         )
     if not path.is_file():
         raise BidexError(
@@ -60,7 +60,5 @@ def _of_run(run: Path) -> list[tuple[str, dict[str, Any]]]:
             "mtppo, mttrpo or mtsac."
         )
     classes = found["policy"]["classes"]
-    source = (
-        f"{config['algo']} on {config['suite'] or config['task']}, {config['steps']:,} steps, seed {config['seed']}"
-    )
-    return [(name, {"return": row["return"], "source": source}) for name, row in classes.items()]
+    told = f"{config['algo']} on {source.name}, {config['steps']:,} steps, seed {config['seed']}"
+    return [(name, {"return": row["return"], "source": told}) for name, row in classes.items()]

@@ -23,7 +23,6 @@ import sys
 from dataclasses import dataclass
 from typing import Any
 
-from bidex_meta.clients import metaworld
 from bidex_meta.errors import BidexError, unknown_name
 from bidex_meta.train.launch import launch
 
@@ -125,21 +124,21 @@ def _from_elsewhere(name: str) -> LearnerKind:
     return LearnerKind(name, make, presets)
 
 
-def choose_preset(kind: LearnerKind, asked: str, device: str, suite: str | None = None) -> tuple[str, str]:
+def choose_preset(kind: LearnerKind, asked: str, device: str, first: tuple[str, str] | None = None) -> tuple[str, str]:
     """The preset's name and, in words, why this one.
 
     Args:
         kind: The learner.
         asked: A preset's name, or ``auto``.
         device: ``cpu``, ``cuda``, ``cuda:0``, ...
-        suite: What it shall train on; None for a task alone.
+        first: A preset that goes before others where the learner has it, and why; ``Source.preset``.
     """
     if asked != "auto":
         if asked not in kind.presets:
             raise unknown_name("preset", asked, ["auto", *kind.presets])
         return asked, "as asked"
-    if metaworld.is_foreign(suite) and "metaworld" in kind.presets:
-        return "metaworld", "the suite is Meta-World's"
+    if first is not None and first[0] in kind.presets:
+        return first
     if not {"laptop", "paper"} <= kind.presets.keys():
         return next(iter(kind.presets)), "it is the learner's first"
     if device.startswith("cpu"):
@@ -149,8 +148,12 @@ def choose_preset(kind: LearnerKind, asked: str, device: str, suite: str | None 
     return "paper", "the device is a GPU"
 
 
-def resolve_device(asked: str, suite: str | None = None) -> str:
-    """``auto`` to ``cuda`` where there is one and the suite can use it, else ``cpu``; anything else as it is.
+def resolve_device(asked: str, on_gpu: bool) -> str:
+    """``auto`` to ``cuda`` where there is one, else ``cpu``; anything else as it is.
+
+    Args:
+        asked: ``auto``, ``cpu``, ``cuda``, ``cuda:0``, ...
+        on_gpu: Whether a GPU is of use; ``Source.on_gpu``.
 
     Raises:
         BidexError: torch does not know the device, or it is not there (for each of several processes).
@@ -158,7 +161,7 @@ def resolve_device(asked: str, suite: str | None = None) -> str:
     import torch
 
     if asked == "auto":
-        asked = "cuda" if torch.cuda.is_available() and not metaworld.is_foreign(suite) else "cpu"
+        asked = "cuda" if on_gpu and torch.cuda.is_available() else "cpu"
     here = launch()
     if here.count > 1 and asked.startswith("cuda:"):
         raise BidexError(f"Expected device auto, cpu or cuda, since each process takes a GPU of its own; got {asked}.")

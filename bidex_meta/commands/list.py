@@ -41,25 +41,9 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _suites() -> list[dict[str, Any]]:
-    from bidex_meta.clients import metaworld
-    from bidex_meta.suite import load_suite, suite_names
+    from bidex_meta.sources import metaworld_suite, own
 
-    suites = [load_suite(name) for name in suite_names()]
-    ours = [
-        {
-            "name": suite.name,
-            "kind": suite.kind,
-            "train_classes": [entry.name for entry in suite.split_classes("train")],
-            "test_classes": [entry.name for entry in suite.split_classes("test")],
-            "summary": suite.description,
-        }
-        for suite in suites
-    ]
-    summary = "Meta-World's own environments, to run our learners on (only run and evaluate know them)"
-    return ours + [
-        {"name": name, "kind": "multi-task", "train_classes": list(classes), "test_classes": [], "summary": summary}
-        for name, classes in metaworld.SUITES.items()
-    ]
+    return own.listed() + metaworld_suite.listed()
 
 
 def _tasks() -> list[dict[str, Any]]:

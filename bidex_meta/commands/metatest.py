@@ -5,12 +5,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from bidex_meta.agents import Agent
-from bidex_meta.clients import metaworld
-from bidex_meta.commands import worlds
 from bidex_meta.commands.learners import learner_kind
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import EVALUATION_SEED
-from bidex_meta.suite import load_suite
+from bidex_meta.sources import Source
 
 SHOTS = 1
 """Shots where nobody says otherwise."""
@@ -46,6 +44,7 @@ class Options:
 
 
 def meta_test(
+    source: Source,
     config: dict[str, Any],
     load: Callable[[], Agent],
     options: Options,
@@ -55,10 +54,11 @@ def meta_test(
     """The meta-test on some of a run's splits.
 
     Args:
-        config: The run's config.
+        source: Of the run's worlds.
+        config: The run's config; read are ``algo``, ``num_envs`` and ``learner``.
         load: Makes the agent, a MetaLearningAgent; called anew for each split, so that neither depends on the other.
         options: How much is played.
-        splits: Out of ``worlds.splits``.
+        splits: Out of ``source.splits``.
         say: Told what begins.
 
     Returns:
@@ -69,13 +69,13 @@ def meta_test(
     """
     from bidex_meta.evaluation.meta_test import MAX_ADAPT_STEPS, meta_evaluate
 
-    check_suite(config)
+    check_source(source, config["algo"])
     check_numbers(options, "rollouts", "episodes", "tasks", "trials", "num_envs")
     found = {}
     limit = options.num_envs or ROWS
     for split in splits:
-        counts = worlds.task_counts(config, split)
-        rollouts = rollouts_of(config, options.rollouts, max(1, limit // len(counts)))
+        counts = [len(pool) for pool in source.tasks(split).values()]
+        rollouts = rollouts_of(source, config, options.rollouts, max(1, limit // len(counts)))
         tasks = min(options.tasks or TASKS, max(counts))
         trials = options.trials or -(-TASKS // tasks)
         rows = rows_for(len(counts), tasks * trials, rollouts, limit)
@@ -87,7 +87,7 @@ def meta_test(
             f"tasks of each{often}, {shots} shot{'s' * (shots != 1)} of {rollouts} episodes, {episodes} evaluation "
             f"episodes, {rows} rows."
         )
-        world = worlds.evaluation_world(config, split, rows)
+        world = source.world(split, rows)
         found[split] = meta_evaluate(
             load(),
             world,
@@ -98,31 +98,32 @@ def meta_test(
             trials=trials,
             max_adapt_steps=config["learner"].get("max_adapt_steps", MAX_ADAPT_STEPS),
             seed=options.seed,
-            references=worlds.references_of(config),
+            references=source.references(),
             split=split,
         )
         world.close()
     return found
 
 
-def rollouts_of(config: dict[str, Any], asked: int | None, rows: int) -> int:
+def rollouts_of(source: Source, config: dict[str, Any], asked: int | None, rows: int) -> int:
     """Episodes of each task in a shot.
 
     Args:
+        source: Of the run's worlds.
         config: The run's config.
         asked: What the user wants; None: what the run was trained with.
         rows: Rows that a class has at most. Where each row learns from its own episodes alone it must have no second
             one in a shot: then there are fewer.
     """
-    rollouts = asked or trained_rollouts(config)
+    rollouts = asked or trained_rollouts(source, config)
     return min(rollouts, rows) if learner_kind(config["algo"]).adapts_by_row else rollouts
 
 
-def trained_rollouts(config: dict[str, Any]) -> int:
+def trained_rollouts(source: Source, config: dict[str, Any]) -> int:
     """Episodes of each task that the run's learner adapted to."""
     if "tasks_per_class" not in config["learner"]:
         return ROLLOUTS
-    counts = worlds.task_counts(config, "train")
+    counts = [len(pool) for pool in source.tasks("train").values()]
     of_class = config["num_envs"] // len(counts)
     return max(1, min(of_class // min(config["learner"]["tasks_per_class"], max(counts)), MOST_ROLLOUTS))
 
@@ -139,16 +140,15 @@ def check_numbers(options: Any, *names: str) -> None:
             raise BidexError(f"--{name.replace('_', '-')} must be at least 1, not {number}.")
 
 
-def check_suite(config: dict[str, Any]) -> None:
-    """Refuse a suite on which there is no meta-test.
+def check_source(source: Source, algo: str) -> None:
+    """Refuse a source on which there is no meta-test.
 
     Raises:
         BidexError: It shows its tasks: it is Meta-World's, multi-task or a class alone.
     """
-    suite = config["suite"]
-    if suite is None or metaworld.is_foreign(suite) or load_suite(suite).kind != "meta":
+    if not source.hides_goals:
         raise BidexError(
-            f"{config['algo']} adapts to hidden goals, but {suite or config['task']} shows them. Name an ML suite: "
+            f"{algo} adapts to hidden goals, but {source.name} shows them. Name an ML suite: "
             "--suite ML1, ML4, ML20, or a file of kind meta."
         )
 

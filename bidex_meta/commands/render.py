@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bidex_meta.clients import metaworld
 from bidex_meta.commands.parsing import parse
 from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.sources import Source
 
 
 @dataclass(frozen=True)
@@ -45,13 +45,15 @@ def main(arguments: Sequence[str]) -> None:
     suffix = video.check_suffix(flags.out)
     if suffix == ".mp4" and (flags.width % 2 or flags.height % 2):
         raise BidexError(f"A film needs an even width and height, not {flags.width} x {flags.height}.")
-    config = _config(flags)
-    from bidex_meta.commands import worlds
 
-    worlds.check_names(config)
-    world = worlds.evaluation_world(config, rows=_rows(config))
-    row = _row(world, flags.task, config["suite"])
-    frames = _episode(flags, world, _policy(flags, world, config), row, film=suffix == ".mp4")
+    source = Source.open(_config(flags))
+    if flags.task not in source.task_classes():
+        raise unknown_name(f"task of {source.name}", flags.task, source.task_classes())
+    # One row for each slot is enough to see one of them; a slot of listed tasks is named Class/task.
+    slots = [name.split("/")[0] for name in source.tasks("train")]
+    world = source.world("train", len(slots))
+    row = world.slot_rows[slots.index(flags.task)].start
+    frames = _episode(flags, world, _policy(flags, world), row, film=suffix == ".mp4")
     if suffix == ".mp4":
         from bidex_meta.tasks.base import CONTROL_RATE
 
@@ -71,35 +73,17 @@ def _config(flags: RenderFlags) -> dict[str, Any]:
 
         stored = RunFolder.open(Path(flags.policy)).config()
         config |= {"suite": flags.suite or stored["suite"], "base": stored.get("base", "own")}
-    return {**config, "device": "cpu", "seed": flags.seed}
+    return {**config, "seed": flags.seed}
 
 
-def _rows(config: dict[str, Any]) -> int:
-    """One row for each slot is enough to see one of them."""
-    if config["suite"] is None:
-        return 1
-    if metaworld.is_foreign(config["suite"]):
-        raise BidexError(f"Pictures are made of classes of our own, got the suite {config['suite']}. Name another.")
-    from bidex_meta.suite import load_suite
-
-    return sum(max(len(entry.tasks), 1) for entry in load_suite(config["suite"]).split_classes("train"))
-
-
-def _row(world: Any, task: str, suite: str | None) -> int:
-    names = [name.split("/")[0] for name in world.task_names]  # a slot of listed tasks is named Class/task
-    if task not in names:
-        raise unknown_name(f"task of {suite}", task, set(names))
-    return world.slot_rows[names.index(task)].start
-
-
-def _policy(flags: RenderFlags, world: Any, config: dict[str, Any]) -> Any:
+def _policy(flags: RenderFlags, world: Any) -> Any:
     from bidex_meta.evaluation.untrained import RandomAgent, ZeroAgent
 
     if flags.policy == "zero":
         return ZeroAgent(world.action_space)
     if flags.policy == "random":
         return RandomAgent(world.action_space, flags.seed)
-    from bidex_meta.commands.worlds import checkpoint, policy_of, policy_shape
+    from bidex_meta.commands.policies import checkpoint, policy_of, policy_shape
     from bidex_meta.record import RunFolder
 
     folder = RunFolder.open(Path(flags.policy))
@@ -113,7 +97,7 @@ def _policy(flags: RenderFlags, world: Any, config: dict[str, Any]) -> Any:
             f"actions, but here are {given['observations']} and {given['actions']}. Leave --suite out, or name the "
             "policy's own."
         )
-    return policy_of(folder, state, config["device"])
+    return policy_of(folder, state, "cpu")
 
 
 def _episode(flags: RenderFlags, world: Any, policy: Any, row: int, film: bool) -> Iterator[Any]:

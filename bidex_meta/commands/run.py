@@ -9,6 +9,7 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -61,9 +62,10 @@ def _run(plan: RunPlan, distributed: Any) -> tuple[Any, Any, bool]:
     config, count = plan.config, launch().count
     # Sums depend on how torch splits them over threads: a resumed run must use the number it began with.
     set_up_torch(config["threads"])
-    subject, times = config["suite"] or config["task"], f"{count} x " if count > 1 else ""
+    times = f"{count} x " if count > 1 else ""
     _say(
-        f"{config['algo']} on {subject}, {times}{config['num_envs']} rows on {config['device']}, seed {config['seed']}"
+        f"{config['algo']} on {plan.source.name}, {times}{config['num_envs']} rows on {config['device']}, "
+        f"seed {config['seed']}"
     )
     _say(f"Preset {config['preset']}: {plan.preset_reason}.")
     world, learner, folder = distributed.together(lambda: _make(plan, loaded is None))
@@ -82,18 +84,17 @@ def _run(plan: RunPlan, distributed: Any) -> tuple[Any, Any, bool]:
 
 
 def _read(plan: RunPlan) -> Checkpoint | None:
-    from bidex_meta.commands import worlds
+    from bidex_meta.commands.policies import checkpoint
     from bidex_meta.record import RunFolder
 
-    worlds.check_names(plan.config)
     if plan.kind.adapts:
-        from bidex_meta.commands.metatest import check_suite
+        from bidex_meta.commands.metatest import check_source
 
-        check_suite(plan.config)
+        check_source(plan.source, plan.config["algo"])
     if plan.folder is None and plan.config["start_from"] is not None:
         start = RunFolder.open(Path(plan.config["start_from"]))
         if start.checkpoints.newest_step() is None:
-            worlds.checkpoint(start)  # refuses it now rather than when the world has been built
+            checkpoint(start)  # refuses it now rather than when the world has been built
     return plan.folder.checkpoints.load() if plan.folder else None
 
 
@@ -125,13 +126,13 @@ def _agree(plan: RunPlan, loaded: Checkpoint | None, distributed: Any) -> RunPla
 
 def _make(plan: RunPlan, fresh: bool) -> tuple[Any, Any, Any]:
     """World, learner (a fresh one with the weights it shall start from) and, in process 0, the run folder."""
-    from bidex_meta.commands import worlds
+    from bidex_meta.commands.policies import checkpoint
     from bidex_meta.record import RunFolder
 
-    world = worlds.training_world(plan.config, plan.kind.autoreset(plan.config["learner"]))
+    world = plan.source.world("train", plan.config["num_envs"], plan.kind.autoreset(plan.config["learner"]))
     learner = plan.kind.make(world, plan.learner_config, plan.config["seed"])
     if fresh and plan.config["start_from"] is not None:
-        state, step = worlds.checkpoint(RunFolder.open(Path(plan.config["start_from"])))
+        state, step = checkpoint(RunFolder.open(Path(plan.config["start_from"])))
         shared("start_from").start_from(learner, state["learner"]["policy"])
         _say(f"Starting from the policy of {plan.config['start_from']} at {step:,} steps.")
     if launch().rank > 0:
@@ -189,40 +190,39 @@ def _evaluate(plan: RunPlan, folder: Any, learner: Any) -> None:
     if plan.kind.adapts:
         _meta_test(plan, folder, learner)
         return
-    from bidex_meta.commands import worlds
     from bidex_meta.commands.tables import evaluation_table, print_table
     from bidex_meta.evaluation.play import EVALUATION_SEED
     from bidex_meta.evaluation.results import compare
     from bidex_meta.evaluation.untrained import RandomAgent
     from bidex_meta.record.atomic import write_json
 
-    episodes = plan.flags.episodes or worlds.default_episodes(plan.config)
+    source, seed = plan.source, EVALUATION_SEED
+    episodes = plan.flags.episodes or source.default_episodes
     _say(f"Evaluating: {episodes} episode{'s' * (episodes > 1)} of each task, and as many of a random policy.")
-    world, seed = worlds.evaluation_world(plan.config), EVALUATION_SEED
-    trained = worlds.judge(plan.config, learner, world, episodes, seed)
-    random = worlds.judge(plan.config, RandomAgent(world.action_space), world, episodes, seed)
+    world = source.world()
+    trained = source.judge(learner, world, episodes, seed)
+    random = source.judge(RandomAgent(world.action_space), world, episodes, seed)
     world.close()
     above = {name: asdict(difference) for name, difference in compare(trained, random).items()}
     found = {"run": str(folder.path), "steps": learner.env_steps, "split": "train", "seed": seed}
     found |= {"policy": trained.to_json(), "random": random.to_json(), "return_above_random": above}
     write_json(folder.path / "evaluation.json", found)
-    title = f"{plan.config['algo']} on {plan.config['suite'] or plan.config['task']}, {learner.env_steps:,} steps"
+    title = f"{plan.config['algo']} on {source.name}, {learner.env_steps:,} steps"
     print_table(evaluation_table(title, trained, random))
     _say(f"Again: bidex-meta evaluate {folder.path}   Curves: bidex-meta plot {folder.path}")
 
 
 def _meta_test(plan: RunPlan, folder: Any, learner: Any) -> None:
-    from bidex_meta.commands import metatest, worlds
+    from bidex_meta.commands import metatest
     from bidex_meta.record.atomic import write_json
 
     state, device = learner.policy_state_dict(), launch().own_device(plan.config["device"])
-    options = metatest.Options(episodes=plan.flags.episodes)
-    splits = worlds.splits(plan.config)
-    found = metatest.meta_test(plan.config, lambda: plan.kind.make.load_policy(state, device), options, splits, _say)
+    options, source = metatest.Options(episodes=plan.flags.episodes), plan.source
+    load = partial(plan.kind.make.load_policy, state, device)
+    found = metatest.meta_test(source, plan.config, load, options, source.splits, _say)
     report = {"steps": learner.env_steps, "seed": options.seed, "splits": metatest.report(found)}
     write_json(folder.path / "evaluation.json", report)
-    subject = plan.config["suite"] or plan.config["task"]
-    metatest.print_tables(f"{plan.config['algo']} on {subject}, {learner.env_steps:,} steps", found)
+    metatest.print_tables(f"{plan.config['algo']} on {source.name}, {learner.env_steps:,} steps", found)
     _say(f"More: bidex-meta evaluate {folder.path} --shots 3 --tasks 50   See bidex-meta plot --help for curves.")
 
 

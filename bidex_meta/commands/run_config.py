@@ -7,21 +7,18 @@ import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-from bidex_meta.clients import metaworld
 from bidex_meta.commands.learners import LearnerKind, choose_preset, learner_kind, resolve_device
 from bidex_meta.commands.parsing import StepCount, Switch, parse, peek
 from bidex_meta.errors import BidexError
 from bidex_meta.record.folder import RunFolder
+from bidex_meta.sources import Source
 from bidex_meta.train.launch import launch, resume_command
 
-_ROWS_AND_STEPS = {"cpu": (1024, 20_000_000), "gpu": (8192, 200_000_000)}
-# Whole episodes of all rows make one meta-batch: with fewer rows there are more of them.
-_ADAPTING_ROWS_AND_STEPS = (300, 20_000_000)
-# Meta-World's rows are environments of some 10 MB each; 2 M steps a class is the budget of published results.
-_FOREIGN_ROWS_AND_STEPS = (4, 2_000_000)
+_EXAMPLE = "MT4"  # a suite whose defaults `run --help` shows
 
 
 @dataclass(frozen=True)
@@ -93,6 +90,11 @@ class RunPlan:
     preset_reason: str
     """Why this preset."""
 
+    @cached_property
+    def source(self) -> Source:
+        """Where this process's worlds come from."""
+        return Source.open({**self.config, "device": launch().own_device(self.config["device"])})
+
 
 def plan_run(arguments: Sequence[str]) -> RunPlan:
     """Parse in two stages: algo, preset and device first, since they decide what the other flags are and default to.
@@ -105,30 +107,21 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     # What older runs did not know.
     older = {"engine": "auto", "base": "own", "start_from": None, "minutes": None}
     stored = {**older, **folder.config()} if folder else {}
-    task = peek(arguments, "--task") or stored.get("task")
+    suite, task = (peek(arguments, f"--{name}") or stored.get(name) for name in ("suite", "task"))
+    # Where neither is named, `run --help` still has defaults to show; without --help _resolved refuses it.
+    source = Source.open({"suite": suite or (None if task else _EXAMPLE), "task": task})
     kind = learner_kind(peek(arguments, "--algo") or stored.get("algo", RunFlags.algo), task)
-    suite = peek(arguments, "--suite") or stored.get("suite")
-    device = resolve_device(peek(arguments, "--device") or stored.get("device", RunFlags.device), suite)
+    device = resolve_device(peek(arguments, "--device") or stored.get("device", RunFlags.device), source.on_gpu)
     asked = peek(arguments, "--preset") or stored.get("preset", RunFlags.preset)
-    preset, reason = choose_preset(kind, asked, device, suite)
+    preset, reason = choose_preset(kind, asked, device, source.preset)
     learner_default = kind.presets[preset]
     if folder:
         learner_default = _stored_learner(type(learner_default), stored, folder)
-    flags = parse(*_options(arguments, learner_default, stored, _rows_and_steps(suite, device, kind)))
+    flags = parse(*_options(arguments, learner_default, stored, source.rows_and_steps(device, kind.adapts)))
     config = _resolved(flags, preset, device, stored)
     if folder:
         _refuse_changes(stored, config, folder)
     return RunPlan(flags, kind, flags.learner, config, folder, reason)
-
-
-def _rows_and_steps(suite: str | None, device: str, kind: LearnerKind) -> tuple[int, int]:
-    """What ``--num-envs`` and ``--steps`` are where nobody says."""
-    if suite in metaworld.SUITES:
-        rows, steps = (number * len(metaworld.SUITES[suite]) for number in _FOREIGN_ROWS_AND_STEPS)
-        return rows, steps
-    if device.startswith("cpu"):
-        return _ADAPTING_ROWS_AND_STEPS if kind.adapts else _ROWS_AND_STEPS["cpu"]
-    return _ROWS_AND_STEPS["gpu"]
 
 
 def _options(

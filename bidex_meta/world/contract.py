@@ -5,23 +5,23 @@ small worlds of the tests. N rows ("environments"), each of one slot (a task cla
 their class). All tensors are on ``device``; what a step returns is fresh memory that no later step changes.
 
 Modes (``autoreset_mode``): in SAME_STEP (training) a row that ends starts its next episode within the step; the
-observation returned is already that of the new episode, ``info["final_obs"]`` has the last one. In DISABLED (evaluation,
-meta-learning) an ended row is frozen: it may be stepped, keeps its flags and gets reward 0, until a ``reset`` whose
-``reset_mask`` names it.
+observation returned is already that of the new episode, ``info["final_obs"]`` has the last one. In DISABLED
+(evaluation, meta-learning) an ended row is frozen: it may be stepped, keeps its flags and gets reward 0, until a
+``reset`` whose ``reset_mask`` names it.
 
 ``info`` of a step, every entry about the transition just made:
 
-=====================  ======================  ==========================================================================
-key                    shape, type             meaning
-=====================  ======================  ==========================================================================
-success                (N,), bool              the goal is met in this state
-unstable               (N,), bool              physics broke: reward 0, truncated, the transition teaches nothing
-reward_unscaled        (N,), float32           reward before the suite's scale of the class
-final_obs              (N, d), float32         the observation that the transition led to
-_final_obs             (N,), bool              rows that ended in this step: there ``final_obs`` is the last of the episode
-episode                dict of (N,)            r (return), l (length), success, unscaled, of the episode so far
-_episode               (N,), bool              rows whose episode ended and counts (shortened first ones do not)
-=====================  ======================  ==========================================================================
+=================  ================  ===================================================================================
+key                shape, type       meaning
+=================  ================  ===================================================================================
+success            (N,), bool        the goal is met in this state
+unstable           (N,), bool        physics broke: reward 0, truncated, the transition teaches nothing
+reward_unscaled    (N,), float32     reward before the suite's scale of the class
+final_obs          (N, d), float32   the observation that the transition led to
+_final_obs         (N,), bool        rows that ended in this step: there ``final_obs`` is the last of the episode
+episode            dict of (N,)      r (return), l (length), success, unscaled, of the episode so far
+_episode           (N,), bool        rows whose episode ended and counts (shortened first ones do not)
+=================  ================  ===================================================================================
 
 A world may add keys (``reward_terms``, ``final_info``); nobody may rely on these.
 """

@@ -17,8 +17,8 @@ from bidex_algos.nets.recurrent import RecurrentNet
 from bidex_meta import Benchmark
 from bidex_meta.agents import MetaLearningAgent, Timestep
 from bidex_meta.commands.learners import learner_kind
-from bidex_meta.commands.worlds import training_world
 from bidex_meta.errors import BidexError
+from bidex_meta.sources import Source
 from tests.algos.families import PointClass, PointGoals, circle
 from tests.algos.resume import resumed
 from tests.algos.test_mtppo import equal
@@ -337,14 +337,14 @@ def test_bad_input_is_named():
 
 
 def test_the_run_makes_the_world_that_the_learner_asks_for():
-    config = {"suite": "ML1-wide", "task": None, "num_envs": 3, "seed": 0, "device": "cpu", "threads": 1}
+    source = Source.open({"suite": "ML1-wide", "threads": 1})
     for algo, learner, mode in (
         ("rl2", {}, "DISABLED"),
         ("mtppo", {}, "SAME_STEP"),
         ("promp", {"slice_steps": None}, "DISABLED"),
         ("promp", {"slice_steps": 8}, "SAME_STEP"),
     ):
-        world = training_world(config, learner_kind(algo).autoreset(learner))
+        world = source.world("train", 3, learner_kind(algo).autoreset(learner))
         assert world.autoreset_mode.name == mode
         world.close()
 
