@@ -13,7 +13,7 @@ from bidex_meta.cli import main
 from bidex_meta.commands import COMMANDS, policies
 from bidex_meta.record import RunFolder, read_metrics
 from bidex_meta.sources import Source
-from bidex_meta.sources.own import OwnSuite, SingleClass
+from bidex_meta.sources.source import OwnSuite, SingleClass
 from bidex_meta.tasks import registry
 from tests.fakes import ToyWorld
 
@@ -285,7 +285,7 @@ _TRAIN = """
 import functools, sys, time
 import bidex_meta.train.runner as runner
 from bidex_meta.cli import main
-from bidex_meta.sources.own import OwnSuite
+from bidex_meta.sources.source import OwnSuite
 from tests.fakes import ToyWorld
 class Slow(ToyWorld):
     def step(self, action):

@@ -39,9 +39,7 @@ ORDER = (
 LEVEL = {room: level for level, rooms in enumerate(ORDER) for room in rooms}
 
 MUTUAL = {
-    # Source.open chooses among its kinds
-    ("bidex_meta.sources.base", "bidex_meta.sources.own"),
-    ("bidex_meta.sources.base", "bidex_meta.sources.metaworld_suite"),
+    ("bidex_meta.sources.metaworld_suite", "bidex_meta.sources.source"),  # Source.open chooses among its kinds
     ("bidex_meta.world.rendering", "bidex_meta.world.world"),  # rendering names World in an annotation only
 }
 """Modules that import each other all the same."""

@@ -12,7 +12,7 @@ from bidex_meta.commands.metatest import rollouts_of, rows_for
 from bidex_meta.evaluation.comparison import read_groups
 from bidex_meta.record import RunFolder
 from bidex_meta.sources import Source
-from bidex_meta.sources.own import OwnSuite
+from bidex_meta.sources.source import OwnSuite
 from tests.adapting_learner import Learner
 from tests.points import PointWorld, ring
 

@@ -10,7 +10,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import references
 from bidex_meta.evaluation.scores import Reference
 from bidex_meta.sources import Source
-from bidex_meta.sources.own import OwnSuite
+from bidex_meta.sources.source import OwnSuite
 from bidex_meta.witness.replay import Replay
 from tests.fakes import ToyWorld
 

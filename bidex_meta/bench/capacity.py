@@ -1,4 +1,4 @@
-"""How many contacts and constraint rows the classes need: what ``bidex_meta/engine/capacity.py`` was filled from."""
+"""How many contacts and constraint rows the classes need: what ``TaskClass.needs`` was filled from."""
 
 import math
 from typing import Any

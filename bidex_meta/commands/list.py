@@ -41,9 +41,9 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _suites() -> list[dict[str, Any]]:
-    from bidex_meta.sources import metaworld_suite, own
+    from bidex_meta.sources import metaworld_suite, source
 
-    return own.listed() + metaworld_suite.listed()
+    return source.listed() + metaworld_suite.listed()
 
 
 def _tasks() -> list[dict[str, Any]]:

@@ -29,10 +29,10 @@ def choose_engine(
     if engine == "warp" or (engine == "auto" and place.type == "cuda"):
         from bidex_meta.engine.warp import WarpEngine
 
-        return place, lambda models, rows: WarpEngine(models, rows, device=str(place))
+        return place, lambda models, rows, room: WarpEngine(models, rows, room, device=str(place))
     from bidex_meta.engine.cpu import CpuEngine
 
-    return place, lambda models, rows: CpuEngine(models, rows, threads)
+    return place, lambda models, rows, room: CpuEngine(models, rows, threads)
 
 
 def _device(device: str | torch.device) -> torch.device:

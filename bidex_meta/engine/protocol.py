@@ -7,6 +7,8 @@ import mujoco
 import torch
 from torch import Tensor
 
+from bidex_meta.engine.capacity import Capacity
+
 
 class Engine(Protocol):
     """A batch of simulations of equal structure.
@@ -89,5 +91,5 @@ class Engine(Protocol):
         ...
 
 
-EngineMaker = Callable[[Sequence[mujoco.MjModel], Sequence[int]], Engine]
-"""Makes an engine of models of equal structure and, for each simulation, the index of its model."""
+EngineMaker = Callable[[Sequence[mujoco.MjModel], Sequence[int], Capacity], Engine]
+"""Makes an engine of models of equal structure, for each simulation the index of its model, and room for contacts."""

@@ -20,7 +20,7 @@ import warp as wp
 from torch import Tensor
 
 from bidex_meta.engine import kernels
-from bidex_meta.engine.capacity import Capacity, capacity_of
+from bidex_meta.engine.capacity import Capacity
 from bidex_meta.errors import BidexError
 
 # What a simulation carries from one step to the next; the fields that a model has none of are skipped.
@@ -64,16 +64,16 @@ class WarpEngine:
         self,
         models: Sequence[mujoco.MjModel],
         rows: Sequence[int],
+        capacity: Capacity,
         device: str | torch.device = "cpu",
-        capacity: Capacity | None = None,
     ) -> None:
         """Puts the models on the device and compiles the kernels.
 
         Args:
             models: The distinct models, of equal structure.
             rows: For each simulation the index of its model.
+            capacity: Room for contacts and constraints.
             device: "cpu" or a CUDA device.
-            capacity: Room for contacts and constraints; None takes what was measured for the models' classes.
         """
         wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # no banner and no line for each kernel
         self.num, self.device = len(rows), torch.device(device)
@@ -83,7 +83,7 @@ class WarpEngine:
         self._lent = wp.stream_to_torch(self._stream) if self._stream is not None else None
         self._graphs: dict[str, Callable[[], None]] = {}
         with self._on_device():
-            self._put(capacity or capacity_of(models))
+            self._put(capacity)
             self._bind()
             self._substeps = 1
             for work in (self._advance, self._begin):  # compiles all kernels, which a capture must not do

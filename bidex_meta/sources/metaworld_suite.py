@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from bidex_meta.clients.metaworld import PREFIX, SUITES, TASKS_PER_CLASS, class_names
 from bidex_meta.errors import BidexError
-from bidex_meta.sources.base import Source
+from bidex_meta.sources.source import Source
 
 if TYPE_CHECKING:
     from bidex_meta.agents import Agent

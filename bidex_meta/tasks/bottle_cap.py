@@ -6,6 +6,7 @@ import mujoco
 import torch
 from torch import Tensor
 
+from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.hand import hand
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.maths import constant, dot, indices
@@ -43,6 +44,7 @@ class BottleCap(TaskClass):
     plane, not through the palm: 3 cm either way along its axis, and 1 cm to the fingers only, for the thumb is behind.
     """
 
+    needs = Capacity(47, 4, 65)
     name = "BottleCap"
     summary = "Hold a bottle in one hand and pull its cap off with the other"
     formula = "0.2 - d_left - d_right + 30 d, d between the cap's centre and the bottle's origin"

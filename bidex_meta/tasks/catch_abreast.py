@@ -4,9 +4,10 @@ import math
 
 from torch import Tensor
 
+from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.maths import constant, norm
-from bidex_meta.tasks.one_egg import OneEgg
+from bidex_meta.tasks.eggs import OneEgg
 from bidex_meta.tasks.state import TaskState
 
 _ANCHORS = {"right": (-0.3, -0.55, 0.5), "left": (-0.3, -1.15, 0.5)}
@@ -20,6 +21,7 @@ class CatchAbreast(OneEgg):
     Observation: Table 16 (422). Reward: equation 5. The episode also fails when a palm is 0.1 m off its anchor.
     """
 
+    needs = Capacity(23, 6, 45)
     name = "CatchAbreast"
     summary = "Throw an egg sideways from the right palm to the left one"
     episode_steps = 150

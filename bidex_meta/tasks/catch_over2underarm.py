@@ -4,9 +4,10 @@ import math
 
 from torch import Tensor
 
+from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_UP_BACK, HandPose
 from bidex_meta.maths import constant, norm
-from bidex_meta.tasks.one_egg import OneEgg
+from bidex_meta.tasks.eggs import OneEgg
 from bidex_meta.tasks.state import TaskState
 
 _ANCHOR_RADIUS = 0.1
@@ -20,6 +21,7 @@ class CatchOver2Underarm(OneEgg):
     start.
     """
 
+    needs = Capacity(17, 4, 33)
     name = "CatchOver2Underarm"
     summary = "Throw an egg from the upright right hand to the upturned left palm"
     formula = "exp(-0.2 (20 d + r)), d and r the distance and the angle between egg and goal"

@@ -1,7 +1,8 @@
 """CatchUnderarm: appendix A.2.2; docs/figures.md, classes."""
 
+from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
-from bidex_meta.tasks.one_egg import OneEgg
+from bidex_meta.tasks.eggs import OneEgg
 
 
 class CatchUnderarm(OneEgg):
@@ -10,6 +11,7 @@ class CatchUnderarm(OneEgg):
     Observation: Table 10 (422). Reward: equation 2.
     """
 
+    needs = Capacity(28, 6, 48)
     name = "CatchUnderarm"
     summary = "Throw an egg underarm from the right hand to the left one"
     episode_steps = 75

@@ -7,6 +7,7 @@ import mujoco
 import torch
 from torch import Tensor
 
+from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
 from bidex_meta.maths import quaternion_from_rpy, xyzw
 from bidex_meta.tasks.base import FAST, TaskClass
@@ -147,6 +148,7 @@ class DoorOpenOutward(_Door):
     Observation: Table 20 (428). Reward: equation 7. Success: handles more than 0.5 m apart along y.
     """
 
+    needs = Capacity(44, 0, 96)
     name = "DoorOpenOutward"
     summary = "Push a double door open"
     formula = "0.2 - d_left - d_right + 2 d, d between the two handles"
@@ -162,6 +164,7 @@ class DoorCloseInward(_Door):
     farther out than in the other door classes, beside the open leaves.
     """
 
+    needs = Capacity(38, 0, 77)
     name = "DoorCloseInward"
     summary = "Push a double door shut that stands open towards the hands"
     formula = "0.2 - d_left - d_right + 2 (1 - d), d between the two handles"
@@ -181,6 +184,7 @@ class DoorOpenInward(_Door):
     Observation: Table 22 (428). Reward: equation 9. Success: handles more than 0.5 m apart along y.
     """
 
+    needs = Capacity(40, 0, 88)
     name = "DoorOpenInward"
     summary = "Pull a double door open by its handles"
     formula = "0.2 - d_left - d_right + 2 d, d between the two handles"
@@ -195,6 +199,7 @@ class DoorCloseOutward(_Door):
     Observation: Table 22 (428). Reward: equation 10. Success: both leaves within 0.157 rad of shut.
     """
 
+    needs = Capacity(37, 0, 98)
     name = "DoorCloseOutward"
     summary = "Pull a double door shut by its handles"
     formula = "0.2 - d_left - d_right + 2 (1 - d), d between the two handles"

@@ -1,13 +1,23 @@
-"""What the throwing and catching classes share: an egg, its goal pose, the exponential reward of equations 1 to 5."""
+"""What the throwing and catching classes share: an egg, its goal pose, the exponential reward of equations 1 to 5.
 
+``OneEgg`` is the part that the four classes with one egg have in common; their files hold the figures.
+"""
+
+from typing import ClassVar
+
+import mujoco
 import torch
 from torch import Tensor
 
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.hands.starts import make_room, noisy_joints
 from bidex_meta.maths import conjugate, constant, norm, random_orientation, rotate, rotation_angle, wxyz, xyzw
-from bidex_meta.tasks.goals import rotation_difference
+from bidex_meta.tasks.base import LIGHT, TaskClass
+from bidex_meta.tasks.goals import frozen_goal, observe_goal, rotation_difference
+from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks
+from bidex_meta.tasks.scene import SceneObject
 from bidex_meta.tasks.state import TaskState
+from bidex_meta.tasks.variation import VariationSpace, box, join, orientation
 
 RADIUS, HALF_LENGTH = 0.03, 0.04
 """Short and long semi-axis of the egg, metres (docs/figures.md, objects)."""
@@ -76,3 +86,74 @@ def pose_reward(state: TaskState, egg: str, goal: str, alpha: float) -> Tensor:
     """exp(-0.2 (alpha d_t + d_r)), shape (n,)."""
     translation, rotation = distances(state, egg, goal)
     return torch.exp(-0.2 * (alpha * translation + rotation))
+
+
+class OneEgg(TaskClass):
+    """Throw an egg to a goal pose at the other hand.
+
+    Attributes:
+        egg_start: Nominal start of the egg, world, metres.
+        goal_centre: Centre of the goals' box, world, metres.
+        position_noise: Half width of the egg's position noise at a start, metres.
+        joint_noise: Joint noise at a start, a share of each joint's range.
+        lies_on_right_hand: Whether the egg starts on the right palm, so that room is made for it.
+        alpha: Weight of the distance in the reward, per metre.
+        floor: The episode fails when the egg's height falls to this, metres.
+    """
+
+    formula = "exp(-0.2 (50 d + r)), d and r the distance and the angle between egg and goal"
+    solved = "egg within 3 cm of its goal"
+    egg_start: ClassVar[tuple[float, float, float]]
+    goal_centre: ClassVar[tuple[float, float, float]]
+    position_noise: ClassVar[float]
+    joint_noise: ClassVar[float]
+    lies_on_right_hand: ClassVar[bool] = True
+    alpha: ClassVar[float] = 50.0
+    floor: ClassVar[float]
+    start_draws: ClassVar[int] = JOINT_DRAWS + 5
+    solver = LIGHT
+
+    @property
+    def variation_space(self) -> VariationSpace:
+        """Goal position (world, metres) and the two draws of its orientation."""
+        return join(box("goal", self.goal_centre, GOAL_RANGE), orientation("goal"))
+
+    @property
+    def layout(self) -> Layout:
+        """Tables 8, 10, 12 and 16."""
+        return Layout((*both_hands(self.moving_base), *object_blocks("object", "object"), *goal_blocks("goal")))
+
+    def add_objects(self, scene: mujoco.MjSpec) -> None:
+        """One egg."""
+        SceneObject("object", "egg", self.egg_start).add_to(scene)
+
+    def freeze(self, variation: Tensor) -> dict[str, Tensor]:
+        """``goal``: the goal pose, (n, 7); ``goal_inverse``: the inverse of its rotation, (n, 4)."""
+        return frozen_goal(goal_pose(variation[:, :3], variation[:, 3:]))
+
+    def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
+        """Noisy hands, the egg on the right one."""
+        start_hands(draws[:, :JOINT_DRAWS], self.joint_noise, qpos)
+        start_egg(qpos["object"], draws[:, JOINT_DRAWS:], self.position_noise)
+        if self.lies_on_right_hand:
+            lay_egg_on_hand(qpos["object"], qpos["right/joints"], self.right)
+
+    def observe(self, state: TaskState) -> dict[str, Tensor]:
+        """The goal blocks."""
+        return observe_goal(state, "object/quaternion")
+
+    def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
+        """``pose``: exp(-0.2 (alpha d_t + d_r))."""
+        return {"pose": pose_reward(state, "object", "goal", self.alpha)}
+
+    def success(self, state: TaskState) -> Tensor:
+        """The egg within 3 cm of its goal, in whatever orientation."""
+        return distances(state, "object", "goal")[0] < SUCCESS_DISTANCE
+
+    def failed(self, state: TaskState) -> Tensor:
+        """The egg dropped: the reward is positive throughout, so an early end is never worth seeking."""
+        return state["object/position"][:, 2] <= self.floor
+
+    def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
+        """The goal."""
+        return [(frozen["goal"], SEMI_AXES)]

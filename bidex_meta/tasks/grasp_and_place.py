@@ -4,6 +4,7 @@ import mujoco
 import torch
 from torch import Tensor
 
+from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
 from bidex_meta.tasks.base import FAST, TaskClass
 from bidex_meta.tasks.bucket import inside_bucket, stands
@@ -27,6 +28,7 @@ class GraspAndPlace(TaskClass):
     pose and bucket link have one orientation here, so entries 401-404 and 414-417 are equal.
     """
 
+    needs = Capacity(35, 4, 108)
     name = "GraspAndPlace"
     summary = "Put a block into a bucket"
     formula = "exp(-10 d_left) + exp(-10 d_right) + 2 exp(-10 d), d between bucket and block"

@@ -1,8 +1,9 @@
 """HandOver: appendix A.2.1; docs/figures.md, classes."""
 
+from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
 from bidex_meta.tasks.base import GENTLE
-from bidex_meta.tasks.one_egg import OneEgg
+from bidex_meta.tasks.eggs import OneEgg
 
 
 class HandOver(OneEgg):
@@ -11,6 +12,7 @@ class HandOver(OneEgg):
     Observation: Table 8 (398) with the fixed base, 422 with the moving one that the suites use. Reward: equation 1.
     """
 
+    needs = Capacity(28, 8, 51)
     name = "HandOver"
     summary = "Throw an egg from the right palm to the left one across a narrow gap"
     deviations = ("In a suite its bases move like CatchUnderarm's (52 actions); on its own they are fixed (40).",)

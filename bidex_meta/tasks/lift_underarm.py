@@ -6,6 +6,7 @@ import mujoco
 import torch
 from torch import Tensor
 
+from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
 from bidex_meta.maths import norm, uprightness
 from bidex_meta.tasks.base import FAST, TaskClass
@@ -37,6 +38,7 @@ class LiftUnderarm(TaskClass):
     Friction: 3 where the table takes part, 2 between wall and hand.
     """
 
+    needs = Capacity(36, 4, 82)
     name = "LiftUnderarm"
     summary = "Lift a pot off a table by its two grips"
     formula = "0.2 - d_left - d_right + 3 (0.985 - d), d from the pot to its goal"

@@ -7,6 +7,7 @@ import mujoco
 import torch
 from torch import Tensor
 
+from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
 from bidex_meta.maths import rotate, xyzw
 from bidex_meta.tasks.base import THIN, TaskClass
@@ -34,6 +35,7 @@ class OpenPenCap(TaskClass):
     reward and success do not read them. The pen lies on flats: the original rolls.
     """
 
+    needs = Capacity(56, 0, 121)
     name = "OpenPenCap"
     summary = "Pull the cap off a pen"
     formula = "exp(-10 d_left) + exp(-10 d_right) + 5 d - 0.8, d between the points on body and cap"

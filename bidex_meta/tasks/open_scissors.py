@@ -6,6 +6,7 @@ import mujoco
 import torch
 from torch import Tensor
 
+from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
 from bidex_meta.maths import conjugate, constant, multiply, rotate, xyzw
 from bidex_meta.tasks.base import THIN, TaskClass
@@ -37,6 +38,7 @@ class OpenScissors(TaskClass):
     with different angles would share a block. Loops are hollow, so that fingers enter them; the original's are filled.
     """
 
+    needs = Capacity(57, 0, 131)
     name = "OpenScissors"
     summary = "Open shears to a given angle with both hands"
     formula = "2 - d_left - d_right + 5 (0.59 - r), r the angle between the hinge and its target"

@@ -4,6 +4,7 @@ import mujoco
 import torch
 from torch import Tensor
 
+from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
 from bidex_meta.maths import norm
 from bidex_meta.tasks.base import FAST, TaskClass
@@ -33,6 +34,7 @@ class PushBlock(TaskClass):
     it. Its half success for the left block alone is left out.
     """
 
+    needs = Capacity(38, 0, 103)
     name = "PushBlock"
     summary = "Push two blocks to their goals, one with each hand"
     formula = "2 - d_left - d_right + 5 (0.8 - d), d the sum of both blocks' distances to their goals"

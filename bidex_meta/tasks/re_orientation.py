@@ -4,6 +4,7 @@ import mujoco
 import torch
 from torch import Tensor
 
+from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
 from bidex_meta.maths import constant, multiply, rotation_angle, wxyz, xyzw
 from bidex_meta.tasks import eggs
@@ -43,6 +44,7 @@ class ReOrientation(TaskClass):
     half a turn, so that none is a success.
     """
 
+    needs = Capacity(26, 0, 67)
     name = "ReOrientation"
     summary = "Turn two cubes on the hands to a given orientation"
     formula = "-10 (d1 + d2) - 1.5 (r1 + r2), distance and angle of each cube and its goal"

@@ -4,6 +4,7 @@ import mujoco
 import torch
 from torch import Tensor
 
+from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_DOWN_AWAY, PALM_DOWN_BACK, HandPose
 from bidex_meta.maths import norm
 from bidex_meta.tasks.base import FIRM, TaskClass
@@ -42,6 +43,7 @@ class StackBlock(TaskClass):
     hand on table 0.225 instead of 0.35.
     """
 
+    needs = Capacity(43, 0, 115)
     name = "StackBlock"
     summary = "Stack two blocks at a given place"
     formula = "1.5 - d_left - d_right + 2 (0.24 - d), d the sum of both blocks' distances to their targets"

@@ -6,6 +6,7 @@ import mujoco
 import torch
 from torch import Tensor
 
+from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
 from bidex_meta.maths import multiply, norm, rotation_angle, xyzw
 from bidex_meta.tasks.base import FIRM, TaskClass
@@ -34,6 +35,7 @@ class SwingCup(TaskClass):
     Goal position is the task's start position; the reward does not read it.
     """
 
+    needs = Capacity(34, 4, 87)
     name = "SwingCup"
     summary = "Turn a two-handled cup with both hands"
     formula = "-1 - d_left - d_right + 5 / (r + 0.1), r the angle between the cup and its goal"

@@ -6,6 +6,7 @@ import mujoco
 import torch
 from torch import Tensor
 
+from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
 from bidex_meta.maths import norm, quaternion_from_rpy, quaternion_product, xyzw
 from bidex_meta.tasks.base import FAST, TaskClass
@@ -41,6 +42,7 @@ class Switch(TaskClass):
     episode draws nothing.
     """
 
+    needs = Capacity(36, 0, 90)
     name = "Switch"
     summary = "Press the buttons of two rocker switches"
     formula = "2 - d_left - d_right + 50 (1.4 - d), d the sum of both buttons' distances to where they are pressed"

@@ -3,6 +3,7 @@
 import mujoco
 from torch import Tensor
 
+from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
 from bidex_meta.tasks import eggs
 from bidex_meta.tasks.base import LIGHT, TaskClass
@@ -25,6 +26,7 @@ class TwoCatchUnderarm(TaskClass):
     orientation (docs/figures.md, start noise). Success: each egg within 3 cm of its goal, both in the same step.
     """
 
+    needs = Capacity(42, 8, 57)
     name = "TwoCatchUnderarm"
     summary = "Throw two eggs at once, each to the other hand"
     formula = "exp(-0.2 (50 d1 + r1)) + exp(-0.2 (50 d2 + r2)), distance and angle of each egg and its goal"

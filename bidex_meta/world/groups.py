@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bidex_meta.engine.capacity import room_for
 from bidex_meta.engine.protocol import Engine, EngineMaker
 from bidex_meta.engine.structure import same_structure
 from bidex_meta.tasks.base import TaskClass
@@ -102,5 +103,5 @@ def _build_group(places: list[tuple[int, Scene, slice]], make_engine: EngineMake
     rows = torch.cat([torch.arange(m.world_rows.start, m.world_rows.stop) for m in members])
     first, last = int(rows[0]), int(rows[-1])
     span = slice(first, last + 1) if last - first + 1 == len(rows) else None
-    engine = make_engine(models, model_of_row)
+    engine = make_engine(models, model_of_row, room_for([scene.task.needs for _, scene, _ in places]))
     return Group(engine, tuple(members), rows.to(engine.device), span)

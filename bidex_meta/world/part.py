@@ -1,42 +1,16 @@
 """The rows of a world that one engine carries: controls, transitions, observations, starts."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from bidex_meta.maths import xyzw
-from bidex_meta.tasks.base import CONTROL_RATE, TaskClass
+from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.world.actions import Controls
 from bidex_meta.world.groups import Group, Member, Slot
 from bidex_meta.world.observations import Observer, Rule, clip
-
-
-@dataclass(frozen=True)
-class Transition:
-    """What a step did to rows of one class, before it is scaled or cleaned.
-
-    Attributes:
-        terms: Reward terms by name, each (n,).
-        reward: Their sum, shape (n,).
-        success: Shape (n,), bool.
-        failed: Shape (n,), bool.
-    """
-
-    terms: dict[str, Tensor]
-    reward: Tensor
-    success: Tensor
-    failed: Tensor
-
-
-def judge(task: TaskClass, state: TaskState) -> Transition:
-    """Reward, success and ends of the step just made."""
-    terms = task.reward_terms(state)
-    values = list(terms.values())
-    reward = torch.stack(values).sum(dim=0) if len(values) > 1 else values[0]
-    return Transition(terms, reward, task.success(state), task.failed(state))
 
 
 class Part:

@@ -1,4 +1,4 @@
-"""What a step did to all rows of a world, gathered from its parts."""
+"""What a step did: to rows of one class by its own formulas, and to all rows of a world, gathered from its parts."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -6,7 +6,34 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bidex_meta.world.part import Part, judge
+from bidex_meta.tasks.base import TaskClass
+from bidex_meta.tasks.state import TaskState
+from bidex_meta.world.part import Part
+
+
+@dataclass(frozen=True)
+class Transition:
+    """What a step did to rows of one class, before it is scaled or cleaned.
+
+    Attributes:
+        terms: Reward terms by name, each (n,).
+        reward: Their sum, shape (n,).
+        success: Shape (n,), bool.
+        failed: Shape (n,), bool.
+    """
+
+    terms: dict[str, Tensor]
+    reward: Tensor
+    success: Tensor
+    failed: Tensor
+
+
+def judge(task: TaskClass, state: TaskState) -> Transition:
+    """Reward, success and ends of the step just made."""
+    terms = task.reward_terms(state)
+    values = list(terms.values())
+    reward = torch.stack(values).sum(dim=0) if len(values) > 1 else values[0]
+    return Transition(terms, reward, task.success(state), task.failed(state))
 
 
 @dataclass(frozen=True)

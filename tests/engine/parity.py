@@ -6,6 +6,7 @@ import mujoco
 import torch
 from torch import Tensor
 
+from bidex_meta.engine.capacity import room_for
 from bidex_meta.engine.cpu import CpuEngine
 from bidex_meta.engine.warp import WarpEngine
 from bidex_meta.hands.pair import SIDES
@@ -124,7 +125,7 @@ def pair(names: tuple[str, ...], rows: int = ROWS, device: str = "cpu") -> Pair:
     (part,) = world.parts
     models = list({id(m.scene.model): m.scene.model for m in part.group.members}.values())
     of_row = [i for i, m in enumerate(part.group.members) for _ in range(m.engine_rows.start, m.engine_rows.stop)]
-    both = Pair(part, WarpEngine(models, of_row, device), part.group.take(world.task_index))
+    both = Pair(part, WarpEngine(models, of_row, room_for([m.scene.task.needs for m in part.group.members]), device), part.group.take(world.task_index))
     both.restart()
     return both
 

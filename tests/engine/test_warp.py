@@ -18,6 +18,7 @@ from tests.engine.test_cpu import BREAKAGES, same
 from tests.tasks.worlds import Lens
 
 SUBSTEPS, ROWS = 2, 4
+ROOM = Capacity(contacts=112, convex=30, rows=208)
 NAMES = ("HandOver", "CatchUnderarm", "CatchOver2Underarm", "CatchUnderarm")
 # A cold cache compiles for a minute and more, and one test process shall do it, not all (--dist loadgroup).
 pytestmark = [pytest.mark.timeout(900), pytest.mark.xdist_group("warp")]
@@ -32,7 +33,7 @@ def scenes() -> list[Scene]:
 def engines(scenes: list[Scene]) -> tuple[WarpEngine, WarpEngine]:
     """Two of the same classes; tests restart them and change their arrays alone."""
     models = [scene.model for scene in scenes]
-    return WarpEngine(models, range(ROWS)), WarpEngine(models, range(ROWS))
+    return WarpEngine(models, range(ROWS), ROOM), WarpEngine(models, range(ROWS), ROOM)
 
 
 @pytest.fixture
@@ -221,7 +222,7 @@ def variant(scene: Scene, change: str) -> mujoco.MjModel:
 def test_each_world_has_the_numbers_of_its_own_model(scenes: list[Scene]) -> None:
     """Mass, damping and pose that differ from row to row: every row moves as in C with its own model."""
     models = [variant(scenes[1], change) for change in ("", "mass", "damping", "pose")]
-    ours, theirs = WarpEngine(models, range(ROWS)), CpuEngine(models, range(ROWS), 1)
+    ours, theirs = WarpEngine(models, range(ROWS), ROOM), CpuEngine(models, range(ROWS), 1)
     start = torch.from_numpy(scenes[1].start_qpos).repeat(ROWS, 1)
     start[:, scenes[1].qpos["object"].start] += 2.0  # nothing touches
     for engine in (ours, theirs):

@@ -82,7 +82,7 @@ def no_looks(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def masked(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Worlds made in this test have the accelerators' kind of engine."""
     with monkeypatch.context() as patch:
-        maker = lambda models, rows: MaskedEngine(models, rows, threads=1)  # noqa: E731
+        maker = lambda models, rows, room: MaskedEngine(models, rows, threads=1)  # noqa: E731
         patch.setattr(world, "choose_engine", lambda *_: (torch.device("cpu"), maker))
         yield
 

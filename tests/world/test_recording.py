@@ -78,7 +78,7 @@ def taped(recorder: list[Recorder], count: list[int]) -> Callable[[Callable[[], 
 def recorded(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str, int], tuple[World, list[int]]]]:
     def make(suite: str, rows: int) -> tuple[World, list[int]]:
         with monkeypatch.context() as patch:
-            maker = lambda models, of: StillEngine(models, of, threads=1)  # noqa: E731
+            maker = lambda models, of, room: StillEngine(models, of, threads=1)  # noqa: E731
             patch.setattr(world, "choose_engine", lambda *_: (torch.device("cpu"), maker))
             made = suite_world(suite, rows)
         holder: list[Recorder] = []
