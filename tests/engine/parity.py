@@ -125,7 +125,8 @@ def pair(names: tuple[str, ...], rows: int = ROWS, device: str = "cpu") -> Pair:
     (part,) = world.parts
     models = list({id(m.scene.model): m.scene.model for m in part.group.members}.values())
     of_row = [i for i, m in enumerate(part.group.members) for _ in range(m.engine_rows.start, m.engine_rows.stop)]
-    both = Pair(part, WarpEngine(models, of_row, room_for([m.scene.task.needs for m in part.group.members]), device), part.group.take(world.task_index))
+    room = room_for([member.scene.task.needs for member in part.group.members])
+    both = Pair(part, WarpEngine(models, of_row, room, device), part.group.take(world.task_index))
     both.restart()
     return both
 

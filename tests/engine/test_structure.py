@@ -73,7 +73,8 @@ def test_other_numbers_are_no_other_structure(change: str) -> None:
 
 def test_groups_of_a_mixed_world() -> None:
     slots = [slot(registry.get(name, True)) for name in MOVING]
-    groups = build_groups(slots, split_rows(23, len(slots)), lambda models, rows, room: CpuEngine(models, rows, threads=1))
+    make = lambda models, rows, room: CpuEngine(models, rows, threads=1)  # noqa: E731
+    groups = build_groups(slots, split_rows(23, len(slots)), make)
     names = [[member.scene.task.name for member in group.members] for group in groups]
     shared = [sorted(name for name, _ in ONE_EGG), sorted(name for name in MOVING if name.startswith("Door"))]
     alone = [[name] for name in MOVING if not any(name in group for group in shared)]
