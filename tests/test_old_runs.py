@@ -1,0 +1,32 @@
+"""Runs of earlier code go on and are judged: a folder of each learner, kept from before the rooms (commit 3dffcfe)."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from bidex_meta.cli import main
+
+FOLDERS = sorted((Path(__file__).parent / "data" / "old_runs").iterdir())
+
+
+@pytest.fixture(params=FOLDERS, ids=lambda folder: folder.name)
+def run(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(request.param, tmp_path / "run"))
+
+
+def test_an_old_run_goes_on(run: Path) -> None:
+    before = json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])["step"]
+    main(["run", "--resume", str(run), "--steps", str(before + 1), "--no-evaluate"])
+    after = json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])
+    assert after["step"] > before
+    assert (run / "checkpoints" / f"step_{after['step']}.pt").is_file()
+
+
+def test_an_old_run_is_judged(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = json.loads((run / "config.json").read_text())
+    adapts = config["algo"] in ("promp", "maml", "rl2")
+    size = ["--rollouts", "1", "--tasks", "1", "--trials", "1", "--episodes", "1"] if adapts else ["--episodes", "1"]
+    main(["evaluate", str(run), "--json", *size])
+    assert json.loads(capsys.readouterr().out)
