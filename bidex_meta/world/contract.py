@@ -48,8 +48,8 @@ class ObservationGroup:
         name: ``right_hand``, ``left_hand``, ``object`` (what is left beside the others), ``goal`` (zeros where a suite
             hides it), ``padding``, or ``task`` where the kind is not the same in all slots: in MT4 the entries that are
             padding to three classes and the second egg to one. ``task_id`` is the one-hot of the slot. Worlds that know
-            no such parts call everything before the task id ``state``. What is padding here may be more in a world of
-            other classes: in ML4's train split it is, where the test split has the second egg.
+            no such parts call everything before the task id ``state``. A world of other
+            classes may have other groups: the test split of ML4 has a second egg where the train split has padding.
         where: Index ranges in ascending order, none next to another.
     """
 
