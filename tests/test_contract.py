@@ -59,7 +59,7 @@ KINDS = {
     "ML4": Kind(lambda mode: suite_world("ML4", ROWS, mode), fixed=True),
     "ML1-test": Kind(lambda mode: suite_world("ML1", 3, mode, "test"), fixed=True),
     "HandOver": Kind(lambda mode: class_world("HandOver", 3, mode)),
-    "metaworld": Kind(lambda mode: MetaWorldWorld("metaworld/MT3", 4, autoreset_mode=mode), TaskWorld),
+    "metaworld": Kind(lambda mode: MetaWorldWorld("metaworld/MT3", 4, autoreset_mode=mode)),
     "ToyWorld": Kind(lambda mode: ToyWorld(ROWS, mode), TaskWorld, fixed=True),
     "PointWorld": Kind(point_world, fixed=True),
     "PointGoals": Kind(point_goals, fixed=True),
@@ -335,7 +335,7 @@ def test_other_tasks(case: Case) -> None:
     if case.kind.fixed or case.mode == "DISABLED":
         rows = world.slot_rows[-1]
         assert world.task_index[rows].tolist() == [j % 2 for j in range(rows.stop - rows.start)]
-    for bad in ({"nobody": chosen}, {name: chosen[0]}, {name: np.zeros((2, 99))}):
+    for bad in ({"nobody": chosen}, {name: chosen[None]}, {name: np.zeros((2, 99))}):
         with pytest.raises(BidexError):
             world.set_tasks(bad)
     world.set_tasks(dict(zip(world.task_names, pools, strict=True)))

@@ -44,8 +44,8 @@ class MetaWorldWorld(VectorEnv):
     [0, 10]; an episode is 500 steps, ended by the time limit alone. In SAME_STEP mode each episode draws one of the
     class's fifty tasks and the first one starts at a random elapsed step, left out of statistics; in DISABLED mode row
     j of a class keeps task j modulo the number of tasks. Starts are part of Meta-World's tasks: an episode depends on
-    its task and actions alone. All else is as in ``bidex_meta.World``: a ``contract.TaskWorld`` whose slots are the
-    classes; ``set_tasks`` takes numbers of tasks.
+    its task and actions alone. All else is as in ``bidex_meta.World``: a ``contract.PooledWorld`` whose slots are the
+    classes; a task's variation is its number among the class's fifty.
     """
 
     single_observation_space: Box
@@ -106,27 +106,36 @@ class MetaWorldWorld(VectorEnv):
         self._keys = torch.cat([row_keys(self.seed, name, r.stop - r.start, self.device) for name, r in pairs])
         self.episodes = Episodes.fresh(self.num_envs, self.device)
 
-    def set_tasks(self, pools: Mapping[str, Sequence[int]]) -> None:
+    def set_tasks(self, pools: Mapping[str, Sequence[int] | np.ndarray]) -> None:
         """Replaces the pools of tasks of some classes; they hold from the next full reset on.
 
         Args:
-            pools: Class name to numbers of tasks among its fifty.
+            pools: Class name to numbers of tasks among its fifty, shape (n,) or (n, 1).
 
         Raises:
-            BidexError: Unknown class, an empty pool or a number out of range.
+            BidexError: Unknown class, an empty pool, a wrong shape or a number out of range.
         """
         chosen = dict(getattr(self, "_pools", {}))
         for name, pool in pools.items():
             if name not in self.task_names:
                 raise unknown_name(f"class of {self.suite}", name, self.task_names)
-            if len(pool) == 0 or min(pool) < 0 or max(pool) >= TASKS_PER_CLASS:
-                raise BidexError(f"Expected tasks of {name} from 0 to {TASKS_PER_CLASS - 1}, got {list(pool)}.")
-            chosen[name] = [int(number) for number in pool]
+            numbers = np.asarray(pool)
+            flat = numbers.size > 0 and numbers.shape in ((len(pool),), (len(pool), 1))
+            if not flat or numbers.min() < 0 or numbers.max() >= TASKS_PER_CLASS:
+                raise BidexError(
+                    f"Expected tasks of {name} from 0 to {TASKS_PER_CLASS - 1}, (n,) or (n, 1), got {numbers.tolist()}."
+                )
+            chosen[name] = [int(number) for number in numbers.flatten()]
         self._pools = chosen
         self.num_slot_tasks = [len(chosen[name]) for name in self.task_names]
         self._pool_size = torch.tensor(self.num_slot_tasks)[self.task_id]
         self.task_index = self._index_in_slot % self._pool_size
         self._ready = False
+
+    @property
+    def pools(self) -> list[np.ndarray]:
+        """Numbers of the tasks of each class, each (n, 1), int64."""
+        return [np.array(self._pools[name])[:, None] for name in self.task_names]
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
         """Starts episodes.
