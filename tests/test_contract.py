@@ -1,5 +1,6 @@
 """One test of the worlds' contract (bidex_meta/world/contract.py) for all of them, the tests' own small ones too."""
 
+import copy
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -92,10 +93,10 @@ def case(request: pytest.FixtureRequest) -> Case:
 
 
 def actions(world: VectorWorld, steps: int, seed: int = 0) -> Tensor:
-    """Uniform ones (steps, N, a), now and then out of range. In the fourth step every other row's is not finite."""
+    """Uniform ones (steps, N, a), now and then out of range. In each fourth step every other row's is not finite."""
     generator = torch.Generator().manual_seed(seed)
     drawn = 2.2 * torch.rand(steps, *world.action_space.shape, generator=generator) - 1.1
-    drawn[3, ::2, -1] = torch.tensor([torch.nan, torch.inf, -torch.inf])[torch.arange(len(drawn[3, ::2])) % 3]
+    drawn[3::4, ::2, -1] = torch.tensor([torch.nan, torch.inf, -torch.inf])[torch.arange(drawn[0, ::2].shape[0]) % 3]
     return drawn
 
 
@@ -108,6 +109,14 @@ def assert_equal(a: list[dict[str, Tensor]], b: list[dict[str, Tensor]]) -> None
     for step, (x, y) in enumerate(zip(a, b, strict=True)):
         assert x.keys() == y.keys()
         assert not [f"step {step}: {name}" for name in x if not torch.equal(x[name], y[name])]
+
+
+def spoil(state: Any) -> None:
+    """Zeroes all tensors in it."""
+    if isinstance(state, Tensor):
+        state.zero_()
+    for value in state.values() if isinstance(state, dict) else state if isinstance(state, list) else ():
+        spoil(value)
 
 
 def copied(step: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -262,7 +271,7 @@ def test_a_reset_mask_starts_just_these(case: Case) -> None:
 def test_what_was_returned_is_the_callers(case: Case) -> None:
     """No later step changes it, and changing it or the action changes nothing in the world."""
     world = case.world
-    given = actions(world, 10)
+    given = actions(world, 10).roll(-3, 0)  # whose first step keeps the start's observation in some rows
     start, _ = world.reset(seed=4)
     kept = [{"obs": start}, *play(world, given)]
     copies = [copied(step) for step in kept]
@@ -308,7 +317,8 @@ def test_a_state_continues_bit_for_bit(case: Case) -> None:
     for steps in (0, 5):  # at a start, and with broken rows
         world.reset(seed=8)
         play(world, given[:steps])
-        state = world.state_dict()
+        state = copy.deepcopy(world.state_dict())
+        spoil(world.state_dict())  # is the caller's as well
         on = play(world, given[steps:])
         after = world.reset()[0]
         other.load_state_dict(state)
