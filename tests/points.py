@@ -1,23 +1,15 @@
 """Points that look for a hidden goal: a small world with pools of tasks, and agents that adapt in it."""
 
-from dataclasses import dataclass, replace
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
 from torch import Tensor
 
 from bidex_meta.agents import Timestep
+from tests.fake_world import FakePools
 
 SPEED = 0.25
-
-
-@dataclass(frozen=True)
-class Pool:
-    name: str
-    tasks: np.ndarray
-    steps: int
 
 
 def ring(count: int, turn: float = 0.0) -> np.ndarray:
@@ -26,11 +18,10 @@ def ring(count: int, turn: float = 0.0) -> np.ndarray:
     return np.stack([np.cos(angle), np.sin(angle)], 1)
 
 
-class PointWorld:
+class PointWorld(FakePools):
     """Rows are points in the plane that see their place and the time left, not their goal.
 
-    Like ``bidex_meta.World`` in DISABLED mode: rows of a slot are contiguous, row j keeps task j modulo their number,
-    an ended row is frozen. Reward: minus the distance to the goal.
+    Reward: minus the distance to the goal, by two.
 
     Args:
         num_envs: Rows over all slots.
@@ -39,7 +30,14 @@ class PointWorld:
         ends: Whether an episode ends (terminated) at its goal.
         noise: Half the range of starts around the origin.
         breaks: Rows whose physics breaks in the second step of each episode.
+
+    Attributes:
+        seeds: What each reset was given.
+        starts: Places of the rows that each reset started.
+        given: What each ``set_tasks`` was given.
     """
+
+    kept = ("x",)
 
     def __init__(
         self,
@@ -53,75 +51,44 @@ class PointWorld:
         mode: str = "DISABLED",
         seed: int = 0,
     ):
-        self.metadata = {"autoreset_mode": gymnasium.vector.AutoresetMode[mode]}
-        self.slots = [Pool(name, goals, steps[i]) for i, (name, goals) in enumerate(pools.items())]
-        self.task_names, self.num_tasks, self.num_envs = list(pools), len(pools), num_envs
-        self.seed, self.ends, self.noise = seed, ends, noise
-        sizes = [len(part) for part in np.array_split(np.arange(num_envs), self.num_tasks)]
-        stops = np.cumsum(sizes)
-        self.slot_rows = [slice(int(stop - size), int(stop)) for size, stop in zip(sizes, stops, strict=True)]
-        self.task_id = torch.repeat_interleave(torch.arange(self.num_tasks), torch.tensor(sizes))
-        self._place = torch.cat([torch.arange(size) for size in sizes])
-        self.max_episode_steps = torch.tensor([slot.steps for slot in self.slots])[self.task_id]
-        self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (3,), np.float32)
-        self.single_action_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
-        self.action_space = gymnasium.spaces.Box(-1, 1, (num_envs, 2), np.float32)
+        super().__init__(pools, num_envs, (3, 2), steps[: len(pools)], mode, seed=seed)
+        self.ends, self.noise, self.x = ends, noise, torch.zeros(num_envs, 2)
         self._breaks = torch.isin(torch.arange(num_envs), torch.tensor(breaks, dtype=torch.int64))
-        self.episode, self.x = torch.zeros(num_envs, dtype=torch.int64), torch.zeros(num_envs, 2)
-        self.elapsed, self.over = torch.zeros(num_envs, dtype=torch.int64), torch.zeros(2, num_envs, dtype=torch.bool)
         self.seeds: list[int | None] = []
         self.starts: list[Tensor] = []
-        self.pools: list[dict[str, np.ndarray]] = []
-        self._assign_tasks()
-
-    def _assign_tasks(self) -> None:
-        self.num_slot_tasks = [len(slot.tasks) for slot in self.slots]
-        self.task_index = self._place % torch.tensor(self.num_slot_tasks)[self.task_id]
-        rows = zip(self.task_id.tolist(), self.task_index.tolist(), strict=True)
-        self.goal = torch.tensor(np.stack([self.slots[i].tasks[j] for i, j in rows]), dtype=torch.float32)
-        self.ready = False
+        self.given: list[dict[str, np.ndarray]] = []
 
     def set_tasks(self, pools: dict[str, np.ndarray]) -> None:
-        self.pools.append(pools)
-        self.slots = [replace(slot, tasks=pools.get(slot.name, slot.tasks)) for slot in self.slots]
-        self._assign_tasks()
+        self.given.append(pools)
+        super().set_tasks(pools)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
-        mask = (options or {}).get("reset_mask", torch.ones(self.num_envs, dtype=torch.bool))
-        assert self.ready or mask.all()
-        self.ready = True
-        if seed is not None:
-            self.seed, self.episode = seed, torch.zeros_like(self.episode)
         self.seeds.append(seed)
-        self.episode = self.episode + mask
-        drawn = np.stack(
-            [np.random.default_rng((self.seed, i, int(n))).uniform(-1, 1, 2) for i, n in enumerate(self.episode)]
-        )
+        before = self.episodes.number
+        obs, info = super().reset(seed=seed, options=options)
+        started = (self.episodes.number != before) | (seed is not None)
+        self.starts.append(self.x[started].clone())
+        return obs, info
+
+    def _start(self, mask: Tensor) -> None:
+        keys = [(self.seed, i, int(n)) for i, n in enumerate(self.episodes.number + 1)]
+        drawn = np.stack([np.random.default_rng(key).uniform(-1, 1, 2) for key in keys])
         self.x = torch.where(mask[:, None], self.noise * torch.tensor(drawn, dtype=torch.float32), self.x)
-        self.starts.append(self.x[mask].clone())
-        self.elapsed, self.over = self.elapsed.masked_fill(mask, 0), self.over & ~mask
-        return self._obs(), {}
 
-    def _obs(self) -> Tensor:
-        return torch.cat([self.x, (self.max_episode_steps - self.elapsed)[:, None] / 10], 1)
+    def _observe(self) -> Tensor:
+        return torch.cat([self.x, (self.max_episode_steps - self.episodes.elapsed)[:, None] / 10], 1)
 
-    def step(self, action: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
-        active = ~self.over.any(0)
-        self.elapsed = self.elapsed + active
-        unstable = active & self._breaks & (self.elapsed == 2)
-        moved = self.x + SPEED * torch.as_tensor(action, dtype=torch.float32).clamp(-1, 1)
-        self.x = torch.where((active & ~unstable)[:, None], moved, self.x)
+    def _broken(self) -> Tensor:
+        return self._breaks & (self.episodes.elapsed == 1)
+
+    def _advance(self, action: Tensor, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        self.x = torch.where(active[:, None], self.x + SPEED * action, self.x)
         distance = (self.x - self.goal).norm(dim=1)
-        success = (distance < 0.2) & ~unstable
-        unscaled = torch.where(active & ~unstable, -distance, 0.0)
-        terminated = self.over[0] | (active & success & self.ends)
-        truncated = self.over[1] | (active & ((self.elapsed >= self.max_episode_steps) | unstable) & ~terminated)
-        self.over = torch.stack([terminated, truncated])
-        info = {"success": success, "unstable": unstable, "reward_unscaled": unscaled}
-        return self._obs(), 2 * unscaled, terminated.clone(), truncated.clone(), info
+        success = distance < 0.2
+        return -distance, success, success & self.ends
 
-    def close(self) -> None:
-        """Nothing is held."""
+    def _scaled(self, unscaled: Tensor) -> Tensor:
+        return 2 * unscaled
 
 
 class Still:

@@ -148,10 +148,10 @@ def test_data_come_from_the_other_world_with_the_same_starts():
 def test_portions_of_tasks_give_what_one_large_world_gives():
     def play(rows):
         place = world(rows, 5, 5, noise=0.0)
-        own = [slot.tasks for slot in place.slots]
+        own = list(place.pools)
         found = meta_evaluate(Explorer(), place, 2, rollouts=2, episodes_per_task=2)
-        assert all(np.array_equal(slot.tasks, tasks) for slot, tasks in zip(place.slots, own, strict=True))
-        return found, len(place.pools)
+        assert all(np.array_equal(*pair) for pair in zip(place.pools, own, strict=True))
+        return found, len(place.given)
 
     whole, untouched = play(20)
     parts, changes = play(8)

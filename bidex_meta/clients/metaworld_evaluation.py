@@ -19,6 +19,7 @@ import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from bidex_meta.errors import BidexError
+from bidex_meta.world.contract import PooledWorld
 
 
 class MetaWorldEnvs(VectorEnv):
@@ -32,17 +33,16 @@ class MetaWorldEnvs(VectorEnv):
         BidexError: A world that resets by itself.
     """
 
-    def __init__(self, world: Any):
+    def __init__(self, world: PooledWorld):
         if world.metadata["autoreset_mode"] != AutoresetMode.DISABLED:
             raise BidexError("Expected a world that does not reset by itself. Make it with autoreset_mode='DISABLED'.")
         self.world, self.num_envs = world, world.num_envs
         self.metadata = {**world.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}
-        for name in ("single_observation_space", "single_action_space", "observation_space", "action_space"):
-            if hasattr(world, name):
-                setattr(self, name, getattr(world, name))
+        self.single_observation_space, self.observation_space = world.single_observation_space, world.observation_space
+        self.single_action_space, self.action_space = world.single_action_space, world.action_space
         self.terminate_on_success = False
         self.task_name = [world.task_names[slot] for slot in world.task_id.tolist()]
-        self._pools = [slot.tasks for slot in world.slots]
+        self._pools = world.pools
         self._samples = 0
         self._returns = torch.zeros(self.num_envs, dtype=torch.float64, device=world.task_id.device)
         self._lengths = torch.zeros_like(world.task_id)

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
 from bidex_meta.agents import Agent
@@ -29,9 +28,11 @@ from bidex_meta.evaluation.play import check_world, play_tasks
 from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.world.actions import clean
 from bidex_meta.world.autoreset import checked_mode, reset_mask
+from bidex_meta.world.contract import plain_groups
 from bidex_meta.world.episodes import Episodes
 from bidex_meta.world.groups import split_rows
 from bidex_meta.world.random import row_keys, uniform
+from bidex_meta.world.spaces import make_spaces
 
 _TASK_DRAW, _ELAPSED_DRAW, _DRAWS = 0, 1, 2
 
@@ -43,18 +44,14 @@ class MetaWorldWorld(VectorEnv):
     [0, 10]; an episode is 500 steps, ended by the time limit alone. In SAME_STEP mode each episode draws one of the
     class's fifty tasks and the first one starts at a random elapsed step, left out of statistics; in DISABLED mode row
     j of a class keeps task j modulo the number of tasks. Starts are part of Meta-World's tasks: an episode depends on
-    its task and actions alone. All else, ``info`` too, is as in ``bidex_meta.World``.
-
-    Attributes:
-        task_id: Class of each row, shape (num_envs,), int64.
-        task_names: Names of the classes.
-        num_tasks: Number of classes.
-        task_index: Task of its class's pool that each row plays, shape (num_envs,), int64.
-        num_slot_tasks: Tasks in the pool of each class.
-        slot_rows: Rows of each class.
-        max_episode_steps: Time limit of each row, steps, shape (num_envs,), int64.
-        num_id_columns: Trailing observation entries that are the one-hot.
+    its task and actions alone. All else is as in ``bidex_meta.World``: a ``contract.PooledWorld`` whose slots are the
+    classes; a task's variation is its number among the class's fifty.
     """
+
+    single_observation_space: Box
+    single_action_space: Box
+    observation_space: Box
+    action_space: Box
 
     def __init__(
         self, suite: str, num_envs: int, *, seed: int = 0, autoreset_mode: str | AutoresetMode | None = None
@@ -98,10 +95,10 @@ class MetaWorldWorld(VectorEnv):
             np.concatenate([np.full(OBSERVATION_SIZE, far), np.full(self.num_tasks, one_hot)]).astype(np.float32)
             for far, one_hot in ((-np.inf, 0.0), (np.inf, 1.0))
         )
-        self.single_observation_space = Box(low, high, dtype=np.float32)
-        self.single_action_space = Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        spaces = make_spaces(Box(low, high, dtype=np.float32), ACTION_SIZE, self.num_envs)
+        self.single_observation_space, self.single_action_space = spaces.single_observation, spaces.single_action
+        self.observation_space, self.action_space = spaces.observation, spaces.action
+        self.observation_groups = plain_groups(OBSERVATION_SIZE + self.num_tasks, self.num_tasks)
 
     def _seed_rows(self, seed: int) -> None:
         self.seed = int(seed)
@@ -109,27 +106,36 @@ class MetaWorldWorld(VectorEnv):
         self._keys = torch.cat([row_keys(self.seed, name, r.stop - r.start, self.device) for name, r in pairs])
         self.episodes = Episodes.fresh(self.num_envs, self.device)
 
-    def set_tasks(self, pools: Mapping[str, Sequence[int]]) -> None:
+    def set_tasks(self, pools: Mapping[str, Sequence[int] | np.ndarray]) -> None:
         """Replaces the pools of tasks of some classes; they hold from the next full reset on.
 
         Args:
-            pools: Class name to numbers of tasks among its fifty.
+            pools: Class name to numbers of tasks among its fifty, shape (n,) or (n, 1).
 
         Raises:
-            BidexError: Unknown class, an empty pool or a number out of range.
+            BidexError: Unknown class, an empty pool, a wrong shape or a number out of range.
         """
         chosen = dict(getattr(self, "_pools", {}))
         for name, pool in pools.items():
             if name not in self.task_names:
                 raise unknown_name(f"class of {self.suite}", name, self.task_names)
-            if len(pool) == 0 or min(pool) < 0 or max(pool) >= TASKS_PER_CLASS:
-                raise BidexError(f"Expected tasks of {name} from 0 to {TASKS_PER_CLASS - 1}, got {list(pool)}.")
-            chosen[name] = [int(number) for number in pool]
+            numbers = np.asarray(pool)
+            flat = numbers.size > 0 and numbers.shape in ((len(pool),), (len(pool), 1))
+            if not flat or numbers.min() < 0 or numbers.max() >= TASKS_PER_CLASS:
+                raise BidexError(
+                    f"Expected tasks of {name} from 0 to {TASKS_PER_CLASS - 1}, (n,) or (n, 1), got {numbers.tolist()}."
+                )
+            chosen[name] = [int(number) for number in numbers.flatten()]
         self._pools = chosen
         self.num_slot_tasks = [len(chosen[name]) for name in self.task_names]
         self._pool_size = torch.tensor(self.num_slot_tasks)[self.task_id]
         self.task_index = self._index_in_slot % self._pool_size
         self._ready = False
+
+    @property
+    def pools(self) -> list[np.ndarray]:
+        """Numbers of the tasks of each class, each (n, 1), int64."""
+        return [np.array(self._pools[name])[:, None] for name in self.task_names]
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
         """Starts episodes.

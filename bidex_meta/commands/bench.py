@@ -8,12 +8,15 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from bidex_meta.commands.parsing import StepCount, Switch, parse
 from bidex_meta.errors import BidexError, unknown_name
+
+if TYPE_CHECKING:
+    from bidex_meta.world.contract import VectorWorld
 
 _KINDS = ("world", "scaling", "mixing", "field", "stability", "capacity", "gpu", "kernels", "learner", "adapt")
 
@@ -107,7 +110,7 @@ def _measurement(what: str) -> Any:
     return getattr(bench, what)
 
 
-def _make_learner(world: Any) -> Any:
+def _make_learner(world: "VectorWorld") -> Any:
     from bidex_meta.commands.learners import choose_preset, learner_kind
 
     kind = learner_kind("mtppo")

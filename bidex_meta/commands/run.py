@@ -11,12 +11,15 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bidex_meta.commands.learners import shared
 from bidex_meta.commands.run_config import RunPlan, plan_run
 from bidex_meta.errors import BidexError
 from bidex_meta.train.launch import launch, resume_command
+
+if TYPE_CHECKING:
+    from bidex_meta.world.contract import VectorWorld
 
 Checkpoint = tuple[dict[str, Any], int]
 """State and environment steps."""
@@ -143,7 +146,7 @@ def _make(plan: RunPlan, fresh: bool) -> tuple[Any, Any, Any]:
     return world, learner, folder
 
 
-def _train(plan: RunPlan, folder: Any, world: Any, learner: Any, loaded: Checkpoint | None) -> bool:
+def _train(plan: RunPlan, folder: Any, world: "VectorWorld", learner: Any, loaded: Checkpoint | None) -> bool:
     """Train to the end; True if a signal ended it early."""
     from bidex_meta.record import Recorder, read_metrics, training_seconds
     from bidex_meta.train import distributed, runner

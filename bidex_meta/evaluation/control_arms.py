@@ -17,6 +17,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.gains import MEASURES, difference_over_runs, grouped
 from bidex_meta.evaluation.meta_test import meta_evaluate
 from bidex_meta.evaluation.results import ClassResult, Difference, Evaluation
+from bidex_meta.world.contract import PooledWorld, TaskWorld
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,8 @@ class Control:
 
 def control(
     load: Callable[[], Agent],
-    test_world: Any,
-    train_world: Any,
+    test_world: TaskWorld,
+    train_world: PooledWorld,
     shots: int = 1,
     *,
     say: Callable[[str], None] = lambda line: None,
@@ -63,7 +64,7 @@ def control(
             f"Expected the same classes in both splits, as ML1 has them; train: {', '.join(train_world.task_names)}; "
             f"test: {', '.join(test_world.task_names)}."
         )
-    pools = [slot.tasks for slot in train_world.slots]
+    pools = train_world.pools
     own = meta_evaluate(load(), test_world, shots, evaluated=(0, shots), **played)
     say(f"before: {_returns(own.before)}; adapted to own data: {_returns(own.after)}")
     foreign = []

@@ -26,6 +26,7 @@ from bidex_meta.evaluation.play import EVALUATION_SEED, check_world, play_tasks,
 from bidex_meta.evaluation.portions import Portions, task_of_row
 from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.evaluation.scores import Reference
+from bidex_meta.world.contract import TaskWorld
 
 MAX_ADAPT_STEPS = 150
 """Steps after which an episode is long enough to adapt to, where nobody says otherwise."""
@@ -85,7 +86,7 @@ class MetaEvaluation:
 
 def meta_evaluate(
     agent: Agent,
-    world: Any,
+    world: TaskWorld,
     shots: int = 1,
     *,
     rollouts: int | None = None,
@@ -95,7 +96,7 @@ def meta_evaluate(
     max_adapt_steps: int = MAX_ADAPT_STEPS,
     seed: int = EVALUATION_SEED,
     references: Mapping[str, Reference] | None = None,
-    adapt_world: Any = None,
+    adapt_world: TaskWorld | None = None,
     evaluated: Collection[int] | None = None,
     split: str = "",
 ) -> MetaEvaluation:
@@ -171,7 +172,7 @@ def _seed(seed: int, *key: object) -> int:
     return int.from_bytes(digest[:4], "little")
 
 
-def _begin(agent: Agent, world: Any, field: Any) -> MetaLearningAgent:
+def _begin(agent: Agent, world: TaskWorld, field: TaskWorld) -> MetaLearningAgent:
     """The agent as it was meta-learned, told which rows share a task."""
     shared = task_of_row(world)
     if not torch.equal(shared, task_of_row(field)):
@@ -186,7 +187,7 @@ def _begin(agent: Agent, world: Any, field: Any) -> MetaLearningAgent:
     return learner
 
 
-def _adapt(agent: MetaLearningAgent, world: Any, rollouts: int, max_steps: int, seed: int) -> int:
+def _adapt(agent: MetaLearningAgent, world: TaskWorld, rollouts: int, max_steps: int, seed: int) -> int:
     """One shot: ``rollouts`` exploring episodes of each task, then ``adapt``.
 
     Returns:
@@ -206,7 +207,7 @@ def _adapt(agent: MetaLearningAgent, world: Any, rollouts: int, max_steps: int, 
 
 
 @torch.no_grad()
-def _explore(agent: MetaLearningAgent, world: Any, obs: Tensor, playing: Tensor, max_steps: int) -> int:
+def _explore(agent: MetaLearningAgent, world: TaskWorld, obs: Tensor, playing: Tensor, max_steps: int) -> int:
     """One exploring episode in each row of ``playing``, told to the agent; its valid transitions, over all rows."""
     limit = world.max_episode_steps.clamp(max=max_steps)
     running, steps = playing.clone(), torch.zeros((), dtype=torch.int64, device=playing.device)
@@ -214,7 +215,7 @@ def _explore(agent: MetaLearningAgent, world: Any, obs: Tensor, playing: Tensor,
         action, outputs = agent.adapt_action(obs)
         action = torch.as_tensor(action, device=obs.device)
         new, reward, terminated, truncated, info = world.step(action)
-        valid = running & ~info.get("unstable", torch.zeros_like(running))
+        valid = running & ~info["unstable"]
         # The world goes on with rows that were cut here; nobody looks at them until their next reset.
         truncated = truncated | ((limit <= step) & ~terminated)
         agent.step(Timestep(obs, action, reward, terminated, truncated, outputs, new, valid))
@@ -226,7 +227,9 @@ def _explore(agent: MetaLearningAgent, world: Any, obs: Tensor, playing: Tensor,
     return int(steps)
 
 
-def _check(agent: Any, world: Any, adapt_world: Any, shots: int, episodes_per_task: int, max_steps: int) -> None:
+def _check(
+    agent: Any, world: TaskWorld, adapt_world: TaskWorld | None, shots: int, episodes_per_task: int, max_steps: int
+) -> None:
     if shots < 0:
         raise BidexError(f"Shots must be 0 or more, not {shots}.")
     if max_steps < 1:

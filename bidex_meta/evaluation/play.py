@@ -8,15 +8,16 @@ the return of random actions, or its own if that is lower (``bidex_meta.evaluati
 """
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.vector import AutoresetMode
 
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.evaluation.scores import Reference
+from bidex_meta.world.contract import TaskWorld
 
 EVALUATION_SEED = 1_000_000
 """Seed of the starts in evaluation: not a seed anybody trains with, so that they are new to the policy."""
@@ -24,7 +25,7 @@ EVALUATION_SEED = 1_000_000
 
 def evaluate(
     agent: Agent,
-    world: Any,
+    world: TaskWorld,
     episodes_per_task: int = 4,
     *,
     seed: int | None = None,
@@ -48,7 +49,7 @@ def evaluate(
     return Evaluation(results_by_class(world.task_names, episodes, references), episodes_per_task)
 
 
-def play_tasks(agent: Agent, world: Any, episodes_per_task: int, seed: int | None) -> dict[str, np.ndarray]:
+def play_tasks(agent: Agent, world: TaskWorld, episodes_per_task: int, seed: int | None) -> dict[str, np.ndarray]:
     """``episodes_per_task`` episodes of every task, as ``evaluate`` plays them.
 
     Returns:
@@ -70,7 +71,7 @@ def play_tasks(agent: Agent, world: Any, episodes_per_task: int, seed: int | Non
     return {"slot": world.task_id.cpu().numpy()[row], "task": tasks.cpu().numpy()[row], **episodes}
 
 
-def check_world(world: Any, episodes_per_task: int) -> None:
+def check_world(world: TaskWorld, episodes_per_task: int) -> None:
     """Refuse what cannot be evaluated on.
 
     Raises:
@@ -78,14 +79,14 @@ def check_world(world: Any, episodes_per_task: int) -> None:
     """
     if episodes_per_task < 1:
         raise BidexError(f"Episodes per task must be at least 1, not {episodes_per_task}.")
-    mode = str(getattr(world.metadata["autoreset_mode"], "name", world.metadata["autoreset_mode"])).upper()
-    if mode != "DISABLED":
-        raise BidexError(f"Evaluation needs a world in autoreset mode DISABLED, but this one is in {mode}.")
+    mode = world.metadata["autoreset_mode"]
+    if mode != AutoresetMode.DISABLED:
+        raise BidexError(f"Evaluation needs a world in autoreset mode DISABLED, but this one is in {mode.name}.")
     if len(set(world.task_names)) != len(world.task_names):
         raise BidexError(f"Results are kept by name, but the world's names are not unique: {world.task_names}.")
 
 
-def quota(world: Any, episodes_per_task: int) -> torch.Tensor:
+def quota(world: TaskWorld, episodes_per_task: int) -> torch.Tensor:
     """Episodes each row has to play, ``(num_envs,)``: those of a task are split over the rows that play it.
 
     Raises:
@@ -109,19 +110,19 @@ def quota(world: Any, episodes_per_task: int) -> torch.Tensor:
 
 
 @torch.no_grad()
-def _play(agent: Agent, world: Any, obs: torch.Tensor, playing: torch.Tensor) -> dict[str, torch.Tensor]:
+def _play(agent: Agent, world: TaskWorld, obs: torch.Tensor, playing: torch.Tensor) -> dict[str, torch.Tensor]:
     """One episode in each row of ``playing``; its return, success, length, unstable, each ``(rows that played,)``."""
     running = playing.clone()
     returns = torch.zeros(world.num_envs, dtype=torch.float64, device=running.device)
     lengths = torch.zeros(world.num_envs, dtype=torch.int64, device=running.device)
     success, unstable = torch.zeros_like(running), torch.zeros_like(running)
     for _ in range(int(world.max_episode_steps.max())):
-        obs, reward, terminated, truncated, info = world.step(agent.eval_action(obs))
-        gained = info.get("reward_unscaled", reward).double()
+        obs, _, terminated, truncated, info = world.step(agent.eval_action(obs))
+        gained = info["reward_unscaled"].double()
         returns += torch.where(running, gained, torch.zeros_like(gained))
         lengths += running
         success |= running & info["success"]
-        unstable |= running & info.get("unstable", torch.zeros_like(running))
+        unstable |= running & info["unstable"]
         running &= ~(terminated | truncated)
         if not bool(running.any()):
             break

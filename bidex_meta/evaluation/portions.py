@@ -7,19 +7,28 @@ adaptations, which are played once more and not counted, so that every portion g
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from bidex_meta.errors import BidexError
+from bidex_meta.world.contract import PooledWorld, TaskWorld
 
 
-def task_of_row(world: Any) -> Tensor:
+def task_of_row(world: TaskWorld) -> Tensor:
     """Numbers from 0 on of the tasks of all slots, int64 ``(num_envs,)``: rows with the same number share a task."""
     before = torch.tensor([0, *world.num_slot_tasks[:-1]], device=world.task_id.device).cumsum(0)
     return world.task_index + before[world.task_id]
+
+
+def _with_pools(world: TaskWorld) -> PooledWorld:
+    if isinstance(world, PooledWorld):
+        return world
+    raise BidexError(
+        f"Expected as many rows as tasks times rollouts from a {type(world).__name__}, whose tasks cannot be set; it "
+        f"has {world.num_envs}. Raise num_envs, or leave out tasks, trials and rollouts."
+    )
 
 
 class Portions:
@@ -30,7 +39,7 @@ class Portions:
         count: Number of portions.
     """
 
-    def __init__(self, world: Any, rollouts: int | None, tasks: int | None, trials: int) -> None:
+    def __init__(self, world: TaskWorld, rollouts: int | None, tasks: int | None, trials: int) -> None:
         """Plans; the world is not touched.
 
         Args:
@@ -57,7 +66,7 @@ class Portions:
         self.rollouts = rollouts or min(number // size for number, size in zip(rows, self._sizes, strict=True))
 
     @contextmanager
-    def applied_to(self, worlds: Sequence[Any]) -> Iterator[Iterator[int]]:
+    def applied_to(self, worlds: Sequence[TaskWorld]) -> Iterator[Iterator[int]]:
         """The portions' numbers; as each is taken, its tasks are put into all worlds. At the end their pools come back.
 
         Raises:
@@ -72,17 +81,12 @@ class Portions:
         if self._whole():
             yield iter(range(1))
             return
-        for world in worlds:
-            if not hasattr(world, "slots"):
-                raise BidexError(
-                    f"Expected as many rows as tasks times rollouts from a {type(world).__name__}, whose tasks cannot "
-                    f"be set; it has {world.num_envs}. Raise num_envs, or leave out tasks, trials and rollouts."
-                )
-        pools = [[slot.tasks for slot in world.slots] for world in worlds]
+        pooled = [_with_pools(world) for world in worlds]
+        pools = [world.pools for world in pooled]
         try:
-            yield self._put(worlds, pools)
+            yield self._put(pooled, pools)
         finally:
-            for world, own in zip(worlds, pools, strict=True):
+            for world, own in zip(pooled, pools, strict=True):
                 world.set_tasks(dict(zip(world.task_names, own, strict=True)))
 
     def labelled(self, episodes: dict[str, np.ndarray], portion: int) -> dict[str, np.ndarray]:
@@ -102,7 +106,7 @@ class Portions:
         """Whether the world's own pools are the only portion."""
         return self.count == 1 and [len(adaptations) for adaptations in self._adaptations] == self._pool_sizes
 
-    def _put(self, worlds: Sequence[Any], pools: Sequence[Sequence[np.ndarray]]) -> Iterator[int]:
+    def _put(self, worlds: Sequence[PooledWorld], pools: Sequence[Sequence[np.ndarray]]) -> Iterator[int]:
         for portion in range(self.count):
             chosen = [
                 adaptations[np.arange(portion * size, (portion + 1) * size) % len(adaptations)]

@@ -1,8 +1,7 @@
 """Policies that nobody trained: what others are measured against."""
 
-from typing import Any
-
 import torch
+from gymnasium.spaces import Box
 
 
 class ZeroAgent:
@@ -12,7 +11,7 @@ class ZeroAgent:
         action_space: The world's batched action space, shape ``(num_envs, action)``.
     """
 
-    def __init__(self, action_space: Any):
+    def __init__(self, action_space: Box):
         self._shape = action_space.shape
 
     def eval_action(self, obs: torch.Tensor) -> torch.Tensor:
@@ -31,7 +30,7 @@ class RandomAgent:
         seed: Of this agent's own generator.
     """
 
-    def __init__(self, action_space: Any, seed: int = 0):
+    def __init__(self, action_space: Box, seed: int = 0):
         self._low = torch.as_tensor(action_space.low)
         self._range = torch.as_tensor(action_space.high) - self._low
         self._generator = torch.Generator().manual_seed(seed)

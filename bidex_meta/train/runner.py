@@ -15,21 +15,10 @@ from typing import Any, Protocol
 
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import any_process, gather, is_main, rank, world_size
+from bidex_meta.world.contract import VectorWorld
 
 # The most of a run's time that may go into checkpoints.
 _SAVING_SHARE = 0.02
-
-
-class Resumable(Protocol):
-    """What the loop needs of a world: its state."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """All that is needed to continue bit for bit."""
-        ...
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`state_dict` gave."""
-        ...
 
 
 class Learner(Protocol):
@@ -72,7 +61,7 @@ class Record(Protocol):
 
 def train(
     learner: Learner,
-    world: Resumable,
+    world: VectorWorld,
     *,
     total_steps: int,
     record: Record | None,
@@ -133,13 +122,13 @@ def train(
         return stopped
 
 
-def _save(learner: Learner, world: Resumable, record: Record | None) -> None:
+def _save(learner: Learner, world: VectorWorld, record: Record | None) -> None:
     state = checkpoint(learner, world)
     if record is not None and state is not None:
         record.save(state, learner.env_steps)
 
 
-def checkpoint(learner: Learner, world: Resumable) -> dict[str, Any] | None:
+def checkpoint(learner: Learner, world: VectorWorld) -> dict[str, Any] | None:
     """The state of a run: ``{"learner": ..., "env": ...}``, tensors and plain values only.
 
     Of several processes all must call it. Process 0 gets its own state with, under ``others``, what differs in each of
@@ -153,7 +142,7 @@ def checkpoint(learner: Learner, world: Resumable) -> dict[str, Any] | None:
     return None if parts is None else {**state, "others": parts[1:]}
 
 
-def resume(learner: Learner, world: Resumable, state: dict[str, Any]) -> None:
+def resume(learner: Learner, world: VectorWorld, state: dict[str, Any]) -> None:
     """Restores what :func:`checkpoint` gave; training then continues bit for bit (CPU, same number of threads).
 
     Raises:

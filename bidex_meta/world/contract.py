@@ -1,27 +1,32 @@
 """What a batched world is to learners, evaluation and clients: the one page that says what they may rely on.
 
-``tests/test_contract.py`` holds every world to it: ``World`` in both modes on MT and ML suites, Meta-World's, and the
-small worlds of the tests. N rows ("environments"), each of one slot (a task class of the suite; MT1 and ML1: a task of
-their class). All tensors are on ``device``; what a step returns is fresh memory that no later step changes.
+``tests/test_contract.py`` holds every world to it: ``World`` in both modes on MT and ML suites, Meta-World's, and
+the small worlds of the tests. N rows ("environments"), each of one slot (a task class of the suite; MT1: a task of its
+class). All tensors are on ``device``. What a reset or step returns is the caller's: no later step changes it, and
+changing it, or the action that was given, changes nothing in the world.
 
-Modes (``autoreset_mode``): in SAME_STEP (training) a row that ends starts its next episode within the step; the
-observation returned is already that of the new episode, ``info["final_obs"]`` has the last one. In DISABLED
-(evaluation, meta-learning) an ended row is frozen: it may be stepped, keeps its flags and gets reward 0, until a
-``reset`` whose ``reset_mask`` names it.
+Modes (``metadata["autoreset_mode"]``): in SAME_STEP (training) a row that ends starts its next episode within the step;
+the observation returned is already that of the new episode, ``info["final_obs"]`` has the last one. In DISABLED
+(evaluation, meta-learning) an ended row is frozen: it may be stepped, keeps its observation and its flags and gets
+reward 0, until a ``reset`` whose ``reset_mask`` names it.
 
-``info`` of a step, every entry about the transition just made:
+``info`` of a reset is empty; that of a step is about the transition just made:
 
-=================  ================  ===================================================================================
-key                shape, type       meaning
-=================  ================  ===================================================================================
-success            (N,), bool        the goal is met in this state
-unstable           (N,), bool        physics broke: reward 0, truncated, the transition teaches nothing
-reward_unscaled    (N,), float32     reward before the suite's scale of the class
-final_obs          (N, d), float32   the observation that the transition led to
-_final_obs         (N,), bool        rows that ended in this step: there ``final_obs`` is the last of the episode
-episode            dict of (N,)      r (return), l (length), success, unscaled, of the episode so far
-_episode           (N,), bool        rows whose episode ended and counts (shortened first ones do not)
-=================  ================  ===================================================================================
+=====================  ====================  ===========================================================================
+key                    shape, type           meaning
+=====================  ====================  ===========================================================================
+success                (N,), bool            the goal is met in this state
+unstable               (N,), bool            physics broke, or the action was not finite: reward 0, truncated, the
+                                             transition teaches nothing; never in a frozen row
+reward_unscaled        (N,), float32         reward before the suite's scale of the class; 0 in a frozen row
+final_obs              (N, d), float32       the observation that the transition led to; of an unstable one the last
+                                             before it
+_final_obs             (N,), bool            rows that ended in this step: there ``final_obs`` is the last of the
+                                             episode; elsewhere it is the observation that the step returns
+episode                dict of (N,)          r (return, float32), l (length, int64), success (at any step, bool),
+                                             unscaled (return, float32), of the episode so far
+_episode               (N,), bool            rows whose episode ended and counts (shortened first ones do not)
+=====================  ====================  ===========================================================================
 
 A world may add keys (``reward_terms``, ``final_info``); nobody may rely on these.
 """
@@ -31,17 +36,21 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
+from gymnasium.spaces import Box
 from torch import Tensor
 
 
 @dataclass(frozen=True)
 class ObservationGroup:
-    """Entries of an observation that belong together.
+    """Entries of an observation that are of one kind in every row of a world.
 
     Attributes:
-        name: ``right_hand``, ``left_hand``, ``object`` (what is left beside the others), ``goal``, ``padding`` or
-            ``task_id`` (one-hot); worlds that know no such parts call everything before the task id ``state``.
-        where: Index ranges, in ascending order.
+        name: ``right_hand``, ``left_hand``, ``object`` (what is left beside the others), ``goal`` (zeros where a suite
+            hides it), ``padding``, or ``task`` where the kind is not the same in all slots: in MT4 the entries that are
+            padding to three classes and the second egg to one. ``task_id`` is the one-hot of the slot. Worlds that know
+            no such parts call everything before the task id ``state``. A world of other
+            classes may have other groups: the test split of ML4 has a second egg where the train split has padding.
+        where: Index ranges in ascending order, none next to another.
     """
 
     name: str
@@ -53,55 +62,85 @@ class ObservationGroup:
         return sum(part.stop - part.start for part in self.where)
 
 
+def plain_groups(size: int, num_id_columns: int) -> tuple[ObservationGroup, ...]:
+    """The groups of a world that knows no parts: ``state``, and behind it the task id where there is one.
+
+    Args:
+        size: Entries of an observation, d.
+        num_id_columns: How many of them, the last ones, are the one-hot.
+    """
+    groups = (("state", slice(0, size - num_id_columns)), ("task_id", slice(size - num_id_columns, size)))
+    return tuple(ObservationGroup(name, (where,)) for name, where in groups if where.stop > where.start)
+
+
 @runtime_checkable
 class VectorWorld(Protocol):
     """Rows that are stepped together.
 
     Attributes:
-        single_observation_space: Box of shape (d,).
+        single_observation_space: Box of shape (d,), float32.
         single_action_space: Box of shape (a,), within [-1, 1].
+        observation_space: The same of all rows, Box of shape (N, d).
+        action_space: The same of all rows, Box of shape (N, a).
         num_envs: Rows, N.
         device: Of all tensors.
         num_tasks: Slots.
         task_id: Slot of each row, ascending, int64 (N,).
         task_names: Names of the slots.
         num_id_columns: Trailing entries of an observation that are the one-hot of the slot: ``num_tasks``, or 0 where
-            the task is hidden or alone.
-        metadata: Holds ``autoreset_mode``.
+            the observation has none.
+        observation_groups: The named parts of an observation, in the order of their first entries: each entry is in
+            one. ``task_id`` is there if ``num_id_columns`` is not 0.
+        metadata: Holds ``autoreset_mode``, gymnasium's SAME_STEP or DISABLED.
     """
 
-    single_observation_space: Any
-    single_action_space: Any
+    single_observation_space: Box
+    single_action_space: Box
+    observation_space: Box
+    action_space: Box
     num_envs: int
     device: torch.device
     num_tasks: int
     task_id: Tensor
     task_names: list[str]
     num_id_columns: int
+    observation_groups: tuple[ObservationGroup, ...]
     metadata: dict[str, Any]
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
         """Starts episodes.
 
         Args:
-            seed: Starts all draws anew, together with a full reset; None goes on with the old seed's next episodes.
-            options: ``reset_mask``: which rows to start, bool (N,); all by default.
+            seed: Starts all draws anew: equal seeds and actions give equal trajectories. None goes on with the old
+                seed's next episodes.
+            options: ``reset_mask``: which rows to start, bool (N,); the others stay as they are. All by default.
 
         Returns:
-            Observations (N, d) and info.
+            Observations (N, d), float32, and an empty info.
+
+        Raises:
+            BidexError: A seed together with a mask that leaves rows out.
         """
         ...
 
     def step(self, action: Tensor, /) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
-        """Takes actions (N, a): observations (N, d), rewards (N,), terminated (N,), truncated (N,), info."""
+        """Takes actions (N, a), clipped to [-1, 1]; a row with a non-finite number ends as unstable.
+
+        Returns:
+            Observations (N, d) and rewards (N,), float32; terminated and truncated (N,), bool, never both; info.
+        """
         ...
 
     def state_dict(self) -> dict[str, Any]:
-        """Tensors and numbers from which it continues bit for bit, copied."""
+        """Tensors and plain values from which it continues bit for bit, copied."""
         ...
 
     def load_state_dict(self, state: dict[str, Any], /) -> None:
-        """Puts back what ``state_dict`` gave, on a world made alike."""
+        """Puts back what ``state_dict`` gave, on a world made alike; it may be stepped without a reset."""
+        ...
+
+    def close(self) -> None:
+        """Frees what it holds."""
         ...
 
 
@@ -112,8 +151,8 @@ class TaskWorld(VectorWorld, Protocol):
     Attributes:
         slot_rows: Rows of each slot, contiguous.
         num_slot_tasks: Tasks in the pool of each slot.
-        task_index: Task of its slot's pool that each row plays, int64 (N,); in worlds whose tasks are fixed row j of a
-            slot plays task j mod n.
+        task_index: Task of its slot's pool that each row plays, int64 (N,). In DISABLED mode, and in ML suites, tasks
+            are fixed: row j of a slot plays task j mod n. Elsewhere each episode may draw one.
         max_episode_steps: Time limit of each row, int64 (N,).
     """
 
@@ -125,28 +164,19 @@ class TaskWorld(VectorWorld, Protocol):
 
 @runtime_checkable
 class PooledWorld(TaskWorld, Protocol):
-    """A world that can be given other tasks.
+    """A world that can be given other tasks."""
 
-    Attributes:
-        pools: Tasks of each slot, each (n, size of a variation).
-    """
-
-    pools: list[np.ndarray]
-
-    def set_tasks(self, pools: dict[str, np.ndarray], /) -> None:
-        """Gives slots other pools; row j of a slot plays task j mod n from the next full reset on."""
+    @property
+    def pools(self) -> list[np.ndarray]:
+        """Tasks of each slot, each (n, size of a variation)."""
         ...
 
+    def set_tasks(self, pools: dict[str, np.ndarray], /) -> None:
+        """Gives slots, by name, other pools; they hold from the next reset on, which must be of all rows.
 
-def observation_groups(world: VectorWorld) -> tuple[ObservationGroup, ...]:
-    """The named groups of a world's observation, in the order of their first entries; they cover it.
+        Row j of a slot plays task j mod n where tasks are fixed.
 
-    A world says so itself by an attribute ``observation_groups``; of one that does not, the last ``num_id_columns`` are
-    the task id and the rest is ``state``.
-    """
-    own = getattr(world, "observation_groups", None)
-    if own is not None:
-        return own
-    size, columns = int(world.single_observation_space.shape[0]), world.num_id_columns
-    state = ObservationGroup("state", (slice(0, size - columns),))
-    return (state, ObservationGroup("task_id", (slice(size - columns, size),))) if columns else (state,)
+        Raises:
+            BidexError: Unknown slot or a wrong shape.
+        """
+        ...

@@ -1,6 +1,6 @@
 """Rows of equal structure share one engine batch."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -9,6 +9,7 @@ from torch import Tensor
 from bidex_meta.engine.capacity import room_for
 from bidex_meta.engine.protocol import Engine, EngineMaker
 from bidex_meta.engine.structure import same_structure
+from bidex_meta.errors import BidexError
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.scene import Scene, compile_scene
 
@@ -59,6 +60,29 @@ class Group:
     def take(self, values: Tensor) -> Tensor:
         """This group's rows of a tensor over the world's rows (a view where the rows are contiguous)."""
         return values[self.span] if self.span is not None else values[self.rows]
+
+
+def with_pools(slots: list[Slot], pools: dict[str, np.ndarray]) -> list[Slot]:
+    """The slots, those named with other pools of tasks.
+
+    Args:
+        slots: All of them.
+        pools: Slot name to variations, shape (n, variation_space.size).
+
+    Raises:
+        BidexError: Unknown slot or a wrong shape.
+    """
+    slots, names = list(slots), [slot.name for slot in slots]
+    for name, tasks in pools.items():
+        if name not in names:
+            raise BidexError(f"Expected a slot among {', '.join(names)}, got {name!r}.")
+        i = names.index(name)
+        size = slots[i].task_class.variation_space.size
+        tasks = np.asarray(tasks, dtype=np.float64)
+        if tasks.ndim != 2 or len(tasks) == 0 or tasks.shape[1] != size:
+            raise BidexError(f"Expected tasks of {name} with shape (n, {size}), got {tasks.shape}.")
+        slots[i] = replace(slots[i], tasks=tasks)
+    return slots
 
 
 def split_rows(num_envs: int, slots: int) -> list[slice]:

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
 from bidex_meta.engine.choice import choose_engine
@@ -24,13 +23,15 @@ from bidex_meta.world import actions
 from bidex_meta.world.attributes import RowAttributes
 from bidex_meta.world.autoreset import checked_mode, reset_mask
 from bidex_meta.world.episodes import Episodes
-from bidex_meta.world.groups import Slot, build_groups, split_rows
+from bidex_meta.world.groups import Slot, build_groups, split_rows, with_pools
+from bidex_meta.world.observation_groups import observation_groups
 from bidex_meta.world.observations import Rule
 from bidex_meta.world.overlap import SideBySide
 from bidex_meta.world.part import Part
 from bidex_meta.world.random import row_keys
 from bidex_meta.world.recording import Recorder, Work, cuda_graph, fresh
 from bidex_meta.world.rendering import render_row
+from bidex_meta.world.spaces import make_spaces
 from bidex_meta.world.starts import Starts
 from bidex_meta.world.threads import one_torch_thread
 from bidex_meta.world.transitions import collect
@@ -42,19 +43,15 @@ _STATE = ("_action", "_obs", "task_index")
 class World(RowAttributes, VectorEnv):
     """Every task of a suite in one Gymnasium vector environment of torch tensors.
 
-    Arrays are fresh tensors on ``device``; NumPy actions are accepted. Rows of a slot are contiguous. Positions and
+    A ``contract.PooledWorld``: attributes and ``info`` are explained there. NumPy actions are accepted. Positions and
     velocities in observations are those of the state after the step; force entries are those of its last substep, and
     zero right after a reset.
-
-    Attributes:
-        task_id: Slot of each row, shape (num_envs,), int64.
-        task_names: Names of the slots.
-        num_tasks: Number of slots.
-        task_index: Task of its slot's pool that each row plays, shape (num_envs,), int64.
-        slot_rows: Rows of each slot.
-        max_episode_steps: Time limit of each row, control steps, shape (num_envs,), int64.
-        num_id_columns: Trailing observation entries that are the one-hot task id.
     """
+
+    single_observation_space: Box
+    single_action_space: Box
+    observation_space: Box
+    action_space: Box
 
     def __init__(
         self,
@@ -138,10 +135,12 @@ class World(RowAttributes, VectorEnv):
         self.num_id_columns = self.num_tasks if observation == "one-hot" else 0
         self._one_hot = torch.eye(self.num_tasks, device=self.device)[self.task_id]
         self.observation_size = self._width + self.num_id_columns
-        self.single_observation_space = Box(-CLIP, CLIP, (self.observation_size,), np.float32)
-        self.single_action_space = Box(-1.0, 1.0, (self.action_size,), np.float32)
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        layouts = [slot.task_class.layout for slot in self.slots]
+        self.observation_groups = observation_groups(layouts, self._width, self.num_id_columns)
+        single = Box(-CLIP, CLIP, (self.observation_size,), np.float32)
+        spaces = make_spaces(single, self.action_size, self.num_envs)
+        self.single_observation_space, self.single_action_space = spaces.single_observation, spaces.single_action
+        self.observation_space, self.action_space = spaces.observation, spaces.action
 
     def _set_pool_sizes(self) -> None:
         self.num_slot_tasks = [len(slot.tasks) for slot in self.slots]
@@ -167,17 +166,7 @@ class World(RowAttributes, VectorEnv):
         Raises:
             BidexError: Unknown slot or a wrong shape.
         """
-        slots = list(self.slots)
-        for name, tasks in pools.items():
-            if name not in self.task_names:
-                raise BidexError(f"Expected a slot among {', '.join(self.task_names)}, got {name!r}.")
-            i = self.task_names.index(name)
-            size = self.slots[i].task_class.variation_space.size
-            tasks = np.asarray(tasks, dtype=np.float64)
-            if tasks.ndim != 2 or len(tasks) == 0 or tasks.shape[1] != size:
-                raise BidexError(f"Expected tasks of {name} with shape (n, {size}), got {tasks.shape}.")
-            slots[i] = replace(slots[i], tasks=tasks)
-        self._set_pools(slots)
+        self._set_pools(with_pools(self.slots, pools))
 
     def _set_pools(self, slots: list[Slot]) -> None:
         self.slots = slots
@@ -190,15 +179,7 @@ class World(RowAttributes, VectorEnv):
         self._ready = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
-        """Starts episodes.
-
-        Args:
-            seed: Starts all random numbers anew; None goes on with the next episodes of the old seed.
-            options: ``reset_mask``: which rows to start, shape (num_envs,), bool; all by default.
-
-        Returns:
-            Observations (num_envs, d) and an empty info.
-        """
+        """Starts episodes of all rows, or those of ``options["reset_mask"]``; see ``VectorWorld.reset``."""
         mask = reset_mask(options, self.num_envs, self.device, self._ready)
         if seed is not None:
             if not mask.all():
@@ -280,10 +261,8 @@ class World(RowAttributes, VectorEnv):
             action: Shape (num_envs, a), clipped to [-1, 1]; a row with a non-finite number ends as unstable.
 
         Returns:
-            Observations (num_envs, d), rewards, terminated and truncated (num_envs,), and info. In SAME_STEP mode the
-            observation of an ended row is already that of its next episode; ``final_obs`` has the last one.
-            ``info["success"]``, ``["unstable"]``, ``["reward_terms"]``, ``["reward_unscaled"]`` and ``["episode"]``
-            describe the transition just made.
+            Observations (num_envs, d), rewards, terminated and truncated (num_envs,), and info as in the contract,
+            with ``reward_terms`` by name beside it, and Gymnasium's ``final_info``.
 
         Raises:
             BidexError: A wrong shape, or no reset since the world was made or got other tasks.

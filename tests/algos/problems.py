@@ -1,9 +1,6 @@
 """Toy worlds whose optimum is known, for the tests of all learners: bandits, LQR and a point mass."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -11,6 +8,7 @@ import torch
 from torch import Tensor
 
 from tests.algos.toy import ToyWorld, nearness
+from tests.fake_world import FakeWorld
 
 
 def one_step_bandit(target: float = 0.6, rows: int = 32) -> ToyWorld:
@@ -26,60 +24,27 @@ def opposite_bandits(target: float = 0.5, scale: float = 1.0, rows: int = 32) ->
     return ToyWorld([nearness(target), nearness(-target, scale)], rows=rows)
 
 
-class _TimedWorld(ABC):
+class _TimedWorld(FakeWorld):
     """What LQR and PointMass share: one task, episodes that a time limit alone ends, reset within the step.
 
-    Rows begin at different times of their first episode. A subclass gives ``_start`` (states of new episodes (N, s)),
-    ``_observe`` (observations (N, d)) and ``_advance`` (takes clamped actions, moves ``self.state``, returns rewards
-    and successes (N,)).
+    Rows begin at different times of their first episode. A subclass gives ``_draw`` (states of new episodes (N, s)).
     """
 
+    kept = ("state",)
+
     def __init__(self, observations: int, actions: int, rows: int, horizon: int):
-        self.num_envs, self.horizon = rows, horizon
-        self.num_tasks, self.num_id_columns = 1, 0
-        self.device = torch.device("cpu")
-        self.task_id = torch.zeros(rows, dtype=torch.int64)
-        self.task_names = [type(self).__name__]
-        self.single_observation_space: Any = SimpleNamespace(shape=(observations,))
-        self.single_action_space: Any = SimpleNamespace(shape=(actions,))
-        self.generator = torch.Generator()
-        self.state = torch.empty(0)
-        self.elapsed = torch.arange(rows) % horizon
-        self.returns = torch.zeros(rows)
+        super().__init__({type(self).__name__: 1}, rows, (observations, actions), (horizon,))
+        self.state = torch.zeros(rows, observations)
+        self.never = torch.zeros(rows, dtype=torch.bool)
 
-    @abstractmethod
-    def _start(self) -> Tensor: ...
+    def _first_elapsed(self) -> Tensor:
+        return torch.arange(self.num_envs) % self.max_episode_steps
 
-    @abstractmethod
-    def _observe(self) -> Tensor: ...
+    def _draw(self) -> Tensor:
+        raise NotImplementedError
 
-    @abstractmethod
-    def _advance(self, action: Tensor) -> tuple[Tensor, Tensor]: ...
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
-        self.generator.manual_seed(seed or 0)
-        self.state = self._start()
-        self.elapsed, self.returns = torch.arange(self.num_envs) % self.horizon, torch.zeros(self.num_envs)
-        return self._observe(), {}
-
-    def step(self, actions: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
-        reward, success = self._advance(torch.as_tensor(actions).clamp(-1.0, 1.0))
-        self.elapsed, self.returns = self.elapsed + 1, self.returns + reward
-        over, never = self.elapsed >= self.horizon, torch.zeros(self.num_envs, dtype=torch.bool)
-        final_obs = self._observe()
-        episode = {"r": self.returns, "l": self.elapsed, "success": success}
-        info = {"unstable": never, "final_obs": final_obs, "_final_obs": over, "episode": episode, "_episode": over}
-        self.state = torch.where(over[:, None], self._start(), self.state)
-        self.elapsed, self.returns = self.elapsed.masked_fill(over, 0), self.returns.masked_fill(over, 0.0)
-        return self._observe(), reward, never, over, info
-
-    def state_dict(self) -> dict[str, Any]:
-        tensors = {"state": self.state, "elapsed": self.elapsed, "returns": self.returns}
-        return {name: x.clone() for name, x in tensors.items()} | {"generator": self.generator.get_state()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.state, self.elapsed, self.returns = (state[name].clone() for name in ("state", "elapsed", "returns"))
-        self.generator.set_state(state["generator"])
+    def _start(self, mask: Tensor) -> None:
+        self.state = torch.where(mask[:, None], self._draw(), self.state)
 
 
 class LQR(_TimedWorld):
@@ -94,18 +59,19 @@ class LQR(_TimedWorld):
         self.a, self.b = 0.95 * np.array([[cos, -sin], [sin, cos]]), 0.5 * np.eye(2)
         self.q, self.r = np.eye(2), 0.1 * np.eye(2)
 
-    def _start(self) -> Tensor:
+    def _draw(self) -> Tensor:
         return torch.rand(self.num_envs, 2, generator=self.generator) - 0.5
 
     def _observe(self) -> Tensor:
         return self.state.clone()
 
-    def _advance(self, action: Tensor) -> tuple[Tensor, Tensor]:
+    def _advance(self, action: Tensor, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         a, b, q, r = (torch.from_numpy(m).float() for m in (self.a, self.b, self.q, self.r))
         cost = ((self.state @ q) * self.state).sum(1) + ((action @ r) * action).sum(1)
         # A policy that blows the state up shall be bad, not infinite.
-        self.state = (self.state @ a.T + action @ b.T).clamp(-5.0, 5.0)
-        return -cost, self.state.abs().amax(1) < 0.1
+        state = (self.state @ a.T + action @ b.T).clamp(-5.0, 5.0)
+        self.state = torch.where(active[:, None], state, self.state)
+        return -cost, self.state.abs().amax(1) < 0.1, self.never
 
     def optimum(self, gamma: float) -> tuple[np.ndarray, np.ndarray]:
         """P and K: the best discounted return from x is -x·Px, by the actions -Kx."""
@@ -137,7 +103,7 @@ class PointMass(_TimedWorld):
         super().__init__(4, 2, rows, horizon)
         self.goal_visible = goal_visible
 
-    def _start(self) -> Tensor:
+    def _draw(self) -> Tensor:
         return torch.rand(self.num_envs, 4, generator=self.generator) - 0.5
 
     def _observe(self) -> Tensor:
@@ -145,11 +111,11 @@ class PointMass(_TimedWorld):
         shown[:, 2:] *= float(self.goal_visible)
         return shown
 
-    def _advance(self, action: Tensor) -> tuple[Tensor, Tensor]:
+    def _advance(self, action: Tensor, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         position, goal = self.state[:, :2] + self.speed * action, self.state[:, 2:]
-        self.state = torch.cat([position.clamp(-1.0, 1.0), goal], dim=1)
+        self.state = torch.where(active[:, None], torch.cat([position.clamp(-1.0, 1.0), goal], dim=1), self.state)
         distance = (self.state[:, :2] - goal).norm(dim=1)
-        return -distance, distance < 0.05
+        return -distance, distance < 0.05, self.never
 
     def best(self, obs: Tensor) -> Tensor:
         """The best action (N, 2) for observations that show the goal."""
@@ -161,7 +127,7 @@ def discounted_return(world: LQR | PointMass, policy: Callable[[Tensor], Tensor]
 
     Leaves ``world`` somewhere else: call it with one that nobody trains on.
     """
-    world.horizon = 10**9
+    world.max_episode_steps.fill_(10**9)
     obs, _ = world.reset(seed=1)
     total = torch.zeros(world.num_envs)
     for t in range(steps):

@@ -95,8 +95,8 @@ def test_a_point_mass_reaches_its_goal():
     test = PointMass(rows=256)
     best = discounted_return(test, test.best, 0.8, 30)
     assert discounted_return(test, learner.eval_action, 0.8, 30) > 1.15 * best
-    _, success = test._advance(torch.zeros(256, 2))
-    assert success.float().mean() > 0.9
+    *_, info = test.step(torch.zeros(256, 2))
+    assert info["success"].float().mean() > 0.9
 
 
 @pytest.mark.parametrize(("terminal", "value"), [(False, 5.0), (True, 1.0)])

@@ -5,14 +5,18 @@ import statistics
 import time
 from dataclasses import replace
 from importlib.metadata import version
-from types import SimpleNamespace
 from typing import Any, Protocol
 
+import numpy as np
 import torch
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode
 from torch import Tensor, nn
 
 from bidex_algos.onpolicy.mtppo import MTPPO, PRESETS, MTPPOConfig
 from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.world.contract import plain_groups
+from bidex_meta.world.spaces import make_spaces
 
 _END = 0.01
 """Chance of a step to end its episode, half of it by a time limit."""
@@ -120,9 +124,11 @@ class Noise:
 
     def __init__(self, num_envs: int, observations: int, actions: int, num_tasks: int, seed: int):
         self.num_envs, self.num_tasks, self.num_id_columns = num_envs, num_tasks, num_tasks
-        self.single_observation_space: Any = SimpleNamespace(shape=(observations,))
-        self.single_action_space: Any = SimpleNamespace(shape=(actions,))
-        self.device = torch.device("cpu")
+        spaces = make_spaces(Box(-np.inf, np.inf, (observations,), np.float32), actions, num_envs)
+        self.single_observation_space, self.single_action_space = spaces.single_observation, spaces.single_action
+        self.observation_space, self.action_space = spaces.observation, spaces.action
+        self.observation_groups = plain_groups(observations, num_tasks)
+        self.device, self.metadata = torch.device("cpu"), {"autoreset_mode": AutoresetMode.SAME_STEP}
         self.task_id = torch.arange(num_envs) * num_tasks // num_envs
         self.task_names = [f"task{i}" for i in range(num_tasks)]
         self.generator = torch.Generator().manual_seed(seed)
@@ -144,6 +150,9 @@ class Noise:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Nothing is kept."""
+
+    def close(self) -> None:
+        """Nothing is held."""
 
     def _observe(self) -> Tensor:
         obs = torch.randn(self.num_envs, *self.single_observation_space.shape, generator=self.generator)

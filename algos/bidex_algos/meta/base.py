@@ -13,13 +13,12 @@ import copy
 import time
 from abc import ABC, abstractmethod
 from dataclasses import asdict
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from bidex_algos.experience.rollout import VectorWorld, may_look
+from bidex_algos.experience.rollout import may_look
 from bidex_algos.meta.adaptation import Objective, TaskBatch, detached
 from bidex_algos.meta.config import MetaConfig
 from bidex_algos.meta.meta_policy import MetaPolicy, make_meta_policy
@@ -29,21 +28,7 @@ from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.reports import as_numbers, check_finite
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import world_size
-
-
-class TaskWorld(VectorWorld, Protocol):
-    """A world whose rows keep their tasks until they are given others."""
-
-    pools: list[np.ndarray]
-    """Variations of each class, (n, size of a variation)."""
-    task_index: Tensor
-    """Which variation of its class each row plays, int64 (N,)."""
-    max_episode_steps: Tensor
-    """Time limit of each row, (N,)."""
-
-    def set_tasks(self, pools: dict[str, np.ndarray]) -> None:
-        """Gives classes other variations; row j of a class plays variation j mod n from the next full reset on."""
-        ...
+from bidex_meta.world.contract import PooledWorld as TaskWorld
 
 
 class Outcome(NamedTuple):

@@ -30,6 +30,7 @@ from bidex_algos.nets.recurrent import RecurrentNet, RecurrentPolicy
 from bidex_algos.reports import as_numbers, check_finite
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import all_sum, broadcast, own_seed, rank, sum_gradients, world_size
+from bidex_meta.world.contract import PooledWorld
 
 __all__ = ["PRESETS", "RL2", "RL2Config"]
 
@@ -366,14 +367,13 @@ def _check(world: Any, config: RL2Config) -> None:
         )
 
 
-def _larger_pools(world: Any) -> dict[str, tuple[Tensor, int]]:
+def _larger_pools(world: PooledWorld) -> dict[str, tuple[Tensor, int]]:
     """Pool of tasks (n, ...) and number of rows of each class that has fewer rows than tasks."""
-    pools, slots = {}, getattr(world, "slots", None)
-    for i, (name, count) in enumerate(zip(world.task_names, world.num_slot_tasks, strict=True)):
+    pools = {}
+    for i, (name, pool) in enumerate(zip(world.task_names, world.pools, strict=True)):
         rows = int((world.task_id == i).sum())
-        if rows < count:
-            # Meta-World's tasks go by their number.
-            pools[name] = (torch.arange(count) if slots is None else torch.tensor(slots[i].tasks), rows)
+        if rows < len(pool):
+            pools[name] = (torch.tensor(pool), rows)
     return pools
 
 

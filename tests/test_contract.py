@@ -1,0 +1,352 @@
+"""One test of the worlds' contract (bidex_meta/world/contract.py) for all of them, the tests' own small ones too."""
+
+import copy
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode
+from torch import Tensor
+
+from bidex_meta.clients.metaworld_world import MetaWorldWorld
+from bidex_meta.errors import BidexError
+from bidex_meta.world import World
+from bidex_meta.world.contract import PooledWorld, TaskWorld, VectorWorld
+from bidex_meta.world.wrapper import PooledWorldWrapper, TaskWorldWrapper, WorldWrapper
+from tests.algos.families import PointClass, PointGoals
+from tests.algos.problems import LQR, PointMass
+from tests.algos.toy import ToyWorld as Bandits
+from tests.algos.toy import nearness
+from tests.fakes import ToyWorld
+from tests.points import PointWorld, ring
+from tests.world.play import class_world, flat, suite_world
+
+ROWS = 7  # two slots share them unevenly
+ROW_INFO = {"success": torch.bool, "unstable": torch.bool, "_final_obs": torch.bool, "_episode": torch.bool}
+ROW_INFO |= {"reward_unscaled": torch.float32}
+EPISODE = {"r": torch.float32, "l": torch.int64, "success": torch.bool, "unscaled": torch.float32}
+BOTH = ("SAME_STEP", "DISABLED")
+
+
+def warp_world(mode: str) -> World:
+    slots = suite_world("MT4", 8).slots[:1]
+    return World(slots, 3, engine="warp", autoreset_mode=mode, observation="one-hot", task_sampling="fixed", threads=1)
+
+
+def point_world(mode: str) -> PointWorld:
+    return PointWorld(ROWS, {"Near": ring(2), "Far": 2 * ring(3)}, (4, 6), mode=mode, ends=True)
+
+
+def point_goals(mode: str) -> PointGoals:
+    return PointGoals(ROWS, True, (PointClass(steps=5), PointClass("Other", 7, 0.5, 3)), autoreset_mode=mode)
+
+
+class Kind(NamedTuple):
+    """A world, made anew by its mode, and which protocol it says it keeps."""
+
+    make: Callable[[str], Any]
+    keeps: type = PooledWorld
+    modes: tuple[str, ...] = BOTH
+    fixed: bool = False
+    """Whether a row keeps its task in SAME_STEP mode too."""
+
+
+KINDS = {
+    "MT4": Kind(lambda mode: suite_world("MT4", 10, mode)),
+    "MT1": Kind(lambda mode: suite_world("MT1", ROWS, mode)),
+    "ML4": Kind(lambda mode: suite_world("ML4", ROWS, mode), fixed=True),
+    "ML1-test": Kind(lambda mode: suite_world("ML1", 3, mode, "test"), fixed=True),
+    "HandOver": Kind(lambda mode: class_world("HandOver", 3, mode)),
+    "metaworld": Kind(lambda mode: MetaWorldWorld("metaworld/MT3", 4, autoreset_mode=mode)),
+    "ToyWorld": Kind(lambda mode: ToyWorld(ROWS, mode), TaskWorld, fixed=True),
+    "PointWorld": Kind(point_world, fixed=True),
+    "PointGoals": Kind(point_goals, fixed=True),
+    "bandits": Kind(lambda _: Bandits([nearness(0.3), nearness(-0.3)], 3), VectorWorld, BOTH[:1]),
+    "bandit": Kind(lambda _: Bandits([nearness(0.3)], 3, terminal=True), VectorWorld, BOTH[:1]),
+    "LQR": Kind(lambda _: LQR(ROWS, 5), VectorWorld, BOTH[:1]),
+    "PointMass": Kind(lambda _: PointMass(ROWS, 5), VectorWorld, BOTH[:1]),
+    "wrapped bandits": Kind(lambda _: WorldWrapper(Bandits([nearness(0.3), nearness(-0.3)], 3)), VectorWorld, BOTH[:1]),
+    "wrapped ToyWorld": Kind(lambda mode: TaskWorldWrapper(ToyWorld(ROWS, mode)), TaskWorld, fixed=True),
+    "wrapped ML4": Kind(lambda mode: PooledWorldWrapper(suite_world("ML4", ROWS, mode)), fixed=True),
+}
+CASES = [pytest.param((kind, mode), id=f"{name}-{mode}") for name, kind in KINDS.items() for mode in kind.modes]
+WARP = Kind(warp_world, fixed=True)
+CASES += [pytest.param((WARP, mode), id=f"warp-{mode}", marks=pytest.mark.parity) for mode in BOTH]
+
+
+class Case(NamedTuple):
+    kind: Kind
+    mode: str
+    world: Any
+    twin: Any
+    """Made alike."""
+
+
+@pytest.fixture(scope="module", params=CASES)
+def case(request: pytest.FixtureRequest) -> Case:
+    """Reset its worlds before use."""
+    kind, mode = request.param
+    return Case(kind, mode, kind.make(mode), kind.make(mode))
+
+
+def actions(world: VectorWorld, steps: int, seed: int = 0) -> Tensor:
+    """Uniform ones (steps, N, a), now and then out of range. In each fourth step every other row's is not finite."""
+    generator = torch.Generator().manual_seed(seed)
+    drawn = 2.2 * torch.rand(steps, *world.action_space.shape, generator=generator) - 1.1
+    drawn[3::4, ::2, -1] = torch.tensor([torch.nan, torch.inf, -torch.inf])[torch.arange(drawn[0, ::2].shape[0]) % 3]
+    return drawn
+
+
+def play(world: VectorWorld, given: Tensor) -> list[dict[str, Tensor]]:
+    return [flat(world.step(action)) for action in given]
+
+
+def assert_equal(a: list[dict[str, Tensor]], b: list[dict[str, Tensor]]) -> None:
+    assert len(a) == len(b)
+    for step, (x, y) in enumerate(zip(a, b, strict=True)):
+        assert x.keys() == y.keys()
+        assert not [f"step {step}: {name}" for name in x if not torch.equal(x[name], y[name])]
+
+
+def spoil(state: Any) -> None:
+    """Zeroes all tensors in it."""
+    if isinstance(state, Tensor):
+        state.zero_()
+    for value in state.values() if isinstance(state, dict) else state if isinstance(state, list) else ():
+        spoil(value)
+
+
+def copied(step: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name: value.clone() for name, value in step.items()}
+
+
+def test_attributes(case: Case) -> None:
+    world, n = case.world, case.world.num_envs
+    assert isinstance(world, case.kind.keeps) and isinstance(n, int) and isinstance(world.num_tasks, int)
+    spaces = world.single_observation_space, world.observation_space, world.single_action_space, world.action_space
+    assert all(isinstance(space, Box) and space.dtype == np.float32 for space in spaces)
+    (d,), (a,) = spaces[0].shape, spaces[2].shape
+    assert spaces[1].shape == (n, d) and spaces[3].shape == (n, a)
+    assert (spaces[3].low == -1).all() and (spaces[3].high == 1).all()
+    assert isinstance(world.device, torch.device)
+    assert world.metadata["autoreset_mode"] is AutoresetMode[case.mode]
+    assert len(world.task_names) == len(set(world.task_names)) == world.num_tasks
+    assert world.task_id.shape == (n,) and world.task_id.dtype == torch.int64 and world.task_id.device == world.device
+    assert (world.task_id.diff() >= 0).all() and world.task_id.unique().tolist() == list(range(world.num_tasks))
+    assert world.num_id_columns in (0, world.num_tasks)
+
+
+def test_tasks_of_rows(case: Case) -> None:
+    if case.kind.keeps is VectorWorld:
+        return
+    world = case.world
+    world.reset(seed=0)
+    for _ in range(2):
+        for slot, (rows, pool) in enumerate(zip(world.slot_rows, world.num_slot_tasks, strict=True)):
+            assert (world.task_id[rows] == slot).all() and rows.stop - rows.start == (world.task_id == slot).sum()
+            index = world.task_index[rows]
+            assert index.min() >= 0 and index.max() < pool
+            if case.kind.fixed or case.mode == "DISABLED":
+                assert index.tolist() == [j % pool for j in range(len(index))]
+        for each in (world.task_index, world.max_episode_steps):
+            assert each.shape == (world.num_envs,) and each.dtype == torch.int64 and each.device == world.device
+        assert (world.max_episode_steps > 0).all()
+        play(world, actions(world, 5))
+        world.reset()
+
+
+def test_observation_groups(case: Case) -> None:
+    world, groups = case.world, case.world.observation_groups
+    d = world.single_observation_space.shape[0]
+    assert isinstance(groups, tuple) and len({group.name for group in groups}) == len(groups)
+    ranges = [where for group in groups for where in group.where]
+    assert sorted(i for where in ranges for i in range(where.start, where.stop)) == list(range(d))
+    assert all(where.stop > where.start for where in ranges)
+    firsts = [group.where[0].start for group in groups]
+    assert firsts == sorted(firsts)
+    for group in groups:
+        assert group.size == sum(where.stop - where.start for where in group.where)
+        assert all(left.stop < right.start for left, right in zip(group.where, group.where[1:], strict=False))
+    named = {group.name: group for group in groups}
+    assert named.keys() <= {"right_hand", "left_hand", "object", "goal", "padding", "task", "task_id", "state"}
+    assert ("task_id" in named) == (world.num_id_columns > 0)
+    if world.num_id_columns:
+        assert named["task_id"].where == (slice(d - world.num_id_columns, d),)
+        one_hot = torch.eye(world.num_tasks, device=world.device)[world.task_id]
+        obs, _ = world.reset(seed=0)
+        for action in actions(world, 6):
+            assert torch.equal(obs[:, named["task_id"].where[0]], one_hot)
+            obs, *_, info = world.step(action)
+            assert torch.equal(info["final_obs"][:, named["task_id"].where[0]], one_hot)
+
+
+def test_shapes_and_types(case: Case) -> None:
+    world, n = case.world, case.world.num_envs
+    obs, told = world.reset(seed=1)
+    assert told == {}
+    for action in actions(world, 8):
+        made = world.step(action)
+        assert len(made) == 5 and isinstance(made[-1], dict)
+        after, reward, terminated, truncated, info = made
+        for each in (obs, after, info["final_obs"]):
+            assert each.shape == world.observation_space.shape and each.dtype == torch.float32 and each.isfinite().all()
+            assert world.observation_space.contains(each.cpu().numpy())
+        expected = {name: (info[name], kind) for name, kind in ROW_INFO.items()}
+        expected |= {f"episode/{name}": (info["episode"][name], kind) for name, kind in EPISODE.items()}
+        expected |= {"reward": (reward, torch.float32), "terminated": (terminated, torch.bool)}
+        expected |= {"truncated": (truncated, torch.bool)}
+        for name, (value, kind) in expected.items():
+            assert value.shape == (n,) and value.dtype == kind, name
+        assert {value.device for value in flat(made).values()} == {world.device}
+        obs = after
+
+
+def test_a_step_tells_its_transition(case: Case) -> None:
+    """Ends, counters and what a broken or frozen row gets, step by step."""
+    world, n = case.world, case.world.num_envs
+    obs, _ = world.reset(seed=2)
+    same = case.mode == "SAME_STEP"
+    frozen, flags, seen = torch.zeros(3, n, dtype=torch.bool, device=world.device).unbind(), None, 0
+    frozen, returns, lengths = frozen[0], torch.zeros(n), torch.zeros(n, dtype=torch.int64)
+    success = torch.zeros(n, dtype=torch.bool)
+    for action in actions(world, 12).to(world.device):
+        after, reward, terminated, truncated, info = world.step(action)
+        broken = ~action.isfinite().all(1) & ~frozen
+        ended, final = info["_final_obs"], info["final_obs"]
+        assert torch.equal(info["unstable"] & broken, broken) and not (info["unstable"] & frozen).any()
+        assert (reward[info["unstable"]] == 0).all() and truncated[info["unstable"]].all()
+        assert torch.equal(final[info["unstable"]], obs[info["unstable"]])
+        assert not (terminated & truncated).any()
+        assert torch.equal(ended, (terminated | truncated) & ~frozen)
+        assert torch.equal(final[~ended], after[~ended])
+        assert not (info["_episode"] & ~ended).any() and (same or torch.equal(info["_episode"], ended))
+        for value in (reward, info["reward_unscaled"]):
+            assert (value[frozen] == 0).all()
+        returns, lengths = returns + reward.cpu(), lengths + (~frozen).cpu()
+        success |= (info["success"] & ~frozen).cpu()
+        assert torch.allclose(info["episode"]["r"].cpu(), returns) and torch.equal(info["episode"]["l"].cpu(), lengths)
+        assert torch.equal(info["episode"]["success"].cpu(), success)
+        seen += int(ended.sum())
+        if same:
+            assert (after[ended] != final[ended]).any(1).all()
+            over = ended.cpu()
+            returns, lengths = returns.masked_fill(over, 0), lengths.masked_fill(over, 0)
+            success = success & ~over
+        else:
+            if flags is not None:
+                assert torch.equal(terminated[frozen], flags[0][frozen])
+                assert torch.equal(truncated[frozen], flags[1][frozen])
+            assert torch.equal(after[frozen], obs[frozen])
+            frozen, flags = frozen | ended, (terminated.clone(), truncated.clone())
+        obs = after
+    assert seen >= n // 2
+
+
+def test_a_reset_mask_starts_just_these(case: Case) -> None:
+    world, n = case.world, case.world.num_envs
+    world.reset(seed=3)
+    given = actions(world, 8)
+    before = play(world, given[:5])[-1]
+    mask = torch.arange(n, device=world.device) % 4 == 0  # half of those whose action was not finite
+    obs, told = world.reset(options={"reset_mask": mask})
+    assert told == {} and torch.equal(obs[~mask], before["obs"][~mask]) and (obs[mask] != before["obs"][mask]).any()
+    after = flat(world.step(given[5]))
+    # Nobody's last step was its episode's end in SAME_STEP mode, or they begin at 1 as well.
+    lengths = after["info/episode/l"]
+    assert (lengths[mask] == 1).all()
+    if case.mode == "DISABLED":
+        over = before["terminated"] | before["truncated"]
+        still, woken = over & ~mask, over & mask
+        assert still.any() and woken.any()
+        assert torch.equal(lengths[still], before["info/episode/l"][still])
+        assert (after["terminated"] | after["truncated"])[still].all()
+        assert (lengths[~over & ~mask] == 6).all()
+    with pytest.raises(BidexError, match="seed"):
+        world.reset(seed=0, options={"reset_mask": mask})
+
+
+def test_what_was_returned_is_the_callers(case: Case) -> None:
+    """No later step changes it, and changing it or the action changes nothing in the world."""
+    world = case.world
+    given = actions(world, 10).roll(-3, 0)  # whose first step keeps the start's observation in some rows
+    start, _ = world.reset(seed=4)
+    kept = [{"obs": start}, *play(world, given)]
+    copies = [copied(step) for step in kept]
+    play(world, given)
+    world.reset()
+    assert_equal(kept, copies)
+    world.reset(seed=4)[0].fill_(7.0)
+    for action, expected in zip(given.clone(), copies[1:], strict=True):
+        made = flat(world.step(action))
+        assert_equal([made], [expected])
+        action.fill_(0.5)
+        for value in made.values():
+            value.logical_not_() if value.dtype == torch.bool else value.fill_(9)
+
+
+def test_equal_seeds_give_equal_trajectories(case: Case) -> None:
+    given = actions(case.world, 8)
+    starts, steps = [], []
+    for world, seed in ((case.world, 5), (case.twin, 5), (case.world, 5), (case.world, 6)):
+        starts.append(world.reset(seed=seed)[0])
+        steps.append(play(world, given))
+    for i in (1, 2):
+        assert torch.equal(starts[0], starts[i])
+        assert_equal(steps[0], steps[i])
+    if case.mode == "SAME_STEP" or not isinstance(case.world, MetaWorldWorld):  # there a task fixes its start
+        assert not all(torch.equal(a["obs"], b["obs"]) for a, b in zip(steps[0], steps[3], strict=True))
+
+
+def test_actions_are_clipped(case: Case) -> None:
+    given = 3 * actions(case.world, 4)[:3]
+    found = []
+    for each in (given, given.clamp(-1, 1)):
+        case.world.reset(seed=7)
+        found.append(play(case.world, each))
+    assert_equal(*found)
+
+
+def test_a_state_continues_bit_for_bit(case: Case) -> None:
+    world, other = case.world, case.twin
+    given = actions(world, 10)
+    other.reset(seed=1)
+    play(other, given[:2])
+    for steps in (0, 5):  # at a start, and with broken rows
+        world.reset(seed=8)
+        play(world, given[:steps])
+        state = copy.deepcopy(world.state_dict())
+        spoil(world.state_dict())  # is the caller's as well
+        on = play(world, given[steps:])
+        after = world.reset()[0]
+        other.load_state_dict(state)
+        for _ in range(2):  # the second time from the same state: loading and playing have left it alone
+            assert_equal(on, play(other, given[steps:]))
+            assert torch.equal(after, other.reset()[0])
+            other.load_state_dict(state)
+
+
+def test_other_tasks(case: Case) -> None:
+    world = case.twin
+    if case.kind.keeps is not PooledWorld:
+        return
+    pools, name = world.pools, world.task_names[-1]
+    assert [len(pool) for pool in pools] == world.num_slot_tasks and all(pool.ndim == 2 for pool in pools)
+    chosen = pools[-1][:1].repeat(2, 0)
+    world.set_tasks({name: chosen})
+    assert world.num_slot_tasks == [len(pool) for pool in pools[:-1]] + [2]
+    assert np.array_equal(world.pools[-1], chosen) and all(map(np.array_equal, world.pools[:-1], pools[:-1]))
+    mask = torch.arange(world.num_envs, device=world.device) > 0
+    with pytest.raises(BidexError):  # the next reset must be of all rows
+        world.reset(options={"reset_mask": mask})
+    world.reset(seed=0)
+    if case.kind.fixed or case.mode == "DISABLED":
+        rows = world.slot_rows[-1]
+        assert world.task_index[rows].tolist() == [j % 2 for j in range(rows.stop - rows.start)]
+    for bad in ({"nobody": chosen}, {name: chosen[None]}, {name: np.zeros((2, 99))}):
+        with pytest.raises(BidexError):
+            world.set_tasks(bad)
+    world.set_tasks(dict(zip(world.task_names, pools, strict=True)))
+    assert all(map(np.array_equal, world.pools, pools))
