@@ -1,41 +1,12 @@
 """A stretch of transitions of all rows, and the loop that collects it; shared by the on-policy learners."""
 
 from collections.abc import Callable
-from typing import Any, Protocol
-
 import torch
 from torch import Tensor
 
 from bidex_algos.experience.episodes import EpisodeStatistics
 from bidex_meta.errors import BidexError
-
-
-class VectorWorld(Protocol):
-    """What a learner may touch of a world: a batched environment that resets finished rows within the step."""
-
-    single_observation_space: Any
-    single_action_space: Any
-    num_envs: int
-    device: torch.device
-    num_tasks: int
-    task_id: Tensor
-    task_names: list[str]
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
-        """Starts new episodes in all rows: observations (N, d) and info."""
-        ...
-
-    def step(self, actions: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
-        """Observations (N, d), rewards (N,), terminated (N,), truncated (N,), info."""
-        ...
-
-    def state_dict(self) -> dict[str, Any]:
-        """All that is needed to continue bit for bit."""
-        ...
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`state_dict` gave."""
-        ...
+from bidex_meta.world.contract import VectorWorld
 
 
 Sampler = Callable[[Tensor], tuple[Tensor, Tensor]]
@@ -100,7 +71,7 @@ def collect(
     return obs
 
 
-def check_autoreset(world: Any, learner: str, expected: str) -> None:
+def check_autoreset(world: VectorWorld, learner: str, expected: str) -> None:
     """Refuses a world that says that it resets in another way than the learner needs.
 
     Raises:

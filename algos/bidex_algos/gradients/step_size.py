@@ -1,6 +1,7 @@
 """Step sizes that follow the KL, and Adam for an actor and its critic with one."""
 
 from collections.abc import Iterable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -10,6 +11,16 @@ def factor_of(kl: Tensor, desired_kl: float) -> Tensor:
     """What to multiply a step size by: 1 / 1.5 above twice the desired KL, 1.5 below half of it, else 1."""
     factor = torch.where(kl > 2.0 * desired_kl, 1.0 / 1.5, 1.0)
     return torch.where(kl < 0.5 * desired_kl, 1.5, factor)
+
+
+class _Adam(torch.optim.Adam):
+    """Adam whose step size stays the tensor that it was given, so that adapting it reaches also a loaded optimiser."""
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        rates = [group["lr"] for group in self.param_groups]
+        super().load_state_dict(state_dict)
+        for group, rate in zip(self.param_groups, rates, strict=True):
+            group["lr"] = rate
 
 
 class AdaptiveAdams:
@@ -42,8 +53,8 @@ class AdaptiveAdams:
         self.rate = torch.tensor(learning_rate, device=device)
         fixed = critic_learning_rate
         self.critic_rate = self.rate if fixed is None else torch.tensor(fixed, device=device)
-        self.actor = torch.optim.Adam(actor, lr=self.rate, fused=True)
-        self.critic = torch.optim.Adam(critic, lr=self.critic_rate, fused=True)
+        self.actor = _Adam(actor, lr=self.rate, fused=True)
+        self.critic = _Adam(critic, lr=self.critic_rate, fused=True)
 
     def zero_grad(self) -> None:
         """Forgets the gradients of both."""
@@ -61,19 +72,6 @@ class AdaptiveAdams:
             return
         self.rate.mul_(factor_of(kl, self.desired_kl)).clamp_(*self.bounds)
 
-    def state_dict(self) -> dict[str, object]:
-        """Both optimisers and the step size."""
-        return {
-            "actor_adam": self.actor.state_dict(),
-            "critic_adam": self.critic.state_dict(),
-            "learning_rate": self.rate.clone(),
-        }
-
-    def load_state_dict(self, state: dict[str, object]) -> None:
-        """Restores what :meth:`state_dict` gave; other entries are passed over."""
-        self.rate.copy_(state["learning_rate"])  # type: ignore[arg-type]
-        for adam, rate, name in ((self.actor, self.rate, "actor_adam"), (self.critic, self.critic_rate, "critic_adam")):
-            adam.load_state_dict(state[name])  # type: ignore[arg-type]
-            for group in adam.param_groups:
-                # Loading put a copy there; adapting must reach the optimiser.
-                group["lr"] = rate
+    def parts(self) -> dict[str, Any]:
+        """Both optimisers and the step size, by their names in a checkpoint."""
+        return {"actor_adam": self.actor, "critic_adam": self.critic, "learning_rate": self.rate}

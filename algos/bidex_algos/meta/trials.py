@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from bidex_algos.experience.episodes import EpisodeStatistics
-from bidex_algos.experience.rollout import VectorWorld, may_look
+from bidex_algos.experience.rollout import may_look
 from bidex_algos.nets.recurrent import Memory, RecurrentPolicy
+from bidex_meta.world.contract import VectorWorld
 
 
 class Trials:
