@@ -100,10 +100,11 @@ class Learner(ABC):
 
     def _place(self) -> dict[str, Any]:
         """Tensors, numbers and None from which the next iteration goes on, for the checkpoint."""
-        return {}
+        return {"env_steps": self.env_steps}
 
     def _go_on_from(self, state: dict[str, Any]) -> None:
         """Puts back what :meth:`_place` gave, from a whole state."""
+        self.env_steps = int(state["env_steps"])
 
     def _check_size(self, state: dict[str, Any]) -> None:
         """Refuses a state of a world of another size."""
@@ -176,8 +177,7 @@ class Learner(ABC):
 
     def state_dict(self) -> dict[str, Any]:
         """A copy of everything but the world, as tensors and plain values (``torch.load(weights_only=True)``)."""
-        place = {**self._place(), "env_steps": self.env_steps}
-        return copy.deepcopy({"policy": self.policy_state_dict(), **_saved(self._parts()), **place})
+        return copy.deepcopy({"policy": self.policy_state_dict(), **_saved(self._parts()), **self._place()})
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`state_dict` gave.
@@ -189,14 +189,13 @@ class Learner(ABC):
         self.policy.load_state_dict(state["policy"]["weights"])
         _restore(self._parts(), state)
         self._go_on_from(state)
-        self.env_steps = int(state["env_steps"])
 
     def _expect(self, what: str, there: Any, here: Any) -> None:
         """Refuses a state whose world was not as this one."""
         if there != here:
             raise BidexError(
-                f"{self.name}: the checkpoint's world had {what}{there}, this one has {here}. Resume with the run's own "
-                "suite and num_envs."
+                f"{self.name}: the checkpoint's world had {what}{there}, this one has {here}. Resume with the run's "
+                "own suite and num_envs."
             )
 
 

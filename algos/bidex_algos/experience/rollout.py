@@ -1,13 +1,13 @@
 """A stretch of transitions of all rows, and the loop that collects it; shared by the on-policy learners."""
 
 from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
 from bidex_algos.experience.episodes import EpisodeStatistics
 from bidex_meta.errors import BidexError
 from bidex_meta.world.contract import VectorWorld
-
 
 Sampler = Callable[[Tensor], tuple[Tensor, Tensor]]
 """Raw observations (N, d) to a sampled action and the mean action, both (N, a) and not clamped."""

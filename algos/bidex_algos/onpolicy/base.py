@@ -5,7 +5,7 @@ An iteration collects ``rollout_steps`` steps in every row, makes them a :class:
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -196,9 +196,10 @@ class OnPolicy(Learner):
         }
 
     def _place(self) -> dict[str, Any]:
-        return {"obs": self.obs}
+        return {"obs": self.obs, **super()._place()}
 
     def _go_on_from(self, state: dict[str, Any]) -> None:
+        super()._go_on_from(state)
         self.obs = None if state["obs"] is None else state["obs"].to(self.device, copy=True)
 
     def _check_size(self, state: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""PPO's loss (Schulman et al. 2017, equations 7 and 9), of any samples: MT-PPO's transitions, RL²'s chunks of trials."""
+"""PPO's loss (Schulman et al. 2017, equations 7 and 9): of MT-PPO's transitions and of RL²'s chunks of trials."""
 
 from typing import NamedTuple
 
