@@ -1,7 +1,7 @@
 """What every learner is: seeds, shapes read from the world, timers, the finite check, checkpoints, several processes.
 
-A family (``onpolicy/base.py``, ``offpolicy/base.py``, ``meta/base.py``, RL²) adds where its data come from; an algorithm
-adds its update.
+A family (``onpolicy/base.py``, ``offpolicy/base.py``, ``meta/base.py``, RL²) adds where its data come from, an
+algorithm its update.
 """
 
 import copy
