@@ -57,8 +57,8 @@ class Learner(ABC):
     """Entries of ``state_dict`` that differ from process to process."""
 
     def __init__(self, world: VectorWorld, config: Any, seed: int):
-        mode = self.autoreset
-        check_autoreset(world, self.name, mode(asdict(config)) if callable(mode) else mode)
+        mode = self.autoreset(asdict(config)) if callable(self.autoreset) else self.autoreset
+        check_autoreset(world, self.name, str(mode))
         self.world, self.config, self.seed = world, config, seed
         self.device = torch.device(world.device)
         self.env_steps = 0

@@ -122,7 +122,7 @@ class Noise:
         self.num_envs, self.num_tasks, self.num_id_columns = num_envs, num_tasks, num_tasks
         self.single_observation_space: Any = SimpleNamespace(shape=(observations,))
         self.single_action_space: Any = SimpleNamespace(shape=(actions,))
-        self.device = torch.device("cpu")
+        self.device, self.metadata = torch.device("cpu"), {"autoreset_mode": "SAME_STEP"}
         self.task_id = torch.arange(num_envs) * num_tasks // num_envs
         self.task_names = [f"task{i}" for i in range(num_tasks)]
         self.generator = torch.Generator().manual_seed(seed)

@@ -31,27 +31,18 @@ class AdaptiveAdams:
     Args:
         actor: The actor's parameters.
         critic: The critic's.
-        learning_rate: Step size at the start.
-        critic_learning_rate: A fixed one for the critic; None makes it follow the actor's.
-        desired_kl: What the step size aims at; None leaves it as it is.
-        bounds: Of the actor's step size.
+        config: Of a learner: ``learning_rate`` (at the start), ``critic_learning_rate`` (a fixed one; None makes it follow
+            the actor's), ``adaptive_learning_rate``, ``desired_kl`` (what is aimed at), ``learning_rate_range`` (bounds).
         device: Where the parameters lie.
     """
 
     def __init__(
-        self,
-        actor: Iterable[nn.Parameter],
-        critic: Iterable[nn.Parameter],
-        *,
-        learning_rate: float,
-        critic_learning_rate: float | None,
-        desired_kl: float | None,
-        bounds: tuple[float, float],
-        device: torch.device,
+        self, actor: Iterable[nn.Parameter], critic: Iterable[nn.Parameter], config: Any, device: torch.device
     ):
-        self.desired_kl, self.bounds = desired_kl, bounds
-        self.rate = torch.tensor(learning_rate, device=device)
-        fixed = critic_learning_rate
+        self.desired_kl = config.desired_kl if config.adaptive_learning_rate else None
+        self.bounds = config.learning_rate_range
+        self.rate = torch.tensor(config.learning_rate, device=device)
+        fixed = config.critic_learning_rate
         self.critic_rate = self.rate if fixed is None else torch.tensor(fixed, device=device)
         self.actor = _Adam(actor, lr=self.rate, fused=True)
         self.critic = _Adam(critic, lr=self.critic_rate, fused=True)

@@ -218,7 +218,7 @@ class MetaLearner(Learner):
         return make_meta_policy(config, cls.objective, shape, init).to(device)
 
     def policy_state_dict(self) -> dict[str, Any]:
-        """What :meth:`load_policy` needs: network, observation statistics, sizes, config, and the seed it explores by."""
+        """What :meth:`load_policy` needs: network, statistics, sizes, config, and the seed that it explores by."""
         return super().policy_state_dict() | {"seed": self.seed}
 
     @classmethod

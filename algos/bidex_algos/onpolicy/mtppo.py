@@ -46,15 +46,7 @@ class MTPPO(OnPolicy):
                 f"{config.rollout_steps} steps give {samples}. Raise num_envs or lower num_minibatches."
             )
         super().__init__(world, config, seed)
-        self.adams = AdaptiveAdams(
-            self.policy.actor.parameters(),
-            self.critic.parameters(),
-            learning_rate=config.learning_rate,
-            critic_learning_rate=config.critic_learning_rate,
-            desired_kl=config.desired_kl if config.adaptive_learning_rate else None,
-            bounds=config.learning_rate_range,
-            device=self.device,
-        )
+        self.adams = AdaptiveAdams(self.policy.actor.parameters(), self.critic.parameters(), config, self.device)
 
     def _optimisers(self) -> dict[str, Any]:
         return self.adams.parts()

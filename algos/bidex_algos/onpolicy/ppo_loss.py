@@ -29,7 +29,7 @@ class PPOLoss(NamedTuple):
         return [self.surrogate.detach(), self.value.detach(), self.kl, self.outside]
 
 
-NAMES = ("Loss/surrogate", "Loss/value", "Policy/kl", "Policy/clip_fraction")
+NAMES: tuple[str, ...] = ("Loss/surrogate", "Loss/value", "Policy/kl", "Policy/clip_fraction")
 """Tags of :meth:`PPOLoss.numbers`."""
 
 
