@@ -45,8 +45,8 @@ MUTUAL = {
 """Modules that import each other all the same."""
 
 TWICE = {"base", "config", "capacity", "episodes", "gallery", "learner", "replay", "starts"}
-"""Names of several modules. ``base`` and ``config`` are a room's own, a bench is called as what it measures; the others are older
-than this rule."""
+"""Names of several modules. ``base`` and ``config`` are a room's own, ``bench.learner`` is called as what it measures;
+the others are older than this rule."""
 
 
 def _name(package: str, path: Path) -> str:

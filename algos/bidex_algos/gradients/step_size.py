@@ -31,8 +31,9 @@ class AdaptiveAdams:
     Args:
         actor: The actor's parameters.
         critic: The critic's.
-        config: Of a learner: ``learning_rate`` (at the start), ``critic_learning_rate`` (a fixed one; None makes it follow
-            the actor's), ``adaptive_learning_rate``, ``desired_kl`` (what is aimed at), ``learning_rate_range`` (bounds).
+        config: Of a learner. It has ``learning_rate``, the step size at the start; ``critic_learning_rate``, a fixed
+            one for the critic (None makes it follow the actor's); and, if ``adaptive_learning_rate``, ``desired_kl``
+            and ``learning_rate_range``, what the actor's aims at and its bounds.
         device: Where the parameters lie.
     """
 
