@@ -28,7 +28,9 @@ ORDER = (
     ("bidex_algos.checks", "bidex_algos.choices", "bidex_algos.reports"),
     ("bidex_algos.gradients", "bidex_algos.experience"),
     ("bidex_algos.nets",),
-    ("bidex_algos.onpolicy", "bidex_algos.offpolicy", "bidex_algos.meta"),
+    ("bidex_algos.learner",),
+    ("bidex_algos.onpolicy", "bidex_algos.offpolicy"),
+    ("bidex_algos.meta",),  # RL² takes PPO's loss
     ("bidex_algos.single_task", "bidex_algos.start_from", "bidex_algos.bench"),
     ("bidex_algos",),
     ("commands",),
@@ -44,8 +46,9 @@ MUTUAL = {
 }
 """Modules that import each other all the same."""
 
-TWICE = {"base", "config", "capacity", "episodes", "gallery", "replay", "starts"}
-"""Names of several modules. ``base`` and ``config`` are a room's own; the others are older than this rule."""
+TWICE = {"base", "config", "capacity", "episodes", "gallery", "learner", "replay", "starts"}
+"""Names of several modules. ``base`` and ``config`` are a room's own, ``bench.learner`` is called as what it measures;
+the others are older than this rule."""
 
 
 def _name(package: str, path: Path) -> str:

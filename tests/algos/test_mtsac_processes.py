@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 
-from bidex_algos.offpolicy import mtsac
+from bidex_algos import learner as base
 from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_meta.train import distributed
 from bidex_meta.train.runner import checkpoint, resume
@@ -41,10 +41,10 @@ def everything(rank: int) -> dict[str, Any]:
     distributed.init_from_environment()
 
     # Twins: the same draws and noise in both. Sums over both must then be the means that one finds.
-    original, mtsac.own_seed = mtsac.own_seed, lambda seed: seed
+    original, base.own_seed = base.own_seed, lambda seed: seed
     twin = learner(PLAIN)
     twin.iterate()
-    mtsac.own_seed = original
+    base.own_seed = original
     found["twin"] = networks(twin)
 
     one = learner()

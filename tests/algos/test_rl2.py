@@ -308,8 +308,8 @@ def test_an_evaluation_leaves_the_training_alone():
         learner.iterate()
         if evaluate:
             test = PointGoals(3)
-            adapted(learner, test)
-            evaluated(learner, test)
+            adapted(learner.agent, test)
+            evaluated(learner.agent, test)
         learner.iterate()
         states.append(learner.state_dict())
     assert equal(states[0], states[1])

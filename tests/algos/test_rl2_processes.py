@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 import torch
 
-from bidex_algos.meta import rl2
+from bidex_algos import learner as base
 from bidex_algos.meta.rl2 import RL2, RL2Config
 from bidex_meta.train import distributed
 from bidex_meta.train.runner import checkpoint, resume
@@ -27,10 +27,10 @@ def everything(rank: int) -> dict[str, Any]:
     distributed.init_from_environment()
 
     # Twins: the same noise in both. What is summed over both must then be what one finds.
-    original, rl2.own_seed = rl2.own_seed, lambda seed: seed
+    original, base.own_seed = base.own_seed, lambda seed: seed
     twin = learner()
     found["twin"] = [twin.iterate() for _ in range(3)][-1]
-    rl2.own_seed = original
+    base.own_seed = original
 
     one = learner(goals=8)
     metrics = [one.iterate() for _ in range(2)]

@@ -1,7 +1,6 @@
 """A stretch of transitions of all rows, and the loop that collects it; shared by the on-policy learners."""
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -72,7 +71,7 @@ def collect(
     return obs
 
 
-def check_autoreset(world: Any, learner: str, expected: str) -> None:
+def check_autoreset(world: VectorWorld, learner: str, expected: str) -> None:
     """Refuses a world that says that it resets in another way than the learner needs.
 
     Raises:

@@ -1,6 +1,7 @@
 """Step sizes that follow the KL, and Adam for an actor and its critic with one."""
 
 from collections.abc import Iterable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -12,6 +13,16 @@ def factor_of(kl: Tensor, desired_kl: float) -> Tensor:
     return torch.where(kl < 0.5 * desired_kl, 1.5, factor)
 
 
+class _Adam(torch.optim.Adam):
+    """Adam whose step size stays the tensor that it was given, so that adapting it reaches also a loaded optimiser."""
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        rates = [group["lr"] for group in self.param_groups]
+        super().load_state_dict(state_dict)
+        for group, rate in zip(self.param_groups, rates, strict=True):
+            group["lr"] = rate
+
+
 class AdaptiveAdams:
     """Two optimisers; the actor's step size is divided by 1.5 above twice the desired KL, multiplied below half of it.
 
@@ -20,30 +31,22 @@ class AdaptiveAdams:
     Args:
         actor: The actor's parameters.
         critic: The critic's.
-        learning_rate: Step size at the start.
-        critic_learning_rate: A fixed one for the critic; None makes it follow the actor's.
-        desired_kl: What the step size aims at; None leaves it as it is.
-        bounds: Of the actor's step size.
+        config: Of a learner. It has ``learning_rate``, the step size at the start; ``critic_learning_rate``, a fixed
+            one for the critic (None makes it follow the actor's); and, if ``adaptive_learning_rate``, ``desired_kl``
+            and ``learning_rate_range``, what the actor's aims at and its bounds.
         device: Where the parameters lie.
     """
 
     def __init__(
-        self,
-        actor: Iterable[nn.Parameter],
-        critic: Iterable[nn.Parameter],
-        *,
-        learning_rate: float,
-        critic_learning_rate: float | None,
-        desired_kl: float | None,
-        bounds: tuple[float, float],
-        device: torch.device,
+        self, actor: Iterable[nn.Parameter], critic: Iterable[nn.Parameter], config: Any, device: torch.device
     ):
-        self.desired_kl, self.bounds = desired_kl, bounds
-        self.rate = torch.tensor(learning_rate, device=device)
-        fixed = critic_learning_rate
+        self.desired_kl = config.desired_kl if config.adaptive_learning_rate else None
+        self.bounds = config.learning_rate_range
+        self.rate = torch.tensor(config.learning_rate, device=device)
+        fixed = config.critic_learning_rate
         self.critic_rate = self.rate if fixed is None else torch.tensor(fixed, device=device)
-        self.actor = torch.optim.Adam(actor, lr=self.rate, fused=True)
-        self.critic = torch.optim.Adam(critic, lr=self.critic_rate, fused=True)
+        self.actor = _Adam(actor, lr=self.rate, fused=True)
+        self.critic = _Adam(critic, lr=self.critic_rate, fused=True)
 
     def zero_grad(self) -> None:
         """Forgets the gradients of both."""
@@ -61,19 +64,6 @@ class AdaptiveAdams:
             return
         self.rate.mul_(factor_of(kl, self.desired_kl)).clamp_(*self.bounds)
 
-    def state_dict(self) -> dict[str, object]:
-        """Both optimisers and the step size."""
-        return {
-            "actor_adam": self.actor.state_dict(),
-            "critic_adam": self.critic.state_dict(),
-            "learning_rate": self.rate.clone(),
-        }
-
-    def load_state_dict(self, state: dict[str, object]) -> None:
-        """Restores what :meth:`state_dict` gave; other entries are passed over."""
-        self.rate.copy_(state["learning_rate"])  # type: ignore[arg-type]
-        for adam, rate, name in ((self.actor, self.rate, "actor_adam"), (self.critic, self.critic_rate, "critic_adam")):
-            adam.load_state_dict(state[name])  # type: ignore[arg-type]
-            for group in adam.param_groups:
-                # Loading put a copy there; adapting must reach the optimiser.
-                group["lr"] = rate
+    def parts(self) -> dict[str, Any]:
+        """Both optimisers and the step size, by their names in a checkpoint."""
+        return {"actor_adam": self.actor, "critic_adam": self.critic, "learning_rate": self.rate}

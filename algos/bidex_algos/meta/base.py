@@ -9,26 +9,24 @@ They differ in the outer step alone. An iteration::
     outer step of the meta-parameters on D_0 ... D_K
 """
 
-import copy
-import time
-from abc import ABC, abstractmethod
-from dataclasses import asdict
+from abc import abstractmethod
 from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
 from bidex_algos.experience.rollout import may_look
+from bidex_algos.learner import Learner
 from bidex_algos.meta.adaptation import Objective, TaskBatch, detached
 from bidex_algos.meta.config import MetaConfig
 from bidex_algos.meta.meta_policy import MetaPolicy, make_meta_policy
 from bidex_algos.meta.stage import Stage, task_batch
 from bidex_algos.meta.task_rows import TaskRows
 from bidex_algos.nets.normalise import RunningStats
-from bidex_algos.reports import as_numbers, check_finite
+from bidex_algos.reports import as_numbers
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import world_size
-from bidex_meta.world.contract import PooledWorld as TaskWorld
+from bidex_meta.world.contract import PooledWorld
 
 
 class Outcome(NamedTuple):
@@ -42,52 +40,41 @@ class Outcome(NamedTuple):
     """Environment steps, int64 (); a row that waits for the others takes none."""
 
 
-class MetaLearner(ABC):
+class MetaLearner(Learner):
     """Learns parameters from which one gradient step on a task's own data goes far.
 
-    Args:
-        world: A world with hidden goals whose rows keep their tasks, in autoreset mode :meth:`autoreset`.
-        config: The learner's config.
-        seed: Of the initial weights, the tasks of each meta-batch, the sampled actions and the world's first reset.
+    Arguments and attributes are those of :class:`~bidex_algos.learner.Learner`; the world hides its goals.
 
     Attributes:
-        env_steps: Environment steps taken so far, over all rows; a waiting row takes none.
-        policy: The adapting agent that evaluation uses.
+        policy: The adapting agent that evaluation uses; the learner itself never adapts it.
+        pools: The tasks of each class that meta-batches are drawn from.
+        rows: Which rows play the same task of the present meta-batch.
 
     Raises:
         BidexError: Several processes, or a class with fewer rows than it has tasks in a meta-batch.
     """
 
-    name: ClassVar[str]
-    """How the learner calls itself in messages."""
+    world: PooledWorld
+    config: MetaConfig
+    policy: MetaPolicy
+    remedy = "lower inner_learning_rate or the outer step"
     objective: ClassVar[Objective]
     """What its inner step follows."""
-    config_type: ClassVar[type[MetaConfig]]
-    """Its config."""
     adapts: ClassVar[bool] = True
     """Its policy adapts to a task: evaluation measures before and after."""
-    per_process: ClassVar[tuple[str, ...]] = ()
 
-    def __init__(self, world: TaskWorld, config: Any, seed: int):
+    def __init__(self, world: PooledWorld, config: MetaConfig, seed: int):
         if world_size() > 1:
             raise BidexError(f"{self.name}: learns in one process, got {world_size()}. Start it without torchrun.")
-        self.world, self.config, self.seed = world, config, seed
-        self.device = torch.device(world.device)
-        self.env_steps = 0
+        super().__init__(world, config, seed)
+        self.policy.seed = seed
         self.obs: Tensor | None = None
         self.elapsed = torch.zeros(world.num_envs, dtype=torch.int64, device=self.device)
         self.steps_with_tasks = 0
         # What can be drawn from; the world's own pools will be those of a meta-batch.
         self.pools = [pool.copy() for pool in world.pools]
         self._check_rows()
-        d, a = int(world.single_observation_space.shape[0]), int(world.single_action_space.shape[0])
-        num_id_columns = int(getattr(world, "num_id_columns", 0))
-        self.shape = {"observations": d, "actions": a, "num_id_columns": num_id_columns}
-        # Weights come from a CPU generator, so that a seed means the same network on every device.
-        init = torch.Generator().manual_seed(seed)
         self.tasks_generator = torch.Generator().manual_seed(seed)
-        self.generator = torch.Generator(self.device).manual_seed(seed)
-        self.policy = make_meta_policy(config, self.objective, self.shape, init, seed).to(self.device)
         self.rows = TaskRows(world.task_id)
 
     @staticmethod
@@ -115,52 +102,31 @@ class MetaLearner(ABC):
         """The optimisers by the names they have in a checkpoint."""
         return {}
 
-    def iterate(self) -> dict[str, float]:
-        """One meta-batch: samples, adapts, learns.
-
-        Returns:
-            Metrics under TensorBoard-like tags; ``docs/learners/`` explains each.
-
-        Raises:
-            FloatingPointError: The loss is no longer finite.
-        """
-        started = time.perf_counter()
+    def _iterate(self) -> dict[str, float]:
+        """One meta-batch: samples, adapts, learns."""
         if self.config.slice_steps is None or self.obs is None or self.steps_with_tasks >= self.config.max_adapt_steps:
             self._draw_tasks()
-        adapter, sampling, steps = self.policy.adapter, 0.0, 0
+        adapter = self.policy.adapter
         adapter.project()
         params = detached(adapter.meta(self.rows.count))
         seen = RunningStats((self.policy.observations.measured,)).to(self.device)
         batches: list[TaskBatch] = []
         told: dict[str, float] = {}
+        steps = 0
         for k in range(self.config.inner_steps + 1):
-            began = time.perf_counter()
-            stage, outcome = self._sample(params, seen)
-            steps += int(outcome.steps)
-            sampling += time.perf_counter() - began
+            with self._collecting():
+                stage, outcome = self._sample(params, seen)
+                steps += int(outcome.steps)
             log_std = params["log_std"].clamp(*adapter.log_std_range)
             batches.append(task_batch(stage, self.rows, log_std, self.config))
             told |= self._told(outcome, k)
             if k < self.config.inner_steps:
                 params = detached(adapter.adapt(params, batches[-1]))
-        losses = as_numbers(self._outer(batches))
-        check_finite(losses, losses, self.name, self.env_steps, "lower inner_learning_rate or the outer step")
-        metrics = told | losses
+        told |= as_numbers(self._outer(batches))
         self.policy.observations.merge(seen.mean, seen.var, seen.count)
-        whole = time.perf_counter() - started
         self.env_steps += steps
-        metrics["Policy/std"] = float(self.policy.actor.log_std.detach().clamp(*adapter.log_std_range).exp().mean())
-        metrics["Perf/collection_time"], metrics["Perf/learning_time"] = sampling, whole - sampling
-        metrics["Perf/steps_per_second"] = steps / whole
-        return metrics
-
-    def eval_action(self, obs: Tensor) -> Tensor:
-        """Mean action before any adaptation, for raw observations (N, d), clamped to [-1, 1]: (N, a)."""
-        return self.policy.actor(self.policy.observations(obs)).detach().clamp(-1.0, 1.0)
-
-    def reset(self, env_mask: Tensor) -> None:
-        """A new episode begins in the rows of ``env_mask``, bool (N,)."""
-        self.policy.reset(env_mask)
+        told["Policy/std"] = float(self.policy.actor.log_std.detach().clamp(*adapter.log_std_range).exp().mean())
+        return told
 
     # Sampling.
 
@@ -221,12 +187,10 @@ class MetaLearner(ABC):
         """Observations to start a stage from."""
         if self.obs is not None and self.config.slice_steps is not None:
             return self.obs
-        first = self.env_steps == 0 and self.steps_with_tasks == 0
-        obs, _ = self.world.reset(seed=self.seed if first else None)
         self.elapsed = torch.zeros_like(self.elapsed)
-        if first:
-            self.policy.observations.update(obs)
-        return obs
+        if self.env_steps == 0 and self.steps_with_tasks == 0:
+            return self._first_observations()
+        return self.world.reset()[0]
 
     # Metrics.
 
@@ -247,14 +211,15 @@ class MetaLearner(ABC):
 
     # Checkpoints.
 
+    @classmethod
+    def _make_policy(
+        cls, config: MetaConfig, shape: dict[str, int], init: torch.Generator, device: torch.device
+    ) -> MetaPolicy:
+        return make_meta_policy(config, cls.objective, shape, init).to(device)
+
     def policy_state_dict(self) -> dict[str, Any]:
-        """What :meth:`load_policy` needs: network, observation statistics, sizes and config."""
-        return {
-            "config": asdict(self.config),
-            "shape": dict(self.shape),
-            "weights": self.policy.state_dict(),
-            "seed": self.seed,
-        }
+        """What :meth:`load_policy` needs: network, statistics, sizes, config, and the seed that it explores by."""
+        return super().policy_state_dict() | {"seed": self.seed}
 
     @classmethod
     def load_policy(cls, state: dict[str, Any], device: str | torch.device = "cpu") -> MetaPolicy:
@@ -264,47 +229,31 @@ class MetaLearner(ABC):
             state: ``checkpoint["learner"]["policy"]``.
             device: Where to run it.
         """
-        config, init = cls.config_type(**state["config"]), torch.Generator().manual_seed(0)
-        policy = make_meta_policy(config, cls.objective, state["shape"], init, state["seed"]).to(device)
-        policy.load_state_dict(state["weights"])
+        policy = super().load_policy(state, device)
+        policy.seed = state["seed"]
         return policy
 
-    def state_dict(self) -> dict[str, Any]:
-        """A copy of everything but the world, as tensors and plain values (``torch.load(weights_only=True)``)."""
-        return copy.deepcopy(
-            {
-                "policy": self.policy_state_dict(),
-                **{name: optimiser.state_dict() for name, optimiser in self._optimisers().items()},
-                "generator": self.generator.get_state(),
-                "tasks_generator": self.tasks_generator.get_state(),
-                "rows": self.rows.task_of_row,
-                "obs": self.obs,
-                "elapsed": self.elapsed,
-                "steps_with_tasks": self.steps_with_tasks,
-                "env_steps": self.env_steps,
-            }
-        )
+    def _parts(self) -> dict[str, Any]:
+        return {**self._optimisers(), "generator": self.generator, "tasks_generator": self.tasks_generator}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`state_dict` gave.
+    def _place(self) -> dict[str, Any]:
+        return {
+            "rows": self.rows.task_of_row,
+            "obs": self.obs,
+            "elapsed": self.elapsed,
+            "steps_with_tasks": self.steps_with_tasks,
+            **super()._place(),
+        }
 
-        Raises:
-            BidexError: The checkpoint comes from a world of another size.
-        """
-        if len(state["elapsed"]) != self.world.num_envs:
-            raise BidexError(
-                f"{self.name}: the checkpoint's world had {len(state['elapsed'])} rows, this one has "
-                f"{self.world.num_envs}. Resume with the run's own suite and num_envs."
-            )
-        self.policy.load_state_dict(state["policy"]["weights"])
-        for name, optimiser in self._optimisers().items():
-            optimiser.load_state_dict(state[name])
-        self.generator.set_state(state["generator"].cpu())
-        self.tasks_generator.set_state(state["tasks_generator"].cpu())
+    def _go_on_from(self, state: dict[str, Any]) -> None:
+        super()._go_on_from(state)
         self.rows = TaskRows(state["rows"].to(self.device))
         self.obs = None if state["obs"] is None else state["obs"].to(self.device, copy=True)
         self.elapsed = state["elapsed"].to(self.device, copy=True)
-        self.steps_with_tasks, self.env_steps = int(state["steps_with_tasks"]), int(state["env_steps"])
+        self.steps_with_tasks = int(state["steps_with_tasks"])
+
+    def _check_size(self, state: dict[str, Any]) -> None:
+        self._expect("num_envs = ", len(state["elapsed"]), self.world.num_envs)
 
 
 def _moments(x: Tensor, counted: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -15,8 +15,9 @@ from torch import Tensor, nn
 
 from bidex_algos.gradients.trust_region import line_search, natural_step
 from bidex_algos.meta.adaptation import TaskBatch, weighted_mean
-from bidex_algos.meta.base import MetaLearner, TaskWorld
+from bidex_algos.meta.base import MetaLearner
 from bidex_algos.meta.maml_config import PRESETS, MAMLConfig
+from bidex_meta.world.contract import PooledWorld
 
 __all__ = ["MAML", "PRESETS", "MAMLConfig"]
 
@@ -31,7 +32,7 @@ class MAML(MetaLearner):
     config_type = MAMLConfig
     config: MAMLConfig
 
-    def __init__(self, world: TaskWorld, config: MAMLConfig, seed: int):
+    def __init__(self, world: PooledWorld, config: MAMLConfig, seed: int):
         super().__init__(world, config, seed)
         self.adam = torch.optim.Adam(self.policy.actor.parameters(), lr=config.outer_learning_rate)
 

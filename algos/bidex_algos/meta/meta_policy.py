@@ -127,7 +127,7 @@ class MetaPolicy(nn.Module):
 
 
 def make_meta_policy(
-    config: MetaConfig, objective: Objective, shape: dict[str, Any], init: torch.Generator, seed: int
+    config: MetaConfig, objective: Objective, shape: dict[str, Any], init: torch.Generator, seed: int = 0
 ) -> MetaPolicy:
     """A policy with fresh weights.
 

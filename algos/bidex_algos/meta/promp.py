@@ -17,8 +17,9 @@ from torch import Tensor, nn
 
 from bidex_algos.gradients.step_size import factor_of
 from bidex_algos.meta.adaptation import TaskBatch, weighted_mean
-from bidex_algos.meta.base import MetaLearner, TaskWorld
+from bidex_algos.meta.base import MetaLearner
 from bidex_algos.meta.promp_config import PRESETS, ProMPConfig
+from bidex_meta.world.contract import PooledWorld
 
 __all__ = ["PRESETS", "ProMP", "ProMPConfig"]
 
@@ -33,7 +34,7 @@ class ProMP(MetaLearner):
     config_type = ProMPConfig
     config: ProMPConfig
 
-    def __init__(self, world: TaskWorld, config: ProMPConfig, seed: int):
+    def __init__(self, world: PooledWorld, config: ProMPConfig, seed: int):
         super().__init__(world, config, seed)
         self.adam = torch.optim.Adam(self.policy.actor.parameters(), lr=config.outer_learning_rate)
 

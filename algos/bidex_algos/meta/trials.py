@@ -5,14 +5,13 @@ untouched. Waiting is not recorded, so that the transitions of a row follow each
 the memory saw at its t-th step.
 """
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
 from bidex_algos.experience.episodes import EpisodeStatistics
-from bidex_algos.experience.rollout import VectorWorld, may_look
+from bidex_algos.experience.rollout import may_look
 from bidex_algos.nets.recurrent import Memory, RecurrentPolicy
+from bidex_meta.world.contract import VectorWorld
 
 
 class Trials:
@@ -144,31 +143,3 @@ def play(
         for each in statistics[episode]:
             each.update({"episode": found, "_episode": whole})
     trials.obs[trials.lengths, rows] = obs
-
-
-@dataclass
-class Batch:
-    """A trial made ready for the update: T slots (a multiple of the chunk C) of N rows, and its S chunks."""
-
-    actions: Tensor
-    """Sampled actions (T, N, a)."""
-    previous: tuple[Tensor, Tensor, Tensor, Tensor]
-    """What the memory is fed beside the observation; see ``Trials.previous``."""
-    old_means: Tensor
-    """Means of the sampling policy (T, N, a)."""
-    old_log_probs: Tensor
-    """Log-density of the actions under it (T, N)."""
-    advantages: Tensor
-    """Normalised advantages (T, N)."""
-    targets: Tensor
-    """What the critic shall predict, in its own units (T, N)."""
-    weights: Tensor
-    """1, or 0 for slots that teach nothing (T, N)."""
-    actor_states: Tensor
-    """The actor's memory before each chunk (T / C, N, memory)."""
-    critic_states: Tensor
-    """The critic's (T / C, N, memory)."""
-    chunk: Tensor
-    """Number of each chunk that holds a step, int64 (S,)."""
-    row: Tensor
-    """Its row, int64 (S,)."""

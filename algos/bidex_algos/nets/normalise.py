@@ -42,6 +42,14 @@ class RunningStats(nn.Module):
         """Standard deviation, at least ``floor``, float64."""
         return (self.var + floor**2).sqrt()
 
+    def normalise(self, x: Tensor, element: Tensor) -> Tensor:
+        """``x`` (..., n) to zero mean and unit variance by the statistics of each entry's element, int64 (n,)."""
+        return (x - self.mean.float()[element]) / self.std().float()[element]
+
+    def restore(self, x: Tensor, element: Tensor) -> Tensor:
+        """What :meth:`normalise` made ``x`` of, (..., n)."""
+        return x * self.std().float()[element] + self.mean.float()[element]
+
 
 class ObservationNormaliser(nn.Module):
     """Observations to zero mean and unit variance, clipped; trailing task-id columns pass through unchanged.

@@ -11,15 +11,15 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.experience.rollout import VectorWorld
 from bidex_algos.gradients.step_size import AdaptiveAdams
 from bidex_algos.gradients.surgery import per_task_gradients, project_conflicting
-from bidex_algos.nets.networks import gaussian_entropy, gaussian_kl, gaussian_log_prob
 from bidex_algos.nets.precision import autocast
 from bidex_algos.onpolicy.base import Batch, OnPolicy
 from bidex_algos.onpolicy.mtppo_config import PRESETS, MTPPOConfig
+from bidex_algos.onpolicy.ppo_loss import NAMES, ppo_loss
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import all_sum, sum_gradients, world_size
+from bidex_meta.world.contract import VectorWorld
 
 __all__ = ["MTPPO", "PRESETS", "Batch", "MTPPOConfig"]
 
@@ -46,15 +46,10 @@ class MTPPO(OnPolicy):
                 f"{config.rollout_steps} steps give {samples}. Raise num_envs or lower num_minibatches."
             )
         super().__init__(world, config, seed)
-        self.adams = AdaptiveAdams(
-            self.policy.actor.parameters(),
-            self.critic.parameters(),
-            learning_rate=config.learning_rate,
-            critic_learning_rate=config.critic_learning_rate,
-            desired_kl=config.desired_kl if config.adaptive_learning_rate else None,
-            bounds=config.learning_rate_range,
-            device=self.device,
-        )
+        self.adams = AdaptiveAdams(self.policy.actor.parameters(), self.critic.parameters(), config, self.device)
+
+    def _optimisers(self) -> dict[str, Any]:
+        return self.adams.parts()
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
         """PPO's update: returns the means over all mini-batches of what it measured."""
@@ -78,7 +73,7 @@ class MTPPO(OnPolicy):
                 self.adams.step()
                 with torch.no_grad():
                     actor.log_std.clamp_(low, high)
-        names = ["Loss/surrogate", "Loss/value", "Policy/kl", "Policy/clip_fraction"]
+        names = list(NAMES)
         if cfg.gradient_surgery == "pcgrad":
             names.append("Policy/conflicts")
         means = torch.stack(measured).mean(0)
@@ -91,31 +86,29 @@ class MTPPO(OnPolicy):
             Surrogate loss, value loss, KL, share of clipped ratios and, with surgery, of conflicts: (4,) or (5,).
         """
         cfg, actor = self.config, self.policy.actor
-        weight = b.weights / count
         with autocast(self.device, self.low_precision):
-            mean = actor(b.obs)
-        log_std = actor.log_std_of(b.obs)
-        values = self._critic(b.obs, b.task_id)
-
-        ratio = torch.exp(gaussian_log_prob(b.actions, mean, log_std) - b.old_log_probs)
-        clipped = ratio.clamp(1.0 - cfg.clip, 1.0 + cfg.clip)
-        earned = weight * torch.minimum(ratio * b.advantages, clipped * b.advantages)
-        surrogate = -earned.sum()
-        value_loss = (weight * (values - b.targets).square()).sum()
-        entropy = (weight * gaussian_entropy(log_std)).sum()
-        rest = cfg.value_loss_weight * value_loss - cfg.entropy_weight * entropy
-
-        with torch.no_grad():
-            kl = (weight * gaussian_kl(b.old_means, actor.log_std_of(b.obs, old_log_std), mean, log_std)).sum()
-            outside = (weight * ((ratio - 1.0).abs() > cfg.clip)).sum()
-        numbers = [surrogate.detach(), value_loss.detach(), kl, outside]
-
+            means = actor(b.obs)
+        loss = ppo_loss(
+            b.actions,
+            means,
+            actor.log_std_of(b.obs),
+            b.old_means,
+            actor.log_std_of(b.obs, old_log_std),
+            b.old_log_probs,
+            b.advantages,
+            self._critic(b.obs, b.task_id),
+            b.targets,
+            weights=b.weights / count,
+            clip=cfg.clip,
+        )
+        rest = cfg.value_loss_weight * loss.value - cfg.entropy_weight * loss.entropy
+        numbers = loss.numbers()
         self.adams.zero_grad()
         if cfg.gradient_surgery == "pcgrad":
-            numbers.append(self._operate(-earned, b.task_id))
+            numbers.append(self._operate(-loss.earned, b.task_id))
             rest.backward()
         else:
-            (surrogate + rest).backward()
+            (loss.surrogate + rest).backward()
         return sum_gradients([*actor.parameters(), *self.critic.parameters()], torch.stack(numbers))
 
     def _operate(self, losses: Tensor, task_id: Tensor) -> Tensor:
@@ -131,11 +124,3 @@ class MTPPO(OnPolicy):
             # All processes have the whole of it, and sum it.
             parameter.grad = part.view_as(parameter) / world_size()
         return apart / world_size()
-
-    # Checkpoints.
-
-    def _optimiser_state(self) -> dict[str, Any]:
-        return self.adams.state_dict()
-
-    def _load_optimisers(self, state: dict[str, Any]) -> None:
-        self.adams.load_state_dict(state)

@@ -15,13 +15,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.experience.rollout import VectorWorld
 from bidex_algos.gradients.trust_region import line_search, natural_step
 from bidex_algos.nets.networks import gaussian_kl, gaussian_log_prob
 from bidex_algos.nets.precision import autocast
 from bidex_algos.onpolicy.base import Batch, OnPolicy
 from bidex_algos.onpolicy.mttrpo_config import PRESETS, MTTRPOConfig
 from bidex_meta.train.distributed import all_sum, sum_gradients
+from bidex_meta.world.contract import VectorWorld
 
 __all__ = ["MTTRPO", "PRESETS", "MTTRPOConfig"]
 
@@ -40,11 +40,8 @@ class MTTRPO(OnPolicy):
         super().__init__(world, config, seed)
         self.critic_adam = torch.optim.Adam(self.critic.parameters(), lr=config.critic_learning_rate, fused=True)
 
-    def _optimiser_state(self) -> dict[str, Any]:
-        return {"critic_adam": self.critic_adam.state_dict()}
-
-    def _load_optimisers(self, state: dict[str, Any]) -> None:
-        self.critic_adam.load_state_dict(state["critic_adam"])
+    def _optimisers(self) -> dict[str, Any]:
+        return {"critic_adam": self.critic_adam}
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
         """TRPO's update: returns what it measured, among it the KL after the step."""

@@ -1,0 +1,227 @@
+"""What every learner is: seeds, shapes read from the world, timers, the finite check, checkpoints, several processes.
+
+A family (``onpolicy/base.py``, ``offpolicy/base.py``, ``meta/base.py``, RL²) adds where its data come from, an
+algorithm its update.
+"""
+
+import copy
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from bidex_algos.experience.rollout import check_autoreset
+from bidex_algos.reports import check_finite
+from bidex_meta.agents import Agent
+from bidex_meta.errors import BidexError
+from bidex_meta.train.distributed import broadcast, own_seed
+from bidex_meta.world.contract import VectorWorld
+
+
+class Learner(ABC):
+    """What ``bidex_meta.train.runner`` trains.
+
+    In a run of several processes each has a world and samples of its own, and all have the same networks: statistics
+    and gradients are those of the samples of all.
+
+    Args:
+        world: A world in autoreset mode :attr:`autoreset`.
+        config: An instance of :attr:`config_type`.
+        seed: Of the initial weights, all that is drawn, and the world's first reset.
+
+    Attributes:
+        env_steps: Environment steps taken so far, over all rows of all processes; a waiting row takes none.
+        shape: ``observations`` (d), ``actions`` (a) and ``num_id_columns`` of the world.
+        generator: Of all that is drawn while learning, on the device; another one in each process.
+        policy: The network that acts and its statistics of observations, a ``torch.nn.Module``.
+        agent: What evaluation plays; the policy itself, but for RL².
+
+    Raises:
+        BidexError: A world in another mode, or policy heads for one that does not show the task.
+    """
+
+    name: ClassVar[str]
+    """How the learner calls itself in messages."""
+    remedy: ClassVar[str]
+    """What helps, mostly, when a loss is no longer finite."""
+    config_type: ClassVar[type[Any]]
+    """Its config, a dataclass."""
+    autoreset: ClassVar[Any] = "SAME_STEP"
+    """Mode of the world it trains on, or a function of the config (as a dict) that gives it."""
+    per_process: ClassVar[tuple[str, ...]] = ()
+    """Entries of ``state_dict`` that differ from process to process."""
+
+    def __init__(self, world: VectorWorld, config: Any, seed: int):
+        mode = self.autoreset(asdict(config)) if callable(self.autoreset) else self.autoreset
+        check_autoreset(world, self.name, str(mode))
+        self.world, self.config, self.seed = world, config, seed
+        self.device = torch.device(world.device)
+        self.env_steps = 0
+        self.shape = {
+            "observations": int(world.single_observation_space.shape[0]),
+            "actions": int(world.single_action_space.shape[0]),
+            "num_id_columns": int(getattr(world, "num_id_columns", 0)),
+        }
+        if getattr(config, "policy_heads", False) and self.shape["num_id_columns"] != world.num_tasks:
+            raise BidexError(
+                f"{self.name}: policy_heads needs the one-hot of {world.num_tasks} tasks at the end of the observation "
+                f"(an MT suite), this world shows {self.shape['num_id_columns']} such entries. Leave policy_heads off."
+            )
+        # Weights come from a CPU generator, so that a seed means the same network on every device.
+        self.initial = torch.Generator().manual_seed(seed)
+        self.generator = torch.Generator(self.device).manual_seed(own_seed(seed))
+        self.policy: Any = self._make_policy(config, self.shape, self.initial, self.device)
+        self.agent: Agent = self.policy
+        self._collected = 0.0
+
+    # What a family or an algorithm adds.
+
+    @classmethod
+    @abstractmethod
+    def _make_policy(cls, config: Any, shape: dict[str, int], init: torch.Generator, device: torch.device) -> nn.Module:
+        """A policy with fresh weights, drawn from ``init`` (a CPU generator), on ``device``."""
+
+    @abstractmethod
+    def _iterate(self) -> dict[str, float]:
+        """Collects, learns, adds to ``env_steps``; returns all metrics but those of time."""
+
+    @abstractmethod
+    def _parts(self) -> dict[str, Any]:
+        """What a checkpoint holds beside the policy, by name.
+
+        Modules, optimisers, statistics, tensors that keep their shape, generators, and dicts and lists of these. The
+        modules' weights are made the same in all processes when training begins.
+        """
+
+    def _place(self) -> dict[str, Any]:
+        """Tensors, numbers and None from which the next iteration goes on, for the checkpoint."""
+        return {"env_steps": self.env_steps}
+
+    def _go_on_from(self, state: dict[str, Any]) -> None:
+        """Puts back what :meth:`_place` gave, from a whole state."""
+        self.env_steps = int(state["env_steps"])
+
+    def _check_size(self, state: dict[str, Any]) -> None:
+        """Refuses a state of a world of another size."""
+        self._expect("", state["policy"]["shape"], self.shape)
+
+    # Training.
+
+    def iterate(self) -> dict[str, float]:
+        """Collects experience and learns from it.
+
+        Returns:
+            Metrics under TensorBoard-like tags; ``docs/learners/`` explains each.
+
+        Raises:
+            FloatingPointError: A loss, or what is told of the policy, is no longer finite.
+        """
+        started, steps, self._collected = time.perf_counter(), self.env_steps, 0.0
+        metrics = self._iterate()
+        judged = [name for name in metrics if name.startswith(("Loss/", "Policy/"))]
+        check_finite(metrics, judged, self.name, self.env_steps, self.remedy)
+        whole = time.perf_counter() - started
+        metrics["Perf/collection_time"], metrics["Perf/learning_time"] = self._collected, whole - self._collected
+        metrics["Perf/steps_per_second"] = (self.env_steps - steps) / whole
+        return metrics
+
+    @contextmanager
+    def _collecting(self) -> Iterator[None]:
+        """What happens within is collection; the rest of an iteration is learning."""
+        began = time.perf_counter()
+        yield
+        self._collected += time.perf_counter() - began
+
+    def _first_observations(self) -> Tensor:
+        """Begins the training: raw observations (N, d) of the world's first reset."""
+        # The same seed has given the same weights everywhere, unless a machine computes differently.
+        modules = [part for part in (self.policy, *self._parts().values()) if isinstance(part, nn.Module)]
+        broadcast([weight for module in modules for weight in module.parameters()])
+        obs, _ = self.world.reset(seed=own_seed(self.seed))
+        self.policy.observations.update(obs)
+        return obs
+
+    # The learner as an agent.
+
+    def eval_action(self, obs: Tensor) -> Tensor:
+        """Actions (N, a) in [-1, 1] for raw observations (N, d), no exploration. N need not be the world's."""
+        return self.agent.eval_action(obs)
+
+    def reset(self, env_mask: Tensor) -> None:
+        """A new episode begins in the rows of ``env_mask``, bool (N,)."""
+        self.agent.reset(env_mask)
+
+    # Checkpoints.
+
+    def policy_state_dict(self) -> dict[str, Any]:
+        """What :meth:`load_policy` needs: network, observation statistics, sizes and config."""
+        return {"config": asdict(self.config), "shape": dict(self.shape), "weights": self.policy.state_dict()}
+
+    @classmethod
+    def load_policy(cls, state: dict[str, Any], device: str | torch.device = "cpu") -> Any:
+        """The agent of a checkpoint, for a world of any number of rows.
+
+        Args:
+            state: ``checkpoint["learner"]["policy"]``.
+            device: Where to run it.
+        """
+        init = torch.Generator().manual_seed(0)
+        policy = cls._make_policy(cls.config_type(**state["config"]), state["shape"], init, torch.device(device))
+        policy.load_state_dict(state["weights"])
+        return policy
+
+    def state_dict(self) -> dict[str, Any]:
+        """A copy of everything but the world, as tensors and plain values (``torch.load(weights_only=True)``)."""
+        return copy.deepcopy({"policy": self.policy_state_dict(), **_saved(self._parts()), **self._place()})
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` gave.
+
+        Raises:
+            BidexError: The checkpoint comes from a world of another size.
+        """
+        self._check_size(state)
+        self.policy.load_state_dict(state["policy"]["weights"])
+        _restore(self._parts(), state)
+        self._go_on_from(state)
+
+    def _expect(self, what: str, there: Any, here: Any) -> None:
+        """Refuses a state whose world was not as this one."""
+        if there != here:
+            raise BidexError(
+                f"{self.name}: the checkpoint's world had {what}{there}, this one has {here}. Resume with the run's "
+                "own suite and num_envs."
+            )
+
+
+def _saved(part: Any) -> Any:
+    """A part of a learner as a part of its checkpoint, not yet copied."""
+    if isinstance(part, dict):
+        return {name: _saved(each) for name, each in part.items()}
+    if isinstance(part, list):
+        return [_saved(each) for each in part]
+    if isinstance(part, Tensor):
+        return part.detach()
+    return part.get_state() if isinstance(part, torch.Generator) else part.state_dict()
+
+
+@torch.no_grad()
+def _restore(part: Any, state: Any) -> None:
+    """Puts a part of a checkpoint into the part of a learner that it was made of."""
+    if isinstance(part, dict):
+        for name, each in part.items():
+            _restore(each, state[name])
+    elif isinstance(part, list):
+        for each, saved in zip(part, state, strict=True):
+            _restore(each, saved)
+    elif isinstance(part, Tensor):
+        part.copy_(state)
+    elif isinstance(part, torch.Generator):
+        part.set_state(state.cpu())
+    else:
+        part.load_state_dict(state)

@@ -1,0 +1,253 @@
+"""What the off-policy learners share: a replay per task, updates after each step, critics, targets, checkpoints.
+
+They differ in how the actor explores, in what the critics shall say, and in the actor's update. An iteration is
+``steps_per_iteration`` times::
+
+    one step in every row, with exploration (uniform actions at first); into the replay
+    updates_per_step times: draw equally many transitions of each task; the learner's update
+
+Rewards are divided by the running deviation of their task's discounted return, so that no task outweighs another.
+"""
+
+import copy
+import math
+from abc import abstractmethod
+from collections.abc import Iterable
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from bidex_algos.experience.advantages import task_moments
+from bidex_algos.experience.episodes import EpisodeStatistics
+from bidex_algos.experience.replay import Transitions
+from bidex_algos.learner import Learner
+from bidex_algos.nets.normalise import RunningStats
+from bidex_algos.nets.precision import autocast, use_bfloat16
+from bidex_algos.offpolicy.config import OffPolicyConfig
+from bidex_algos.offpolicy.critics import Critics
+from bidex_algos.offpolicy.replay_within import replay_within
+from bidex_algos.reports import as_numbers
+from bidex_meta.train.distributed import all_sum, sum_gradients, world_size
+from bidex_meta.world.contract import VectorWorld
+
+
+class OffPolicy(Learner):
+    """An actor and critics that learn from a replay; the critics from the value of the next state by their targets.
+
+    Arguments, attributes and errors are those of :class:`~bidex_algos.learner.Learner`. Several processes have a replay
+    each, and an update is of as many times more transitions.
+
+    Attributes:
+        critic: See :class:`~bidex_algos.offpolicy.critics.Critics`; ``target_critic`` follows it.
+        adams: Optimisers by name; an algorithm may add some.
+        batch_per_task: Transitions of each task in an update; B is ``num_tasks`` times as many, task after task.
+        task_of_draw: Their tasks, int64 (B,).
+
+    Raises:
+        BidexError: A task without rows, or no room for a replay.
+    """
+
+    config: OffPolicyConfig
+    per_process = ("generator", "episodes", "replay", "discounted")
+    num_critics: ClassVar[int] = 2
+
+    def __init__(self, world: VectorWorld, config: OffPolicyConfig, seed: int):
+        super().__init__(world, config, seed)
+        self.low_precision = use_bfloat16(config.autocast, self.device)
+        d, a = self.shape["observations"], self.shape["actions"]
+        heads = world.num_tasks if config.value_heads else 1
+        self.critic = Critics(d + a, heads, config, self.initial, self.num_critics).to(self.device)
+        self.target_critic = copy.deepcopy(self.critic)
+        self.adams = {
+            "actor": self._adam(self.policy.actor.parameters(), config.learning_rate),
+            "critic": self._adam(self.critic.parameters(), config.critic_learning_rate),
+        }
+        self.replay = replay_within(self.name, world, config, d, a)
+        self.batch_per_task = config.batch_per_task or math.ceil(config.batch_size / world.num_tasks)
+        self.task_of_draw = torch.arange(world.num_tasks, device=self.device).repeat_interleave(self.batch_per_task)
+        # Rewards that have left the replay fade from the statistics too.
+        horizon = self.replay.steps * world.num_envs * world_size() / world.num_tasks
+        self.return_stats = RunningStats((world.num_tasks,), max_count=horizon).to(self.device)
+        self.discounted = torch.zeros(world.num_envs, device=self.device)
+        self.episodes = EpisodeStatistics(world.task_id, world.task_names)
+
+    def _adam(self, parameters: Iterable[nn.Parameter], rate: float) -> torch.optim.Adam:
+        return torch.optim.Adam(parameters, lr=rate, eps=self.config.adam_eps, fused=True)
+
+    # What a learner adds.
+
+    @abstractmethod
+    def _explore(self, obs: Tensor) -> Tensor:
+        """Actions (N, a) in [-1, 1] to try, for raw observations (N, d)."""
+
+    @abstractmethod
+    def _update(self, draw: Transitions, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
+        """One update of all networks.
+
+        Args:
+            draw: Transitions, task after task (B).
+            weights: 0 for those that teach nothing (B,).
+            counts: Sum of the weights of each task over all processes (num_tasks,).
+
+        Returns:
+            Scalars to be logged, the same ones each time; an iteration tells their means.
+        """
+
+    def _own_parts(self) -> dict[str, Any]:
+        """Networks and parameters of its own, beside those of the base, by their names in a checkpoint."""
+        return {}
+
+    def _told(self) -> dict[str, Tensor]:
+        """Scalars to be logged at the end of every iteration, before the first update too."""
+        return {}
+
+    # Experience.
+
+    def _iterate(self) -> dict[str, float]:
+        """Some vector steps, each followed by its updates."""
+        unstable = torch.zeros((), dtype=torch.int64, device=self.device)
+        measured: list[dict[str, Tensor]] = []
+        for _ in range(self.config.steps_per_iteration):
+            with self._collecting():
+                if self.replay.added == 0:
+                    self.replay.begin(self._first_observations())
+                unstable += self._step()
+            if self.replay.added >= self.config.warmup_steps:
+                measured += self._learn()
+        self.env_steps += self.config.steps_per_iteration * self.world.num_envs * world_size()
+        tensors = {"Train/unstable": all_sum(unstable)}
+        if measured:
+            names = sorted(measured[0], key=lambda name: name.partition("/")[0])
+            means = torch.stack([torch.stack([each[name] for name in names]) for each in measured]).mean(0)
+            tensors |= dict(zip(names, means, strict=True))
+        return self.episodes.metrics() | as_numbers(tensors | self._told())
+
+    @torch.no_grad()
+    def _step(self) -> Tensor:
+        """One step in every row; returns how many broke physics."""
+        actions = self._act(self.replay.obs)
+        obs, reward, terminated, truncated, info = self.world.step(actions)
+        self.replay.add(actions, reward, terminated, truncated, obs, info)
+        broken = info["unstable"] if "unstable" in info else torch.zeros_like(terminated)
+        self._note_returns(reward, terminated | truncated | broken, ~broken)
+        self.policy.observations.update(obs)
+        self.episodes.update(info)
+        return broken.sum()
+
+    def _act(self, obs: Tensor) -> Tensor:
+        if self.replay.added < self.config.warmup_steps:
+            shape = (len(obs), self.shape["actions"])
+            return torch.rand(shape, generator=self.generator, device=self.device) * 2.0 - 1.0
+        return self._explore(obs)
+
+    def _note_returns(self, reward: Tensor, ended: Tensor, valid: Tensor) -> None:
+        """Follows the discounted sum of rewards since each episode began."""
+        self.discounted = self.config.gamma * self.discounted + reward
+        moments = task_moments(self.discounted[None], self.world.task_id, self.world.num_tasks, valid[None])
+        self.return_stats.merge(*moments)
+        self.discounted = self.discounted.masked_fill(ended, 0.0)
+
+    def _reward_scale(self) -> Tensor:
+        """What rewards of each task are divided by (num_tasks,)."""
+        if not self.config.per_task_rewards:
+            return torch.ones(self.world.num_tasks, device=self.device)
+        # Where all returns are about the same, their deviation alone would blow them up.
+        return (self.return_stats.std().square() + (0.1 * self.return_stats.mean).square()).sqrt().float()
+
+    # Learning.
+
+    def _learn(self) -> list[dict[str, Tensor]]:
+        """The updates that follow one vector step; what each measured."""
+        updates, tasks = self.config.updates_per_step, self.world.num_tasks
+        places = self.replay.draw(updates, self.batch_per_task, self.generator)
+        weights = self.replay.weights(places)
+        # Divided by the draws of all processes, losses and gradients become means by being summed over them.
+        counts = all_sum(weights.view(updates, tasks, -1).sum(2))
+        return [self._update(self.replay.take(places[i]), weights[i], counts[i]) for i in range(updates)]
+
+    def _values(self, critic: Critics, obs: Tensor, actions: Tensor) -> Tensor:
+        """The critics' values of a draw (num_critics, B), in scaled units of reward."""
+        with autocast(self.device, self.low_precision):
+            return critic(obs, actions, self.task_of_draw)
+
+    def _bootstrapped(self, draw: Transitions, following: Tensor) -> Tensor:
+        """Targets (B,): scaled reward + gamma * ``following`` (B,), the value of the state after the transition.
+
+        Nothing follows a true end. After a time limit the episode could have gone on: the replay has its last state.
+        """
+        rewards = draw.rewards / self._reward_scale()[self.task_of_draw]
+        return rewards + self.config.gamma * following.masked_fill(draw.terminated, 0.0)
+
+    def _fit_critics(
+        self, obs: Tensor, draw: Transitions, target: Tensor, weights: Tensor, counts: Tensor
+    ) -> dict[str, Tensor]:
+        """One step of all critics towards ``target`` (B,), of normalised observations (B, d)."""
+        values = self._values(self.critic, obs, draw.actions)
+        loss = (weights / counts.sum().clamp_min(1.0) * (values - target).square()).sum()
+        value = self._per_task(weights * values[0].detach()) / counts.clamp_min(1.0)
+        weightless = (1.0 - weights).mean() / world_size()
+        numbers = torch.stack([loss.detach(), weightless, *value])
+        numbers = self._descend(loss, numbers, "critic", critic=list(self.critic.parameters()))
+        names = [f"Value/q/{name}" for name in self.world.task_names]
+        return dict(zip(["Loss/critic", "Train/weightless", *names], numbers, strict=True))
+
+    def _descend(self, loss: Tensor, numbers: Tensor, clipped: str, **parameters: list[nn.Parameter]) -> Tensor:
+        """One step of the optimisers named, down the sum of ``loss`` over all processes; no other weight gets a slope.
+
+        Args:
+            loss: A scalar.
+            numbers: What shall be summed over the processes besides (n,).
+            clipped: The optimiser whose gradient is shortened to ``max_grad_norm``.
+            parameters: What each optimiser moves.
+
+        Returns:
+            The sums of the numbers (n,).
+        """
+        weights = [weight for each in parameters.values() for weight in each]
+        for name in parameters:
+            self.adams[name].zero_grad()
+        loss.backward(inputs=weights)
+        numbers = sum_gradients(weights, numbers)
+        nn.utils.clip_grad_norm_(parameters[clipped], self.config.max_grad_norm)
+        for name in parameters:
+            self.adams[name].step()
+        return numbers
+
+    @torch.no_grad()
+    def _follow(self, target: nn.Module, network: nn.Module) -> None:
+        """Moves a target network a share ``tau`` of the way to its network (Polyak averaging)."""
+        for behind, ahead in zip(target.parameters(), network.parameters(), strict=True):
+            behind.lerp_(ahead, self.config.tau)
+
+    def _per_task(self, x: Tensor) -> Tensor:
+        """Sums (num_tasks,) of what a draw holds (B,)."""
+        return x.view(self.world.num_tasks, -1).sum(1)
+
+    # Checkpoints.
+
+    def _parts(self) -> dict[str, Any]:
+        return {
+            "critic": self.critic,
+            "target_critic": self.target_critic,
+            **self._own_parts(),
+            "adams": self.adams,
+            "return_stats": self.return_stats,
+            "discounted": self.discounted,
+            "generator": self.generator,
+            "episodes": self.episodes,
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """A copy of everything but the world, as tensors and plain values (``torch.load(weights_only=True)``)."""
+        # The replay makes its own copy: two of it at once may not fit.
+        return super().state_dict() | {"replay": self.replay.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` gave.
+
+        Raises:
+            BidexError: The checkpoint comes from a world or a replay of another size.
+        """
+        self.replay.load_state_dict(state["replay"])
+        super().load_state_dict(state)

@@ -1,0 +1,80 @@
+"""What can be set about every off-policy learner; imports no torch, so that a command line can show it at once."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from bidex_algos.checks import at_least, between, positive
+from bidex_algos.choices import Activation, Autocast
+from bidex_meta.errors import BidexError
+
+
+@dataclass(frozen=True)
+class OffPolicyConfig:
+    """Networks, replay, updates, statistics; the defaults are the preset ``laptop``.
+
+    A vector step is one step in every row of the world.
+    """
+
+    algo: ClassVar[str] = "off-policy"
+    """How the learner calls itself in messages."""
+
+    hidden: tuple[int, ...] = (256, 256)
+    """Widths of the hidden layers, of actor and critics alike."""
+    activation: Activation = "relu"
+    """Non-linearity of the hidden layers."""
+    policy_heads: bool = False
+    """Give the actor an output layer per task; the world must show the task's one-hot."""
+    value_heads: bool = True
+    """Give each critic one output per task instead of one for all."""
+    critic_layer_norm: bool = True
+    """Normalise the hidden layers of the critics, which keeps many updates per step from blowing values up."""
+    replay_steps: int = 500
+    """Vector steps that the replay keeps, if replay_memory allows."""
+    replay_memory: float = 2.0
+    """The most that the replay of each process may take, in GB (10^9 bytes)."""
+    cut_share: float = 0.0625
+    """Room in it for last observations before time limits, as a share of all transitions. Too small where episodes are
+    shorter than 1 / cut_share; Train/weightless shows it."""
+    warmup_steps: int = 20
+    """Vector steps of uniform actions before the first update."""
+    steps_per_iteration: int = 8
+    """Vector steps between two reports."""
+    updates_per_step: int = 4
+    """Updates of all networks after each vector step."""
+    batch_size: int = 1024
+    """Transitions of an update, split evenly over the tasks."""
+    batch_per_task: int | None = None
+    """Take this many of each task instead."""
+    gamma: float = 0.93
+    """Discount per step."""
+    tau: float = 0.02
+    """Share of the critics that enters the target critics in each update (1 - Polyak's factor)."""
+    learning_rate: float = 3e-4
+    """Adam's step size for the actor."""
+    critic_learning_rate: float = 1e-3
+    """Adam's step size for the critics."""
+    adam_eps: float = 1e-8
+    """What Adam adds to its denominators."""
+    max_grad_norm: float = 1.0
+    """Gradients longer than this are shortened to it, those of actor and critics apart."""
+    normalise_observations: bool = True
+    """Give observations zero mean and unit variance by running statistics; the task's one-hot stays as it is."""
+    per_task_rewards: bool = True
+    """Divide rewards, when they are drawn, by the running standard deviation of their task's discounted return."""
+    autocast: Autocast = "auto"
+    """Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX."""
+
+    def __post_init__(self) -> None:
+        """Rejects values that could only fail later.
+
+        Raises:
+            BidexError: A field is out of its range.
+        """
+        at_least(self, 1, "replay_steps", "steps_per_iteration", "updates_per_step", "batch_size")
+        if self.batch_per_task is not None:
+            at_least(self, 1, "batch_per_task")
+        at_least(self, 0, "warmup_steps")
+        if not 0.0 <= self.gamma < 1.0:
+            raise BidexError(f"{self.algo}: gamma must lie in [0, 1), got {self.gamma}.")
+        between(self, 0.0, 1.0, "tau", "cut_share")
+        positive(self, "tau", "cut_share", "replay_memory", "max_grad_norm")

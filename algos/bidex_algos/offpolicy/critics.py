@@ -1,0 +1,35 @@
+"""The critics of the off-policy learners: values of actions."""
+
+import torch
+from torch import Tensor, nn
+
+from bidex_algos.nets.networks import MLP
+from bidex_algos.offpolicy.config import OffPolicyConfig
+
+
+class Critics(nn.Module):
+    """Networks of observation and action, alike but for their initial weights.
+
+    Args:
+        inputs: Width of observation and action together.
+        heads: Outputs of each network: one per task, or 1 for all.
+        config: Layers.
+        generator: CPU generator of the initial weights.
+        count: How many: 2 against overestimation (Fujimoto et al. 2018), or 1.
+    """
+
+    def __init__(self, inputs: int, heads: int, config: OffPolicyConfig, generator: torch.Generator, count: int = 2):
+        super().__init__()
+        self.heads = heads
+        self.nets = nn.ModuleList(
+            MLP(inputs, config.hidden, heads, 1.0, generator, config.activation, config.critic_layer_norm)
+            for _ in range(count)
+        )
+
+    def forward(self, obs: Tensor, actions: Tensor, task_id: Tensor) -> Tensor:
+        """Values of each action: normalised observations (B, d), actions (B, a), tasks (B,) to (count, B)."""
+        x = torch.cat([obs, actions], dim=1)
+        all_values = torch.stack([net(x) for net in self.nets])
+        if self.heads == 1:
+            return all_values.squeeze(2)
+        return all_values.gather(2, task_id.expand(len(self.nets), -1)[..., None]).squeeze(2)

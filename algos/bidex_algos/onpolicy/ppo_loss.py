@@ -1,0 +1,72 @@
+"""PPO's loss (Schulman et al. 2017, equations 7 and 9): of MT-PPO's transitions and of RL²'s chunks of trials."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from bidex_algos.nets.networks import gaussian_entropy, gaussian_kl, gaussian_log_prob
+
+
+class PPOLoss(NamedTuple):
+    """Losses and what is told of them; scalars but for ``earned``. With weights that sum to 1 they are means."""
+
+    surrogate: Tensor
+    """Minus the clipped surrogate objective: min(ratio A, clip(ratio, 1 - eps, 1 + eps) A)."""
+    value: Tensor
+    """Squared error of the critic, in its own units."""
+    entropy: Tensor
+    """Entropy of the policy."""
+    kl: Tensor
+    """KL of the sampling policy from the present one; without a gradient."""
+    outside: Tensor
+    """Share of the ratios outside the clip range; without a gradient."""
+    earned: Tensor
+    """The surrogate objective of each sample, weighted (...)."""
+
+    def numbers(self) -> list[Tensor]:
+        """Surrogate, value loss, KL and share outside, without gradients: what :data:`NAMES` names."""
+        return [self.surrogate.detach(), self.value.detach(), self.kl, self.outside]
+
+
+NAMES: tuple[str, ...] = ("Loss/surrogate", "Loss/value", "Policy/kl", "Policy/clip_fraction")
+"""Tags of :meth:`PPOLoss.numbers`."""
+
+
+def ppo_loss(
+    actions: Tensor,
+    means: Tensor,
+    log_std: Tensor,
+    old_means: Tensor,
+    old_log_std: Tensor,
+    old_log_probs: Tensor,
+    advantages: Tensor,
+    values: Tensor,
+    targets: Tensor,
+    weights: Tensor,
+    clip: float,
+) -> PPOLoss:
+    """The loss of samples of any shape (...), which the weights sum up.
+
+    Args:
+        actions: What was done (..., a).
+        means: Of the present policy (..., a), with a gradient.
+        log_std: Logarithms of its standard deviations, (a,) or (..., a), with a gradient.
+        old_means: Of the sampling policy (..., a).
+        old_log_std: Of the sampling policy, (a,) or (..., a).
+        old_log_probs: Log-density of the actions under it (...).
+        advantages: Normalised (...).
+        values: What the critic says (...), in its own units, with a gradient.
+        targets: What it shall say (...).
+        weights: Of each sample (...); 0 for those that teach nothing.
+        clip: How far the ratio may leave 1 before it earns nothing more.
+    """
+    ratio = torch.exp(gaussian_log_prob(actions, means, log_std) - old_log_probs)
+    clipped = ratio.clamp(1.0 - clip, 1.0 + clip)
+    earned = weights * torch.minimum(ratio * advantages, clipped * advantages)
+    value = (weights * (values - targets).square()).sum()
+    entropy = (weights * gaussian_entropy(log_std)).sum()
+    with torch.no_grad():
+        kl = (weights * gaussian_kl(old_means, old_log_std, means, log_std)).sum()
+        outside = (weights * ((ratio - 1.0).abs() > clip)).sum()
+    return PPOLoss(-earned.sum(), value, entropy, kl, outside, earned)
