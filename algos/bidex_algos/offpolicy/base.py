@@ -40,7 +40,7 @@ class OffPolicy(Learner):
 
     Attributes:
         policy: Has ``observations`` (normaliser) and ``actor`` (network), beside the methods of an agent.
-        critic: See :class:`~bidex_algos.offpolicy.critics.Critics`; ``target_critic`` follows it.
+        critic: ``num_critics`` networks (:class:`Critics`); ``target_critic`` follows them.
         adams: Optimisers by name; an algorithm may add some.
         batch_per_task: Transitions of each task in an update; B is ``num_tasks`` times as many, task after task.
         task_of_draw: Their tasks, int64 (B,).
@@ -52,7 +52,6 @@ class OffPolicy(Learner):
     config: OffPolicyConfig
     per_process = ("generator", "episodes", "replay", "discounted")
     num_critics: ClassVar[int] = 2
-    """Two against overestimation, or one."""
 
     def __init__(self, world: VectorWorld, config: OffPolicyConfig, seed: int):
         super().__init__(world, config, seed)
