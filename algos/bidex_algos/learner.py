@@ -65,7 +65,7 @@ class Learner(ABC):
         self.shape = {
             "observations": int(world.single_observation_space.shape[0]),
             "actions": int(world.single_action_space.shape[0]),
-            "num_id_columns": int(getattr(world, "num_id_columns", 0)),
+            "num_id_columns": int(world.num_id_columns),
         }
         if getattr(config, "policy_heads", False) and self.shape["num_id_columns"] != world.num_tasks:
             raise BidexError(

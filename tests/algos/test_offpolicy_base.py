@@ -174,7 +174,7 @@ def test_metrics_and_errors_carry_its_name() -> None:
     assert {"Loss/critic", "Loss/actor", "Value/q/task0", "Train/weightless"} <= learner.iterate().keys()
     with torch.no_grad():
         next(learner.critic.parameters()).fill_(float("nan"))
-    with pytest.raises(FloatingPointError, match="twin: the loss is not finite after 512 steps; lower"):
+    with pytest.raises(FloatingPointError, match=r"twin: the loss is not finite after \d+ steps; lower critic_"):
         learner.iterate()
     with pytest.raises(BidexError, match="twin: tau"):
         replace(SMALL, tau=0.0)

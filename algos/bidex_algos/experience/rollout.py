@@ -72,14 +72,13 @@ def collect(
 
 
 def check_autoreset(world: VectorWorld, learner: str, expected: str) -> None:
-    """Refuses a world that says that it resets in another way than the learner needs.
+    """Refuses a world that resets in another way than the learner needs.
 
     Raises:
         BidexError: It is in another autoreset mode.
     """
-    mode = getattr(world, "metadata", {}).get("autoreset_mode")
-    name = getattr(mode, "name", mode)
-    if name is not None and name != expected:
+    name = world.metadata["autoreset_mode"].name
+    if name != expected:
         raise BidexError(
             f"{learner}: needs a world in autoreset mode {expected}, but this one is in {name}. Make it with "
             f'autoreset_mode="{expected}".'

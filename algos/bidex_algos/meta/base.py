@@ -10,7 +10,7 @@ They differ in the outer step alone. An iteration::
 """
 
 from abc import abstractmethod
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -20,24 +20,13 @@ from bidex_algos.learner import Learner
 from bidex_algos.meta.adaptation import Objective, TaskBatch, detached
 from bidex_algos.meta.config import MetaConfig
 from bidex_algos.meta.meta_policy import MetaPolicy, make_meta_policy
-from bidex_algos.meta.stage import Stage, task_batch
+from bidex_algos.meta.stage import Outcome, Stage, moments, task_batch
 from bidex_algos.meta.task_rows import TaskRows
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.reports import as_numbers
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import world_size
 from bidex_meta.world.contract import PooledWorld
-
-
-class Outcome(NamedTuple):
-    """What a stage came to."""
-
-    earned: Tensor
-    """Undiscounted, unscaled return of each row (N,)."""
-    success: Tensor
-    """Whether each row succeeded, bool (N,)."""
-    steps: Tensor
-    """Environment steps, int64 (); a row that waits for the others takes none."""
 
 
 class MetaLearner(Learner):
@@ -165,7 +154,7 @@ class MetaLearner(Learner):
             obs, reward, terminated, truncated, info = self.world.step(action)
             broken = info.get("unstable", torch.zeros_like(terminated))
             valid = running & ~broken
-            seen.merge(*_moments(before[:, : policy.observations.measured], valid))
+            seen.merge(*moments(before[:, : policy.observations.measured], valid))
             over = terminated | truncated | broken
             last = torch.full_like(over, self.config.slice_steps is None and t + 1 == horizon)
             stage.add(
@@ -253,13 +242,4 @@ class MetaLearner(Learner):
         self.steps_with_tasks = int(state["steps_with_tasks"])
 
     def _check_size(self, state: dict[str, Any]) -> None:
-        self._expect("num_envs = ", len(state["elapsed"]), self.world.num_envs)
-
-
-def _moments(x: Tensor, counted: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean, variance and count of each column of (N, d), over the rows of a mask (N,)."""
-    count = counted.sum()
-    x = x.masked_fill(~counted[:, None], 0.0)
-    mean = x.sum(0) / count.clamp_min(1)
-    var = ((x - mean).square() * counted[:, None]).sum(0) / count.clamp_min(1)
-    return mean, var, count
+        self._expect("", f"{len(state['elapsed'])} rows", f"{self.world.num_envs} rows")

@@ -1,6 +1,7 @@
 """One stage of adaptation: what all rows did and got, and the batch by task that is made of it."""
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -87,3 +88,23 @@ def task_batch(stage: Stage, rows: TaskRows, log_std: Tensor, config: MetaConfig
         advantages=rows.steps_by_task(scaled),
         weights=weights,
     )
+
+
+class Outcome(NamedTuple):
+    """What a stage came to."""
+
+    earned: Tensor
+    """Undiscounted, unscaled return of each row (N,)."""
+    success: Tensor
+    """Whether each row succeeded, bool (N,)."""
+    steps: Tensor
+    """Environment steps, int64 (); a row that waits for the others takes none."""
+
+
+def moments(x: Tensor, counted: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean, variance and count of each column of (N, d), over the rows of a mask (N,)."""
+    count = counted.sum()
+    x = x.masked_fill(~counted[:, None], 0.0)
+    mean = x.sum(0) / count.clamp_min(1)
+    var = ((x - mean).square() * counted[:, None]).sum(0) / count.clamp_min(1)
+    return mean, var, count

@@ -39,7 +39,8 @@ class OffPolicy(Learner):
     each, and an update is of as many times more transitions.
 
     Attributes:
-        critic: See :class:`~bidex_algos.offpolicy.critics.Critics`; ``target_critic`` follows it.
+        policy: Has ``observations`` (normaliser) and ``actor`` (network), beside the methods of an agent.
+        critic: ``num_critics`` networks (:class:`Critics`); ``target_critic`` follows them.
         adams: Optimisers by name; an algorithm may add some.
         batch_per_task: Transitions of each task in an update; B is ``num_tasks`` times as many, task after task.
         task_of_draw: Their tasks, int64 (B,).
@@ -244,10 +245,6 @@ class OffPolicy(Learner):
         return super().state_dict() | {"replay": self.replay.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`state_dict` gave.
-
-        Raises:
-            BidexError: The checkpoint comes from a world or a replay of another size.
-        """
+        """Restores what :meth:`state_dict` gave; a ``BidexError`` where world or replay had another size."""
         self.replay.load_state_dict(state["replay"])
         super().load_state_dict(state)
