@@ -10,11 +10,10 @@ import pytest
 import torch
 
 from bidex_meta.cli import main
-from bidex_meta.commands import COMMANDS, policies
+from bidex_meta.commands import COMMANDS
 from bidex_meta.record import RunFolder, read_metrics
 from bidex_meta.sources import Source
-from bidex_meta.sources.source import OwnSuite, SingleClass
-from bidex_meta.tasks import registry
+from bidex_meta.sources.source import OwnSuite
 from tests.fakes import ToyWorld
 
 SMALL = ["--suite", "MT4", "--num-envs", "6", "--threads", "1", "--device", "cpu"]
@@ -317,37 +316,6 @@ def test_a_killed_run_resumes_to_the_same_end(number, toy_worlds, tmp_path):
     assert main(["run", "--resume", str(path), "--steps", str(goal), "--no-evaluate"]) == 0
     assert run("--steps", goal, "--run-dir", tmp_path / "whole", "--no-evaluate") == 0
     assert same(final(path), final(tmp_path / "whole"))
-
-
-@pytest.fixture
-def toy_class(monkeypatch, toy_worlds):
-    """The first class of ``ToyWorld`` on its own."""
-    monkeypatch.setattr(registry, "names", lambda: ["Near"])
-    monkeypatch.setattr(SingleClass, "world", toy)
-    monkeypatch.setattr(SingleClass, "task_classes", lambda source: {source.name: None})
-
-
-def test_render_picture_and_film(toy_class, tmp_path, capsys):
-    flags = ["render", "--task", "Near", "--width", "64", "--height", "48", "--policy", "random"]
-    assert main([*flags, "--out", str(tmp_path / "a.png"), "--steps", "2"]) == 0
-    assert capsys.readouterr().out == f"{tmp_path / 'a.png'}\n"
-    import imageio.v3 as imageio
-
-    assert imageio.imread(tmp_path / "a.png")[0, :, 0].tolist() == [0] * 2 + [255] * 62
-    assert main(["render", "--task", "Nearer", "--out", str(tmp_path / "b.png")]) == 2
-    assert "Did you mean 'Near'?" in capsys.readouterr().err
-
-
-def test_render_refuses_a_policy_of_other_observations(monkeypatch, toy_class, tmp_path, capsys):
-    monkeypatch.setattr(OwnSuite, "task_classes", lambda source: {"Near": None})
-    monkeypatch.setattr(OwnSuite, "tasks", lambda source, split: {"Near": ["0"]})
-    assert run("--steps", 24, "--run-dir", tmp_path / "a", "--no-evaluate") == 0
-    flags = ["render", "--task", "Near", "--width", "64", "--height", "48", "--policy", str(tmp_path / "a")]
-    capsys.readouterr()
-    assert main([*flags, "--out", str(tmp_path / "a.png"), "--steps", "2"]) == 0
-    monkeypatch.setattr(policies, "policy_shape", lambda folder: {"observations": 7, "actions": 1})
-    assert main([*flags, "--out", str(tmp_path / "b.png"), "--steps", "2"]) == 2
-    assert "takes 7 observations" in capsys.readouterr().err
 
 
 # List and bench.

@@ -209,9 +209,9 @@ def test_a_step_tells_its_transition(case: Case) -> None:
     world, n = case.world, case.world.num_envs
     obs, _ = world.reset(seed=2)
     same = case.mode == "SAME_STEP"
-    frozen, flags, seen = torch.zeros(3, n, dtype=torch.bool, device=world.device).unbind(), None, 0
-    frozen, returns, lengths = frozen[0], torch.zeros(n), torch.zeros(n, dtype=torch.int64)
-    success = torch.zeros(n, dtype=torch.bool)
+    frozen, success = torch.zeros(n, dtype=torch.bool, device=world.device), torch.zeros(n, dtype=torch.bool)
+    returns, lengths = torch.zeros(n), torch.zeros(n, dtype=torch.int64)
+    flags, seen = None, 0
     for action in actions(world, 12).to(world.device):
         after, reward, terminated, truncated, info = world.step(action)
         broken = ~action.isfinite().all(1) & ~frozen

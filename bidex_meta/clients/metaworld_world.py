@@ -28,7 +28,7 @@ from bidex_meta.evaluation.play import check_world, play_tasks
 from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.world.actions import clean
 from bidex_meta.world.autoreset import checked_mode, reset_mask
-from bidex_meta.world.contract import plain_groups
+from bidex_meta.world.contract import PooledWorld, plain_groups
 from bidex_meta.world.episodes import Episodes
 from bidex_meta.world.groups import split_rows
 from bidex_meta.world.random import row_keys, uniform
@@ -292,7 +292,7 @@ class MetaWorldWorld(VectorEnv):
 
 
 def evaluate_all_tasks(
-    agent: Agent, world: MetaWorldWorld, episodes_per_task: int = 1, *, seed: int | None = None
+    agent: Agent, world: PooledWorld, episodes_per_task: int = 1, *, seed: int | None = None
 ) -> Evaluation:
     """``evaluate`` over all tasks of all classes, as many at a time as the world has rows for.
 
@@ -301,7 +301,7 @@ def evaluate_all_tasks(
 
     Args:
         agent: The policy.
-        world: A world in autoreset mode DISABLED; it is left with other pools of tasks.
+        world: A ``MetaWorldWorld`` in autoreset mode DISABLED; it is left with other pools of tasks.
         episodes_per_task: Episodes of each task.
         seed: Passed to the world's resets.
     """
@@ -309,7 +309,7 @@ def evaluate_all_tasks(
     at_once = min(rows.stop - rows.start for rows in world.slot_rows)
     parts: list[dict[str, np.ndarray]] = []
     for first in range(0, TASKS_PER_CLASS, at_once):
-        pool = range(first, min(first + at_once, TASKS_PER_CLASS))
+        pool = np.arange(first, min(first + at_once, TASKS_PER_CLASS))
         world.set_tasks({name: pool for name in world.task_names})
         played = play_tasks(agent, world, episodes_per_task, seed)
         parts.append(played | {"task": played["task"] + first})

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from bidex_meta.evaluation.results import Evaluation
     from bidex_meta.evaluation.scores import Reference
     from bidex_meta.tasks.base import TaskClass
+    from bidex_meta.world.contract import PooledWorld
 
 # Of each class. A row is an environment of some 10 MB; 2 M steps a class is the budget of published results.
 _TRAINING_ROWS, _TRAINING_STEPS = 4, 2_000_000
@@ -35,7 +36,7 @@ class MetaWorldSuite(Source):
         super().__init__(name, config)
         self.class_names = class_names(name)
 
-    def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> Any:
+    def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> "PooledWorld":
         """As in ``Source``."""
         if split != "train":
             raise BidexError(f"{self.name} has the split train alone, got {split!r}. Leave --split out.")
@@ -66,7 +67,7 @@ class MetaWorldSuite(Source):
         """As in ``Source``: none."""
         return {}
 
-    def judge(self, agent: "Agent", world: Any, episodes: int | None, seed: int) -> "Evaluation":
+    def judge(self, agent: "Agent", world: "PooledWorld", episodes: int | None, seed: int) -> "Evaluation":
         """As in ``Source``: the fifty tasks of each class a few at a time, as many as the world has rows for."""
         from bidex_meta.clients.metaworld_world import evaluate_all_tasks
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from bidex_meta.evaluation.results import Evaluation
     from bidex_meta.evaluation.scores import Reference
     from bidex_meta.tasks.base import TaskClass
+    from bidex_meta.world.contract import PooledWorld
 
 _ROWS_AND_STEPS = {"cpu": (1024, 20_000_000), "gpu": (8192, 200_000_000)}
 # Whole episodes of all rows make one meta-batch: with fewer rows there are more of them.
@@ -64,7 +65,7 @@ class Source(ABC):
         return (MetaWorldSuite if is_foreign(suite) else OwnSuite)(suite, config)
 
     @abstractmethod
-    def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> Any:
+    def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> "PooledWorld":
         """A fresh world of one split.
 
         Args:
@@ -115,7 +116,7 @@ class Source(ABC):
 
         return references() if self.moving_bases else {}
 
-    def judge(self, agent: "Agent", world: Any, episodes: int | None, seed: int) -> "Evaluation":
+    def judge(self, agent: "Agent", world: "PooledWorld", episodes: int | None, seed: int) -> "Evaluation":
         """Evaluate a policy on all tasks of a split, beside the references.
 
         Args:
@@ -149,7 +150,7 @@ class OwnSuite(Source):
 
         return Benchmark(self.name, seed=self.seed)
 
-    def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> Any:
+    def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> "PooledWorld":
         """As in ``Source``."""
         if rows is None:
             # Rows are split evenly over slots, so that all need as many as the slot with the most tasks.
@@ -182,7 +183,7 @@ class SingleClass(Source):
         # None: as the class has it alone.
         self.moving_base: bool | None = {"own": None, "moving": True, "fixed": False}[config.get("base", "own")]
 
-    def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> Any:
+    def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> "PooledWorld":
         """As in ``Source``."""
         from bidex_meta.benchmark import make_task_world
 

@@ -1,5 +1,6 @@
 """Toy worlds whose optimum is known, for the tests of all learners: bandits, LQR and a point mass."""
 
+from abc import abstractmethod
 from collections.abc import Callable
 
 import numpy as np
@@ -40,8 +41,8 @@ class _TimedWorld(FakeWorld):
     def _first_elapsed(self) -> Tensor:
         return torch.arange(self.num_envs) % self.max_episode_steps
 
-    def _draw(self) -> Tensor:
-        raise NotImplementedError
+    @abstractmethod
+    def _draw(self) -> Tensor: ...
 
     def _start(self, mask: Tensor) -> None:
         self.state = torch.where(mask[:, None], self._draw(), self.state)

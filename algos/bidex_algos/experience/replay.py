@@ -106,12 +106,12 @@ class Replay:
         self, actions: Tensor, reward: Tensor, terminated: Tensor, truncated: Tensor, obs: Tensor, info: dict[str, Any]
     ) -> None:
         """Takes one vector step from ``self.obs``: ``actions`` (N, a) and what a world's ``step`` returned for them."""
-        valid = ~info["unstable"] if "unstable" in info else torch.ones_like(terminated)
+        valid = ~info["unstable"]
         cut = truncated & ~terminated & valid
         number = self._cuts + cut.cumsum(0)
         # All rows write, those whose episode goes on into the last cell: to pick rows the host would have to wait.
         cell = torch.where(cut, (number - 1) % self.cuts_kept, self.cuts_kept)
-        self._final_obs.index_copy_(0, cell, info.get("final_obs", obs))
+        self._final_obs.index_copy_(0, cell, info["final_obs"])
         self._cuts += cut.sum()
         step = {
             "actions": actions,

@@ -61,11 +61,11 @@ def collect(
         action, mean = sample(obs)
         rollout.obs[t], rollout.actions[t], rollout.means[t] = obs, action, mean
         obs, reward, terminated, truncated, info = world.step(action)
-        valid = ~info["unstable"] if "unstable" in info else torch.ones_like(terminated)
+        valid = ~info["unstable"]
         rollout.rewards[t] = reward.masked_fill(~valid, 0.0)
         rollout.terminated[t], rollout.ended[t], rollout.valid[t] = terminated, terminated | truncated | ~valid, valid
         cut = truncated & ~terminated & valid
-        rollout.final_values[t] = _values_where(cut, info.get("final_obs"), world.task_id, final_value)
+        rollout.final_values[t] = _values_where(cut, info["final_obs"], world.task_id, final_value)
         episodes.update(info)
     rollout.last_obs.copy_(obs)
     return obs
@@ -90,11 +90,9 @@ def may_look(device: torch.device) -> bool:
     return device.type == "cpu"
 
 
-def _values_where(cut: Tensor, final_obs: Tensor | None, task_id: Tensor, final_value: FinalValue) -> Tensor:
+def _values_where(cut: Tensor, final_obs: Tensor, task_id: Tensor, final_value: FinalValue) -> Tensor:
     """Values (N,) of ``final_obs`` in the rows ``cut``, 0 elsewhere."""
     values = torch.zeros(cut.shape, device=cut.device)
-    if final_obs is None:
-        return values
     if not may_look(cut.device):
         # A forward of all rows is cheaper than the wait for which rows there are.
         return torch.where(cut, final_value(final_obs, task_id), values)

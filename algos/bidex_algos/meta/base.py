@@ -152,7 +152,7 @@ class MetaLearner(Learner):
             steps += running.sum()
             before = obs
             obs, reward, terminated, truncated, info = self.world.step(action)
-            broken = info.get("unstable", torch.zeros_like(terminated))
+            broken = info["unstable"]
             valid = running & ~broken
             seen.merge(*moments(before[:, : policy.observations.measured], valid))
             over = terminated | truncated | broken
@@ -161,8 +161,8 @@ class MetaLearner(Learner):
                 obs=normal, actions=action, means=mean, rewards=reward.masked_fill(~valid, 0.0), terminated=terminated,
                 ended=over | last | ~running, valid=valid, elapsed=self.elapsed,
             )  # fmt: skip
-            earned += info.get("reward_unscaled", reward).masked_fill(~valid, 0.0)
-            success |= info["success"] & valid if "success" in info else False
+            earned += info["reward_unscaled"].masked_fill(~valid, 0.0)
+            success |= info["success"] & valid
             self.elapsed = (self.elapsed + 1).masked_fill(over, 0)
             if self.config.slice_steps is None:
                 running = running & ~over

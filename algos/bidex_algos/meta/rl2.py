@@ -54,8 +54,9 @@ class RL2(Learner):
     autoreset = "DISABLED"
     per_process = ("generator", "episodes")
     adapts: ClassVar[bool] = True
+    """Its agent is a ``MetaLearningAgent``: evaluation measures before and after."""
     adapts_by_row: ClassVar[bool] = True
-    """Whether its agent is a ``MetaLearningAgent``."""
+    """A row learns from its own episodes alone."""
 
     def __init__(self, world: PooledWorld, config: RL2Config, seed: int):
         super().__init__(world, config, seed)

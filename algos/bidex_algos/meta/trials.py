@@ -119,7 +119,7 @@ def play(
             # Not clamped: the world does that, and the density must be that of what was drawn.
             action = mean + std * torch.randn(mean.shape, generator=generator, device=device)
             next_obs, reward, terminated, truncated, info = world.step(action)
-            valid = ~info["unstable"] if "unstable" in info else torch.ones_like(playing)
+            valid = ~info["unstable"]
             reward = reward.masked_fill(~(valid & playing), 0.0)
             elapsed = elapsed + playing
             left = trials.limits - elapsed

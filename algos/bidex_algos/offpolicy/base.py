@@ -130,7 +130,7 @@ class OffPolicy(Learner):
         actions = self._act(self.replay.obs)
         obs, reward, terminated, truncated, info = self.world.step(actions)
         self.replay.add(actions, reward, terminated, truncated, obs, info)
-        broken = info["unstable"] if "unstable" in info else torch.zeros_like(terminated)
+        broken = info["unstable"]
         self._note_returns(reward, terminated | truncated | broken, ~broken)
         self.policy.observations.update(obs)
         self.episodes.update(info)
