@@ -102,8 +102,7 @@ class Simulator:
         alive = torch.ones(self.num, dtype=torch.bool)
         rewards, success = [], []
         for action in actions:
-            self._part.control(action)
-            self._part.advance(None)
+            self._part.step(action, None)
             (_, _, state), *_ = self._part.states(self._world.task_index)
             transition = judge(self._part.group.members[0].scene.task, state)
             alive &= ~self._part.unstable()

@@ -68,6 +68,11 @@ class Part:
         """Writes the actions of the part's rows, shape (num, a), into the engine."""
         self._controls.write(action)
 
+    def step(self, action: Tensor, active: Tensor | None) -> None:
+        """Applies actions, shape (num, a), and advances all rows, or those of the mask, by one control step."""
+        self.control(action)
+        self.advance(active)
+
     def advance(self, active: Tensor | None) -> None:
         """Advances all rows, or those of the mask, by one control step."""
         self._engine.step(self.substeps, active)
