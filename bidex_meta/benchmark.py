@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, cast
 
 import numpy as np
 
-from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.errors import BidexError, known_name, unknown_name
 from bidex_meta.suite import SPLITS, ListedTask, Split, Suite, SuiteClass, load_suite
 from bidex_meta.tasks import registry
 
@@ -228,6 +228,7 @@ def make_task_world(
     from bidex_meta.world import Slot
     from bidex_meta.world.autoreset import checked_mode
 
+    task_name = known_name("task class", task_name, registry.names())
     task_class = registry.get(task_name, moving_base)
     tasks = _drawn(task_class.variation_space, _checked_seed(seed), task_name, "train", _TASKS_ALONE)
     slot = Slot(task_name, task_class, np.stack([task.variation for task in tasks]))
