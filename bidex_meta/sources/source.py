@@ -173,7 +173,7 @@ class OwnSuite(Source):
 
     def task_classes(self) -> "dict[str, TaskClass]":
         """As in ``Source``."""
-        return self.benchmark.train_classes
+        return self.benchmark.task_classes()
 
 
 class SingleClass(Source):
