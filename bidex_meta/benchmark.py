@@ -6,12 +6,13 @@ physics is made here: this module decides which numbers belong to which task and
 
 import hashlib
 import operator
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple, cast
 
 import numpy as np
 
-from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.errors import BidexError, known_name, unknown_name
 from bidex_meta.suite import SPLITS, ListedTask, Split, Suite, SuiteClass, load_suite
 from bidex_meta.tasks import registry
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     import torch
     from gymnasium.vector import AutoresetMode
 
+    from bidex_meta.envs.suite_env import SuiteEnv
     from bidex_meta.tasks.base import TaskClass
     from bidex_meta.tasks.variation import VariationSpace
     from bidex_meta.world import Slot, World
@@ -55,8 +57,10 @@ class Benchmark:
 
     The same name and seed give the same tasks in every process; no global random generator is read or written.
 
+    To those who ask it is a `metaworld.Benchmark`, and its classes make single environments as Meta-World's do.
+
     Args:
-        name_or_path: A shipped suite (`bidex_meta.suite_names()`), or the path of a suite file of your own.
+        name_or_path: A shipped suite (`bidex_meta.suite_names()`), the path of a suite file of your own, or a `Suite`.
         seed: Chooses the tasks; also the default seed of the worlds. A whole number from 0 on.
 
     Raises:
@@ -69,8 +73,8 @@ class Benchmark:
         (['TwoCatchUnderarm'], 150)
     """
 
-    def __init__(self, name_or_path: str | Path, *, seed: int = 0) -> None:
-        self.suite: Suite = load_suite(name_or_path)
+    def __init__(self, name_or_path: str | Path | Suite, seed: int = 0) -> None:
+        self.suite = name_or_path if isinstance(name_or_path, Suite) else load_suite(name_or_path)
         self.seed = _checked_seed(seed)
         self._classes = {entry.name: _task_class(self.suite, entry) for entry in self.suite.classes}
         self._tasks = {
@@ -91,19 +95,34 @@ class Benchmark:
         return f"Benchmark({self.name!r}, seed={self.seed})"
 
     @property
+    def __class__(self) -> type:  # type: ignore[override]
+        """Its class, which is by now known to Meta-World: `isinstance(self, metaworld.Benchmark)` reads this first.
+
+        Only so can whoever has imported Meta-World at whatever time be told, without importing it here.
+        """
+        library = sys.modules.get("metaworld")
+        if library is not None and hasattr(library, "Benchmark"):
+            library.Benchmark.register(Benchmark)
+        return type(self)
+
+    @property
     def name(self) -> str:
         """The suite's name."""
         return self.suite.name
 
     @property
-    def train_classes(self) -> "dict[str, TaskClass]":
-        """Task classes of the train split by name, in the order of the suite file."""
-        return self._split_classes("train")
+    def train_classes(self) -> "dict[str, type[SuiteEnv]]":
+        """Environment classes of the train split by name, in the order of the suite file."""
+        return self._env_classes("train")
 
     @property
-    def test_classes(self) -> "dict[str, TaskClass]":
-        """Task classes of the test split by name; empty in a multi-task suite."""
-        return self._split_classes("test")
+    def test_classes(self) -> "dict[str, type[SuiteEnv]]":
+        """Environment classes of the test split by name; empty in a multi-task suite."""
+        return self._env_classes("test")
+
+    def task_classes(self, split: str = "train") -> "dict[str, TaskClass]":
+        """What the classes of a split are (scene, observation, reward), by name."""
+        return {entry.name: self._classes[entry.name] for entry in self.suite.split_classes(cast(Split, split))}
 
     @property
     def train_tasks(self) -> list[Task]:
@@ -171,8 +190,16 @@ class Benchmark:
             return [Task.from_variation(entry.name, _listed(space, self.seed, entry.name, task)) for task in listed]
         return _drawn(space, self.seed, entry.name, split, self.suite.tasks_per_class or 0)
 
-    def _split_classes(self, split: Split) -> "dict[str, TaskClass]":
-        return {entry.name: self._classes[entry.name] for entry in self.suite.split_classes(split)}
+    def _env_classes(self, split: Split) -> "dict[str, type[SuiteEnv]]":
+        from bidex_meta.envs.suite_env import EnvRecipe
+
+        moving, hides = True if self.suite.base == "moving" else None, self.suite.observation == "masked"
+        return {
+            entry.name: EnvRecipe(
+                entry.name, moving, tuple(entry.options.items()), self.padded_size, hides, entry.reward_scale
+            ).make_class()
+            for entry in self.suite.split_classes(split)
+        }
 
     def _checked_split(self, split: str) -> Split:
         if split not in self.suite.splits:
@@ -228,6 +255,7 @@ def make_task_world(
     from bidex_meta.world import Slot
     from bidex_meta.world.autoreset import checked_mode
 
+    task_name = known_name("task class", task_name, registry.names())
     task_class = registry.get(task_name, moving_base)
     tasks = _drawn(task_class.variation_space, _checked_seed(seed), task_name, "train", _TASKS_ALONE)
     slot = Slot(task_name, task_class, np.stack([task.variation for task in tasks]))

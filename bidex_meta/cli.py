@@ -9,10 +9,7 @@ import sys
 from collections.abc import Sequence
 
 from bidex_meta.commands import COMMANDS
-from bidex_meta.errors import BidexError, unknown_name
-
-EXIT_BAD_INPUT = 2
-EXIT_INTERRUPTED = 130
+from bidex_meta.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, BidexError, known_name
 
 _EXAMPLE = "bidex-meta run --suite MT4 --algo mtppo"
 
@@ -25,6 +22,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns:
         The exit code: 0, 2 for bad input, 130 after Ctrl-C.
+
+    Raises:
+        SystemExit: With another exit code, from a subcommand.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in given
@@ -55,8 +55,7 @@ def _dispatch(arguments: list[str]) -> int:
 
         print(__version__)
         return 0
-    if name not in COMMANDS:
-        raise unknown_name("command", name, COMMANDS)
+    name = known_name("command", name, COMMANDS)
     importlib.import_module(COMMANDS[name].module).main(rest)
     return 0
 

@@ -1,11 +1,46 @@
-"""The one exception for bad input: a line that names the expected, the received and the mend."""
+"""The one exception for bad input (a line that names the expected, the received and the mend), and exit codes."""
 
 import difflib
 from collections.abc import Iterable
 
+EXIT_BAD_INPUT = 2
+EXIT_INTERRUPTED = 130
+"""Exit codes of the command line: 128 and the signal's number after Ctrl-C, as shells expect."""
+
 
 class BidexError(ValueError):
     """Bad input from a user. The command line prints it as one line and exits with code 2."""
+
+
+def known_name(kind: str, name: str, known: Iterable[str]) -> str:
+    """The known name that a given one is, without regard to case.
+
+    Args:
+        kind: What is looked up, e.g. ``"suite"``.
+        name: The name that was given.
+        known: All names that exist.
+
+    Raises:
+        BidexError: There is none; with the nearest name and the list.
+    """
+    names = list(known)
+    if name in names:
+        return name
+    found = [other for other in names if other.casefold() == str(name).casefold()]
+    if len(found) != 1:
+        raise unknown_name(kind, name, names)
+    return found[0]
+
+
+def nearest(name: str, known: Iterable[str]) -> str | None:
+    """The known name that was probably meant; of one with a prefix (``metaworld/MT10``) the rest alone will do."""
+    given, names = name.casefold(), list(known)
+    for other in names:
+        if other.rpartition("/")[2].casefold() == given:
+            return other
+    folded = {other.casefold(): other for other in names}
+    near = difflib.get_close_matches(given, list(folded), n=1, cutoff=0.4)
+    return folded[near[0]] if near else None
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> BidexError:
@@ -17,6 +52,6 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> BidexError:
         known: All names that exist.
     """
     names = sorted(known)
-    near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.4)
-    hint = f" Did you mean {near[0]!r}?" if near else ""
+    near = nearest(str(name), names)
+    hint = f" Did you mean {near!r}?" if near else ""
     return BidexError(f"Unknown {kind} {name!r}.{hint} Known: {', '.join(names) or 'none'}.")

@@ -12,6 +12,8 @@ from bidex_meta.suite import Suite, load_suite, suite_names
 from bidex_meta.tasks import registry
 
 if TYPE_CHECKING:
+    from gymnasium.vector import VectorEnv
+
     from bidex_meta.world import World
 
 NAMESPACE = "bidex-meta"
@@ -39,6 +41,9 @@ def register_ids() -> None:
                     vector_entry_point="bidex_meta.registration:make_suite_world",
                     kwargs={"suite": name, "split": split},
                 )
+    for kind in ("mt", "ml"):
+        if (env_id := f"{NAMESPACE}/custom-{kind}-envs") not in gymnasium.registry:
+            gymnasium.register(env_id, vector_entry_point="bidex_meta.metaworld.vector_envs:make_custom")
     for name in registry.names():
         if task_id(name) not in gymnasium.registry:
             gymnasium.register(
@@ -49,19 +54,39 @@ def register_ids() -> None:
             )
 
 
-def make_suite_world(suite: str, split: str, num_envs: int = 1, benchmark_seed: int = 0, **options: Any) -> "World":
+_METAWORLD = ("vector_strategy", "meta_batch_size", "total_tasks_per_cls", "env_name")
+"""Keywords of Meta-World's that ask for its kind of vector environment."""
+
+
+def make_suite_world(
+    suite: str,
+    split: str,
+    num_envs: int = 1,
+    seed: int | None = None,
+    benchmark_seed: int | None = None,
+    **options: Any,
+) -> "World | VectorEnv":
     """What `gymnasium.make_vec("bidex-meta/MT4-v1", num_envs=...)` calls.
 
     Args:
         suite: Name of the suite.
         split: `"train"` or `"test"`.
         num_envs: Rows over all classes.
-        benchmark_seed: Chooses the tasks.
-        **options: The other keywords of `Benchmark.make_world`.
+        seed: Chooses the tasks, the starts and the task draws; None: 0.
+        benchmark_seed: Chooses the tasks instead, and the rest where there is no seed.
+        **options: The other keywords of `Benchmark.make_world`. With `vector_strategy`, `meta_batch_size`,
+            `total_tasks_per_cls` or `env_name` those of Meta-World's ids, and what comes is what `metaworld` gives:
+            single environments of NumPy arrays side by side, however many `num_envs` says.
     """
+    of_tasks = next(given for given in (benchmark_seed, seed, 0) if given is not None)
+    if any(name in options for name in _METAWORLD):
+        from bidex_meta.metaworld.vector_envs import make_split
+
+        return make_split(suite, split, of_tasks, **options)
     from bidex_meta.benchmark import Benchmark
 
-    return Benchmark(suite, seed=benchmark_seed).make_world(split, num_envs=num_envs, **options)
+    benchmark = Benchmark(suite, seed=of_tasks)
+    return benchmark.make_world(split, num_envs=num_envs, seed=seed, **options)
 
 
 def make_class_world(task_name: str, num_envs: int = 1, **options: Any) -> "World":

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, cast
 
-from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.errors import BidexError, known_name, unknown_name
 from bidex_meta.paths import suites_dir
 
 Split = Literal["train", "test"]
@@ -93,7 +93,7 @@ def load_suite(name_or_path: str | Path) -> Suite:
     """Reads a shipped suite by name, or any suite file by path.
 
     Args:
-        name_or_path: E.g. `"MT4"`, or the path of a `.toml` file (a `Path`, or a text that ends in `.toml`).
+        name_or_path: E.g. `"MT4"`, in any case, or the path of a `.toml` file: a `Path`, or a text that ends so.
 
     Raises:
         BidexError: No such suite or file, or the file does not say what `suites/README.md` asks for.
@@ -101,9 +101,7 @@ def load_suite(name_or_path: str | Path) -> Suite:
     text = str(name_or_path)
     if isinstance(name_or_path, Path) or text.endswith(".toml"):
         return _parse(Path(name_or_path).expanduser())
-    if text not in suite_names():
-        raise unknown_name("suite", text, suite_names())
-    return _parse(suites_dir() / f"{text}.toml")
+    return _parse(suites_dir() / f"{known_name('suite', text, suite_names())}.toml")
 
 
 def _parse(file: Path) -> Suite:

@@ -66,7 +66,7 @@ def test_classes_and_task_counts() -> None:
 
 
 def test_hand_over_moves_in_suites_and_stands_alone(asked: None) -> None:
-    in_suite = Benchmark("MT4").train_classes["HandOver"]
+    in_suite = Benchmark("MT4").task_classes()["HandOver"]
     assert (in_suite.observation_size, in_suite.action_size) == (422, 52)
     alone = make_task_world("HandOver", num_envs=2).slots[0].task_class
     assert (alone.observation_size, alone.action_size) == (398, 40)
@@ -82,7 +82,7 @@ def test_tasks_are_distinct_and_disjoint(name: str) -> None:
 @pytest.mark.parametrize("name", ["MT4", "ML4"])
 def test_drawn_tasks_lie_in_their_space(name: str) -> None:
     benchmark = Benchmark(name)
-    classes = benchmark.train_classes | benchmark.test_classes
+    classes = benchmark.task_classes("train") | benchmark.task_classes("test")
     for task in benchmark.train_tasks + benchmark.test_tasks:
         assert classes[task.env_name].variation_space.contains(task.variation)
 
@@ -116,7 +116,7 @@ _ROOT = Path(__file__).parents[1]
 
 def test_listed_tasks_fix_the_goal_and_share_the_drawn_rest() -> None:
     mt1, ml1, other = Benchmark("MT1"), Benchmark("ML1"), Benchmark("MT1", seed=1)
-    names = mt1.train_classes["CatchUnderarm"].variation_space.names
+    names = mt1.task_classes()["CatchUnderarm"].variation_space.names
     goal = [names.index(f"goal_{axis}") for axis in "xyz"]
     expected = [(0.0, -0.79, 0.54), (0.03, -0.79, 0.54), (-0.03, -0.79, 0.54), (0.0, -0.82, 0.54)]
     np.testing.assert_array_equal([task.variation[goal] for task in mt1.train_tasks], expected)
@@ -203,7 +203,7 @@ def test_bad_worlds(asked: None, arguments: dict[str, Any], message: str) -> Non
 
 def test_bad_names_and_seeds(tmp_path: Path) -> None:
     with pytest.raises(BidexError, match="Did you mean 'HandOver'"):
-        make_task_world("Handover")
+        make_task_world("HandOve")
     with pytest.raises(BidexError, match=r"own\.toml: classes: Unknown task class 'HandOvr'\. Did you mean 'HandOver'"):
         Benchmark(own_suite(tmp_path, HandOver="HandOvr"))
     listed = own_suite(

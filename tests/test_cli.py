@@ -1,5 +1,6 @@
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -55,6 +56,68 @@ def same(a, b):
 # Help and errors.
 
 
+def test_lists_of_suites_need_no_torch():
+    heavy = {"torch", "mujoco", "metaworld", "scipy", "tensorboard"}
+    code = f"import sys; from bidex_meta.cli import main; main(['list', 'suites']); print({heavy} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "metaworld/MT10" in done.stdout and done.stdout.rstrip().endswith("set()")
+
+
+def test_names_are_taken_in_any_case_and_kept_as_they_are_written(capsys):
+    for flags, expected in (
+        (["--suite", "mt4", "--algo", "MTPPO", "--preset", "Paper"], ("MT4", None, "mtppo", "paper")),
+        (["--suite", "MetaWorld/mt3", "--algo", "mtsac"], ("metaworld/MT3", None, "mtsac", "metaworld")),
+        (["--task", "handover", "--algo", "PPO"], (None, "HandOver", "ppo", "laptop")),
+    ):
+        assert main(["Run", *flags, "--device", "cpu", "--print-config"]) == 0
+        config = json.loads(capsys.readouterr().out)
+        assert (config["suite"], config["task"], config["algo"], config["preset"]) == expected
+    assert main(["list", "SUITES", "--json"]) == 0
+
+
+def test_hints_name_extras_that_there_are():
+    import re
+    import tomllib
+    from pathlib import Path
+
+    root = Path(__file__).parents[1]
+    extras = tomllib.loads((root / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    sources = [*root.glob("bidex_meta/**/*.py"), *root.glob("algos/**/*.py"), *root.glob("docs/**/*.md")]
+    named = {found for path in sources for found in re.findall(r"bidex-meta\[([\w-]+)\]", path.read_text())}
+    assert named and named <= set(extras)
+
+
+# A line of bash that completes the last of its words with the script that is read from a file.
+_COMPLETE = """
+source "$1"; shift; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); COMPREPLY=()
+_tyro_bidex_meta bidex-meta "${COMP_WORDS[$COMP_CWORD]}" ""; echo "${COMPREPLY[*]}"
+"""
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+def test_bash_completes_commands_flags_and_names(tmp_path, capsys):
+    assert main(["completion", "bash"]) == 0
+    (tmp_path / "script").write_text(capsys.readouterr().out)
+    for words, expected in (
+        ("ru", {"run"}),
+        ("run --learner.gam", {"--learner.gamma"}),
+        ("run --suite MT", {"MT1", "MT4", "MT20"}),
+        ("run --algo mtp", {"mtppo"}),
+        ("witness --task Hand", {"HandOver"}),
+        ("run --base ", {"own", "moving", "fixed"}),
+    ):
+        command = ["bash", "-c", _COMPLETE, "bash", str(tmp_path / "script"), "bidex-meta", *words.split(" ")]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        assert set(done.stdout.split()) == expected, words
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_other_shells_get_a_script_too(shell, capsys):
+    assert main(["completion", shell]) == 0
+    script = capsys.readouterr().out
+    assert all(f"'{name}'" in script for name in COMMANDS)
+
+
 def test_help_is_quick_and_needs_no_torch():
     code = "import sys; from bidex_meta.cli import main; main(['--help']); print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -92,6 +155,10 @@ def test_help_of_run_names_every_field_of_the_learner(capsys):
         ("rum", "Did you mean 'run'?"),
         ("run --suite MT4 --num-evns 4", "Did you mean --num-envs?"),
         ("run --suite MT4 --learner.gama 0.9", "Did you mean --learner.gamma?"),
+        ("run --suite MT4 --gamma 0.9", "Did you mean --learner.gamma?"),
+        ("run --suite MT4 --lr 3e-4", "Did you mean --learner.learning-rate? See"),
+        ("run --suite ML4 --algo promp --lr=1", "--learner.inner-learning-rate or --learner.outer-learning-rate?"),
+        ("run --suite MT4 --xyzzy", "Unknown flag --xyzzy of bidex-meta run. See"),
         ("run --suite MT4 --num-envs many", "--num-envs"),
         ("run --suite MT4 --num-envs 0", "at least 1"),
         ("run --suite MT4 --steps 2.5", "2e7"),
@@ -107,6 +174,9 @@ def test_help_of_run_names_every_field_of_the_learner(capsys):
         ("run", "either --suite SUITE or --task TASK"),
         ("run --suite MT4 --task HandOver", "either --suite SUITE or --task TASK"),
         ("run --suite MT5", "Did you mean 'MT4'?"),
+        ("run --suite MT5", "MT20, MT4, metaworld/MT10, metaworld/MT3."),
+        ("run --suite mt10", "Did you mean 'metaworld/MT10'?"),
+        ("run --task handove", "Did you mean 'HandOver'?"),
         ("run --resume nowhere", "not a run folder"),
         ("list suits", "Did you mean 'suites'?"),
         ("list", "suites|tasks|algos"),
@@ -296,7 +366,7 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
 def test_a_killed_run_resumes_to_the_same_end(number, toy_worlds, tmp_path):
     path, steps = tmp_path / "killed", 10_000_000
     command = [sys.executable, "-c", _TRAIN, "run", *SMALL, "--steps", str(steps), "--run-dir", str(path)]
@@ -307,8 +377,8 @@ def test_a_killed_run_resumes_to_the_same_end(number, toy_worlds, tmp_path):
         time.sleep(0.01)
     process.send_signal(number)
     _, errors = process.communicate()
-    if number == signal.SIGTERM:
-        assert process.returncode == 0
+    if number != signal.SIGKILL:
+        assert process.returncode == {signal.SIGTERM: 0, signal.SIGINT: 130}[number]
         assert f"bidex-meta run --resume {path}" in errors
     stopped = final(path)[1]
     assert 0 < stopped < steps, errors

@@ -19,7 +19,9 @@ ORDER = (
     ("engine", "record", "hands", "suite"),
     ("tasks",),
     ("world",),
+    ("envs",),
     ("evaluation", "benchmark", "train"),
+    ("metaworld",),
     ("registration",),
     ("bidex_meta",),  # the package's own names
     ("clients", "witness"),

@@ -306,7 +306,7 @@ def test_defaults_follow_the_suite(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        ("run --suite metaworld/MT4", "Unknown suite of Meta-World 'metaworld/MT4'. Did you mean 'metaworld/MT3'?"),
+        ("run --suite metaworld/MT4", "Unknown suite 'metaworld/MT4'. Did you mean 'metaworld/MT3'?"),
         ("run --suite metaworld/MT10 --num-envs 9", "at least 10 rows"),
         ("run --suite metaworld/MT3 --engine warp", "--device cpu"),
         ("run --suite metaworld/MT3 --preset metaworl", "Did you mean 'metaworld'?"),

@@ -26,8 +26,8 @@ def test_without_a_file_nothing_is_known(folder: Path) -> None:
 
 
 def test_storing_keeps_the_other_classes_and_how_each_was_made(folder: Path) -> None:
-    references.store("random", {"HandOver": {"return": 0.4}, "Switch": {"return": 9.0}}, {"seed": 0})
-    references.store("random", {"Switch": {"return": 8.0}}, {"seed": 1})
+    references.store(folder / "random.json", {"HandOver": {"return": 0.4}, "Switch": {"return": 9.0}}, {"seed": 0})
+    references.store(folder / "random.json", {"Switch": {"return": 8.0}}, {"seed": 1})
     assert references.load("random") == {
         "HandOver": {"return": 0.4, "made": {"seed": 0}},
         "Switch": {"return": 8.0, "made": {"seed": 1}},
@@ -36,8 +36,8 @@ def test_storing_keeps_the_other_classes_and_how_each_was_made(folder: Path) -> 
 
 def test_a_score_needs_both_ends_and_an_expert_above_random_actions(folder: Path) -> None:
     low = {"HandOver": {"return": 0.4}, "Switch": {"return": 9.0}, "PushBlock": {"return": 5.0}}
-    references.store("random", low, {})
-    references.store("expert", {"HandOver": {"return": 30.0}, "PushBlock": {"return": 4.0}}, {})
+    references.store(folder / "random.json", low, {})
+    references.store(folder / "expert.json", {"HandOver": {"return": 30.0}, "PushBlock": {"return": 4.0}}, {})
     assert references.references() == {
         "HandOver": Reference(0.4, 30.0),
         "Switch": Reference(9.0),
@@ -48,7 +48,9 @@ def test_a_score_needs_both_ends_and_an_expert_above_random_actions(folder: Path
 def test_an_expert_that_doing_nothing_beats_gives_no_score(folder: Path) -> None:
     returns: dict[references.Kind, float] = {"random": 1.0, "zero": 3.0, "expert": 2.0}
     for kind, value in returns.items():
-        references.store(kind, {"A": {"return": value}, "B": {"return": value + (kind == "expert") * 2}}, {})
+        references.store(
+            folder / f"{kind}.json", {"A": {"return": value}, "B": {"return": value + (kind == "expert") * 2}}, {}
+        )
     assert references.references() == {"A": Reference(1.0, None, 3.0), "B": Reference(1.0, 4.0, 3.0)}
 
 
@@ -67,6 +69,26 @@ def test_baseline_measures_every_class_and_stores_what_it_printed(
         assert row["episodes"] == printed[name]["episodes"] > 0
         assert row["made"]["policy"].startswith({"random": "uniform", "zero": "zero"}[what])
         assert row["made"]["suite"] == "MT4" and row["made"]["versions"]["packages"]["mujoco"]
+
+
+@pytest.mark.parametrize("what", ["random", "expert"])
+def test_a_baseline_without_out_writes_nothing(
+    what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(OwnSuite, "world", lambda source: ToyWorld(6, "DISABLED", source.seed))
+    monkeypatch.setattr(experts, "best_known", lambda *_: {"HandOver": {"return": 1.0, "source": "a test"}})
+    monkeypatch.setattr(references, "write_json", lambda *_: pytest.fail("something was written"))
+    monkeypatch.chdir(tmp_path)
+    assert main(["baseline", what, "--suite", "MT4", "--episodes", "1"]) == 0
+    assert capsys.readouterr().out and list(tmp_path.iterdir()) == []
+
+
+def test_references_do_not_go_into_a_file_of_something_else(tmp_path: Path) -> None:
+    for text in ("no json", "[1]", '{"other": 1}'):
+        (tmp_path / "notes").write_text(text)
+        with pytest.raises(BidexError, match="file of references"):
+            references.store(tmp_path / "notes", {"HandOver": {"return": 1.0}}, {})
+        assert (tmp_path / "notes").read_text() == text
 
 
 def test_an_unknown_baseline_names_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:

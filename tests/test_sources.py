@@ -92,7 +92,7 @@ def test_a_policy_is_judged_on_every_task_of_its_slots() -> None:
         ({"suite": "MT5"}, "Unknown suite 'MT5'. Did you mean"),
         ({"suite": "none.toml"}, "Expected a suite file at none.toml"),
         ({"task": "HandOvr"}, "Unknown task 'HandOvr'. Did you mean 'HandOver'?"),
-        ({"suite": "metaworld/MT4"}, "Unknown suite of Meta-World 'metaworld/MT4'. Did you mean 'metaworld/MT3'?"),
+        ({"suite": "metaworld/MT4"}, "Unknown suite 'metaworld/MT4'. Did you mean 'metaworld/MT3'?"),
     ],
 )
 def test_an_unknown_name_is_one_line(config: dict[str, Any], told: str) -> None:

@@ -101,7 +101,7 @@ def test_a_class_takes_its_options(tmp_path: Path) -> None:
     text = head + '[[classes]]\nname = "PourWater"\noptions = { water = 30 }\n'
     suite = load_suite(write(tmp_path, text))
     assert dict(suite.classes[0].options) == {"water": 30}
-    assert Benchmark(suite.file).train_classes["PourWater"].water == 30  # type: ignore[attr-defined]
+    assert Benchmark(suite.file).task_classes()["PourWater"].water == 30  # type: ignore[attr-defined]
     with pytest.raises(BidexError, match=r"Unknown option of PourWater 'watr'\. Did you mean 'water'"):
         Benchmark(write(tmp_path, text.replace("water =", "watr =")))
 

@@ -98,7 +98,7 @@ def test_copies_that_do_not_divide_the_samples_are_refused() -> None:
 
 def test_a_witness_survives_the_disk(tmp_path: Path) -> None:
     actions = random_actions(30).numpy()
-    path = save_witness("HandOver", actions, {"return": 1.5}, tmp_path / "HandOver.npz")
+    path = save_witness(tmp_path / "HandOver.npz", actions, {"return": 1.5})
     assert path.stat().st_size < 10_000
     with np.load(path) as stored:
         np.testing.assert_array_equal(stored["actions"].astype(np.float32) / LEVELS, actions)
@@ -221,6 +221,19 @@ def test_steadying_prefers_soft_blows(monkeypatch: pytest.MonkeyPatch) -> None:
     actions = load_witness("Switch").actions[:20]
     found = steady.steadied("Switch", actions, 1, threads=1)
     assert (found != actions).any(axis=0).nonzero()[0].tolist() == [20]
+
+
+def test_what_a_search_finds_goes_into_the_working_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("bidex_meta.witness.steady.steadied", lambda name, actions, *_: actions[:20])
+    shipped = witness_path("Switch")
+    before = shipped.read_bytes()
+    monkeypatch.chdir(tmp_path)
+    assert main(["witness", "--task", "switch", "--find", "--improve", str(shipped), "--steady", "1", "--json"]) == 0
+    assert "Switch: stored witnesses" in capsys.readouterr().out
+    assert len(load_witness("Switch", Path("witnesses/Switch.npz")).actions) == 20
+    assert shipped.read_bytes() == before
 
 
 def test_steady_needs_an_episode(capsys: pytest.CaptureFixture[str]) -> None:

@@ -78,7 +78,7 @@ def variants(suite: str | None, task: str | None) -> list[tuple[str, bool]]:
     """Names of the classes to test, each with whether its base moves."""
     if suite is not None and task is None:
         benchmark = Benchmark(suite)
-        classes = benchmark.train_classes | benchmark.test_classes
+        classes = benchmark.task_classes("train") | benchmark.task_classes("test")
         return [(name, task_class.moving_base) for name, task_class in classes.items()]
     names = [task] if task else registry.names()
     return [(n, moving) for n in names for moving in (True, False) if moving or not registry.get(n).moving_base]

@@ -74,7 +74,9 @@ def _slot(benchmark: Any, task: str) -> Any:
     from bidex_meta.world import Slot
 
     variations = [one.variation for one in benchmark.train_tasks if one.env_name == task]
-    return Slot(task, benchmark.train_classes[task], np.stack(variations))
+    task_class = benchmark.train_classes[task]
+    task_class = getattr(task_class, "task_class", task_class)  # older code has descriptions there
+    return Slot(task, task_class, np.stack(variations))
 
 
 def main() -> None:

@@ -1,17 +1,14 @@
 """One of our worlds as the ``eval_envs`` of ``metaworld.evaluation``, for agents and scripts that know no other way.
 
-    from metaworld.evaluation import metalearning_evaluation
+    from bidex_meta.metaworld.evaluation import metalearning_evaluation
     envs = MetaWorldEnvs(Benchmark("ML1").make_world("test", 4, autoreset_mode="DISABLED"))
-    with known_to_metaworld(envs):
-        metalearning_evaluation(ForMetaWorld(agent), envs, num_evals=1, adaptation_episodes=10)
+    metalearning_evaluation(ForMetaWorld(agent), envs, num_evals=1, adaptation_episodes=10)
 
 A check that both protocols fit, not our score: with several rows of a name Meta-World counts the first episodes that
 finish, and success ends them, so easy tasks crowd out hard ones. ``bidex_meta.evaluation.meta_test`` plays each task
 equally often.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -124,25 +121,3 @@ class MetaWorldEnvs(VectorEnv):
     def close_extras(self, **kwargs: Any) -> None:
         """Frees the world."""
         self.world.close()
-
-
-@contextmanager
-def known_to_metaworld(envs: MetaWorldEnvs) -> Iterator[None]:
-    """While it lasts, ``metaworld.evaluation`` finds the names of our classes.
-
-    Its functions look up each row's ``task_name`` among the class names of their module's ``ALL_V3_ENVIRONMENTS``, and
-    would raise KeyError. The module's attribute is replaced, not the dict, which other modules of Meta-World's share.
-
-    Args:
-        envs: Whose names they are.
-    """
-    from metaworld import evaluation
-
-    module: Any = evaluation
-    before = module.ALL_V3_ENVIRONMENTS
-    ours: dict[str, Any] = {name: type(name, (), {}) for name in envs.task_name}
-    module.ALL_V3_ENVIRONMENTS = {**before, **ours}
-    try:
-        yield
-    finally:
-        module.ALL_V3_ENVIRONMENTS = before

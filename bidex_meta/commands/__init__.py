@@ -24,5 +24,6 @@ COMMANDS: dict[str, Command] = {
     "baseline": Command("bidex_meta.commands.baseline", "measure the references of the normalised score"),
     "gallery": Command("bidex_meta.commands.gallery", "write the page that shows every task"),
     "plot": Command("bidex_meta.commands.plot", "learning curves of a run, as a picture"),
+    "completion": Command("bidex_meta.commands.completion", "a script that completes commands and flags in a shell"),
     "bench": Command("bidex_meta.commands.bench", "measure speed, scaling or stability of the world"),
 }

@@ -4,12 +4,12 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, cast
+from typing import Annotated, Any
 
 import tyro
 
 from bidex_meta.commands.parsing import Switch, parse
-from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.errors import BidexError, known_name
 from bidex_meta.sources import Source
 
 _POLICIES = {"random": "uniform actions", "zero": "zero actions"}
@@ -17,9 +17,9 @@ _POLICIES = {"random": "uniform actions", "zero": "zero actions"}
 
 @dataclass(frozen=True)
 class BaselineFlags:
-    """Store the two ends of the normalised score: what a policy that has learned nothing gets, and the best known one.
+    """Measure the two ends of the normalised score: what a policy that has learned nothing gets, and the best known.
 
-    Example: bidex-meta baseline random --suite MT20
+    Example: bidex-meta baseline random --suite MT20 --out random.json
 
     The better of random and zero actions scores 0, the expert 100. An episode in which the physics breaks counts here
     with the worst finished one of its class, elsewhere with what is stored of random actions.
@@ -39,57 +39,61 @@ class BaselineFlags:
     runs: tuple[Path, ...] = ()
     """expert: run folders of trained policies."""
     out: Path | None = None
-    """File to write; None: the installation's own, which `evaluate` reads."""
+    """JSON file that takes the figures, beside those it has of other classes; None: print them alone. `evaluate` reads
+    assets/references/ of the installation, which is not written unless this names it."""
     json: Switch = False
     """Print JSON."""
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Measure, store, print."""
+    """Measure, print, and store where it was asked."""
     flags = parse(BaselineFlags, arguments, "baseline")
-    if flags.what == "expert":
+    what = known_name("baseline", flags.what, [*_POLICIES, "expert"])
+    if what == "expert":
         _expert(flags)
-    elif flags.what in _POLICIES:
-        _measure(flags)
     else:
-        raise unknown_name("baseline", flags.what, [*_POLICIES, "expert"])
+        _measure(what, flags)
 
 
 def _expert(flags: BaselineFlags) -> None:
     from bidex_meta.commands.experts import best_known
     from bidex_meta.commands.tables import plain_table, print_table
-    from bidex_meta.evaluation import references
-    from bidex_meta.record.versions import collect_versions
 
     known = best_known(Source.open({"suite": flags.suite}).task_classes(), flags.runs, flags.threads)
-    references.store("expert", known, {"versions": collect_versions()}, flags.out)
+    _store(flags.out, known, {})
     if flags.json:
         print(json.dumps(known, indent=2))
         return
     print_table(plain_table(["class", "return", "source"], [[n, *row.values()] for n, row in known.items()]))
 
 
-def _measure(flags: BaselineFlags) -> None:
-    from bidex_meta.evaluation import references
+def _measure(what: str, flags: BaselineFlags) -> None:
     from bidex_meta.evaluation.play import EVALUATION_SEED, evaluate
     from bidex_meta.evaluation.untrained import RandomAgent, ZeroAgent
-    from bidex_meta.record.versions import collect_versions
 
     source = Source.open({"suite": flags.suite, "seed": flags.seed, "threads": flags.threads})
     if not source.moving_bases:
         raise BidexError(f'References are of moving bases, but {flags.suite} has fixed ones. Write base = "moving".')
     world = source.world()
-    agent = RandomAgent(world.action_space, flags.seed) if flags.what == "random" else ZeroAgent(world.action_space)
+    agent = RandomAgent(world.action_space, flags.seed) if what == "random" else ZeroAgent(world.action_space)
     found = evaluate(agent, world, flags.episodes, seed=EVALUATION_SEED)
     world.close()
     numbers = {name: result.to_json() for name, result in found.classes.items()}
-    made = {"policy": _POLICIES[flags.what], "suite": flags.suite, "seed": flags.seed, "versions": collect_versions()}
     kept = ("return", "return_interval", "success", "episodes", "unstable")
-    kind = cast(references.Kind, flags.what)  # checked above
-    path = references.store(kind, {n: {k: row[k] for k in kept} for n, row in numbers.items()}, made, flags.out)
+    made = {"policy": _POLICIES[what], "suite": flags.suite, "seed": flags.seed}
+    _store(flags.out, {n: {k: row[k] for k in kept} for n, row in numbers.items()}, made)
     if flags.json:
         print(json.dumps(numbers, indent=2))
         return
     from bidex_meta.commands.tables import evaluation_table, print_table
 
-    print_table(evaluation_table(f"{_POLICIES[flags.what]} on {flags.suite}, stored in {path}", found, None))
+    stored = "" if flags.out is None else f", stored in {flags.out}"
+    print_table(evaluation_table(f"{_POLICIES[what]} on {flags.suite}{stored}", found, None))
+
+
+def _store(out: Path | None, classes: dict[str, dict[str, Any]], made: dict[str, Any]) -> None:
+    from bidex_meta.evaluation import references
+    from bidex_meta.record.versions import collect_versions
+
+    if out is not None:
+        references.store(out, classes, made | {"versions": collect_versions()})

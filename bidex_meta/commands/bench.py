@@ -6,14 +6,14 @@ What is measured, and how, stands in ``bidex_meta.bench``, for a learner in ``bi
 import inspect
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from bidex_meta.commands.parsing import StepCount, Switch, parse
-from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.errors import BidexError, known_name
 
 if TYPE_CHECKING:
     from bidex_meta.world.contract import VectorWorld
@@ -71,8 +71,7 @@ class BenchFlags:
 def main(arguments: Sequence[str]) -> None:
     """Measure and print."""
     flags = parse(BenchFlags, arguments, "bench")
-    if flags.what not in _KINDS:
-        raise unknown_name("bench", flags.what, _KINDS)
+    flags = replace(flags, what=known_name("bench", flags.what, _KINDS))
     if 0 in (flags.steps, flags.num_envs) or (flags.repeats is not None and flags.repeats < 1):
         raise BidexError(f"bench {flags.what}: expected --steps, --num-envs and --repeats of 1 or more.")
     measure = _measurement("world_against" if flags.what == "world" and flags.against is not None else flags.what)

@@ -23,7 +23,7 @@ import sys
 from dataclasses import dataclass
 from typing import Any
 
-from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.errors import BidexError, known_name
 from bidex_meta.train.launch import launch
 
 ALGOS: dict[str, str] = {
@@ -78,7 +78,7 @@ def learner_kind(name: str, task: str | None = None) -> LearnerKind:
     """Load a learner by name.
 
     Args:
-        name: As in ``ALGOS``, or ``package.module:Class``.
+        name: As in ``ALGOS``, in any case, or ``package.module:Class``.
         task: The task class it shall learn alone, for which it may have presets of its own.
 
     Raises:
@@ -86,8 +86,7 @@ def learner_kind(name: str, task: str | None = None) -> LearnerKind:
     """
     if ":" in name:
         return _from_elsewhere(name)
-    if name not in ALGOS:
-        raise unknown_name("algo", name, ALGOS)
+    name = known_name("algo", name, ALGOS)
     module_name, _, class_name = ALGOS[name].partition(":")
     try:
         module = importlib.import_module(module_name)
@@ -133,10 +132,8 @@ def choose_preset(kind: LearnerKind, asked: str, device: str, first: tuple[str, 
         device: ``cpu``, ``cuda``, ``cuda:0``, ...
         first: A preset that goes before others where the learner has it, and why; ``Source.preset``.
     """
-    if asked != "auto":
-        if asked not in kind.presets:
-            raise unknown_name("preset", asked, ["auto", *kind.presets])
-        return asked, "as asked"
+    if asked.casefold() != "auto":
+        return known_name("preset", asked, ["auto", *kind.presets]), "as asked"
     if first is not None and first[0] in kind.presets:
         return first
     if not {"laptop", "paper"} <= kind.presets.keys():

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import tyro
 
 from bidex_meta.commands.parsing import Switch, parse
-from bidex_meta.errors import unknown_name
+from bidex_meta.errors import known_name
 
 
 @dataclass(frozen=True)
@@ -28,9 +28,7 @@ def main(arguments: Sequence[str]) -> None:
     """Print a table or JSON, one row for each."""
     flags = parse(ListFlags, arguments, "list")
     kinds: dict[str, Callable[[], list[dict[str, Any]]]] = {"suites": _suites, "tasks": _tasks, "algos": _algos}
-    if flags.what not in kinds:
-        raise unknown_name("list", flags.what, kinds)
-    rows = kinds[flags.what]()
+    rows = kinds[known_name("list", flags.what, kinds)]()
     if flags.json:
         print(json.dumps(rows, indent=2))
         return

@@ -5,7 +5,8 @@ import dataclasses
 import difflib
 import io
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeVar
 
@@ -15,6 +16,34 @@ from tyro.constructors import PrimitiveConstructorSpec
 from bidex_meta.errors import BidexError
 
 Options = TypeVar("Options")
+
+
+class FlagsFound(Exception):
+    """Tells the flags of a command in place of parsing them; only ``flags_of`` asks for it."""
+
+    def __init__(self, options: type, default: Any) -> None:
+        super().__init__(options.__name__)
+        self.options, self.default = options, default
+
+
+_asked_for_flags: ContextVar[bool] = ContextVar("asked_for_flags", default=False)
+
+
+def flags_of(command: Callable[[Sequence[str]], None], arguments: Sequence[str] = ()) -> FlagsFound:
+    """The dataclass of a command's flags, and the default of it where the command has one of its own.
+
+    Args:
+        command: A subcommand's ``main``, which calls ``parse`` before it does anything.
+        arguments: What the flags may depend on, e.g. ``--algo``.
+    """
+    token = _asked_for_flags.set(True)
+    try:
+        command(arguments)
+    except FlagsFound as found:
+        return found
+    finally:
+        _asked_for_flags.reset(token)
+    raise TypeError(f"{command.__module__}.main parses no flags")
 
 
 def _whole_number(words: list[str]) -> int:
@@ -60,6 +89,8 @@ def parse(options: type[Options], arguments: Sequence[str], command: str, defaul
         BidexError: An unknown flag (with the nearest one) or a bad value.
         SystemExit: After printing the help text.
     """
+    if _asked_for_flags.get():
+        raise FlagsFound(options, default)
     complaint = io.StringIO()
     keywords: dict[str, Any] = {} if default is None else {"default": default}
     try:
@@ -96,9 +127,30 @@ def _refuse(word: str, options: Any, command: str) -> NoReturn:
     if not word.startswith("-"):
         raise BidexError(f"Unexpected {word!r} after bidex-meta {command}. {end}")
     flag = word.split("=")[0]
-    near = difflib.get_close_matches(flag, list(_flags(options)), n=1, cutoff=0.5)
-    hint = f"Did you mean {near[0]}? " if near else ""
+    near = _near(flag, list(_flags(options)))
+    hint = f"Did you mean {' or '.join(near)}? " if near else ""
     raise BidexError(f"Unknown flag {flag} of bidex-meta {command}. {hint}{end}")
+
+
+def _near(flag: str, known: list[str]) -> list[str]:
+    """The flags that were probably meant.
+
+    Those of the same last part (``--gamma``) or of words that begin with its letters (``--lr``), else what is spelt
+    most like it.
+    """
+    given = flag.lstrip("-").lower().replace("_", "-").rpartition(".")[2]
+    last = {name: name.lstrip("-").rpartition(".")[2] for name in known}
+    same = [name for name in known if last[name] == given]
+    short = [name for name in known if _initials(last[name]) == given]
+    # Of critic-learning-rate and the like, where there is no plain learning-rate.
+    ending = [name for name in known if _initials(last[name])[-2:] == given]
+    spelt = difflib.get_close_matches(flag.lower(), known, n=1, cutoff=0.5)
+    by_last = difflib.get_close_matches(given, list(last.values()), n=1, cutoff=0.75)
+    return same or short or ending or spelt or [name for name in known if last[name] in by_last]
+
+
+def _initials(name: str) -> str:
+    return "".join(word[:1] for word in name.split("-"))
 
 
 def _flags(options: Any, prefix: str = "--") -> Iterator[str]:

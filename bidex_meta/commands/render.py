@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from bidex_meta.commands.parsing import parse
-from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.errors import BidexError, known_name
 from bidex_meta.sources import Source
 
 
@@ -47,12 +47,11 @@ def main(arguments: Sequence[str]) -> None:
         raise BidexError(f"A film needs an even width and height, not {flags.width} x {flags.height}.")
 
     source = Source.open(_config(flags))
-    if flags.task not in source.task_classes():
-        raise unknown_name(f"task of {source.name}", flags.task, source.task_classes())
+    task = known_name(f"task of {source.name}", flags.task, source.task_classes())
     # One row for each slot is enough to see one of them; a slot of listed tasks is named Class/task.
     slots = [name.split("/")[0] for name in source.tasks("train")]
     world = source.world("train", len(slots))
-    row = world.slot_rows[slots.index(flags.task)].start
+    row = world.slot_rows[slots.index(task)].start
     frames = _episode(flags, world, _policy(flags, world), row, film=suffix == ".mp4")
     if suffix == ".mp4":
         from bidex_meta.tasks.base import CONTROL_RATE

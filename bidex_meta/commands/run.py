@@ -6,6 +6,7 @@ Of several processes (torchrun) each has a world and a learner; process 0 alone 
 import contextlib
 import json
 import math
+import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from bidex_meta.commands.learners import shared
 from bidex_meta.commands.run_config import RunPlan, plan_run
-from bidex_meta.errors import BidexError
+from bidex_meta.errors import EXIT_INTERRUPTED, BidexError
 from bidex_meta.train.launch import launch, resume_command
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ def main(arguments: Sequence[str]) -> None:
 
     Raises:
         BidexError: Bad input. Nothing has been written then.
-        SystemExit: Another process was lost (exit code 1), or has said what is wrong with the input (2).
+        SystemExit: Another process was lost (exit code 1), or has said what is wrong with the input (2); Ctrl-C (130).
     """
     from bidex_meta.train import distributed
 
@@ -49,14 +50,17 @@ def main(arguments: Sequence[str]) -> None:
     if not stopped and learner.env_steps < plan.config["steps"]:
         _say(f"The {plan.config['minutes']:g} minutes are up after {learner.env_steps:,} steps.")
     if stopped:
+        # A batch system's SIGTERM asks for a checkpoint and gets it; Ctrl-C breaks off whatever calls this too.
         command = resume_command(folder.path, launch().count)
         _say(f"Stopped after {learner.env_steps:,} steps and saved. Continue: {command}")
+        if stopped == signal.SIGINT:
+            raise SystemExit(EXIT_INTERRUPTED)
     elif plan.flags.evaluate and launch().rank == 0:
         _evaluate(plan, folder, learner)
 
 
-def _run(plan: RunPlan, distributed: Any) -> tuple[Any, Any, bool]:
-    """What all processes do: the run folder, the trained learner, and whether a signal ended it early."""
+def _run(plan: RunPlan, distributed: Any) -> tuple[Any, Any, int]:
+    """What all processes do: the run folder, the trained learner, and the signal that ended it early, or 0."""
     from bidex_meta.record import RunFolder
     from bidex_meta.world.threads import set_up_torch
 
@@ -146,8 +150,8 @@ def _make(plan: RunPlan, fresh: bool) -> tuple[Any, Any, Any]:
     return world, learner, folder
 
 
-def _train(plan: RunPlan, folder: Any, world: "VectorWorld", learner: Any, loaded: Checkpoint | None) -> bool:
-    """Train to the end; True if a signal ended it early."""
+def _train(plan: RunPlan, folder: Any, world: "VectorWorld", learner: Any, loaded: Checkpoint | None) -> int:
+    """Train to the end; the signal that ended it early, or 0."""
     from bidex_meta.record import Recorder, read_metrics, training_seconds
     from bidex_meta.train import distributed, runner
 

@@ -110,7 +110,8 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     suite, task = (peek(arguments, f"--{name}") or stored.get(name) for name in ("suite", "task"))
     # Where neither is named, `run --help` still has defaults to show; without --help _resolved refuses it.
     source = Source.open({"suite": suite or (None if task else _EXAMPLE), "task": task})
-    kind = learner_kind(peek(arguments, "--algo") or stored.get("algo", RunFlags.algo), task)
+    alone = source.name if task and not suite else None
+    kind = learner_kind(peek(arguments, "--algo") or stored.get("algo", RunFlags.algo), alone)
     device = resolve_device(peek(arguments, "--device") or stored.get("device", RunFlags.device), source.on_gpu)
     asked = peek(arguments, "--preset") or stored.get("preset", RunFlags.preset)
     preset, reason = choose_preset(kind, asked, device, source.preset)
@@ -118,7 +119,8 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     if folder:
         learner_default = _stored_learner(type(learner_default), stored, folder)
     flags = parse(*_options(arguments, learner_default, stored, source.rows_and_steps(device, kind.adapts)))
-    config = _resolved(flags, preset, device, stored)
+    names = {"source": source.name, "algo": kind.name, "preset": preset}
+    config = _resolved(flags, names, device, stored)
     if folder:
         _refuse_changes(stored, config, folder)
     return RunPlan(flags, kind, flags.learner, config, folder, reason)
@@ -142,7 +144,8 @@ def _options(
     return options, arguments, "run", default
 
 
-def _resolved(flags: Any, preset: str, device: str, stored: dict[str, Any]) -> dict[str, Any]:
+def _resolved(flags: Any, names: dict[str, str], device: str, stored: dict[str, Any]) -> dict[str, Any]:
+    """The config, with names as they are written (``MT4`` where ``--suite mt4`` was given)."""
     if (flags.suite is None) == (flags.task is None):
         raise BidexError("Name what to train on: either --suite SUITE or --task TASK, for example --suite MT4.")
     if flags.base != "own" and flags.task is None:
@@ -153,16 +156,16 @@ def _resolved(flags: Any, preset: str, device: str, stored: dict[str, Any]) -> d
             raise BidexError(f"--{name.replace('_', '-')} must be at least 1, not {value}.")
     if flags.minutes is not None and not 0.0 < flags.minutes < math.inf:
         raise BidexError(f"--minutes must be a number above 0, such as 4 or 0.5, not {flags.minutes:g}.")
-    suite = flags.suite
+    suite = names["source"] if flags.suite else None
     if suite is not None and suite.endswith(".toml"):
         suite = str(Path(suite).expanduser().resolve())  # a run may be resumed from another folder
     config = {
         "suite": suite,
-        "task": flags.task,
+        "task": names["source"] if flags.task else None,
         "base": flags.base,
         "start_from": None if flags.start_from is None else str(flags.start_from.expanduser().resolve()),
-        "algo": flags.algo,
-        "preset": preset,
+        "algo": names["algo"],
+        "preset": names["preset"],
         "learner": dataclasses.asdict(flags.learner),
         "num_envs": flags.num_envs,
         "steps": flags.steps,

@@ -4,11 +4,18 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bidex_meta.commands.parsing import Switch, parse
-from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.errors import BidexError, known_name
 from bidex_meta.witness.config import PlannerConfig
+
+if TYPE_CHECKING:
+    from bidex_meta.witness.store import Witness
+
+
+_FOUND = Path("witnesses")
+"""Folder, in the working folder, of what a search finds. The installation's own are data of a release."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +30,8 @@ class WitnessFlags:
     all: Switch = False
     """Every class there is, instead of one."""
     find: Switch = False
-    """Search with a sampling planner on the printed reward, and store the episode found if it holds."""
+    """Search with a sampling planner on the printed reward, and keep the episode found if it holds: as --file says, or
+    in witnesses/TASK.npz of the working folder."""
     tries: int = 1
     """Searches with other seeds before giving up."""
     file: Path | None = None
@@ -50,12 +58,11 @@ def main(arguments: Sequence[str]) -> None:
     """Search or replay, and print what was found."""
     flags = parse(WitnessFlags, arguments, "witness")
     names = _names(flags)
-    if flags.find:
-        for name in names:
-            (_play_script if flags.script else _steady if flags.steady else _find)(name, flags)
-    rows = [_replay(name, flags) for name in names]
+    find = _play_script if flags.script else _steady if flags.steady else _find
+    files = {name: find(name, flags) if flags.find else flags.file for name in names}
+    rows = [_replay(name, file, flags.threads) for name, file in files.items()]
     if flags.out is not None:
-        _film(names[0], flags)
+        _film(names[0], files[names[0]], flags)
     if flags.json:
         print(json.dumps(rows, indent=2))
         return
@@ -73,20 +80,19 @@ def _names(flags: WitnessFlags) -> list[str]:
         raise BidexError("witness: --improve and --script say how to find an episode; give them with --find.")
     if flags.all and (flags.out is not None or flags.file is not None or flags.improve is not None):
         raise BidexError("witness: films and files are of one class; give --task T with --out or --file.")
-    if flags.task is not None and flags.task not in registry.names():
-        raise unknown_name("task", flags.task, registry.names())
-    return registry.names() if flags.task is None else [flags.task]
+    return registry.names() if flags.task is None else [known_name("task", flags.task, registry.names())]
 
 
-def _replay(name: str, flags: WitnessFlags) -> dict[str, Any]:
+def _replay(name: str, file: Path | None, threads: int | None) -> dict[str, Any]:
+    """A row of the table: of the witness in a file, or the installation's."""
     from bidex_meta.witness.replay import replay
     from bidex_meta.witness.store import load_witness, witness_path
 
     keys = ("found", "return", "first_success", "shifted", "steps", "deepest_mm", "rival")
-    if flags.file is None and not witness_path(name).is_file():
+    if file is None and not witness_path(name).is_file():
         return {"task": name, **dict.fromkeys(keys), "found": False}
-    witness = load_witness(name, flags.file)
-    result, rival = replay(name, witness, flags.threads), witness.made.get("rival")
+    witness = load_witness(name, file)
+    result, rival = replay(name, witness, threads), witness.made.get("rival")
     values = (
         result.found,
         round(result.total, 3),
@@ -99,18 +105,18 @@ def _replay(name: str, flags: WitnessFlags) -> dict[str, Any]:
     return {"task": name, **dict(zip(keys, values, strict=True))}
 
 
-def _find(name: str, flags: WitnessFlags) -> None:
-    """Searches with one seed after another until an episode holds; keeps it."""
+def _find(name: str, flags: WitnessFlags) -> Path | None:
+    """Searches with one seed after another until an episode holds; where it is kept."""
     from dataclasses import asdict, replace
 
     from bidex_meta.record.versions import collect_versions
     from bidex_meta.witness.planner import Planner
     from bidex_meta.witness.replay import replay
-    from bidex_meta.witness.store import Witness, load_witness, save_witness
+    from bidex_meta.witness.store import Witness, load_witness
 
     earlier = None if flags.improve is None else load_witness(name, flags.improve)
     rivals: list[float] = []
-    best = -float("inf")
+    best, kept = -float("inf"), flags.file
     for attempt in range(flags.tries):
         config = replace(flags.planner, seed=flags.planner.seed + attempt)
         plan = Planner(name, config, flags.threads).search(
@@ -126,21 +132,22 @@ def _find(name: str, flags: WitnessFlags) -> None:
         holds = plan.first_success is not None and replay(name, witness, flags.threads).found
         if holds or (flags.file is not None and plan.total > best):
             best = plan.total
-            print(f"{name}: stored {save_witness(name, witness.actions, witness.made, flags.file)}")
+            kept = _keep(name, witness, flags)
         if holds:
-            return
+            break
         print(f"{name}: seed {config.seed} gave a return of {plan.total:.3f}, first success {plan.first_success}.")
+    return kept
 
 
-def _play_script(name: str, flags: WitnessFlags) -> None:
-    """Plays a class's script and keeps the episode if it holds."""
+def _play_script(name: str, flags: WitnessFlags) -> Path | None:
+    """Plays a class's script; where the episode is kept if it holds."""
     import numpy as np
 
     from bidex_meta.record.versions import collect_versions
     from bidex_meta.witness.puppets import Puppets
     from bidex_meta.witness.replay import replay
     from bidex_meta.witness.scripts import script_of
-    from bidex_meta.witness.store import Witness, save_witness
+    from bidex_meta.witness.store import Witness
 
     play = script_of(name)
     hands = Puppets(name, flags.threads)
@@ -148,19 +155,19 @@ def _play_script(name: str, flags: WitnessFlags) -> None:
     first = hands.success.index(True) if any(hands.success) else None
     made = {"return": sum(hands.rewards), "first_success": first, "script": play.__name__, "rival": None}
     witness = Witness(np.stack([a.numpy() for a in hands.actions]), made | {"versions": collect_versions()})
-    if flags.file is not None or replay(name, witness, flags.threads).found:
-        print(f"{name}: stored {save_witness(name, witness.actions, witness.made, flags.file)}")
+    holds = flags.file is not None or replay(name, witness, flags.threads).found
+    return _keep(name, witness, flags) if holds else None
 
 
-def _steady(name: str, flags: WitnessFlags) -> None:
-    """Makes an episode safer against shifted starts and keeps it if it holds."""
+def _steady(name: str, flags: WitnessFlags) -> Path | None:
+    """Makes an episode safer against shifted starts; where it is kept if it holds."""
     import torch
 
     from bidex_meta.record.versions import collect_versions
     from bidex_meta.witness.replay import replay
     from bidex_meta.witness.simulator import Simulator
     from bidex_meta.witness.steady import steadied
-    from bidex_meta.witness.store import Witness, load_witness, save_witness
+    from bidex_meta.witness.store import Witness, load_witness
 
     if flags.improve is None:
         raise BidexError("witness: --steady makes an episode safer; give it with --improve FILE.")
@@ -175,8 +182,16 @@ def _steady(name: str, flags: WitnessFlags) -> None:
     made = earlier.made | {"return": float(trace.rewards.sum()), "first_success": won[0] if won else None}
     made |= {"steadied": {"rounds": flags.steady, "seed": seed}, "versions": collect_versions()}
     witness = Witness(actions, made)
-    if flags.file is not None or replay(name, witness, flags.threads).found:
-        print(f"{name}: stored {save_witness(name, witness.actions, witness.made, flags.file)}")
+    holds = flags.file is not None or replay(name, witness, flags.threads).found
+    return _keep(name, witness, flags) if holds else None
+
+
+def _keep(name: str, witness: "Witness", flags: WitnessFlags) -> Path:
+    from bidex_meta.witness.store import save_witness
+
+    path = save_witness(flags.file or _FOUND / f"{name}.npz", witness.actions, witness.made)
+    print(f"{name}: stored {path}")
+    return path
 
 
 def _reporter(name: str) -> Any:
@@ -186,14 +201,14 @@ def _reporter(name: str) -> Any:
     return report
 
 
-def _film(name: str, flags: WitnessFlags) -> None:
+def _film(name: str, file: Path | None, flags: WitnessFlags) -> None:
     from bidex_meta.record import video
     from bidex_meta.tasks.base import CONTROL_RATE
     from bidex_meta.witness.replay import frames
     from bidex_meta.witness.store import load_witness
 
     assert flags.out is not None
-    pictures = frames(name, load_witness(name, flags.file), camera=flags.camera)
+    pictures = frames(name, load_witness(name, file), camera=flags.camera)
     if video.check_suffix(flags.out) == ".mp4":
         video.write_video(flags.out, pictures, CONTROL_RATE)
         return

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from bidex_meta import paths
+from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.scores import Reference
 from bidex_meta.record.atomic import write_json
 
@@ -28,21 +29,24 @@ def load(kind: Kind) -> dict[str, dict[str, Any]]:
     return json.loads(path.read_text())["classes"] if path.is_file() else {}
 
 
-def store(kind: Kind, classes: dict[str, dict[str, Any]], made: dict[str, Any], path: Path | None = None) -> Path:
-    """Writes references: those of other classes stay.
+def store(path: Path, classes: dict[str, dict[str, Any]], made: dict[str, Any]) -> None:
+    """Writes references: those of other classes in the file stay.
 
     Args:
-        kind: Which end.
+        path: The file. Those of the installation are never a default: they are data of a release.
         classes: Per class ``return`` and whatever else was measured.
         made: How they were measured; kept with each of these classes.
-        path: The file; the installation's own by default.
+
+    Raises:
+        BidexError: The file holds something else.
     """
-    path = path or reference_path(kind)
-    known = json.loads(path.read_text())["classes"] if path.is_file() else {}
+    try:
+        known = json.loads(path.read_text())["classes"] if path.is_file() else {}
+    except (ValueError, KeyError, TypeError) as error:
+        raise BidexError(f"{path}: expected a file of references or none, got another. Name another file.") from error
     known |= {name: {**numbers, "made": made} for name, numbers in classes.items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, {"classes": dict(sorted(known.items()))})
-    return path
 
 
 def references() -> dict[str, Reference]:

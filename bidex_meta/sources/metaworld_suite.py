@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from bidex_meta.clients.metaworld import PREFIX, SUITES, TASKS_PER_CLASS, class_names
+from bidex_meta.clients.metaworld import SUITES, TASKS_PER_CLASS, class_names
 from bidex_meta.errors import BidexError
 from bidex_meta.sources.source import Source
 
@@ -18,11 +18,6 @@ if TYPE_CHECKING:
 _TRAINING_ROWS, _TRAINING_STEPS = 4, 2_000_000
 # Its tasks are played in turns, and 5 divides 50.
 _EVALUATION_ROWS = 5
-
-
-def is_foreign(suite: str) -> bool:
-    """Whether a suite's name is one of Meta-World's (``metaworld/...``, and not the path of a file)."""
-    return suite.startswith(PREFIX) and not suite.endswith(".toml")
 
 
 class MetaWorldSuite(Source):

@@ -8,7 +8,8 @@ from collections.abc import Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
-from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.clients.metaworld import SUITES as METAWORLD_SUITES
+from bidex_meta.errors import BidexError, known_name
 from bidex_meta.suite import Split, load_suite, suite_names
 from bidex_meta.tasks import registry
 
@@ -52,17 +53,19 @@ class Source(ABC):
 
     @staticmethod
     def open(config: Mapping[str, Any]) -> "Source":
-        """The source of a run's config: its ``suite``, or without one the class ``task`` on its own.
+        """The source of a run's config: its ``suite``, or without one the class ``task`` on its own, in any case.
 
         Raises:
             BidexError: Unknown suite or task, with the nearest name; or a faulty suite file.
         """
-        from bidex_meta.sources.metaworld_suite import MetaWorldSuite, is_foreign
+        from bidex_meta.sources.metaworld_suite import MetaWorldSuite
 
         suite = config.get("suite")
         if suite is None:
-            return SingleClass(config["task"], config)
-        return (MetaWorldSuite if is_foreign(suite) else OwnSuite)(suite, config)
+            return SingleClass(known_name("task", config["task"], registry.names()), config)
+        if not suite.endswith(".toml"):
+            suite = known_name("suite", suite, source_names())
+        return (MetaWorldSuite if suite in METAWORLD_SUITES else OwnSuite)(suite, config)
 
     @abstractmethod
     def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> "PooledWorld":
@@ -170,7 +173,7 @@ class OwnSuite(Source):
 
     def task_classes(self) -> "dict[str, TaskClass]":
         """As in ``Source``."""
-        return self.benchmark.train_classes
+        return self.benchmark.task_classes()
 
 
 class SingleClass(Source):
@@ -178,8 +181,6 @@ class SingleClass(Source):
 
     def __init__(self, name: str, config: Mapping[str, Any]) -> None:
         super().__init__(name, config)
-        if name not in registry.names():
-            raise unknown_name("task", name, registry.names())
         # None: as the class has it alone.
         self.moving_base: bool | None = {"own": None, "moving": True, "fixed": False}[config.get("base", "own")]
 
@@ -207,6 +208,11 @@ class SingleClass(Source):
     def task_classes(self) -> "dict[str, TaskClass]":
         """As in ``Source``."""
         return {self.name: registry.get(self.name, self.moving_base)}
+
+
+def source_names() -> list[str]:
+    """Every suite that a config may name: the shipped ones and Meta-World's."""
+    return [*suite_names(), *METAWORLD_SUITES]
 
 
 def listed() -> list[dict[str, Any]]:

@@ -68,7 +68,7 @@ def train(
     total_seconds: float = math.inf,
     spent_seconds: float = 0.0,
     checkpoint_seconds: float = 60.0,
-) -> bool:
+) -> int:
     """Trains until ``total_steps`` environment steps are done or ``total_seconds`` are up, whichever comes first.
 
     Both count what a resumed run had done before. The time is that from the first world step to the end of an
@@ -88,7 +88,7 @@ def train(
             save: a replay makes them large. 0 saves after every iteration. One more is always saved at the end.
 
     Returns:
-        True if a signal ended the training early.
+        Number of the signal that ended the training early, 0 if none did; where another process got it, SIGTERM's.
 
     Raises:
         LostProcess: Another process is gone. What was saved stays as it is.
@@ -119,7 +119,7 @@ def train(
                     pause = max(checkpoint_seconds, (saved_at - began) / _SAVING_SHARE)
         if learner.env_steps != saved_step:
             _save(learner, world, record)
-        return stopped
+        return stop.number if stopped else 0
 
 
 def _save(learner: Learner, world: VectorWorld, record: Record | None) -> None:
@@ -156,10 +156,16 @@ def resume(learner: Learner, world: VectorWorld, state: dict[str, Any]) -> None:
     learner.load_state_dict({**state["learner"], **mine["learner"]})
 
 
+class _Stop(threading.Event):
+    """A request to stop, and the signal that brought it."""
+
+    number: int = signal.SIGTERM
+
+
 @contextmanager
-def _stop_requests() -> Iterator[threading.Event]:
+def _stop_requests() -> Iterator["_Stop"]:
     """Turns the first SIGINT or SIGTERM into a set event; puts the old handlers back then and on leaving."""
-    stop = threading.Event()
+    stop = _Stop()
     if threading.current_thread() is not threading.main_thread():
         # Python lets only the main thread set handlers; elsewhere signals stay the caller's business.
         yield stop
@@ -172,6 +178,7 @@ def _stop_requests() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
     def on_signal(number: int, frame: FrameType | None) -> None:
+        stop.number = number
         stop.set()
         restore()
 

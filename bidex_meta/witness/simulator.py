@@ -39,10 +39,11 @@ def task_slot(name: str) -> Slot:
         BidexError: The suite has no such class.
     """
     benchmark = Benchmark(SUITE, seed=SEED)
-    if name not in benchmark.train_classes:
-        raise unknown_name("task", name, benchmark.train_classes)
+    classes = benchmark.task_classes()
+    if name not in classes:
+        raise unknown_name("task", name, classes)
     task = next(t for t in benchmark.train_tasks if t.env_name == name)
-    return Slot(name, benchmark.train_classes[name], task.variation[None])
+    return Slot(name, classes[name], task.variation[None])
 
 
 class Simulator:

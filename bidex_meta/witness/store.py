@@ -23,7 +23,7 @@ class Witness:
 
 
 def witness_path(name: str) -> Path:
-    """Where the witness of a class lies."""
+    """Where the installation's witness of a class lies. Nothing is written there by default."""
     return paths.assets_dir() / "witnesses" / f"{name}.npz"
 
 
@@ -43,9 +43,8 @@ def load_witness(name: str, path: Path | None = None) -> Witness:
         return Witness(actions, json.loads(str(stored["made"])))
 
 
-def save_witness(name: str, actions: np.ndarray, made: dict[str, Any], path: Path | None = None) -> Path:
+def save_witness(path: Path, actions: np.ndarray, made: dict[str, Any]) -> Path:
     """Writes a witness; actions (T, action_size) must be multiples of 1/127."""
-    path = path or witness_path(name)
     path.parent.mkdir(parents=True, exist_ok=True)
     levels = np.rint(actions * LEVELS).astype(np.int8)
     with path.open("wb") as file:

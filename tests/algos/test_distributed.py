@@ -120,7 +120,7 @@ def training(rank: int) -> dict[str, Any]:
     return {"metrics": notes.metrics, "saved": [step for step, _ in notes.saved], "whole": ends[0], "parts": ends[1]}
 
 
-def stopping(rank: int) -> tuple[bool, int, list[int]]:
+def stopping(rank: int) -> tuple[int, int, list[int]]:
     """A signal to process 1 in the second iteration."""
     learner, world = make(rank)
     notes = Notes(lambda iteration: os.kill(os.getpid(), signal.SIGTERM) if (rank, iteration) == (1, 2) else None)
@@ -128,7 +128,7 @@ def stopping(rank: int) -> tuple[bool, int, list[int]]:
     return stopped, learner.env_steps, [step for step, _ in notes.saved]
 
 
-def out_of_time(rank: int) -> list[tuple[bool, int]]:
+def out_of_time(rank: int) -> list[tuple[int, int]]:
     """No time but for the first iteration, in process 0 and then in process 1 alone."""
     found = []
     for late in range(2):
@@ -227,8 +227,8 @@ def test_the_first_iteration_and_the_last_are_saved_by_process_0_alone(found):
 
 
 def test_a_signal_to_one_stops_both_after_the_same_iteration(found):
-    assert found[0]["stopping"] == (True, 2 * ITERATION, [ITERATION, 2 * ITERATION])
-    assert found[1]["stopping"] == (True, 2 * ITERATION, [])
+    assert found[0]["stopping"] == (signal.SIGTERM, 2 * ITERATION, [ITERATION, 2 * ITERATION])
+    assert found[1]["stopping"] == (signal.SIGTERM, 2 * ITERATION, [])
 
 
 def test_the_time_of_process_0_ends_both_after_the_same_iteration(found):

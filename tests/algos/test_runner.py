@@ -40,10 +40,10 @@ def make() -> tuple[MTPPO, ToyWorld]:
 def test_training_ends_at_the_budget_and_saves_the_end():
     learner, world = make()
     notes = Notes()
-    assert train(learner, world, total_steps=3 * ITERATION - 1, record=notes) is False
+    assert train(learner, world, total_steps=3 * ITERATION - 1, record=notes) == 0
     assert notes.logged == [ITERATION, 2 * ITERATION, 3 * ITERATION]
     assert [step for step, _ in notes.saved] == [3 * ITERATION]
-    assert train(learner, world, total_steps=ITERATION, record=notes) is False
+    assert train(learner, world, total_steps=ITERATION, record=notes) == 0
     assert len(notes.logged) == 3 and len(notes.saved) == 1
 
 
@@ -65,7 +65,7 @@ def test_training_ends_with_the_iteration_in_which_the_time_is_up(monkeypatch: p
 
     learner, world = make()
     notes = Timed()
-    assert train(learner, world, total_steps=100 * ITERATION, total_seconds=25.0, record=notes) is False
+    assert train(learner, world, total_steps=100 * ITERATION, total_seconds=25.0, record=notes) == 0
     assert notes.times == [0.0, 10.0, 20.0]
     assert [step for step, _ in notes.saved] == [3 * ITERATION]
     resumed = {"spent_seconds": 30.0, "record": notes}
@@ -117,7 +117,7 @@ def test_a_signal_ends_after_the_iteration_and_saves(number: signal.Signals):
     before = signal.getsignal(number)
     learner, world = make()
     notes = Notes(after=lambda i: os.kill(os.getpid(), number) if i == 2 else None)
-    assert train(learner, world, total_steps=100 * ITERATION, record=notes) is True
+    assert train(learner, world, total_steps=100 * ITERATION, record=notes) == number
     assert [step for step, _ in notes.saved] == [2 * ITERATION]
     assert signal.getsignal(number) is before
 

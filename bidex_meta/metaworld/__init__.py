@@ -1,0 +1,60 @@
+"""Meta-World's interface on the classes of this benchmark: change the import and the names, keep the code.
+
+    import bidex_meta.metaworld as metaworld
+
+    ml20 = metaworld.ML20(seed=0)
+    for name, env_cls in ml20.train_classes.items():
+        env = env_cls()
+        env.set_task(next(task for task in ml20.train_tasks if task.env_name == name))
+        obs, info = env.reset()
+
+docs/metaworld.md says what is the same, what is not, and what is faster.
+"""
+
+from typing import Any
+
+from bidex_meta.benchmark import Benchmark, Task
+from bidex_meta.metaworld.benchmarks import ML1, ML4, ML20, MT1, MT4, MT20, CustomML, CustomMT
+from bidex_meta.metaworld.vector_envs import make_ml_envs, make_ml_envs_test, make_ml_envs_train, make_mt_envs
+
+__all__ = [
+    "ML1",
+    "ML4",
+    "ML20",
+    "MT1",
+    "MT4",
+    "MT20",
+    "Benchmark",
+    "CustomML",
+    "CustomMT",
+    "Task",
+    "make_ml_envs",
+    "make_ml_envs_test",
+    "make_ml_envs_train",
+    "make_mt_envs",
+]
+
+_NOT_HERE = {
+    "MT10": "MT4 or MT20",
+    "MT25": "MT20",
+    "MT50": "MT20",
+    "ML10": "ML4 or ML20",
+    "ML25": "ML20",
+    "ML45": "ML20",
+}
+_CLASSES = "ALL_V3_ENVIRONMENTS"
+
+
+def __getattr__(name: str) -> Any:
+    """Meta-World's other names: its wrappers as they are; of its suites and classes what is here instead."""
+    if name == _CLASSES:
+        return {task: MT1(task).train_classes[task] for task in MT1.ENV_NAMES}
+    if name in _NOT_HERE:
+        raise AttributeError(f"{name} has Meta-World's own classes. Here there is {_NOT_HERE[name]}.")
+    if name.startswith(_CLASSES):
+        raise AttributeError(f"{name} is not here: MT1(name) shows the goal and ML1(name) hides it.")
+    from metaworld import wrappers
+
+    if name.startswith("_") or not hasattr(wrappers, name):
+        raise AttributeError(f"bidex_meta.metaworld has no {name!r}; docs/metaworld.md says what it has.")
+    return getattr(wrappers, name)

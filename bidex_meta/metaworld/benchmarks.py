@@ -1,0 +1,132 @@
+"""Meta-World's constructors of benchmarks: `MT1(env_name, seed)`, `ML20(seed)`, `CustomML(train_envs, test_envs)`.
+
+As there, `MT1` and `ML1` are of any one class; the suites of these names (CatchUnderarm with listed goals, the paper's)
+are `bidex_meta.Benchmark("MT1")` and `Benchmark("ML1")`. Hands move, as in every suite.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import ClassVar, Literal
+
+from bidex_meta.benchmark import Benchmark
+from bidex_meta.errors import BidexError, known_name
+from bidex_meta.suite import Split, Suite, SuiteClass
+from bidex_meta.tasks import registry
+
+_TASKS = 50
+
+
+class MT1(Benchmark):
+    """One class with its goal visible, 50 tasks.
+
+    Args:
+        env_name: The class, e.g. `"CatchUnderarm"`.
+        seed: Chooses the tasks; None: 0.
+    """
+
+    ENV_NAMES: ClassVar[list[str]] = registry.names()
+
+    def __init__(self, env_name: str, seed: int | None = None) -> None:
+        super().__init__(_suite("MT1", "plain", {"train": [env_name]}), seed or 0)
+
+
+class ML1(Benchmark):
+    """One class with its goal hidden: 50 tasks to train on, 50 others to be tested on.
+
+    Args:
+        env_name: The class, e.g. `"CatchUnderarm"`.
+        seed: Chooses the tasks; None: 0.
+    """
+
+    ENV_NAMES: ClassVar[list[str]] = registry.names()
+
+    def __init__(self, env_name: str, seed: int | None = None) -> None:
+        super().__init__(_suite("ML1", "masked", {"train": [env_name], "test": [env_name]}), seed or 0)
+
+
+class CustomMT(Benchmark):
+    """Some classes with their goals visible, 50 tasks each.
+
+    Args:
+        envs: The classes.
+        seed: Chooses the tasks; None: 0.
+    """
+
+    def __init__(self, envs: Sequence[str], seed: int | None = None) -> None:
+        super().__init__(_suite("CustomMT", "one-hot", {"train": envs}), seed or 0)
+
+
+class CustomML(Benchmark):
+    """Some classes to train on and others to be tested on, goals hidden, 50 tasks each.
+
+    Args:
+        train_envs: The former.
+        test_envs: The latter.
+        seed: Chooses the tasks; None: 0.
+
+    Raises:
+        BidexError: A class is in both.
+    """
+
+    def __init__(self, train_envs: Sequence[str], test_envs: Sequence[str], seed: int | None = None) -> None:
+        both = sorted(set(_named(train_envs)) & set(_named(test_envs)))
+        if both:
+            raise BidexError(f"Expected other classes in test_envs than in train_envs, got {', '.join(both)} in both.")
+        super().__init__(_suite("CustomML", "masked", {"train": train_envs, "test": test_envs}), seed or 0)
+
+
+class MT4(Benchmark):
+    """The suite MT4; `seed` chooses the tasks, None: 0."""
+
+    def __init__(self, seed: int | None = None) -> None:
+        super().__init__("MT4", seed or 0)
+
+
+class MT20(Benchmark):
+    """The suite MT20: all classes; `seed` chooses the tasks, None: 0."""
+
+    def __init__(self, seed: int | None = None) -> None:
+        super().__init__("MT20", seed or 0)
+
+
+class ML4(Benchmark):
+    """The suite ML4: three classes, tested on a fourth; `seed` chooses the tasks, None: 0."""
+
+    def __init__(self, seed: int | None = None) -> None:
+        super().__init__("ML4", seed or 0)
+
+
+class ML20(Benchmark):
+    """The suite ML20: fifteen classes, tested on five others; `seed` chooses the tasks, None: 0."""
+
+    def __init__(self, seed: int | None = None) -> None:
+        super().__init__("ML20", seed or 0)
+
+
+def _suite(name: str, observation: Literal["plain", "one-hot", "masked"], classes: dict[Split, Sequence[str]]) -> Suite:
+    """A suite that no file says, of the given classes by split."""
+    splits: dict[str, tuple[Split, ...]] = {}
+    for split, given in classes.items():
+        for entry in _named(given):
+            splits[entry] = (*splits.get(entry, ()), split)
+    if not all(classes.values()):
+        raise BidexError(f"{name}: expected at least one class in each list, got an empty one.")
+    return Suite(
+        name=name,
+        version=1,
+        kind="meta" if "test" in classes else "multi-task",
+        description=", ".join(splits),
+        observation=observation,
+        task_id="class",
+        reward="paper",
+        base="moving",
+        tasks_per_class=_TASKS,
+        classes=tuple(SuiteClass(entry, where, 1.0, (), MappingProxyType({})) for entry, where in splits.items()),
+        file=Path(f"metaworld.{name}"),
+    )
+
+
+def _named(envs: Sequence[str]) -> list[str]:
+    """The classes of a list, each once, as they are written."""
+    return list(dict.fromkeys(known_name("task class", name, registry.names()) for name in envs))
