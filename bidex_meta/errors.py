@@ -1,6 +1,7 @@
 """The one exception for bad input (a line that names the expected, the received and the mend), and exit codes."""
 
 import difflib
+import operator
 from collections.abc import Iterable
 
 EXIT_BAD_INPUT = 2
@@ -55,3 +56,34 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> BidexError:
     near = nearest(str(name), names)
     hint = f" Did you mean {near!r}?" if near else ""
     return BidexError(f"Unknown {kind} {name!r}.{hint} Known: {', '.join(names) or 'none'}.")
+
+
+def whole_number(name: str, value: object, least: int, most: int | None = None) -> int:
+    """A whole number within bounds, of whatever integer type.
+
+    Args:
+        name: What it is, for the message.
+        value: What was given.
+        least: Lower bound.
+        most: Upper bound, or None.
+
+    Raises:
+        BidexError: Not a whole number (1.0, True and "1" are none), or out of bounds.
+    """
+    try:
+        number = None if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        number = None
+    if number is None or number < least or (most is not None and number > most):
+        bounds = f"from {least} on" if most is None else f"from {least} to {most}"
+        raise BidexError(f"{name}: expected a whole number {bounds}, got {_shortened(value)}.")
+    return number
+
+
+def _shortened(value: object) -> str:
+    """A value for one line of an error. Python refuses to print whole numbers of more than 4,300 digits."""
+    try:
+        shown = " ".join(repr(value).split())
+    except Exception:
+        shown = f"a {type(value).__name__} that cannot be printed"
+    return shown if len(shown) <= 80 else shown[:77] + "..."

@@ -3,9 +3,10 @@
 import torch
 
 from bidex_meta.engine.protocol import EngineMaker
-from bidex_meta.errors import BidexError
+from bidex_meta.errors import BidexError, whole_number
 
 ENGINES = ("auto", "c", "warp")
+_MOST_THREADS = 1024
 
 
 def choose_engine(
@@ -19,8 +20,10 @@ def choose_engine(
         threads: Threads of C MuJoCo; None takes all CPUs.
 
     Raises:
-        BidexError: Unknown engine, a device that is not there, or C MuJoCo on a GPU.
+        BidexError: Unknown engine, a device that is not there, C MuJoCo on a GPU, or an impossible number of threads.
     """
+    if threads is not None:
+        threads = whole_number("threads", threads, 1, _MOST_THREADS)
     place = _device(device)
     if engine not in ENGINES:
         raise BidexError(f"Expected an engine among {', '.join(ENGINES)}, got {engine!r}.")
@@ -38,7 +41,7 @@ def choose_engine(
 def _device(device: str | torch.device) -> torch.device:
     try:
         place = torch.device(device)
-    except RuntimeError:
+    except (RuntimeError, TypeError):
         place = None
     if place is None or place.type not in ("cpu", "cuda"):
         raise BidexError(f"Expected device 'cpu' or 'cuda:N', got {str(device)!r}.")

@@ -10,6 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bidex_meta.engine.health import LARGEST, LONGEST, SHORTEST, checked_state, outside, quaternion_columns
+
 # What a simulation carries from one step to the next; the fields that a model has none of are skipped.
 _STATE_FIELDS = (
     "time qpos qvel act history qacc_warmstart ctrl qfrc_applied xfrc_applied eq_active mocap_pos mocap_quat userdata"
@@ -30,6 +32,10 @@ class CpuEngine:
 
     Sensors are refreshed by a velocity stage after each step, which costs about a tenth of the speed but makes
     positions and velocities those of the new state; a persistent batch takes its next step from there.
+
+    A row with a number out of bounds is told by ``unstable`` and put at rest at the model's reference pose, before a
+    step by ``_quarantine``, within it by MuJoCo's autoreset: all geoms of a row with NaN would touch, and solving for
+    their contacts takes up to thousands of times a normal step, for which all rows wait.
     """
 
     device = torch.device("cpu")
@@ -46,7 +52,9 @@ class CpuEngine:
         self.num = len(rows)
         # MuJoCo would print each broken row to stderr and to a log file in the working folder; unstable() tells it.
         mujoco.set_mju_user_warning(_silent)
-        self.batch = mujoco.batch.Batch(models[0], self.num, nthread=threads or default_threads(), persistent=True)
+        self.batch = mujoco.batch.Batch(
+            models[0], self.num, nthread=default_threads() if threads is None else threads, persistent=True
+        )
         if len(models) > 1:
             self.batch.set_models([models[i] for i in rows])
         self._state = {name: self._bind(name) for name in _STATE if 0 not in self.batch.bind(name).shape}
@@ -55,8 +63,21 @@ class CpuEngine:
         self.sensordata = self._bind("sensordata")
         self._mocap = [self._state[name] for name in ("mocap_pos", "mocap_quat") if name in self._state]
         self._failed = torch.zeros(self.num, dtype=torch.bool)
+        self._numbers = torch.from_numpy(self.batch.state)
+        self._quaternions = self._quaternion_columns(models[0])
         self._models, self._model_of = list(models), list(rows)
         self._probe: mujoco.MjData | None = None
+
+    def _quaternion_columns(self, model: mujoco.MjModel) -> Tensor:
+        """Columns of the batch's numbers that hold quaternions, four for each, shape (4 k,)."""
+        found = [self._column("qpos") + quaternion_columns(model)]
+        if self._mocap:
+            found.append(self._column("mocap_quat") + np.arange(4 * model.nmocap))
+        return torch.from_numpy(np.concatenate(found))
+
+    def _column(self, name: str) -> int:
+        """First column of a field of the state."""
+        return (self._state[name].data_ptr() - self._numbers.data_ptr()) // self._numbers.element_size()
 
     def _bind(self, name: str) -> Tensor:
         with warnings.catch_warnings():  # torch warns that outputs of the batch are read-only; nothing here writes them
@@ -65,12 +86,29 @@ class CpuEngine:
 
     def step(self, substeps: int, active: Tensor | None = None) -> None:
         """Advances all simulations, or those of the mask ``active``."""
+        self._quarantine()
         ids = None if active is None else active.numpy()
         try:
             self.batch.step(ids=ids, nstep=substeps, stage=mujoco.mjtStage.mjSTAGE_VEL)
         except mujoco.batch.SimulationError as error:
             # A broken row can meet more contacts than its memory holds; it keeps its old state, the others are done.
             self._failed[torch.as_tensor(error.ids)] = True
+
+    def _quarantine(self) -> None:
+        """Puts rows with a number out of bounds, written by hand or left by the last step, on a safe state."""
+        # Few operations over all rows: a row whose norm is within the least bound is within all of them.
+        size = torch.linalg.vector_norm(self._numbers, dim=1)
+        turns = self._numbers.index_select(1, self._quaternions).unflatten(1, (-1, 4))
+        lengths = torch.linalg.vector_norm(turns, dim=2)
+        rotations = (lengths >= SHORTEST) & (lengths <= LONGEST)  # false where NaN
+        if size.max().item() <= LARGEST and rotations.all():
+            return
+        broken = ~rotations.all(dim=1)
+        suspects = (~(size <= LARGEST)).nonzero()[:, 0]
+        broken[suspects] |= outside(self._state, suspects)
+        if broken.any():
+            self.batch.reset(ids=broken.numpy(), stage=mujoco.mjtStage.mjSTAGE_NONE)
+            self._failed |= broken
 
     def unstable(self) -> Tensor:
         """Which simulations broke since their last reset. Shape (num,), bool."""
@@ -81,7 +119,7 @@ class CpuEngine:
 
     def warnings(self) -> Tensor:
         """How many of MuJoCo's warnings each simulation has told since its last reset. Shape (num,), int64."""
-        return torch.from_numpy((self.batch.warning[:, :, 1] > 0).sum(axis=1))
+        return torch.from_numpy((self.batch.warning[:, :, 1] > 0).sum(axis=1)) + self._failed
 
     def placement(self) -> Tensor:
         """What ``reset`` takes, of every simulation as it stands, a copy. Shape (num, nq + 7 nmocap)."""
@@ -90,11 +128,17 @@ class CpuEngine:
         return torch.cat((self.qpos, torch.cat(self._mocap, dim=2).flatten(1)), dim=1)
 
     def reset(self, mask: Tensor, start: Tensor) -> None:
-        """Starts the simulations of a mask anew, at rest, at given positions (one row per true entry)."""
+        """Starts the simulations of a mask anew, at rest, at given positions (one row per true entry).
+
+        A start with a number out of bounds is not written: its row stands at the reference pose and is unstable.
+        """
         ids = mask.numpy()
         self.batch.reset(ids=ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
-        self._failed[mask] = False
         start, nq = start.to(self.qpos.dtype), self.qpos.shape[1]
+        good = (start.abs() <= LARGEST).all(dim=1)
+        self._failed[mask] = ~good
+        if not good.all():
+            start = torch.where(good[:, None], start, self.placement()[mask])
         self.qpos[mask] = start[:, :nq]
         if self._mocap:
             position, quaternion = start[:, nq:].unflatten(1, (-1, 7)).split((3, 4), dim=2)
@@ -107,6 +151,7 @@ class CpuEngine:
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Puts back what ``state_dict`` gave and refreshes position and velocity sensors."""
+        state = checked_state(state, self._state)
         self.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
         self._failed[:] = False
         for name, value in state.items():

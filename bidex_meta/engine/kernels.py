@@ -15,14 +15,65 @@ def watch(
     qvel: wp.array2d[float],
     qacc: wp.array2d[float],
     limit: float,
+    limit_of_qacc: float,
     failed: wp.array[bool],
 ):
-    """Marks worlds with a number that is not finite or beyond the limit (a comparison with NaN is false)."""
+    """Marks worlds with a number that is not finite or beyond its limit (a comparison with NaN is false)."""
     world, i = wp.tid()
     if not (wp.abs(qpos[world, i]) <= limit):
         failed[world] = True
     if i < qvel.shape[1]:
-        if not (wp.abs(qvel[world, i]) <= limit and wp.abs(qacc[world, i]) <= limit):
+        if not (wp.abs(qvel[world, i]) <= limit and wp.abs(qacc[world, i]) <= limit_of_qacc):
+            failed[world] = True
+
+
+@wp.kernel(enable_backward=False)
+def examine(
+    time: wp.array[float],
+    warmstart: wp.array2d[float],
+    ctrl: wp.array2d[float],
+    qfrc_applied: wp.array2d[float],
+    xfrc_applied: wp.array2d[wp.spatial_vector],
+    limit: float,
+    failed: wp.array[bool],
+):
+    """Marks worlds whose time, controls, forces or warm start are not finite or beyond the limit."""
+    world, i = wp.tid()
+    if not (wp.abs(time[world]) <= limit):
+        failed[world] = True
+    if i < warmstart.shape[1]:
+        if not (wp.abs(warmstart[world, i]) <= limit and wp.abs(qfrc_applied[world, i]) <= limit):
+            failed[world] = True
+    if i < ctrl.shape[1]:
+        if not (wp.abs(ctrl[world, i]) <= limit):
+            failed[world] = True
+    if i < xfrc_applied.shape[1]:
+        for k in range(6):
+            if not (wp.abs(xfrc_applied[world, i][k]) <= limit):
+                failed[world] = True
+
+
+@wp.kernel(enable_backward=False)
+def examine_poses(
+    qpos: wp.array2d[float],
+    quaternions: wp.array[int],
+    mocap_pos: wp.array2d[wp.vec3],
+    mocap_quat: wp.array2d[wp.quat],
+    limit: float,
+    shortest: float,
+    longest: float,
+    failed: wp.array[bool],
+):
+    """Marks worlds with a fixture out of bounds, or a quaternion (four entries of qpos each) that is no rotation."""
+    world, i = wp.tid()
+    if i < quaternions.shape[0]:
+        k = quaternions[i]
+        q = wp.vec4(qpos[world, k], qpos[world, k + 1], qpos[world, k + 2], qpos[world, k + 3])
+        if not (wp.length(q) >= shortest and wp.length(q) <= longest):
+            failed[world] = True
+    if i < mocap_pos.shape[1]:
+        turn = wp.length(mocap_quat[world, i])
+        if not (wp.length(mocap_pos[world, i]) <= limit and turn >= shortest and turn <= longest):
             failed[world] = True
 
 
@@ -41,6 +92,34 @@ def quarantine(
         if i < qvel.shape[1]:
             qvel[world, i] = 0.0
             warmstart[world, i] = 0.0
+
+
+@wp.kernel(enable_backward=False)
+def disarm(
+    failed: wp.array[bool],
+    mocap_pos0: wp.array2d[wp.vec3],
+    mocap_quat0: wp.array2d[wp.quat],
+    time: wp.array[float],
+    ctrl: wp.array2d[float],
+    qfrc_applied: wp.array2d[float],
+    xfrc_applied: wp.array2d[wp.spatial_vector],
+    mocap_pos: wp.array2d[wp.vec3],
+    mocap_quat: wp.array2d[wp.quat],
+):
+    """Takes controls and forces from failed worlds, and puts their fixtures back."""
+    world, i = wp.tid()
+    if not failed[world]:
+        return
+    time[world] = 0.0
+    if i < ctrl.shape[1]:
+        ctrl[world, i] = 0.0
+    if i < qfrc_applied.shape[1]:
+        qfrc_applied[world, i] = 0.0
+    if i < xfrc_applied.shape[1]:
+        xfrc_applied[world, i] = wp.spatial_vector(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    if i < mocap_pos.shape[1]:
+        mocap_pos[world, i] = mocap_pos0[world, i]
+        mocap_quat[world, i] = mocap_quat0[world, i]
 
 
 @wp.kernel(enable_backward=False)

@@ -14,6 +14,8 @@ class Engine(Protocol):
     """A batch of simulations of equal structure.
 
     The views are created once and stay; the world writes ``qpos``, ``qvel``, ``ctrl`` and ``xfrc_applied`` in place.
+    Whatever it writes, a step costs a broken row no more than others: it is looked for before each step
+    (``health.py``) and goes on from the model's reference pose until its reset.
 
     Attributes:
         num: Number of simulations.
@@ -48,7 +50,7 @@ class Engine(Protocol):
         ...
 
     def unstable(self) -> Tensor:
-        """Which simulations broke (bad numbers, non-finite values, no room for contacts) since their last reset.
+        """Which simulations broke (numbers out of bounds or not finite, no room for contacts) since their last reset.
 
         Shape (num,), bool.
         """
@@ -75,7 +77,11 @@ class Engine(Protocol):
         ...
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Puts back what ``state_dict`` gave."""
+        """Puts back what ``state_dict`` gave.
+
+        Raises:
+            BidexError: A state of another model or number of rows, or one with numbers that are not finite.
+        """
         ...
 
     def model(self, row: int) -> mujoco.MjModel:

@@ -21,6 +21,8 @@ from torch import Tensor
 
 from bidex_meta.engine import kernels
 from bidex_meta.engine.capacity import Capacity
+from bidex_meta.engine.health import LARGEST, checked_state
+from bidex_meta.engine.ward import Ward
 from bidex_meta.errors import BidexError
 
 # What a simulation carries from one step to the next; the fields that a model has none of are skipped.
@@ -91,6 +93,7 @@ class WarpEngine:
         self._mask_view.fill_(True)
         with self._on_device():
             mjw.reset_data(self._m, self._d, reset=self._mask)
+            self._ward.keep(self._d)
         self._failed_view.zero_()
 
     def _put(self, capacity: Capacity) -> None:
@@ -109,7 +112,7 @@ class WarpEngine:
         )
         _put_static_frames(self._d, self._models, self._rows)
         d = self._d
-        self._failed = wp.zeros(self.num, dtype=bool)
+        self._ward = Ward(self._models[0], d)
         self._mask = wp.zeros(self.num, dtype=bool)
         self._start = wp.zeros((self.num, d.qpos.shape[1] + 7 * d.mocap_pos.shape[1]), dtype=float)
 
@@ -120,7 +123,7 @@ class WarpEngine:
         self._state = {name: views[name] for name in _STATE if name in views}
         self.qpos, self.qvel, self.ctrl = (views[name] for name in ("qpos", "qvel", "ctrl"))
         self.xfrc_applied, self.sensordata = views["xfrc_applied"], views["sensordata"]
-        self._overflow, self._failed_view = views["overflow"], wp.to_torch(self._failed)
+        self._overflow, self._failed_view = views["overflow"], wp.to_torch(self._ward.failed)
         self._stepped = [views[name] for name in _STEPPED if name in views] + [self._failed_view]
         self._mocap = [views[name] for name in ("mocap_pos", "mocap_quat") if name in views]
         self._mask_view, self._start_view = wp.to_torch(self._mask), wp.to_torch(self._start)
@@ -177,11 +180,12 @@ class WarpEngine:
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Puts back what ``state_dict`` gave, here or of the C engine, and refreshes position and velocity sensors."""
+        state = checked_state(state, self._state)
         self._mask_view.fill_(True)
         self._play("reset", self._begin)
         self._failed_view.zero_()
         for name, value in state.items():
-            self._state[name].copy_(value.reshape(self._state[name].shape))
+            self._state[name].copy_(value)
         self._play("refresh", self._refresh)
 
     def model(self, row: int) -> mujoco.MjModel:
@@ -222,31 +226,14 @@ class WarpEngine:
         """The substeps of a control step, then position and velocity sensors of the new state."""
         m, d = self._m, self._d
         wanted = m.opt.disableflags
+        self._ward.examine(d)
         for left in reversed(range(self._substeps)):
-            self._watch()
-            wp.launch(
-                kernels.quarantine,
-                dim=(self.num, d.qpos.shape[1]),
-                inputs=[self._failed, m.qpos0],
-                outputs=[d.qpos, d.qvel, d.qacc_warmstart],
-                device=self._device,
-            )
+            self._ward.watch(m, d)
             m.opt.disableflags = wanted | _NO_SENSORS if left else wanted  # only the last substep's forces are read
             mjw.step(m, d)
         m.opt.disableflags = wanted
-        self._watch()
+        self._ward.watch(m, d)
         self._refresh()
-
-    def _watch(self) -> None:
-        """Marks worlds with a bad number (mj_checkPos, mj_checkVel, mj_checkAcc)."""
-        d = self._d
-        wp.launch(
-            kernels.watch,
-            dim=d.qpos.shape,
-            inputs=[d.qpos, d.qvel, d.qacc, mujoco.mjMAXVAL],
-            outputs=[self._failed],
-            device=self._device,
-        )
 
     def _refresh(self) -> None:
         """Position and velocity sensors of the state as it stands; force sensors are left alone."""
@@ -262,8 +249,8 @@ class WarpEngine:
         wp.launch(
             kernels.place,
             dim=self.num,
-            inputs=[self._mask, self._start, mujoco.mjMAXVAL],
-            outputs=[d.qpos, d.mocap_pos, d.mocap_quat, self._failed],
+            inputs=[self._mask, self._start, LARGEST],
+            outputs=[d.qpos, d.mocap_pos, d.mocap_quat, self._ward.failed],
             device=self._device,
         )
         self._refresh()

@@ -177,6 +177,6 @@ class PooledWorld(TaskWorld, Protocol):
         Row j of a slot plays task j mod n where tasks are fixed.
 
         Raises:
-            BidexError: Unknown slot or a wrong shape.
+            BidexError: Unknown slot, a wrong shape, or numbers that are not finite.
         """
         ...

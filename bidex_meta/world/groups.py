@@ -1,5 +1,6 @@
 """Rows of equal structure share one engine batch."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +13,9 @@ from bidex_meta.engine.structure import same_structure
 from bidex_meta.errors import BidexError
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.scene import Scene, compile_scene
+
+_LARGEST = 1e6
+"""Bound of a variation's numbers (metres, radians, draws): single precision keeps the square of a distance finite."""
 
 
 @dataclass(frozen=True)
@@ -70,19 +74,44 @@ def with_pools(slots: list[Slot], pools: dict[str, np.ndarray]) -> list[Slot]:
         pools: Slot name to variations, shape (n, variation_space.size).
 
     Raises:
-        BidexError: Unknown slot or a wrong shape.
+        BidexError: Unknown slot, a wrong shape, or numbers that are not finite.
     """
+    if not isinstance(pools, Mapping):
+        raise BidexError(f"Expected tasks as a dict from slot to variations, got {type(pools).__name__}.")
     slots, names = list(slots), [slot.name for slot in slots]
     for name, tasks in pools.items():
         if name not in names:
             raise BidexError(f"Expected a slot among {', '.join(names)}, got {name!r}.")
         i = names.index(name)
-        size = slots[i].task_class.variation_space.size
-        tasks = np.asarray(tasks, dtype=np.float64)
-        if tasks.ndim != 2 or len(tasks) == 0 or tasks.shape[1] != size:
-            raise BidexError(f"Expected tasks of {name} with shape (n, {size}), got {tasks.shape}.")
-        slots[i] = replace(slots[i], tasks=tasks)
+        slots[i] = with_pool(slots[i], tasks)
     return slots
+
+
+def with_pool(slot: Slot, tasks: np.ndarray) -> Slot:
+    """The slot with another pool of tasks, shape (n, variation_space.size), of which it keeps a copy.
+
+    Raises:
+        BidexError: A wrong shape, or numbers that are not finite.
+    """
+    space = slot.task_class.variation_space
+    wanted = f"Expected tasks of {slot.name} with shape (n, {space.size})"
+    try:
+        given = np.asarray(tasks)
+    except (TypeError, ValueError, RuntimeError):
+        given = np.array(None)
+    if given.dtype.kind not in "fiub":
+        raise BidexError(f"{wanted}, got {type(tasks).__name__} that is no array of real numbers.")
+    tasks = given.astype(np.float64)  # a copy
+    if tasks.ndim != 2 or len(tasks) == 0 or tasks.shape[1] != space.size:
+        raise BidexError(f"{wanted}, got {tasks.shape}.")
+    good = np.abs(tasks) <= _LARGEST  # false for NaN
+    if not good.all():
+        row, column = (int(i) for i in np.argwhere(~good)[0])
+        raise BidexError(
+            f"{wanted} and numbers within +-{_LARGEST:g}, got {space.names[column]} = {tasks[row, column]} "
+            f"in row {row}."
+        )
+    return replace(slot, tasks=tasks)
 
 
 def split_rows(num_envs: int, slots: int) -> list[slice]:

@@ -5,7 +5,7 @@ The way of one observation: ``Part.advance`` (engine) -> ``sensordata`` -> ``Obs
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from functools import partial
 from typing import Any
 
@@ -16,14 +16,14 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from torch import Tensor
 
 from bidex_meta.engine.choice import choose_engine
-from bidex_meta.errors import BidexError
+from bidex_meta.errors import BidexError, whole_number
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.layout import CLIP
-from bidex_meta.world import actions
+from bidex_meta.world import actions, checked
 from bidex_meta.world.attributes import RowAttributes
 from bidex_meta.world.autoreset import checked_mode, reset_mask
 from bidex_meta.world.episodes import Episodes
-from bidex_meta.world.groups import Slot, build_groups, split_rows, with_pools
+from bidex_meta.world.groups import Slot, build_groups, split_rows, with_pool, with_pools
 from bidex_meta.world.observation_groups import observation_groups
 from bidex_meta.world.observations import Rule
 from bidex_meta.world.overlap import SideBySide
@@ -36,6 +36,7 @@ from bidex_meta.world.starts import Starts
 from bidex_meta.world.threads import one_torch_thread
 from bidex_meta.world.transitions import collect
 
+_MOST_COLUMNS = 1_000_000
 _STATE = ("_action", "_obs", "task_index")
 """What a step changes beside the episodes' counters."""
 
@@ -86,13 +87,9 @@ class World(RowAttributes, VectorEnv):
             BidexError: Fewer rows than slots, unknown device, engine, mode or sampling, or too narrow a padding.
         """
         self.device, make_engine = choose_engine(device, engine, threads)
-        if num_envs < len(slots):
-            raise BidexError(
-                f"Expected at least {len(slots)} rows, one for each of the suite's classes, got {num_envs}."
-            )
-        if task_sampling not in ("uniform", "fixed"):
-            raise BidexError(f"Expected task_sampling 'uniform' or 'fixed', got {task_sampling!r}.")
-        self.num_envs, self.slots, self.seed = num_envs, list(slots), seed
+        num_envs = checked.num_rows(num_envs, slots)
+        checked.choices(task_sampling, observation)
+        self.num_envs, self.slots, self.seed = num_envs, [with_pool(slot, slot.tasks) for slot in slots], seed
         self.autoreset_mode = checked_mode(autoreset_mode)
         self.metadata = {
             "autoreset_mode": self.autoreset_mode, "render_modes": ["rgb_array"], "render_fps": CONTROL_RATE
@@ -129,7 +126,7 @@ class World(RowAttributes, VectorEnv):
     def _make_spaces(self, observation: Rule, pad_to: int | None) -> None:
         widest = max(slot.task_class.observation_size for slot in self.slots)
         self._width = widest if pad_to is None else pad_to
-        if self._width < widest:
+        if whole_number("pad_to", self._width, 0, _MOST_COLUMNS) < widest:
             raise BidexError(f"Expected pad_to of at least {widest}, the widest class, got {pad_to}.")
         self.action_size = max(slot.task_class.action_size for slot in self.slots)
         self.num_id_columns = self.num_tasks if observation == "one-hot" else 0
@@ -148,7 +145,7 @@ class World(RowAttributes, VectorEnv):
         self.task_index = self._index_in_slot % self._pool_size
 
     def _seed_rows(self, seed: int) -> None:
-        self.seed = int(seed)
+        self.seed = checked.seed(seed)
         counts = zip(self.slots, self.slot_rows, strict=True)
         keys = torch.cat([row_keys(seed, s.name, rows.stop - rows.start, self.device) for s, rows in counts])
         draws = max(slot.task_class.start_draws for slot in self.slots)
@@ -164,7 +161,7 @@ class World(RowAttributes, VectorEnv):
             pools: Slot name to variations, shape (n, variation_space.size).
 
         Raises:
-            BidexError: Unknown slot or a wrong shape.
+            BidexError: Unknown slot, a wrong shape, or numbers that are not finite.
         """
         self._set_pools(with_pools(self.slots, pools))
 
@@ -265,15 +262,11 @@ class World(RowAttributes, VectorEnv):
             with ``reward_terms`` by name beside it, and Gymnasium's ``final_info``.
 
         Raises:
-            BidexError: A wrong shape, or no reset since the world was made or got other tasks.
+            BidexError: No real numbers, a wrong shape, or no reset since the world was made or got other tasks.
         """
-        action = torch.as_tensor(action, dtype=torch.float32, device=self.device)
         if not self._ready:
             raise BidexError("Expected reset() before step(): the rows have no episode yet.")
-        if action.shape != (self.num_envs, self.action_size):
-            raise BidexError(
-                f"Expected actions of shape ({self.num_envs}, {self.action_size}), got {tuple(action.shape)}."
-            )
+        action = checked.action(action, (self.num_envs, self.action_size), self.device)
         with one_torch_thread():
             return self._advance(action)
 
@@ -362,14 +355,8 @@ class World(RowAttributes, VectorEnv):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Puts back what ``state_dict`` gave, on a world of the same suite and rows."""
-        here, there = (self.task_names, tuple(self._obs.shape)), (state["slots"], tuple(state["observation"].shape))
-        if here != there:
-            raise BidexError(
-                f"Expected the state of a world of {here[0]} with observations {here[1]}, got one of {there[0]} with "
-                f"{there[1]}; build the world with the same suite, split and num_envs."
-            )
-        self._set_pools([replace(s, tasks=t.numpy()) for s, t in zip(self.slots, state["tasks"], strict=True)])
+        """Puts back what ``state_dict`` gave, on a world of the same suite and rows; all of it or nothing."""
+        self._set_pools(checked.state(state, self.state_dict(), self.slots, self.task_id))
         self._seed_rows(int(state["seed"]))
         self.episodes.load_state_dict(state["episodes"])
         # Checkpoints are loaded to the CPU, wherever the world lives.
@@ -381,12 +368,14 @@ class World(RowAttributes, VectorEnv):
 
     def render(self, row: int = 0, width: int = 640, height: int = 480, camera: str | None = None) -> np.ndarray:
         """A picture of a row with its goal, shape (height, width, 3), uint8."""
+        row = whole_number("row", row, 0, self.num_envs - 1)
+        width, height = (whole_number(name, n, 1) for name, n in (("width", width), ("height", height)))
         return render_row(self, row, width, height, camera)
 
     @property
     def pools(self) -> list[np.ndarray]:
         """The tasks that each slot draws from, each (n, size of its variation)."""
-        return [slot.tasks for slot in self.slots]
+        return [slot.tasks.copy() for slot in self.slots]
 
     def close_extras(self, **kwargs: Any) -> None:
         """Nothing is held outside memory."""

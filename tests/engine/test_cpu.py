@@ -55,6 +55,12 @@ BREAKAGES = {
     "infinite velocity": lambda engine: engine.qvel[1].__setitem__(3, torch.inf),
     "huge velocity": lambda engine: engine.qvel[1].__setitem__(7, 1e12),
     "NaN force": lambda engine: engine.xfrc_applied[1, 1].__setitem__(0, torch.nan),
+    "infinite control": lambda engine: engine.ctrl[1].__setitem__(0, torch.inf),
+    "NaN warm start": lambda engine: engine._state["qacc_warmstart"][1].fill_(torch.nan),
+    "infinite time": lambda engine: engine._state["time"].__setitem__(1, torch.inf),
+    "velocity of 1e9": lambda engine: engine.qvel[1].__setitem__(7, 1e9),
+    "quaternion of length zero": lambda engine: engine.qpos[1, -4:].zero_(),
+    "blow-up within the step": lambda engine: engine.qvel[1].fill_(5e5),
 }
 
 

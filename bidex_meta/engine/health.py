@@ -1,0 +1,77 @@
+"""What a simulation's numbers may be, and what a saved state must be before it is put back."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from bidex_meta.errors import BidexError
+
+LARGEST = 1e6
+"""Bound of positions (m, rad) and velocities (m/s, rad/s), far from what healthy rows reach (hands/README.md). All
+else (forces, accelerations, controls, time) is bounded by MuJoCo's own 1e10."""
+SHORTEST, LONGEST = 1e-3, 1e3
+"""Bounds of a quaternion's length; MuJoCo would take a shorter one for "not turned" without a word."""
+_POSES = ("qpos", "qvel", "mocap_pos", "mocap_quat")
+
+
+def quaternion_columns(model: mujoco.MjModel) -> np.ndarray:
+    """Columns of ``qpos`` that hold a quaternion, four for each free and ball joint, shape (4 k,)."""
+    kinds = np.asarray(model.jnt_type)
+    free, ball = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
+    first = np.concatenate((model.jnt_qposadr[kinds == free] + 3, model.jnt_qposadr[kinds == ball]))
+    return (np.sort(first)[:, None] + np.arange(4)).ravel()
+
+
+def limit_of(field: str) -> float:
+    """Largest magnitude of a healthy number of a field of the state."""
+    return LARGEST if field in _POSES else float(mujoco.mjMAXVAL)
+
+
+def checked_state(state: object, views: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The saved state of an engine with the views' shapes and types.
+
+    Args:
+        state: What ``Engine.state_dict`` gave, here or of the other engine.
+        views: The fields of the engine that takes it, by name.
+
+    Raises:
+        BidexError: Another model's or number of rows' state, or one with numbers that are not finite.
+    """
+    if not isinstance(state, Mapping) or set(state) != set(views):
+        got = sorted(map(str, state)) if isinstance(state, Mapping) else type(state).__name__
+        raise BidexError(f"Expected an engine's state with {sorted(views)}, got {got}; build the same world first.")
+    return {name: _checked_field(name, state[name], view) for name, view in views.items()}
+
+
+def _checked_field(name: str, value: Any, view: Tensor) -> Tensor:
+    if not isinstance(value, Tensor) or value.shape[:1] != view.shape[:1] or value.numel() != view.numel():
+        got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+        raise BidexError(
+            f"Expected {name} of an engine's state of shape {tuple(view.shape)}, got {got}; build the world with the "
+            "same suite and num_envs."
+        )
+    value = value.to(view).reshape(view.shape)
+    if view.is_floating_point() and not bool(value.isfinite().all()):
+        row = int((~value.reshape(len(value), -1).isfinite().all(dim=1)).nonzero()[0])
+        raise BidexError(
+            f"Expected finite numbers in {name} of an engine's state, got others in row {row}; take an older state."
+        )
+    return value
+
+
+def outside(fields: Mapping[str, Tensor], rows: Tensor) -> Tensor:
+    """Which of some rows hold a number that is not finite or out of bounds, shape (k,), bool.
+
+    Args:
+        fields: The fields of a state, each (num, ...).
+        rows: Row indices, shape (k,).
+    """
+    found = torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
+    for name, value in fields.items():
+        # A comparison with NaN is false.
+        found |= ~(value[rows].unsqueeze(-1).flatten(1).abs() <= limit_of(name)).all(dim=1)
+    return found
