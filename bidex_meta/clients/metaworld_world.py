@@ -121,7 +121,7 @@ class MetaWorldWorld(VectorEnv):
                 raise unknown_name(f"class of {self.suite}", name, self.task_names)
             numbers = np.asarray(pool)
             flat = numbers.size > 0 and numbers.shape in ((len(pool),), (len(pool), 1))
-            if not flat or numbers.min() < 0 or numbers.max() >= TASKS_PER_CLASS:
+            if not flat or not (numbers.min() >= 0 and numbers.max() < TASKS_PER_CLASS):  # false for NaN
                 raise BidexError(
                     f"Expected tasks of {name} from 0 to {TASKS_PER_CLASS - 1}, (n,) or (n, 1), got {numbers.tolist()}."
                 )
