@@ -23,6 +23,7 @@ from bidex_algos.meta.meta_policy import MetaPolicy, make_meta_policy
 from bidex_algos.meta.stage import Outcome, Stage, moments, task_batch
 from bidex_algos.meta.task_rows import TaskRows
 from bidex_algos.nets.normalise import RunningStats
+from bidex_algos.nets.shape import Shape
 from bidex_algos.reports import as_numbers
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import world_size
@@ -98,7 +99,7 @@ class MetaLearner(Learner):
         adapter = self.policy.adapter
         adapter.project()
         params = detached(adapter.meta(self.rows.count))
-        seen = RunningStats((self.policy.observations.measured,)).to(self.device)
+        seen = RunningStats((self.policy.observations.measured.size,)).to(self.device)
         batches: list[TaskBatch] = []
         told: dict[str, float] = {}
         steps = 0
@@ -154,7 +155,7 @@ class MetaLearner(Learner):
             obs, reward, terminated, truncated, info = self.world.step(action)
             broken = info["unstable"]
             valid = running & ~broken
-            seen.merge(*moments(before[:, : policy.observations.measured], valid))
+            seen.merge(*moments(policy.observations.measured(before), valid))
             over = terminated | truncated | broken
             last = torch.full_like(over, self.config.slice_steps is None and t + 1 == horizon)
             stage.add(
@@ -201,10 +202,8 @@ class MetaLearner(Learner):
     # Checkpoints.
 
     @classmethod
-    def _make_policy(
-        cls, config: MetaConfig, shape: dict[str, int], init: torch.Generator, device: torch.device
-    ) -> MetaPolicy:
-        return make_meta_policy(config, cls.objective, shape, init).to(device)
+    def _make_policy(cls, config: MetaConfig, shape: Shape, init: torch.Generator, device: torch.device) -> MetaPolicy:
+        return make_meta_policy(config, cls.objective, cls._inputs(config, shape), shape.actions, init).to(device)
 
     def policy_state_dict(self) -> dict[str, Any]:
         """What :meth:`load_policy` needs: network, statistics, sizes, config, and the seed that it explores by."""

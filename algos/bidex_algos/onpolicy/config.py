@@ -23,6 +23,8 @@ class OnPolicyConfig:
     policy_heads: bool = False
     """Give the actor an output layer and standard deviations per task instead of one for all; for MT suites, whose
     observations show the task."""
+    task_embedding: int = 0
+    """Let each network read the task by a learned vector of so many entries in place of its one-hot; 0: by the one-hot."""
     init_std: float = 0.8
     """Standard deviation of the actions at the start."""
     std_range: tuple[float, float] = (0.05, 1.5)
@@ -51,6 +53,7 @@ class OnPolicyConfig:
             BidexError: A field is out of its range.
         """
         at_least(self, 1, "rollout_steps")
+        at_least(self, 0, "task_embedding")
         between(self, 0.0, 1.0, "gamma", "lam")
         rising(self, "std_range")
         positive(self, "init_std", "value_horizon")
