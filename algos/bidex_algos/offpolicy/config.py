@@ -25,7 +25,7 @@ class OffPolicyConfig:
     policy_heads: bool = False
     """Give the actor an output layer per task; the world must show the task's one-hot."""
     task_embedding: int = 0
-    """Let each network read the task by a learned vector of so many entries in place of its one-hot; 0: by the one-hot."""
+    """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
     value_heads: bool = True
     """Give each critic one output per task instead of one for all."""
     critic_layer_norm: bool = True

@@ -24,7 +24,7 @@ class OnPolicyConfig:
     """Give the actor an output layer and standard deviations per task instead of one for all; for MT suites, whose
     observations show the task."""
     task_embedding: int = 0
-    """Let each network read the task by a learned vector of so many entries in place of its one-hot; 0: by the one-hot."""
+    """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
     init_std: float = 0.8
     """Standard deviation of the actions at the start."""
     std_range: tuple[float, float] = (0.05, 1.5)
