@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from bidex_algos.experience.rollout import check_autoreset
 from bidex_algos.nets.encoders.inputs import Inputs
-from bidex_algos.nets.encoders.task_embedding import embedded_task
+from bidex_algos.nets.encoders.task_embedding import with_task_embedding
 from bidex_algos.nets.shape import Shape
 from bidex_algos.reports import check_finite
 from bidex_meta.agents import Agent
@@ -91,7 +91,7 @@ class Learner(ABC):
     @classmethod
     def _inputs(cls, config: Any, shape: Shape) -> Inputs:
         """How its networks read an observation: the place for encoders of its groups."""
-        return Inputs(shape.groups, embedded_task(getattr(config, "task_embedding", 0)))
+        return with_task_embedding(Inputs(shape.groups), getattr(config, "task_embedding", 0))
 
     @abstractmethod
     def _iterate(self) -> dict[str, float]:

@@ -14,7 +14,7 @@ from bidex_algos.meta.promp import ProMP, ProMPConfig
 from bidex_algos.meta.rl2 import RL2, RL2Config
 from bidex_algos.nets.encoders.columns import Columns
 from bidex_algos.nets.encoders.inputs import GroupEncoder, Inputs
-from bidex_algos.nets.encoders.task_embedding import embedded_task
+from bidex_algos.nets.encoders.task_embedding import with_task_embedding
 from bidex_algos.nets.networks import MLP, GaussianActor
 from bidex_algos.nets.normalise import ObservationNormaliser
 from bidex_algos.nets.shape import Shape
@@ -97,7 +97,7 @@ def test_without_encoders_a_network_sees_the_observation_as_it_is() -> None:
 
 
 def test_encoded_groups_stand_behind_the_others() -> None:
-    inputs, x = replace(SCATTERED, encoders={"points": PointNet, **embedded_task(5)}), scattered()
+    inputs, x = with_task_embedding(SCATTERED.encoded("points", PointNet), 5), scattered()
     encoder = GroupEncoder(inputs, generator())
     out = encoder(x)
     assert out.shape == (6, encoder.size) == (6, 1 + 4 + 5)
@@ -121,7 +121,7 @@ def test_unknown_groups_are_named() -> None:
     with pytest.raises(BidexError, match=r"observation group.*'goals'.*goal"):
         SCATTERED.only("goals")
     with pytest.raises(BidexError, match=r"observation group.*'cloud'"):
-        GroupEncoder(replace(SCATTERED, encoders={"cloud": PointNet}), generator())
+        SCATTERED.encoded("cloud", PointNet)
 
 
 def test_heads_and_statistics_find_the_task_id_in_the_middle() -> None:
@@ -215,20 +215,16 @@ def test_in_bfloat16_the_rollout_and_the_update_embed_alike() -> None:
 # Learners with an encoder of their own: what a learner from outside would write.
 
 
-def with_point_net(inputs: Inputs) -> Inputs:
-    return replace(inputs, encoders={"cloud": PointNet}, unscaled=frozenset({"cloud"}))
-
-
 class CloudProMP(ProMP):
     @classmethod
     def _inputs(cls, config: Any, shape: Shape) -> Inputs:
-        return with_point_net(super()._inputs(config, shape))
+        return super()._inputs(config, shape).encoded("cloud", PointNet, scaled=False)
 
 
 class CloudRL2(RL2):
     @classmethod
     def _inputs(cls, config: Any, shape: Shape) -> Inputs:
-        return with_point_net(super()._inputs(config, shape))
+        return super()._inputs(config, shape).encoded("cloud", PointNet, scaled=False)
 
 
 class CloudGoals(PointGoals):

@@ -18,7 +18,7 @@ MakeEncoder = Callable[[int, torch.Generator], nn.Module]
 
 @dataclass(frozen=True)
 class Inputs:
-    """How a network reads an observation, before it has weights.
+    """How a network reads an observation, before it has weights. A ``BidexError`` names a group that is not there.
 
     Attributes:
         groups: The parts of the observation; each column is in one. A network reads the task from ``task_id``.
@@ -32,6 +32,10 @@ class Inputs:
     hidden: frozenset[str] = frozenset()
     unscaled: frozenset[str] = frozenset({"task_id"})
 
+    def __post_init__(self) -> None:
+        """Refuses encoders of no group."""
+        self.columns(*self.encoders)
+
     @classmethod
     def of(cls, inputs: "int | Inputs") -> "Inputs":
         """Itself, or of a width: so many columns of one kind."""
@@ -43,11 +47,7 @@ class Inputs:
         return sum(group.size for group in self.groups)
 
     def columns(self, *names: str) -> Columns:
-        """The columns of some groups.
-
-        Raises:
-            BidexError: The observation has no such group.
-        """
+        """The columns of some groups."""
         ranges = {group.name: group.where for group in self.groups}
         for name in names:
             if name not in ranges:
@@ -59,8 +59,13 @@ class Inputs:
         end = slice(self.width, self.width + size)
         return replace(self, groups=(*self.groups, ObservationGroup(name, (end,))))
 
+    def encoded(self, name: str, make: MakeEncoder, scaled: bool = True) -> "Inputs":
+        """With an encoder for a group; not ``scaled``: running statistics leave its columns as they are."""
+        unscaled = self.unscaled if scaled else self.unscaled | {name}
+        return replace(self, encoders={**self.encoders, name: make}, unscaled=unscaled)
+
     def only(self, *names: str) -> "Inputs":
-        """With all other groups hidden: what an agent sees that has a view of its own. ``BidexError`` as above."""
+        """With all other groups hidden: what an agent sees that has a view of its own."""
         self.columns(*names)
         return replace(self, hidden=frozenset(group.name for group in self.groups) - {*names})
 
@@ -84,7 +89,6 @@ class GroupEncoder(nn.Module):
         super().__init__()
         inputs = Inputs.of(inputs)
         names = [group.name for group in inputs.groups if group.name not in inputs.hidden]
-        inputs.columns(*inputs.encoders)  # refuses those of no group
         encoded = {name: inputs.columns(name) for name in names if name in inputs.encoders}
         self.columns = nn.ModuleDict(encoded)
         made: dict[str, Any] = {n: inputs.encoders[n](columns.size, generator) for n, columns in encoded.items()}

@@ -5,7 +5,7 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.nets.encoders.inputs import MakeEncoder
+from bidex_algos.nets.encoders.inputs import Inputs
 
 
 class TaskEmbedding(nn.Module):
@@ -27,6 +27,6 @@ class TaskEmbedding(nn.Module):
         return one_hot @ self.vectors
 
 
-def embedded_task(size: int) -> dict[str, MakeEncoder]:
-    """The encoders of a network that reads the task by an embedding of so many entries; none for 0."""
-    return {"task_id": partial(TaskEmbedding, size=size)} if size else {}
+def with_task_embedding(inputs: Inputs, size: int) -> Inputs:
+    """The same with the task read by an embedding of so many entries; 0: as it was."""
+    return inputs.encoded("task_id", partial(TaskEmbedding, size=size)) if size else inputs
