@@ -16,6 +16,9 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.experience.rollout import check_autoreset
+from bidex_algos.nets.encoders.inputs import Inputs
+from bidex_algos.nets.encoders.task_embedding import with_task_embedding
+from bidex_algos.nets.shape import Shape
 from bidex_algos.reports import check_finite
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError
@@ -36,13 +39,14 @@ class Learner(ABC):
 
     Attributes:
         env_steps: Environment steps taken so far, over all rows of all processes; a waiting row takes none.
-        shape: ``observations`` (d), ``actions`` (a) and ``num_id_columns`` of the world.
+        shape: Sizes of the world's spaces and the groups of its observation.
+        inputs: How networks read the observation.
         generator: Of all that is drawn while learning, on the device; another one in each process.
         policy: The network that acts and its statistics of observations, a ``torch.nn.Module``.
         agent: What evaluation plays; the policy itself, but for RL².
 
     Raises:
-        BidexError: A world in another mode, or policy heads for one that does not show the task.
+        BidexError: A world in another mode, or policy heads or a task embedding for one that does not show the task.
     """
 
     name: ClassVar[str]
@@ -62,16 +66,14 @@ class Learner(ABC):
         self.world, self.config, self.seed = world, config, seed
         self.device = torch.device(world.device)
         self.env_steps = 0
-        self.shape = {
-            "observations": int(world.single_observation_space.shape[0]),
-            "actions": int(world.single_action_space.shape[0]),
-            "num_id_columns": int(world.num_id_columns),
-        }
-        if getattr(config, "policy_heads", False) and self.shape["num_id_columns"] != world.num_tasks:
-            raise BidexError(
-                f"{self.name}: policy_heads needs the one-hot of {world.num_tasks} tasks at the end of the observation "
-                f"(an MT suite), this world shows {self.shape['num_id_columns']} such entries. Leave policy_heads off."
-            )
+        self.shape = Shape.of(world)
+        for option in ("policy_heads", "task_embedding"):
+            if getattr(config, option, False) and self.shape.num_id_columns != world.num_tasks:
+                raise BidexError(
+                    f"{self.name}: {option} needs the one-hot of {world.num_tasks} tasks in the observation (an MT "
+                    f"suite), this world shows {self.shape.num_id_columns} such entries. Leave {option} off."
+                )
+        self.inputs = self._inputs(config, self.shape)
         # Weights come from a CPU generator, so that a seed means the same network on every device.
         self.initial = torch.Generator().manual_seed(seed)
         self.generator = torch.Generator(self.device).manual_seed(own_seed(seed))
@@ -83,8 +85,13 @@ class Learner(ABC):
 
     @classmethod
     @abstractmethod
-    def _make_policy(cls, config: Any, shape: dict[str, int], init: torch.Generator, device: torch.device) -> nn.Module:
+    def _make_policy(cls, config: Any, shape: Shape, init: torch.Generator, device: torch.device) -> nn.Module:
         """A policy with fresh weights, drawn from ``init`` (a CPU generator), on ``device``."""
+
+    @classmethod
+    def _inputs(cls, config: Any, shape: Shape) -> Inputs:
+        """How its networks read an observation: the place for encoders of its groups."""
+        return with_task_embedding(Inputs(shape.groups), getattr(config, "task_embedding", 0))
 
     @abstractmethod
     def _iterate(self) -> dict[str, float]:
@@ -108,7 +115,7 @@ class Learner(ABC):
 
     def _check_size(self, state: dict[str, Any]) -> None:
         """Refuses a state of a world of another size."""
-        self._expect("", state["policy"]["shape"], self.shape)
+        self._expect("", Shape.load(state["policy"]["shape"]).sizes(), self.shape.sizes())
 
     # Training.
 
@@ -160,7 +167,7 @@ class Learner(ABC):
 
     def policy_state_dict(self) -> dict[str, Any]:
         """What :meth:`load_policy` needs: network, observation statistics, sizes and config."""
-        return {"config": asdict(self.config), "shape": dict(self.shape), "weights": self.policy.state_dict()}
+        return {"config": asdict(self.config), "shape": self.shape.state_dict(), "weights": self.policy.state_dict()}
 
     @classmethod
     def load_policy(cls, state: dict[str, Any], device: str | torch.device = "cpu") -> Any:
@@ -171,7 +178,8 @@ class Learner(ABC):
             device: Where to run it.
         """
         init = torch.Generator().manual_seed(0)
-        policy = cls._make_policy(cls.config_type(**state["config"]), state["shape"], init, torch.device(device))
+        config, shape = cls.config_type(**state["config"]), Shape.load(state["shape"])
+        policy = cls._make_policy(config, shape, init, torch.device(device))
         policy.load_state_dict(state["weights"])
         return policy
 

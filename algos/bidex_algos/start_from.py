@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 from torch import nn
 
+from bidex_algos.nets.shape import Shape
 from bidex_algos.nets.squashed import SquashedActor
 from bidex_meta.errors import BidexError
 
@@ -20,12 +21,13 @@ class PolicyLearner(Protocol):
     """What acts: network and observation statistics."""
     config: Any
     """The learner's config."""
-    shape: dict[str, int]
-    """``observations``, ``actions`` and ``num_id_columns`` of its world."""
+    shape: Shape
+    """Of its world."""
 
 
 # What decides, beside the shapes of the weights, what they compute.
-_FORM = ("hidden", "activation", "normalise_observations", "reward_unit", "observations", "actions", "num_id_columns")
+_WORLD = ("observations", "actions", "task_id")
+_FORM = ("hidden", "activation", "normalise_observations", "reward_unit", "task_embedding", *_WORLD)
 
 
 def start_from(learner: PolicyLearner, state: dict[str, Any]) -> None:
@@ -38,25 +40,31 @@ def start_from(learner: PolicyLearner, state: dict[str, Any]) -> None:
     Raises:
         BidexError: Weights of one would not mean the same in the other.
     """
-    own, given = asdict(learner.config) | learner.shape, state["config"] | state["shape"]
-    _agree(own, given, _FORM, learner.shape)
+    own, given = asdict(learner.config) | _seen(learner.shape), state["config"] | _seen(Shape.load(state["shape"]))
+    _agree(own, given, _FORM)
     if _shapes(learner.policy.state_dict()) != _shapes(state["weights"]):
         raise BidexError(
             "Expected a policy to start from of the same kind (mtppo, mttrpo, promp and maml share one; mtsac and rl2 "
-            "have their own, and policy heads another), got one with other weights. Name another run."
+            "have their own, policy heads and a task embedding others), got one with other weights. Name another run."
         )
     if isinstance(getattr(learner.policy, "actor", None), SquashedActor):
         # Its network speaks of a place between these bounds; a Gaussian one has its deviation as a weight.
-        _agree(own, given, ("std_range",), learner.shape)
+        _agree(own, given, ("std_range",))
     learner.policy.load_state_dict(state["weights"])
 
 
-def _agree(own: dict[str, Any], given: dict[str, Any], names: tuple[str, ...], shape: dict[str, int]) -> None:
+def _seen(shape: Shape) -> dict[str, Any]:
+    """What of a world's shape a network's weights depend on."""
+    ids = [[part.start, part.stop] for group in shape.groups if group.name == "task_id" for part in group.where]
+    return dict(zip(_WORLD, (shape.observations, shape.actions, ids), strict=True))
+
+
+def _agree(own: dict[str, Any], given: dict[str, Any], names: tuple[str, ...]) -> None:
     """Refuses what is not alike in both, where both know it."""
     for name in names:
         if name in own and name in given and _plain(own[name]) != _plain(given[name]):
             flag = f"--learner.{name.replace('_', '-')}"
-            mend = f"Add {flag} as there" if name not in shape else "Name a run on the same observations"
+            mend = "Name a run on the same observations" if name in _WORLD else f"Add {flag} as there"
             raise BidexError(
                 f"Expected a policy to start from with {name} = {_plain(own[name])}, got {_plain(given[name])}. "
                 f"{mend}, or start afresh."

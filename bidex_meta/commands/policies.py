@@ -31,8 +31,8 @@ def load_policy(folder: RunFolder, device: str) -> tuple[Agent, int]:
     return load(), step
 
 
-def policy_shape(state: dict[str, Any]) -> dict[str, int]:
-    """Numbers of ``observations`` and ``actions`` of the policy in a run's ``checkpoint``."""
+def policy_shape(state: dict[str, Any]) -> dict[str, Any]:
+    """Numbers of ``observations`` and ``actions`` of the policy in a run's ``checkpoint``, and more that it keeps."""
     return state["learner"]["policy"]["shape"]
 
 

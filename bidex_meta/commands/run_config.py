@@ -118,6 +118,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     learner_default = kind.presets[preset]
     if folder:
         learner_default = _stored_learner(type(learner_default), stored, folder)
+        stored["learner"] = json.loads(json.dumps(dataclasses.asdict(learner_default)))  # with options it did not know
     flags = parse(*_options(arguments, learner_default, stored, source.rows_and_steps(device, kind.adapts)))
     names = {"source": source.name, "algo": kind.name, "preset": preset}
     config = _resolved(flags, names, device, stored)

@@ -16,9 +16,11 @@ from bidex_algos.meta.maml import MAML, MAMLConfig
 from bidex_algos.meta.maml import PRESETS as MAML_PRESETS
 from bidex_algos.meta.meta_policy import make_meta_policy
 from bidex_algos.meta.promp import PRESETS, ProMP, ProMPConfig
+from bidex_algos.nets.encoders.inputs import Inputs
 from bidex_algos.nets.networks import gaussian_log_prob
 from bidex_meta.agents import Timestep
 from bidex_meta.errors import BidexError
+from bidex_meta.world.contract import plain_groups
 from tests.algos.families import PointClass, PointGoals, circle
 from tests.algos.ranks import same
 from tests.algos.resume import resumed
@@ -316,8 +318,8 @@ def test_the_paper_presets_are_table_48():
 def test_rows_in_one_state_with_other_tasks_look_alike_to_policy_and_baseline(rule: str, equal: bool):
     _, obs, reward = twins("CatchUnderarm", True, rule)
     assert len(reward.unique()) > 1
-    shape = {"observations": obs.shape[1], "actions": 52, "num_id_columns": 0}
-    policy = make_meta_policy(PROMP, "ratio", shape, torch.Generator().manual_seed(0), seed=0)
+    inputs = Inputs(plain_groups(obs.shape[1], 0))
+    policy = make_meta_policy(PROMP, "ratio", inputs, 52, torch.Generator().manual_seed(0), seed=0)
     _, aux = policy.adapt_action(obs)
     x = features(policy.observations(obs), torch.zeros(len(obs)))
     assert torch.equal(aux["mean"], aux["mean"][:1].expand_as(aux["mean"])) == equal

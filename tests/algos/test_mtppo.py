@@ -11,6 +11,7 @@ from bidex_algos.experience.rollout import collect
 from bidex_algos.nets.networks import gaussian_log_prob
 from bidex_algos.onpolicy.mtppo import MTPPO, PRESETS, MTPPOConfig
 from bidex_meta.errors import BidexError
+from bidex_meta.world.contract import plain_groups
 from tests.algos.resume import resumed
 from tests.algos.toy import ToyWorld, nearness
 
@@ -85,7 +86,7 @@ def test_surgery_between_tasks_that_agree_changes_nothing_but_rounding():
 
 def test_policy_heads_need_a_world_that_shows_the_task():
     world = ToyWorld([nearness(0.4), nearness(-0.4)])
-    world.num_id_columns = 0
+    world.num_id_columns, world.observation_groups = 0, plain_groups(3, 0)
     with pytest.raises(BidexError, match="policy_heads"):
         MTPPO(world, replace(SMALL, policy_heads=True), seed=0)
 

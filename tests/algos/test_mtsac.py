@@ -12,6 +12,7 @@ from torch.testing import assert_close
 from bidex_algos.offpolicy.mtsac import MTSAC, PRESETS, MTSACConfig
 from bidex_meta.commands.learners import learner_kind
 from bidex_meta.errors import BidexError
+from bidex_meta.world.contract import plain_groups
 from tests.algos.problems import LQR, PointMass, discounted_return, one_step_bandit, opposite_bandits
 from tests.algos.ranks import same
 from tests.algos.resume import resumed
@@ -331,7 +332,7 @@ def test_config_errors_name_the_field(field: str, value: Any):
 
 def test_worlds_that_do_not_fit_are_refused():
     world = opposite_bandits()
-    world.num_id_columns = 0
+    world.num_id_columns, world.observation_groups = 0, plain_groups(3, 0)
     with pytest.raises(BidexError, match="policy_heads needs the one-hot of 2 tasks"):
         MTSAC(world, replace(SMALL, policy_heads=True), seed=0)
     world.task_id = torch.zeros_like(world.task_id)

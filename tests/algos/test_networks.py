@@ -4,8 +4,12 @@ from hypothesis import strategies as st
 from torch.distributions import Independent, Normal, kl_divergence
 from torch.testing import assert_close
 
+from bidex_algos.nets.encoders.inputs import Inputs
 from bidex_algos.nets.networks import MLP, GaussianActor, gaussian_entropy, gaussian_kl, gaussian_log_prob
 from bidex_algos.nets.normalise import ObservationNormaliser, RunningStats
+from bidex_meta.world.contract import plain_groups
+
+TASKS_LAST = Inputs(plain_groups(5, 2))
 
 
 @settings(max_examples=30, deadline=None)
@@ -21,7 +25,7 @@ def test_gaussian_formulas_agree_with_torch_distributions(seed: int, actions: in
 
 
 def test_heads_are_chosen_in_float32_under_autocast():
-    actor = GaussianActor(5, (8,), 3, 0.8, torch.Generator().manual_seed(0), heads=2)
+    actor = GaussianActor(TASKS_LAST, (8,), 3, 0.8, torch.Generator().manual_seed(0), heads=2)
     with torch.no_grad():
         actor.log_std += torch.linspace(0.0, 1.0, 6).view(2, 3)
     obs = torch.cat([torch.randn(4, 3), torch.eye(2).repeat(2, 1)], dim=1)
@@ -43,7 +47,7 @@ def test_initial_weights_follow_the_seed_and_leave_the_global_generator_alone():
 
 
 def test_a_head_sees_its_own_task_alone():
-    actor = GaussianActor(5, (8,), 3, 0.8, torch.Generator().manual_seed(0), heads=2)
+    actor = GaussianActor(TASKS_LAST, (8,), 3, 0.8, torch.Generator().manual_seed(0), heads=2)
     x = torch.cat([torch.randn(4, 3), torch.eye(2).repeat(2, 1)], dim=1)
     mean, log_std = actor(x), actor.log_std_of(x)
     with torch.no_grad():
@@ -84,7 +88,7 @@ def test_running_stats_skip_empty_groups_and_forget_beyond_max_count():
 
 def test_observations_are_normalised_and_task_ids_are_not():
     obs = torch.cat([torch.randn(200, 2) * 50 + 7, torch.zeros(200, 1), torch.ones(200, 1)], dim=1)
-    normaliser = ObservationNormaliser(4, num_id_columns=1)
+    normaliser = ObservationNormaliser(Inputs(plain_groups(4, 1)))
     normaliser.update(obs)
     out = normaliser(obs)
     assert_close(out[:, :2].mean(0), torch.zeros(2), atol=1e-4, rtol=0)

@@ -12,6 +12,7 @@ from torch.testing import assert_close
 from bidex_algos.experience.replay import Transitions
 from bidex_algos.nets.networks import MLP
 from bidex_algos.nets.normalise import ObservationNormaliser
+from bidex_algos.nets.shape import Shape
 from bidex_algos.offpolicy.base import OffPolicy
 from bidex_algos.offpolicy.config import OffPolicyConfig
 from bidex_meta.errors import BidexError
@@ -91,11 +92,11 @@ class Twin(OffPolicy):
 
     @classmethod
     def _make_policy(
-        cls, config: TwinConfig, shape: dict[str, int], init: torch.Generator, device: torch.device
+        cls, config: TwinConfig, shape: Shape, init: torch.Generator, device: torch.device
     ) -> DeterministicPolicy:
-        d = shape["observations"]
-        actor = MLP(d, config.hidden, shape["actions"], 0.01, init, config.activation)
-        observations = ObservationNormaliser(d, shape["num_id_columns"], config.normalise_observations)
+        inputs = cls._inputs(config, shape)
+        actor = MLP(inputs, config.hidden, shape.actions, 0.01, init, config.activation)
+        observations = ObservationNormaliser(inputs, config.normalise_observations)
         return DeterministicPolicy(observations, actor).to(device)
 
     def _own_parts(self) -> dict[str, Any]:

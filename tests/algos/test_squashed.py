@@ -7,11 +7,14 @@ from hypothesis import strategies as st
 from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
 from torch.testing import assert_close
 
+from bidex_algos.nets.encoders.inputs import Inputs
 from bidex_algos.nets.squashed import SquashedActor, sample_squashed, squashed_log_prob
+from bidex_meta.world.contract import plain_groups
 
 
 def actor(heads: int = 1, init_std: float = 0.5, std_range: tuple[float, float] = (0.02, 2.0)) -> SquashedActor:
-    return SquashedActor(5, (16,), 3, heads, init_std, std_range, torch.Generator().manual_seed(0), "relu")
+    inputs, g = Inputs(plain_groups(5, 2)), torch.Generator().manual_seed(0)
+    return SquashedActor(inputs, (16,), 3, heads, init_std, std_range, g, "relu")
 
 
 @settings(max_examples=40, deadline=None)

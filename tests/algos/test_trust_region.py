@@ -6,7 +6,9 @@ from torch import Tensor, nn
 from torch.testing import assert_close
 
 from bidex_algos.gradients.trust_region import conjugate_gradient, fisher_product, flatten, line_search, write
+from bidex_algos.nets.encoders.inputs import Inputs
 from bidex_algos.nets.networks import GaussianActor, gaussian_kl
+from bidex_meta.world.contract import plain_groups
 
 
 @settings(max_examples=25, deadline=None)
@@ -28,7 +30,7 @@ def test_zero_on_the_right_gives_zero():
 @pytest.mark.parametrize("heads", [1, 2])
 def test_fisher_products_are_those_of_the_hessian_of_the_kl(heads: int):
     g = torch.Generator().manual_seed(0)
-    actor = GaussianActor(3, (4,), 2, 0.5, g, "tanh", heads).double()
+    actor = GaussianActor(Inputs(plain_groups(3, 2)), (4,), 2, 0.5, g, "tanh", heads).double()
     one_hot = torch.eye(2, dtype=torch.float64)[torch.tensor([0, 1, 0, 1, 1])]
     obs = torch.cat([torch.randn(5, 1, generator=g, dtype=torch.float64), one_hot], dim=1)
     parameters = list(actor.parameters())

@@ -1,6 +1,7 @@
 """A step as far as the KL allows: conjugate gradients, Fisher-vector products and line search, on flat vectors."""
 
 from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -130,3 +131,53 @@ def line_search(
         share *= factor
     write(parameters, start)
     return 0.0
+
+
+class Stepped(NamedTuple):
+    """What a trust-region step has come to."""
+
+    objective: float
+    """The objective where it ended."""
+    kl: float
+    """KL from the sampling policy there."""
+    share: float
+    """Share of the natural step that was taken; 0: the parameters are as before."""
+
+    def told(self, kl_tag: str, device: torch.device) -> dict[str, Tensor]:
+        """Scalars to be logged."""
+        found = {"Loss/surrogate": -self.objective, kl_tag: self.kl, "Policy/step_share": self.share}
+        return {name: torch.tensor(value, device=device) for name, value in found.items()}
+
+
+def trust_region_step(
+    parameters: Sequence[nn.Parameter],
+    objective: Tensor,
+    kl: Tensor,
+    measure: Callable[[], tuple[float, float]],
+    config: Any,
+    accept_ratio: float = 0.0,
+) -> Stepped:
+    """Moves parameters along the natural gradient, back along it until objective and KL are what was asked for.
+
+    Args:
+        parameters: The policy's.
+        objective: As for :func:`natural_step`.
+        kl: As for :func:`fisher_product`.
+        measure: As for :func:`line_search`.
+        config: Of a learner. It has ``max_kl``, ``damping``, ``cg_iterations``, ``backtracks`` (points tried) and
+            ``backtrack_factor`` (by which the step is shortened from one to the next).
+        accept_ratio: Share of the promised rise that must come true.
+    """
+    size = {"max_kl": config.max_kl, "damping": config.damping, "iterations": config.cg_iterations}
+    step, promised = natural_step(objective, kl, parameters, **size)
+    share = line_search(
+        parameters,
+        step,
+        measure,
+        expected=promised,
+        max_kl=config.max_kl,
+        accept_ratio=accept_ratio,
+        factor=config.backtrack_factor,
+        tries=config.backtracks,
+    )
+    return Stepped(*measure(), share)

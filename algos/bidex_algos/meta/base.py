@@ -13,16 +13,17 @@ from abc import abstractmethod
 from typing import Any, ClassVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from bidex_algos.experience.rollout import may_look
 from bidex_algos.learner import Learner
 from bidex_algos.meta.adaptation import Objective, TaskBatch, detached
-from bidex_algos.meta.config import MetaConfig
+from bidex_algos.meta.config import MetaConfig, OuterConfig
 from bidex_algos.meta.meta_policy import MetaPolicy, make_meta_policy
 from bidex_algos.meta.stage import Outcome, Stage, moments, task_batch
 from bidex_algos.meta.task_rows import TaskRows
 from bidex_algos.nets.normalise import RunningStats
+from bidex_algos.nets.shape import Shape
 from bidex_algos.reports import as_numbers
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import world_size
@@ -44,7 +45,7 @@ class MetaLearner(Learner):
     """
 
     world: PooledWorld
-    config: MetaConfig
+    config: OuterConfig
     policy: MetaPolicy
     remedy = "lower inner_learning_rate or the outer step"
     objective: ClassVar[Objective]
@@ -52,7 +53,7 @@ class MetaLearner(Learner):
     adapts: ClassVar[bool] = True
     """Its policy adapts to a task: evaluation measures before and after."""
 
-    def __init__(self, world: PooledWorld, config: MetaConfig, seed: int):
+    def __init__(self, world: PooledWorld, config: OuterConfig, seed: int):
         if world_size() > 1:
             raise BidexError(f"{self.name}: learns in one process, got {world_size()}. Start it without torchrun.")
         super().__init__(world, config, seed)
@@ -65,6 +66,7 @@ class MetaLearner(Learner):
         self._check_rows()
         self.tasks_generator = torch.Generator().manual_seed(seed)
         self.rows = TaskRows(world.task_id)
+        self.adam = torch.optim.Adam(self.policy.actor.parameters(), lr=config.outer_learning_rate)
 
     @staticmethod
     def autoreset(config: dict[str, Any]) -> str:
@@ -89,7 +91,15 @@ class MetaLearner(Learner):
 
     def _optimisers(self) -> dict[str, torch.optim.Optimizer]:
         """The optimisers by the names they have in a checkpoint."""
-        return {}
+        return {"adam": self.adam}
+
+    def _descend(self, loss: Tensor) -> Tensor:
+        """One step of Adam of the meta-parameters; the norm of the meta-gradient before it was shortened, a scalar."""
+        self.adam.zero_grad()
+        loss.backward()
+        norm = nn.utils.clip_grad_norm_(self.policy.actor.parameters(), self.config.max_grad_norm)
+        self.adam.step()
+        return norm
 
     def _iterate(self) -> dict[str, float]:
         """One meta-batch: samples, adapts, learns."""
@@ -98,7 +108,7 @@ class MetaLearner(Learner):
         adapter = self.policy.adapter
         adapter.project()
         params = detached(adapter.meta(self.rows.count))
-        seen = RunningStats((self.policy.observations.measured,)).to(self.device)
+        seen = RunningStats((self.policy.observations.measured.size,)).to(self.device)
         batches: list[TaskBatch] = []
         told: dict[str, float] = {}
         steps = 0
@@ -154,7 +164,7 @@ class MetaLearner(Learner):
             obs, reward, terminated, truncated, info = self.world.step(action)
             broken = info["unstable"]
             valid = running & ~broken
-            seen.merge(*moments(before[:, : policy.observations.measured], valid))
+            seen.merge(*moments(policy.observations.measured(before), valid))
             over = terminated | truncated | broken
             last = torch.full_like(over, self.config.slice_steps is None and t + 1 == horizon)
             stage.add(
@@ -201,10 +211,8 @@ class MetaLearner(Learner):
     # Checkpoints.
 
     @classmethod
-    def _make_policy(
-        cls, config: MetaConfig, shape: dict[str, int], init: torch.Generator, device: torch.device
-    ) -> MetaPolicy:
-        return make_meta_policy(config, cls.objective, shape, init).to(device)
+    def _make_policy(cls, config: MetaConfig, shape: Shape, init: torch.Generator, device: torch.device) -> MetaPolicy:
+        return make_meta_policy(config, cls.objective, cls._inputs(config, shape), shape.actions, init).to(device)
 
     def policy_state_dict(self) -> dict[str, Any]:
         """What :meth:`load_policy` needs: network, statistics, sizes, config, and the seed that it explores by."""

@@ -11,33 +11,25 @@ theta_K depends on theta through the inner steps; ``first_order`` leaves their d
 """
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from bidex_algos.gradients.trust_region import line_search, natural_step
+from bidex_algos.gradients.trust_region import trust_region_step
 from bidex_algos.meta.adaptation import TaskBatch, weighted_mean
 from bidex_algos.meta.base import MetaLearner
 from bidex_algos.meta.maml_config import PRESETS, MAMLConfig
-from bidex_meta.world.contract import PooledWorld
 
 __all__ = ["MAML", "PRESETS", "MAMLConfig"]
 
 
 class MAML(MetaLearner):
-    """Model-agnostic meta-learning with a trust region.
-
-    Arguments and attributes are those of :class:`~bidex_algos.meta.base.MetaLearner`.
-    """
+    """Model-agnostic meta-learning with a trust region; arguments and attributes are those of its base."""
 
     name, objective = "maml", "likelihood"
     config_type = MAMLConfig
     config: MAMLConfig
 
-    def __init__(self, world: PooledWorld, config: MAMLConfig, seed: int):
-        super().__init__(world, config, seed)
-        self.adam = torch.optim.Adam(self.policy.actor.parameters(), lr=config.outer_learning_rate)
-
     def _optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        return {"adam": self.adam} if self.config.outer == "adam" else {}
+        return super()._optimisers() if self.config.outer == "adam" else {}
 
     def _outer(self, batches: list[TaskBatch]) -> dict[str, Tensor]:
         return self._trust_region(batches) if self.config.outer == "trpo" else self._adam_step(batches)
@@ -53,36 +45,17 @@ class MAML(MetaLearner):
 
     def _adam_step(self, batches: list[TaskBatch]) -> dict[str, Tensor]:
         surrogate, _ = self._objective(batches)
-        self.adam.zero_grad()
-        (-surrogate).backward()
-        norm = nn.utils.clip_grad_norm_(self.policy.actor.parameters(), self.config.max_grad_norm)
-        self.adam.step()
+        norm = self._descend(-surrogate)
         with torch.no_grad():
             _, kl = self._objective(batches)
         return {"Loss/surrogate": -surrogate.detach(), "Policy/outer_kl": kl, "Policy/gradient_norm": norm}
 
     def _trust_region(self, batches: list[TaskBatch]) -> dict[str, Tensor]:
-        cfg, parameters = self.config, list(self.policy.actor.parameters())
-        surrogate, kl = self._objective(batches)
-        step, promised = natural_step(
-            surrogate, kl, parameters, max_kl=cfg.max_kl, damping=cfg.damping, iterations=cfg.cg_iterations
-        )
-
         @torch.no_grad()
         def measure() -> tuple[float, float]:
             objective, moved = torch.stack(self._objective(batches)).tolist()
             return objective, moved
 
-        share = line_search(
-            parameters,
-            step,
-            measure,
-            expected=promised,
-            max_kl=cfg.max_kl,
-            accept_ratio=0.0,
-            factor=cfg.backtrack_factor,
-            tries=cfg.backtracks,
-        )
-        objective, moved = measure()
-        told = {"Loss/surrogate": -objective, "Policy/outer_kl": moved, "Policy/step_share": share}
-        return {name: torch.tensor(value) for name, value in told.items()}
+        surrogate, kl = self._objective(batches)
+        stepped = trust_region_step(list(self.policy.actor.parameters()), surrogate, kl, measure, self.config)
+        return stepped.told("Policy/outer_kl", self.device)

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from bidex_algos.checks import at_least, between, positive
-from bidex_algos.meta.config import MetaConfig
+from bidex_algos.meta.config import TABLE_48, TUNED, OuterConfig
 
 
 @dataclass(frozen=True)
-class MAMLConfig(MetaConfig):
+class MAMLConfig(OuterConfig):
     """Everything that can be set about MAML; the defaults are the preset ``laptop``."""
 
     algo: ClassVar[str] = "maml"
@@ -44,30 +44,8 @@ class MAMLConfig(MetaConfig):
 
 
 PRESETS: dict[str, MAMLConfig] = {
-    # The Bi-DexHands appendix has no table for MAML: networks, slices, steps and discount are those of ProMP's Table
-    # 48, the trust region is MAML's own.
-    "paper": MAMLConfig(
-        hidden=(2048, 1024, 512),
-        activation="elu",
-        init_std=1.0,
-        slice_steps=8,
-        inner_steps=1,
-        inner_learning_rate=3e-4,
-        gamma=0.9,
-        lam=0.95,
-        max_kl=0.01,
-        damping=1e-5,
-        normalise_observations=False,
-    ),
-    # As ProMP's.
-    "tuned": MAMLConfig(
-        hidden=(256, 256, 128),
-        activation="elu",
-        std_range=(0.05, 1.5),
-        adapted="head",
-        inner_learning_rate=0.05,
-        gamma=0.93,
-        lam=0.9,
-    ),
+    # The Bi-DexHands appendix has no table for MAML: all but the trust region, MAML's own, is as in ProMP's.
+    "paper": MAMLConfig(**TABLE_48, max_kl=0.01, damping=1e-5),
+    "tuned": MAMLConfig(**TUNED),
     "laptop": MAMLConfig(),
 }

@@ -1,7 +1,5 @@
 """The agent of MAML and ProMP: a policy that takes gradient steps on what it sees of a task."""
 
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 
@@ -9,6 +7,7 @@ from bidex_algos.meta.adaptation import Adapter, Objective, Params, detached
 from bidex_algos.meta.config import MetaConfig
 from bidex_algos.meta.stage import Stage, task_batch
 from bidex_algos.meta.task_rows import TaskRows
+from bidex_algos.nets.encoders.inputs import Inputs
 from bidex_algos.nets.networks import GaussianActor
 from bidex_algos.nets.normalise import ObservationNormaliser
 from bidex_meta.agents import Timestep
@@ -127,18 +126,17 @@ class MetaPolicy(nn.Module):
 
 
 def make_meta_policy(
-    config: MetaConfig, objective: Objective, shape: dict[str, Any], init: torch.Generator, seed: int = 0
+    config: MetaConfig, objective: Objective, inputs: Inputs, actions: int, init: torch.Generator, seed: int = 0
 ) -> MetaPolicy:
     """A policy with fresh weights.
 
     Args:
         config: Of the learner.
         objective: What an inner step follows.
-        shape: ``observations``, ``actions`` and ``num_id_columns`` of the world.
+        inputs: How the network reads an observation. Encoders are meta-learned: no inner step moves them.
+        actions: Number of actions.
         init: CPU generator of the weights.
         seed: Of the exploring actions.
     """
-    d, ids = shape["observations"], shape["num_id_columns"]
-    actor = GaussianActor(d, config.hidden, shape["actions"], config.init_std, init, config.activation)
-    observations = ObservationNormaliser(d, ids, config.normalise_observations)
-    return MetaPolicy(observations, actor, config, objective, seed)
+    actor = GaussianActor(inputs, config.hidden, actions, config.init_std, init, config.activation)
+    return MetaPolicy(ObservationNormaliser(inputs, config.normalise_observations), actor, config, objective, seed)

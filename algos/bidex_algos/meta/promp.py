@@ -13,13 +13,12 @@ the data that adaptation needs (their section 4).
 """
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from bidex_algos.gradients.step_size import factor_of
 from bidex_algos.meta.adaptation import TaskBatch, weighted_mean
 from bidex_algos.meta.base import MetaLearner
 from bidex_algos.meta.promp_config import PRESETS, ProMPConfig
-from bidex_meta.world.contract import PooledWorld
 
 __all__ = ["PRESETS", "ProMP", "ProMPConfig"]
 
@@ -34,24 +33,13 @@ class ProMP(MetaLearner):
     config_type = ProMPConfig
     config: ProMPConfig
 
-    def __init__(self, world: PooledWorld, config: ProMPConfig, seed: int):
-        super().__init__(world, config, seed)
-        self.adam = torch.optim.Adam(self.policy.actor.parameters(), lr=config.outer_learning_rate)
-
-    def _optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        return {"adam": self.adam}
-
     def _outer(self, batches: list[TaskBatch]) -> dict[str, Tensor]:
-        weights = list(self.policy.actor.parameters())
         measured = []
         for epoch in range(self.config.outer_epochs):
             surrogate, inner_kl, outer_kl = self._objective(batches)
             if epoch > 0:  # before the first step it is 0 by construction
                 self._follow(outer_kl)
-            self.adam.zero_grad()
-            (self.config.kl_weight * inner_kl - surrogate).backward()
-            norm = nn.utils.clip_grad_norm_(weights, self.config.max_grad_norm)
-            self.adam.step()
+            norm = self._descend(self.config.kl_weight * inner_kl - surrogate)
             measured.append(torch.stack([-surrogate, inner_kl, outer_kl, norm]).detach())
         means = torch.stack(measured).mean(0)
         names = ("Loss/surrogate", "Policy/inner_kl", "Policy/outer_kl", "Policy/gradient_norm")

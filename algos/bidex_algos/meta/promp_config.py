@@ -4,11 +4,11 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from bidex_algos.checks import at_least, positive, rising
-from bidex_algos.meta.config import MetaConfig
+from bidex_algos.meta.config import TABLE_48, TUNED, OuterConfig
 
 
 @dataclass(frozen=True)
-class ProMPConfig(MetaConfig):
+class ProMPConfig(OuterConfig):
     """Everything that can be set about ProMP; the defaults are the preset ``laptop``."""
 
     algo: ClassVar[str] = "promp"
@@ -46,42 +46,19 @@ class ProMPConfig(MetaConfig):
 
 
 PRESETS: dict[str, ProMPConfig] = {
-    # Table 48 of the Bi-DexHands appendix to the letter: eight steps of running episodes, and an inner step of 3e-4,
-    # which moves the weights too little to matter. It names no KL weight: ProMP's own 5e-4. "Desired kl" is read by the
-    # original and used nowhere; here the outer step size follows it from 3e-4 on, as in PPO's tables.
+    # Table 48 of the Bi-DexHands appendix to the letter. It names no KL weight: ProMP's own 5e-4. "Desired kl" is read
+    # by the original and used nowhere; here the outer step size follows it from 3e-4 on, as in PPO's tables.
     "paper": ProMPConfig(
-        hidden=(2048, 1024, 512),
-        activation="elu",
-        init_std=1.0,
-        slice_steps=8,
-        inner_steps=1,
-        inner_learning_rate=3e-4,
-        gamma=0.9,
-        lam=0.95,
+        **TABLE_48,
         outer_epochs=3,
         outer_learning_rate=3e-4,
         desired_kl=0.016,
         clip=0.2,
         kl_weight=5e-4,
         max_grad_norm=1.0,
-        normalise_observations=False,
     ),
-    # For what MT-PPO's preset laptop has learned on the same tasks (--start-from): its network and discount. Steps that
-    # learn from nothing are too large there: of an outer step of 1e-3 five made a KL of 1.1 and lost a third of the
-    # return, with a KL of 0.05 a seed lost 0.5 of 7.4 in 1.6 M steps, inner steps of 0.1 lost more than they gained.
-    # Before any meta-training (seed 0) five shots of 100 episodes moved the return on ML1-wide's held-out task, 8, by
-    # +2.2 with inner steps of 0.05, whether all layers move or the head alone, by +0.8 with 0.02; a trace of 0.95 by
-    # +1.7, of 0.7 by 0.0, of 0.5 by -1.7 (4 to 6 trials, intervals of about 1.2 to either side).
-    "tuned": ProMPConfig(
-        hidden=(256, 256, 128),
-        activation="elu",
-        std_range=(0.05, 1.5),
-        adapted="head",
-        inner_learning_rate=0.05,
-        gamma=0.93,
-        lam=0.9,
-        outer_learning_rate=1e-4,
-        desired_kl=0.0125,
-    ),
+    # Outer steps that learn from nothing are too large for what is learned already: of 1e-3 five made a KL of 1.1 and
+    # lost a third of the return, with a KL of 0.05 a seed lost 0.5 of 7.4 in 1.6 M steps.
+    "tuned": ProMPConfig(**TUNED, outer_learning_rate=1e-4, desired_kl=0.0125),
     "laptop": ProMPConfig(),
 }

@@ -23,6 +23,7 @@ from bidex_algos.meta.trial_batch import Batch, make_batch, of_task
 from bidex_algos.meta.trials import Trials, play
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.recurrent import RecurrentNet, RecurrentPolicy
+from bidex_algos.nets.shape import Shape
 from bidex_algos.onpolicy.ppo_loss import NAMES, ppo_loss
 from bidex_algos.reports import as_numbers
 from bidex_meta.errors import BidexError
@@ -73,7 +74,7 @@ class RL2(Learner):
         self.adams = AdaptiveAdams(self.policy.parameters(), self.critic.parameters(), config, self.device)
 
         limits = world.max_episode_steps.clamp_max(config.max_adapt_steps)
-        d, a = self.shape["observations"], self.shape["actions"]
+        d, a = self.shape.observations, self.shape.actions
         self.trials, self.trials_played = Trials(config.episodes_per_trial, limits, d, a, config.chunk), 0
         steps = config.episodes_per_trial * float(limits.float().mean()) * world.num_envs * world_size()
         horizon = config.value_horizon * steps / world.num_tasks
@@ -196,12 +197,11 @@ class RL2(Learner):
 
     @classmethod
     def _make_policy(
-        cls, config: RL2Config, shape: dict[str, int], init: torch.Generator, device: torch.device
+        cls, config: RL2Config, shape: Shape, init: torch.Generator, device: torch.device
     ) -> RecurrentPolicy:
         return RecurrentPolicy(
-            shape["observations"],
-            shape["num_id_columns"],
-            shape["actions"],
+            cls._inputs(config, shape),
+            shape.actions,
             config.hidden,
             config.memory,
             config.init_std,

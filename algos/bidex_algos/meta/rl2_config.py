@@ -1,14 +1,17 @@
 """What can be set about RL², and its presets; imports no torch, so that a command line can show it at once."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
+from bidex_algos.checks import at_least, between, positive, rising
 from bidex_algos.choices import Activation
+from bidex_algos.onpolicy.ppo_config import PPOConfig
 from bidex_meta.errors import BidexError
 
 
 @dataclass(frozen=True)
-class RL2Config:
-    """Everything that can be set about RL²; the defaults are the preset ``laptop``."""
+class TrialConfig:
+    """Networks and trials of RL²."""
 
     hidden: tuple[int, ...] = (256, 128)
     """Widths of the encoder's layers, before the memory; of actor and critic alike."""
@@ -36,22 +39,16 @@ class RL2Config:
     """Trace decay of the advantage estimate."""
     chunk: int = 25
     """Steps that gradients flow back through the memory."""
-    num_minibatches: int = 4
-    """Mini-batches per epoch; each holds shuffled chunks of all rows."""
-    epochs: int = 4
-    """Passes over the trial per update."""
-    clip: float = 0.2
-    """How far the likelihood ratio may leave 1 before it earns nothing more."""
-    learning_rate: float = 3e-4
-    """Adam's step size at the start."""
-    adaptive_learning_rate: bool = True
-    """Divide the step size by 1.5 when the KL exceeds twice desired_kl, multiply it when below half."""
-    desired_kl: float = 0.03
-    """KL of the sampling policy from the current one that the adaptive step size aims at."""
+
+
+@dataclass(frozen=True)
+class RL2Config(PPOConfig, TrialConfig):
+    """Everything that can be set about RL²; the defaults are the preset ``laptop``."""
+
+    algo: ClassVar[str] = "rl2"
+
     learning_rate_range: tuple[float, float] = (1e-5, 3e-3)
     """Bounds of the adaptive step size."""
-    critic_learning_rate: float | None = 1e-3
-    """A fixed step size for the critic; None makes it follow the actor's."""
     entropy_weight: float = 0.0
     """Factor of the entropy bonus."""
     max_grad_norm: float = 1.0
@@ -67,21 +64,13 @@ class RL2Config:
         Raises:
             BidexError: A field is out of its range.
         """
-        for name in ("memory", "episodes_per_trial", "max_adapt_steps", "chunk", "num_minibatches", "epochs"):
-            if getattr(self, name) < 1:
-                raise BidexError(f"rl2: {name} must be at least 1, got {getattr(self, name)}.")
-        for name in ("gamma", "lam", "blind_share"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise BidexError(f"rl2: {name} must lie in [0, 1], got {getattr(self, name)}.")
-        for name in ("init_std", "reward_unit", "clip", "learning_rate", "max_grad_norm", "value_horizon"):
-            if not getattr(self, name) > 0.0:
-                raise BidexError(f"rl2: {name} must be positive, got {getattr(self, name)}.")
+        self._check_ppo()
+        at_least(self, 1, "memory", "episodes_per_trial", "max_adapt_steps", "chunk")
+        between(self, 0.0, 1.0, "gamma", "lam", "blind_share")
+        positive(self, "init_std", "reward_unit", "max_grad_norm", "value_horizon")
+        rising(self, "std_range")
         if not self.hidden:
             raise BidexError("rl2: hidden must name at least one layer, got none.")
-        for name in ("std_range", "learning_rate_range"):
-            low, high = getattr(self, name)
-            if not 0.0 < low <= high:
-                raise BidexError(f"rl2: {name} must be two rising positive numbers, got {low} {high}.")
 
 
 PRESETS: dict[str, RL2Config] = {
@@ -90,25 +79,11 @@ PRESETS: dict[str, RL2Config] = {
     # counterpart, since a trial is made of whole episodes. Memory, ten episodes a trial and 250 steps of
     # backpropagation are those of RL² in Meta-World's baselines (metaworld-algorithms).
     "paper": RL2Config(
-        hidden=(2048, 1024, 512),
-        memory=256,
-        value_heads=False,
-        init_std=1.0,
-        episodes_per_trial=10,
-        gamma=0.9,
-        lam=0.95,
-        chunk=250,
-        num_minibatches=1,
-        epochs=3,
-        clip=0.2,
-        learning_rate=3e-4,
-        desired_kl=0.016,
-        critic_learning_rate=None,
-        entropy_weight=0.0,
-        max_grad_norm=1.0,
-        normalise_observations=False,
+        hidden=(2048, 1024, 512), memory=256, value_heads=False, init_std=1.0, episodes_per_trial=10, gamma=0.9,
+        lam=0.95, chunk=250, num_minibatches=1, epochs=3, clip=0.2, learning_rate=3e-4, desired_kl=0.016,
+        critic_learning_rate=None, entropy_weight=0.0, max_grad_norm=1.0, normalise_observations=False,
     ),
     # Discount and KL are MT-PPO's. With 0.97, so that what an episode finds out is paid in the next, and a KL of 0.02
     # the egg of ML1-wide was carried and not thrown after 5 M steps (docs/results/ml1.md).
     "laptop": RL2Config(),
-}
+}  # fmt: skip

@@ -5,6 +5,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from bidex_algos.nets.encoders.inputs import Inputs
 from bidex_meta.train.distributed import pool_moments
 
 
@@ -52,29 +53,32 @@ class RunningStats(nn.Module):
 
 
 class ObservationNormaliser(nn.Module):
-    """Observations to zero mean and unit variance, clipped; trailing task-id columns pass through unchanged.
+    """Observations to zero mean and unit variance, clipped; the task id passes unchanged.
 
     Statistics change only in :meth:`update`, so the observations of a rollout look the same to the sampling policy and
     to the update.
 
     Args:
-        columns: Width of the observation.
-        num_id_columns: How many trailing columns hold the one-hot task id.
+        inputs: The groups of the observation, or its width.
         enabled: False makes this the identity.
         clip: Bound of the normalised values.
+
+    Attributes:
+        measured: The columns that are normalised: of all groups but ``inputs.unscaled``.
     """
 
-    def __init__(self, columns: int, num_id_columns: int = 0, enabled: bool = True, clip: float = 10.0):
+    def __init__(self, inputs: int | Inputs, enabled: bool = True, clip: float = 10.0):
         super().__init__()
         self.enabled = enabled
         self.clip = clip
-        self.measured = columns - num_id_columns
-        self.stats = RunningStats((self.measured,))
+        inputs = Inputs.of(inputs)
+        self.measured = inputs.columns(*(group.name for group in inputs.groups if group.name not in inputs.unscaled))
+        self.stats = RunningStats((self.measured.size,))
         # float32 copies of what forward needs, refreshed by update.
         self.shift: Tensor
         self.scale: Tensor
-        self.register_buffer("shift", torch.zeros(columns))
-        self.register_buffer("scale", torch.ones(columns))
+        self.register_buffer("shift", torch.zeros(inputs.width))
+        self.register_buffer("scale", torch.ones(inputs.width))
 
     def forward(self, obs: Tensor) -> Tensor:
         """Normalises (..., columns), float32."""
@@ -85,9 +89,9 @@ class ObservationNormaliser(nn.Module):
     @torch.no_grad()
     def update(self, obs: Tensor) -> None:
         """Takes (..., columns) raw observations, of all processes, into the statistics."""
-        if not self.enabled:
+        if not self.enabled or self.measured.size == 0:
             return
-        flat = obs.reshape(-1, obs.shape[-1])[:, : self.measured]
+        flat = self.measured(obs.reshape(-1, obs.shape[-1]))
         var, mean = torch.var_mean(flat, dim=0, correction=0)
         self.merge(mean, var, torch.full_like(mean, flat.shape[0], dtype=torch.float64))
 
@@ -97,6 +101,6 @@ class ObservationNormaliser(nn.Module):
         if not self.enabled:
             return
         self.stats.merge(*pool_moments(mean, var, count))
-        self.shift[: self.measured] = self.stats.mean.float()
+        self.measured.write(self.shift, self.stats.mean.float())
         # The floor keeps a column that has been constant so far from blowing up noise a thousandfold.
-        self.scale[: self.measured] = self.stats.std(floor=3e-3).reciprocal().float()
+        self.measured.write(self.scale, self.stats.std(floor=3e-3).reciprocal().float())

@@ -1,4 +1,4 @@
-"""The agent that evaluation and sampling use: observation statistics, actor and precision in one module."""
+"""The agents that evaluation and sampling use: observation statistics, actor and precision in one module."""
 
 import torch
 from torch import Tensor, nn
@@ -8,8 +8,8 @@ from bidex_algos.nets.normalise import ObservationNormaliser
 from bidex_algos.nets.precision import autocast
 
 
-class GaussianPolicy(nn.Module):
-    """A Gaussian actor on raw observations; follows the Agent protocol of evaluation.
+class ActorPolicy(nn.Module):
+    """An actor on raw observations; with ``eval_action`` it follows the Agent protocol of evaluation.
 
     Args:
         observations: Normaliser of raw observations.
@@ -17,11 +17,20 @@ class GaussianPolicy(nn.Module):
         low_precision: Whether hidden layers run in bfloat16.
     """
 
-    def __init__(self, observations: ObservationNormaliser, actor: GaussianActor, low_precision: bool):
+    def __init__(self, observations: ObservationNormaliser, actor: nn.Module, low_precision: bool):
         super().__init__()
         self.observations = observations
         self.actor = actor
         self.low_precision = low_precision
+
+    def reset(self, env_mask: Tensor) -> None:
+        """Nothing to forget between episodes; the argument is part of the Agent protocol."""
+
+
+class GaussianPolicy(ActorPolicy):
+    """A Gaussian actor on raw observations; arguments are those of its base."""
+
+    actor: GaussianActor
 
     @torch.no_grad()
     def mean(self, obs: Tensor) -> Tensor:
@@ -38,6 +47,3 @@ class GaussianPolicy(nn.Module):
     def eval_action(self, obs: Tensor) -> Tensor:
         """Mean action of raw observations (N, d), clamped to [-1, 1]: (N, a)."""
         return self.mean(obs).clamp(-1.0, 1.0)
-
-    def reset(self, env_mask: Tensor) -> None:
-        """Nothing to forget between episodes; the argument is part of the Agent protocol."""

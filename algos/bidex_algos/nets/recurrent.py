@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.choices import Activation
+from bidex_algos.nets.encoders.inputs import Inputs
 from bidex_algos.nets.networks import ACTIVATIONS, MLP
 from bidex_algos.nets.normalise import ObservationNormaliser
 
@@ -18,7 +19,7 @@ class RecurrentNet(nn.Module):
     All in float32: a memory would carry the rounding of bfloat16 through hundreds of steps.
 
     Args:
-        inputs: Width of the input.
+        inputs: What it is fed: groups, or a width.
         hidden: Widths of the encoder's layers.
         memory: Width of the GRU's state.
         outputs: Width of the output.
@@ -29,7 +30,7 @@ class RecurrentNet(nn.Module):
 
     def __init__(
         self,
-        inputs: int,
+        inputs: int | Inputs,
         hidden: Sequence[int],
         memory: int,
         outputs: int,
@@ -104,8 +105,7 @@ class RecurrentPolicy(nn.Module):
     the unit and tells ratios apart above it, normalised by the mean and deviation it had in training.
 
     Args:
-        observations: Width of the raw observation.
-        num_id_columns: How many of its trailing columns hold a one-hot task id.
+        inputs: The groups of the raw observation.
         actions: Number of actions.
         hidden: Widths of the encoder's layers.
         memory: Width of the memory.
@@ -116,14 +116,13 @@ class RecurrentPolicy(nn.Module):
         activation: Name of the encoder's non-linearity.
 
     Attributes:
-        inputs: Width of what the networks see.
+        inputs: What the networks see: these groups, normalised, and ``last_step``, what the memory is fed beside them.
         log_std: Logarithms of the standard deviations, (a,).
     """
 
     def __init__(
         self,
-        observations: int,
-        num_id_columns: int,
+        inputs: Inputs,
         actions: int,
         hidden: Sequence[int],
         memory: int,
@@ -135,8 +134,8 @@ class RecurrentPolicy(nn.Module):
     ):
         super().__init__()
         self.num_actions, self.memory, self.reward_unit = actions, memory, reward_unit
-        self.inputs = observations + actions + 3
-        self.observations = ObservationNormaliser(observations, num_id_columns, normalise_observations)
+        self.inputs = inputs.extended("last_step", actions + 3)
+        self.observations = ObservationNormaliser(inputs, normalise_observations)
         self.rewards = ObservationNormaliser(1)
         self.actor = RecurrentNet(self.inputs, hidden, memory, actions, 0.01, generator, activation)
         self.log_std = nn.Parameter(torch.full((actions,), math.log(init_std)))
@@ -152,7 +151,7 @@ class RecurrentPolicy(nn.Module):
             done: Whether the last step ended an episode, bool (...).
 
         Returns:
-            Shape (..., inputs).
+            Shape (..., width of ``inputs``).
         """
         earned = torch.where(known, self.rewards(self._compressed(reward)).squeeze(-1), 0.0)
         last = torch.stack([earned, known.float(), done.float()], dim=-1)

@@ -8,8 +8,9 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from bidex_algos.choices import Activation
+from bidex_algos.nets.encoders.inputs import Inputs
 from bidex_algos.nets.networks import MLP, gaussian_log_prob
-from bidex_algos.nets.normalise import ObservationNormaliser
+from bidex_algos.nets.policy import ActorPolicy
 from bidex_algos.nets.precision import autocast
 
 
@@ -50,10 +51,10 @@ class SquashedActor(nn.Module):
     that an output that went there would never return.
 
     Args:
-        observations: Width of the (normalised) observation.
+        inputs: The groups of the (normalised) observation, or its width.
         hidden: Widths of the hidden layers.
         actions: Number of actions.
-        heads: Output layers; with more than one, the last ``heads`` observations are the one-hot that chooses.
+        heads: Output layers; with more than one, the group ``task_id`` is the one-hot that chooses.
         init_std: Standard deviation at the start, before the squashing.
         std_range: Its bounds.
         generator: CPU generator of the initial weights.
@@ -62,7 +63,7 @@ class SquashedActor(nn.Module):
 
     def __init__(
         self,
-        observations: int,
+        inputs: int | Inputs,
         hidden: Sequence[int],
         actions: int,
         heads: int,
@@ -73,9 +74,10 @@ class SquashedActor(nn.Module):
     ):
         super().__init__()
         self.heads = heads
+        self.one_hot = Inputs.of(inputs).columns(*["task_id"] * (heads > 1))
         low, high = (math.log(std) for std in std_range)
         self.middle, self.reach = 0.5 * (low + high), 0.5 * (high - low)
-        self.net = MLP(observations, hidden, heads * 2 * actions, 0.01, generator, activation)
+        self.net = MLP(inputs, hidden, heads * 2 * actions, 0.01, generator, activation)
         with torch.no_grad():
             start = math.atanh((math.log(init_std) - self.middle) / self.reach)
             self.net.head.bias.view(heads, 2, actions)[:, 1] = start
@@ -86,25 +88,15 @@ class SquashedActor(nn.Module):
         if self.heads == 1:
             mean, log_std = out[:, 0].unbind(1)
         else:
-            head = x[:, -self.heads :].argmax(1).view(-1, 1, 1, 1).expand(-1, 1, *out.shape[2:])
+            head = self.one_hot(x).argmax(1).view(-1, 1, 1, 1).expand(-1, 1, *out.shape[2:])
             mean, log_std = out.gather(1, head)[:, 0].unbind(1)
         return mean, self.middle + self.reach * torch.tanh(log_std)
 
 
-class SquashedPolicy(nn.Module):
-    """A squashed actor on raw observations; follows the Agent protocol of evaluation.
+class SquashedPolicy(ActorPolicy):
+    """A squashed actor on raw observations; arguments are those of its base."""
 
-    Args:
-        observations: Normaliser of raw observations.
-        actor: Network on normalised observations.
-        low_precision: Whether hidden layers run in bfloat16.
-    """
-
-    def __init__(self, observations: ObservationNormaliser, actor: SquashedActor, low_precision: bool):
-        super().__init__()
-        self.observations = observations
-        self.actor = actor
-        self.low_precision = low_precision
+    actor: SquashedActor
 
     def sample(self, obs: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Actions (N, a) and their log-densities (N,) for normalised observations (N, d)."""
@@ -119,6 +111,3 @@ class SquashedPolicy(nn.Module):
         with autocast(obs.device, self.low_precision):
             mean, _ = self.actor(self.observations(obs))
         return torch.tanh(mean)
-
-    def reset(self, env_mask: Tensor) -> None:
-        """Nothing to forget between episodes; the argument is part of the Agent protocol."""

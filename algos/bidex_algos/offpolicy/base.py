@@ -56,15 +56,15 @@ class OffPolicy(Learner):
     def __init__(self, world: VectorWorld, config: OffPolicyConfig, seed: int):
         super().__init__(world, config, seed)
         self.low_precision = use_bfloat16(config.autocast, self.device)
-        d, a = self.shape["observations"], self.shape["actions"]
+        judged = self.inputs.extended("action", self.shape.actions)
         heads = world.num_tasks if config.value_heads else 1
-        self.critic = Critics(d + a, heads, config, self.initial, self.num_critics).to(self.device)
+        self.critic = Critics(judged, heads, config, self.initial, self.num_critics).to(self.device)
         self.target_critic = copy.deepcopy(self.critic)
         self.adams = {
             "actor": self._adam(self.policy.actor.parameters(), config.learning_rate),
             "critic": self._adam(self.critic.parameters(), config.critic_learning_rate),
         }
-        self.replay = replay_within(self.name, world, config, d, a)
+        self.replay = replay_within(self.name, world, config, self.shape.observations, self.shape.actions)
         self.batch_per_task = config.batch_per_task or math.ceil(config.batch_size / world.num_tasks)
         self.task_of_draw = torch.arange(world.num_tasks, device=self.device).repeat_interleave(self.batch_per_task)
         # Rewards that have left the replay fade from the statistics too.
@@ -138,7 +138,7 @@ class OffPolicy(Learner):
 
     def _act(self, obs: Tensor) -> Tensor:
         if self.replay.added < self.config.warmup_steps:
-            shape = (len(obs), self.shape["actions"])
+            shape = (len(obs), self.shape.actions)
             return torch.rand(shape, generator=self.generator, device=self.device) * 2.0 - 1.0
         return self._explore(obs)
 

@@ -24,6 +24,8 @@ class OffPolicyConfig:
     """Non-linearity of the hidden layers."""
     policy_heads: bool = False
     """Give the actor an output layer per task; the world must show the task's one-hot."""
+    task_embedding: int = 0
+    """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
     value_heads: bool = True
     """Give each critic one output per task instead of one for all."""
     critic_layer_norm: bool = True
@@ -73,7 +75,7 @@ class OffPolicyConfig:
         at_least(self, 1, "replay_steps", "steps_per_iteration", "updates_per_step", "batch_size")
         if self.batch_per_task is not None:
             at_least(self, 1, "batch_per_task")
-        at_least(self, 0, "warmup_steps")
+        at_least(self, 0, "warmup_steps", "task_embedding")
         if not 0.0 <= self.gamma < 1.0:
             raise BidexError(f"{self.algo}: gamma must lie in [0, 1), got {self.gamma}.")
         between(self, 0.0, 1.0, "tau", "cut_share")

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor, nn
 
+from bidex_algos.nets.encoders.inputs import Inputs
 from bidex_algos.nets.networks import MLP
 from bidex_algos.offpolicy.config import OffPolicyConfig
 
@@ -11,14 +12,16 @@ class Critics(nn.Module):
     """Networks of observation and action, alike but for their initial weights.
 
     Args:
-        inputs: Width of observation and action together.
+        inputs: The groups of observation and action together, or their width.
         heads: Outputs of each network: one per task, or 1 for all.
         config: Layers.
         generator: CPU generator of the initial weights.
         count: How many: 2 against overestimation (Fujimoto et al. 2018), or 1.
     """
 
-    def __init__(self, inputs: int, heads: int, config: OffPolicyConfig, generator: torch.Generator, count: int = 2):
+    def __init__(
+        self, inputs: int | Inputs, heads: int, config: OffPolicyConfig, generator: torch.Generator, count: int = 2
+    ):
         super().__init__()
         self.heads = heads
         self.nets = nn.ModuleList(

@@ -24,6 +24,7 @@ from torch import Tensor, nn
 from bidex_algos.experience.replay import Transitions
 from bidex_algos.nets.normalise import ObservationNormaliser
 from bidex_algos.nets.precision import use_bfloat16
+from bidex_algos.nets.shape import Shape
 from bidex_algos.nets.squashed import SquashedActor, SquashedPolicy
 from bidex_algos.offpolicy.base import OffPolicy
 from bidex_algos.offpolicy.mtsac_config import PRESETS, MTSACConfig
@@ -50,7 +51,7 @@ class MTSAC(OffPolicy):
     def __init__(self, world: VectorWorld, config: MTSACConfig, seed: int):
         super().__init__(world, config, seed)
         self.log_alpha = nn.Parameter(torch.full((world.num_tasks,), math.log(config.init_alpha), device=self.device))
-        self.target_entropy = config.target_entropy_per_action * self.shape["actions"]
+        self.target_entropy = config.target_entropy_per_action * self.shape.actions
         self.adams["alpha"] = self._adam([self.log_alpha], config.alpha_learning_rate)
 
     def _explore(self, obs: Tensor) -> Tensor:
@@ -91,14 +92,13 @@ class MTSAC(OffPolicy):
 
     @classmethod
     def _make_policy(
-        cls, config: MTSACConfig, shape: dict[str, int], init: torch.Generator, device: torch.device
+        cls, config: MTSACConfig, shape: Shape, init: torch.Generator, device: torch.device
     ) -> SquashedPolicy:
-        d, ids, actions = shape["observations"], shape["num_id_columns"], shape["actions"]
-        heads = ids if config.policy_heads else 1
+        inputs, heads = cls._inputs(config, shape), shape.num_id_columns if config.policy_heads else 1
         actor = SquashedActor(
-            d, config.hidden, actions, heads, config.init_std, config.std_range, init, config.activation
+            inputs, config.hidden, shape.actions, heads, config.init_std, config.std_range, init, config.activation
         )
-        observations = ObservationNormaliser(d, ids, config.normalise_observations)
+        observations = ObservationNormaliser(inputs, config.normalise_observations)
         return SquashedPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
 
     def _own_parts(self) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """What can be set about MT-SAC, and its presets; imports no torch, so that a command line can show it at once."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from bidex_algos.checks import positive
@@ -41,56 +41,29 @@ class MTSACConfig(OffPolicyConfig):
             )
 
 
+# What the published settings have in common: log standard deviations from -20 to 2, one step size for all, nothing
+# normalised.
+_PLAIN = MTSACConfig(
+    value_heads=False, critic_layer_norm=False, init_std=1.0, std_range=(2e-9, 7.4), learning_rate=3e-4,
+    critic_learning_rate=3e-4, alpha_learning_rate=3e-4, max_grad_norm=1.0, normalise_observations=False,
+    per_task_rewards=False,
+)  # fmt: skip
+
 PRESETS: dict[str, MTSACConfig] = {
     # Table 43 of the Bi-DexHands appendix (SAC, "other tasks"; it has none for MT-SAC): layers, step size, discount,
     # Polyak 0.99, gradient norm, entropy coefficient 0.2 (here where each temperature starts), reward scale 1, 5000
     # steps of replay, 1 epoch of 4 mini-batches of 32 (here after every vector step, and of each task). From Table 49
     # (SAC on Humanoid) only what Table 43 leaves out: 32 steps, here between two reports. Both are silent on
     # non-linearity, bounds of the standard deviation, target entropy and warm-up, and learn no temperature.
-    "paper": MTSACConfig(
-        hidden=(1024, 1024, 1024),
-        value_heads=False,
-        critic_layer_norm=False,
-        init_std=1.0,
-        std_range=(2e-9, 7.4),
-        replay_steps=5000,
-        warmup_steps=32,
-        steps_per_iteration=32,
-        updates_per_step=4,
-        batch_per_task=32,
-        gamma=0.96,
-        tau=0.01,
-        learning_rate=3e-4,
-        critic_learning_rate=3e-4,
-        alpha_learning_rate=3e-4,
-        init_alpha=0.2,
-        max_grad_norm=1.0,
-        normalise_observations=False,
-        per_task_rewards=False,
+    "paper": replace(
+        _PLAIN, hidden=(1024, 1024, 1024), replay_steps=5000, warmup_steps=32, steps_per_iteration=32,
+        updates_per_step=4, batch_per_task=32, gamma=0.96, tau=0.01, init_alpha=0.2,
     ),
     "laptop": MTSACConfig(),
     # MT-SAC as Meta-World's baselines run it, with one row of each task: 128 transitions of each task in an update, one
-    # update a vector step, log standard deviations from -20 to 2, 100,000 transitions of each task.
-    "metaworld": MTSACConfig(
-        hidden=(400, 400, 400),
-        value_heads=False,
-        critic_layer_norm=False,
-        init_std=1.0,
-        std_range=(2e-9, 7.4),
-        replay_steps=100_000,
-        warmup_steps=4000,
-        steps_per_iteration=500,
-        updates_per_step=1,
-        batch_per_task=128,
-        gamma=0.99,
-        tau=0.005,
-        learning_rate=3e-4,
-        critic_learning_rate=3e-4,
-        alpha_learning_rate=3e-4,
-        adam_eps=1e-5,
-        init_alpha=1.0,
-        max_grad_norm=1.0,
-        normalise_observations=False,
-        per_task_rewards=False,
+    # update a vector step, 100,000 transitions of each task.
+    "metaworld": replace(
+        _PLAIN, hidden=(400, 400, 400), replay_steps=100_000, warmup_steps=4000, steps_per_iteration=500,
+        updates_per_step=1, batch_per_task=128, gamma=0.99, tau=0.005, adam_eps=1e-5, init_alpha=1.0,
     ),
-}
+}  # fmt: skip

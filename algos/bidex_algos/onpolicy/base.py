@@ -24,6 +24,7 @@ from bidex_algos.nets.networks import MLP, GaussianActor, gaussian_log_prob
 from bidex_algos.nets.normalise import ObservationNormaliser, RunningStats
 from bidex_algos.nets.policy import GaussianPolicy
 from bidex_algos.nets.precision import autocast, use_bfloat16
+from bidex_algos.nets.shape import Shape
 from bidex_algos.onpolicy.config import OnPolicyConfig
 from bidex_algos.reports import as_numbers
 from bidex_meta.train.distributed import all_sum, world_size
@@ -74,13 +75,13 @@ class OnPolicy(Learner):
         super().__init__(world, config, seed)
         self.low_precision = self.policy.low_precision
         self.obs: Tensor | None = None
-        d, a = self.shape["observations"], self.shape["actions"]
         value_heads = world.num_tasks if config.value_heads else 1
-        self.critic = MLP(d, config.hidden, value_heads, 1.0, self.initial, config.activation).to(self.device)
+        self.critic = MLP(self.inputs, config.hidden, value_heads, 1.0, self.initial, config.activation).to(self.device)
         samples = config.rollout_steps * world.num_envs
         horizon = config.value_horizon * samples * world_size() / world.num_tasks
         self.return_stats = RunningStats((world.num_tasks,), max_count=horizon).to(self.device)
-        self.rollout = Rollout(config.rollout_steps, world.num_envs, d, a, self.device)
+        sizes = self.shape.observations, self.shape.actions
+        self.rollout = Rollout(config.rollout_steps, world.num_envs, *sizes, self.device)
         self.episodes = EpisodeStatistics(world.task_id, world.task_names)
 
     # What a learner adds.
@@ -178,12 +179,11 @@ class OnPolicy(Learner):
 
     @classmethod
     def _make_policy(
-        cls, config: OnPolicyConfig, shape: dict[str, int], init: torch.Generator, device: torch.device
+        cls, config: OnPolicyConfig, shape: Shape, init: torch.Generator, device: torch.device
     ) -> GaussianPolicy:
-        d, ids = shape["observations"], shape["num_id_columns"]
-        heads = ids if config.policy_heads else 1
-        actor = GaussianActor(d, config.hidden, shape["actions"], config.init_std, init, config.activation, heads)
-        observations = ObservationNormaliser(d, ids, config.normalise_observations)
+        inputs, heads = cls._inputs(config, shape), shape.num_id_columns if config.policy_heads else 1
+        actor = GaussianActor(inputs, config.hidden, shape.actions, config.init_std, init, config.activation, heads)
+        observations = ObservationNormaliser(inputs, config.normalise_observations)
         return GaussianPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
 
     def _parts(self) -> dict[str, Any]:

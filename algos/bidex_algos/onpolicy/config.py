@@ -1,7 +1,7 @@
 """What can be set about every on-policy learner; imports no torch, so that a command line can show it at once."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from bidex_algos.checks import at_least, between, positive, rising
 from bidex_algos.choices import Activation, Autocast
@@ -23,6 +23,8 @@ class OnPolicyConfig:
     policy_heads: bool = False
     """Give the actor an output layer and standard deviations per task instead of one for all; for MT suites, whose
     observations show the task."""
+    task_embedding: int = 0
+    """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
     init_std: float = 0.8
     """Standard deviation of the actions at the start."""
     std_range: tuple[float, float] = (0.05, 1.5)
@@ -51,6 +53,21 @@ class OnPolicyConfig:
             BidexError: A field is out of its range.
         """
         at_least(self, 1, "rollout_steps")
+        at_least(self, 0, "task_embedding")
         between(self, 0.0, 1.0, "gamma", "lam")
         rising(self, "std_range")
         positive(self, "init_std", "value_horizon")
+
+
+TABLE_47: dict[str, Any] = {
+    "hidden": (2048, 1024, 512),
+    "value_heads": False,
+    "init_std": 0.8,
+    "rollout_steps": 8,
+    "num_minibatches": 4,
+    "gamma": 0.96,
+    "lam": 0.95,
+    "max_grad_norm": 1.0,
+    "normalise_observations": False,
+}
+"""Networks, rollouts and returns of MT-PPO in the Bi-DexHands appendix."""

@@ -3,32 +3,17 @@
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from bidex_algos.checks import at_least, positive, rising
-from bidex_algos.onpolicy.config import OnPolicyConfig
+from bidex_algos.checks import positive
+from bidex_algos.onpolicy.config import TABLE_47, OnPolicyConfig
+from bidex_algos.onpolicy.ppo_config import PPOConfig
 
 
 @dataclass(frozen=True)
-class MTPPOConfig(OnPolicyConfig):
+class MTPPOConfig(PPOConfig, OnPolicyConfig):
     """Everything that can be set about MT-PPO; the defaults are the preset ``laptop``."""
 
     algo: ClassVar[str] = "mtppo"
 
-    num_minibatches: int = 4
-    """Mini-batches per epoch; each holds shuffled steps of all rows."""
-    epochs: int = 4
-    """Passes over the rollout per update."""
-    clip: float = 0.2
-    """How far the likelihood ratio may leave 1 before it earns nothing more."""
-    learning_rate: float = 3e-4
-    """Adam's step size at the start."""
-    adaptive_learning_rate: bool = True
-    """Divide the step size by 1.5 when the KL exceeds twice desired_kl, multiply it when below half."""
-    desired_kl: float = 0.03
-    """KL of the sampling policy from the current one that the adaptive step size aims at."""
-    learning_rate_range: tuple[float, float] = (1e-5, 1e-2)
-    """Bounds of the adaptive step size."""
-    critic_learning_rate: float | None = 1e-3
-    """A fixed step size for the critic; None makes it follow the actor's."""
     value_loss_weight: float = 2.0
     """Factor of the value loss. Adam undoes it; it matters only beside max_grad_norm."""
     entropy_weight: float = 0.0
@@ -47,47 +32,22 @@ class MTPPOConfig(OnPolicyConfig):
             BidexError: A field is out of its range.
         """
         super().__post_init__()
-        at_least(self, 1, "num_minibatches", "epochs")
-        rising(self, "learning_rate_range")
-        positive(self, "learning_rate", "desired_kl", "clip", "max_grad_norm")
+        self._check_ppo()
+        positive(self, "max_grad_norm")
 
 
 PRESETS: dict[str, MTPPOConfig] = {
     # Table 47 of the Bi-DexHands appendix; the value loss weight is their loader's default.
     "paper": MTPPOConfig(
-        hidden=(2048, 1024, 512),
-        value_heads=False,
-        init_std=0.8,
-        rollout_steps=8,
-        num_minibatches=4,
-        epochs=5,
-        clip=0.2,
-        gamma=0.96,
-        lam=0.95,
-        learning_rate=3e-4,
-        desired_kl=0.016,
-        critic_learning_rate=None,
-        value_loss_weight=2.0,
-        entropy_weight=0.0,
-        max_grad_norm=1.0,
-        normalise_observations=False,
+        **TABLE_47, epochs=5, clip=0.2, learning_rate=3e-4, desired_kl=0.016, critic_learning_rate=None,
+        value_loss_weight=2.0, entropy_weight=0.0,
     ),
     "laptop": MTPPOConfig(),
     # Meta-World's multi-task suites: discount, trace and clip are those of the MTPPO that its authors publish
     # (metaworld-algorithms). A rollout is 100 steps instead of their 10,000 and the networks are small: on MT3 one of
     # 250 steps (ELU, 8 mini-batches) had learned less after 150 k steps: 24 against 42 % in training, one seed each.
     "metaworld": MTPPOConfig(
-        hidden=(256, 256, 128),
-        activation="tanh",
-        init_std=0.8,
-        rollout_steps=100,
-        num_minibatches=4,
-        epochs=5,
-        clip=0.2,
-        gamma=0.99,
-        lam=0.97,
-        learning_rate=5e-4,
-        desired_kl=0.02,
-        std_range=(0.1, 1.5),
+        hidden=(256, 256, 128), activation="tanh", init_std=0.8, rollout_steps=100, num_minibatches=4, epochs=5,
+        clip=0.2, gamma=0.99, lam=0.97, learning_rate=5e-4, desired_kl=0.02, std_range=(0.1, 1.5),
     ),
-}
+}  # fmt: skip

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.gradients.trust_region import line_search, natural_step
+from bidex_algos.gradients.trust_region import trust_region_step
 from bidex_algos.nets.networks import gaussian_kl, gaussian_log_prob
 from bidex_algos.nets.precision import autocast
 from bidex_algos.onpolicy.base import Batch, OnPolicy
@@ -30,6 +30,9 @@ class MTTRPO(OnPolicy):
     """Multi-task TRPO on a batched world.
 
     Arguments and attributes are those of :class:`~bidex_algos.onpolicy.base.OnPolicy`.
+
+    Attributes:
+        critic_adam: Moves the critic; the actor has no optimiser.
     """
 
     name, remedy = "mttrpo", "lower max_kl or critic_learning_rate"
@@ -54,15 +57,7 @@ class MTTRPO(OnPolicy):
         parameters = list(actor.parameters())
         old_log_std = actor.log_std_of(batch.obs).detach().clone()
         weight = batch.weights / all_sum(batch.weights.sum()).clamp_min(1.0)
-
-        step, promised = natural_step(
-            self._surrogate_and_kl(batch, weight, old_log_std)[0],
-            self._kl_from_itself(batch),
-            parameters,
-            max_kl=cfg.max_kl,
-            damping=cfg.damping,
-            iterations=cfg.cg_iterations,
-        )
+        objective, _ = self._surrogate_and_kl(batch, weight, old_log_std)
 
         @torch.no_grad()
         def measure() -> tuple[float, float]:
@@ -72,19 +67,10 @@ class MTTRPO(OnPolicy):
             objective, kl = all_sum(numbers).tolist()
             return objective, kl
 
-        share = line_search(
-            parameters,
-            step,
-            measure,
-            expected=promised,
-            max_kl=cfg.max_kl,
-            accept_ratio=cfg.accept_ratio,
-            factor=cfg.backtrack_factor,
-            tries=cfg.backtracks,
+        stepped = trust_region_step(
+            parameters, objective, self._kl_from_itself(batch), measure, cfg, accept_ratio=cfg.accept_ratio
         )
-        objective, kl = measure()
-        found = {"Loss/surrogate": -objective, "Policy/kl": kl, "Policy/step_share": share}
-        return {name: torch.tensor(value, device=self.device) for name, value in found.items()}
+        return stepped.told("Policy/kl", self.device)
 
     def _surrogate_and_kl(self, batch: Batch, weight: Tensor, old_log_std: Tensor) -> tuple[Tensor, Tensor]:
         """This process's part of the surrogate objective and of the KL from the sampling policy, scalars."""
