@@ -30,6 +30,7 @@ ALGOS: dict[str, str] = {
     "mtppo": "bidex_algos.onpolicy.mtppo:MTPPO",
     "mttrpo": "bidex_algos.onpolicy.mttrpo:MTTRPO",
     "mtsac": "bidex_algos.offpolicy.mtsac:MTSAC",
+    "mttd3": "bidex_algos.offpolicy.td3:TD3",
     "promp": "bidex_algos.meta.promp:ProMP",
     "maml": "bidex_algos.meta.maml:MAML",
     "rl2": "bidex_algos.meta.rl2:RL2",
@@ -37,6 +38,8 @@ ALGOS: dict[str, str] = {
     "ppo": "bidex_algos.onpolicy.mtppo:MTPPO",
     "trpo": "bidex_algos.onpolicy.mttrpo:MTTRPO",
     "sac": "bidex_algos.offpolicy.mtsac:MTSAC",
+    "ddpg": "bidex_algos.offpolicy.ddpg:DDPG",
+    "td3": "bidex_algos.offpolicy.td3:TD3",
 }
 
 _NEEDED = ("iterate", "state_dict", "load_state_dict", "policy_state_dict", "load_policy", "per_process")

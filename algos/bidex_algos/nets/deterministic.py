@@ -1,0 +1,64 @@
+"""An actor without a distribution, and its agent (Silver et al. 2014)."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from bidex_algos.choices import Activation
+from bidex_algos.nets.encoders.inputs import Inputs
+from bidex_algos.nets.networks import MLP
+from bidex_algos.nets.policy import ActorPolicy
+from bidex_algos.nets.precision import autocast
+
+
+class DeterministicActor(nn.Module):
+    """One action for each observation, squashed by tanh.
+
+    Args:
+        inputs: The groups of the (normalised) observation, or its width.
+        hidden: Widths of the hidden layers.
+        actions: Number of actions.
+        heads: Output layers; with more than one, the group ``task_id`` is the one-hot that chooses.
+        generator: CPU generator of the initial weights.
+        activation: Name of the non-linearity.
+    """
+
+    def __init__(
+        self,
+        inputs: int | Inputs,
+        hidden: Sequence[int],
+        actions: int,
+        heads: int,
+        generator: torch.Generator,
+        activation: Activation,
+    ):
+        super().__init__()
+        self.heads = heads
+        self.one_hot = Inputs.of(inputs).columns(*["task_id"] * (heads > 1))
+        self.net = MLP(inputs, hidden, heads * actions, 0.01, generator, activation)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Actions of normalised observations (batch, d): float32 (batch, a) in [-1, 1]."""
+        out = self.net(x)
+        if self.heads > 1:
+            head = self.one_hot(x).argmax(1).view(-1, 1, 1)
+            out = out.unflatten(1, (self.heads, -1))
+            out = out.gather(1, head.expand(-1, 1, out.shape[2]))[:, 0]
+        return torch.tanh(out)
+
+
+class DeterministicPolicy(ActorPolicy):
+    """A deterministic actor on raw observations; arguments are those of its base."""
+
+    actor: DeterministicActor
+
+    def act(self, obs: Tensor) -> Tensor:
+        """Actions (N, a) for normalised observations (N, d), with their slopes."""
+        with autocast(obs.device, self.low_precision):
+            return self.actor(obs)
+
+    @torch.no_grad()
+    def eval_action(self, obs: Tensor) -> Tensor:
+        """The action for raw observations (N, d): (N, a) in [-1, 1]."""
+        return self.act(self.observations(obs))

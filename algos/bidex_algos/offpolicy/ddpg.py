@@ -1,0 +1,124 @@
+"""DDPG: a deterministic actor that climbs its critic (Lillicrap et al. 2016; Bi-DexHands' appendix B.1.3), on all tasks.
+
+For each vector step of the world::
+
+    a = mu(s) + noise                            one step in every row; into the replay
+    y = r + gamma (1 - terminated) Q'(s', mu'(s'))
+    Q   towards y                                on equally many transitions of each task
+    mu  up on Q(s, mu(s))
+    Q', mu'  a small step towards Q, mu
+
+The noise is normal and without memory. Its size differs from row to row of a task, so that some rows show what the
+policy does and others what lies far from it (the spread of Horgan et al. 2018); two equal numbers give the original.
+"""
+
+import copy
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bidex_algos.experience.replay import Transitions
+from bidex_algos.nets.deterministic import DeterministicActor, DeterministicPolicy
+from bidex_algos.nets.normalise import ObservationNormaliser
+from bidex_algos.nets.precision import autocast, use_bfloat16
+from bidex_algos.nets.shape import Shape
+from bidex_algos.offpolicy.base import OffPolicy
+from bidex_algos.offpolicy.ddpg_config import PRESETS, DDPGConfig
+from bidex_meta.world.contract import VectorWorld
+
+__all__ = ["DDPG", "PRESETS", "DDPGConfig"]
+
+
+class DDPG(OffPolicy):
+    """Multi-task DDPG on a batched world.
+
+    Arguments and errors are those of :class:`~bidex_algos.offpolicy.base.OffPolicy`, so are the attributes.
+
+    Attributes:
+        target_actor: Follows the actor.
+        noise_std: Of each row (N, 1).
+    """
+
+    name, remedy = "ddpg", "lower critic_learning_rate"
+    config_type = DDPGConfig
+    config: DDPGConfig
+    policy: DeterministicPolicy
+    num_critics = 1
+
+    def __init__(self, world: VectorWorld, config: DDPGConfig, seed: int):
+        super().__init__(world, config, seed)
+        self.target_actor = copy.deepcopy(self.policy.actor)
+        self.noise_std = spread(*config.exploration_std, world.task_id, world.num_tasks)[:, None]
+        self.actor_loss = torch.zeros((), device=self.device)
+
+    def _explore(self, obs: Tensor) -> Tensor:
+        action = self.policy.eval_action(obs)
+        return (action + self.noise_std * self._normal(action)).clamp(-1.0, 1.0)
+
+    def _normal(self, like: Tensor) -> Tensor:
+        return torch.randn(like.shape, generator=self.generator, device=self.device)
+
+    def _update(self, draw: Transitions, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
+        """One update of the critic and, when it is due, of the actor and the targets."""
+        obs, next_obs = self.policy.observations(draw.obs), self.policy.observations(draw.next_obs)
+        told = self._fit_critics(obs, draw, self._target(draw, next_obs), weights, counts)
+        if self._actor_is_due():
+            self._policy_step(obs, weights, counts)
+            self._follow(self.target_actor, self.policy.actor)
+            self._follow(self.target_critic, self.critic)
+        return told
+
+    def _actor_is_due(self) -> bool:
+        """Whether the actor learns in this update."""
+        return True
+
+    @torch.no_grad()
+    def _target(self, draw: Transitions, next_obs: Tensor) -> Tensor:
+        """What the critics shall say of the drawn transitions (B,); ``next_obs`` are normalised."""
+        following = self._values(self.target_critic, next_obs, self._target_action(next_obs))
+        return self._bootstrapped(draw, following.amin(0))
+
+    def _target_action(self, next_obs: Tensor) -> Tensor:
+        """What the target actor does (B, a) with normalised observations (B, d)."""
+        with autocast(self.device, self.low_precision):
+            return self.target_actor(next_obs)
+
+    def _policy_step(self, obs: Tensor, weights: Tensor, counts: Tensor) -> None:
+        """One step of the actor up the first critic, on normalised observations (B, d)."""
+        value = self._values(self.critic, obs, self.policy.act(obs))[0]
+        loss = -(weights / counts.sum().clamp_min(1.0) * value).sum()
+        actor = list(self.policy.actor.parameters())
+        self.actor_loss = self._descend(loss, loss.detach()[None], "actor", actor=actor)[0]
+
+    def _told(self) -> dict[str, Tensor]:
+        return {"Loss/actor": self.actor_loss}
+
+    @classmethod
+    def _make_policy(
+        cls, config: DDPGConfig, shape: Shape, init: torch.Generator, device: torch.device
+    ) -> DeterministicPolicy:
+        inputs, heads = cls._inputs(config, shape), shape.num_id_columns if config.policy_heads else 1
+        actor = DeterministicActor(inputs, config.hidden, shape.actions, heads, init, config.activation)
+        observations = ObservationNormaliser(inputs, config.normalise_observations)
+        return DeterministicPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
+
+    def _own_parts(self) -> dict[str, Any]:
+        return {"target_actor": self.target_actor, "actor_loss": self.actor_loss}
+
+
+def spread(low: float, high: float, task_id: Tensor, num_tasks: int) -> Tensor:
+    """Numbers (N,) that go evenly from ``low`` in the first row of each task to ``high`` in its last.
+
+    Args:
+        low: The least.
+        high: The greatest; of a task with one row the only one.
+        task_id: Task of each row, int64 (N,).
+        num_tasks: How many tasks there are.
+    """
+    numbers = torch.empty(len(task_id), device=task_id.device)
+    for task in range(num_tasks):
+        rows = (task_id == task).nonzero().squeeze(1)
+        share = torch.linspace(0.0, 1.0, len(rows)) if len(rows) > 1 else torch.ones(len(rows))
+        numbers[rows] = (low + (high - low) * share).to(task_id.device)
+    return numbers
