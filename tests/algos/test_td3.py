@@ -1,4 +1,4 @@
-"""DDPG and TD3: problems with a known optimum, one target and its delay by hand, resume; with them the off-policy base."""
+"""DDPG and TD3, and with them the off-policy base: known optima, a target and the delay by hand, resume."""
 
 import copy
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""DDPG: a deterministic actor that climbs its critic (Lillicrap et al. 2016; Bi-DexHands' appendix B.1.3), on all tasks.
+"""DDPG: a deterministic actor that climbs its critic (Lillicrap et al. 2016; appendix B.1.3), on all tasks of a world.
 
 For each vector step of the world::
 

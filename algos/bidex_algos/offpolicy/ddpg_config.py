@@ -33,9 +33,10 @@ class DDPGConfig(OffPolicyConfig):
 def of_paper() -> dict[str, Any]:
     """What DDPG and TD3 share of the preset ``paper``, by field.
 
-    The Bi-DexHands appendix describes both (B.1.3, B.1.4) and has no table for either. Table 43 (SAC, "other tasks") has
-    layers, step size, discount, Polyak 0.99, gradient norm, 5000 steps of replay and 1 epoch of 4 mini-batches of 32 (of each task); Table
-    49 32 steps between two reports. The noise of 0.1 is Fujimoto et al.'s (2018, section 6.1).
+    The Bi-DexHands appendix describes both (B.1.3, B.1.4) and has no table for either. Table 43 (SAC, "other tasks")
+    has layers, step size, discount, Polyak 0.99, gradient norm, 5000 steps of replay and 1 epoch of 4 mini-batches of
+    32 (here of each task); Table 49 32 steps between two reports. The noise of 0.1 is Fujimoto et al.'s (2018, section
+    6.1).
     """
     return {
         "hidden": (1024, 1024, 1024),
