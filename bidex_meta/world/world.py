@@ -30,7 +30,7 @@ from bidex_meta.world.overlap import SideBySide
 from bidex_meta.world.part import Part
 from bidex_meta.world.random import row_keys
 from bidex_meta.world.recording import Recorder, Work, cuda_graph, fresh
-from bidex_meta.world.rendering import render_row
+from bidex_meta.world.rendering import Painter
 from bidex_meta.world.spaces import make_spaces
 from bidex_meta.world.starts import Starts
 from bidex_meta.world.threads import one_torch_thread
@@ -120,6 +120,7 @@ class World(RowAttributes, VectorEnv):
         self._action = torch.zeros(num_envs, self.action_size, device=self.device)
         self._obs = torch.zeros(num_envs, self.observation_size, device=self.device)
         self._ready = False
+        self._painter = Painter()
         self._seed_rows(seed)
 
     def _of_rows(self, of_slots: Sequence[float]) -> Tensor:
@@ -381,7 +382,7 @@ class World(RowAttributes, VectorEnv):
 
     def render(self, row: int = 0, width: int = 640, height: int = 480, camera: str | None = None) -> np.ndarray:
         """A picture of a row with its goal, shape (height, width, 3), uint8."""
-        return render_row(self, row, width, height, camera)
+        return self._painter.picture(self, row, width, height, camera)
 
     @property
     def pools(self) -> list[np.ndarray]:
@@ -389,4 +390,5 @@ class World(RowAttributes, VectorEnv):
         return [slot.tasks for slot in self.slots]
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Nothing is held outside memory."""
+        """Frees what pictures were drawn with."""
+        self._painter.close()
