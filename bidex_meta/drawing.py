@@ -49,7 +49,7 @@ def prepare() -> None:
     """
     if _impossible is not None:
         raise BidexError(
-            f"{_VARIABLE}={_impossible} cannot be used here: expected {', '.join(_LIBRARIES)} or glfw, and its library. "
+            f"{_VARIABLE}={_impossible} cannot be used here: expected egl, osmesa or glfw, and its library. "
             "Unset it to take what there is, or install it (Debian, Ubuntu: apt-get install libegl1 libosmesa6)."
         )
     from mujoco.rendering.classic import gl_context
