@@ -7,8 +7,8 @@
         versions.json   Python, packages, machine, git commit
         metrics.jsonl   one line a log call: {"step": ..., "time": ..., "Train/mean_return": ...}
         events.out...   the same for TensorBoard
-        checkpoints/    step_<N>.pt (the last few) and last.pt
-        videos/
+        checkpoints/    step_<N>.pt (the last few), last.pt, best.pt
+        videos/         <name>_<N>.mp4
 """
 
 import json
