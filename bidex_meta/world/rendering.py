@@ -20,7 +20,11 @@ _MOST_RENDERERS = 32
 """A tiled film of all classes fits; each takes some megabytes."""
 _SMALL = 320
 """Up to this width, pixels, pictures are tiles, drawn faster: without reflections and with coarser shadows."""
-_GHOST = np.array((0.25, 0.75, 0.40, 0.35), dtype=np.float32)
+GHOST = np.array((0.25, 0.75, 0.40, 0.35), dtype=np.float32)
+"""Colour of goals."""
+
+Ghost = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""A goal: position (3,), quaternion (w, x, y, z), semi-axes (3,), world, metres."""
 
 
 class Painter:
@@ -47,11 +51,10 @@ class Painter:
             raise BidexError(f"Expected a camera among {', '.join(CAMERAS)}, got {name!r}.")
         if not 0 <= row < world.num_envs:
             raise BidexError(f"Expected a row from 0 to {world.num_envs - 1}, got {row}.")
-        part = next(p for p in world.parts if bool((p.group.rows == row).any()))
-        engine_row = int((part.group.rows == row).nonzero()[0])
-        renderer = self._renderer(part.group.engine, engine_row, (int(world.task_id[row]), width, height))
-        renderer.update_scene(part.group.engine.data(engine_row), _camera(world, row, name))
-        _add_ghosts(world, row, renderer.scene)
+        engine, engine_row = simulation(world, row)
+        renderer = self._renderer(engine, engine_row, (int(world.task_id[row]), width, height))
+        renderer.update_scene(engine.data(engine_row), _camera(world, row, name))
+        add_ghosts(ghosts(world, row), renderer.scene)
         return renderer.render()
 
     def _renderer(self, engine: "Engine", row: int, key: tuple[int, int, int]) -> mujoco.Renderer:
@@ -87,15 +90,26 @@ def _camera(world: "World", row: int, name: str) -> mujoco.MjvCamera:
     return view
 
 
-def _add_ghosts(world: "World", row: int, scene: mujoco.MjvScene) -> None:
+def simulation(world: "World", row: int) -> "tuple[Engine, int]":
+    """The engine that carries a row, and its row there."""
+    part = next(p for p in world.parts if bool((p.group.rows == row).any()))
+    return part.group.engine, int((part.group.rows == row).nonzero()[0])
+
+
+def ghosts(world: "World", row: int) -> list[Ghost]:
+    """The goals of a row's task."""
     slot = int(world.task_id[row])
     task = world.slots[slot].task_class
     variation = torch.as_tensor(world.slots[slot].tasks[int(world.task_index[row])])[None]
-    for pose, size in task.ghosts(task.freeze(variation)):
-        rotation = np.zeros(9)
-        mujoco.mju_quat2Mat(rotation, wxyz(pose[0, 3:]).numpy())
+    found = task.ghosts(task.freeze(variation))
+    return [(pose[0, :3].numpy(), wxyz(pose[0, 3:]).numpy(), np.array(size)) for pose, size in found]
+
+
+def add_ghosts(goals: list[Ghost], scene: mujoco.MjvScene) -> None:
+    """Puts goals into a scene that is about to be drawn, translucent."""
+    rotation = np.zeros(9)
+    for position, quaternion, size in goals:
+        mujoco.mju_quat2Mat(rotation, quaternion)
         geom = scene.geoms[scene.ngeom]
-        mujoco.mjv_initGeom(
-            geom, mujoco.mjtGeom.mjGEOM_ELLIPSOID, np.array(size), pose[0, :3].numpy(), rotation, _GHOST
-        )
+        mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_ELLIPSOID, size, position, rotation, GHOST)
         scene.ngeom += 1
