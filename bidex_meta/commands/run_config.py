@@ -14,7 +14,7 @@ from typing import Any, Literal
 from bidex_meta.commands.learners import LearnerKind, choose_preset, learner_kind, resolve_device
 from bidex_meta.commands.parsing import StepCount, Switch, parse, peek
 from bidex_meta.errors import BidexError
-from bidex_meta.record.folder import RunFolder
+from bidex_meta.record.folder import RunFolder, flat
 from bidex_meta.sources import Source
 from bidex_meta.train.launch import launch, resume_command
 
@@ -209,7 +209,7 @@ def _stored_learner(config_class: Any, stored: dict[str, Any], folder: RunFolder
 
 
 def _refuse_changes(stored: dict[str, Any], config: dict[str, Any], folder: RunFolder) -> None:
-    before, after = _flat({"processes": 1, **stored}), _flat(config)
+    before, after = flat({"processes": 1, **stored}), flat(config)
     if before["processes"] != after["processes"]:
         raise BidexError(
             f"{folder.path} has worlds of {before['processes']} process(es), not {after['processes']}. "
@@ -222,10 +222,3 @@ def _refuse_changes(stored: dict[str, Any], config: dict[str, Any], folder: RunF
                 f"{flag} is {before.get(name)} in {folder.path}, not {after.get(name)}: "
                 f"a resumed run keeps its config. Leave {flag} out, or start a new run."
             )
-
-
-def _flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in config.items():
-        flat.update(_flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value})
-    return flat

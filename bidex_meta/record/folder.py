@@ -114,6 +114,14 @@ class RunFolder:
         write_json(self.config_path, config)
 
 
+def flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """A config without nesting: ``{"learner": {"gamma": 0.9}}`` becomes ``{"learner.gamma": 0.9}``."""
+    found: dict[str, Any] = {}
+    for name, value in config.items():
+        found.update(flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value})
+    return found
+
+
 def _new_folder(config: dict[str, Any], root: Path) -> Path:
     subject = Path(str(config.get("suite") or config.get("task"))).stem  # a suite may be a path to a TOML file
     now = datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S")

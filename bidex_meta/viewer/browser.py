@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 
 from bidex_meta.errors import BidexError
-from bidex_meta.viewer.shapes import colour, shape, visible
 from bidex_meta.viewer.playback import Stage
+from bidex_meta.viewer.shapes import colour, shape, visible
 from bidex_meta.world.rendering import CAMERAS, GHOST
 
 
