@@ -24,7 +24,8 @@ COMMANDS: dict[str, Command] = {
     "witness": Command("bidex_meta.commands.witness", "find or replay actions that solve a task"),
     "baseline": Command("bidex_meta.commands.baseline", "measure the references of the normalised score"),
     "gallery": Command("bidex_meta.commands.gallery", "write the page that shows every task"),
-    "plot": Command("bidex_meta.commands.plot", "learning curves of a run, as a picture"),
+    "plot": Command("bidex_meta.commands.plot", "learning curves of runs, as a picture"),
+    "report": Command("bidex_meta.commands.report", "runs as one HTML page: tables, curves, films"),
     "completion": Command("bidex_meta.commands.completion", "a script that completes commands and flags in a shell"),
     "bench": Command("bidex_meta.commands.bench", "measure speed, scaling or stability of the world"),
 }

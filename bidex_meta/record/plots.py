@@ -180,12 +180,22 @@ def _draw_shots(axis: Any, rows: list[dict[str, Any]], measure: str, colour: str
         axis.set_xlabel("shots")
 
 
+def missing() -> str | None:
+    """What to install where nothing can be drawn; None where it can."""
+    try:
+        import matplotlib.figure  # noqa: F401
+    except ImportError:
+        return "Plots need matplotlib: pip install 'bidex-meta[plot]'."
+    return None
+
+
 def _figure() -> Any:
     """Matplotlib's class of figures, without its global state."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise BidexError("Plots need matplotlib: pip install 'bidex-meta[plot]'.") from None
+    told = missing()
+    if told is not None:
+        raise BidexError(told)
+    from matplotlib.figure import Figure
+
     return Figure
 
 
