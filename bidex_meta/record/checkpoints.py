@@ -86,7 +86,7 @@ class Checkpoints:
         content = _read(path, "name another")
         if content is None:
             raise BidexError(f"{path} is no checkpoint that can be read. Name another.")
-        return content["state"], int(content["step"])
+        return content["state"], content["step"]
 
     def newest_step(self) -> int | None:
         """Environment steps of the newest checkpoint, by the names of the files; None where there is none yet."""
@@ -106,7 +106,7 @@ class Checkpoints:
         for path in candidates:
             loaded = _read(path)
             if loaded is not None:
-                return loaded["state"], int(loaded["step"])
+                return loaded["state"], loaded["step"]
         if candidates:
             raise BidexError(
                 f"None of the {len(candidates)} checkpoints in {self.folder} can be read. Start a new run."
@@ -125,8 +125,7 @@ def _read(path: Path, then: str = "trying an older one") -> dict[str, Any] | Non
     try:
         # weights_only: a checkpoint from somebody else must not be able to run code.
         content = torch.load(path, map_location="cpu", weights_only=True)
-        int(content["step"]), content["state"]
-        return content
+        return {**content, "state": content["state"], "step": int(content["step"])}
     except Exception as error:  # torch raises a dozen kinds for a damaged file; each means "try the one before"
         reason = (str(error).splitlines() or [""])[0][:100]
         print(

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -60,7 +61,7 @@ def write_animation(path: Path, frames: Iterable[np.ndarray], fps: float, qualit
 
     path.parent.mkdir(parents=True, exist_ok=True)
     pictures = (Image.fromarray(frame) for frame in frames)
-    options = {"duration": round(1000 / fps), "loop": 0, "quality": quality, "method": 6}
+    options: dict[str, Any] = {"duration": round(1000 / fps), "loop": 0, "quality": quality, "method": 6}
     next(pictures).save(path, save_all=True, append_images=pictures, **options)
 
 

@@ -3,6 +3,7 @@
 import json
 import uuid
 from collections.abc import Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -82,7 +83,7 @@ class TensorBoardWriter:
 
     def film(self, tag: str, path: Path, frames: Sequence[np.ndarray], fps: float, step: int) -> None:
         """An animated GIF under the tab Images, which is how TensorBoard shows films."""
-        from tensorboard.compat.proto.summary_pb2 import Summary
+        from tensorboard.compat.proto.summary_pb2 import Summary  # type: ignore[attr-defined]
 
         height, width, _ = frames[0].shape
         picture = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=_gif(frames, fps))
@@ -165,10 +166,9 @@ LOGGERS = {"tensorboard": TensorBoardWriter, "wandb": WandbWriter, "none": NoWri
 
 def _wandb() -> Any:
     try:
-        import wandb
+        return import_module("wandb")
     except ImportError:
         raise BidexError("--logger wandb needs wandb: pip install 'bidex-meta[wandb]'. Or use tensorboard.") from None
-    return wandb
 
 
 def _gif(frames: Sequence[np.ndarray], fps: float) -> bytes:

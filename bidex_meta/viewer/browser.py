@@ -1,5 +1,6 @@
 """The same in the browser, by viser: for machines without a screen. Needs the extra ``viewer``."""
 
+from importlib import import_module
 from typing import Any
 
 import mujoco
@@ -27,7 +28,7 @@ class Browser:
             BidexError: viser is missing.
         """
         try:
-            import viser
+            viser = import_module("viser")
         except ImportError:
             raise BidexError(
                 "The view in the browser needs viser: pip install 'bidex-meta[viewer]'. Or film it: bidex-meta render."

@@ -1,5 +1,7 @@
 """Geoms of a model as triangles, for viewers that know no primitives of MuJoCo's."""
 
+from importlib import import_module
+
 import mujoco
 import numpy as np
 
@@ -28,8 +30,7 @@ def colour(model: mujoco.MjModel, geom: int) -> tuple[float, float, float, float
 
 def shape(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
     """Points (n, 3), metres, in the geom's frame, and triangles (m, 3) of a geom."""
-    import trimesh.creation as make
-
+    make = import_module("trimesh.creation")  # of viser's packages
     kind, size = model.geom_type[geom], model.geom_size[geom]
     if kind == _TYPE.mjGEOM_MESH:
         mesh = int(model.geom_dataid[geom])
