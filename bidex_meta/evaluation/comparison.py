@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,8 @@ class Group:
     """Environment steps of a seed, over all its runs."""
     hours: float
     """Mean time of a seed's training, over all its runs, without evaluation."""
+    paths: list[Path]
+    """Its run folders."""
 
 
 @dataclass(frozen=True)
@@ -204,4 +207,5 @@ def _group(label: str, members: list[dict[str, Any]]) -> Group:
         scores=None if np.isnan(scores).any() else scores,
         steps=rows[seeds[0]]["steps"],
         hours=float(np.mean([rows[seed]["seconds"] for seed in seeds])) / 3600.0,
+        paths=[run["path"] for run in members],
     )

@@ -2,6 +2,7 @@
 
 import io
 import json
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -106,7 +107,7 @@ def draw_comparison(panels: Mapping[str, Sequence[Bar]]) -> Any:
             colour = f"C{place % 10}"
             axis.plot([low, high], [place, place], linewidth=2.5, alpha=0.5, color=colour)
             axis.plot([value], [place], marker="o", color=colour)
-        axis.set_yticks(range(len(bars)), [_plain(label) for label, _, _ in bars])
+        axis.set_yticks(range(len(bars)), ["\n".join(textwrap.wrap(_plain(label), 40)) for label, _, _ in bars])
         axis.set_ylim(len(bars) - 0.5, -0.5)
         axis.set_title(title)
         axis.grid(alpha=0.3, axis="x")
@@ -240,7 +241,11 @@ def _add_legend(figure: Any, labels: Sequence[str]) -> None:
     from matplotlib.lines import Line2D
 
     lines = [Line2D([], [], color=f"C{number % 10}") for number in range(len(labels))]
-    figure.legend(lines, [_plain(label) for label in labels], loc="outside upper left", ncols=2, frameon=False)
+    inches = figure.get_size_inches()[0]
+    words = ["\n".join(textwrap.wrap(_plain(label), max(20, int(12 * inches)))) for label in labels]
+    longest = max(map(len, labels))
+    columns = max(1, min(len(labels), int(12 * inches) // (longest + 6)))
+    figure.legend(lines, words, loc="outside upper left", ncols=columns, frameon=False)
 
 
 def _plain(name: str) -> str:

@@ -7,6 +7,7 @@ extra ``plot``.
 import base64
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -33,16 +34,19 @@ def render(folders: Sequence[RunFolder]) -> str:
     except ImportError:
         raise BidexError("Reports need jinja2 and matplotlib: pip install 'bidex-meta[plot]'.") from None
     histories = read_histories(folders)
-    curves = [(history.label, history.curves) for history in histories]
-    names = _names(histories)
+    short = [f"{_letter(place)} {history.label.partition(',')[0]}" for place, history in enumerate(histories)]
+    curves = [(name, history.curves) for name, history in zip(short, histories, strict=True)]
+    names = _names(histories, short)
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
     return environment.get_template("page.html").render(
         title=_title(folders),
-        groups=[(history.label, len(history.folders)) for history in histories],
+        groups=[(name, history.label, len(history.folders)) for name, history in zip(short, histories, strict=True)],
         runs=[_run(folder, names[folder.path]) for folder in folders],
-        final=_final(folders),
+        final=_final(
+            folders, {run.path: name for name, history in zip(short, histories, strict=True) for run in history.folders}
+        ),
         learning=_picture(lambda: plots.draw_learning(curves)),
         speed=_picture(lambda: plots.draw_metrics(curves, _SPEED)),
         adaptation=list(_adaptation(folders, names)),
@@ -59,14 +63,19 @@ def _title(folders: Sequence[RunFolder]) -> str:
     return f"{algos} on {subjects}"
 
 
-def _names(histories: Sequence[History]) -> dict[Path, str]:
+def _letter(place: int) -> str:
+    """A, B, ..., Z, AA, ...: labels tell all that differs, which is too much for a legend."""
+    return ("" if place < 26 else _letter(place // 26 - 1)) + chr(ord("A") + place % 26)
+
+
+def _names(histories: Sequence[History], short: Sequence[str]) -> dict[Path, str]:
     """What each run is called on the page."""
     names: dict[Path, str] = {}
-    for history in histories:
+    for group, history in zip(short, histories, strict=True):
         for folder in history.folders:
             config = folder.config()
             of_task = f", {config['task']}" if config["task"] else ""
-            name = f"{history.label}{of_task}, seed {config['seed']}"
+            name = f"{group}{of_task}, seed {config['seed']}"
             twice = sum(known.split(" (")[0] == name for known in names.values())
             names[folder.path] = f"{name} ({twice + 1})" if twice else name
     return names
@@ -92,13 +101,13 @@ def _run(folder: RunFolder, name: str) -> dict[str, Any]:
     }
 
 
-def _final(folders: Sequence[RunFolder]) -> dict[str, Any]:
-    """The groups' final evaluations as rows, and why runs are missing."""
+def _final(folders: Sequence[RunFolder], short: dict[Path, str]) -> dict[str, Any]:
+    """The groups' final evaluations as rows, and why runs are missing; groups are called as ``short`` says."""
     evaluated = [folder for folder in folders if (folder.path / "evaluation.json").is_file()]
     found: dict[str, Any] = {"missing": len(folders) - len(evaluated), "reason": "", "rows": [], "classes": []}
     found |= {"names": [], "picture": None}
     try:
-        groups = read_groups(evaluated) if evaluated else []
+        groups = [replace(group, label=short[group.paths[0]]) for group in read_groups(evaluated)]
     except BidexError as error:
         return {**found, "reason": str(error)}
     if not groups:
@@ -109,7 +118,7 @@ def _final(folders: Sequence[RunFolder]) -> dict[str, Any]:
         "rows": [_final_row(group, groups[0]) for group in groups],
         "names": names,
         "classes": [row for group in groups for row in _class_rows(group, names)],
-        "picture": _picture(lambda: plots.draw_comparison(estimates(groups))),
+        "picture": _picture(lambda: plots.draw_comparison(estimates(groups))) if len(groups) > 1 else None,
     }
 
 
