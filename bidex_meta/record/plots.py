@@ -18,6 +18,8 @@ Bar = tuple[str, float, tuple[float, float] | None]
 _COLUMNS = 4
 _MEASURES = ("return", "success")
 _STYLES = ("-", "--")
+_FEW = 60
+"""Evaluations up to which each is a dot: more of them would hide the dashes."""
 _COLOURS = {"train": "tab:blue", "test": "tab:orange"}
 _AGAIN = "Write one: bidex-meta evaluate RUN --shots 3 --json > {}"
 
@@ -231,7 +233,7 @@ def _draw_curve(axis: Any, curve: Curve | None, label: str, number: int, style: 
     if curve is None:
         return
     steps, colour = curve.steps / 1e6, f"C{number % 10}"
-    marker = "." if style != "-" or len(steps) == 1 else None
+    marker = "." if len(steps) == 1 or (style != "-" and len(steps) <= _FEW) else None
     axis.plot(steps, curve.mean, linewidth=1.2, color=colour, linestyle=style, marker=marker, label=_plain(label))
     if curve.low is not None and curve.high is not None:
         axis.fill_between(steps, curve.low, curve.high, alpha=0.2, color=colour, linewidth=0.0)
