@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import tyro
 
 from bidex_meta.commands.parsing import Switch, parse
-from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.errors import BidexError, known_name
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,7 @@ def main(arguments: Sequence[str]) -> None:
     policy = flags.policy if flags.run is None else str(flags.run)
     source = looked_at(policy, flags.suite, flags.task, flags.seed)
     slots = slots_of(source)
-    task = flags.task or slots[0]
-    if task not in source.task_classes():
-        raise unknown_name(f"task of {source.name}", task, source.task_classes())
+    task = known_name(f"task of {source.name}", flags.task or slots[0], source.task_classes())
     world = source.world("train", len(slots))
     stage = Stage(world, acting(policy, world, flags.seed, flags.checkpoint), slots.index(task), flags.seed)
     screen = _screen(flags, stage)
