@@ -11,6 +11,7 @@ from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
+from bidex_meta.drawing import set_aside_what_is_missing
 from bidex_meta.errors import BidexError
 from bidex_meta.registration import register_ids
 from bidex_meta.suite import Suite, load_suite, suite_names
@@ -43,6 +44,7 @@ try:
 except PackageNotFoundError:  # run from a checkout that was never installed
     __version__ = "0.0.0"
 
+set_aside_what_is_missing()
 register_ids()
 
 

@@ -15,7 +15,7 @@ PACKAGES = {package.__name__: Path(next(iter(package.__path__))) for package in 
 
 ORDER = (
     ("errors",),
-    ("paths", "maths", "agents"),
+    ("paths", "maths", "agents", "drawing"),
     ("engine", "record", "hands", "suite"),
     ("tasks",),
     ("world",),
@@ -26,7 +26,7 @@ ORDER = (
     ("bidex_meta",),  # the package's own names
     ("clients", "witness"),
     ("sources",),
-    ("bench", "gallery"),  # both replay witnesses; bench measures clients too
+    ("bench", "gallery", "viewer", "report"),  # the first two replay witnesses; bench measures clients too
     ("bidex_algos.checks", "bidex_algos.choices", "bidex_algos.reports"),
     ("bidex_algos.gradients", "bidex_algos.experience"),
     ("bidex_algos.nets",),

@@ -168,3 +168,13 @@ def test_where_rows_share_nothing_each_plays_one_episode_a_shot(monkeypatch):
 )
 def test_rows_fit_the_limit_and_the_rollouts(classes, adaptations, rollouts, limit, rows):
     assert rows_for(classes, adaptations, rollouts, limit) == rows
+
+
+def test_while_training_an_adapting_learner_is_judged_after_a_shot_on_train_tasks(tmp_path):
+    flags = ["--suite", "ML4", "--algo", "finder", "--num-envs", "24", "--steps", "72", "--threads", "1"]
+    flags += ["--device", "cpu", "--run-dir", str(tmp_path / "r"), "--no-evaluate", "--evaluate-every", "2"]
+    assert main(["run", *flags]) == 0
+    rows = [json.loads(line) for line in (tmp_path / "r" / "metrics.jsonl").read_text().splitlines()]
+    assert ["Eval/success_rate" in row for row in rows] == [False, True, False]
+    assert rows[1]["Eval/success_rate"] > rows[1]["Eval/success_before_adapt"]
+    assert (tmp_path / "r" / "checkpoints" / "best.pt").is_file()

@@ -40,3 +40,72 @@ def test_render_refuses_a_policy_of_other_observations(monkeypatch, toy_class, t
     monkeypatch.setattr(policies, "policy_shape", lambda folder: {"observations": 7, "actions": 1})
     assert main([*flags, "--out", str(tmp_path / "b.png"), "--steps", "2"]) == 2
     assert "takes 7 observations" in capsys.readouterr().err
+
+
+def test_a_run_is_filmed_with_all_its_classes_beside_each_other(monkeypatch, toy_class, tmp_path, capsys):
+    import imageio.v3 as imageio
+    from PIL import Image
+
+    monkeypatch.setattr(OwnSuite, "task_classes", lambda source: {"Near": None})
+    monkeypatch.setattr(OwnSuite, "tasks", lambda source, split: {"Near": ["0"], "Far": ["0"]})
+    path = tmp_path / "a"
+    assert run("--steps", 24, "--run-dir", path, "--no-evaluate") == 0
+    capsys.readouterr()
+    small = ["--tiled", "--width", "64", "--height", "44"]
+    assert main(["render", str(path), *small]) == 0
+    assert capsys.readouterr().out == f"{path / 'videos' / 'tiled.mp4'}\n"
+    # Episodes take four steps, of which every second is shown; two tiles, a name of 20 under each.
+    assert imageio.imread(path / "videos" / "tiled.mp4", plugin="FFMPEG").shape == (3, 64, 128, 3)
+    out = tmp_path / "b.webp"
+    assert main(["render", str(path), *small, "--steps", "6", "--every", "3", "--out", str(out)]) == 0
+    with Image.open(out) as film:
+        assert (film.n_frames, film.size) == (3, (128, 64))
+    assert main(["render", str(path), "--width", "64", "--every", "4"]) == 0  # its first class
+    assert (path / "videos" / "film.mp4").is_file()
+    capsys.readouterr()
+    for flags, told in (
+        (["--task", "Near"], "--out film.mp4"),
+        (["--task", "Near", "--out", "a.mp4", "--every", "-1"], "--every must be at least 1"),
+        ([str(path), "--checkpoint", "best"], "no best.pt"),
+    ):
+        assert main(["render", *flags]) == 2
+        assert told in capsys.readouterr().err
+
+
+def test_a_tile_of_a_row_that_ends_goes_on_and_its_name_is_green_while_solved():
+    import numpy as np
+
+    from bidex_meta.evaluation import filming
+    from tests.fakes import Seeker, ToyWorld
+
+    world, agent, seen = ToyWorld(2, "DISABLED", slot_tasks=[1, 1]), Seeker(), []
+    world.max_episode_steps[:] = 5
+
+    def tiled(pictures, names, done):
+        seen.append((world.episodes.number.tolist(), list(done)))
+        return np.zeros((2, 2, 3), np.uint8)
+
+    original, filming.tiled = filming.tiled, tiled
+    try:
+        list(filming.film_tiles(agent, world, [0, 1], 7, seed=0, width=4, height=4))
+    finally:
+        filming.tiled = original
+    numbers, done = zip(*seen, strict=True)
+    assert len(seen) == 8 and numbers[0] != numbers[-1]
+    assert done[0] == [False, False] and [True, True] in done[1:5]
+    ends = next(i for i in range(1, 8) if numbers[i] != numbers[i - 1])
+    assert done[ends] == [False, False]
+
+
+def test_tiles_are_wider_than_high_with_a_name_under_each():
+    import numpy as np
+
+    from bidex_meta.record.tiles import grid, tiled
+
+    assert [grid(n) for n in (1, 2, 4, 5, 20)] == [(1, 1), (2, 1), (2, 2), (3, 2), (5, 4)]
+    pictures = [np.full((30, 80, 3), 10 * i, np.uint8) for i in range(3)]
+    whole = tiled(pictures, ["A", "B", "C"], [False, True, False])
+    assert whole.shape == (2 * 50, 2 * 80, 3)
+    assert (whole[:30, 80:] == 10).all() and (whole[50:80, :80] == 20).all()
+    grey, green = whole[30:50, :80].astype(int), whole[30:50, 80:].astype(int)
+    assert (green[..., 1] - green[..., 0]).max() > 80 > (grey[..., 1] - grey[..., 0]).max()

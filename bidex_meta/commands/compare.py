@@ -28,6 +28,8 @@ class CompareFlags:
     """Run folders."""
     json: Switch = False
     """Print JSON."""
+    out: Path | None = None
+    """Also draw success and score of the groups, with their intervals, into this picture (.png, .svg, .pdf)."""
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -40,10 +42,14 @@ def main(arguments: Sequence[str]) -> None:
     if not flags.runs:
         raise BidexError("Name the run folders to compare: bidex-meta compare RUN RUN...")
     from bidex_meta.commands.tables import plain_table, print_table
-    from bidex_meta.evaluation.comparison import read_groups
+    from bidex_meta.evaluation.comparison import estimates, read_groups
     from bidex_meta.record import RunFolder
 
     groups = read_groups([RunFolder.open(path) for path in flags.runs])
+    if flags.out is not None:
+        from bidex_meta.record import plots
+
+        plots.save(plots.draw_comparison(estimates(groups)), flags.out)
     if flags.json:
         print(json.dumps([_row(group, groups[0]) for group in groups], indent=2))
         return

@@ -21,6 +21,8 @@ class EvaluateFlags:
 
     run: RunPath
     """Run folder."""
+    checkpoint: str = "last"
+    """Which policy: last, best (kept by `bidex-meta run --evaluate-every N`) or a file."""
     episodes: int | None = None
     """Episodes of each task; None: 4, or 1 where a task fixes its start (metaworld/...); for what adapts, as many as
     --rollouts."""
@@ -51,7 +53,7 @@ class EvaluateFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Evaluate the newest checkpoint and print a table or JSON."""
+    """Evaluate a checkpoint and print a table or JSON."""
     flags = parse(EvaluateFlags, arguments, "evaluate")
 
     from bidex_meta.commands.learners import learner_kind, resolve_device
@@ -74,7 +76,7 @@ def main(arguments: Sequence[str]) -> None:
         _meta_test(flags, folder, config, source)
         return
     _refuse_adaptation(flags, stored["algo"])
-    policy, step = load_policy(folder, device)
+    policy, step = load_policy(folder, device, flags.checkpoint)
     split = "train" if flags.split == "auto" else flags.split
     world = source.world(split, flags.num_envs)
     seed = EVALUATION_SEED if flags.seed is None else flags.seed
@@ -118,7 +120,7 @@ def _meta_test(flags: EvaluateFlags, folder: Any, config: dict[str, Any], source
     splits = [name for name in known if flags.split in ("auto", "both", name)]
     seed = EVALUATION_SEED if flags.seed is None else flags.seed
     numbers = (flags.shots, flags.rollouts, flags.episodes, flags.tasks, flags.trials, flags.num_envs)
-    load, step = policy_loader(folder, config["device"])
+    load, step = policy_loader(folder, config["device"], flags.checkpoint)
     found = metatest.meta_test(
         source,
         config,

@@ -3,40 +3,56 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-from bidex_meta.commands.parsing import RunPath, Switch, parse
+import tyro
+
+from bidex_meta.commands.parsing import Switch, parse
+from bidex_meta.errors import BidexError
 
 
 @dataclass(frozen=True)
 class PlotFlags:
     """Return and success of every task against environment steps, or against shots of adaptation, as a picture.
 
-    Example: bidex-meta plot runs/MT4/mtppo/2026-11-21_10-00-00_seed0 --out curves.png
+    Example: bidex-meta plot runs/MT4/mtppo/* --out curves.png
+
+    Runs that differ in the seed alone are one line, with the 95 % bootstrap interval over runs.
     """
 
-    run: RunPath
-    """Run folder."""
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
+    """Run folders."""
     adaptation: Switch = False
-    """Against shots of adaptation, from the meta-test in the run's evaluation.json."""
+    """Against shots of adaptation, from the meta-test in the run's evaluation.json; of one run."""
     evaluation: Path | None = None
     """The output of another `bidex-meta evaluate RUN --shots K --json`, instead of the run's evaluation.json."""
     out: Path | None = None
-    """The picture; None: curves.png or adaptation.png in the run folder."""
+    """The picture; None: curves.png or adaptation.png, in the run folder or, of several, here."""
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Draw the curves and print where they are."""
+    """Draw the curves and print where they are.
+
+    Raises:
+        BidexError: No run is named, or there is nothing to draw.
+    """
     flags = parse(PlotFlags, arguments, "plot")
+    if not flags.runs:
+        raise BidexError("Name the run folders to draw: bidex-meta plot RUN...")
 
-    from bidex_meta.record import RunFolder
-    from bidex_meta.record.plots import plot_adaptation, plot_learning_curves
+    from bidex_meta.record import RunFolder, plots
 
-    folder = RunFolder.open(flags.run)
+    folders = [RunFolder.open(path) for path in flags.runs]
+    home = folders[0].path if len(folders) == 1 else Path()
     if flags.adaptation or flags.evaluation:
-        out = flags.out or folder.path / "adaptation.png"
-        plot_adaptation(flags.evaluation or folder.path / "evaluation.json", out)
-        print(out)
-        return
-    out = flags.out or folder.path / "curves.png"
-    plot_learning_curves(folder.metrics_path, out)
+        if len(folders) > 1:
+            raise BidexError(f"--adaptation draws one run, got {len(folders)}. bidex-meta report shows all.")
+        out, source = flags.out or home / "adaptation.png", flags.evaluation or home / "evaluation.json"
+        figure = plots.draw_adaptation(plots.read_evaluation(source), source)
+    else:
+        from bidex_meta.evaluation.histories import read_histories
+
+        out = flags.out or home / "curves.png"
+        figure = plots.draw_learning([(history.label, history.curves) for history in read_histories(folders)])
+    plots.save(figure, out)
     print(out)

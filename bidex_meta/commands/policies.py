@@ -1,33 +1,50 @@
 """From a run folder to its policy: the commands' one way."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from bidex_meta.agents import Agent
 from bidex_meta.commands.learners import learner_kind
 from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder
+from bidex_meta.sources import Source
 
 
-def checkpoint(folder: RunFolder) -> tuple[dict[str, Any], int]:
-    """State and environment steps of a run's newest checkpoint.
+def checkpoint(folder: RunFolder, which: str = "last") -> tuple[dict[str, Any], int]:
+    """State and environment steps of a run's checkpoint.
+
+    Args:
+        folder: The run.
+        which: ``last``, the newest one; ``best``, of which the state holds the policy alone; or a file, by its path or
+            by its name in the run's folder of checkpoints.
 
     Raises:
-        BidexError: The run has not saved one yet.
+        BidexError: The run has not saved such a one.
     """
+    if which == "best":
+        if not folder.checkpoints.best.is_file():
+            raise BidexError(
+                f"{folder.path} has no best.pt: it was not evaluated while training (run --evaluate-every N). Use "
+                "--checkpoint last."
+            )
+        return folder.checkpoints.load_one(folder.checkpoints.best)
+    if which != "last":
+        own = folder.checkpoints.folder / which
+        return folder.checkpoints.load_one(own if own.is_file() else Path(which))
     loaded = folder.checkpoints.load()
     if loaded is None:
         raise BidexError(f"{folder.path} has no checkpoint yet. Train on: bidex-meta run --resume {folder.path}")
     return loaded
 
 
-def load_policy(folder: RunFolder, device: str) -> tuple[Agent, int]:
-    """The policy of a run's newest checkpoint and the environment steps it was trained for.
+def load_policy(folder: RunFolder, device: str, which: str = "last") -> tuple[Agent, int]:
+    """The policy of a run's ``checkpoint`` and the environment steps it was trained for.
 
     Raises:
-        BidexError: The run has not saved a checkpoint yet.
+        BidexError: The run has not saved such a checkpoint.
     """
-    load, step = policy_loader(folder, device)
+    load, step = policy_loader(folder, device, which)
     return load(), step
 
 
@@ -41,13 +58,66 @@ def policy_of(folder: RunFolder, state: dict[str, Any], device: str) -> Agent:
     return learner_kind(folder.config()["algo"]).make.load_policy(state["learner"]["policy"], device)
 
 
-def policy_loader(folder: RunFolder, device: str) -> tuple[Callable[[], Agent], int]:
-    """What makes the policy of a run's newest checkpoint anew, as often as it is asked, and that checkpoint's steps.
+def policy_loader(folder: RunFolder, device: str, which: str = "last") -> tuple[Callable[[], Agent], int]:
+    """What makes the policy of a run's ``checkpoint`` anew, as often as it is asked, and that checkpoint's steps.
 
     The checkpoint is read once: a run that trains on meanwhile gives no other.
 
     Raises:
-        BidexError: The run has not saved a checkpoint yet.
+        BidexError: The run has not saved such a checkpoint.
     """
-    state, step = checkpoint(folder)
+    state, step = checkpoint(folder, which)
     return lambda: policy_of(folder, state, device), step
+
+
+def acting(policy: str, world: Any, seed: int, which: str = "last") -> Agent:
+    """What acts in a world to be looked at: ``zero``, ``random``, or the policy of a run folder.
+
+    Raises:
+        BidexError: The policy is of other observations or actions than the world's.
+    """
+    from bidex_meta.evaluation.untrained import RandomAgent, ZeroAgent
+
+    if policy == "zero":
+        return ZeroAgent(world.action_space)
+    if policy == "random":
+        return RandomAgent(world.action_space, seed)
+    folder = RunFolder.open(Path(policy))
+    state, _ = checkpoint(folder, which)
+    shape = policy_shape(state)
+    spaces = {"observations": world.single_observation_space, "actions": world.single_action_space}
+    given = {name: space.shape[0] for name, space in spaces.items()}
+    if any(shape.get(name, size) != size for name, size in given.items()):
+        raise BidexError(
+            f"The policy of {policy} takes {shape['observations']} observations and gives {shape['actions']} "
+            f"actions, but here are {given['observations']} and {given['actions']}. Leave --suite out, or name the "
+            "policy's own."
+        )
+    return policy_of(folder, state, "cpu")
+
+
+def looked_at(policy: str, suite: str | None, task: str | None, seed: int) -> Source:
+    """The worlds in which a policy is looked at: those of its run, or of a suite or a task that is named.
+
+    Args:
+        policy: ``zero``, ``random`` or a run folder.
+        suite: A suite; None: the run's, if it has one.
+        task: A class; alone where there is no suite.
+        seed: Of the tasks.
+
+    Raises:
+        BidexError: Nothing is named, or what is not there.
+    """
+    config: dict[str, Any] = {"suite": suite, "task": task, "threads": 1}
+    if policy not in ("zero", "random"):
+        stored = RunFolder.open(Path(policy)).config()
+        config |= {"suite": suite or stored["suite"], "base": stored.get("base", "own")}
+        config |= {"task": task or stored["task"]}
+    if config["suite"] is None and config["task"] is None:
+        raise BidexError("Name what to show: a run folder, --task TASK or --suite SUITE.")
+    return Source.open({**config, "seed": seed})
+
+
+def slots_of(source: Source) -> list[str]:
+    """The class of each slot of a source's worlds; a slot of listed tasks is named Class/task."""
+    return [name.split("/")[0] for name in source.tasks("train")]

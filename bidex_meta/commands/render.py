@@ -1,117 +1,132 @@
-"""``bidex-meta render``: what a task looks like."""
+"""``bidex-meta render``: what a task looks like, or what a policy does."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from bidex_meta.commands.parsing import parse
+import tyro
+
+from bidex_meta.commands.parsing import Switch, parse
 from bidex_meta.errors import BidexError, known_name
-from bidex_meta.sources import Source
 
 
 @dataclass(frozen=True)
 class RenderFlags:
-    """A picture of a task's start, or a film of an episode.
+    """A picture of a task's start, or a film of an episode; of a run all classes beside each other.
 
     Example: bidex-meta render --task CatchUnderarm --policy random --out catch.mp4
+
+    bidex-meta render RUN --tiled puts a film of every class it was trained on into RUN/videos/.
     """
 
-    task: str
-    """Task class."""
-    out: Path
-    """File to write: .png for a picture, .mp4 for a film."""
+    run: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = None
+    """Run folder whose policy is shown; the same as --policy RUN."""
+    task: str | None = None
+    """Task class; None: the run's first one."""
+    out: Path | None = None
+    """File to write: .png for a picture, .mp4 for a film, .webp for one that web pages show; None, of a run: a film in
+    its folder videos/."""
     policy: str = "zero"
     """zero, random, or a run folder."""
+    checkpoint: str = "last"
+    """Of a run: last, best (see `bidex-meta run --help`, --evaluate-every) or a file."""
     suite: str | None = None
     """Show the task as this suite has it; None: on its own, or as in the run."""
+    tiled: Switch = False
+    """All classes of the suite beside each other; where an episode ends the next one begins. A name is green from its
+    first success to the end of the episode."""
     seed: int = 0
     """Seed of task and start."""
     steps: int | None = None
-    """Steps to take; None: none for a picture, one episode for a film."""
-    width: int = 640
-    """Pixels."""
-    height: int = 480
-    """Pixels."""
+    """Steps to take, 60 a second; None: none for a picture, one episode for a film, with --tiled the longest one."""
+    every: int | None = None
+    """Steps from one frame of a film to the next; None: 1, with --tiled 2."""
+    width: int | None = None
+    """Pixels, of a tile with --tiled; None: 640, with --tiled 240."""
+    height: int | None = None
+    """Pixels, likewise; None: three quarters of the width."""
     camera: str | None = None
-    """Name of a camera of the scene; None: its first."""
+    """front, side, top or back; None: front."""
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Render and print where the file is."""
+    """Render and print where the file is.
+
+    Raises:
+        BidexError: Bad flags, a policy that does not fit, or no way to draw here.
+    """
     flags = parse(RenderFlags, arguments, "render")
     from bidex_meta.record import video
 
-    suffix = video.check_suffix(flags.out)
-    if suffix == ".mp4" and (flags.width % 2 or flags.height % 2):
-        raise BidexError(f"A film needs an even width and height, not {flags.width} x {flags.height}.")
-
-    source = Source.open(_config(flags))
-    task = known_name(f"task of {source.name}", flags.task, source.task_classes())
-    # One row for each slot is enough to see one of them; a slot of listed tasks is named Class/task.
-    slots = [name.split("/")[0] for name in source.tasks("train")]
-    world = source.world("train", len(slots))
-    row = world.slot_rows[slots.index(task)].start
-    frames = _episode(flags, world, _policy(flags, world), row, film=suffix == ".mp4")
+    policy = flags.policy if flags.run is None else str(flags.run)
+    out = _out(flags, policy)
+    suffix = video.check_suffix(out)
+    width = flags.width or (240 if flags.tiled else 640)
+    height = flags.height or width * 3 // 4
     if suffix == ".mp4":
-        from bidex_meta.tasks.base import CONTROL_RATE
+        if width % 2 or height % 2:
+            raise BidexError(f"A film needs an even width and height, not {width} x {height}.")
+        video.check_films()
+    every = flags.every or (2 if flags.tiled else 1)
+    if every < 1:
+        raise BidexError(f"--every must be at least 1, not {every}.")
 
-        video.write_video(flags.out, frames, CONTROL_RATE)
-    else:
-        for frame in frames:
-            video.write_image(flags.out, frame)
+    from bidex_meta.commands.policies import acting, looked_at, slots_of
+
+    source = looked_at(policy, flags.suite, flags.task, flags.seed)
+    slots, task = slots_of(source), flags.task
+    if not flags.tiled:
+        task = known_name(f"task of {source.name}", task or slots[0], source.task_classes())
+    # One row for each slot is enough to see one of them.
+    world = source.world("train", len(slots))
+    agent = acting(policy, world, flags.seed, flags.checkpoint)
+    rows = list(range(len(slots))) if flags.tiled else [world.slot_rows[slots.index(str(task))].start]
+    look = {"width": width, "height": height, "camera": flags.camera}
+    _write(out, _frames(flags, agent, world, rows, every if suffix != ".png" else None, look), every)
     world.close()
-    print(flags.out)
+    print(out)
 
 
-def _config(flags: RenderFlags) -> dict[str, Any]:
-    """A run's config with the flags' seed, or one made of the flags alone."""
-    config: dict[str, Any] = {"suite": flags.suite, "task": flags.task, "threads": 1}
-    if flags.policy not in ("zero", "random"):
-        from bidex_meta.record import RunFolder
+def _out(flags: RenderFlags, policy: str) -> Path:
+    """The file to write.
 
-        stored = RunFolder.open(Path(flags.policy)).config()
-        config |= {"suite": flags.suite or stored["suite"], "base": stored.get("base", "own")}
-    return {**config, "seed": flags.seed}
-
-
-def _policy(flags: RenderFlags, world: Any) -> Any:
-    from bidex_meta.evaluation.untrained import RandomAgent, ZeroAgent
-
-    if flags.policy == "zero":
-        return ZeroAgent(world.action_space)
-    if flags.policy == "random":
-        return RandomAgent(world.action_space, flags.seed)
-    from bidex_meta.commands.policies import checkpoint, policy_of, policy_shape
-    from bidex_meta.record import RunFolder
-
-    folder = RunFolder.open(Path(flags.policy))
-    state, _ = checkpoint(folder)
-    shape = policy_shape(state)
-    spaces = {"observations": world.single_observation_space, "actions": world.single_action_space}
-    given = {name: space.shape[0] for name, space in spaces.items()}
-    if any(shape.get(name, size) != size for name, size in given.items()):
-        raise BidexError(
-            f"The policy of {flags.policy} takes {shape['observations']} observations and gives {shape['actions']} "
-            f"actions, but here are {given['observations']} and {given['actions']}. Leave --suite out, or name the "
-            "policy's own."
-        )
-    return policy_of(folder, state, "cpu")
+    Raises:
+        BidexError: None is named and there is no run to put it in.
+    """
+    if flags.out is not None:
+        return flags.out
+    if policy in ("zero", "random"):
+        raise BidexError("Name the file to write: --out film.mp4, or --out picture.png.")
+    name = "tiled" if flags.tiled else flags.task or "film"
+    return Path(policy) / "videos" / f"{name}.mp4"
 
 
-def _episode(flags: RenderFlags, world: Any, policy: Any, row: int, film: bool) -> Iterator[Any]:
-    """Every frame of a film, or the one of a picture after ``--steps`` steps."""
-    steps = flags.steps if flags.steps is not None else int(world.max_episode_steps[row]) if film else 0
+def _frames(
+    flags: RenderFlags, agent: Any, world: Any, rows: list[int], every: int | None, look: dict[str, Any]
+) -> tuple[Iterator[Any], int]:
+    """The frames, and how many there will be at most; with ``every`` None the last one alone."""
+    from bidex_meta.evaluation.filming import film_row, film_tiles
 
-    def look() -> Any:
-        return world.render(row=row, width=flags.width, height=flags.height, camera=flags.camera)
+    longest = int(world.max_episode_steps[rows].max())
+    steps = flags.steps if flags.steps is not None else 0 if every is None else longest
+    if flags.tiled:
+        each = every or max(steps, 1)
+        frames = film_tiles(agent, world, rows, steps, flags.seed, each, **look)
+        return frames, steps // each + 1
+    return film_row(agent, world, rows[0], steps, flags.seed, every, **look), 1 if every is None else steps // every + 1
 
-    obs, _ = world.reset(seed=flags.seed)
-    policy.reset(obs.new_ones(len(obs), dtype=bool))
-    for _ in range(steps):
-        if film:
-            yield look()
-        obs, _, terminated, truncated, _ = world.step(policy.eval_action(obs))
-        if bool(terminated[row] | truncated[row]):
-            break
-    yield look()
+
+def _write(out: Path, frames: tuple[Iterator[Any], int], every: int) -> None:
+    from bidex_meta.record import video
+    from bidex_meta.record.progress import counted
+    from bidex_meta.tasks.base import CONTROL_RATE
+
+    shown = counted(*frames, "frames")
+    if out.suffix.lower() == ".mp4":
+        video.write_video(out, shown, CONTROL_RATE / every)
+    elif out.suffix.lower() == ".webp":
+        video.write_animation(out, shown, CONTROL_RATE / every)
+    else:
+        for frame in shown:  # a tiled picture comes after the first frame
+            video.write_image(out, frame)

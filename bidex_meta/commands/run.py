@@ -98,6 +98,10 @@ def _read(plan: RunPlan) -> Checkpoint | None:
         from bidex_meta.commands.metatest import check_source
 
         check_source(plan.source, plan.config["algo"])
+    if launch().rank == 0:
+        from bidex_meta.commands import watching
+
+        watching.check(plan)
     if plan.folder is None and plan.config["start_from"] is not None:
         start = RunFolder.open(Path(plan.config["start_from"]))
         if start.checkpoints.newest_step() is None:
@@ -164,10 +168,19 @@ def _train(plan: RunPlan, folder: Any, world: "VectorWorld", learner: Any, loade
         resume_step = 0  # killed before its first checkpoint: the same seed takes it there again
         _say("No checkpoint yet: starting from the beginning.")
     budget = _budget(plan.config)
-    spent = training_seconds([row for row in read_metrics(folder.metrics_path) if row["step"] <= (resume_step or 0)])
-    recorder = Recorder(folder, **budget, resume_step=resume_step) if launch().rank == 0 else contextlib.nullcontext()
-    with recorder as record:
-        return runner.train(learner, world, **budget, spent_seconds=spent, record=record)
+    done = [row for row in read_metrics(folder.metrics_path) if row["step"] <= (resume_step or 0)]
+    budget["spent_seconds"] = training_seconds(done)
+    if launch().rank > 0:
+        return runner.train(learner, world, **budget, record=None)
+    logger, total = plan.config["logger"], {name: budget[name] for name in ("total_steps", "total_seconds")}
+    with Recorder(folder, **total, resume_step=resume_step, logger=logger) as record, contextlib.ExitStack() as stack:
+        watch = None
+        if plan.config["evaluate_every"] or plan.config["video_every"]:
+            from bidex_meta.commands.watching import Watch
+
+            watch = Watch(plan, folder, learner, record, iterations=len(done))
+            stack.callback(watch.close)
+        return runner.train(learner, world, **budget, record=record, watch=watch)
 
 
 def _budget(config: dict[str, Any]) -> dict[str, Any]:

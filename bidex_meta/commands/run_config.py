@@ -14,10 +14,12 @@ from typing import Any, Literal
 from bidex_meta.commands.learners import LearnerKind, choose_preset, learner_kind, resolve_device
 from bidex_meta.commands.parsing import StepCount, Switch, parse, peek
 from bidex_meta.errors import BidexError
-from bidex_meta.record.folder import RunFolder
+from bidex_meta.record.folder import RunFolder, flat
 from bidex_meta.sources import Source
 from bidex_meta.train.launch import launch, resume_command
 
+_MAY_CHANGE = ("steps", "minutes", "evaluate_every", "video_every", "logger")
+"""What a resumed run may be given anew: nothing of it changes what is learned."""
 _EXAMPLE = "MT4"  # a suite whose defaults `run --help` shows
 
 
@@ -63,7 +65,14 @@ class RunFlags:
     """Folder of this run; None: runs/SUITE/ALGO/DATE_seedSEED."""
     resume: Path | None = None
     """Continue this run from its last checkpoint, with its own config; only --steps and --minutes may change, which
-    count what it has done already."""
+    count what it has done already, and --logger, --evaluate-every and --video-every."""
+    evaluate_every: int | None = None
+    """Evaluate every so many iterations, one episode of ten tasks of each class (what adapts: one shot on train tasks),
+    and keep the policy that did best as checkpoints/best.pt. Changes nothing of the training. None: never."""
+    video_every: int | None = None
+    """Film every so many iterations, a row of each class, into videos/ and the logger. None: never."""
+    logger: Literal["tensorboard", "wandb", "none"] = "tensorboard"
+    """Where metrics, config and films go beside metrics.jsonl."""
     evaluate: bool = True
     """Evaluate at the end."""
     episodes: int | None = None
@@ -106,6 +115,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     folder = RunFolder.open(Path(resume)) if resume else None
     # What older runs did not know.
     older = {"engine": "auto", "base": "own", "start_from": None, "minutes": None}
+    older |= {"evaluate_every": None, "video_every": None, "logger": "tensorboard"}
     stored = {**older, **folder.config()} if folder else {}
     suite, task = (peek(arguments, f"--{name}") or stored.get(name) for name in ("suite", "task"))
     # Where neither is named, `run --help` still has defaults to show; without --help _resolved refuses it.
@@ -151,7 +161,7 @@ def _resolved(flags: Any, names: dict[str, str], device: str, stored: dict[str, 
         raise BidexError("Name what to train on: either --suite SUITE or --task TASK, for example --suite MT4.")
     if flags.base != "own" and flags.task is None:
         raise BidexError(f"--base {flags.base} goes with --task; a suite's file says whether bases move.")
-    for name in ("num_envs", "threads", "episodes"):
+    for name in ("num_envs", "threads", "episodes", "evaluate_every", "video_every"):
         value = getattr(flags, name)
         if value is not None and value < 1:
             raise BidexError(f"--{name.replace('_', '-')} must be at least 1, not {value}.")
@@ -171,6 +181,9 @@ def _resolved(flags: Any, names: dict[str, str], device: str, stored: dict[str, 
         "num_envs": flags.num_envs,
         "steps": flags.steps,
         "minutes": flags.minutes,
+        "evaluate_every": flags.evaluate_every,
+        "video_every": flags.video_every,
+        "logger": flags.logger,
         "processes": launch().count,
         "seed": flags.seed,
         "device": device,
@@ -197,23 +210,16 @@ def _stored_learner(config_class: Any, stored: dict[str, Any], folder: RunFolder
 
 
 def _refuse_changes(stored: dict[str, Any], config: dict[str, Any], folder: RunFolder) -> None:
-    before, after = _flat({"processes": 1, **stored}), _flat(config)
+    before, after = flat({"processes": 1, **stored}), flat(config)
     if before["processes"] != after["processes"]:
         raise BidexError(
             f"{folder.path} has worlds of {before['processes']} process(es), not {after['processes']}. "
             f"Continue: {resume_command(folder.path, before['processes'])}"
         )
     for name in sorted(before.keys() | after.keys()):
-        if name not in ("steps", "minutes") and before.get(name) != after.get(name):
+        if name not in _MAY_CHANGE and before.get(name) != after.get(name):
             flag = "--" + name.replace("_", "-")
             raise BidexError(
                 f"{flag} is {before.get(name)} in {folder.path}, not {after.get(name)}: "
                 f"a resumed run keeps its config. Leave {flag} out, or start a new run."
             )
-
-
-def _flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in config.items():
-        flat.update(_flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value})
-    return flat

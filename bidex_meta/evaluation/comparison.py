@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,8 @@ class Group:
     """Environment steps of a seed, over all its runs."""
     hours: float
     """Mean time of a seed's training, over all its runs, without evaluation."""
+    paths: list[Path]
+    """Its run folders."""
 
 
 @dataclass(frozen=True)
@@ -51,17 +54,41 @@ def read_groups(folders: Sequence[RunFolder]) -> list[Group]:
     Raises:
         BidexError: A run is not evaluated, two are the same, or a group's seeds do not cover the same classes.
     """
-    runs = [_read(folder) for folder in folders]
+    return [_group(label, members) for label, members in by_kind([_read(folder) for folder in folders])]
+
+
+def run_kind(config: dict[str, Any], split: str = "train") -> dict[str, Any]:
+    """What runs that are compared as one have in common: all of the config that matters but the seed."""
+    kind = {"algo": config["algo"], "on": config["suite"] or "one class at a time", "steps": config["steps"]}
+    kind |= {"num_envs": config["num_envs"], "minutes": config.get("minutes"), "split": split}
+    kind["started"] = "afresh" if config.get("start_from") is None else "from another run"  # which: one for each seed
+    return kind | {f"learner.{name}": value for name, value in config["learner"].items()}
+
+
+def by_kind(runs: Sequence[dict[str, Any]]) -> list[tuple[str, list[dict[str, Any]]]]:
+    """Runs of the same ``kind`` together, in the order they are named; with a label that tells them from others."""
     kinds: dict[str, list[dict[str, Any]]] = {}
     for run in runs:
         kinds.setdefault(json.dumps(run["kind"], sort_keys=True), []).append(run)
     differing = _differing([members[0]["kind"] for members in kinds.values()])
-    return [_group(members, differing) for members in kinds.values()]
+    return [(_label(members[0]["kind"], differing), members) for members in kinds.values()]
 
 
 def iqm(values: np.ndarray) -> Estimate:
     """Interquartile mean over seeds and classes (seeds, classes), and its interval over seeds."""
     return Estimate(_iqm(values), _interval(lambda rows: _iqm(values[rows]), len(values)))
+
+
+def estimates(groups: Sequence[Group]) -> dict[str, list[tuple[str, float, Interval | None]]]:
+    """What a picture of groups shows: by title the label, interquartile mean and interval of each."""
+    found: dict[str, list[tuple[str, float, Interval | None]]] = {}
+    for group in groups:
+        for title, values, factor in (("success, IQM (%)", group.success, 100.0), ("score, IQM", group.scores, 1.0)):
+            if values is not None:
+                of_all = iqm(values)
+                ends = of_all.interval and (factor * of_all.interval[0], factor * of_all.interval[1])
+                found.setdefault(title, []).append((group.label, factor * of_all.value, ends))
+    return found
 
 
 def iqm_difference(a: np.ndarray, b: np.ndarray) -> Estimate:
@@ -116,14 +143,9 @@ def _read(folder: RunFolder) -> dict[str, Any]:
             f"{path} is of {steps:,} steps, but the run goes on to {goal:,}. Let it end, or write "
             f"it anew: bidex-meta evaluate {folder.path} --json > {path}"
         )
-    subject = config["suite"] or "one class at a time"
-    kind = {"algo": config["algo"], "on": subject, "steps": config["steps"], "num_envs": config["num_envs"]}
-    kind["minutes"] = minutes
-    kind["split"] = found.get("split", "train")
-    kind["started"] = "afresh" if config.get("start_from") is None else "from another run"  # which: one for each seed
     return {
         "path": folder.path,
-        "kind": kind | {f"learner.{name}": value for name, value in config["learner"].items()},
+        "kind": run_kind(config, found.get("split", "train")),
         "seed": config["seed"],
         "classes": _classes(found),
         "seconds": training_seconds(rows),
@@ -150,10 +172,12 @@ def _differing(kinds: list[dict[str, Any]]) -> dict[str, set[str]]:
     return found
 
 
-def _group(members: list[dict[str, Any]], differing: dict[str, set[str]]) -> Group:
-    kind = members[0]["kind"]
+def _label(kind: dict[str, Any], differing: dict[str, set[str]]) -> str:
     told = [f"{name.removeprefix('learner.')} {kind.get(name)}" for name in sorted(differing[kind["algo"]])]
-    label = ", ".join([kind["algo"], *told])
+    return ", ".join([kind["algo"], *told])
+
+
+def _group(label: str, members: list[dict[str, Any]]) -> Group:
     rows: dict[int, dict[str, Any]] = {}
     for run in members:
         row = rows.setdefault(run["seed"], {"classes": {}, "seconds": 0.0, "steps": 0})
@@ -183,4 +207,5 @@ def _group(members: list[dict[str, Any]], differing: dict[str, set[str]]) -> Gro
         scores=None if np.isnan(scores).any() else scores,
         steps=rows[seeds[0]]["steps"],
         hours=float(np.mean([rows[seed]["seconds"] for seed in seeds])) / 3600.0,
+        paths=[run["path"] for run in members],
     )

@@ -1,4 +1,7 @@
-"""Checkpoints: ``step_<N>.pt`` (the last few) and ``last.pt``, written atomically and read without unpickling code."""
+"""Checkpoints: ``step_<N>.pt`` (the last few), ``last.pt`` and ``best.pt``.
+
+Written atomically, read without unpickling code.
+"""
 
 import re
 import shutil
@@ -30,6 +33,11 @@ class Checkpoints:
         """The newest checkpoint; exists after the first ``save``."""
         return self.folder / "last.pt"
 
+    @property
+    def best(self) -> Path:
+        """The policy that did best in an evaluation while training; exists if there was one."""
+        return self.folder / "best.pt"
+
     def save(self, state: dict[str, Any], step: int) -> None:
         """Write ``step_<step>.pt`` and ``last.pt``, then forget the oldest.
 
@@ -46,6 +54,39 @@ class Checkpoints:
             write_atomic(self.last, lambda file: shutil.copyfileobj(source, file))
         for old in self._step_files()[self.keep :]:
             old.unlink(missing_ok=True)
+
+    def save_best(self, policy: dict[str, Any], step: int, found: dict[str, float]) -> None:
+        """Write ``best.pt``: a policy alone, from which no training continues.
+
+        Args:
+            policy: Entry ``learner.policy`` of a checkpoint.
+            step: Environment steps so far.
+            found: What was found of it; ``found_of_best`` returns it.
+        """
+        import torch
+
+        remove_leftovers(self.folder)
+        content = {"step": step, "state": {"learner": {"policy": policy}}, "found": found}
+        write_atomic(self.best, lambda file: torch.save(content, file))
+
+    def found_of_best(self) -> dict[str, float] | None:
+        """What was found of the policy in ``best.pt``; None where there is none that can be read."""
+        content = _read(self.best) if self.best.exists() else None
+        return None if content is None else content.get("found")
+
+    def load_one(self, path: Path) -> tuple[dict[str, Any], int]:
+        """A certain checkpoint as ``load`` gives it.
+
+        Raises:
+            BidexError: There is no such file, or it cannot be read.
+        """
+        if not path.is_file():
+            there = ", ".join(sorted(found.name for found in self.folder.glob("*.pt"))) or "none"
+            raise BidexError(f"There is no {path}. Checkpoints in {self.folder}: {there}.")
+        content = _read(path, "name another")
+        if content is None:
+            raise BidexError(f"{path} is no checkpoint that can be read. Name another.")
+        return content["state"], content["step"]
 
     def newest_step(self) -> int | None:
         """Environment steps of the newest checkpoint, by the names of the files; None where there is none yet."""
@@ -65,7 +106,7 @@ class Checkpoints:
         for path in candidates:
             loaded = _read(path)
             if loaded is not None:
-                return loaded
+                return loaded["state"], loaded["step"]
         if candidates:
             raise BidexError(
                 f"None of the {len(candidates)} checkpoints in {self.folder} can be read. Start a new run."
@@ -78,17 +119,17 @@ class Checkpoints:
         return [path for _, path in sorted(found, reverse=True)]
 
 
-def _read(path: Path) -> tuple[dict[str, Any], int] | None:
+def _read(path: Path, then: str = "trying an older one") -> dict[str, Any] | None:
     import torch
 
     try:
         # weights_only: a checkpoint from somebody else must not be able to run code.
         content = torch.load(path, map_location="cpu", weights_only=True)
-        return content["state"], int(content["step"])
+        return {**content, "state": content["state"], "step": int(content["step"])}
     except Exception as error:  # torch raises a dozen kinds for a damaged file; each means "try the one before"
         reason = (str(error).splitlines() or [""])[0][:100]
         print(
-            f"Checkpoint {path} cannot be read ({type(error).__name__}: {reason}); trying an older one.",
+            f"Checkpoint {path} cannot be read ({type(error).__name__}: {reason}); {then}.",
             file=sys.stderr,
         )
         return None

@@ -7,8 +7,8 @@
         versions.json   Python, packages, machine, git commit
         metrics.jsonl   one line a log call: {"step": ..., "time": ..., "Train/mean_return": ...}
         events.out...   the same for TensorBoard
-        checkpoints/    step_<N>.pt (the last few) and last.pt
-        videos/
+        checkpoints/    step_<N>.pt (the last few), last.pt, best.pt
+        videos/         <name>_<N>.mp4
 """
 
 import json
@@ -112,6 +112,14 @@ class RunFolder:
         """Replace ``config.json``, atomically."""
         remove_leftovers(self.path)
         write_json(self.config_path, config)
+
+
+def flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """A config without nesting: ``{"learner": {"gamma": 0.9}}`` becomes ``{"learner.gamma": 0.9}``."""
+    found: dict[str, Any] = {}
+    for name, value in config.items():
+        found.update(flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value})
+    return found
 
 
 def _new_folder(config: dict[str, Any], root: Path) -> Path:

@@ -1,4 +1,4 @@
-"""Metrics of a run: a line of JSON and a TensorBoard point for each logged value, over environment steps."""
+"""Metrics of a run: a line of JSON for each report, and a logger's point for each value, over environment steps."""
 
 import json
 import math
@@ -8,31 +8,28 @@ from pathlib import Path
 from typing import Any
 
 from bidex_meta.record.atomic import write_atomic
+from bidex_meta.record.writers import Writer, make_writer
 
 
 class MetricsWriter:
-    """Appends to ``metrics.jsonl`` and to TensorBoard's event file in the same folder.
+    """Appends to ``metrics.jsonl`` in the run folder, and tells a logger.
 
     Args:
         folder: The run folder.
         resume_step: Of the checkpoint a resumed run starts from. Whatever was logged after it is dropped from
             both, since the resumed run logs it again. None for a new run.
+        logger: Name in ``bidex_meta.record.writers``.
     """
 
-    def __init__(self, folder: Path, resume_step: int | None = None):
-        # Loaded here since it takes a second.
-        from torch.utils.tensorboard.writer import SummaryWriter
-
+    def __init__(self, folder: Path, resume_step: int | None = None, logger: str = "tensorboard"):
         path = folder / "metrics.jsonl"
-        purge_step = None
         if resume_step is not None:
             drop_after(path, resume_step)
-            purge_step = resume_step + 1
         self._file = path.open("a")
-        self._board = SummaryWriter(str(folder), purge_step=purge_step)
+        self.writer: Writer = make_writer(logger, folder, resume_step)
 
     def log(self, metrics: Mapping[str, float], step: int) -> None:
-        """Write one line and one TensorBoard point per value.
+        """Write one line, and one point of the logger per value.
 
         Args:
             metrics: Tag to number; a value that is not finite stands as null in the JSON.
@@ -42,17 +39,16 @@ class MetricsWriter:
         finite = {tag: value if math.isfinite(value) else None for tag, value in values.items()}
         self._file.write(json.dumps({"step": step, "time": round(time.time(), 3), **finite}) + "\n")
         self._file.flush()  # into the hands of the system: a killed process loses no line
-        for tag, value in values.items():
-            self._board.add_scalar(tag, value, step)
+        self.writer.scalars(values, step)
 
     def flush(self) -> None:
-        """Also hand TensorBoard's buffered points to the system."""
-        self._board.flush()
+        """Also hand the logger's buffered points over."""
+        self.writer.flush()
 
     def close(self) -> None:
-        """Write what is buffered and close both files."""
+        """Write what is buffered and close both."""
         self._file.close()
-        self._board.close()
+        self.writer.close()
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:

@@ -1,82 +1,139 @@
-"""Curves of a run as a PNG: of learning, from its ``metrics.jsonl``; of adaptation, from its ``evaluation.json``.
+"""Curves and points of runs as figures: learning, metrics, adaptation, comparison. Needs the extra ``plot``."""
 
-Needs the extra ``plot``.
-"""
-
+import io
 import json
+import textwrap
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from bidex_meta.errors import BidexError
-from bidex_meta.record.metrics import read_metrics
+from bidex_meta.record.curves import Curve
+
+Group = tuple[str, Mapping[str, Curve]]
+"""Runs that are drawn in one colour: their label, and curves by tag."""
+Bar = tuple[str, float, tuple[float, float] | None]
+"""A label, a value, and its interval where it is known."""
 
 _COLUMNS = 4
-_PANELS = (("Train/return/", "return"), ("Train/success/", "success"))
+_MEASURES = ("return", "success")
+_STYLES = ("-", "--")
+_FEW = 60
+"""Evaluations up to which each is a dot: more of them would hide the dashes."""
 _COLOURS = {"train": "tab:blue", "test": "tab:orange"}
+_AGAIN = "Write one: bidex-meta evaluate RUN --shots 3 --json > {}"
 
 
-def plot_learning_curves(metrics_path: Path, out: Path) -> None:
-    """Draw return and success of every task against environment steps.
+def draw_learning(groups: Sequence[Group], families: Sequence[str] = ("Train", "Eval")) -> Any:
+    """Return and success of every task against environment steps, a line for each group of runs.
 
-    Each task has its own panels: their returns differ by orders of magnitude.
+    Each task has its own panels: their returns differ by orders of magnitude. Evaluations while training are dashed.
 
     Args:
-        metrics_path: A run's ``metrics.jsonl``.
-        out: The picture to write; its ending names the format.
+        groups: Label and curves by tag.
+        families: Of tags, in the order of their line styles; drawn where there are any.
+
+    Returns:
+        A figure.
 
     Raises:
-        BidexError: matplotlib is missing or does not know the ending, or no episode has been logged yet.
+        BidexError: matplotlib is missing, or no episode has ended yet.
     """
     make_figure = _figure()
-    rows = read_metrics(metrics_path)
-    names = list(dict.fromkeys(tag[len(p) :] for row in rows for tag in row for p, _ in _PANELS if tag.startswith(p)))
+    starts = [f"{family}/{measure}/" for measure in _MEASURES for family in families]
+    tags = [tag for _, curves in groups for tag in curves]
+    names = list(dict.fromkeys(tag[len(start) :] for tag in tags for start in starts if tag.startswith(start)))
     if not names:
-        raise BidexError(f"{metrics_path} holds no finished episode yet: nothing to plot.")
+        raise BidexError("There is no finished episode yet: nothing to plot.")
     columns, blocks = _grid(len(names))
     figure = make_figure(figsize=(3.2 * columns, 4.0 * blocks), layout="constrained")
     axes = figure.subplots(2 * blocks, columns, squeeze=False)
     for place in range(blocks * columns):
-        for panel, (prefix, label) in enumerate(_PANELS):
+        for panel, measure in enumerate(_MEASURES):
             axis = axes[2 * (place // columns) + panel, place % columns]
             if place >= len(names):
                 axis.set_axis_off()
                 continue
-            steps, values = _series(rows, prefix + names[place])
-            axis.plot([step / 1e6 for step in steps], values, linewidth=1.2)
+            for number, (label, curves) in enumerate(groups):
+                for family, style in zip(families, _STYLES, strict=False):
+                    _draw_curve(axis, curves.get(f"{family}/{measure}/{names[place]}"), label, number, style)
             axis.grid(alpha=0.3)
             if panel == 0:
-                axis.set_title(names[place])
+                axis.set_title(_plain(names[place]))
             else:
                 axis.set_ylim(-0.02, 1.02)
                 axis.set_xlabel("environment steps (millions)")
             if place % columns == 0:
-                axis.set_ylabel(label)
-    _save(figure, out)
+                axis.set_ylabel(measure)
+    if len(groups) > 1:
+        _add_legend(figure, [label for label, _ in groups])
+    return figure
 
 
-def plot_adaptation(evaluation_path: Path, out: Path) -> None:
-    """Draw return and success of every class against shots of adaptation, train classes first, then test classes.
+def draw_metrics(groups: Sequence[Group], tags: Mapping[str, str]) -> Any:
+    """Some metrics against environment steps, a panel each and a line for each group of runs.
+
+    Args:
+        groups: Label and curves by tag.
+        tags: Tag to what is written beside its panel.
+
+    Raises:
+        BidexError: matplotlib is missing.
+    """
+    figure = _figure()(figsize=(5.2 * len(tags), 3.0), layout="constrained")
+    for axis, (tag, title) in zip(figure.subplots(1, len(tags), squeeze=False).flat, tags.items(), strict=True):
+        for number, (label, curves) in enumerate(groups):
+            _draw_curve(axis, curves.get(tag), label, number, "-")
+        axis.grid(alpha=0.3)
+        axis.set_ylabel(title)
+        axis.set_xlabel("environment steps (millions)")
+    if len(groups) > 1:
+        _add_legend(figure, [label for label, _ in groups])
+    return figure
+
+
+def draw_comparison(panels: Mapping[str, Sequence[Bar]]) -> Any:
+    """Numbers of groups beside each other, as points with their intervals.
+
+    Args:
+        panels: Title to label, value and interval of each group.
+
+    Raises:
+        BidexError: matplotlib is missing.
+    """
+    most = max(len(bars) for bars in panels.values())
+    figure = _figure()(figsize=(5.2 * len(panels), 1.2 + 0.45 * most), layout="constrained")
+    for axis, (title, bars) in zip(figure.subplots(1, len(panels), squeeze=False).flat, panels.items(), strict=True):
+        for place, (_, value, interval) in enumerate(bars):
+            low, high = interval or (value, value)
+            colour = f"C{place % 10}"
+            axis.plot([low, high], [place, place], linewidth=2.5, alpha=0.5, color=colour)
+            axis.plot([value], [place], marker="o", color=colour)
+        axis.set_yticks(range(len(bars)), ["\n".join(textwrap.wrap(_plain(label), 40)) for label, _, _ in bars])
+        axis.set_ylim(len(bars) - 0.5, -0.5)
+        axis.set_title(title)
+        axis.grid(alpha=0.3, axis="x")
+    return figure
+
+
+def draw_adaptation(found: Any, where: object) -> Any:
+    """Return and success of every class against shots of adaptation, train classes first, then test classes.
 
     Bands are the 95 % bootstrap intervals over episodes.
 
     Args:
-        evaluation_path: A run's ``evaluation.json``, or what ``bidex-meta evaluate RUN --shots K --json`` prints.
-        out: The picture to write; its ending names the format.
+        found: Content of a run's ``evaluation.json``, or what ``bidex-meta evaluate RUN --shots K --json`` prints.
+        where: Its file, for messages.
 
     Raises:
-        BidexError: matplotlib is missing or does not know the ending, or the file holds no meta-test.
+        BidexError: matplotlib is missing, or it holds no meta-test.
     """
     make_figure = _figure()
-    again = f"Write one: bidex-meta evaluate RUN --shots 3 --json > {evaluation_path}"
-    if not evaluation_path.is_file():
-        raise BidexError(f"There is no {evaluation_path}. {again}")
-    try:
-        found = json.loads(evaluation_path.read_text())
-    except ValueError:
-        raise BidexError(f"{evaluation_path} is not JSON. {again}") from None
     splits = found.get("splits") if isinstance(found, dict) else None
     if not splits:
-        raise BidexError(f"{evaluation_path} holds no meta-test: its learner does not adapt, or it is older. {again}")
+        raise BidexError(
+            f"{where} holds no meta-test: its learner does not adapt, or it is older. {_AGAIN.format(where)}"
+        )
     grids = {split: _grid(len(part["before"]["classes"])) for split, part in splits.items()}
     columns, blocks = max(grid[0] for grid in grids.values()), sum(grid[1] for grid in grids.values())
     figure = make_figure(figsize=(3.2 * columns, 4.0 * blocks), layout="constrained")
@@ -94,9 +151,23 @@ def plot_adaptation(evaluation_path: Path, out: Path) -> None:
                 _draw_shots(axis, rows, measure, _COLOURS.get(split))
                 if place % grids[split][0] == 0:
                     axis.set_ylabel(measure)
-            axes[row, place % grids[split][0]].set_title(f"{split}: {name}", fontsize=10)
+            axes[row, place % grids[split][0]].set_title(_plain(f"{split}: {name}"), fontsize=10)
         first += grids[split][1]
-    _save(figure, out)
+    return figure
+
+
+def read_evaluation(path: Path) -> Any:
+    """What an evaluation's file holds.
+
+    Raises:
+        BidexError: There is none, or it is not JSON.
+    """
+    if not path.is_file():
+        raise BidexError(f"There is no {path}. {_AGAIN.format(path)}")
+    try:
+        return json.loads(path.read_text())
+    except ValueError:
+        raise BidexError(f"{path} is not JSON. {_AGAIN.format(path)}") from None
 
 
 def _draw_shots(axis: Any, rows: list[dict[str, Any]], measure: str, colour: str | None) -> None:
@@ -112,16 +183,35 @@ def _draw_shots(axis: Any, rows: list[dict[str, Any]], measure: str, colour: str
         axis.set_xlabel("shots")
 
 
+def missing() -> str | None:
+    """What to install where nothing can be drawn; None where it can."""
+    try:
+        import matplotlib.figure  # noqa: F401
+    except ImportError:
+        return "Plots need matplotlib: pip install 'bidex-meta[plot]'."
+    return None
+
+
 def _figure() -> Any:
     """Matplotlib's class of figures, without its global state."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise BidexError("Plots need matplotlib: pip install 'bidex-meta[plot]'.") from None
+    told = missing()
+    if told is not None:
+        raise BidexError(told)
+    from matplotlib.figure import Figure
+
     return Figure
 
 
-def _save(figure: Any, out: Path) -> None:
+def save(figure: Any, out: Path) -> None:
+    """Write a figure.
+
+    Args:
+        figure: One of those drawn here.
+        out: The picture to write; its ending names the format.
+
+    Raises:
+        BidexError: matplotlib does not know the ending.
+    """
     known = figure.canvas.get_supported_filetypes()
     if out.suffix[1:].lower() not in known:
         raise BidexError(f"Expected a picture's ending ({', '.join(sorted(known))}), got {out.name!r}. Name it .png.")
@@ -129,12 +219,43 @@ def _save(figure: Any, out: Path) -> None:
     figure.savefig(out, dpi=120)
 
 
+def svg(figure: Any) -> bytes:
+    """A figure as SVG, its words as text."""
+    from matplotlib import rc_context
+
+    out = io.BytesIO()
+    with rc_context({"svg.fonttype": "none"}):
+        figure.savefig(out, format="svg", metadata={"Date": None})
+    return out.getvalue()
+
+
+def _draw_curve(axis: Any, curve: Curve | None, label: str, number: int, style: str) -> None:
+    if curve is None:
+        return
+    steps, colour = curve.steps / 1e6, f"C{number % 10}"
+    marker = "." if len(steps) == 1 or (style != "-" and len(steps) <= _FEW) else None
+    axis.plot(steps, curve.mean, linewidth=1.2, color=colour, linestyle=style, marker=marker, label=_plain(label))
+    if curve.low is not None and curve.high is not None:
+        axis.fill_between(steps, curve.low, curve.high, alpha=0.2, color=colour, linewidth=0.0)
+
+
+def _add_legend(figure: Any, labels: Sequence[str]) -> None:
+    from matplotlib.lines import Line2D
+
+    lines = [Line2D([], [], color=f"C{number % 10}") for number in range(len(labels))]
+    inches = figure.get_size_inches()[0]
+    words = ["\n".join(textwrap.wrap(_plain(label), max(20, int(12 * inches)))) for label in labels]
+    longest = max(map(len, labels))
+    columns = max(1, min(len(labels), int(12 * inches) // (longest + 6)))
+    figure.legend(lines, words, loc="outside upper left", ncols=columns, frameon=False)
+
+
+def _plain(name: str) -> str:
+    """A name of the user's, in which matplotlib shall see no formulas."""
+    return name.replace("$", r"\$")
+
+
 def _grid(panels: int) -> tuple[int, int]:
     """Columns, and blocks of two rows, for so many tasks."""
     columns = min(_COLUMNS, panels)
     return columns, -(-panels // columns)
-
-
-def _series(rows: list[dict[str, Any]], tag: str) -> tuple[list[int], list[float]]:
-    points = [(row["step"], row[tag]) for row in rows if row.get(tag) is not None]
-    return [step for step, _ in points], [value for _, value in points]

@@ -1,14 +1,17 @@
-"""How training goes, on stderr: a live table in a terminal, a plain line every few seconds elsewhere."""
+"""How training, or filming, goes, on stderr: a live table in a terminal, a plain line every few seconds elsewhere."""
 
 import math
 import sys
 import time
-from collections.abc import Mapping
-from typing import TextIO
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TextIO, TypeVar
 
 from rich.console import Console
 from rich.live import Live
+from rich.progress import track
 from rich.table import Table
+
+Item = TypeVar("Item")
 
 _PLAIN_SECONDS = 5.0
 _SUCCESS = "Train/success/"
@@ -98,6 +101,27 @@ class Progress:
     def _overall(self) -> list[str]:
         mean_return, success = self._shown.get("Train/mean_return"), self._shown.get("Train/success_rate")
         return [f"return {_number(mean_return)}", f"success {_percent(success)}"]
+
+
+def counted(items: Iterable[Item], total: int, what: str, stream: TextIO | None = None) -> Iterator[Item]:
+    """The items, with how far it is on stderr: a bar in a terminal, a plain line every few seconds elsewhere.
+
+    Args:
+        items: What is made one after the other.
+        total: How many there will be at most.
+        what: Their name in the plural.
+        stream: Where to write instead.
+    """
+    console = Console(file=stream or sys.stderr)
+    if console.is_terminal:
+        yield from track(items, description=what, total=total, console=console, transient=True)
+        return
+    said = time.monotonic()
+    for number, item in enumerate(items, start=1):
+        yield item
+        if time.monotonic() - said >= _PLAIN_SECONDS:
+            said = time.monotonic()
+            console.print(f"{number} of {total} {what}", highlight=False, markup=False)
 
 
 def _percent(value: float | None) -> str:

@@ -8,7 +8,7 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any, Protocol
@@ -68,6 +68,7 @@ def train(
     total_seconds: float = math.inf,
     spent_seconds: float = 0.0,
     checkpoint_seconds: float = 60.0,
+    watch: Callable[[], dict[str, float]] | None = None,
 ) -> int:
     """Trains until ``total_steps`` environment steps are done or ``total_seconds`` are up, whichever comes first.
 
@@ -86,6 +87,8 @@ def train(
         spent_seconds: Training time of a resumed run before.
         checkpoint_seconds: Least time between two checkpoints, and never less than 50 times what the last one took to
             save: a replay makes them large. 0 saves after every iteration. One more is always saved at the end.
+        watch: Looks at the learner after each iteration and changes nothing of it; what it returns joins the metrics,
+            and its time is no time of training. None in processes other than 0.
 
     Returns:
         Number of the signal that ended the training early, 0 if none did; where another process got it, SIGTERM's.
@@ -109,6 +112,10 @@ def train(
         while not over() and not (stopped := any_process(stop.is_set())):
             metrics = learner.iterate()
             metrics["Perf/training_time"] = time.monotonic() - began_at
+            if watch is not None:
+                paused_at = time.monotonic()
+                metrics |= watch()
+                began_at += time.monotonic() - paused_at
             if record is not None:
                 record.log(metrics, learner.env_steps)
             if any_process(is_main() and time.monotonic() - saved_at >= pause):

@@ -1,46 +1,84 @@
 """Pictures of a row: its scene from a fixed camera, with its goal as a ghost."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
 import torch
 
+from bidex_meta import drawing
 from bidex_meta.errors import BidexError
 from bidex_meta.maths import wxyz
 
 if TYPE_CHECKING:
+    from bidex_meta.engine.protocol import Engine
     from bidex_meta.world.world import World
 
 CAMERAS = {"front": (125.0, -25.0), "side": (180.0, -15.0), "top": (90.0, -75.0), "back": (-55.0, -25.0)}
 """Azimuth and elevation of the named views, degrees."""
-_GHOST = np.array((0.25, 0.75, 0.40, 0.35), dtype=np.float32)
+_MOST_RENDERERS = 32
+"""A tiled film of all classes fits; each takes some megabytes."""
+_SMALL = 320
+"""Up to this width, pixels, pictures are tiles, drawn faster: without reflections and with coarser shadows."""
+GHOST = np.array((0.25, 0.75, 0.40, 0.35), dtype=np.float32)
+"""Colour of goals."""
+
+Ghost = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""A goal: position (3,), quaternion (w, x, y, z), semi-axes (3,), world, metres."""
 
 
-def render_row(world: "World", row: int, width: int, height: int, camera: str | None) -> np.ndarray:
-    """A picture of a row, shape (height, width, 3), uint8.
+class Painter:
+    """Draws rows of a world; renderers are kept, since making one takes longer than a picture.
 
-    Raises:
-        BidexError: Unknown camera, a row that does not exist, or no way to draw on this machine.
+    Another painter in copies: what holds a place in a drawing library cannot be copied.
     """
-    name = camera or "front"
-    if name not in CAMERAS:
-        raise BidexError(f"Expected a camera among {', '.join(CAMERAS)}, got {name!r}.")
-    if not 0 <= row < world.num_envs:
-        raise BidexError(f"Expected a row from 0 to {world.num_envs - 1}, got {row}.")
-    part = next(p for p in world.parts if bool((p.group.rows == row).any()))
-    engine_row = int((part.group.rows == row).nonzero()[0])
-    model, data = part.group.engine.model(engine_row), part.group.engine.data(engine_row)
-    try:
-        renderer = mujoco.Renderer(model, height, width)
-    except Exception as error:  # the drawing library raises errors of many kinds when it finds no display
-        raise BidexError(
-            f"Expected a way to draw, got {type(error).__name__}; without a screen set MUJOCO_GL=egl or osmesa."
-        ) from error
-    with renderer:
-        renderer.update_scene(data, _camera(world, row, name))
-        _add_ghosts(world, row, renderer.scene)
+
+    def __init__(self) -> None:
+        self._renderers: dict[tuple[int, int, int], mujoco.Renderer] = {}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Painter, ()
+
+    def picture(self, world: "World", row: int, width: int, height: int, camera: str | None) -> np.ndarray:
+        """A picture of a row, shape (height, width, 3), uint8.
+
+        Raises:
+            BidexError: Unknown camera, a row that does not exist, too large a picture, or no way to draw on this
+                machine.
+        """
+        name = camera or "front"
+        if name not in CAMERAS:
+            raise BidexError(f"Expected a camera among {', '.join(CAMERAS)}, got {name!r}.")
+        if not 0 <= row < world.num_envs:
+            raise BidexError(f"Expected a row from 0 to {world.num_envs - 1}, got {row}.")
+        engine, engine_row = simulation(world, row)
+        renderer = self._renderer(engine, engine_row, (int(world.task_id[row]), width, height))
+        renderer.update_scene(engine.data(engine_row), _camera(world, row, name))
+        add_ghosts(ghosts(world, row), renderer.scene)
         return renderer.render()
+
+    def _renderer(self, engine: "Engine", row: int, key: tuple[int, int, int]) -> mujoco.Renderer:
+        """That of a slot (its rows have one model) and a size, width and height."""
+        if key not in self._renderers:
+            drawing.prepare()
+            model = engine.model(row)
+            most = model.vis.global_.offwidth, model.vis.global_.offheight
+            if not (0 < key[1] <= most[0] and 0 < key[2] <= most[1]):
+                raise BidexError(
+                    f"Expected a picture of at most {most[0]} x {most[1]} pixels, got {key[1]} x {key[2]}."
+                )
+            if len(self._renderers) >= _MOST_RENDERERS:
+                self._renderers.pop(next(iter(self._renderers))).close()
+            if key[1] <= _SMALL:
+                model.vis.quality.shadowsize, model.vis.quality.offsamples = 1024, 4
+            renderer = self._renderers[key] = mujoco.Renderer(model, key[2], key[1])
+            renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = key[1] > _SMALL
+        return self._renderers[key]
+
+    def close(self) -> None:
+        """Frees the renderers."""
+        while self._renderers:
+            self._renderers.popitem()[1].close()
 
 
 def _camera(world: "World", row: int, name: str) -> mujoco.MjvCamera:
@@ -52,15 +90,26 @@ def _camera(world: "World", row: int, name: str) -> mujoco.MjvCamera:
     return view
 
 
-def _add_ghosts(world: "World", row: int, scene: mujoco.MjvScene) -> None:
+def simulation(world: "World", row: int) -> "tuple[Engine, int]":
+    """The engine that carries a row, and its row there."""
+    part = next(p for p in world.parts if bool((p.group.rows == row).any()))
+    return part.group.engine, int((part.group.rows == row).nonzero()[0])
+
+
+def ghosts(world: "World", row: int) -> list[Ghost]:
+    """The goals of a row's task."""
     slot = int(world.task_id[row])
     task = world.slots[slot].task_class
     variation = torch.as_tensor(world.slots[slot].tasks[int(world.task_index[row])])[None]
-    for pose, size in task.ghosts(task.freeze(variation)):
-        rotation = np.zeros(9)
-        mujoco.mju_quat2Mat(rotation, wxyz(pose[0, 3:]).numpy())
+    found = task.ghosts(task.freeze(variation))
+    return [(pose[0, :3].numpy(), wxyz(pose[0, 3:]).numpy(), np.array(size)) for pose, size in found]
+
+
+def add_ghosts(goals: list[Ghost], scene: mujoco.MjvScene) -> None:
+    """Puts goals into a scene that is about to be drawn, translucent."""
+    rotation = np.zeros(9)
+    for position, quaternion, size in goals:
+        mujoco.mju_quat2Mat(rotation, quaternion)
         geom = scene.geoms[scene.ngeom]
-        mujoco.mjv_initGeom(
-            geom, mujoco.mjtGeom.mjGEOM_ELLIPSOID, np.array(size), pose[0, :3].numpy(), rotation, _GHOST
-        )
+        mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_ELLIPSOID, size, position, rotation, GHOST)
         scene.ngeom += 1

@@ -30,7 +30,7 @@ from bidex_meta.world.overlap import SideBySide
 from bidex_meta.world.part import Part
 from bidex_meta.world.random import row_keys
 from bidex_meta.world.recording import Recorder, Work, cuda_graph, fresh
-from bidex_meta.world.rendering import render_row
+from bidex_meta.world.rendering import Painter
 from bidex_meta.world.spaces import make_spaces
 from bidex_meta.world.starts import Starts
 from bidex_meta.world.threads import one_torch_thread
@@ -117,6 +117,7 @@ class World(RowAttributes, VectorEnv):
         self._action = torch.zeros(num_envs, self.action_size, device=self.device)
         self._obs = torch.zeros(num_envs, self.observation_size, device=self.device)
         self._ready = False
+        self._painter = Painter()
         self._seed_rows(seed)
 
     def _of_rows(self, of_slots: Sequence[float]) -> Tensor:
@@ -370,7 +371,7 @@ class World(RowAttributes, VectorEnv):
         """A picture of a row with its goal, shape (height, width, 3), uint8."""
         row = whole_number("row", row, 0, self.num_envs - 1)
         width, height = (whole_number(name, n, 1) for name, n in (("width", width), ("height", height)))
-        return render_row(self, row, width, height, camera)
+        return self._painter.picture(self, row, width, height, camera)
 
     @property
     def pools(self) -> list[np.ndarray]:
@@ -378,4 +379,5 @@ class World(RowAttributes, VectorEnv):
         return [slot.tasks.copy() for slot in self.slots]
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Nothing is held outside memory."""
+        """Frees what pictures were drawn with."""
+        self._painter.close()

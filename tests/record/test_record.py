@@ -8,7 +8,8 @@ import pytest
 from bidex_meta.errors import BidexError
 from bidex_meta.record import MetricsWriter, Progress, RunFolder, read_metrics, training_seconds
 from bidex_meta.record import progress as progress_module
-from bidex_meta.record.plots import plot_adaptation, plot_learning_curves
+from bidex_meta.record.curves import Curve
+from bidex_meta.record.plots import draw_adaptation, draw_learning, read_evaluation, save, svg
 from bidex_meta.record.video import check_suffix, write_image, write_video
 
 CONFIG = {"suite": "MT4", "task": None, "algo": "mtppo", "seed": 3, "learner": {"hidden": [8]}}
@@ -135,31 +136,43 @@ def test_progress_in_a_terminal_is_a_table(monkeypatch):
     assert "25.0 %" in stream.getvalue()
 
 
+def curve(*values, spread=None):
+    mean = np.array(values, float)
+    ends = (None, None) if spread is None else (mean - spread, mean + spread)
+    return Curve(np.arange(len(values), dtype=float), mean, *ends)
+
+
 def test_curves_are_drawn_and_an_empty_run_says_so(tmp_path):
-    metrics = tmp_path / "metrics.jsonl"
-    metrics.write_text("")
     with pytest.raises(BidexError, match="no finished episode"):
-        plot_learning_curves(metrics, tmp_path / "c.png")
-    names = [f"T{i}" for i in range(5)]
-    rows = [{"step": 0, "Loss/value": 1.0}]
-    rows += [{"step": s, **{f"Train/{k}/{n}": s * 1e-6 for n in names for k in ("return", "success")}} for s in (1, 2)]
-    metrics.write_text("".join(json.dumps(row) + "\n" for row in rows))
-    plot_learning_curves(metrics, tmp_path / "new" / "c.png")
+        draw_learning([("mtppo", {"Loss/value": curve(1.0)})])
+    tags = {f"Train/{kind}/T{i}": curve(0.1, 0.2, spread=0.05) for i in range(5) for kind in ("return", "success")}
+    other = {"Eval/success/T0": curve(0.5), "Train/return/T5": curve(1.0, 2.0)}
+    figure = draw_learning([("mtppo, gamma $0.9$", tags), ("mtsac", other)])
+    shown = [axis for axis in figure.axes if axis.axison]
+    assert len(shown) == 2 * 6
+    assert [len(axis.lines) for axis in shown[:4]] == [1, 1, 1, 1]
+    success = next(axis for axis in figure.axes if axis.get_ylabel() == "success")
+    assert [line.get_linestyle() for line in success.lines] == ["-", "--"]
+    assert len(success.collections) == 1  # the interval of the first group
+    save(figure, tmp_path / "new" / "c.png")
     assert (tmp_path / "new" / "c.png").read_bytes()[:4] == b"\x89PNG"
+    assert b"gamma $0.9$" in svg(figure)
 
 
 def test_an_ending_that_is_no_pictures_is_one_line(tmp_path):
-    metrics = tmp_path / "metrics.jsonl"
-    metrics.write_text(json.dumps({"step": 1, "time": 1.0, "Train/return/Near": 2.0}) + "\n")
+    figure = draw_learning([("mtppo", {"Train/return/Near": curve(2.0)})])
     with pytest.raises(BidexError, match=r"png.*got 'c\.txt'"):
-        plot_learning_curves(metrics, tmp_path / "c.txt")
+        save(figure, tmp_path / "c.txt")
 
 
 @pytest.mark.parametrize("text", ["[1]", "{}"])
 def test_a_file_without_a_meta_test_is_one_line(text, tmp_path):
-    (tmp_path / "evaluation.json").write_text(text)
+    path = tmp_path / "evaluation.json"
+    with pytest.raises(BidexError, match="There is no"):
+        read_evaluation(path)
+    path.write_text(text)
     with pytest.raises(BidexError, match="holds no meta-test"):
-        plot_adaptation(tmp_path / "evaluation.json", tmp_path / "c.png")
+        draw_adaptation(read_evaluation(path), path)
 
 
 @pytest.mark.parametrize("text", ["[]", '{"algo": "mtppo"}'])
@@ -172,7 +185,7 @@ def test_a_config_that_is_no_runs_is_one_line(text, tmp_path):
 def test_missing_matplotlib_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
     with pytest.raises(BidexError, match=r"bidex-meta\[plot\]"):
-        plot_learning_curves(tmp_path / "metrics.jsonl", tmp_path / "c.png")
+        draw_learning([])
 
 
 def test_picture_and_film_read_back(tmp_path):

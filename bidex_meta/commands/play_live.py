@@ -1,0 +1,86 @@
+"""``bidex-meta play``: a policy at work, live."""
+
+import contextlib
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from bidex_meta.commands.parsing import Switch, parse
+from bidex_meta.errors import BidexError, known_name
+
+
+@dataclass(frozen=True)
+class PlayFlags:
+    """Look at a policy live: in MuJoCo's viewer, or in the browser where there is no screen.
+
+    Example: bidex-meta play runs/MT4/mtppo/2026-11-21_10-00-00_seed0 --task CatchAbreast
+
+    bidex-meta play --task SwingCup --policy random needs no run.
+    """
+
+    run: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = None
+    """Run folder; the same as --policy RUN."""
+    task: str | None = None
+    """Class to look at; None: the first one. In the browser it can be changed."""
+    policy: str = "zero"
+    """zero, random, or a run folder."""
+    checkpoint: str = "last"
+    """Of a run: last, best (see `bidex-meta run --help`, --evaluate-every) or a file."""
+    suite: str | None = None
+    """Show the classes of this suite; None: the run's."""
+    seed: int = 0
+    """Seed of tasks and starts."""
+    speed: float = 1.0
+    """Of the clock; 0.5 is slow motion."""
+    browser: Switch = False
+    """In the browser, also where there is a screen."""
+    host: str = "127.0.0.1"
+    """Address the browser's page is served at; 0.0.0.0 lets other machines in."""
+    port: int = 8080
+    """Port of that page; where it is taken, the next free one."""
+    seconds: float | None = None
+    """End after so many seconds; None: when the window is closed, or Ctrl-C."""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Play until it is closed.
+
+    Raises:
+        BidexError: Bad flags, a policy that does not fit, or no window and no viser.
+    """
+    flags = parse(PlayFlags, arguments, "play")
+    if flags.speed <= 0.0:
+        raise BidexError(f"--speed must be above 0, not {flags.speed:g}.")
+    from bidex_meta.commands.policies import acting, looked_at, slots_of
+    from bidex_meta.viewer.loop import play
+    from bidex_meta.viewer.playback import Stage
+
+    policy = flags.policy if flags.run is None else str(flags.run)
+    source = looked_at(policy, flags.suite, flags.task, flags.seed)
+    slots = slots_of(source)
+    task = known_name(f"task of {source.name}", flags.task or slots[0], source.task_classes())
+    world = source.world("train", len(slots))
+    stage = Stage(world, acting(policy, world, flags.seed, flags.checkpoint), slots.index(task), flags.seed)
+    screen = _screen(flags, stage)
+    with contextlib.suppress(KeyboardInterrupt):  # how the view in the browser is ended
+        play(stage, screen, flags.seconds)
+    world.close()
+
+
+def _screen(flags: PlayFlags, stage: Any) -> Any:
+    from bidex_meta import drawing
+
+    if drawing.has_screen() and not flags.browser:
+        from bidex_meta.viewer import desktop
+
+        print(desktop.KEYS, file=sys.stderr)
+        return desktop.Desktop(stage, flags.speed)
+    from bidex_meta.viewer.browser import Browser
+
+    screen = Browser(stage, flags.host, flags.port, flags.speed)
+    print(f"Open {screen.address} in a browser; Ctrl-C ends it.", file=sys.stderr, flush=True)
+    return screen

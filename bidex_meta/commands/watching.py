@@ -1,0 +1,176 @@
+"""Looking at a learner while it learns: evaluations, the best policy, films. Nothing of the training depends on it."""
+
+import random
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+
+from bidex_meta.agents import Agent
+from bidex_meta.commands.run_config import RunPlan
+from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.results import Evaluation
+from bidex_meta.record import Recorder, RunFolder
+from bidex_meta.sources import Source
+from bidex_meta.train.launch import launch
+
+TASKS = 10
+"""Tasks of each class in such an evaluation, the first of its pool; one episode each."""
+_FILM = {"width": 240, "height": 180}
+_FILM_EVERY, _MOST_FILM_STEPS = 2, 300
+
+
+def check(plan: RunPlan) -> None:
+    """Refuse what would fail in the middle of the training.
+
+    Raises:
+        BidexError: There are no pictures of such a suite, no way to draw here, no ffmpeg, or no such logger.
+    """
+    from bidex_meta.record.writers import check_logger
+
+    check_logger(plan.config["logger"])
+    if plan.config["video_every"] is not None:
+        from bidex_meta import drawing
+        from bidex_meta.record.video import check_films
+
+        plan.source.task_classes()
+        check_films()
+        drawing.prepare()
+
+
+class Watch:
+    """Called after each iteration; every so many it evaluates or films.
+
+    Args:
+        plan: What is run.
+        folder: Where it is run.
+        learner: What is looked at.
+        record: Where films go.
+        iterations: Iterations that a resumed run has made before.
+    """
+
+    def __init__(self, plan: RunPlan, folder: RunFolder, learner: Any, record: Recorder, iterations: int) -> None:
+        self._plan, self._folder, self._learner, self._record = plan, folder, learner, record
+        self._iterations = iterations
+        self._device = launch().own_device(plan.config["device"])
+        self._worlds: dict[str, Any] = {}
+        self._best = folder.checkpoints.found_of_best()
+
+    def __call__(self) -> dict[str, float]:
+        """Metrics of this iteration's evaluation, ``Eval/...``; none without one."""
+        self._iterations += 1
+        metrics: dict[str, float] = {}
+        with undisturbed(torch.device(self._device)):
+            if self._is_due("evaluate_every"):
+                metrics = self._evaluate()
+            if self._is_due("video_every"):
+                self._film()
+        return metrics
+
+    def close(self) -> None:
+        """Frees the worlds."""
+        for world in self._worlds.values():
+            world.close()
+
+    def _is_due(self, name: str) -> bool:
+        every = self._plan.config[name]
+        return every is not None and self._iterations % every == 0
+
+    def _policy(self, device: str) -> Agent:
+        """A copy: recurrent ones remember what they saw, adapting ones learn."""
+        return self._plan.kind.make.load_policy(self._learner.policy_state_dict(), device)
+
+    def _evaluate(self) -> dict[str, float]:
+        metrics = self._meta_test() if self._plan.kind.adapts else _metrics(self._judge())
+        ranks = ("Eval/success_rate", "Eval/score", "Eval/mean_return")
+        found = {name: metrics[name] for name in ranks if name in metrics}
+        if self._best is None or _better(found, self._best):
+            self._best = found
+            self._folder.checkpoints.save_best(self._learner.policy_state_dict(), self._learner.env_steps, found)
+        return metrics
+
+    def _judge(self) -> Evaluation:
+        from bidex_meta.evaluation.play import EVALUATION_SEED, evaluate
+        from bidex_meta.world.contract import PooledWorld
+
+        source = self._plan.source
+        if "evaluation" not in self._worlds:
+            pools = source.tasks("train")
+            tasks = min(TASKS, max(map(len, pools.values())))
+            world = self._worlds["evaluation"] = source.world("train", tasks * len(pools))
+            if isinstance(world, PooledWorld):
+                first = zip(world.task_names, world.pools, strict=True)
+                world.set_tasks({name: pool[:tasks] for name, pool in first})
+        world = self._worlds["evaluation"]
+        return evaluate(self._policy(self._device), world, 1, seed=EVALUATION_SEED, references=source.references())
+
+    def _meta_test(self) -> dict[str, float]:
+        """One shot on train tasks: test tasks must not choose the policy that is judged on them."""
+        from bidex_meta.commands import metatest
+
+        load, source = partial(self._policy, self._device), self._plan.source
+        found = metatest.meta_test(source, self._plan.config, load, metatest.Options(), ["train"])["train"]
+        before = _metrics(found.before)["Eval/success_rate"]
+        return {**_metrics(found.after), "Eval/success_before_adapt": before}
+
+    def _film(self) -> None:
+        """A film of a row of each class beside each other; its failure is told and ends nothing."""
+        from bidex_meta.commands.policies import slots_of
+        from bidex_meta.evaluation.filming import film_tiles
+        from bidex_meta.tasks.base import CONTROL_RATE
+
+        try:
+            if "film" not in self._worlds:
+                source = Source.open({**self._plan.config, "device": "cpu", "engine": "auto"})
+                self._worlds["film"] = source.world("train", len(slots_of(source)))
+            world = self._worlds["film"]
+            steps = min(_MOST_FILM_STEPS, int(world.max_episode_steps.max()))
+            frames = film_tiles(
+                self._policy("cpu"),
+                world,
+                range(world.num_envs),
+                steps,
+                self._plan.config["seed"],
+                _FILM_EVERY,
+                **_FILM,
+            )
+            self._record.film("training", frames, CONTROL_RATE / _FILM_EVERY, self._learner.env_steps)
+        except (BidexError, OSError) as error:
+            print(f"No film at {self._learner.env_steps:,} steps: {error}", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def undisturbed(device: torch.device) -> Iterator[None]:
+    """Whatever is drawn inside, the random numbers outside go on as if it had not been."""
+    python, legacy = random.getstate(), np.random.get_state()
+    with torch.random.fork_rng([device] if device.type == "cuda" else []), torch.no_grad():
+        yield
+    random.setstate(python)
+    np.random.set_state(legacy)
+
+
+def _metrics(found: Evaluation) -> dict[str, float]:
+    """Means over classes, and each class."""
+    classes = found.classes
+    metrics = {
+        "Eval/success_rate": float(np.mean([result.success for result in classes.values()])),
+        "Eval/mean_return": float(np.mean([result.mean_return for result in classes.values()])),
+    }
+    scores = [result.score for result in classes.values()]
+    known = [score for score in scores if score is not None]
+    if len(known) == len(scores):
+        metrics["Eval/score"] = float(np.mean(known))
+    for name, result in classes.items():
+        metrics[f"Eval/success/{name}"], metrics[f"Eval/return/{name}"] = result.success, result.mean_return
+    return metrics
+
+
+def _better(found: dict[str, float], best: dict[str, float]) -> bool:
+    """By success; where that is equal by the score, or the return where there is no score."""
+    second = "Eval/score" if "Eval/score" in found and "Eval/score" in best else "Eval/mean_return"
+    names = ("Eval/success_rate", second)
+    return [found[name] for name in names] > [best[name] for name in names]

@@ -1,0 +1,109 @@
+"""How MuJoCo draws on this machine: a screen, else EGL, else OSMesa, found when the first picture is asked for.
+
+MuJoCo decides when it is imported, by ``MUJOCO_GL`` alone, and cannot be imported at all where that names what is not
+there. Most runs draw nothing: they shall not fail on it.
+"""
+
+import os
+import sys
+import warnings
+from ctypes.util import find_library
+from functools import cache
+from importlib import import_module
+from typing import Any
+
+from bidex_meta.errors import BidexError
+
+_VARIABLE = "MUJOCO_GL"
+_LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
+"""Backends that need no screen, in the order they are tried, and the library of each."""
+_OTHERS = {"enable", "enabled", "on", "true", "1", "glfw", "glx", "disable", "disabled", "off", "false", "0"}
+"""Other values that MuJoCo knows on Linux."""
+_INSTALL = "Install one (Debian, Ubuntu: apt-get install libegl1 libosmesa6)"
+
+_impossible: str | None = None
+"""What ``MUJOCO_GL`` asked for and this machine does not have."""
+
+
+def set_aside_what_is_missing() -> None:
+    """Takes ``MUJOCO_GL`` out of the environment where MuJoCo could not be imported with it; drawing then tells."""
+    global _impossible
+    asked = _asked()
+    if not sys.platform.startswith("linux") or "mujoco" in sys.modules or asked in {"", *_OTHERS}:
+        return
+    if asked not in _LIBRARIES or find_library(_LIBRARIES[asked]) is None:
+        _impossible = os.environ.pop(_VARIABLE)
+
+
+def has_screen() -> bool:
+    """Whether windows can be opened here, as far as the environment tells."""
+    return not sys.platform.startswith("linux") or any(os.environ.get(n) for n in ("DISPLAY", "WAYLAND_DISPLAY"))
+
+
+@cache
+def prepare() -> None:
+    """Makes sure that ``mujoco.Renderer`` works; costs some time once, and nothing later.
+
+    Raises:
+        BidexError: There is no way to draw, or not the one that ``MUJOCO_GL`` names.
+    """
+    if _impossible is not None:
+        raise BidexError(
+            f"{_VARIABLE}={_impossible} cannot be used here: expected egl, osmesa or glfw, and its library. "
+            "Unset it to take what there is, or install it (Debian, Ubuntu: apt-get install libegl1 libosmesa6)."
+        )
+    from mujoco.rendering.classic import gl_context
+
+    asked = _asked()
+    if asked or not sys.platform.startswith("linux"):
+        reason = _reason(lambda: _try(gl_context.GLContext))
+        if reason is not None:
+            raise BidexError(f"Drawing by {_VARIABLE}={asked or 'default'} failed ({reason}). Unset it, or mend that.")
+        return
+    reasons = []
+    for backend in [*(["glfw"] if has_screen() else []), *_LIBRARIES]:
+        reason = _reason(lambda backend=backend: _load(backend, gl_context))
+        if reason is None:
+            return
+        reasons.append(f"{backend}: {reason}")
+    raise BidexError(f"Expected a screen, EGL or OSMesa to draw with, found none ({'; '.join(reasons)}). {_INSTALL}.")
+
+
+def _asked() -> str:
+    return os.environ.get(_VARIABLE, "").lower().strip()
+
+
+def _reason(attempt: Any) -> str | None:
+    """Why an attempt failed, on one line; None where it did not."""
+    try:
+        attempt()
+    except Exception as error:  # drawing libraries raise errors of many kinds
+        return (str(error).splitlines() or [type(error).__name__])[0][:120].rstrip(".")
+    return None
+
+
+def _load(backend: str, gl_context: Any) -> None:
+    """Makes a backend MuJoCo's, and tries it; what a failed one imported is forgotten, or it would spoil the next."""
+    before, platform = set(sys.modules), os.environ.get("PYOPENGL_PLATFORM")
+    try:
+        context = import_module(f"mujoco.{backend}").GLContext
+        _try(context)
+        gl_context.GLContext = context
+    except Exception:
+        for name in set(sys.modules) - before:
+            if name.startswith(("OpenGL", f"mujoco.{backend}")):
+                del sys.modules[name]
+        if platform is None:
+            os.environ.pop("PYOPENGL_PLATFORM", None)
+        raise
+
+
+def _try(context: Any) -> None:
+    """Makes a context; MuJoCo must not meet one that failed: it would not draw with the next one either."""
+    with warnings.catch_warnings():  # GLFW's are what the caller is told
+        warnings.simplefilter("ignore")
+        made = context(16, 16)
+        made.make_current()
+        if context.__module__ == "mujoco.glfw" and not import_module("glfw").get_current_context():
+            raise OSError("no window can be opened")
+    made.free()

@@ -1,0 +1,1 @@
+"""A policy at work, live: on a screen in MuJoCo's own viewer, without one in the browser."""

@@ -1,0 +1,117 @@
+"""The same in the browser, by viser: for machines without a screen. Needs the extra ``viewer``."""
+
+from importlib import import_module
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from bidex_meta.errors import BidexError
+from bidex_meta.viewer.playback import Stage
+from bidex_meta.viewer.shapes import colour, shape, visible
+from bidex_meta.world.rendering import CAMERAS, GHOST
+
+
+class Browser:
+    """A server that shows the stage to whoever opens its page. A ``loop.Screen``."""
+
+    def __init__(self, stage: Stage, host: str = "127.0.0.1", port: int = 8080, speed: float = 1.0) -> None:
+        """Starts it.
+
+        Args:
+            stage: What is shown.
+            host: Address it listens at; 0.0.0.0 lets other machines in.
+            port: Port; where it is taken, the next free one.
+            speed: Of the clock.
+
+        Raises:
+            BidexError: viser is missing.
+        """
+        try:
+            viser = import_module("viser")
+        except ImportError:
+            raise BidexError(
+                "The view in the browser needs viser: pip install 'bidex-meta[viewer]'. Or film it: bidex-meta render."
+            ) from None
+        self.paused, self.speed = False, speed
+        self._asked: list[str] = []
+        self._server: Any = viser.ViserServer(host=host, port=port, label="bidex-meta", verbose=False)
+        self.address = f"http://{host}:{self._server.get_port()}"
+        self._server.scene.set_up_direction("+z")
+        self._shapes: dict[int, Any] = {}
+        self._ghosts: list[Any] = []
+        self._add_controls(stage)
+        self._set_the_scene(stage)
+
+    def _add_controls(self, stage: Stage) -> None:
+        gui = self._server.gui
+        self._text = gui.add_markdown("")
+        self._class = gui.add_dropdown("Class", options=stage.names, initial_value=stage.names[stage.row])
+        self._pause = gui.add_checkbox("Pause", False)
+        self._pace = gui.add_slider("Speed", min=0.1, max=2.0, step=0.1, initial_value=min(2.0, max(0.1, self.speed)))
+        for label in ("Another episode", "Next task"):
+            # Called in a thread of the server's: the stage is played in another one, which looks there.
+            gui.add_button(label).on_click(lambda event, label=label: self._asked.append(label))
+
+    def is_open(self) -> bool:
+        """Until it is interrupted."""
+        return True
+
+    def obey(self, stage: Stage) -> None:
+        """The controls."""
+        self.paused, self.speed = bool(self._pause.value), float(self._pace.value)
+        if self._class.value != stage.names[stage.row]:
+            stage.row = stage.names.index(self._class.value)
+            self._set_the_scene(stage)
+            self.show(stage)
+        while self._asked:
+            stage.restart() if self._asked.pop(0) == "Another episode" else stage.next_task()
+
+    def _set_the_scene(self, stage: Stage) -> None:
+        """Shapes and camera of the class that is looked at."""
+        scene, self._model = self._server.scene, stage.model()
+        for handle in (*self._shapes.values(), *self._ghosts):
+            handle.remove()
+        self._shapes, self._ghosts = {}, []
+        scene.add_grid("/floor", width=8.0, height=8.0, cell_size=0.25, section_size=1.0, plane_opacity=0.3)
+        for geom in visible(self._model):
+            points, faces = shape(self._model, geom)
+            red, green, blue, alpha = colour(self._model, geom)
+            self._shapes[geom] = scene.add_mesh_simple(
+                f"/geoms/{geom}", points, faces, color=(red, green, blue), opacity=alpha if alpha < 1.0 else None
+            )
+        target, distance = stage.camera()
+        azimuth, elevation = np.radians(CAMERAS["front"])
+        away = np.array((np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)))
+        camera = self._server.initial_camera
+        camera.position, camera.look_at, camera.fov = np.array(target) - distance * away, np.array(target), 0.7
+        for client in self._server.get_clients().values():
+            client.camera.position, client.camera.look_at = camera.position, camera.look_at
+
+    def show(self, stage: Stage) -> None:
+        """Places of all shapes, goals, and the numbers."""
+        data, turned = stage.data(), np.empty(4)
+        with self._server.atomic():
+            for geom, handle in self._shapes.items():
+                mujoco.mju_mat2Quat(turned, data.geom_xmat[geom])
+                handle.position, handle.wxyz = data.geom_xpos[geom], turned.copy()
+            self._show_ghosts(stage)
+        self._text.content = "\n".join(["| | |", "|-|-|", *(f"| {k} | {v} |" for k, v in stage.told().items())])
+        self._server.flush()
+
+    def _show_ghosts(self, stage: Stage) -> None:
+        ghosts = stage.ghosts()
+        if len(ghosts) != len(self._ghosts):
+            *rgb, alpha = GHOST.tolist()
+            self._ghosts = [
+                self._server.scene.add_icosphere(
+                    f"/goals/{i}", radius=1.0, scale=size, color=tuple(rgb), opacity=alpha, subdivisions=3
+                )
+                for i, (_, _, size) in enumerate(ghosts)
+            ]
+        for handle, (position, turned, _) in zip(self._ghosts, ghosts, strict=True):
+            handle.position, handle.wxyz = position, turned
+
+    def close(self) -> None:
+        """Stops the server."""
+        self._server.stop()

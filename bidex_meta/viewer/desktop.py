@@ -1,0 +1,81 @@
+"""MuJoCo's own viewer, in a window."""
+
+import sys
+from typing import Any
+
+import mujoco
+
+from bidex_meta.errors import BidexError
+from bidex_meta.viewer.playback import Stage
+from bidex_meta.world.rendering import CAMERAS, add_ghosts
+
+_SPACE, _RIGHT, _ENTER, _MINUS, _EQUAL = 32, 262, 257, 45, 61
+KEYS = "Space pauses, Enter begins another episode, Right goes to the next task, - and = change the speed."
+
+
+class Desktop:
+    """A window; its keys are ``KEYS``. A ``loop.Screen``."""
+
+    def __init__(self, stage: Stage, speed: float = 1.0) -> None:
+        """Opens it.
+
+        Raises:
+            BidexError: No window can be opened.
+        """
+        self.paused, self.speed = False, speed
+        self._asked: list[int] = []
+        self._model = stage.model()
+        self._data = mujoco.MjData(self._model)
+        try:
+            from mujoco.viewer import launch_passive
+
+            self._viewer: Any = launch_passive(
+                self._model, self._data, key_callback=self._asked.append, show_left_ui=False, show_right_ui=False
+            )
+        except Exception as error:  # the window library raises errors of many kinds
+            hint = " On macOS start it by mjpython -m bidex_meta.cli play." if sys.platform == "darwin" else ""
+            raise BidexError(f"No window can be opened ({error}).{hint} Add --browser.") from error
+        target, distance = stage.camera()
+        with self._viewer.lock():
+            camera = self._viewer.cam
+            camera.lookat[:], camera.distance = target, distance
+            camera.azimuth, camera.elevation = CAMERAS["front"]
+
+    def is_open(self) -> bool:
+        """Until the window is closed."""
+        return self._viewer.is_running()
+
+    def obey(self, stage: Stage) -> None:
+        """The keys."""
+        while self._asked:
+            key = self._asked.pop(0)
+            if key == _SPACE:
+                self.paused = not self.paused
+            elif key == _ENTER:
+                stage.restart()
+            elif key == _RIGHT:
+                stage.next_task()
+            elif key in (_MINUS, _EQUAL):
+                self.speed = min(4.0, max(1.0 / 16.0, self.speed * (2.0 if key == _EQUAL else 0.5)))
+
+    def show(self, stage: Stage) -> None:
+        """State, goals, and a few words."""
+        now = stage.data()
+        with self._viewer.lock():
+            for name in ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat", "time"):
+                if name == "time":
+                    self._data.time = now.time
+                else:
+                    getattr(self._data, name)[:] = getattr(now, name)
+            mujoco.mj_forward(self._model, self._data)
+            scene = self._viewer.user_scn
+            scene.ngeom = 0
+            add_ghosts(stage.ghosts(), scene)
+        told = stage.told()
+        corner = mujoco.mjtGridPos.mjGRID_TOPLEFT
+        self._viewer.set_texts((None, corner, "\n".join(told), "\n".join(told.values())))
+        self._viewer.sync()
+
+    def close(self) -> None:
+        """Closes the window."""
+        self._viewer.close()

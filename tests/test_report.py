@@ -1,0 +1,126 @@
+"""The report: self-contained, escaped, and with the numbers of the runs."""
+
+import base64
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from bidex_meta.cli import main
+from bidex_meta.record import RunFolder
+from bidex_meta.report import page
+from tests.test_comparison import run
+from tests.test_histories import log
+
+ROWS = [
+    {
+        "step": step, "Train/success/A": step / 1000, "Train/return/A": 1.0, "Train/success/<b>&": 0.1,
+        "Eval/success/A": 0.5, "Perf/steps_per_second": 100.0 + step, "Perf/training_time": float(step),
+    }
+    for step in (500, 1000)
+]  # fmt: skip
+
+
+class Tags(HTMLParser):
+    """Elements with their attributes, and the text of table cells."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict]] = []
+        self.cells: list[str] = []
+        self._inside = False
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+        self._inside = tag in ("td", "th")
+
+    def handle_data(self, data):
+        if self._inside and data.strip():
+            self.cells.append(data.strip())
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> list[Path]:
+    paths = [run(tmp_path, seed, {"A": 0.5 + seed / 10, "<b>&": 0.1}, gamma=0.9) for seed in (0, 1)]
+    paths += [run(tmp_path, 0, {"A": 0.9, "<b>&": 0.2}, gamma=0.8, activation="<script>")]
+    for path in paths:
+        log(path, *ROWS)
+    return paths
+
+
+def report(paths, capsys, *more: str) -> str:
+    assert main(["report", *map(str, paths), *more]) == 0
+    return Path(capsys.readouterr().out.strip()).read_text()
+
+
+def test_the_page_holds_everything_itself_and_no_markup_of_names(runs, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (runs[0] / "videos" / "training_500.mp4").write_bytes(b"old")
+    (runs[0] / "videos" / "training_1000.mp4").write_bytes(b"new film")
+    (runs[0] / "videos" / "tiled.mp4").write_bytes(b"tiles")
+    text = report(runs, capsys)
+    tags = Tags(text)
+    names = {tag for tag, _ in tags.elements}
+    assert not names & {"script", "link", "iframe", "b"}
+    addresses = [a[name] for _, a in tags.elements for name in ("src", "href") if name in a]
+    assert addresses and all(address.startswith("data:") for address in addresses)
+    assert not re.search(r"https?://|url\(", re.sub(r"base64,[^\"]*", "", text))
+    films = [a["src"] for tag, a in tags.elements if tag == "video"]
+    assert {base64.b64decode(film.partition(",")[2]) for film in films} == {b"new film", b"tiles"}
+    pictures = [base64.b64decode(a["src"].partition(",")[2]) for tag, a in tags.elements if tag == "img"]
+    assert len(pictures) == 3 and all(b"<svg" in picture for picture in pictures)
+    assert "&lt;b&gt;&amp;" in text
+
+
+def test_its_numbers_are_those_of_compare(runs, capsys, tmp_path):
+    out = tmp_path / "new" / "page.html"
+    cells = Tags(report(runs, capsys, "--out", str(out))).cells
+    assert main(["compare", *map(str, runs), "--json"]) == 0
+    for letter, group in zip("AB", json.loads(capsys.readouterr().out), strict=True):
+        iqm = group["success_iqm"]
+        ends = iqm["interval"]
+        told = f"{100 * iqm['value']:.1f}" + (f" [{100 * ends[0]:.1f}, {100 * ends[1]:.1f}]" if ends else "")
+        assert cells[cells.index(f"{letter} mtppo") + 4] == told
+    assert "850" in cells  # median steps a second
+    assert cells[cells.index("learner.gamma") + 1 :][:3] == ["0.9", "0.9", "0.8"]
+    assert "num_envs" not in cells  # the same in all
+
+
+def test_runs_without_an_evaluation_and_of_one_seed(runs, capsys):
+    (runs[1] / "evaluation.json").unlink()
+    text = report(runs, capsys, "--out", str(runs[0] / "r.html"))
+    assert "1 run has no evaluation.json" in text
+    alone = report(runs[:1], capsys)
+    assert (runs[0] / "report.html").is_file()
+    assert "Differences of configs" not in alone and "Adaptation" not in alone
+    (runs[0] / "evaluation.json").write_text('{"policy": {"classes": {}}, "steps": 10}')
+    assert "No table: " in report(runs[:1], capsys)
+
+
+def test_a_meta_test_is_drawn(runs, capsys):
+    measures = {"success": 0.5, "return": 2.0, "score": None, "success_interval": [0.4, 0.6], "return_interval": None}
+    shots = {"classes": {"A": measures}}
+    splits = {"train": {"before": shots, "after": shots, "by_shot": [shots, shots]}}
+    (runs[0] / "evaluation.json").write_text(json.dumps({"splits": splits}))
+    assert "over shots" in report(runs[:1], capsys)
+
+
+def test_large_films_are_named_alone(runs, monkeypatch, capsys):
+    monkeypatch.setattr(page, "FILM_BYTES", 4)
+    (RunFolder.open(runs[0]).videos_path / "a.mp4").write_bytes(b"12345")
+    text = report(runs[:1], capsys)
+    assert "too large for this page" in text and "<video" not in text
+
+
+def test_nothing_to_show_is_one_line(runs, capsys, monkeypatch):
+    assert main(["report"]) == 2
+    log(runs[0])
+    assert main(["report", str(runs[0])]) == 2
+    assert "holds nothing yet" in capsys.readouterr().err
+    log(runs[0], *ROWS)
+    monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
+    assert main(["report", str(runs[0])]) == 2
+    assert "bidex-meta[plot]" in capsys.readouterr().err

@@ -1,0 +1,156 @@
+"""The live view: what is played, the clock, shapes, and the page by a real viser where it is installed."""
+
+import sys
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from bidex_meta import drawing
+from bidex_meta.cli import main
+from bidex_meta.evaluation.untrained import ZeroAgent
+from bidex_meta.sources import Source
+from bidex_meta.viewer import loop
+from bidex_meta.viewer.playback import Stage
+from bidex_meta.viewer.shapes import colour, shape, visible
+
+
+@pytest.fixture(scope="module")
+def world():
+    return Source.open({"suite": "MT4", "threads": 1}).world("train", 4)
+
+
+@pytest.fixture
+def stage(world):
+    return Stage(world, ZeroAgent(world.action_space), row=1)
+
+
+def test_a_stage_plays_on_and_counts_episodes(stage, world, monkeypatch):
+    steps = []
+
+    def step(action):
+        """The first row ends at once, the others go on; row 1 succeeds in the second step."""
+        made = list(type(world).step(world, action))
+        made[2] = torch.tensor([True, False, False, False])
+        made[4] = {**made[4], "success": torch.tensor([False, len(steps) == 1, False, False])}
+        steps.append(world.episodes.number.tolist())
+        return made
+
+    monkeypatch.setattr(world, "step", step)
+    before = stage.data().qpos.copy()
+    assert stage.told()["step"] == "0 of 75"
+    for _ in range(3):
+        stage.step()
+    assert [number[0] for number in steps] == [0, 1, 2] and [number[1] for number in steps] == [0, 0, 0]
+    assert stage.told()["step"] == "3 of 75"
+    assert (stage.told()["success"], stage.told()["episodes"]) == ("yes", "0 of 0 solved")
+    assert not np.allclose(stage.data().qpos, before)
+    stage.restart()
+    assert (stage.told()["step"], stage.told()["success"]) == ("0 of 75", "not yet")
+    stage.row = 0
+    assert (stage.told()["class"], stage.told()["episodes"]) == (world.task_names[0], "0 of 3 solved")
+
+
+def test_the_next_task_moves_the_goal(stage):
+    first = stage.ghosts()[0][0].copy()
+    stage.next_task()
+    assert not np.allclose(stage.ghosts()[0][0], first)
+    assert stage.told()["step"] == "0 of 75"
+
+
+class Screen:
+    paused, speed = False, 1.0
+
+    def __init__(self, looks):
+        self.looks, self.shown, self.closed = looks, 0, False
+
+    def is_open(self):
+        self.looks -= 1
+        return self.looks >= 0
+
+    def obey(self, stage):
+        self.paused = self.looks < 5
+
+    def show(self, stage):
+        self.shown += 1
+
+    def close(self):
+        self.closed = True
+
+
+def test_the_clock_steps_sixty_times_a_second_and_shows_thirty(monkeypatch):
+    now, steps = [0.0], []
+    clock = SimpleNamespace(monotonic=lambda: now[0], sleep=lambda seconds: now.__setitem__(0, now[0] + seconds))
+    monkeypatch.setattr(loop, "time", clock)
+    stage = SimpleNamespace(step=lambda: steps.append(now[0]))
+    screen = Screen(looks=121)
+    loop.play(stage, screen)  # type: ignore[arg-type]
+    assert len(steps) == 116 and screen.closed  # of the last five it is paused
+    assert np.allclose(np.diff(steps), 1 / 60)
+    assert 60 <= screen.shown <= 62
+    later = Screen(looks=10_000)
+    loop.play(stage, later, seconds=1.0)  # type: ignore[arg-type]
+    assert later.closed and later.looks > 9_000
+
+
+def test_shapes_fill_the_boxes_that_mujoco_knows():
+    pytest.importorskip("trimesh")
+    model = mujoco.MjModel.from_xml_string("""<mujoco>
+      <asset><mesh name="m" vertex="0 0 0  1 0 0  0 2 0  0 0 3"/><material name="r" rgba="1 0 0 .5"/></asset>
+      <worldbody>
+        <geom type="plane" size="1 1 1"/>
+        <geom type="sphere" size=".2" material="r"/> <geom type="capsule" size=".1 .3"/>
+        <geom type="ellipsoid" size=".1 .2 .3"/> <geom type="cylinder" size=".1 .4"/>
+        <geom type="box" size=".1 .2 .3" rgba="0 1 0 1"/> <geom type="mesh" mesh="m"/>
+        <geom type="box" size=".1 .1 .1" group="3"/> <geom type="box" size=".1 .1 .1" rgba="0 0 0 0"/>
+      </worldbody></mujoco>""")
+    shown = visible(model)
+    assert shown == [1, 2, 3, 4, 5, 6]
+    for geom in shown:
+        points, faces = shape(model, geom)
+        assert faces.min() == 0 and faces.max() < len(points)
+        centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+        assert np.allclose((points.max(0) + points.min(0)) / 2, centre, atol=1e-6)
+        assert np.allclose((points.max(0) - points.min(0)) / 2, half, rtol=0.02, atol=1e-6)
+    assert colour(model, 1) == (1.0, 0.0, 0.0, 0.5) and colour(model, 5) == (0.0, 1.0, 0.0, 1.0)
+
+
+def test_the_page_shows_the_row_and_obeys(stage):
+    pytest.importorskip("viser")
+    from bidex_meta.viewer.browser import Browser
+
+    page = Browser(stage, port=18_080)
+    try:
+        page.show(stage)
+        shown = visible(stage.model())
+        assert list(page._shapes) == shown
+        moved = shown[-1]
+        for _ in range(3):
+            stage.step()
+        page.show(stage)
+        assert np.allclose(page._shapes[moved].position, stage.data().geom_xpos[moved])
+        assert len(page._ghosts) == len(stage.ghosts()) > 0
+        page._class.value, page._pace.value, page._pause.value = stage.names[3], 0.5, True
+        page._asked.append("Another episode")
+        page.obey(stage)
+        assert (stage.row, page.paused, page.speed) == (3, True, 0.5)
+        assert len(page._ghosts) == len(stage.ghosts())
+        assert f"| class | {stage.names[3]} |" in page._text.content
+    finally:
+        page.close()
+
+
+def test_without_a_screen_and_viser_one_line_says_what_to_install(monkeypatch, capsys):
+    monkeypatch.setattr(drawing, "has_screen", lambda: False)
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert main(["play", "--task", "CatchUnderarm"]) == 2
+    assert "bidex-meta[viewer]" in capsys.readouterr().err
+    for flags, told in (
+        ([], "a run folder, --task TASK or --suite SUITE"),
+        (["--task", "CatchUnderarms"], "Did you mean 'CatchUnderarm'"),
+        (["--task", "CatchUnderarm", "--speed", "0"], "--speed must be above 0"),
+    ):
+        assert main(["play", *flags]) == 2
+        assert told in capsys.readouterr().err
