@@ -163,8 +163,8 @@ class Benchmark:
             autoreset_mode: SAME_STEP (the default, for training) or DISABLED (for evaluation); also as text.
             threads: Engine threads on the CPU; left out, one per core. Results do not depend on it.
             engine: `"c"` (C MuJoCo, on the CPU), `"warp"` (mujoco_warp, on either) or `"auto"`: what is fast there.
-            stagger: In training worlds the first episodes begin at random elapsed steps (and do not count), so that rows
-                do not end together; False: at 0.
+            stagger: In training worlds the first episodes begin at random elapsed steps (and do not count), so that
+                rows do not end together; False: at 0.
 
         Raises:
             BidexError: A split without classes, too few rows, an unknown mode, device or engine.

@@ -12,6 +12,7 @@ import torch
 
 from bidex_meta.benchmark import make_task_world
 from bidex_meta.errors import BidexError
+from bidex_meta.registration import check_render_mode
 
 
 class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -32,8 +33,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def __init__(
         self, task_name: str, render_mode: str | None = None, seed: int = 0, device: str | torch.device = "cpu"
     ) -> None:
-        if render_mode not in (None, "rgb_array"):
-            raise BidexError(f"render_mode: expected None or 'rgb_array', got {render_mode!r}.")
+        check_render_mode(render_mode)
         self.render_mode = render_mode
         self.world = make_task_world(
             task_name, num_envs=1, device=device, seed=seed, autoreset_mode="DISABLED", task_sampling="uniform"
@@ -67,7 +67,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             ``unstable`` and ``reward_terms``; at the end of an episode also ``is_success``: at any of its steps.
         """
         obs, reward, terminated, truncated, told = self.world.step(torch.as_tensor(action)[None])
-        info = {"success": bool(told["success"][0]), "unstable": bool(told["unstable"][0])}
+        info: dict[str, Any] = {"success": bool(told["success"][0]), "unstable": bool(told["unstable"][0])}
         info["reward_terms"] = {name: float(term[0]) for name, term in told["reward_terms"].items()}
         if terminated[0] or truncated[0]:
             info["is_success"] = bool(told["so_far"]["success"][0])

@@ -36,8 +36,8 @@ def reset_mask(options: dict[str, Any] | None, num_envs: int, device: torch.devi
     """
     if unknown := sorted(map(str, (options or {}).keys() - {"reset_mask"})):
         raise BidexError(
-            f"Expected no reset option but reset_mask, got {', '.join(unknown)}. To start some rows alone give a bool mask "
-            f"of all: reset(options={{'reset_mask': mask}}), shape ({num_envs},)."
+            f"Expected no reset option but reset_mask, got {', '.join(unknown)}. To start some rows alone give a bool "
+            f"mask of all: reset(options={{'reset_mask': mask}}), shape ({num_envs},)."
         )
     mask = (options or {}).get("reset_mask")
     if mask is None:

@@ -28,9 +28,9 @@ so_far                 dict of (N,)          r (return, float32), l (length, int
 counted                (N,), bool            rows whose episode ended and counts (shortened first ones do not)
 =====================  ====================  ===========================================================================
 
-For users of Gymnasium our worlds add its ``episode``, ``_episode``, ``final_info`` and ``_final_info`` (``ends.py``) where
-a row ended, and on accelerators, which would have to wait for the answer, in every step: zero outside their masks. A
-world may add keys like these and ``reward_terms``; nobody may rely on them.
+For users of Gymnasium our worlds add its ``episode``, ``_episode``, ``final_info`` and ``_final_info`` (``ends.py``)
+where a row ended, and on the warp engine, which would have to wait for the answer, in every step: zero outside their
+masks. A world may add keys like these and ``reward_terms``; learners may not rely on them.
 
 Shortened first episodes: in SAME_STEP mode the first episode of each row, after the first reset and after each with a
 seed, may begin at a random elapsed step, so that rows do not end together; the time limit counts from there.
@@ -125,7 +125,8 @@ class VectorWorld(Protocol):
             Observations (N, d), float32, and an empty info.
 
         Raises:
-            BidexError: Another option, a seed that is no whole number from 0 on, or one with a mask that leaves rows out.
+            BidexError: Another option, a seed that is no whole number from 0 on, or one with a mask that leaves rows
+                out.
         """
         ...
 

@@ -6,8 +6,8 @@ from typing import Any, Self
 class Recreated:
     """Makes a world that can be pickled and copied: the copy is built anew and goes on bit for bit.
 
-    Its class has ``state_dict`` and ``load_state_dict``, and tells by ``_ready`` whether it may be stepped. Engine threads
-    that were left out are counted anew where the copy is made; attributes set from outside stay behind.
+    Its class has ``state_dict`` and ``load_state_dict``, and tells by ``_ready`` whether it may be stepped. Engine
+    threads that were left out are counted anew where the copy is made; attributes set from outside stay behind.
     """
 
     _made_with: tuple[tuple[Any, ...], dict[str, Any]]
