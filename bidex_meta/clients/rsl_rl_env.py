@@ -19,21 +19,19 @@ with extra("rsl-rl"):
 class RslRlVecEnv(VecEnv):
     """All rows of one world on its device; observations in the groups `policy` and `critic`.
 
-    `extras`: `time_outs` (cut by the time limit or by broken physics) and, where rows ended, `log` (`EpisodeLog`). Rows
-    begin staggered already: leave `init_at_random_ep_len` False.
+    `extras`: `time_outs` (cut by the time limit or by broken physics) and `log` (`EpisodeLog`; empty where no row ended).
+    Rows begin staggered already: leave `init_at_random_ep_len` False.
 
     Args:
         world: In autoreset mode SAME_STEP.
-        policy: The world's `observation_groups` that the policy sees; None: all. The critic sees everything.
+        policy: The world's `observation_groups` that the policy sees; none: all. The critic sees everything.
         cfg: What rsl-rl's loggers shall keep as the environment's config.
 
     Raises:
         BidexError: Another autoreset mode, or an unknown group.
     """
 
-    def __init__(
-        self, world: TaskWorld, policy: Sequence[str] | None = None, cfg: dict[str, Any] | None = None
-    ) -> None:
+    def __init__(self, world: TaskWorld, policy: Sequence[str] = (), cfg: dict[str, Any] | None = None) -> None:
         check_training(world)
         self.world: Any = world
         self.num_envs, self.num_actions = world.num_envs, world.action_space.shape[1]
@@ -41,9 +39,9 @@ class RslRlVecEnv(VecEnv):
         limits = world.max_episode_steps
         self.max_episode_length = int(limits[0]) if bool((limits == limits[0]).all()) else limits
         groups = {group.name: group for group in world.observation_groups}
-        for name in set(policy or ()) - groups.keys():
+        for name in set(policy) - groups.keys():
             raise unknown_name("observation group", name, groups)
-        entries = [torch.arange(part.start, part.stop) for name in policy or () for part in groups[name].where]
+        entries = [torch.arange(part.start, part.stop) for name in policy for part in groups[name].where]
         self._policy = torch.cat(entries).to(world.device) if entries else None
         self._log = EpisodeLog(world)
         self._obs: Tensor | None = None
@@ -77,6 +75,5 @@ class RslRlVecEnv(VecEnv):
         """Takes actions (num_envs, a): observations, rewards and dones (num_envs,), extras."""
         with torch.inference_mode(False), torch.no_grad():  # the world outlives the runner's mode
             self._obs, reward, terminated, truncated, told = self.world.step(actions)
-            log = self._log.update(told, terminated, truncated)
-            extras = {"time_outs": truncated} | ({"log": log} if log else {})
+            extras = {"time_outs": truncated, "log": self._log.update(told, terminated, truncated)}
             return self.get_observations(), reward, terminated | truncated, extras

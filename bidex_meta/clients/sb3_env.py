@@ -60,8 +60,7 @@ class SB3VecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """The world's attribute for each row."""
-        values = self.world.get_attr(attr_name)
-        return [values[i] for i in self._get_indices(indices)]
+        return [self.world.get_attr(attr_name)[i] for i in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Sets an attribute of the world, for all rows."""

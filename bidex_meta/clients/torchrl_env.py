@@ -35,8 +35,7 @@ class TorchRLEnv(EnvBase):
         rows, device = world.num_envs, world.device
         super().__init__(device=device, batch_size=torch.Size([rows]))
         self.world, self._world_seed = world, None
-        space: Any = world.observation_space
-        low, high = torch.as_tensor(space.low), torch.as_tensor(space.high)
+        low, high = torch.as_tensor(world.observation_space.low), torch.as_tensor(world.observation_space.high)
         bounded = bool(low.isfinite().all() and high.isfinite().all())
         seen = Bounded(low, high, device=device) if bounded else Unbounded(low.shape, device=device)
         column = torch.Size([rows, 1])
