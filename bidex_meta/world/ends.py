@@ -20,8 +20,8 @@ def ended_info(info: dict[str, Any]) -> dict[str, Any]:
         the last step's values, ``episode`` once more, and a mask each; its own mask ``_final_info``: ended.
     """
     ended, counted = info["_final_obs"], info["counted"]
-    episode = {name: torch.where(counted, value, 0) for name, value in info["so_far"].items()}
-    final: dict[str, Any] = {name: torch.where(ended, info[name], 0) for name in _FINAL}
+    episode = {name: value.masked_fill(~counted, 0) for name, value in info["so_far"].items()}
+    final: dict[str, Any] = {name: info[name].masked_fill(~ended, 0) for name in _FINAL}
     final |= {f"_{name}": ended for name in _FINAL} | {"episode": dict(episode), "_episode": counted}
     return {"episode": episode, "_episode": counted, "final_info": final, "_final_info": ended}
 

@@ -84,10 +84,10 @@ def test_they_repeat_the_contracts_keys(kind: str) -> None:
         assert torch.equal(info["_final_info"], ended) and torch.equal(info["_episode"], info["counted"])
         final = info["final_info"]
         for name, mask, of in [("success", ended, info), ("unstable", ended, info), ("reward_unscaled", ended, info)]:
-            assert torch.equal(final[name], of[name] * mask)
+            assert torch.equal(final[name], of[name] * mask) and final[name].dtype == of[name].dtype
         for name, value in info["so_far"].items():
             for episode in (info["episode"], final["episode"]):
-                assert torch.equal(episode[name], value * info["counted"])
+                assert torch.equal(episode[name], value * info["counted"]) and episode[name].dtype == value.dtype
     assert seen > 0
 
 
