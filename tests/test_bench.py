@@ -131,4 +131,4 @@ def test_bench_clients_tells_both_sides(client: str, package: str, capsys: pytes
     found = json.loads(capsys.readouterr().out)
     for part in (found["rollout"], found["training"]):
         assert part["ratio"] == pytest.approx(part["through_the_adapter"] / part["own_loop"], rel=0.02)
-        assert 0.01 < part["ratio"] < 100
+        assert 0.01 < part["ratio"] < 100 and 0.01 < part["cpu_ratio"] < 100

@@ -19,7 +19,7 @@ with extra("rsl-rl"):
 class RslRlVecEnv(VecEnv):
     """All rows of one world on its device; observations in the groups `policy` and `critic`.
 
-    `extras`: `time_outs` (cut by the time limit or by broken physics) and `log` (`EpisodeLog`; empty where no row ended).
+    `extras`: `time_outs` (cut by the time limit or broken physics) and `log` (`EpisodeLog`; empty where no row ended).
     Rows begin staggered already: leave `init_at_random_ep_len` False.
 
     Args:
