@@ -148,6 +148,7 @@ class Benchmark:
         autoreset_mode: "AutoresetMode | str | None" = None,
         threads: int | None = None,
         engine: str = "auto",
+        stagger: bool = True,
     ) -> "World":
         """A batched world of one split.
 
@@ -162,6 +163,8 @@ class Benchmark:
             autoreset_mode: SAME_STEP (the default, for training) or DISABLED (for evaluation); also as text.
             threads: Engine threads on the CPU; left out, one per core. Results do not depend on it.
             engine: `"c"` (C MuJoCo, on the CPU), `"warp"` (mujoco_warp, on either) or `"auto"`: what is fast there.
+            stagger: In training worlds the first episodes begin at random elapsed steps (and do not count), so that
+                rows do not end together; False: at 0.
 
         Raises:
             BidexError: A split without classes, too few rows, an unknown mode, device or engine.
@@ -178,6 +181,7 @@ class Benchmark:
             autoreset_mode,
             threads,
             engine,
+            stagger,
             observation=self.suite.observation,
             pad_to=self.padded_size,
             task_sampling="fixed" if evaluation or self.suite.kind == "meta" else "uniform",
@@ -234,6 +238,7 @@ def make_task_world(
     task_sampling: TaskSampling | None = None,
     moving_base: bool | None = None,
     engine: str = "auto",
+    stagger: bool = True,
 ) -> "World":
     """A world of one class as it is on its own: goal visible, no one-hot, no padding, 50 tasks drawn by the seed.
 
@@ -248,6 +253,7 @@ def make_task_world(
             uniform in training worlds, fixed in evaluation worlds.
         moving_base: Drive the hands' bases or fix them; left out, as the class has it on its own.
         engine: As in `Benchmark.make_world`.
+        stagger: As in `Benchmark.make_world`.
 
     Raises:
         BidexError: Unknown class, too few rows, an unknown mode, device or engine.
@@ -269,6 +275,7 @@ def make_task_world(
         autoreset_mode,
         threads,
         engine,
+        stagger,
         observation="plain",
         pad_to=None,
         task_sampling=task_sampling,
@@ -283,6 +290,7 @@ def _make_world(
     autoreset_mode: "AutoresetMode | str | None",
     threads: int | None,
     engine: str,
+    stagger: bool,
     *,
     observation: Literal["plain", "one-hot", "masked"],
     pad_to: int | None,
@@ -309,6 +317,7 @@ def _make_world(
         task_sampling=task_sampling,
         threads=threads,
         engine=engine,
+        stagger=stagger,
     )
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
+from bidex_meta.errors import BidexError
 from bidex_meta.suite import Suite, load_suite, suite_names
 from bidex_meta.tasks import registry
 
@@ -64,6 +65,7 @@ def make_suite_world(
     num_envs: int = 1,
     seed: int | None = None,
     benchmark_seed: int | None = None,
+    render_mode: str | None = None,
     **options: Any,
 ) -> "World | VectorEnv":
     """What `gymnasium.make_vec("bidex-meta/MT4-v1", num_envs=...)` calls.
@@ -74,10 +76,12 @@ def make_suite_world(
         num_envs: Rows over all classes.
         seed: Chooses the tasks, the starts and the task draws; None: 0.
         benchmark_seed: Chooses the tasks instead, and the rest where there is no seed.
+        render_mode: None or `"rgb_array"`, which are the same: a world draws when it is asked to.
         **options: The other keywords of `Benchmark.make_world`. With `vector_strategy`, `meta_batch_size`,
             `total_tasks_per_cls` or `env_name` those of Meta-World's ids, and what comes is what `metaworld` gives:
             single environments of NumPy arrays side by side, however many `num_envs` says.
     """
+    check_render_mode(render_mode)
     of_tasks = next(given for given in (benchmark_seed, seed, 0) if given is not None)
     if any(name in options for name in _METAWORLD):
         from bidex_meta.metaworld.vector_envs import make_split
@@ -89,14 +93,26 @@ def make_suite_world(
     return benchmark.make_world(split, num_envs=num_envs, seed=seed, **options)
 
 
-def make_class_world(task_name: str, num_envs: int = 1, **options: Any) -> "World":
+def make_class_world(task_name: str, num_envs: int = 1, render_mode: str | None = None, **options: Any) -> "World":
     """What `gymnasium.make_vec("bidex-meta/CatchUnderarm-v1", num_envs=...)` calls.
 
     Args:
         task_name: Name of the task class.
         num_envs: Rows.
+        render_mode: As in `make_suite_world`.
         **options: The other keywords of `make_task_world`.
     """
     from bidex_meta.benchmark import make_task_world
 
+    check_render_mode(render_mode)
     return make_task_world(task_name, num_envs=num_envs, **options)
+
+
+def check_render_mode(render_mode: str | None) -> None:
+    """Refuses what cannot be drawn.
+
+    Raises:
+        BidexError: Neither None nor `"rgb_array"`.
+    """
+    if render_mode not in (None, "rgb_array"):
+        raise BidexError(f"render_mode: expected None or 'rgb_array', got {render_mode!r}.")

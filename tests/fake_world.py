@@ -11,8 +11,9 @@ from torch import Tensor
 
 from bidex_meta.errors import BidexError
 from bidex_meta.world.actions import clean
-from bidex_meta.world.autoreset import checked_mode, reset_mask
+from bidex_meta.world.autoreset import checked_mode, checked_seed, reset_mask
 from bidex_meta.world.contract import plain_groups
+from bidex_meta.world.ends import Clock, ended_info
 from bidex_meta.world.episodes import Episodes
 from bidex_meta.world.groups import split_rows
 from bidex_meta.world.spaces import make_spaces
@@ -62,7 +63,7 @@ class FakeWorld(ABC):
         self.task_id = torch.arange(self.num_tasks).repeat_interleave(counts)
         self._index_in_slot = torch.cat([torch.arange(int(count)) for count in counts])
         self.max_episode_steps = torch.tensor(limits)[self.task_id]
-        self.unstable, self.steps = unstable, 0
+        self.unstable, self.steps, self._clock = unstable, 0, Clock(num_envs, self.device)
         self._obs = torch.zeros(num_envs, sizes[0])
         self._seed_rows(seed)
         self._set_pool_sizes(list(tasks.values()))
@@ -102,9 +103,7 @@ class FakeWorld(ABC):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
         mask = reset_mask(options, self.num_envs, self.device, self._ready)
         if seed is not None:
-            if not mask.all():
-                raise BidexError("Expected a seed with a full reset, got it with a reset_mask.")
-            self._seed_rows(seed)
+            self._seed_rows(checked_seed(seed, mask))
         first = not self._ready or seed is not None
         self._ready = True
         self._begin(mask, first and self.autoreset_mode == AutoresetMode.SAME_STEP)
@@ -112,6 +111,7 @@ class FakeWorld(ABC):
         return self._obs.clone(), {}
 
     def _begin(self, mask: Tensor, stagger: bool = False) -> None:
+        self._clock.begin(mask)
         self.episodes.number = self.episodes.number + mask
         elapsed = self._first_elapsed() if stagger else torch.zeros_like(self.episodes.elapsed)
         self.episodes.begin(mask, elapsed)
@@ -151,9 +151,12 @@ class FakeWorld(ABC):
             "reward_terms": {"all": unscaled},
             "final_obs": final_obs,
             "_final_obs": ended,
-            "episode": episodes.statistics(),
-            "_episode": ended & episodes.counts,
+            "so_far": episodes.statistics(),
+            "counted": ended & episodes.counts,
         }
+        if ended.any():
+            info |= ended_info(info)
+            self._clock.stamp(info)
         self._obs = final_obs.clone()
         if self.autoreset_mode == AutoresetMode.SAME_STEP:
             self._begin(ended)

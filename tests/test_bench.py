@@ -121,3 +121,14 @@ def test_rough_actions_are_half_uniform_half_held_extremes() -> None:
     assert min(lengths) >= 5
     assert 35 < max(lengths) <= 80  # two holds in a row may draw the same signs
     assert sum(length > 40 for length in lengths) < 0.1 * len(lengths)
+
+
+@pytest.mark.parametrize(("client", "package"), [("sb3", "stable_baselines3"), ("rsl-rl", "rsl_rl")])
+def test_bench_clients_tells_both_sides(client: str, package: str, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip(package, reason=f"needs the extra {client}")
+    arguments = ["bench", "clients", "--client", client, "--num-envs", "4", "--steps", "8", "--repeats", "1", "--json"]
+    assert main([*arguments, "--threads", "1"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    for part in (found["rollout"], found["training"]):
+        assert part["ratio"] == pytest.approx(part["through_the_adapter"] / part["own_loop"], rel=0.02)
+        assert 0.01 < part["ratio"] < 100 and 0.01 < part["cpu_ratio"] < 100

@@ -1,9 +1,11 @@
 """One test of the worlds' contract (bidex_meta/world/contract.py) for all of them, the tests' own small ones too."""
 
 import copy
+import pickle
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import cloudpickle
 import numpy as np
 import pytest
 import torch
@@ -25,7 +27,7 @@ from tests.points import PointWorld, ring
 from tests.world.play import class_world, flat, suite_world
 
 ROWS = 7  # two slots share them unevenly
-ROW_INFO = {"success": torch.bool, "unstable": torch.bool, "_final_obs": torch.bool, "_episode": torch.bool}
+ROW_INFO = {"success": torch.bool, "unstable": torch.bool, "_final_obs": torch.bool, "counted": torch.bool}
 ROW_INFO |= {"reward_unscaled": torch.float32}
 EPISODE = {"r": torch.float32, "l": torch.int64, "success": torch.bool, "unscaled": torch.float32}
 BOTH = ("SAME_STEP", "DISABLED")
@@ -195,7 +197,7 @@ def test_shapes_and_types(case: Case) -> None:
             assert each.shape == world.observation_space.shape and each.dtype == torch.float32 and each.isfinite().all()
             assert world.observation_space.contains(each.cpu().numpy())
         expected = {name: (info[name], kind) for name, kind in ROW_INFO.items()}
-        expected |= {f"episode/{name}": (info["episode"][name], kind) for name, kind in EPISODE.items()}
+        expected |= {f"so_far/{name}": (info["so_far"][name], kind) for name, kind in EPISODE.items()}
         expected |= {"reward": (reward, torch.float32), "terminated": (terminated, torch.bool)}
         expected |= {"truncated": (truncated, torch.bool)}
         for name, (value, kind) in expected.items():
@@ -222,13 +224,13 @@ def test_a_step_tells_its_transition(case: Case) -> None:
         assert not (terminated & truncated).any()
         assert torch.equal(ended, (terminated | truncated) & ~frozen)
         assert torch.equal(final[~ended], after[~ended])
-        assert not (info["_episode"] & ~ended).any() and (same or torch.equal(info["_episode"], ended))
+        assert not (info["counted"] & ~ended).any() and (same or torch.equal(info["counted"], ended))
         for value in (reward, info["reward_unscaled"]):
             assert (value[frozen] == 0).all()
         returns, lengths = returns + reward.cpu(), lengths + (~frozen).cpu()
         success |= (info["success"] & ~frozen).cpu()
-        assert torch.allclose(info["episode"]["r"].cpu(), returns) and torch.equal(info["episode"]["l"].cpu(), lengths)
-        assert torch.equal(info["episode"]["success"].cpu(), success)
+        assert torch.allclose(info["so_far"]["r"].cpu(), returns) and torch.equal(info["so_far"]["l"].cpu(), lengths)
+        assert torch.equal(info["so_far"]["success"].cpu(), success)
         seen += int(ended.sum())
         if same:
             assert (after[ended] != final[ended]).any(1).all()
@@ -255,17 +257,46 @@ def test_a_reset_mask_starts_just_these(case: Case) -> None:
     assert told == {} and torch.equal(obs[~mask], before["obs"][~mask]) and (obs[mask] != before["obs"][mask]).any()
     after = flat(world.step(given[5]))
     # Nobody's last step was its episode's end in SAME_STEP mode, or they begin at 1 as well.
-    lengths = after["info/episode/l"]
+    lengths = after["info/so_far/l"]
     assert (lengths[mask] == 1).all()
     if case.mode == "DISABLED":
         over = before["terminated"] | before["truncated"]
         still, woken = over & ~mask, over & mask
         assert still.any() and woken.any()
-        assert torch.equal(lengths[still], before["info/episode/l"][still])
+        assert torch.equal(lengths[still], before["info/so_far/l"][still])
         assert (after["terminated"] | after["truncated"])[still].all()
         assert (lengths[~over & ~mask] == 6).all()
     with pytest.raises(BidexError, match="seed"):
         world.reset(seed=0, options={"reset_mask": mask})
+
+
+def test_resets_refuse_what_they_would_not_do(case: Case) -> None:
+    world = case.world
+    for options in ({"env_idx": torch.tensor([0])}, {"typo": 1, "reset_mask": torch.ones(world.num_envs).bool()}):
+        with pytest.raises(BidexError, match=f"got {next(iter(options))}.*reset_mask"):
+            world.reset(options=options)
+    for seed in ([1, 2], -1, 1.5, True, "one"):
+        with pytest.raises(BidexError, match=r"^seed: expected one whole number"):
+            world.reset(seed=seed)
+    assert torch.equal(world.reset(seed=np.int64(3), options={})[0], world.reset(seed=3)[0])
+
+
+def test_copies_and_pickles_go_on_alike(case: Case) -> None:
+    """In the middle of episodes, and before a first reset."""
+    world = case.world
+    dumps = cloudpickle.dumps if case.kind.keeps is VectorWorld else pickle.dumps  # bandits hold lambdas
+    world.reset(seed=9)
+    given = actions(world, 10)
+    play(world, given[:5])
+    copies = copy.deepcopy(world), pickle.loads(dumps(world))
+    expected = play(world, given[5:])
+    for other in copies:
+        assert_equal(expected, play(other, given[5:]))
+        assert torch.equal(world.reset(seed=1)[0], other.reset(seed=1)[0])
+    raw = pickle.loads(dumps(case.kind.make(case.mode)))
+    with pytest.raises(BidexError, match="reset"):
+        raw.step(given[0])
+    assert torch.equal(raw.reset(seed=1)[0], world.reset(seed=1)[0])
 
 
 def test_what_was_returned_is_the_callers(case: Case) -> None:

@@ -1,3 +1,5 @@
+import copy
+import pickle
 import subprocess
 import sys
 import warnings
@@ -10,6 +12,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 
 import bidex_meta
+from bidex_meta.errors import BidexError
 from bidex_meta.registration import register_ids, suite_ids, task_id
 from bidex_meta.tasks import registry
 
@@ -128,3 +131,38 @@ def test_single_environment_ends_by_its_time_limit(env: gymnasium.Env) -> None:
         assert isinstance(reward, float) and info["success"] in (True, False)
         flags.append((terminated, truncated))
     assert len(flags) == limit or flags[-1] == (True, False)
+
+
+def test_single_environment_tells_gymnasiums_keys_alone(env: gymnasium.Env) -> None:
+    """Nothing of the batch: wrappers add ``episode`` themselves, and what they count is what was played."""
+    counted = gymnasium.wrappers.RecordEpisodeStatistics(env)
+    _, info = counted.reset(seed=3)
+    assert info == {}
+    total, steps, success, ended = 0.0, 0, False, False
+    while not ended:
+        _, reward, terminated, truncated, info = counted.step(env.action_space.sample())
+        total, steps, ended = total + float(reward), steps + 1, terminated or truncated
+        success |= info["success"]
+        assert info.keys() - {"episode", "is_success"} == {"success", "unstable", "reward_terms"}
+        assert ("is_success" in info) == ("episode" in info) == ended
+        assert sum(info["reward_terms"].values()) == pytest.approx(reward, abs=1e-5)
+    assert info["episode"]["l"] == steps and info["episode"]["r"] == pytest.approx(total)
+    assert info["is_success"] is success
+
+
+def test_single_environment_refuses_options(env: gymnasium.Env) -> None:
+    with pytest.raises(BidexError, match="no reset options, got typo"):
+        env.unwrapped.reset(options={"typo": 1})
+
+
+def test_single_environment_copies(env: gymnasium.Env) -> None:
+    env.reset(seed=0)
+    actions = [env.action_space.sample() for _ in range(6)]
+    for action in actions[:3]:
+        env.step(action)
+    for other in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
+        twin = copy.deepcopy(env)
+        for action in actions[3:]:
+            a, b = twin.step(action), other.step(action)
+            np.testing.assert_array_equal(a[0], b[0])
+            assert a[1:] == b[1:]

@@ -132,9 +132,8 @@ def test_same_step_statistics_are_those_of_a_count_by_hand(short: None) -> None:
         ended = step["info/_final_obs"]
         assert torch.equal(step["truncated"], ended) and not step["terminated"].any()
         assert torch.equal(ended, torch.where(whole, length, length + elapsed) >= SHORT)
-        assert torch.equal(step["info/episode/r"], total) and torch.equal(step["info/episode/l"], length)
-        assert torch.equal(step["info/_episode"], ended & whole)
-        assert torch.equal(step["info/_final_info"], ended)
+        assert torch.equal(step["info/so_far/r"], total) and torch.equal(step["info/so_far/l"], length)
+        assert torch.equal(step["info/counted"], ended & whole)
         assert torch.equal(step["info/final_obs"][~ended], step["obs"][~ended])
         if ended.any():
             before, after = step["info/final_obs"][ended], step["obs"][ended]
@@ -212,9 +211,9 @@ def test_finished_rows_are_frozen_and_a_mask_restarts_its_rows(short: None) -> N
     world = make(mode="DISABLED")
     world.reset(seed=0)
     last = play(world, actions(world, SHORT))[-1]
-    assert last["truncated"].all() and last["info/_episode"].all()
+    assert last["truncated"].all() and last["info/counted"].all()
     step = play(world, actions(world, 1, seed=1))[0]
-    for name in ("obs", "truncated", "info/success", "info/episode/r", "info/episode/l"):
+    for name in ("obs", "truncated", "info/success", "info/so_far/r", "info/so_far/l"):
         assert torch.equal(step[name], last[name]), name
     assert not step["reward"].any() and not step["info/_final_obs"].any()
     mask = torch.tensor([True, False] * 3)

@@ -1,5 +1,6 @@
 """What ``bidex-meta bench`` measures."""
 
+from bidex_meta.bench.adapters import clients
 from bidex_meta.bench.against import world_against
 from bidex_meta.bench.capacity import capacity
 from bidex_meta.bench.gpu import gpu, kernels
@@ -7,4 +8,4 @@ from bidex_meta.bench.others import field
 from bidex_meta.bench.physics import stability
 from bidex_meta.bench.speed import mixing, scaling, world
 
-__all__ = ["capacity", "field", "gpu", "kernels", "mixing", "scaling", "stability", "world", "world_against"]
+__all__ = ["capacity", "clients", "field", "gpu", "kernels", "mixing", "scaling", "stability", "world", "world_against"]

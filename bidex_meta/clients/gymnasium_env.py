@@ -1,6 +1,7 @@
 """One row of a world as a plain `gymnasium.Env` with NumPy arrays, for `gymnasium.make("bidex-meta/CatchUnderarm-v1")`.
 
-For trying things out and for libraries that know single environments only; for speed use the world itself.
+For trying things out and for libraries that know single environments only; for speed use the world itself. Its copies
+and pickles go on where it was.
 """
 
 from typing import Any
@@ -11,6 +12,7 @@ import torch
 
 from bidex_meta.benchmark import make_task_world
 from bidex_meta.errors import BidexError
+from bidex_meta.registration import check_render_mode
 
 
 class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -31,8 +33,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def __init__(
         self, task_name: str, render_mode: str | None = None, seed: int = 0, device: str | torch.device = "cpu"
     ) -> None:
-        if render_mode not in (None, "rgb_array"):
-            raise BidexError(f"render_mode: expected None or 'rgb_array', got {render_mode!r}.")
+        check_render_mode(render_mode)
         self.render_mode = render_mode
         self.world = make_task_world(
             task_name, num_envs=1, device=device, seed=seed, autoreset_mode="DISABLED", task_sampling="uniform"
@@ -44,11 +45,16 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Starts an episode; with a seed, the same one every time.
 
         Returns:
-            The observation, shape (d,), float32, and the world's info of this row.
+            The observation, shape (d,), float32, and an empty info.
+
+        Raises:
+            BidexError: An option: there are none.
         """
         super().reset(seed=seed, options=options)
-        obs, info = self.world.reset(seed=seed, options=options or None)
-        return _array(obs), _row(info)
+        if options:
+            raise BidexError(f"Expected no reset options, got {', '.join(map(str, options))}.")
+        obs, _ = self.world.reset(seed=seed)
+        return _array(obs), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         """One control step of 1/60 s.
@@ -57,10 +63,15 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             action: Shape (a,), in [-1, 1].
 
         Returns:
-            Observation (d,) float32, reward, terminated, truncated, and the world's info of this row.
+            Observation (d,) float32, reward, terminated, truncated, and info: ``success`` (of this state),
+            ``unstable`` and ``reward_terms``; at the end of an episode also ``is_success``: at any of its steps.
         """
-        obs, reward, terminated, truncated, info = self.world.step(torch.as_tensor(action)[None])
-        return _array(obs), float(reward[0]), bool(terminated[0]), bool(truncated[0]), _row(info)
+        obs, reward, terminated, truncated, told = self.world.step(torch.as_tensor(action)[None])
+        info: dict[str, Any] = {"success": bool(told["success"][0]), "unstable": bool(told["unstable"][0])}
+        info["reward_terms"] = {name: float(term[0]) for name, term in told["reward_terms"].items()}
+        if terminated[0] or truncated[0]:
+            info["is_success"] = bool(told["so_far"]["success"][0])
+        return _array(obs), float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """The picture of this row, shape (height, width, 3), uint8; None without a render mode."""
@@ -73,16 +84,3 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 def _array(batch: torch.Tensor) -> np.ndarray:
     return batch[0].cpu().numpy()
-
-
-def _row(info: dict[str, Any]) -> dict[str, Any]:
-    """The first row of a batched info: numbers and flags as Python values, vectors as arrays."""
-    row = {}
-    for key, value in info.items():
-        if isinstance(value, dict):
-            row[key] = _row(value)
-        elif isinstance(value, torch.Tensor):
-            row[key] = value[0].item() if value.ndim == 1 else _array(value)
-        else:
-            row[key] = value
-    return row

@@ -27,8 +27,10 @@ from bidex_meta.errors import BidexError, unknown_name
 from bidex_meta.evaluation.play import check_world, play_tasks
 from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.world.actions import clean
-from bidex_meta.world.autoreset import checked_mode, reset_mask
+from bidex_meta.world.autoreset import checked_mode, checked_seed, reset_mask
 from bidex_meta.world.contract import PooledWorld, plain_groups
+from bidex_meta.world.copying import Recreated
+from bidex_meta.world.ends import Clock, ended_info
 from bidex_meta.world.episodes import Episodes
 from bidex_meta.world.groups import split_rows
 from bidex_meta.world.random import row_keys, uniform
@@ -37,7 +39,7 @@ from bidex_meta.world.spaces import make_spaces
 _TASK_DRAW, _ELAPSED_DRAW, _DRAWS = 0, 1, 2
 
 
-class MetaWorldWorld(VectorEnv):
+class MetaWorldWorld(Recreated, VectorEnv):
     """A suite of Meta-World's with ``num_envs`` rows, split evenly and contiguously over its classes, on the CPU.
 
     Observations are Meta-World's 39 numbers (goal visible) with the class's one-hot behind them; rewards its "v2" in
@@ -54,7 +56,13 @@ class MetaWorldWorld(VectorEnv):
     action_space: Box
 
     def __init__(
-        self, suite: str, num_envs: int, *, seed: int = 0, autoreset_mode: str | AutoresetMode | None = None
+        self,
+        suite: str,
+        num_envs: int,
+        *,
+        seed: int = 0,
+        autoreset_mode: str | AutoresetMode | None = None,
+        stagger: bool = True,
     ) -> None:
         """Makes the environments; no row is started before ``reset``.
 
@@ -63,6 +71,7 @@ class MetaWorldWorld(VectorEnv):
             num_envs: Rows over all classes, at least one for each.
             seed: Chooses Meta-World's tasks, and the draws of tasks until ``reset(seed=...)`` says otherwise.
             autoreset_mode: SAME_STEP (training) or DISABLED (evaluation), as a member or its name.
+            stagger: As in ``bidex_meta.World``.
 
         Raises:
             BidexError: Unknown suite or mode, too few rows, or Meta-World is not installed.
@@ -73,6 +82,7 @@ class MetaWorldWorld(VectorEnv):
         if num_envs < self.num_tasks:
             raise BidexError(f"Expected at least {self.num_tasks} rows, one for each class of {suite}, got {num_envs}.")
         self.autoreset_mode = checked_mode(autoreset_mode)
+        self._stagger = stagger and self.autoreset_mode == AutoresetMode.SAME_STEP
         self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
         self._task_seed, self._tasks = seed, make_tasks(suite, seed)
         self.slot_rows = split_rows(num_envs, self.num_tasks)
@@ -80,7 +90,7 @@ class MetaWorldWorld(VectorEnv):
         self.task_id = torch.arange(self.num_tasks).repeat_interleave(torch.tensor(counts))
         self._index_in_slot = torch.cat([torch.arange(count) for count in counts])
         self._singles = [Single(self.task_names[i]) for i in self.task_id.tolist()]
-        self.max_episode_steps = torch.full((num_envs,), EPISODE_STEPS)
+        self.max_episode_steps, self._clock = torch.full((num_envs,), EPISODE_STEPS), Clock(num_envs, self.device)
         self._make_spaces()
         self._actions = torch.zeros(num_envs, EPISODE_STEPS, ACTION_SIZE)  # of the running episodes, for checkpoints
         self._obs = torch.zeros(self.observation_space.shape or ())
@@ -149,16 +159,15 @@ class MetaWorldWorld(VectorEnv):
         """
         mask = reset_mask(options, self.num_envs, self.device, self._ready)
         if seed is not None:
-            if not mask.all():
-                raise BidexError("Expected a seed with a full reset, got it with a reset_mask; drop one of the two.")
-            self._seed_rows(seed)
+            self._seed_rows(checked_seed(seed, mask))
         first = not self._ready or seed is not None
         self._ready = True
-        self._begin(mask, stagger=first and self.autoreset_mode == AutoresetMode.SAME_STEP)
+        self._begin(mask, stagger=first and self._stagger)
         return self._obs.clone(), {}
 
     def _begin(self, mask: Tensor, stagger: bool) -> None:
         """Starts new episodes in the rows of a mask and writes their observations."""
+        self._clock.begin(mask)
         self.episodes.number = self.episodes.number + mask
         draws = uniform(self._keys, self.episodes.number, _DRAWS)
         if self.autoreset_mode == AutoresetMode.SAME_STEP:
@@ -228,11 +237,12 @@ class MetaWorldWorld(VectorEnv):
             "reward_unscaled": reward.clone(),
             "final_obs": obs,
             "_final_obs": ended,
-            "episode": episodes.statistics(),
-            "_episode": ended & episodes.counts,
+            "so_far": episodes.statistics(),
+            "counted": ended & episodes.counts,
         }
-        info["final_info"] = {k: info[k] for k in ("success", "unstable", "reward_unscaled", "episode")}
-        info["_final_info"] = ended
+        if ended.any():
+            info |= ended_info(info)
+            self._clock.stamp(info)
         self._obs, self._success = obs.clone(), success.clone()
         if self.autoreset_mode == AutoresetMode.SAME_STEP:
             if ended.any():

@@ -18,7 +18,19 @@ from bidex_meta.errors import BidexError, known_name
 if TYPE_CHECKING:
     from bidex_meta.world.contract import VectorWorld
 
-_KINDS = ("world", "scaling", "mixing", "field", "stability", "capacity", "gpu", "kernels", "learner", "adapt")
+_KINDS = (
+    "world",
+    "scaling",
+    "mixing",
+    "field",
+    "stability",
+    "capacity",
+    "gpu",
+    "kernels",
+    "learner",
+    "adapt",
+    "clients",
+)
 
 
 @dataclass(frozen=True)
@@ -30,11 +42,14 @@ class BenchFlags:
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="|".join(_KINDS))]
     """world, scaling, mixing, stability, capacity, gpu, kernels; field: beside Meta-World and gymnasium-robotics;
-    learner: MT-PPO's update against rsl-rl-lib's; adapt: all tasks' adaptation at once against a loop over them."""
+    learner: MT-PPO's update against rsl-rl-lib's; adapt: all tasks' adaptation at once against a loop over them;
+    clients: another library's PPO through its adapter against the world's own loop."""
     suite: str | None = None
     """Suite to measure: by default world and scaling take MT4, mixing, gpu and kernels MT20, the others every class."""
     task: str | None = None
-    """For stability and capacity: this task class alone."""
+    """For stability, capacity and clients: this task class alone."""
+    client: str | None = None
+    """For clients: sb3 or rsl-rl."""
     tasks: tuple[str, ...] | None = None
     """For gpu: the classes to step alone, beside the suite."""
     sizes: tuple[int, ...] | None = None

@@ -4,9 +4,11 @@ from typing import Any
 
 from torch import Tensor
 
+from bidex_meta.world.numpy_form import NumpyWorld
+
 
 class RowAttributes:
-    """``get_attr``, ``set_attr`` and ``call`` of a batched world.
+    """``get_attr``, ``set_attr``, ``call`` and ``to_numpy`` of a batched world.
 
     Attributes:
         num_envs: Rows.
@@ -22,6 +24,11 @@ class RowAttributes:
     def task_name(self) -> list[str]:
         """Slot name of each row."""
         return [self.task_names[i] for i in self.task_id.tolist()]
+
+    def to_numpy(self) -> NumpyWorld:
+        """This world in NumPy arrays, as Gymnasium's vector wrappers expect one."""
+        world: Any = self
+        return NumpyWorld(world)
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """An attribute for each row: its own entry of a per-row attribute, else the world's value."""

@@ -1,5 +1,6 @@
 """When rows start anew: within the step that ended them (training), or when they are told to (evaluation)."""
 
+import operator
 from typing import Any
 
 import torch
@@ -30,8 +31,14 @@ def reset_mask(options: dict[str, Any] | None, num_envs: int, device: torch.devi
     """The rows that ``reset`` is asked to start, shape (num_envs,), bool: those of ``reset_mask``, else all.
 
     Raises:
-        BidexError: A mask of another shape or dtype, or one with false entries before the first full reset.
+        BidexError: Another option, a mask of another shape or dtype, or one with false entries before the first full
+            reset.
     """
+    if unknown := sorted(map(str, (options or {}).keys() - {"reset_mask"})):
+        raise BidexError(
+            f"Expected no reset option but reset_mask, got {', '.join(unknown)}. To start some rows alone give a bool "
+            f"mask of all: reset(options={{'reset_mask': mask}}), shape ({num_envs},)."
+        )
     mask = (options or {}).get("reset_mask")
     if mask is None:
         return torch.ones(num_envs, dtype=torch.bool, device=device)
@@ -41,3 +48,22 @@ def reset_mask(options: dict[str, Any] | None, num_envs: int, device: torch.devi
     if not ready and not mask.all():
         raise BidexError("Expected a full reset first, got a reset_mask with false entries; call reset() once without.")
     return mask
+
+
+def checked_seed(seed: Any, mask: Tensor) -> int:
+    """The seed of a reset.
+
+    Raises:
+        BidexError: No whole number from 0 on, or a seed together with a mask that leaves rows out.
+    """
+    try:
+        number = -1 if isinstance(seed, bool) else operator.index(seed)
+    except TypeError:
+        number = -1
+    if number < 0:
+        raise BidexError(
+            f"seed: expected one whole number from 0 on, got {seed!r}. One seed is of all rows, whose draws differ."
+        )
+    if not mask.all():
+        raise BidexError("Expected a seed with a full reset, got it with a reset_mask; a seed starts all rows anew.")
+    return number

@@ -23,12 +23,17 @@ final_obs              (N, d), float32       the observation that the transition
                                              before it
 _final_obs             (N,), bool            rows that ended in this step: there ``final_obs`` is the last of the
                                              episode; elsewhere it is the observation that the step returns
-episode                dict of (N,)          r (return, float32), l (length, int64), success (at any step, bool),
+so_far                 dict of (N,)          r (return, float32), l (length, int64), success (at any step, bool),
                                              unscaled (return, float32), of the episode so far
-_episode               (N,), bool            rows whose episode ended and counts (shortened first ones do not)
+counted                (N,), bool            rows whose episode ended and counts (shortened first ones do not)
 =====================  ====================  ===========================================================================
 
-A world may add keys (``reward_terms``, ``final_info``); nobody may rely on these.
+For users of Gymnasium our worlds add its ``episode``, ``_episode``, ``final_info`` and ``_final_info`` (``ends.py``)
+where a row ended, and on the warp engine, which would have to wait for the answer, in every step: zero outside their
+masks. A world may add keys like these and ``reward_terms``; learners may not rely on them.
+
+Shortened first episodes: in SAME_STEP mode the first episode of each row, after the first reset and after each with a
+seed, may begin at a random elapsed step, so that rows do not end together; the time limit counts from there.
 """
 
 from dataclasses import dataclass
@@ -113,13 +118,15 @@ class VectorWorld(Protocol):
         Args:
             seed: Starts all draws anew: equal seeds and actions give equal trajectories. None goes on with the old
                 seed's next episodes.
-            options: ``reset_mask``: which rows to start, bool (N,); the others stay as they are. All by default.
+            options: ``reset_mask``: which rows to start, bool (N,); the others stay as they are. All by default. There
+                are no other options.
 
         Returns:
             Observations (N, d), float32, and an empty info.
 
         Raises:
-            BidexError: A seed together with a mask that leaves rows out.
+            BidexError: Another option, a seed that is no whole number from 0 on, or one with a mask that leaves rows
+                out.
         """
         ...
 

@@ -65,7 +65,7 @@ class Episodes:
         self.unscaled = self.unscaled + unscaled * active
 
     def statistics(self) -> dict[str, Tensor]:
-        """Return, length, success and unscaled return so far, as ``info["episode"]`` carries them."""
+        """Return, length, success and unscaled return so far, as ``info["so_far"]`` carries them."""
         return {
             "r": self.reward.clone(),
             "l": self.length.clone(),

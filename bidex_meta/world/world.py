@@ -21,7 +21,9 @@ from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.layout import CLIP
 from bidex_meta.world import actions, checked
 from bidex_meta.world.attributes import RowAttributes
-from bidex_meta.world.autoreset import checked_mode, reset_mask
+from bidex_meta.world.autoreset import checked_mode, checked_seed, reset_mask
+from bidex_meta.world.copying import Recreated
+from bidex_meta.world.ends import Clock, ended_info
 from bidex_meta.world.episodes import Episodes
 from bidex_meta.world.groups import Slot, build_groups, split_rows, with_pool, with_pools
 from bidex_meta.world.observation_groups import observation_groups
@@ -41,7 +43,7 @@ _STATE = ("_action", "_obs", "task_index")
 """What a step changes beside the episodes' counters."""
 
 
-class World(RowAttributes, VectorEnv):
+class World(Recreated, RowAttributes, VectorEnv):
     """Every task of a suite in one Gymnasium vector environment of torch tensors.
 
     A ``contract.PooledWorld``: attributes and ``info`` are explained there. NumPy actions are accepted. Positions and
@@ -67,6 +69,7 @@ class World(RowAttributes, VectorEnv):
         pad_to: int | None = None,
         task_sampling: str = "fixed",
         threads: int | None = None,
+        stagger: bool = True,
     ) -> None:
         """Builds the world; no row is started before ``reset``.
 
@@ -82,6 +85,8 @@ class World(RowAttributes, VectorEnv):
             pad_to: Observation entries before the task id; None takes the widest class.
             task_sampling: "uniform": each autoreset draws a task of the slot's pool; "fixed": row j keeps task j mod n.
             threads: Engine threads; None takes all CPUs. Trajectories do not depend on it.
+            stagger: In SAME_STEP mode the first episodes begin at random elapsed steps, so that rows do not end
+                together; these shortened ones do not count in ``episode``. False: they begin at 0.
 
         Raises:
             BidexError: Fewer rows than slots, unknown device, engine, mode or sampling, or too narrow a padding.
@@ -91,6 +96,7 @@ class World(RowAttributes, VectorEnv):
         checked.choices(task_sampling, observation)
         self.num_envs, self.slots, self.seed = num_envs, [with_pool(slot, slot.tasks) for slot in slots], seed
         self.autoreset_mode = checked_mode(autoreset_mode)
+        self._stagger = stagger and self.autoreset_mode == AutoresetMode.SAME_STEP
         self.metadata = {
             "autoreset_mode": self.autoreset_mode, "render_modes": ["rgb_array"], "render_fps": CONTROL_RATE
         }  # fmt: skip
@@ -110,7 +116,7 @@ class World(RowAttributes, VectorEnv):
         self._side_by_side = SideBySide(len(groups), self.device)
         captured = self.device.type == "cuda" and self.autoreset_mode == AutoresetMode.SAME_STEP
         self._recorder = Recorder(self._state, self._put_state, cuda_graph) if captured else None
-        self.episodes = Episodes.fresh(num_envs, self.device)
+        self.episodes, self._clock = Episodes.fresh(num_envs, self.device), Clock(num_envs, self.device)
         counted = [torch.arange(rows.stop - rows.start, device=self.device) for rows in self.slot_rows]
         self._index_in_slot = torch.cat(counted)
         self._set_pool_sizes()
@@ -180,13 +186,8 @@ class World(RowAttributes, VectorEnv):
         """Starts episodes of all rows, or those of ``options["reset_mask"]``; see ``VectorWorld.reset``."""
         mask = reset_mask(options, self.num_envs, self.device, self._ready)
         if seed is not None:
-            if not mask.all():
-                raise BidexError(
-                    "Expected a seed with a full reset, got it with a reset_mask; a seed starts all rows anew."
-                )
-            self._seed_rows(seed)
-        first = not self._ready or seed is not None
-        stagger = self.autoreset_mode == AutoresetMode.SAME_STEP and first
+            self._seed_rows(checked_seed(seed, mask))
+        stagger = self._stagger and (not self._ready or seed is not None)
         self._ready = True
         with one_torch_thread():
             self._begin(mask, stagger)
@@ -206,6 +207,7 @@ class World(RowAttributes, VectorEnv):
 
     def _begin(self, mask: Tensor, stagger: bool) -> None:
         """Starts new episodes in the rows of a mask and refreshes their observations."""
+        self._clock.begin(mask)
         if self._masked:
             self._starts.look_ahead(self.episodes.number + 1, self.task_index)
         starts = self._run(f"begin, staggered {stagger}", partial(self._draw, stagger), mask)
@@ -260,7 +262,7 @@ class World(RowAttributes, VectorEnv):
 
         Returns:
             Observations (num_envs, d), rewards, terminated and truncated (num_envs,), and info as in the contract,
-            with ``reward_terms`` by name beside it, and Gymnasium's ``final_info``.
+            with ``reward_terms`` by name beside it, and Gymnasium's ``episode`` and ``final_info`` where a row ended.
 
         Raises:
             BidexError: No real numbers, a wrong shape, or no reset since the world was made or got other tasks.
@@ -281,6 +283,7 @@ class World(RowAttributes, VectorEnv):
         else:
             made = self._finish(stepped, active, broken)
         reward, terminated, truncated, info = made if self._recorder is None else fresh(made)
+        self._clock.stamp(info)
         ended = info["_final_obs"]
         if not disabled and (self._masked or ended.any()):
             self._begin(ended, stagger=False)
@@ -323,7 +326,6 @@ class World(RowAttributes, VectorEnv):
         kept = broken | ~active
         if self._masked or kept.any():  # on the CPU looking costs less than a pass over all observations
             obs = torch.where(kept[:, None], self._obs, obs)
-        statistics = episodes.statistics()
         info: dict[str, Any] = {
             "success": success & ~unstable,
             "unstable": broken,
@@ -331,11 +333,11 @@ class World(RowAttributes, VectorEnv):
             "reward_unscaled": unscaled,
             "final_obs": obs,
             "_final_obs": ended,
-            "episode": statistics,
-            "_episode": ended & episodes.counts,
+            "so_far": episodes.statistics(),
+            "counted": ended & episodes.counts,
         }
-        info["final_info"] = {k: info[k] for k in ("success", "unstable", "reward_unscaled", "episode")}
-        info["_final_info"] = ended
+        if self._masked or ended.any():
+            info |= ended_info(info)
         self._obs = obs.clone()
         if self.autoreset_mode == AutoresetMode.DISABLED:
             episodes.terminated, episodes.truncated = terminated.clone(), truncated.clone()

@@ -36,9 +36,9 @@ def test_finished_rows_are_frozen_until_reset():
     for t in range(8):
         obs, reward, terminated, truncated, info = world.step(torch.ones(4, 2))
         assert truncated[:2].all() == (t >= 4) and not terminated.any()
-        assert bool(info["_episode"][0]) == (t == 4)
+        assert bool(info["counted"][0]) == (t == 4)
     assert reward[:2].tolist() == [0, 0] and (reward[2:] < 0).all()
-    assert torch.equal(info["episode"]["l"], torch.tensor([5, 5, 8, 8]))
+    assert torch.equal(info["so_far"]["l"], torch.tensor([5, 5, 8, 8]))
     again, _ = world.reset(options={"reset_mask": torch.tensor([True, False, False, False])})
     assert torch.equal(again[1:], obs[1:]) and not torch.equal(again[0], obs[0])
 

@@ -15,6 +15,8 @@ THROWN = ["HandOver", "CatchUnderarm", "CatchOver2Underarm", "TwoCatchUnderarm",
 CLASSES = [*THROWN, "DoorCloseInward", "BottleCap"]
 """What a world does is seen in these: one and two free objects, a movable fixture, an object with joints."""
 
+ENDS = ("episode", "_episode", "final_info", "_final_info")
+
 
 def suite_world(name: str, rows: int, mode: str = "SAME_STEP", split: str = "train", seed: int = 0, threads: int = 1):
     return Benchmark(name).make_world(
@@ -34,9 +36,13 @@ def random_actions(world: World, steps: int, rows: int | None = None, seed: int 
 
 
 def flat(result: tuple[Any, ...]) -> dict[str, Tensor]:
-    """The tensors of a step by name, those of info and of its dicts included."""
+    """The tensors of a step by name, those of info and of its dicts included.
+
+    Left out is what Gymnasium adds where rows ended: it repeats the others, but for the time on the clock.
+    """
     names = ("obs", "reward", "terminated", "truncated")
-    return dict(zip(names, result, strict=False)) | _flat(result[-1], "info")
+    info = {name: value for name, value in result[-1].items() if name not in ENDS}
+    return dict(zip(names, result, strict=False)) | _flat(info, "info")
 
 
 def _flat(info: dict[str, Any], prefix: str) -> dict[str, Tensor]:

@@ -60,9 +60,9 @@ def test_shapes_types_and_spaces(world: World) -> None:
             value = flat(result)[name]
             assert value.dtype == torch.float32 and world.observation_space.contains(value.numpy())
         assert reward.shape == (ROWS,) and reward.dtype == torch.float32
-        for flags in (terminated, truncated, *(info[k] for k in ("success", "unstable", "_final_obs", "_episode"))):
+        for flags in (terminated, truncated, *(info[k] for k in ("success", "unstable", "_final_obs", "counted"))):
             assert flags.shape == (ROWS,) and flags.dtype == torch.bool
-        assert info["episode"].keys() >= {"r", "l", "success"}
+        assert info["so_far"].keys() >= {"r", "l", "success"}
         assert all(value.shape[0] == ROWS and value.device == world.device for value in flat(result).values())
         assert torch.equal(info["_final_obs"], terminated | truncated)
         assert not (terminated & truncated).any()

@@ -21,12 +21,12 @@ def test_finished_rows_are_frozen(world: World) -> None:
     for action in random_actions(world, 160):
         engines = engine_state(world)
         frozen = world.episodes.finished.clone()
-        statistics = {name: value.clone() for name, value in last.items() if name.startswith("info/episode/")}
+        statistics = {name: value.clone() for name, value in last.items() if name.startswith("info/so_far/")}
         step = flat(world.step(action))
         for name in ("obs", "info/final_obs", "terminated", "truncated"):
             if frozen.any():
                 assert torch.equal(step[name][frozen], at_end[name][frozen]), name
-        for name in ("reward", "info/reward_unscaled", "info/_final_obs", "info/_episode", "info/unstable"):
+        for name in ("reward", "info/reward_unscaled", "info/_final_obs", "info/counted", "info/unstable"):
             assert not step[name][frozen].any(), name
         for name, value in statistics.items():
             assert torch.equal(step[name][frozen], value[frozen]), name
@@ -46,9 +46,9 @@ def test_each_row_ends_once_and_counts(world: World) -> None:
     world.reset(seed=0)
     steps = play(world, random_actions(world, 160))
     assert torch.stack([s["info/_final_obs"] for s in steps]).sum(dim=0).tolist() == [1] * ROWS
-    assert torch.stack([s["info/_episode"] for s in steps]).sum(dim=0).tolist() == [1] * ROWS
+    assert torch.stack([s["info/counted"] for s in steps]).sum(dim=0).tolist() == [1] * ROWS
     lengths = torch.stack([s["info/_final_obs"] for s in steps]).int().argmax(dim=0) + 1
-    assert torch.equal(steps[-1]["info/episode/l"], lengths)
+    assert torch.equal(steps[-1]["info/so_far/l"], lengths)
     late = steps[-1]["truncated"]
     assert torch.equal(lengths[late], world.max_episode_steps[late])
     assert (lengths[~late] <= world.max_episode_steps[~late]).all()

@@ -54,13 +54,10 @@ def test_episode_statistics_are_those_of_a_count_by_hand(
     for step in steps:
         total, length, success = total + step["reward"], length + 1, success | step["info/success"]
         ended = step["info/_final_obs"]
-        assert torch.equal(step["info/episode/r"], total)
-        assert torch.equal(step["info/episode/l"], length)
-        assert torch.equal(step["info/episode/success"], success)
-        assert torch.equal(step["info/_episode"], ended & whole)
-        assert torch.equal(step["info/_final_info"], ended)
-        for name in ("success", "unstable", "reward_unscaled", "episode/r", "episode/l", "episode/success"):
-            assert torch.equal(step[f"info/final_info/{name}"], step[f"info/{name}"])
+        assert torch.equal(step["info/so_far/r"], total)
+        assert torch.equal(step["info/so_far/l"], length)
+        assert torch.equal(step["info/so_far/success"], success)
+        assert torch.equal(step["info/counted"], ended & whole)
         late = torch.where(whole, length, length + elapsed) >= world.max_episode_steps
         assert torch.equal(step["truncated"], late & ~step["terminated"])
         counted, left_out = counted + int((ended & whole).sum()), left_out + int((ended & ~whole).sum())
@@ -141,7 +138,7 @@ def test_success_belongs_to_the_transition_also_in_a_reset_row() -> None:
     world.episodes.elapsed = world.max_episode_steps - 1
     step = flat(world.step(torch.zeros(3, 52)))
     assert step["info/_final_obs"].all()
-    assert step["info/success"].tolist() == step["info/episode/success"].tolist() == [False, True, False]
+    assert step["info/success"].tolist() == step["info/so_far/success"].tolist() == [False, True, False]
     assert step["reward"][1] > 0.4 and torch.equal(step["reward"], step["info/reward_terms/pose"])
     assert not world.episodes.success.any() and (world.episodes.reward == 0).all()
 

@@ -48,7 +48,7 @@ def test_the_reward_is_that_of_the_new_task() -> None:
     a, b = (play(made, random_actions(world, 10)) for made in (world, twin))
     assert all((x["reward"][:2] != y["reward"][:2]).all() for x, y in zip(a, b, strict=True))
     for step in (*a, *b):
-        del step["info/episode/unscaled"], step["info/final_info/episode/unscaled"]
+        del step["info/so_far/unscaled"]
     assert_same(a, b, slice(2, None))
 
 

@@ -141,5 +141,5 @@ def play(
                 break
         found = {"r": earned, "l": elapsed, "success": success}
         for each in statistics[episode]:
-            each.update({"episode": found, "_episode": whole})
+            each.update({"so_far": found, "counted": whole})
     trials.obs[trials.lengths, rows] = obs

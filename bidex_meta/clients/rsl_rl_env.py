@@ -1,0 +1,79 @@
+"""A world as rsl-rl's VecEnv: `OnPolicyRunner(RslRlVecEnv(world), config)`. Extra: `rsl-rl`."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bidex_meta.clients.episode_log import EpisodeLog
+from bidex_meta.clients.needs import check_training, extra
+from bidex_meta.errors import unknown_name
+from bidex_meta.world.contract import TaskWorld
+
+with extra("rsl-rl"):
+    from rsl_rl.env import VecEnv
+    from tensordict import TensorDict
+
+
+class RslRlVecEnv(VecEnv):
+    """All rows of one world on its device; observations in the groups `policy` and `critic`.
+
+    `extras`: `time_outs` (cut by the time limit or broken physics) and `log` (`EpisodeLog`; empty where no row ended).
+    Rows begin staggered already: leave `init_at_random_ep_len` False.
+
+    Args:
+        world: In autoreset mode SAME_STEP.
+        policy: The world's `observation_groups` that the policy sees; none: all. The critic sees everything.
+        cfg: What rsl-rl's loggers shall keep as the environment's config.
+
+    Raises:
+        BidexError: Another autoreset mode, or an unknown group.
+    """
+
+    def __init__(self, world: TaskWorld, policy: Sequence[str] = (), cfg: dict[str, Any] | None = None) -> None:
+        check_training(world)
+        self.world: Any = world
+        self.num_envs, self.num_actions = world.num_envs, world.action_space.shape[1]
+        self.device, self.cfg = world.device, cfg or {}
+        limits = world.max_episode_steps
+        self.max_episode_length = int(limits[0]) if bool((limits == limits[0]).all()) else limits
+        groups = {group.name: group for group in world.observation_groups}
+        for name in set(policy) - groups.keys():
+            raise unknown_name("observation group", name, groups)
+        entries = [torch.arange(part.start, part.stop) for name in policy for part in groups[name].where]
+        self._policy = torch.cat(entries).to(world.device) if entries else None
+        self._log = EpisodeLog(world)
+        self._obs: Tensor | None = None
+
+    @property
+    def episode_length_buf(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Steps since each row's start, int64 (num_envs,). Setting it shortens the running episodes, uncounted."""
+        return self.world.episodes.elapsed.clone()
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, value: Tensor) -> None:
+        self.get_observations()
+        episodes = self.world.episodes
+        episodes.counts = episodes.counts & (value == episodes.elapsed)
+        episodes.elapsed = value.to(episodes.elapsed).minimum(self.world.max_episode_steps - 1)
+
+    def reset(self, seed: int | None = None) -> tuple[TensorDict, dict[str, Any]]:
+        """Starts episodes of all rows."""
+        with torch.inference_mode(False):
+            self._obs, self._log = self.world.reset(seed=seed)[0], EpisodeLog(self.world)
+        return self.get_observations(), {}
+
+    def get_observations(self) -> TensorDict:
+        """The present observations, `policy` (num_envs, p) and `critic` (num_envs, d)."""
+        if self._obs is None:
+            return self.reset()[0]
+        policy = self._obs if self._policy is None else self._obs[:, self._policy]
+        return TensorDict({"policy": policy, "critic": self._obs}, [self.num_envs])
+
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
+        """Takes actions (num_envs, a): observations, rewards and dones (num_envs,), extras."""
+        with torch.inference_mode(False), torch.no_grad():  # the world outlives the runner's mode
+            self._obs, reward, terminated, truncated, told = self.world.step(actions)
+            extras = {"time_outs": truncated, "log": self._log.update(told, terminated, truncated)}
+            return self.get_observations(), reward, terminated | truncated, extras

@@ -1,0 +1,79 @@
+"""A world as stable-baselines3's VecEnv: `PPO("MlpPolicy", SB3VecEnv(world))`. Extra: `sb3`."""
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from bidex_meta.clients.needs import check_training, extra
+from bidex_meta.world.contract import VectorWorld
+
+with extra("sb3"):
+    from stable_baselines3.common.vec_env import VecEnv
+
+
+class SB3VecEnv(VecEnv):
+    """All rows of one world, NumPy arrays in and out.
+
+    `infos` of a row that ended: `terminal_observation`, `TimeLimit.truncated` (the episode was cut: SB3 goes on with
+    the value of that observation) and, unless it was a shortened first episode, `episode` (r, l, t) and `is_success`
+    (at any step). Those of running rows are empty.
+
+    Args:
+        world: In autoreset mode SAME_STEP. One seed of SB3's starts all its rows.
+
+    Raises:
+        BidexError: Another autoreset mode.
+    """
+
+    def __init__(self, world: VectorWorld) -> None:
+        check_training(world)
+        self.world: Any = world
+        super().__init__(world.num_envs, world.single_observation_space, world.single_action_space)
+
+    def reset(self) -> np.ndarray:
+        """Starts episodes of all rows; observations (num_envs, d)."""
+        obs, _ = self.world.reset(seed=self._seeds[0], options=self._options[0])
+        self._reset_seeds()
+        self._reset_options()
+        return obs.cpu().numpy()
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keeps the actions (num_envs, a)."""
+        self._actions = torch.as_tensor(actions, dtype=torch.float32, device=self.world.device)
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Takes them: observations (num_envs, d), rewards and dones (num_envs,), infos."""
+        obs, reward, _, truncated, told = self.world.step(self._actions)
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        ended = told["_final_obs"]
+        rows = ended.nonzero().squeeze(1).tolist()
+        if rows:
+            values = {"truncated": truncated, "counted": told["counted"], **told.get("episode", told["so_far"])}
+            columns = {name: value[ended].tolist() for name, value in values.items()}
+            for i, (row, final) in enumerate(zip(rows, told["final_obs"][ended].cpu().numpy(), strict=True)):
+                infos[row] = {"terminal_observation": final, "TimeLimit.truncated": columns["truncated"][i]}
+                if columns["counted"][i]:
+                    episode = {name: columns[name][i] for name in ("r", "l", "t") if name in columns}
+                    infos[row] |= {"episode": episode, "is_success": columns["success"][i]}
+        return obs.cpu().numpy(), reward.cpu().numpy(), ended.cpu().numpy(), infos
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """The world's attribute for each row."""
+        return [self.world.get_attr(attr_name)[i] for i in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Sets an attribute of the world, for all rows."""
+        setattr(self.world, attr_name, value)
+
+    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        """Calls a method of the world once; its result for each row."""
+        return [getattr(self.world, method_name)(*method_args, **method_kwargs)] * len(list(self._get_indices(indices)))
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        """Rows have no wrappers."""
+        return [False for _ in self._get_indices(indices)]
+
+    def close(self) -> None:
+        """Frees the world."""
+        self.world.close()

@@ -1,0 +1,73 @@
+"""A world as skrl's environment wrapper: `SequentialTrainer(env=SkrlEnv(world), agents=agent)`. Extra: `skrl`."""
+
+from typing import Any
+
+import torch
+from gymnasium.spaces import Box
+from torch import Tensor
+
+from bidex_meta.clients.needs import check_training, extra
+from bidex_meta.world.contract import VectorWorld
+
+with extra("skrl"):
+    from skrl.envs.wrappers.torch import Wrapper
+
+
+class SkrlEnv(Wrapper):
+    """All rows of one world on its device, without a way over NumPy (as `wrap_env` takes it).
+
+    `infos`: the world's; where episodes that count ended, `episode` has their means as skrl's trainers log them.
+
+    Args:
+        world: In autoreset mode SAME_STEP.
+        seed: Of the first reset; None: the world's.
+
+    Raises:
+        BidexError: Another autoreset mode.
+    """
+
+    def __init__(self, world: VectorWorld, seed: int | None = None) -> None:
+        check_training(world)
+        super().__init__(world)
+        self.world, self._seed = world, seed
+        self._obs: Tensor | None = None
+
+    @property
+    def observation_space(self) -> Box:
+        """Of a row."""
+        return self.world.single_observation_space
+
+    @property
+    def action_space(self) -> Box:
+        """Of a row."""
+        return self.world.single_action_space
+
+    def reset(self) -> tuple[Tensor, dict[str, Any]]:
+        """Starts the rows once; later the present observations (num_envs, d), since rows start anew by themselves."""
+        if self._obs is None:
+            self._obs, _ = self.world.reset(seed=self._seed)
+        return self._obs, {}
+
+    def step(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+        """Takes actions (num_envs, a): observations (num_envs, d); reward and both ends (num_envs, 1); infos."""
+        with torch.no_grad():
+            self._obs, *made, told = self.world.step(actions)
+        infos = {name: value for name, value in told.items() if name not in ("episode", "_episode")}
+        counted = told["counted"]
+        if bool(counted.any()):
+            names = {"r": "Episode / Return", "l": "Episode / Length", "success": "Episode / Success"}
+            infos["episode"] = {names[name]: told["so_far"][name][counted].float().mean() for name in names}
+        reward, terminated, truncated = (each[:, None] for each in made)
+        return self._obs, reward, terminated, truncated, infos
+
+    def state(self) -> None:
+        """None: the policy sees what there is."""
+
+    def render(self, *args: Any, **kwargs: Any) -> Any:
+        """A picture of a row, (height, width, 3), uint8."""
+        world: Any = self.world
+        return world.render(*args, **kwargs)
+
+    def close(self) -> None:
+        """Frees the world."""
+        self.world.close()

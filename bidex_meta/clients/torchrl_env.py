@@ -1,0 +1,79 @@
+"""A world as TorchRL's environment: `Collector(TorchRLEnv(world), policy, ...)`. Extra: `torchrl`."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bidex_meta.clients.needs import check_training, extra
+from bidex_meta.world.contract import VectorWorld
+
+with extra("torchrl"):
+    from tensordict import TensorDict, TensorDictBase
+    from torchrl.data import Binary, Bounded, Composite, Unbounded
+    from torchrl.envs import EnvBase
+
+_EPISODE = {"r": torch.float32, "l": torch.int64, "success": torch.bool}
+
+
+class TorchRLEnv(EnvBase):
+    """All rows of one world, batch size (num_envs,).
+
+    `next` holds the observation that the step led to, also where an episode ended; the reset that TorchRL asks for then
+    hands out the new episode's, which the world has begun by itself. Beside `observation` there are `success` (of this
+    state) and `episode` (r, l, success so far), each (num_envs, 1).
+
+    Args:
+        world: In autoreset mode SAME_STEP.
+
+    Raises:
+        BidexError: Another autoreset mode.
+    """
+
+    def __init__(self, world: VectorWorld) -> None:
+        check_training(world)
+        rows, device = world.num_envs, world.device
+        super().__init__(device=device, batch_size=torch.Size([rows]))
+        self.world, self._world_seed = world, None
+        low, high = torch.as_tensor(world.observation_space.low), torch.as_tensor(world.observation_space.high)
+        bounded = bool(low.isfinite().all() and high.isfinite().all())
+        seen = Bounded(low, high, device=device) if bounded else Unbounded(low.shape, device=device)
+        column = torch.Size([rows, 1])
+        flag = Binary(1, column, dtype=torch.bool, device=device)
+        counters = {name: Unbounded(column, dtype=_EPISODE[name], device=device) for name in ("r", "l")}
+        episode = Composite({**counters, "success": flag}, shape=(rows,))
+        self.observation_spec = Composite(observation=seen, success=flag.clone(), episode=episode, shape=(rows,))
+        self.done_spec = Composite({name: flag.clone() for name in ("done", "terminated", "truncated")}, shape=(rows,))
+        self.action_spec = Bounded(-1.0, 1.0, torch.Size(world.action_space.shape), device=device)
+        self.reward_spec = Unbounded(column, device=device)
+        self._obs, self._begun = (
+            torch.zeros_like(low, device=device),
+            torch.zeros(rows, dtype=torch.bool, device=device),
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._world_seed = seed
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
+        asked = tensordict.get("_reset", None) if tensordict is not None else None
+        mask = torch.ones_like(self._begun) if asked is None else asked.squeeze(-1)
+        left = mask & ~self._begun  # what did not end in the last step
+        if asked is None or bool(left.any()):
+            options = None if bool(left.all()) or asked is None else {"reset_mask": left}
+            self._obs, _ = self.world.reset(seed=self._world_seed if options is None else None, options=options)
+            self._world_seed = None if options is None else self._world_seed
+        self._begun = self._begun & ~mask
+        return self._told(self._obs, {name: torch.zeros_like(mask, dtype=kind) for name, kind in _EPISODE.items()})
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        self._obs, reward, terminated, truncated, info = self.world.step(tensordict.get("action"))
+        self._begun = terminated | truncated
+        told = self._told(info["final_obs"], info["so_far"], info["success"])
+        ends = {"reward": reward, "done": self._begun, "terminated": terminated, "truncated": truncated}
+        return told.update({name: value[:, None] for name, value in ends.items()})
+
+    def _told(self, obs: Tensor, episode: dict[str, Tensor], success: Tensor | None = None) -> TensorDict:
+        so_far = TensorDict({name: episode[name][:, None] for name in _EPISODE}, self.batch_size)
+        success = torch.zeros_like(self._begun) if success is None else success
+        told = {"observation": obs.clone(), "success": success[:, None], "episode": so_far}
+        return TensorDict(told, self.batch_size, device=self.device)

@@ -1,0 +1,244 @@
+"""The adapters' episodes beside the world's own: 1,000 of a small world, some of a real one."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from bidex_meta.clients.needs import extra
+from bidex_meta.errors import BidexError
+from tests.points import PointWorld, ring
+from tests.world.play import suite_world
+
+ROWS = 40
+
+
+class Staggered(PointWorld):
+    """Points whose first episodes are shortened, with true ends, cuts and broken rows."""
+
+    def _first_elapsed(self) -> Tensor:
+        return torch.arange(self.num_envs) % 5
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        return (getattr(self, name, None),) * self.num_envs
+
+
+def points(mode: str = "SAME_STEP") -> Staggered:
+    return Staggered(ROWS, {"Near": ring(3), "Far": 2 * ring(3)}, (8, 12), ends=True, breaks=(1, 30), mode=mode)
+
+
+def real() -> Any:
+    return suite_world("MT4", 8)
+
+
+class Seen(NamedTuple):
+    """What a client was told, in the order of steps and rows."""
+
+    episodes: list[tuple[float, float, bool]]
+    """Return, length, success of each that counts."""
+    finals: list[np.ndarray]
+    """The last observation of each."""
+    ends: list[tuple[int, bool]]
+    """Row, and whether it was cut."""
+
+
+def own(world: Any, actions: Tensor) -> Seen:
+    """The world itself."""
+    seen = Seen([], [], [])
+    world.reset()
+    for action in actions:
+        _, _, _, truncated, info = world.step(action)
+        for row in info["_final_obs"].nonzero().squeeze(1).tolist():
+            seen.finals.append(info["final_obs"][row].numpy())
+            seen.ends.append((row, bool(truncated[row])))
+            if info["counted"][row]:
+                so_far = info["so_far"]
+                seen.episodes.append((float(so_far["r"][row]), int(so_far["l"][row]), bool(so_far["success"][row])))
+    return seen
+
+
+def of_sb3(world: Any, actions: Tensor) -> Seen:
+    pytest.importorskip("stable_baselines3")
+    from bidex_meta.clients.sb3_env import SB3VecEnv
+
+    env, seen = SB3VecEnv(world), Seen([], [], [])
+    obs = env.reset()
+    total = np.zeros(env.num_envs)
+    for action in actions.numpy():
+        obs, reward, dones, infos = env.step(action)
+        total += reward
+        assert obs.dtype == reward.dtype == np.float32 and dones.dtype == bool
+        for row, (done, info) in enumerate(zip(dones, infos, strict=True)):
+            assert done == bool(info) and ("episode" in info) == ("is_success" in info)
+            if done:
+                seen.finals.append(info["terminal_observation"])
+                seen.ends.append((row, info["TimeLimit.truncated"]))
+            if "episode" in info:
+                episode = info["episode"]
+                assert episode["r"] == pytest.approx(total[row], rel=1e-5, abs=1e-6) and episode["t"] >= 0
+                seen.episodes.append((episode["r"], episode["l"], info["is_success"]))
+        total[dones] = 0
+    return seen
+
+
+def of_rsl_rl(world: Any, actions: Tensor) -> Seen:
+    pytest.importorskip("rsl_rl")
+    from bidex_meta.clients.rsl_rl_env import RslRlVecEnv
+
+    env, seen = RslRlVecEnv(world), Seen([], [], [])
+    assert torch.equal(env.get_observations()["policy"], env.get_observations()["critic"])
+    for action in actions:
+        with torch.inference_mode():  # as its runner has it
+            obs, _, dones, extras = env.step(action.clone())
+        assert obs.batch_size == dones.shape == extras["time_outs"].shape
+        log = extras.get("log", {})
+        names = ("Metrics/return", "Metrics/length", "Metrics/success_rate")
+        told = [log.get(name, torch.zeros(0)).tolist() for name in names]
+        seen.episodes.extend((r, n, bool(s)) for r, n, s in zip(*told, strict=True))
+        seen.ends.extend((row, bool(extras["time_outs"][row])) for row in dones.nonzero().squeeze(1).tolist())
+    return seen
+
+
+def of_skrl(world: Any, actions: Tensor) -> Seen:
+    pytest.importorskip("skrl")
+    from bidex_meta.clients.skrl_env import SkrlEnv
+
+    env, seen = SkrlEnv(world), Seen([], [], [])
+    obs, _ = env.reset()
+    for action in actions:
+        obs, reward, terminated, truncated, infos = env.step(action)
+        assert torch.equal(env.reset()[0], obs) and reward.shape == terminated.shape == (env.num_envs, 1)
+        for row in (terminated | truncated).squeeze(1).nonzero().squeeze(1).tolist():
+            seen.finals.append(infos["final_obs"][row].numpy())
+            seen.ends.append((row, bool(truncated[row])))
+        counted, so_far = infos["counted"], infos["so_far"]
+        seen.episodes.extend(zip(*(so_far[name][counted].tolist() for name in ("r", "l", "success")), strict=True))
+        assert ("episode" in infos) == bool(counted.any())
+        if "episode" in infos:
+            assert infos["episode"]["Episode / Return"] == so_far["r"][counted].mean()
+    return seen
+
+
+def of_torchrl(world: Any, actions: Tensor) -> Seen:
+    pytest.importorskip("torchrl")
+    from bidex_meta.clients.torchrl_env import TorchRLEnv
+
+    env, seen = TorchRLEnv(world), Seen([], [], [])
+    state = env.reset()
+    whole = world.episodes.counts.clone()
+    for action in actions:
+        told, state = env.step_and_maybe_reset(state.set("action", action))
+        after = told["next"]
+        done = after["done"].squeeze(1)
+        for row in done.nonzero().squeeze(1).tolist():
+            seen.finals.append(after["observation"][row].numpy())
+            seen.ends.append((row, bool(after["truncated"][row])))
+            if whole[row]:
+                episode = after["episode"][row]
+                seen.episodes.append((float(episode["r"]), int(episode["l"]), bool(episode["success"])))
+        assert torch.equal(state["observation"][~done], after["observation"][~done])
+        assert not done.any() or not torch.equal(state["observation"][done], after["observation"][done])
+        whole |= done
+    return seen
+
+
+CLIENTS = {"sb3": of_sb3, "rsl-rl": of_rsl_rl, "skrl": of_skrl, "torchrl": of_torchrl}
+
+
+@pytest.mark.parametrize("client", CLIENTS)
+@pytest.mark.parametrize(("make", "steps", "least"), [(points, 260, 1000), (real, 150, 10)], ids=["points", "MT4"])
+def test_episodes_are_the_worlds_own(client: str, make: Callable[[], Any], steps: int, least: int) -> None:
+    world = make()
+    generator = torch.Generator().manual_seed(0)
+    actions = 2 * torch.rand(steps, *world.action_space.shape, generator=generator) - 1
+    expected, found = own(make(), actions), CLIENTS[client](world, actions)
+    assert len(expected.episodes) >= least and len(expected.episodes) < len(expected.ends)
+    np.testing.assert_allclose(found.episodes, expected.episodes, rtol=1e-6, atol=1e-6)
+    assert found.ends == expected.ends and len({cut for _, cut in found.ends}) == 2
+    if client != "rsl-rl":  # which asks for none: it goes on from the value of the observation before
+        np.testing.assert_array_equal(found.finals, expected.finals)
+
+
+@pytest.mark.parametrize("client", CLIENTS)
+def test_adapters_refuse_evaluation_worlds(client: str) -> None:
+    with pytest.raises(BidexError, match="SAME_STEP, got DISABLED"):
+        CLIENTS[client](points("DISABLED"), torch.zeros(1, ROWS, 2))
+
+
+def test_a_missing_package_is_one_line() -> None:
+    with (
+        pytest.raises(BidexError, match=r"'sb3', but nobodys_package is not installed.*'bidex-meta\[sb3\]'"),
+        extra("sb3"),
+    ):
+        import nobodys_package  # type: ignore[import-not-found]  # noqa: F401
+
+
+def test_sb3_seeds_options_and_attributes() -> None:
+    pytest.importorskip("stable_baselines3")
+    from bidex_meta.clients.sb3_env import SB3VecEnv
+
+    env, twin = SB3VecEnv(real()), real()
+    env.seed(3)
+    np.testing.assert_array_equal(env.reset(), twin.reset(seed=3)[0])
+    assert env.get_attr("task_name", [0, 7]) == ["CatchUnderarm", "TwoCatchUnderarm"]
+    assert env.env_method("get_attr", "num_tasks", indices=[0]) == [(4,) * 8]
+    assert env.render_mode == "rgb_array" and env.env_is_wrapped(object, [1]) == [False]
+    env.set_attr("note", 1)
+    assert env.get_attr("note", 0) == [1]
+    env.set_options({"env_idx": 1})
+    with pytest.raises(BidexError, match="env_idx"):
+        env.reset()
+
+
+def test_rsl_rl_groups_limits_and_lengths() -> None:
+    pytest.importorskip("rsl_rl")
+    from bidex_meta.clients.rsl_rl_env import RslRlVecEnv
+
+    world = real()
+    env = RslRlVecEnv(world, policy=("right_hand", "goal"))
+    obs = env.get_observations()
+    parts = [part for g in world.observation_groups if g.name in ("right_hand", "goal") for part in g.where]
+    assert torch.equal(obs["policy"], torch.cat([obs["critic"][:, part] for part in parts], 1))
+    assert torch.equal(env.max_episode_length, world.max_episode_steps)
+    assert RslRlVecEnv(suite_world("MT1", 4)).max_episode_length == 75
+    env.episode_length_buf = torch.full((8,), 74)
+    dones = env.step(torch.zeros(8, 52))[2]
+    assert torch.equal(dones, world.max_episode_steps == 75)
+    with pytest.raises(BidexError, match=r"Unknown observation group 'gaol'. Did you mean 'goal'"):
+        RslRlVecEnv(world, policy=("gaol",))
+
+
+def test_a_world_leaves_rsl_rls_inference_mode_unharmed() -> None:
+    pytest.importorskip("rsl_rl")
+    from bidex_meta.clients.rsl_rl_env import RslRlVecEnv
+
+    world = real()
+    with torch.inference_mode():
+        env = RslRlVecEnv(world)
+        env.get_observations()
+        for _ in range(3):
+            env.step(torch.zeros(8, 52))
+    assert not any(value.is_inference() for value in world.state_dict()["episodes"].values())
+    obs = world.step(torch.zeros(8, 52, requires_grad=False))[0]
+    torch.nn.Linear(446 + 4, 1)(obs).sum().backward()
+
+
+def test_torchrl_specs_seeds_and_part_resets() -> None:
+    pytest.importorskip("torchrl")
+    from torchrl.envs.utils import check_env_specs
+
+    from bidex_meta.clients.torchrl_env import TorchRLEnv
+
+    world = real()
+    env = TorchRLEnv(world)
+    check_env_specs(env)
+    env.set_seed(5)
+    assert torch.equal(env.reset()["observation"], real().reset(seed=5)[0])
+    state = env.rand_step(env.reset())["next"]
+    mask = torch.arange(8)[:, None] < 3
+    part = env.reset(state.select("observation", "episode", "success", "done").set("_reset", mask))
+    assert torch.equal(part["observation"][3:], state["observation"][3:])
+    assert world.episodes.length.tolist() == [0, 0, 0, 1, 1, 1, 1, 1]
