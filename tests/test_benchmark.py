@@ -149,6 +149,7 @@ def test_what_a_world_is_asked_for(
         "task_sampling": sampling,
         "threads": 2,
         "engine": "auto",
+        "stagger": True,
     }
 
 
