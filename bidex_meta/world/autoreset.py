@@ -1,13 +1,12 @@
 """When rows start anew: within the step that ended them (training), or when they are told to (evaluation)."""
 
-import operator
 from typing import Any
 
 import torch
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
-from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.errors import BidexError, unknown_name, whole_number
 
 _MODES = {"SAME_STEP": AutoresetMode.SAME_STEP, "DISABLED": AutoresetMode.DISABLED}
 
@@ -56,14 +55,7 @@ def checked_seed(seed: Any, mask: Tensor) -> int:
     Raises:
         BidexError: No whole number from 0 on, or a seed together with a mask that leaves rows out.
     """
-    try:
-        number = -1 if isinstance(seed, bool) else operator.index(seed)
-    except TypeError:
-        number = -1
-    if number < 0:
-        raise BidexError(
-            f"seed: expected one whole number from 0 on, got {seed!r}. One seed is of all rows, whose draws differ."
-        )
+    number = whole_number("seed", seed, 0)  # one of all rows, whose draws differ
     if not mask.all():
         raise BidexError("Expected a seed with a full reset, got it with a reset_mask; a seed starts all rows anew.")
     return number

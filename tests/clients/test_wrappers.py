@@ -42,8 +42,8 @@ def films(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[np.ndarray]]:
     for name in ("moviepy", "moviepy.video", "moviepy.video.io", "moviepy.video.io.ImageSequenceClip"):
         monkeypatch.setitem(sys.modules, name, ModuleType(name))
     sys.modules["moviepy.video.io.ImageSequenceClip"].ImageSequenceClip = ImageSequenceClip  # type: ignore[attr-defined]
-    draw = lambda world, row, *view: np.full(PICTURE, row, np.uint8)  # noqa: E731
-    monkeypatch.setattr("bidex_meta.world.world.render_row", draw)
+    draw = lambda painter, world, row, *view: np.full(PICTURE, row, np.uint8)  # noqa: E731
+    monkeypatch.setattr("bidex_meta.world.rendering.Painter.picture", draw)
     return written
 
 
