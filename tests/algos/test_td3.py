@@ -29,6 +29,7 @@ SHARED: dict[str, Any] = {
     "tau": 0.05,
     "learning_rate": 3e-3,
     "critic_learning_rate": 5e-3,
+    "squash_price": 0.0,
     "autocast": "off",
 }
 SMALL = TD3Config(**SHARED)
@@ -147,13 +148,25 @@ def test_the_actor_climbs_the_first_critic(kind: Any, config: Any) -> None:
     learner, draw = kind(opposite_bandits(rows=6), replace(config, batch_per_task=3), seed=0), a_draw()
 
     def value() -> Tensor:
-        return learner._values(learner.critic, draw.obs, learner.policy.act(draw.obs))[0].mean()
+        return learner._values(learner.critic, draw.obs, learner.policy.raw(draw.obs).tanh())[0].mean()
 
     before, critic = value(), copy.deepcopy(learner.critic.state_dict())
     for _ in range(5):
         learner._policy_step(draw.obs, torch.ones(6), torch.full((2,), 3.0))
     assert value() > before
     assert all(torch.equal(critic[name], weight) for name, weight in learner.critic.state_dict().items())
+
+
+@both
+def test_the_price_keeps_actions_from_their_corners(kind: Any, config: Any) -> None:
+    def greedy(action: Tensor) -> Tensor:
+        return 10.0 * action.sum(1)  # the more the better
+
+    reached = []
+    for price in (0.0, 1.0):
+        learner = trained(kind, ToyWorld([greedy]), replace(config, squash_price=price), 6)
+        reached.append(float(learner.eval_action(learner.replay.obs).mean()))
+    assert reached[0] > 0.95 and 0.2 < reached[1] < 0.9
 
 
 def test_noise_goes_from_little_to_much_over_the_rows_of_each_task() -> None:
@@ -186,7 +199,12 @@ def test_metrics_and_errors_carry_its_name(kind: Any, config: Any) -> None:
         FloatingPointError, match=rf"{kind.name}: the loss is not finite after \d+ steps; lower critic_"
     ):
         learner.iterate()
-    for wrong in ({"tau": 0.0}, {"exploration_std": (0.5, 0.1)}, {"exploration_std": (-0.1, 0.1)}):
+    for wrong in (
+        {"tau": 0.0},
+        {"exploration_std": (0.5, 0.1)},
+        {"exploration_std": (-0.1, 0.1)},
+        {"squash_price": -1.0},
+    ):
         with pytest.raises(BidexError, match=f"{kind.name}: {next(iter(wrong))}"):
             replace(config, **wrong)
 

@@ -40,12 +40,16 @@ class DeterministicActor(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Actions of normalised observations (batch, d): float32 (batch, a) in [-1, 1]."""
+        return torch.tanh(self.raw(x))
+
+    def raw(self, x: Tensor) -> Tensor:
+        """The same before the squashing: float32 (batch, a)."""
         out = self.net(x)
         if self.heads > 1:
             head = self.one_hot(x).argmax(1).view(-1, 1, 1)
             out = out.unflatten(1, (self.heads, -1))
             out = out.gather(1, head.expand(-1, 1, out.shape[2]))[:, 0]
-        return torch.tanh(out)
+        return out
 
 
 class DeterministicPolicy(ActorPolicy):
@@ -53,12 +57,12 @@ class DeterministicPolicy(ActorPolicy):
 
     actor: DeterministicActor
 
-    def act(self, obs: Tensor) -> Tensor:
-        """Actions (N, a) for normalised observations (N, d), with their slopes."""
+    def raw(self, obs: Tensor) -> Tensor:
+        """What tanh makes the actions of (N, a), for normalised observations (N, d), with their slopes."""
         with autocast(obs.device, self.low_precision):
-            return self.actor(obs)
+            return self.actor.raw(obs)
 
     @torch.no_grad()
     def eval_action(self, obs: Tensor) -> Tensor:
         """The action for raw observations (N, d): (N, a) in [-1, 1]."""
-        return self.act(self.observations(obs))
+        return torch.tanh(self.raw(self.observations(obs)))

@@ -8,6 +8,10 @@ For each vector step of the world::
     mu  up on Q(s, mu(s))
     Q', mu'  a small step towards Q, mu
 
+A critic's slope drives actions into the corners of their box, where tanh has no slope that would bring them back: on
+two hands 86 % of all actions were beyond 0.99 after 0.4 M steps, and the policy stood still. ``squash_price`` on the
+square of what goes into tanh keeps them from there; 0 gives the original.
+
 The noise is normal and without memory. Its size differs from row to row of a task, so that some rows show what the
 policy does and others what lies far from it (the spread of Horgan et al. 2018); two equal numbers give the original.
 """
@@ -86,8 +90,10 @@ class DDPG(OffPolicy):
 
     def _policy_step(self, obs: Tensor, weights: Tensor, counts: Tensor) -> None:
         """One step of the actor up the first critic, on normalised observations (B, d)."""
-        value = self._values(self.critic, obs, self.policy.act(obs))[0]
-        loss = -(weights / counts.sum().clamp_min(1.0) * value).sum()
+        raw = self.policy.raw(obs)
+        value = self._values(self.critic, obs, torch.tanh(raw))[0]
+        price = self.config.squash_price * raw.square().mean(1)
+        loss = (weights / counts.sum().clamp_min(1.0) * (price - value)).sum()
         actor = list(self.policy.actor.parameters())
         self.actor_loss = self._descend(loss, loss.detach()[None], "actor", actor=actor)[0]
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from bidex_algos.checks import at_least
 from bidex_algos.offpolicy.config import OffPolicyConfig
 from bidex_meta.errors import BidexError
 
@@ -15,6 +16,8 @@ class DDPGConfig(OffPolicyConfig):
 
     exploration_std: tuple[float, float] = (0.05, 0.5)
     """Standard deviation of the noise on actions: of the first row of each task, of its last; evenly between."""
+    squash_price: float = 1.0
+    """Price, in the actor's loss, on the mean square of what tanh makes the actions of; 0: none."""
 
     def __post_init__(self) -> None:
         """Rejects values that could only fail later.
@@ -23,6 +26,7 @@ class DDPGConfig(OffPolicyConfig):
             BidexError: A field is out of its range.
         """
         super().__post_init__()
+        at_least(self, 0, "squash_price")
         low, high = self.exploration_std
         if not 0.0 <= low <= high:
             raise BidexError(
@@ -55,6 +59,7 @@ def of_paper() -> dict[str, Any]:
         "normalise_observations": False,
         "per_task_rewards": False,
         "exploration_std": (0.1, 0.1),
+        "squash_price": 0.0,
     }
 
 
