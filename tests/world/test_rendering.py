@@ -57,9 +57,9 @@ def test_one_renderer_draws_a_film_and_closes_with_the_world(world):
 def test_bad_pictures_are_one_line(world):
     for asked, told in (
         ({"camera": "frnt"}, "camera among front"),
-        ({"row": 3}, "row from 0 to 2, got 3"),
+        ({"row": 3}, "row: expected a whole number from 0 to 2, got 3"),
         ({"width": 4000}, "at most 1920 x 1080 pixels, got 4000 x 480"),
-        ({"height": 0}, "got 640 x 0"),
+        ({"height": 0}, "height: expected a whole number from 1 on, got 0"),
     ):
         with pytest.raises(BidexError, match=told):
             world.render(**asked)
