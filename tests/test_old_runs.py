@@ -28,7 +28,7 @@ def test_options_keep_their_names_order_and_values(run: Path, capsys: pytest.Cap
     main(["run", "--resume", str(run), "--print-config"])
     old, new = json.loads((run / "config.json").read_text()), json.loads(capsys.readouterr().out)
     known = {name: value for name, value in new["learner"].items() if name in old["learner"]}
-    assert known == old["learner"] and list(new) == list(old)
+    assert known == old["learner"] and [name for name in new if name in old] == list(old)
     if old["algo"] != "mtsac":  # two of its own once stood among those of all off-policy learners
         assert list(known) == list(old["learner"])
 
