@@ -76,14 +76,20 @@ def whole_number(name: str, value: object, least: int, most: int | None = None) 
         number = None
     if number is None or number < least or (most is not None and number > most):
         bounds = f"from {least} on" if most is None else f"from {least} to {most}"
-        raise BidexError(f"{name}: expected a whole number {bounds}, got {_shortened(value)}.")
+        raise BidexError(f"{name}: expected a whole number {bounds}, got {shortened(value)}.")
     return number
 
 
-def _shortened(value: object) -> str:
+def shortened(value: object) -> str:
     """A value for one line of an error. Python refuses to print whole numbers of more than 4,300 digits."""
     try:
         shown = " ".join(repr(value).split())
     except Exception:
         shown = f"a {type(value).__name__} that cannot be printed"
     return shown if len(shown) <= 80 else shown[:77] + "..."
+
+
+def one_line(text: object) -> str:
+    """A text for a terminal: on one line, and without what a terminal would obey; names in it may be anybody's."""
+    words = " ".join(str(text).split())
+    return "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in words)
