@@ -1,7 +1,8 @@
 """The one door for files that somebody else may have written or damaged: opened, bounded, parsed and checked here.
 
-Whatever is wrong with a file is one line: it is a folder, a pipe, a loop of links, too large, not UTF-8, cut off, nested
-too deep, or its numbers cannot be. Nothing is read that is larger than its kind can be, and nothing waits for a writer.
+Whatever is wrong with a file is one line: it is a folder, a pipe, a loop of links, too large, not UTF-8, cut off,
+nested too deep, or its numbers cannot be. Nothing is read that is larger than its kind can be, and nothing waits for a
+writer.
 """
 
 import json

@@ -3,6 +3,12 @@
 from typing import Any
 
 from bidex_meta.errors import BidexError
+from bidex_meta.fields import check_fields
+
+
+def types(config: Any) -> None:
+    """Refuses fields that are not of their type, and numbers that no field can mean: before all other checks."""
+    check_fields(config, config.algo)
 
 
 def at_least(config: Any, least: float, *names: str) -> None:

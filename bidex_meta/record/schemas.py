@@ -68,16 +68,18 @@ def read_evaluation(path: Path, again: str) -> dict[str, Any]:
     """
     try:
         found = read_json(path, "an evaluation")
-        if isinstance(found, dict):
-            _check_evaluation(found, path)
+        check_evaluation(found, path)
     except BidexError as error:
         raise BidexError(f"{error} Write it anew: {again}") from None
-    if not isinstance(found, dict):
-        raise BidexError(f"{path}: expected an evaluation, got another content. Write it anew: {again}")
     return found
 
 
-def _check_evaluation(found: dict[str, Any], path: Path) -> None:
+def check_evaluation(found: Any, path: Path) -> None:
+    """Refuses what is no evaluation.
+
+    Raises:
+        BidexError: Told of the first entry that is not what it must be.
+    """
     check(found, {"steps": whole(0), "split": TEXT, "splits": TABLE, "policy": TABLE}, path)
     for name, part in found.get("splits", {}).items():
         _check_meta_test(part, path, f"splits.{name}.")

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
-from bidex_algos.checks import at_least, between, positive, rising
+from bidex_algos.checks import at_least, between, positive, rising, types
 from bidex_algos.choices import Activation, Adapted
 
 
@@ -53,6 +53,7 @@ class MetaConfig:
         Raises:
             BidexError: A field is out of its range.
         """
+        types(self)
         at_least(self, 1, "tasks_per_class", "max_adapt_steps", "inner_steps")
         if self.slice_steps is not None:
             at_least(self, 1, "slice_steps")

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from bidex_algos.checks import at_least, between, positive, rising
+from bidex_algos.checks import at_least, between, positive, rising, types
 from bidex_algos.choices import Activation
 from bidex_algos.onpolicy.ppo_config import PPOConfig
 from bidex_meta.errors import BidexError
@@ -12,6 +12,9 @@ from bidex_meta.errors import BidexError
 @dataclass(frozen=True)
 class TrialConfig:
     """Networks and trials of RL²."""
+
+    algo: ClassVar[str] = "rl2"
+    """How the learner calls itself in messages."""
 
     hidden: tuple[int, ...] = (256, 128)
     """Widths of the encoder's layers, before the memory; of actor and critic alike."""
@@ -64,6 +67,7 @@ class RL2Config(PPOConfig, TrialConfig):
         Raises:
             BidexError: A field is out of its range.
         """
+        types(self)
         self._check_ppo()
         at_least(self, 1, "memory", "episodes_per_trial", "max_adapt_steps", "chunk")
         between(self, 0.0, 1.0, "gamma", "lam", "blind_share")

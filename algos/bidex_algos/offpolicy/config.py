@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from bidex_algos.checks import at_least, between, positive
+from bidex_algos.checks import at_least, between, positive, types
 from bidex_algos.choices import Activation, Autocast
 from bidex_meta.errors import BidexError
 
@@ -72,6 +72,7 @@ class OffPolicyConfig:
         Raises:
             BidexError: A field is out of its range.
         """
+        types(self)
         at_least(self, 1, "replay_steps", "steps_per_iteration", "updates_per_step", "batch_size")
         if self.batch_per_task is not None:
             at_least(self, 1, "batch_per_task")

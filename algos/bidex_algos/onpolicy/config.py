@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from bidex_algos.checks import at_least, between, positive, rising
+from bidex_algos.checks import at_least, between, positive, rising, types
 from bidex_algos.choices import Activation, Autocast
 
 
@@ -52,6 +52,7 @@ class OnPolicyConfig:
         Raises:
             BidexError: A field is out of its range.
         """
+        types(self)
         at_least(self, 1, "rollout_steps")
         at_least(self, 0, "task_embedding")
         between(self, 0.0, 1.0, "gamma", "lam")
