@@ -5,8 +5,10 @@ import operator
 from collections.abc import Iterable
 
 EXIT_BAD_INPUT = 2
+EXIT_FAILED = 1
 EXIT_INTERRUPTED = 130
-"""Exit codes of the command line: 128 and the signal's number after Ctrl-C, as shells expect."""
+EXIT_TERMINATED = 143
+"""Exit codes of the command line: 128 and the signal's number after Ctrl-C and SIGTERM, as shells expect."""
 
 
 class BidexError(ValueError):
@@ -55,7 +57,7 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> BidexError:
     names = sorted(known)
     near = nearest(str(name), names)
     hint = f" Did you mean {near!r}?" if near else ""
-    return BidexError(f"Unknown {kind} {name!r}.{hint} Known: {', '.join(names) or 'none'}.")
+    return BidexError(f"Unknown {kind} {shortened(name)}.{hint} Known: {', '.join(names) or 'none'}.")
 
 
 def whole_number(name: str, value: object, least: int, most: int | None = None) -> int:

@@ -13,9 +13,6 @@ from bidex_meta.errors import BidexError
 class TrialConfig:
     """Networks and trials of RL²."""
 
-    algo: ClassVar[str] = "rl2"
-    """How the learner calls itself in messages."""
-
     hidden: tuple[int, ...] = (256, 128)
     """Widths of the encoder's layers, before the memory; of actor and critic alike."""
     activation: Activation = "elu"
