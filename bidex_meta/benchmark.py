@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, cast
 import numpy as np
 
 from bidex_meta.errors import BidexError, known_name, unknown_name
+from bidex_meta.memory import ROW_BYTES, check_memory
 from bidex_meta.suite import SPLITS, ListedTask, Split, Suite, SuiteClass, load_suite
 from bidex_meta.tasks import registry
 
@@ -305,6 +306,8 @@ def _make_world(
     if not isinstance(num_envs, int | np.integer) or isinstance(num_envs, bool) or num_envs < len(slots):
         names = ", ".join(slot.name for slot in slots)
         raise BidexError(f"num_envs: expected at least {len(slots)}, a row each for {names}; got {num_envs!r}.")
+    if place.type == "cpu":
+        check_memory(int(num_envs) * ROW_BYTES, f"{num_envs:,} rows", "Lower num_envs.")
     keep_freed_memory()
     return World(
         slots,

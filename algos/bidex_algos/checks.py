@@ -11,6 +11,12 @@ def types(config: Any) -> None:
     check_fields(config, config.algo)
 
 
+def network_bytes(hidden: tuple[int, ...], width: int, copies: int) -> int:
+    """Bytes of a network's layers on observations of a width, with gradient and Adam's two moments, so many times."""
+    widths = (width, *hidden)
+    return 4 * 4 * copies * sum(a * b for a, b in zip(widths, hidden, strict=False))
+
+
 def at_least(config: Any, least: float, *names: str) -> None:
     """Refuses fields below ``least``."""
     for name in names:

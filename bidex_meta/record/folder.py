@@ -187,11 +187,16 @@ def flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return found
 
 
-def _new_folder(config: dict[str, Any], root: Path) -> Path:
+def new_folder_name(config: dict[str, Any], root: Path = Path("runs")) -> Path:
+    """Where a run is kept that is given no folder, by its config and the present time."""
     subject = Path(str(config.get("suite") or config.get("task"))).stem  # a suite may be a path to a TOML file
     now = datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S")
     algo = str(config["algo"]).rpartition(":")[2]  # of package.module:Class the class
-    base = root / subject / algo / f"{now}_seed{config['seed']}"
+    return root / subject / algo / f"{now}_seed{config['seed']}"
+
+
+def _new_folder(config: dict[str, Any], root: Path) -> Path:
+    base = new_folder_name(config, root)
     base.parent.mkdir(parents=True, exist_ok=True)
     path, count = base, 1
     while True:

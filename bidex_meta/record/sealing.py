@@ -73,8 +73,9 @@ def _feed(value: Any, found: Any, depth: int) -> None:
         raise ValueError(f"it is nested more than {_DEEPEST} deep")
     if isinstance(value, torch.Tensor):
         found.update(f"tensor {value.dtype} {tuple(value.shape)}:".encode())
-        # A flat copy where it is not contiguous: a view of bytes needs one.
-        flat = value.detach().cpu().contiguous().reshape(-1)
+        flat = value.detach().cpu().contiguous()
+        # Of a single number the stride can be any, and a view of bytes asks for 1.
+        flat = flat.as_strided((flat.numel(),), (1,))
         found.update(memoryview(flat.view(torch.uint8).numpy()))
     elif isinstance(value, dict):
         found.update(f"dict {len(value)}:".encode())

@@ -60,8 +60,6 @@ class PlannerConfig:
         for name in ("knots", "horizon"):
             if getattr(self, name) < 2:
                 raise BidexError(f"planner: {name} must be at least 2, got {getattr(self, name)}.")
-        if self.execute > self.horizon:
-            raise BidexError(f"planner: execute must be at most horizon, {self.horizon}, got {self.execute}.")
         for name, low, high in (("elite_share", 0.0, 1.0), ("mutants", 0.0, 1.0), ("mutated", 0.0, 1.0)):
             if not low <= getattr(self, name) <= high:
                 raise BidexError(f"planner: {name} must lie in [{low:g}, {high:g}], got {getattr(self, name)}.")
