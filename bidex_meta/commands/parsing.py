@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import difflib
 import io
+import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
@@ -118,6 +119,7 @@ _BOUNDS = {
     "height": (1, 16_384),
     "shots": (0, 1000),
     "steady": (0, 1_000_000),
+    "port": (1, 65_535),
 }
 """Least and most of whole numbers by the name of their flag; a resumed run may have more threads than cores."""
 _OTHERS = (1, 1_000_000)
@@ -130,9 +132,11 @@ def _check_numbers(parsed: Any) -> None:
         value = getattr(parsed, entry.name)
         least, most = _BOUNDS.get(entry.name, _OTHERS)
         for number in value if isinstance(value, tuple) else (value,):
+            flag = "--" + entry.name.replace("_", "-")
+            if type(number) is float and not math.isfinite(number):
+                raise BidexError(f"{flag} must be a finite number, not {number}.")
             if type(number) is not int:
                 continue
-            flag = "--" + entry.name.replace("_", "-")
             if number < least:
                 raise BidexError(f"{flag} must be at least {least}, not {shortened(number)}.")
             if number > most:

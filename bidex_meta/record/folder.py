@@ -123,7 +123,7 @@ class RunFolder:
         Raises:
             BidexError: A part of it is a link that leads elsewhere, or the folder cannot be written.
         """
-        refuse_links(self.checkpoints_path, self.videos_path, self.metrics_path)
+        refuse_links(self.checkpoints_path, self.videos_path, self.metrics_path, self.path / "wandb-id")
         for folder in (self.path, self.checkpoints_path):
             if folder == self.path or folder.exists():
                 check_writable(folder / "last.pt")

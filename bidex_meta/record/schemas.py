@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from bidex_meta.errors import BidexError
-from bidex_meta.reading import TABLE, TEXT, check, choice, number, read_json, whole
+from bidex_meta.reading import TABLE, TEXT, Rule, check, choice, exists, number, read_json, whole
 
 NAMES = ("suite", "task", "algo", "seed")
 """What every run's config holds."""
@@ -54,6 +54,29 @@ def read_config(path: Path, needed: tuple[str, ...] = ()) -> dict[str, Any]:
     if (config["suite"] is None) == (config["task"] is None):
         raise BidexError(f"{path}: expected either a suite or a task, the other null. Name a run.")
     return config
+
+
+_VERSIONS = {
+    "gpus": Rule("a list of texts", lambda value: isinstance(value, list) and all(map(TEXT.fits, value))).or_none(),
+    "git": TABLE.or_none(),
+}
+
+
+def read_versions(folder: Path) -> dict[str, Any]:
+    """A run's ``versions.json``; empty where it has none.
+
+    Raises:
+        BidexError: The file cannot be read, or holds something else.
+    """
+    path = folder / "versions.json"
+    if not exists(path):
+        return {}
+    found = read_json(path, "a run's versions")
+    check(found, _VERSIONS, path)
+    commit = (found.get("git") or {}).get("commit")
+    if commit is not None and not TEXT.fits(commit):
+        raise BidexError(f"{path}: git.commit: expected a text.")
+    return found
 
 
 def read_evaluation(path: Path, again: str) -> dict[str, Any]:
