@@ -25,6 +25,8 @@ from bidex_meta.errors import (
 )
 from bidex_meta.train.launch import launch
 
+_LONGEST = 2000
+"""Letters of an error: what was given may be any text."""
 _EXAMPLE = "bidex-meta run --suite MT4 --algo mtppo"
 
 
@@ -96,7 +98,10 @@ def _failed(reason: str, code: int, debug: bool) -> int:
     """Says why, on one line; within an ``except`` whose error ``--debug`` shows."""
     if debug:
         raise
-    print(f"bidex-meta: {one_line(reason)}", file=sys.stderr)
+    told = one_line(reason)
+    if len(told) > _LONGEST:
+        told = f"{told[: _LONGEST - 300]} ... {told[-200:]}"  # the end says how to mend it
+    print(f"bidex-meta: {told}", file=sys.stderr)
     return code
 
 

@@ -92,6 +92,9 @@ def shortened(value: object) -> str:
 
 
 def one_line(text: object) -> str:
-    """A text for a terminal: on one line, and without what a terminal would obey; names in it may be anybody's."""
-    words = " ".join(str(text).split())
+    """A text for a terminal: on one line, and without what a terminal would obey; names in it may be anybody's.
+
+    Of words of more than 400 letters it keeps the beginning.
+    """
+    words = " ".join(word if len(word) <= 400 else f"{word[:200]}..." for word in str(text).split())
     return "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in words)

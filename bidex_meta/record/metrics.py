@@ -132,8 +132,5 @@ def _row(line: bytes) -> dict[str, Any] | None:
         return None
     if not isinstance(row, dict) or not whole(0).fits(row.get("step")):
         return None
-    return (
-        row
-        if all(value is None or (type(value) in (int, float) and math.isfinite(value)) for value in row.values())
-        else None
-    )
+    numbers = [value for value in row.values() if value is not None]
+    return row if all(type(value) in (int, float) and math.isfinite(value) for value in numbers) else None

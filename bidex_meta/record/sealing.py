@@ -76,7 +76,7 @@ def _feed(value: Any, found: Any, depth: int) -> None:
         flat = value.detach().cpu().contiguous()
         # Of a single number the stride can be any, and a view of bytes asks for 1.
         flat = flat.as_strided((flat.numel(),), (1,))
-        found.update(memoryview(flat.view(torch.uint8).numpy()))
+        found.update(flat.view(torch.uint8).numpy().data)
     elif isinstance(value, dict):
         found.update(f"dict {len(value)}:".encode())
         for name, each in value.items():
