@@ -14,6 +14,10 @@ EXIT_TERMINATED = 143
 class BidexError(ValueError):
     """Bad input from a user. The command line prints it as one line and exits with code 2."""
 
+    def __init__(self, message: str) -> None:
+        # Values that were given may be printed over several lines.
+        super().__init__(" ".join(message.split()) if "\n" in message else message)
+
 
 def known_name(kind: str, name: str, known: Iterable[str]) -> str:
     """The known name that a given one is, without regard to case.
@@ -27,7 +31,7 @@ def known_name(kind: str, name: str, known: Iterable[str]) -> str:
         BidexError: There is none; with the nearest name and the list.
     """
     names = list(known)
-    if name in names:
+    if isinstance(name, str) and name in names:
         return name
     found = [other for other in names if other.casefold() == str(name).casefold()]
     if len(found) != 1:

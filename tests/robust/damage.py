@@ -9,35 +9,39 @@ from typing import Any
 from hypothesis import strategies as st
 
 ODD = (
-    None, True, -1, 0, 1.5, 1e308, 10**18, 10**30, "", "x", "\x1b[2J", "[/x]", "../..", "x" * 5000, [], [1], {}, {"a": 1}
+    None, True, -1, 0, 1.5, 1e308, 10**18, 10**30, "", "x", "\x1b[2J", "[/x]", "../..", "x" * 5000, [], [1], {},
+    {"a": 1},
 )  # fmt: skip
 """Values that no field expects."""
 TEXTS = (
     b"", b"\0", b"null", b"[]", b"{}", b"1", b'"x"', b"\xff\xfe{\0}\0", b"\x80abc", b"[" * 5000, b'{"a":' * 5000,
-    b'{"step": ' + b"9" * 5000 + b"}", b"a = " + b"9" * 5000, b"a = " + b"[" * 5000, b"<html>", b"PK\x03\x04", b"\n" * 999,
-    b"\x80\x04\x95\x0b\x00\x00\x00\x00\x00\x00\x00\x8c\x02os\x94.",
+    b'{"step": ' + b"9" * 5000 + b"}", b"a = " + b"9" * 5000, b"a = " + b"[" * 5000, b"<html>", b"PK\x03\x04",
+    b"\n" * 999, b"\x80\x04\x95\x0b\x00\x00\x00\x00\x00\x00\x00\x8c\x02os\x94.",
 )  # fmt: skip
 """Whole contents that are something else."""
 
 
 def of_bytes() -> st.SearchStrategy[Any]:
     """Damages that any file can take; each is a function of the content."""
-    place, byte = st.floats(0, 1, exclude_max=True), st.integers(0, 255)
-    at = lambda data, where: int(where * max(len(data), 1))  # noqa: E731
+    place = st.floats(0, 1, exclude_max=True)
     return st.one_of(
-        st.builds(lambda w: ("cut", lambda data: data[: at(data, w)]), place),
-        st.builds(
-            lambda w, bit: ("flip", lambda data: data[: (i := at(data, w))] + bytes([data[i] ^ (1 << bit)]) + data[i + 1 :]),
-            place, st.integers(0, 7),
-        ),
-        st.builds(lambda w, b: ("insert", lambda data: data[: (i := at(data, w))] + bytes([b]) * 3 + data[i:]), place, byte),
-        st.builds(
-            lambda w, n: ("zeros", lambda data: data[: (i := at(data, w))] + bytes(n) + data[i + n :]),
-            place, st.integers(1, 4000),
-        ),
+        st.builds(lambda at: ("cut", lambda data: data[: int(at * len(data))]), place),
+        st.builds(lambda at, bit: ("flip", lambda data: _flipped(data, at, bit)), place, st.integers(0, 7)),
+        st.builds(lambda at, n: ("insert", lambda data: _put(data, at, bytes([n]) * 3, 0)), place, st.integers(0, 255)),
+        st.builds(lambda at, n: ("zeros", lambda data: _put(data, at, bytes(n), n)), place, st.integers(1, 4000)),
         st.builds(lambda text: ("other", lambda data: text), st.sampled_from(TEXTS)),
         st.builds(lambda text: ("random", lambda data: text), st.binary(max_size=200)),
-    )  # fmt: skip
+    )
+
+
+def _flipped(data: bytes, at: float, bit: int) -> bytes:
+    place = int(at * len(data))
+    return _put(data, at, bytes([data[place] ^ (1 << bit)]), 1)
+
+
+def _put(data: bytes, at: float, new: bytes, gone: int) -> bytes:
+    place = int(at * len(data))
+    return data[:place] + new + data[place + gone :]
 
 
 def of_values() -> st.SearchStrategy[Any]:

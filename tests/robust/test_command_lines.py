@@ -1,29 +1,24 @@
-"""Odd command lines, drawn by hypothesis: exit code 0 or one line and 2, before a world is built, and nothing is left."""
+"""Odd command lines, drawn by hypothesis: exit code 0, or one line and 2 before a world is built; nothing is left."""
 
-import contextlib
-import io
 import os
-import shutil
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from bidex_meta.cli import main
-from bidex_meta.clients import metaworld_world
-from bidex_meta.world import world as world_module
 from tests.robust.damage import listing
+from tests.robust.lines import called, working_folder
 
 VALUES = (
-    "", "0", "1", "2", "-1", "1.5", "1e9", "-1e9", "nan", "inf", "-inf", "9" * 30, "9" * 5000, "1e400", "0x10", "None",
-    "true", "[/x]", "\x1b[31mred", "\udc80", "näme", "x" * 256, "x" * 5000, "/", "..", ".", "~", "~nobody/x.toml", "/dev/null",
-    "/dev/zero", "/proc/self/mem", "no/such/folder/x", "-", "--", "=", "MT4", "mt20", "ML4", "MT5", "metaworld/MT3",
-    "HandOver", "handover", "mtppo", "rl2", "os:system", "nowhere.x:Y", ":", "auto", "cpu", "cuda:7", "c", "warp", "paper",
-    "laptop", "random", "zero", "train", "test", "last", "best", "front", "suites", "expert", "world", "gpu", "loop.toml",
-    "folder.toml", "empty.toml", "x.png", "x.mp4", "x.json", "a/b.png", "run", "meta", "torn", "empty",
+    "", "0", "1", "2", "-1", "1.5", "1e9", "-1e9", "nan", "inf", "-inf", "9" * 30, "9" * 5000, "1e400", "0x10",
+    "None", "true", "[/x]", "\x1b[31mred", "\udc80", "näme", "x" * 256, "x" * 5000, "/", "..", ".", "~",
+    "~nobody/x.toml", "/dev/null", "/dev/zero", "/proc/self/mem", "no/such/folder/x", "-", "--", "=", "MT4", "mt20",
+    "ML4", "MT5", "metaworld/MT3", "HandOver", "handover", "mtppo", "rl2", "os:system", "nowhere.x:Y", ":", "auto",
+    "cpu", "cuda:7", "c", "warp", "paper", "laptop", "random", "zero", "train", "test", "last", "best", "front",
+    "suites", "expert", "world", "gpu", "loop.toml", "folder.toml", "empty.toml", "x.png", "x.mp4", "x.json",
+    "a/b.png", "run", "meta", "torn", "empty",
 )  # fmt: skip
 FLAGS = {
     "run": "suite task base algo preset num-envs steps minutes seed device engine threads start-from run-dir resume "
@@ -57,50 +52,10 @@ NAMED = ("list", "bench", "baseline")
 """Commands whose first word is no run folder."""
 
 
-class Built(BaseException):
-    """A world was asked for: nothing was wrong with the command line, as far as can be told before."""
-
-
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory):
-    """A working folder with a few things in it, where no world can be built and no command can take long."""
-    folder = tmp_path_factory.mktemp("fuzz")
-    (folder / "loop.toml").symlink_to("loop.toml")
-    (folder / "folder.toml").mkdir()
-    (folder / "empty.toml").touch()
-    (folder / "empty").mkdir()
-    (folder / "torn" / "checkpoints").mkdir(parents=True)
-    (folder / "torn" / "metrics.jsonl").touch()
-    for name, run in (("run", "mtppo"), ("meta", "promp")):
-        shutil.copytree(Path(__file__).parents[1] / "data" / "old_runs" / run, folder / name)
-
-    def built(*_, **__):
-        raise Built
-
-    patch = pytest.MonkeyPatch()
-    patch.chdir(folder)
-    patch.setattr(world_module.World, "__init__", built)
-    patch.setattr(metaworld_world.MetaWorldWorld, "__init__", built)
-    for what in ("draw_learning", "draw_adaptation", "missing"):  # drawing takes a second
-        patch.setattr(f"bidex_meta.record.plots.{what}", built)
-    # What these measure is another project's, or trains on made-up numbers.
-    patch.setattr(
-        "bidex_meta.commands.bench._measurement", lambda what: lambda suite=None, num_envs=1, steps=1: {"a": 1}
-    )
-    yield folder
-    patch.undo()
-
-
-def called(arguments: list[str]) -> SimpleNamespace:
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        try:
-            code: object = main(arguments)
-        except SystemExit as stop:
-            code = stop.code
-        except Built:
-            code = "built"
-    return SimpleNamespace(code=code, out=out.getvalue(), err=err.getvalue())
+    with pytest.MonkeyPatch.context() as patch:
+        yield working_folder(tmp_path_factory.mktemp("fuzz"), patch)
 
 
 def lines(command: str) -> st.SearchStrategy[list[str]]:

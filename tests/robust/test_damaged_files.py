@@ -1,4 +1,4 @@
-"""Damaged and foreign files, drawn by hypothesis: each is told in one line, or read as it was; no line of it is lost."""
+"""Damaged and foreign files, drawn by hypothesis: each is told in one line, or read as it was; no line is lost."""
 
 import json
 import os
@@ -21,7 +21,7 @@ from bidex_meta.record import Checkpoints, RunFolder, mend
 from bidex_meta.record.schemas import read_evaluation, read_versions
 from bidex_meta.witness.store import load_witness
 from tests.robust.damage import NO_FILES, listing, of_bytes, of_values, remove, replace
-from tests.robust.test_command_lines import called, place  # noqa: F401
+from tests.robust.lines import called, working_folder
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs pipes and links")
 RUN = Path(__file__).parents[1] / "data" / "old_runs" / "mtppo"
@@ -48,7 +48,8 @@ def one_line_or(read: Callable[[], Any]) -> Any:
         return None
 
 
-def test_configs_of_a_run_that_goes_on(place: Path) -> None:  # noqa: F811
+def test_configs_of_a_run_that_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    place = working_folder(tmp_path, monkeypatch)
     path = place / "run" / "config.json"
     whole = path.read_bytes()
 
