@@ -163,4 +163,10 @@ def _memory(device: str) -> int:
 
 
 def _machine(device: str) -> str:
+    try:
+        kind = torch.device(device).type
+    except RuntimeError:
+        kind = device
+    if kind not in ("cpu", "cuda") or (kind == "cuda" and not torch.cuda.is_available()):
+        raise BidexError(f"--device: expected one that is here, got {device}. Add --device cpu, or go where a GPU is.")
     return torch.cuda.get_device_name(device) if torch.device(device).type == "cuda" else "cpu"
