@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, cast
 
 import numpy as np
 
-from bidex_meta.errors import BidexError, known_name, unknown_name
+from bidex_meta.errors import BidexError, known_name, shortened, unknown_name
+from bidex_meta.memory import ROW_BYTES, check_memory
 from bidex_meta.suite import SPLITS, ListedTask, Split, Suite, SuiteClass, load_suite
 from bidex_meta.tasks import registry
 
@@ -48,8 +49,18 @@ class Task(NamedTuple):
 
     @property
     def variation(self) -> np.ndarray:
-        """The numbers of `data`: shape (size,), float64, a copy."""
-        return np.frombuffer(self.data, dtype=_NUMBERS).astype(np.float64)
+        """The numbers of `data`: shape (size,), float64, a copy.
+
+        Raises:
+            BidexError: `data` holds no such numbers.
+        """
+        try:
+            return np.frombuffer(self.data, dtype=_NUMBERS).astype(np.float64)
+        except (TypeError, ValueError):
+            raise BidexError(
+                f"Expected a task's data as bytes of float64 numbers, got {shortened(self.data)}. Take tasks from a "
+                "Benchmark, or make one by Task.from_variation."
+            ) from None
 
 
 class Benchmark:
@@ -206,9 +217,9 @@ class Benchmark:
         }
 
     def _checked_split(self, split: str) -> Split:
-        if split not in self.suite.splits:
+        if not isinstance(split, str) or split not in self.suite.splits:
             raise BidexError(
-                f"{self.name} has the splits {', '.join(self.suite.splits)}, got {split!r}. Name one of these."
+                f"{self.name} has the splits {', '.join(self.suite.splits)}, got {shortened(split)}. Name one of these."
             )
         return cast(Split, split)
 
@@ -305,6 +316,8 @@ def _make_world(
     if not isinstance(num_envs, int | np.integer) or isinstance(num_envs, bool) or num_envs < len(slots):
         names = ", ".join(slot.name for slot in slots)
         raise BidexError(f"num_envs: expected at least {len(slots)}, a row each for {names}; got {num_envs!r}.")
+    if place.type == "cpu":
+        check_memory(int(num_envs) * ROW_BYTES, f"{num_envs:,} rows", "Lower num_envs.")
     keep_freed_memory()
     return World(
         slots,
@@ -364,12 +377,12 @@ def _checked_seed(seed: object) -> int:
 def _checked_device(device: "str | torch.device") -> "torch.device":
     import torch
 
-    if device == "auto":
+    if isinstance(device, str) and device == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
         place = torch.device(device)
-    except (RuntimeError, TypeError) as error:
-        raise BidexError(f"device: expected auto, cpu, cuda or cuda:N, got {device!r}.") from error
+    except (RuntimeError, TypeError, ValueError) as error:
+        raise BidexError(f"device: expected auto, cpu, cuda or cuda:N, got {shortened(device)}.") from error
     if place.type == "cuda" and not torch.cuda.is_available():
         raise BidexError(f"device: expected one that is here, got {device!r} without a CUDA device. Use cpu or auto.")
     return place

@@ -3,14 +3,30 @@
 Nothing heavy is imported here: each subcommand is a module of ``bidex_meta.commands``, loaded when it is called.
 """
 
+import contextlib
 import importlib
 import os
+import re
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from types import FrameType
 
 from bidex_meta.commands import COMMANDS
-from bidex_meta.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, BidexError, known_name
+from bidex_meta.errors import (
+    EXIT_BAD_INPUT,
+    EXIT_FAILED,
+    EXIT_INTERRUPTED,
+    EXIT_TERMINATED,
+    BidexError,
+    known_name,
+    one_line,
+)
+from bidex_meta.train.launch import launch
 
+_LONGEST = 2000
+"""Letters of an error: what was given may be any text."""
 _EXAMPLE = "bidex-meta run --suite MT4 --algo mtppo"
 
 
@@ -21,7 +37,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: What follows ``bidex-meta``; the process's own by default.
 
     Returns:
-        The exit code: 0, 2 for bad input, 130 after Ctrl-C.
+        The exit code: 0, 1 where training diverged, 2 for bad input or what the system refuses (a full disk, a
+        folder that cannot be written, no memory), 130 after Ctrl-C, 143 after SIGTERM.
 
     Raises:
         SystemExit: With another exit code, from a subcommand.
@@ -30,19 +47,62 @@ def main(arguments: Sequence[str] | None = None) -> int:
     debug = "--debug" in given
     given = [argument for argument in given if argument != "--debug"]
     try:
-        return _dispatch(given)
+        with _told_of_sigterm():
+            return _dispatch(given)
     except BidexError as error:
-        if debug:
-            raise
-        print(f"bidex-meta: {error}", file=sys.stderr)
-        return EXIT_BAD_INPUT
+        return _failed(str(error), EXIT_BAD_INPUT, debug)
+    except FloatingPointError as error:
+        return _failed(f"{error} What was saved before stays as it is.", EXIT_FAILED, debug)
+    except _Terminated:
+        return _failed("stopped by SIGTERM.", EXIT_TERMINATED, debug=False)
     except KeyboardInterrupt:
-        print("bidex-meta: interrupted.", file=sys.stderr)
-        return EXIT_INTERRUPTED
+        return _failed("interrupted.", EXIT_INTERRUPTED, debug=False)
+    except MemoryError as error:
+        return _failed(f"out of memory: {error or 'ask for fewer rows'}.", EXIT_BAD_INPUT, debug)
     except BrokenPipeError:
         # The reader has seen enough (`| head`); without this Python complains again when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:
+        place = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
+        return _failed(f"{place}{error.strerror or error}. Mend the path, or make room.", EXIT_BAD_INPUT, debug)
+
+
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM came: everything is cleaned up as after Ctrl-C."""
+
+
+@contextlib.contextmanager
+def _told_of_sigterm() -> Iterator[None]:
+    """Turns SIGTERM into an exception, so that it leaves no half-written file and says why the command ended.
+
+    Not in one of several processes: a collective operation, which waits outside Python, would hold it up.
+    """
+    number = signal.SIGTERM
+    if threading.current_thread() is not threading.main_thread() or launch().count > 1:
+        yield
+        return
+
+    def stop(signum: int, frame: FrameType | None) -> None:
+        raise _Terminated
+
+    before = signal.getsignal(number)
+    signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        signal.signal(number, before if before is not None else signal.SIG_DFL)
+
+
+def _failed(reason: str, code: int, debug: bool) -> int:
+    """Says why, on one line; within an ``except`` whose error ``--debug`` shows."""
+    if debug:
+        raise
+    told = one_line(reason)
+    if len(told) > _LONGEST:
+        told = f"{told[: _LONGEST - 300]} ... {told[-200:]}"  # the end says how to mend it
+    print(f"bidex-meta: {told}", file=sys.stderr)
+    return code
 
 
 def _dispatch(arguments: list[str]) -> int:
@@ -56,6 +116,10 @@ def _dispatch(arguments: list[str]) -> int:
         print(__version__)
         return 0
     name = known_name("command", name, COMMANDS)
+    for place, word in enumerate(rest):
+        if not word or re.fullmatch(r"--[\w.-]+=", word):
+            flag = word.rstrip("=") or (rest[place - 1] if place else "a word")
+            raise BidexError(f"{flag} after bidex-meta {name} has no value. Give it one, or leave it out.")
     importlib.import_module(COMMANDS[name].module).main(rest)
     return 0
 

@@ -5,12 +5,18 @@ import operator
 from collections.abc import Iterable
 
 EXIT_BAD_INPUT = 2
+EXIT_FAILED = 1
 EXIT_INTERRUPTED = 130
-"""Exit codes of the command line: 128 and the signal's number after Ctrl-C, as shells expect."""
+EXIT_TERMINATED = 143
+"""Exit codes of the command line: 128 and the signal's number after Ctrl-C and SIGTERM, as shells expect."""
 
 
 class BidexError(ValueError):
     """Bad input from a user. The command line prints it as one line and exits with code 2."""
+
+    def __init__(self, message: str) -> None:
+        # Values that were given may be printed over several lines.
+        super().__init__(" ".join(message.split()) if "\n" in message else message)
 
 
 def known_name(kind: str, name: str, known: Iterable[str]) -> str:
@@ -25,7 +31,7 @@ def known_name(kind: str, name: str, known: Iterable[str]) -> str:
         BidexError: There is none; with the nearest name and the list.
     """
     names = list(known)
-    if name in names:
+    if isinstance(name, str) and name in names:
         return name
     found = [other for other in names if other.casefold() == str(name).casefold()]
     if len(found) != 1:
@@ -55,7 +61,7 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> BidexError:
     names = sorted(known)
     near = nearest(str(name), names)
     hint = f" Did you mean {near!r}?" if near else ""
-    return BidexError(f"Unknown {kind} {name!r}.{hint} Known: {', '.join(names) or 'none'}.")
+    return BidexError(f"Unknown {kind} {shortened(name)}.{hint} Known: {', '.join(names) or 'none'}.")
 
 
 def whole_number(name: str, value: object, least: int, most: int | None = None) -> int:
@@ -76,14 +82,23 @@ def whole_number(name: str, value: object, least: int, most: int | None = None) 
         number = None
     if number is None or number < least or (most is not None and number > most):
         bounds = f"from {least} on" if most is None else f"from {least} to {most}"
-        raise BidexError(f"{name}: expected a whole number {bounds}, got {_shortened(value)}.")
+        raise BidexError(f"{name}: expected a whole number {bounds}, got {shortened(value)}.")
     return number
 
 
-def _shortened(value: object) -> str:
+def shortened(value: object) -> str:
     """A value for one line of an error. Python refuses to print whole numbers of more than 4,300 digits."""
     try:
         shown = " ".join(repr(value).split())
     except Exception:
         shown = f"a {type(value).__name__} that cannot be printed"
     return shown if len(shown) <= 80 else shown[:77] + "..."
+
+
+def one_line(text: object) -> str:
+    """A text for a terminal: on one line, and without what a terminal would obey; names in it may be anybody's.
+
+    Of words of more than 400 letters it keeps the beginning.
+    """
+    words = " ".join(word if len(word) <= 400 else f"{word[:200]}..." for word in str(text).split())
+    return "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in words)

@@ -5,18 +5,22 @@ Names of task classes and of the components of their variations are checked wher
 """
 
 import math
-import tomllib
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, cast
 
-from bidex_meta.errors import BidexError, known_name, unknown_name
+from bidex_meta.errors import BidexError, known_name, shortened, unknown_name
 from bidex_meta.paths import suites_dir
+from bidex_meta.reading import expanded, read_toml
 
 Split = Literal["train", "test"]
 SPLITS: tuple[Split, Split] = ("train", "test")
+_LARGEST = 1_000_000
+"""Of any number in a suite file: metres, radians, tasks; beyond it nothing is meant."""
+_LONGEST_TEXT, _MOST_TABLES = 500, 1000
 
 
 @dataclass(frozen=True)
@@ -100,17 +104,12 @@ def load_suite(name_or_path: str | Path) -> Suite:
     """
     text = str(name_or_path)
     if isinstance(name_or_path, Path) or text.endswith(".toml"):
-        return _parse(Path(name_or_path).expanduser())
+        return _parse(expanded(name_or_path))
     return _parse(suites_dir() / f"{known_name('suite', text, suite_names())}.toml")
 
 
 def _parse(file: Path) -> Suite:
-    try:
-        content = tomllib.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise BidexError(f"Expected a suite file at {file}, but {error.strerror or error}. Mend the path.") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise BidexError(f"{file}: expected TOML in UTF-8, but {error}.") from error
+    content = read_toml(file, "a suite file")
     table = _Table(file, "", content)
     suite = Suite(
         name=table.text("name"),
@@ -200,9 +199,9 @@ def _check_listed(entry: SuiteClass, table: "_Table") -> None:
 
 
 def _check_unique(table: "_Table", key: str, names: list[str]) -> None:
-    for name in names:
-        if names.count(name) > 1:
-            raise table.error(f"{key}.name", "each name once", f"{name!r} {names.count(name)} times", "Remove one.")
+    for name, times in Counter(names).items():
+        if times > 1:
+            raise table.error(f"{key}.name", "each name once", f"{name!r} {times} times", "Remove one.")
 
 
 _REQUIRED: Any = object()
@@ -221,6 +220,9 @@ class _Table:
         value = self._get(key, "a text in quotes", _REQUIRED)
         if not isinstance(value, str) or not value.strip():
             raise self.error(key, "a text in quotes", value)
+        # Names and descriptions come to terminals, which obey what is not printable.
+        if not value.isprintable() or len(value) > _LONGEST_TEXT:
+            raise self.error(key, f"printable text of at most {_LONGEST_TEXT} letters", value)
         return value
 
     def choice(self, key: str, *choices: str, default: str = _REQUIRED) -> Any:
@@ -234,12 +236,16 @@ class _Table:
         value = self._get(key, "a whole number from 1 on", _REQUIRED)
         if type(value) is not int or value < 1:
             raise self.error(key, "a whole number from 1 on", value)
+        if value > _LARGEST:
+            raise self.error(key, f"a whole number of at most {_LARGEST:,}", value)
         return value
 
     def number(self, key: str, default: float = _REQUIRED) -> float:
         value = self._get(key, "a number", default)
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             raise self.error(key, "a finite number", value)
+        if abs(value) > _LARGEST:
+            raise self.error(key, f"a number within +-{_LARGEST:,}", value)
         return float(value)
 
     def table(self, key: str) -> "_Table":
@@ -255,6 +261,8 @@ class _Table:
             return []
         if not isinstance(value, list) or not value or not all(isinstance(entry, dict) for entry in value):
             raise self.error(key, expected, value)
+        if len(value) > _MOST_TABLES:
+            raise self.error(key, f"at most {_MOST_TABLES:,} tables", f"{len(value):,}", "Leave some out.")
         return [_Table(self.file, f"{self._prefix}{key}[{index}].", entry) for index, entry in enumerate(value)]
 
     def finish(self) -> None:
@@ -264,7 +272,7 @@ class _Table:
                 raise BidexError(f"{where}: {unknown_name('key', key, self._asked)}")
 
     def error(self, key: str, expected: str, received: object, mend: str = "") -> BidexError:
-        shown = received if isinstance(received, str) and mend else repr(received)
+        shown = received if isinstance(received, str) and mend else shortened(received)
         hint = mend or "See suites/README.md."
         return BidexError(f"{self.file}: {self._prefix}{key}: expected {expected}, got {shown}. {hint}")
 

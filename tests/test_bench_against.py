@@ -91,7 +91,7 @@ def test_flags_that_do_not_fit_are_told(capsys: pytest.CaptureFixture[str]) -> N
     for words, expected in (
         ("world --classes", "takes no --classes"),
         ("scaling --against HEAD", "takes no --against"),
-        ("world --against HEAD --repeats 0", "of 1 or more"),
+        ("world --against HEAD --repeats 0", "at least 1"),
         ("world --against HEAD --suite MT5", "Did you mean 'MT4'?"),
         ("world --against HEAD --out no/such/folder/a.json", "a folder that exists"),
     ):

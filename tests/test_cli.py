@@ -344,7 +344,8 @@ def test_a_run_can_start_from_the_policy_of_another(toy_worlds, tmp_path, capsys
         (["--start-from", first, "--learner.activation", "tanh"], "activation = tanh, got elu"),
         (["--resume", second, "--start-from", second], "--start-from is"),
     ):
-        assert run(*flags, "--run-dir", tmp_path / "third") == 2
+        folder = [] if "--resume" in flags else ["--run-dir", tmp_path / "third"]
+        assert run(*flags, *folder) == 2
         shown = capsys.readouterr().err
         assert expected in shown and shown.rstrip().count("\n") <= 2
         assert not (tmp_path / "third").exists()

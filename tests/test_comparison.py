@@ -103,7 +103,7 @@ def test_an_evaluation_that_is_torn_or_of_fewer_steps_is_refused(tmp_path: Path)
     with pytest.raises(BidexError, match="is of 500 steps, but the run goes on to 1,000"):
         groups(path)
     (path / "evaluation.json").write_text("")
-    with pytest.raises(BidexError, match="is not JSON"):
+    with pytest.raises(BidexError, match="expected an evaluation in JSON"):
         groups(path)
 
 

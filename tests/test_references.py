@@ -100,7 +100,7 @@ def evaluated_run(path: Path, task: str | None, suite: str | None, returns: dict
     path.mkdir()
     config = {"task": task, "suite": suite, "algo": "mtppo", "steps": 1000, "seed": 3}
     (path / "config.json").write_text(json.dumps(config))
-    classes = {name: {"return": value} for name, value in returns.items()}
+    classes = {name: {"success": 0.5, "return": value, "score": None} for name, value in returns.items()}
     (path / "evaluation.json").write_text(json.dumps({"policy": {"classes": classes}}))
     return path
 

@@ -189,7 +189,7 @@ FAULTS = {
         "classes[0].tasks[1].fixed.goal_x: expected a finite",
     ),
     "value is not finite": (LISTED, "goal_x = 0.1", "goal_x = nan", "goal_x: expected a finite number, got nan"),
-    "no TOML": (META, 'name = "own"', "name: own", "expected TOML in UTF-8"),
+    "no TOML": (META, 'name = "own"', "name: own", "expected a suite file in TOML, but"),
 }
 
 

@@ -3,6 +3,18 @@
 from typing import Any
 
 from bidex_meta.errors import BidexError
+from bidex_meta.fields import check_fields
+
+
+def types(config: Any) -> None:
+    """Refuses fields that are not of their type, and numbers that no field can mean: before all other checks."""
+    check_fields(config, config.algo)
+
+
+def network_bytes(hidden: tuple[int, ...], width: int, copies: int) -> int:
+    """Bytes of a network's layers on observations of a width, with gradient and Adam's two moments, so many times."""
+    widths = (width, *hidden)
+    return 4 * 4 * copies * sum(a * b for a, b in zip(widths, hidden, strict=False))
 
 
 def at_least(config: Any, least: float, *names: str) -> None:

@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import json
 import subprocess
 import tarfile
 import tempfile
@@ -10,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from bidex_meta.errors import BidexError
+from bidex_meta.reading import is_file, read_json
 
 HERE = Path(__file__).resolve().parents[2]
 """Where this code runs from: a checkout, or the site-packages that it is installed in."""
@@ -17,10 +17,10 @@ HERE = Path(__file__).resolve().parents[2]
 
 def recorded(against: str) -> tuple[str, dict[str, float]]:
     """What to measure against, and where an earlier run's file was given the ratios that it found."""
-    if not Path(against).is_file():
+    if not is_file(Path(against)):
         return against, {}
     try:
-        found = json.loads(Path(against).read_text())
+        found = read_json(Path(against), "what bench world --against wrote")
         commit, ratios = found["old"], {row["what"]: float(row["ratio"]) for row in found["table"]}
         if commit["dirty"] or not commit["commit"]:
             raise ValueError

@@ -1,6 +1,5 @@
 """What an accelerator gives: speed over the number of rows, memory a row, and where the time of a step goes."""
 
-import json
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -10,6 +9,7 @@ import torch
 
 from bidex_meta.benchmark import Benchmark, make_task_world
 from bidex_meta.errors import BidexError
+from bidex_meta.reading import TABLE, check, exists, read_json
 from bidex_meta.record.atomic import write_json
 from bidex_meta.world import World
 
@@ -86,9 +86,10 @@ def kernels(suite: str = "MT20", device: str = "cuda:0", engine: str = "warp") -
 
 
 def _known(out: Path | None, setting: dict[str, Any]) -> dict[str, Any]:
-    if out is None or not out.is_file():
+    if out is None or not exists(out):
         return {}
-    stored = json.loads(out.read_text())
+    stored = read_json(out, "what bench gpu measured")
+    check(stored, {"setting": TABLE, "rows": TABLE.each()}, out, ("setting", "rows"))
     if stored["setting"] != setting:
         raise BidexError(f"Expected {out} to be measured with {setting}, got {stored['setting']}; name another file.")
     return stored["rows"]
@@ -162,4 +163,10 @@ def _memory(device: str) -> int:
 
 
 def _machine(device: str) -> str:
+    try:
+        kind = torch.device(device).type
+    except RuntimeError:
+        kind = device
+    if kind not in ("cpu", "cuda") or (kind == "cuda" and not torch.cuda.is_available()):
+        raise BidexError(f"--device: expected one that is here, got {device}. Add --device cpu, or go where a GPU is.")
     return torch.cuda.get_device_name(device) if torch.device(device).type == "cuda" else "cpu"

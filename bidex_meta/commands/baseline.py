@@ -49,6 +49,12 @@ def main(arguments: Sequence[str]) -> None:
     """Measure, print, and store where it was asked."""
     flags = parse(BaselineFlags, arguments, "baseline")
     what = known_name("baseline", flags.what, [*_POLICIES, "expert"])
+    if flags.out is not None:
+        from bidex_meta.evaluation.references import load_from
+        from bidex_meta.record.atomic import check_writable
+
+        load_from(flags.out)
+        check_writable(flags.out)
     if what == "expert":
         _expert(flags)
     else:

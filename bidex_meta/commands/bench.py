@@ -89,6 +89,10 @@ def main(arguments: Sequence[str]) -> None:
     flags = replace(flags, what=known_name("bench", flags.what, _KINDS))
     if 0 in (flags.steps, flags.num_envs) or (flags.repeats is not None and flags.repeats < 1):
         raise BidexError(f"bench {flags.what}: expected --steps, --num-envs and --repeats of 1 or more.")
+    if flags.out is not None:
+        from bidex_meta.record.atomic import check_writable
+
+        check_writable(flags.out)
     measure = _measurement("world_against" if flags.what == "world" and flags.against is not None else flags.what)
     asked = {
         name: value

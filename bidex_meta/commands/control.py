@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from bidex_meta.record import RunFolder
 
 
+_NEEDED = ("learner", "num_envs", "steps", "threads")
+
+
 @dataclass(frozen=True)
 class ControlFlags:
     """Adapt held-out tasks to their own data and to data of each train task, with common random numbers.
@@ -64,7 +67,7 @@ def main(arguments: Sequence[str]) -> None:
 
     metatest.check_numbers(flags, "trials", "episodes", "shots", "rollouts", "num_envs")
     folders = [RunFolder.open(path) for path in flags.runs]
-    config = folders[0].config()
+    config = folders[0].config(*_NEEDED)
     source = Source.open(config)
     _check(folders)
     played = [_play(folder, flags) for folder in folders]
@@ -91,7 +94,7 @@ def _check(folders: "Sequence[RunFolder]") -> None:
     kinds: list[dict[str, Any]] = []
     seeds: dict[int, Path] = {}
     for folder in folders:
-        config = folder.config()
+        config = folder.config(*_NEEDED)
         if not learner_kind(config["algo"]).adapts:
             raise BidexError(
                 f"{folder.path}: {config['algo']} does not adapt to tasks. Name runs of maml, promp or rl2."
@@ -123,7 +126,7 @@ def _play(folder: "RunFolder", flags: ControlFlags) -> "Control":
     from bidex_meta.evaluation.play import EVALUATION_SEED
     from bidex_meta.world.threads import set_up_torch
 
-    config = folder.config()
+    config = folder.config(*_NEEDED)
     device = resolve_device(flags.device, Source.open(config).on_gpu)
     source = Source.open({**config, "device": device, "engine": flags.engine})
     set_up_torch(config["threads"])

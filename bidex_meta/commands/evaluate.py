@@ -66,7 +66,7 @@ def main(arguments: Sequence[str]) -> None:
     from bidex_meta.world.threads import set_up_torch
 
     folder = RunFolder.open(flags.run)
-    stored = folder.config()
+    stored = folder.config("learner", "num_envs", "threads")
     device = resolve_device(flags.device, Source.open(stored).on_gpu)
     config = {**stored, "device": device, "engine": flags.engine}
     source = Source.open(config)

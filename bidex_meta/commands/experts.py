@@ -1,12 +1,13 @@
 """The upper end of the normalised score: per class the best of its witness and of trained policies."""
 
-import json
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
 from bidex_meta.errors import BidexError
+from bidex_meta.reading import exists
 from bidex_meta.record import RunFolder
+from bidex_meta.record.schemas import read_evaluation
 from bidex_meta.sources import Source
 from bidex_meta.witness.replay import replay
 from bidex_meta.witness.store import load_witness, witness_path
@@ -43,17 +44,17 @@ def _of_witness(name: str, threads: int | None) -> list[tuple[str, dict[str, Any
 def _of_run(run: Path) -> list[tuple[str, dict[str, Any]]]:
     """What a run's evaluation says of its classes: the mean over all tasks."""
     folder = RunFolder.open(run)
-    config, path = folder.config(), folder.path / "evaluation.json"
+    config, path = folder.config("steps"), folder.path / "evaluation.json"
     source = Source.open(config)
     if not source.moving_bases:
         raise BidexError(
             f"Expected a run with moving bases, as suites have them, but {run} plays {source.name} with fixed ones."
         )
-    if not path.is_file():
+    if not exists(path):
         raise BidexError(
             f"{run} has no evaluation.json. Let the run end, or write one: bidex-meta evaluate {run} --json > {path}"
         )
-    found = json.loads(path.read_text())
+    found = read_evaluation(path, f"bidex-meta evaluate {run} --json > {path}")
     if "policy" not in found:
         raise BidexError(
             f"Expected the evaluation of a policy, but {path} is a meta-test, whose policies are many. Name a run of "

@@ -22,6 +22,8 @@ def main(arguments: Sequence[str]) -> None:
     """Write the page and print where it is."""
     flags = parse(GalleryFlags, arguments, "gallery")
     from bidex_meta import gallery
+    from bidex_meta.record.atomic import check_writable
 
+    check_writable(flags.out)
     gallery.write(flags.out)
     print(flags.out)

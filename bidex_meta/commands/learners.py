@@ -10,6 +10,7 @@ Beside the class the module holds ``PRESETS``: a dict from preset name to an ins
   meta-test reads ``max_adapt_steps`` (longest episode it adapts to) and ``tasks_per_class`` (of a meta-batch, over
   which a class's rows are split: as many rollouts has a task); ``adapts_by_row = True`` where rows of a task share
   nothing of what they learn;
+* of its config, if it is there, `run` asks ``bytes_held(rows, width)``: about what it takes beside the world;
 * where it does not train in autoreset mode SAME_STEP, ``autoreset``: the mode, or a function of the learner's config
   that gives it;
 * ``policy_state_dict()`` and ``load_policy(state, device)``, which gives an agent for ``bidex_meta.evaluation.play``

@@ -41,9 +41,14 @@ def main(arguments: Sequence[str]) -> None:
         raise BidexError("Name the run folders to draw: bidex-meta plot RUN...")
 
     from bidex_meta.record import RunFolder, plots
+    from bidex_meta.record.atomic import check_writable, refuse_links
 
     folders = [RunFolder.open(path) for path in flags.runs]
     home = folders[0].path if len(folders) == 1 else Path()
+    if flags.out is None:
+        refuse_links(home / "curves.png", home / "adaptation.png")
+    else:
+        check_writable(flags.out)
     if flags.adaptation or flags.evaluation:
         if len(folders) > 1:
             raise BidexError(f"--adaptation draws one run, got {len(folders)}. bidex-meta report shows all.")

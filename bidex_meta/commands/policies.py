@@ -1,14 +1,20 @@
 """From a run folder to its policy: the commands' one way."""
 
-from collections.abc import Callable
+import contextlib
+import itertools
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from bidex_meta.agents import Agent
 from bidex_meta.commands.learners import learner_kind
-from bidex_meta.errors import BidexError
+from bidex_meta.errors import BidexError, one_line
+from bidex_meta.reading import is_file
 from bidex_meta.record import RunFolder
 from bidex_meta.sources import Source
+
+_SMALL = 1_000_000
+"""Numbers that fit anywhere."""
 
 
 def checkpoint(folder: RunFolder, which: str = "last") -> tuple[dict[str, Any], int]:
@@ -31,11 +37,34 @@ def checkpoint(folder: RunFolder, which: str = "last") -> tuple[dict[str, Any], 
         return folder.checkpoints.load_one(folder.checkpoints.best)
     if which != "last":
         own = folder.checkpoints.folder / which
-        return folder.checkpoints.load_one(own if own.is_file() else Path(which))
+        return folder.checkpoints.load_one(own if is_file(own) else Path(which))
     loaded = folder.checkpoints.load()
     if loaded is None:
         raise BidexError(f"{folder.path} has no checkpoint yet. Train on: bidex-meta run --resume {folder.path}")
     return loaded
+
+
+@contextlib.contextmanager
+def fitting(path: Path) -> Iterator[None]:
+    """What happens within puts a run's checkpoint into what its config describes; each error says that it does not fit.
+
+    A checkpoint may be of another version, or of anybody: its tensors and words can be any.
+
+    Raises:
+        BidexError: It does not fit.
+    """
+    from bidex_meta.train.distributed import LostProcess
+
+    try:
+        yield
+    except (BidexError, LostProcess):
+        raise
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        reason = f"{type(error).__name__}: {one_line(error)[:200].rstrip('.')}"
+        raise BidexError(
+            f"The checkpoint of {path} does not fit its config ({reason}). Use the version in versions.json, or start "
+            "a new run."
+        ) from error
 
 
 def load_policy(folder: RunFolder, device: str, which: str = "last") -> tuple[Agent, int]:
@@ -50,12 +79,29 @@ def load_policy(folder: RunFolder, device: str, which: str = "last") -> tuple[Ag
 
 def policy_shape(state: dict[str, Any]) -> dict[str, Any]:
     """Numbers of ``observations`` and ``actions`` of the policy in a run's ``checkpoint``, and more that it keeps."""
-    return state["learner"]["policy"]["shape"]
+    with fitting(Path("the policy")):
+        return dict(_checked(state)["shape"])
 
 
 def policy_of(folder: RunFolder, state: dict[str, Any], device: str) -> Agent:
     """The policy in a run's ``checkpoint``."""
-    return learner_kind(folder.config()["algo"]).make.load_policy(state["learner"]["policy"], device)
+    with fitting(folder.path):
+        return learner_kind(folder.config()["algo"]).make.load_policy(_checked(state), device)
+
+
+def _checked(state: dict[str, Any]) -> dict[str, Any]:
+    """The policy in a checkpoint; refused where it would be larger than the weights that stand beside it."""
+    policy = state["learner"]["policy"]
+    hidden, weights = policy.get("config", {}).get("hidden", ()), policy.get("weights")
+    if not isinstance(weights, dict):
+        return policy  # of a learner from elsewhere
+    there = sum(each.numel() for each in weights.values())
+    sizes = [size for size in policy.get("shape", {}).values() if isinstance(size, int)]
+    # Of the first layer only roughly: what it sees need not be as wide as the observations.
+    asked = [a * b for a, b in itertools.pairwise(hidden)] + [size * max([*hidden, 1]) // 100 for size in sizes]
+    if max(asked, default=0) > there + _SMALL:
+        raise ValueError(f"its layers ask for more than the {there:,} weights there are")
+    return policy
 
 
 def policy_loader(folder: RunFolder, device: str, which: str = "last") -> tuple[Callable[[], Agent], int]:

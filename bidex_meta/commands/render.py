@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from bidex_meta.commands.parsing import Switch, parse
+from bidex_meta.commands.parsing import StepCount, Switch, parse
 from bidex_meta.errors import BidexError, known_name
 
 
@@ -38,7 +38,7 @@ class RenderFlags:
     first success to the end of the episode."""
     seed: int = 0
     """Seed of task and start."""
-    steps: int | None = None
+    steps: StepCount | None = None
     """Steps to take, 60 a second; None: none for a picture, one episode for a film, with --tiled the longest one."""
     every: int | None = None
     """Steps from one frame of a film to the next; None: 1, with --tiled 2."""
@@ -58,10 +58,13 @@ def main(arguments: Sequence[str]) -> None:
     """
     flags = parse(RenderFlags, arguments, "render")
     from bidex_meta.record import video
+    from bidex_meta.record.atomic import check_writable, refuse_links
 
     policy = flags.policy if flags.run is None else str(flags.run)
     out = _out(flags, policy)
     suffix = video.check_suffix(out)
+    refuse_links(*([] if flags.out else [out.parent, out]))
+    check_writable(out)
     width = flags.width or (240 if flags.tiled else 640)
     height = flags.height or width * 3 // 4
     if suffix == ".mp4":

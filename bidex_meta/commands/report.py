@@ -36,11 +36,13 @@ def main(arguments: Sequence[str]) -> None:
     if not flags.runs:
         raise BidexError("Name the run folders to show: bidex-meta report RUN...")
     from bidex_meta.record import RunFolder
-    from bidex_meta.record.atomic import write_atomic
+    from bidex_meta.record.atomic import check_writable, refuse_links, write_atomic
     from bidex_meta.report import page
 
     folders = [RunFolder.open(path) for path in flags.runs]
     out = flags.out or (folders[0].path if len(folders) == 1 else Path()) / "report.html"
+    refuse_links(*([] if flags.out else [out]))
+    check_writable(out)
     text = page.render(folders)
     out.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(out, lambda file: file.write(text.encode()))

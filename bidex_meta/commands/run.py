@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from bidex_meta.commands.learners import shared
 from bidex_meta.commands.run_config import RunPlan, plan_run
 from bidex_meta.errors import EXIT_INTERRUPTED, BidexError
+from bidex_meta.record.folder import check_new, new_folder_name
 from bidex_meta.train.launch import launch, resume_command
 
 if TYPE_CHECKING:
@@ -35,6 +36,12 @@ def main(arguments: Sequence[str]) -> None:
     """
     from bidex_meta.train import distributed
 
+    with contextlib.ExitStack() as held:
+        _main(arguments, distributed, held)
+
+
+def _main(arguments: Sequence[str], distributed: Any, held: contextlib.ExitStack) -> None:
+    """Does what ``main`` does, and holds the lock of the run folder for as long as ``held`` is open."""
     try:
         distributed.init_from_environment()
         plan = distributed.together(lambda: plan_run(arguments))
@@ -43,7 +50,7 @@ def main(arguments: Sequence[str]) -> None:
                 print(json.dumps(plan.config, indent=2))
             distributed.shut_down()
             return
-        folder, learner, stopped = _run(plan, distributed)
+        folder, learner, stopped = _run(plan, distributed, held)
     except distributed.LostProcess as loss:
         _say_loss(loss, distributed)
         raise SystemExit(1) from None
@@ -59,11 +66,12 @@ def main(arguments: Sequence[str]) -> None:
         _evaluate(plan, folder, learner)
 
 
-def _run(plan: RunPlan, distributed: Any) -> tuple[Any, Any, int]:
+def _run(plan: RunPlan, distributed: Any, held: contextlib.ExitStack) -> tuple[Any, Any, int]:
     """What all processes do: the run folder, the trained learner, and the signal that ended it early, or 0."""
     from bidex_meta.record import RunFolder
     from bidex_meta.world.threads import set_up_torch
 
+    distributed.together(lambda: _check_folder(plan, held))
     loaded = distributed.together(lambda: _read(plan))
     plan = _agree(plan, loaded, distributed)
     config, count = plan.config, launch().count
@@ -75,7 +83,7 @@ def _run(plan: RunPlan, distributed: Any) -> tuple[Any, Any, int]:
         f"seed {config['seed']}"
     )
     _say(f"Preset {config['preset']}: {plan.preset_reason}.")
-    world, learner, folder = distributed.together(lambda: _make(plan, loaded is None))
+    world, learner, folder = distributed.together(lambda: _make(plan, loaded is None, held))
     folder = RunFolder(distributed.share(folder and folder.path)[0])
     _say(f"Run folder: {folder.path}")
     waits = distributed.LostProcess("this one was asked to stop and waits for it")
@@ -88,6 +96,19 @@ def _run(plan: RunPlan, distributed: Any) -> tuple[Any, Any, int]:
         raise SystemExit(1) from None
     world.close()
     return folder, learner, stopped
+
+
+def _check_folder(plan: RunPlan, held: contextlib.ExitStack) -> None:
+    """Makes sure that the run's folder can be written, and that nobody else trains there, before anything is built."""
+    if launch().rank > 0:
+        return
+    if plan.folder is not None:
+        plan.folder.check_own()
+        held.enter_context(plan.folder.locked())
+    else:
+        # Of a name that no other run has, should one begin in this second too.
+        name = new_folder_name(plan.config)
+        check_new(plan.flags.run_dir or name.with_name(f"{name.name}_0"))
 
 
 def _read(plan: RunPlan) -> Checkpoint | None:
@@ -135,44 +156,51 @@ def _agree(plan: RunPlan, loaded: Checkpoint | None, distributed: Any) -> RunPla
     return replace(plan, config=everyone[0][0])
 
 
-def _make(plan: RunPlan, fresh: bool) -> tuple[Any, Any, Any]:
+def _make(plan: RunPlan, fresh: bool, held: contextlib.ExitStack) -> tuple[Any, Any, Any]:
     """World, learner (a fresh one with the weights it shall start from) and, in process 0, the run folder."""
-    from bidex_meta.commands.policies import checkpoint
+    from bidex_meta.commands.policies import checkpoint, fitting
     from bidex_meta.record import RunFolder
 
     world = plan.source.world("train", plan.config["num_envs"], plan.kind.autoreset(plan.config["learner"]))
     learner = plan.kind.make(world, plan.learner_config, plan.config["seed"])
     if fresh and plan.config["start_from"] is not None:
-        state, step = checkpoint(RunFolder.open(Path(plan.config["start_from"])))
-        shared("start_from").start_from(learner, state["learner"]["policy"])
+        start = RunFolder.open(Path(plan.config["start_from"]))
+        state, step = checkpoint(start)
+        with fitting(start.path):
+            shared("start_from").start_from(learner, state["learner"]["policy"])
         _say(f"Starting from the policy of {plan.config['start_from']} at {step:,} steps.")
     if launch().rank > 0:
         return world, learner, None
-    folder = plan.folder or RunFolder.create(plan.config, plan.flags.run_dir)
-    if folder.config() != plan.config:
-        folder.change_config(plan.config)  # a resumed run with more steps or minutes
+    if plan.folder is not None:
+        return world, learner, plan.folder
+    folder = RunFolder.create(plan.config, plan.flags.run_dir)
+    held.enter_context(folder.locked())
     return world, learner, folder
 
 
 def _train(plan: RunPlan, folder: Any, world: "VectorWorld", learner: Any, loaded: Checkpoint | None) -> int:
     """Train to the end; the signal that ended it early, or 0."""
-    from bidex_meta.record import Recorder, read_metrics, training_seconds
+    from bidex_meta.commands.policies import fitting
+    from bidex_meta.record import Recorder, mend, training_seconds
     from bidex_meta.train import distributed, runner
 
     resume_step = None
     if loaded is not None:
         state, resume_step = loaded
-        distributed.together(lambda: runner.resume(learner, world, state))
+        with fitting(folder.path):
+            distributed.together(lambda: runner.resume(learner, world, state))
         _say(f"Continuing at {resume_step:,} steps.")
     elif plan.folder is not None:
         resume_step = 0  # killed before its first checkpoint: the same seed takes it there again
         _say("No checkpoint yet: starting from the beginning.")
     budget = _budget(plan.config)
-    done = [row for row in read_metrics(folder.metrics_path) if row["step"] <= (resume_step or 0)]
-    budget["spent_seconds"] = training_seconds(done)
     if launch().rank > 0:
-        return runner.train(learner, world, **budget, record=None)
-    logger, total = plan.config["logger"], {name: budget[name] for name in ("total_steps", "total_seconds")}
+        return runner.train(learner, world, **budget, record=None)  # process 0's clock decides
+    if plan.folder is not None and folder.config() != plan.config:
+        folder.change_config(plan.config)  # more steps, say; not before it is known that the run goes on
+    done = mend(folder.metrics_path, resume_step or 0)
+    logger, total = plan.config["logger"], dict(budget)
+    budget["spent_seconds"] = training_seconds(done)
     with Recorder(folder, **total, resume_step=resume_step, logger=logger) as record, contextlib.ExitStack() as stack:
         watch = None
         if plan.config["evaluate_every"] or plan.config["video_every"]:

@@ -13,7 +13,9 @@ from typing import Any, Literal
 
 from bidex_meta.commands.learners import LearnerKind, choose_preset, learner_kind, resolve_device
 from bidex_meta.commands.parsing import StepCount, Switch, parse, peek
-from bidex_meta.errors import BidexError
+from bidex_meta.errors import BidexError, one_line
+from bidex_meta.memory import ROW_BYTES, check_memory
+from bidex_meta.reading import expanded
 from bidex_meta.record.folder import RunFolder, flat
 from bidex_meta.sources import Source
 from bidex_meta.train.launch import launch, resume_command
@@ -112,11 +114,13 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
         BidexError: Bad flags, or flags that contradict the run to be resumed.
     """
     resume = peek(arguments, "--resume")
+    if resume and peek(arguments, "--run-dir"):
+        raise BidexError("--resume goes on in the run's own folder. Leave --run-dir out, or start a new run there.")
     folder = RunFolder.open(Path(resume)) if resume else None
     # What older runs did not know.
     older = {"engine": "auto", "base": "own", "start_from": None, "minutes": None}
     older |= {"evaluate_every": None, "video_every": None, "logger": "tensorboard"}
-    stored = {**older, **folder.config()} if folder else {}
+    stored = {**older, **folder.config("learner", "num_envs", "steps")} if folder else {}
     suite, task = (peek(arguments, f"--{name}") or stored.get(name) for name in ("suite", "task"))
     # Where neither is named, `run --help` still has defaults to show; without --help _resolved refuses it.
     source = Source.open({"suite": suite or (None if task else _EXAMPLE), "task": task})
@@ -167,14 +171,16 @@ def _resolved(flags: Any, names: dict[str, str], device: str, stored: dict[str, 
             raise BidexError(f"--{name.replace('_', '-')} must be at least 1, not {value}.")
     if flags.minutes is not None and not 0.0 < flags.minutes < math.inf:
         raise BidexError(f"--minutes must be a number above 0, such as 4 or 0.5, not {flags.minutes:g}.")
+    if device.startswith("cpu") and not flags.print_config:
+        _check_memory(flags)
     suite = names["source"] if flags.suite else None
     if suite is not None and suite.endswith(".toml"):
-        suite = str(Path(suite).expanduser().resolve())  # a run may be resumed from another folder
+        suite = str(expanded(suite).resolve())  # a run may be resumed from another folder
     config = {
         "suite": suite,
         "task": names["source"] if flags.task else None,
         "base": flags.base,
-        "start_from": None if flags.start_from is None else str(flags.start_from.expanduser().resolve()),
+        "start_from": None if flags.start_from is None else str(expanded(flags.start_from).resolve()),
         "algo": names["algo"],
         "preset": names["preset"],
         "learner": dataclasses.asdict(flags.learner),
@@ -193,6 +199,19 @@ def _resolved(flags: Any, names: dict[str, str], device: str, stored: dict[str, 
     return json.loads(json.dumps(config))  # tuples to lists, so that it equals what is read back
 
 
+_WIDTH = 1200
+"""Numbers that a row's step holds at most: an observation before and after, actions and what was computed of them."""
+
+
+def _check_memory(flags: Any) -> None:
+    """Refuses a world, and what the learner says it holds (``bytes_held``), that this machine has no room for."""
+    held = getattr(flags.learner, "bytes_held", None)
+    of_learner = 0 if held is None else held(flags.num_envs, _WIDTH)
+    needed = launch().local_count * (flags.num_envs * ROW_BYTES + of_learner)
+    told = f"--num-envs {flags.num_envs} ({of_learner / 1e9:,.1f} GB of it the learner's)"
+    check_memory(needed, told, "Lower it, or the learner's layers, steps or replay.")
+
+
 def _cores() -> int:
     # The cores we may use, not those of the machine: containers and batch systems give a share.
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
@@ -206,7 +225,12 @@ def _stored_learner(config_class: Any, stored: dict[str, Any], folder: RunFolder
             f"{folder.config_path} sets {', '.join(sorted(unknown))}, which this version of {stored['algo']} does not "
             "have. Resume with the version in versions.json."
         )
-    return config_class(**values)
+    try:
+        return config_class(**values)
+    except BidexError as error:
+        raise BidexError(f"{folder.config_path}: {error}") from None
+    except (TypeError, ValueError) as error:  # of a learner from elsewhere
+        raise BidexError(f"{folder.config_path}: learner: {one_line(error)}.") from None
 
 
 def _refuse_changes(stored: dict[str, Any], config: dict[str, Any], folder: RunFolder) -> None:

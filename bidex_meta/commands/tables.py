@@ -5,8 +5,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
+from bidex_meta.errors import one_line
 from bidex_meta.evaluation.gains import Gains
 from bidex_meta.evaluation.results import Difference, Evaluation, compare
 from bidex_meta.evaluation.statistics import Interval
@@ -29,7 +31,7 @@ def evaluation_table(
         random: The same of a random policy on the same tasks.
         gains: What adaptation gained.
     """
-    table = Table(title=title, title_justify="left", caption_justify="left")
+    table = Table(title=escape(title), title_justify="left", caption_justify="left")
     table.caption = "[..] 95 % bootstrap interval over tasks (of few: episodes); success: at any step of the episode"
     table.add_column("task")
     headers = ["episodes", "length", "success", "return [95 %]", "score"]
@@ -48,7 +50,7 @@ def evaluation_table(
     rows, others = policy.to_json(), random.to_json() if random is not None else None
     for name, row in rows["classes"].items():
         episodes = f"{row['episodes']}" + (f" ({row['unstable']} unstable)" if row["unstable"] else "")
-        cells = [name, episodes, f"{row['length']:.1f}", _percent(row["success"])]
+        cells = [_name(name), episodes, f"{row['length']:.1f}", _percent(row["success"])]
         cells += [_ranged(row["return"], row["return_interval"]), _score(row["score"])]
         if others is not None:
             other, difference = others["classes"][name], differences[name]
@@ -83,7 +85,7 @@ def _gained(measures: Mapping[str, Difference | None]) -> list[str]:
 
 def control_table(title: str, by_arm: Mapping[str, Mapping[str, Any]]) -> Table:
     """What ``bidex_meta.evaluation.control_arms.arms`` found: an arm a row."""
-    table = Table(title=title, title_justify="left", caption_justify="left")
+    table = Table(title=escape(title), title_justify="left", caption_justify="left")
     table.caption = (
         "gains: own data above this arm, same starts; [..] 95 % bootstrap interval over runs, adaptations, episodes"
     )
@@ -93,7 +95,12 @@ def control_table(title: str, by_arm: Mapping[str, Mapping[str, Any]]) -> Table:
     labels = {"before": "nothing", "own": "its own data", "foreign": "train tasks' data, mean"}
     for arm, values in by_arm.items():
         of_runs = " ".join(f"{value:.4g}" for value in values["runs"])
-        cells = [labels.get(arm, f"data of {arm}"), f"{values['return']:.4g}", of_runs, _percent(values["success"])]
+        cells = [
+            labels.get(arm) or _name(f"data of {arm}"),
+            f"{values['return']:.4g}",
+            of_runs,
+            _percent(values["success"]),
+        ]
         table.add_row(*cells, *(_gained(values["own_minus"]) if "own_minus" in values else []))
     return table
 
@@ -103,9 +110,9 @@ def plain_table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> Tab
     table = Table()
     for place, column in enumerate(columns):
         numbers = bool(rows) and all(isinstance(row[place], int | float) for row in rows)
-        table.add_column(column, justify="right" if numbers else "left")
+        table.add_column(_name(column), justify="right" if numbers else "left")
     for row in rows:
-        table.add_row(*(f"{cell:,.4g}" if isinstance(cell, float) else str(cell) for cell in row))
+        table.add_row(*(f"{cell:,.4g}" if isinstance(cell, float) else _name(str(cell)) for cell in row))
     return table
 
 
@@ -126,3 +133,8 @@ def _ranged(value: float, interval: Interval | None, sign: bool = False, unit: s
     form = "+.4g" if sign else ".4g"
     ends = _NONE if interval is None else f"{interval[0]:{form}}, {interval[1]:{form}}"
     return f"{value:{form}}{unit} \\[{ends}]"
+
+
+def _name(name: str) -> str:
+    """A text that rich shall show as it is: a name of a class or a task may be anybody's."""
+    return escape(one_line(name))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from bidex_meta.commands.parsing import Switch, parse
 from bidex_meta.errors import BidexError, known_name
+from bidex_meta.memory import ROW_BYTES, check_memory
 from bidex_meta.witness.config import PlannerConfig
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ def main(arguments: Sequence[str]) -> None:
     """Search or replay, and print what was found."""
     flags = parse(WitnessFlags, arguments, "witness")
     names = _names(flags)
+    _check_files(flags)
     find = _play_script if flags.script else _steady if flags.steady else _find
     files = {name: find(name, flags) if flags.find else flags.file for name in names}
     rows = [_replay(name, file, flags.threads) for name, file in files.items()]
@@ -81,6 +83,19 @@ def _names(flags: WitnessFlags) -> list[str]:
     if flags.all and (flags.out is not None or flags.file is not None or flags.improve is not None):
         raise BidexError("witness: films and files are of one class; give --task T with --out or --file.")
     return registry.names() if flags.task is None else [known_name("task", flags.task, registry.names())]
+
+
+def _check_files(flags: WitnessFlags) -> None:
+    """Refuses, before a search or a replay, what could not be written after it, and too many samples."""
+    from bidex_meta.record import video
+    from bidex_meta.record.atomic import check_writable
+
+    if flags.out is not None:
+        video.check_suffix(flags.out)
+        check_writable(flags.out)
+    if flags.find:
+        check_memory(flags.planner.samples * ROW_BYTES, f"{flags.planner.samples:,} samples", "Lower them.")
+        check_writable(flags.file or _FOUND / f"{flags.task or 'x'}.npz")
 
 
 def _replay(name: str, file: Path | None, threads: int | None) -> dict[str, Any]:

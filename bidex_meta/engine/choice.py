@@ -3,7 +3,7 @@
 import torch
 
 from bidex_meta.engine.protocol import EngineMaker
-from bidex_meta.errors import BidexError, whole_number
+from bidex_meta.errors import BidexError, shortened, whole_number
 
 ENGINES = ("auto", "c", "warp")
 _MOST_THREADS = 1024
@@ -25,8 +25,8 @@ def choose_engine(
     if threads is not None:
         threads = whole_number("threads", threads, 1, _MOST_THREADS)
     place = _device(device)
-    if engine not in ENGINES:
-        raise BidexError(f"Expected an engine among {', '.join(ENGINES)}, got {engine!r}.")
+    if not isinstance(engine, str) or engine not in ENGINES:
+        raise BidexError(f"Expected an engine among {', '.join(ENGINES)}, got {shortened(engine)}.")
     if engine == "c" and place.type != "cpu":
         raise BidexError(f"Expected device 'cpu' for the C engine, got {str(device)!r}; leave engine at 'auto'.")
     if engine == "warp" or (engine == "auto" and place.type == "cuda"):

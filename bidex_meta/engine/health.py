@@ -54,7 +54,7 @@ def _checked_field(name: str, value: Any, view: Tensor) -> Tensor:
             f"Expected {name} of an engine's state of shape {tuple(view.shape)}, got {got}; build the world with the "
             "same suite and num_envs."
         )
-    value = value.to(view).reshape(view.shape)
+    value = value.detach().to(view).reshape(view.shape)
     if view.is_floating_point() and not bool(value.isfinite().all()):
         row = int((~value.reshape(len(value), -1).isfinite().all(dim=1)).nonzero()[0])
         raise BidexError(

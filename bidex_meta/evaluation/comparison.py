@@ -10,8 +10,10 @@ import numpy as np
 
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.statistics import Interval, bootstrap_interval
+from bidex_meta.reading import exists
 from bidex_meta.record.folder import RunFolder
 from bidex_meta.record.metrics import read_metrics, training_seconds
+from bidex_meta.record.schemas import read_evaluation
 
 
 @dataclass(frozen=True)
@@ -122,18 +124,13 @@ def _along(i: np.ndarray, j: np.ndarray, statistic: Any) -> Any:
 
 def _read(folder: RunFolder) -> dict[str, Any]:
     path = folder.path / "evaluation.json"
-    if not path.is_file():
+    if not exists(path):
         raise BidexError(
             f"{folder.path} has no evaluation.json. Let the run end, or write one: bidex-meta evaluate {folder.path} "
             f"--json > {path}"
         )
-    config = folder.config()
-    try:
-        found = json.loads(path.read_text())
-    except json.JSONDecodeError as error:
-        raise BidexError(
-            f"{path} is not JSON ({error}). Write it anew: bidex-meta evaluate {folder.path} --json."
-        ) from None
+    config = folder.config("learner", "num_envs", "steps")
+    found = read_evaluation(path, f"bidex-meta evaluate {folder.path} --json > {path}")
     minutes, rows = config.get("minutes"), read_metrics(folder.metrics_path)
     # Where time ends a run, its last line tells how far it came.
     goal = config["steps"] if minutes is None else max((row["step"] for row in rows), default=0)

@@ -34,7 +34,7 @@ def read_histories(folders: Sequence[RunFolder]) -> list[History]:
     Raises:
         BidexError: None of them has logged anything.
     """
-    runs = [{"kind": run_kind(folder.config()), "folder": folder} for folder in folders]
+    runs = [{"kind": run_kind(folder.config("learner", "num_envs", "steps")), "folder": folder} for folder in folders]
     histories = []
     for label, members in by_kind(runs):
         logged = [read_metrics(run["folder"].metrics_path) for run in members]

@@ -14,7 +14,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 
 from bidex_meta.agents import Agent
-from bidex_meta.errors import BidexError
+from bidex_meta.errors import BidexError, shortened, whole_number
 from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.evaluation.scores import Reference
 from bidex_meta.world.contract import TaskWorld
@@ -77,11 +77,15 @@ def check_world(world: TaskWorld, episodes_per_task: int) -> None:
     Raises:
         BidexError: The world resets by itself or its names are not unique, or ``episodes_per_task`` is not positive.
     """
-    if episodes_per_task < 1:
-        raise BidexError(f"Episodes per task must be at least 1, not {episodes_per_task}.")
-    mode = world.metadata["autoreset_mode"]
+    # numpy's whole numbers are some too.
+    whole_number("episodes_per_task", episodes_per_task, 1, 1_000_000)
+    if not isinstance(getattr(world, "metadata", None), Mapping):
+        raise BidexError(f"Expected a world to evaluate on, as Benchmark.make_world makes it, got {shortened(world)}.")
+    mode = world.metadata.get("autoreset_mode")
     if mode != AutoresetMode.DISABLED:
-        raise BidexError(f"Evaluation needs a world in autoreset mode DISABLED, but this one is in {mode.name}.")
+        raise BidexError(
+            f"Evaluation needs a world in autoreset mode DISABLED, but this one is in {getattr(mode, 'name', mode)}."
+        )
     if len(set(world.task_names)) != len(world.task_names):
         raise BidexError(f"Results are kept by name, but the world's names are not unique: {world.task_names}.")
 

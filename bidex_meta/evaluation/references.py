@@ -5,7 +5,6 @@ and ``zero.json``, the returns of random actions and of doing nothing, the bette
 ``expert.json``; ``bidex-meta baseline`` measures all three.
 """
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -13,6 +12,7 @@ from typing import Any, Literal
 from bidex_meta import paths
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.scores import Reference
+from bidex_meta.reading import TABLE, check, exists, number, read_json
 from bidex_meta.record.atomic import write_json
 
 Kind = Literal["random", "zero", "expert"]
@@ -26,7 +26,7 @@ def reference_path(kind: Kind) -> Path:
 def load(kind: Kind) -> dict[str, dict[str, Any]]:
     """What is known of each class by its name, e.g. ``{"return": 0.49, "source": ...}``; empty without a file."""
     path = reference_path(kind)
-    return json.loads(path.read_text())["classes"] if path.is_file() else {}
+    return _read(path) if exists(path) else {}
 
 
 def store(path: Path, classes: dict[str, dict[str, Any]], made: dict[str, Any]) -> None:
@@ -40,13 +40,32 @@ def store(path: Path, classes: dict[str, dict[str, Any]], made: dict[str, Any]) 
     Raises:
         BidexError: The file holds something else.
     """
-    try:
-        known = json.loads(path.read_text())["classes"] if path.is_file() else {}
-    except (ValueError, KeyError, TypeError) as error:
-        raise BidexError(f"{path}: expected a file of references or none, got another. Name another file.") from error
+    known = load_from(path)
     known |= {name: {**numbers, "made": made} for name, numbers in classes.items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, {"classes": dict(sorted(known.items()))})
+
+
+def load_from(path: Path) -> dict[str, dict[str, Any]]:
+    """What a file of references knows of each class; empty without a file.
+
+    Raises:
+        BidexError: The file holds something else.
+    """
+    if not exists(path):
+        return {}
+    try:
+        return _read(path)
+    except BidexError as error:
+        raise BidexError(f"{error} Expected a file of references or none: name another file.") from None
+
+
+def _read(path: Path) -> dict[str, dict[str, Any]]:
+    content = read_json(path, "references")
+    check(content, {"classes": TABLE}, path, ("classes",))
+    for name, row in content["classes"].items():
+        check(row, {"return": number()}, path, ("return",), f"classes.{name}.")
+    return content["classes"]
 
 
 def references() -> dict[str, Reference]:

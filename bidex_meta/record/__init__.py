@@ -5,8 +5,17 @@ Importing this package is cheap; torch, TensorBoard, matplotlib and imageio are 
 
 from bidex_meta.record.checkpoints import Checkpoints
 from bidex_meta.record.folder import RunFolder
-from bidex_meta.record.metrics import MetricsWriter, read_metrics, training_seconds
+from bidex_meta.record.metrics import MetricsWriter, mend, read_metrics, training_seconds
 from bidex_meta.record.progress import Progress
 from bidex_meta.record.recorder import Recorder
 
-__all__ = ["Checkpoints", "MetricsWriter", "Progress", "Recorder", "RunFolder", "read_metrics", "training_seconds"]
+__all__ = [
+    "Checkpoints",
+    "MetricsWriter",
+    "Progress",
+    "Recorder",
+    "RunFolder",
+    "mend",
+    "read_metrics",
+    "training_seconds",
+]

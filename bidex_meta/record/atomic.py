@@ -7,6 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
+from bidex_meta.errors import BidexError, one_line
+from bidex_meta.reading import exists
+
 TEMPORARY_SUFFIX = ".tmp"
 
 
@@ -41,6 +44,51 @@ def remove_leftovers(folder: Path) -> None:
     """Delete the temporary files that a killed process left in ``folder``."""
     for leftover in folder.glob(f".*{TEMPORARY_SUFFIX}"):
         leftover.unlink(missing_ok=True)
+
+
+def refuse_links(*paths: Path) -> None:
+    """Refuses links where a run keeps its own files: what is written or deleted there would be somebody else's.
+
+    Raises:
+        BidexError: One is a link.
+    """
+    for path in paths:
+        if path.is_symlink():
+            raise BidexError(
+                f"{path} is a link, and what a run writes stays in its folder. Put a folder or file there."
+            )
+
+
+def check_writable(path: Path) -> None:
+    """Makes sure, before long work, that ``path`` can be written at its end; leaves everything as it was.
+
+    Args:
+        path: A file to be made or replaced; folders above it may be missing.
+
+    Raises:
+        BidexError: It is no file, or cannot be written: the name is too long, the folder is not ours, the disk is full.
+    """
+    if exists(path) and not path.is_file():
+        raise BidexError(f"Expected a file to write at {path}, but there is something else. Name another.")
+    missing = [folder for folder in path.parents if not exists(folder)]
+    made: list[Path] = []
+    try:
+        for folder in reversed(missing):
+            folder.mkdir()
+            made.append(folder)
+        # As long a name as the file's own will have while it is written.
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=TEMPORARY_SUFFIX, dir=path.parent)
+        try:
+            os.write(handle, bytes(4096))
+        finally:
+            os.close(handle)
+            os.unlink(name)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or one_line(error)
+        raise BidexError(f"{path} cannot be written: {reason}. Name another place, or make room.") from None
+    finally:
+        for folder in reversed(made):
+            folder.rmdir()
 
 
 def _sync_folder(folder: Path) -> None:

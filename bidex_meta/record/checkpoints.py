@@ -1,6 +1,6 @@
 """Checkpoints: ``step_<N>.pt`` (the last few), ``last.pt`` and ``best.pt``.
 
-Written atomically, read without unpickling code.
+Written atomically, read without unpickling code, each with a digest of its content (:mod:`bidex_meta.record.sealing`).
 """
 
 import re
@@ -9,17 +9,19 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from bidex_meta.errors import BidexError
-from bidex_meta.record.atomic import remove_leftovers, write_atomic
+from bidex_meta.errors import BidexError, one_line
+from bidex_meta.reading import exists, is_file
+from bidex_meta.record.atomic import refuse_links, remove_leftovers, write_atomic
+from bidex_meta.record.sealing import opened, sealed
 
-_STEP_FILE = re.compile(r"step_(\d+)\.pt")
+_STEP_FILE = re.compile(r"step_(\d{1,18})\.pt", re.ASCII)
 
 
 class Checkpoints:
     """The checkpoints of one run.
 
     Args:
-        folder: Where they lie; must exist.
+        folder: Where they lie; made by the first ``save``.
         keep: How many ``step_<N>.pt`` are kept. More than one, so that a file damaged after it was written
             (a full disk, a failing one) does not end the run.
     """
@@ -47,9 +49,11 @@ class Checkpoints:
         """
         import torch
 
+        refuse_links(self.folder)
+        self.folder.mkdir(exist_ok=True)
         remove_leftovers(self.folder)
-        path = self.folder / f"step_{step}.pt"
-        write_atomic(path, lambda file: torch.save({"step": step, "state": state}, file))
+        path, content = self.folder / f"step_{step}.pt", sealed({"step": step, "state": state})
+        write_atomic(path, lambda file: torch.save(content, file))
         with path.open("rb") as source:
             write_atomic(self.last, lambda file: shutil.copyfileobj(source, file))
         for old in self._step_files()[self.keep :]:
@@ -65,13 +69,15 @@ class Checkpoints:
         """
         import torch
 
+        refuse_links(self.folder)
+        self.folder.mkdir(exist_ok=True)
         remove_leftovers(self.folder)
-        content = {"step": step, "state": {"learner": {"policy": policy}}, "found": found}
+        content = sealed({"step": step, "state": {"learner": {"policy": policy}}, "found": found})
         write_atomic(self.best, lambda file: torch.save(content, file))
 
     def found_of_best(self) -> dict[str, float] | None:
         """What was found of the policy in ``best.pt``; None where there is none that can be read."""
-        content = _read(self.best) if self.best.exists() else None
+        content = _read(self.best, "none is known") if exists(self.best) else None
         return None if content is None else content.get("found")
 
     def load_one(self, path: Path) -> tuple[dict[str, Any], int]:
@@ -80,7 +86,7 @@ class Checkpoints:
         Raises:
             BidexError: There is no such file, or it cannot be read.
         """
-        if not path.is_file():
+        if not is_file(path):
             there = ", ".join(sorted(found.name for found in self.folder.glob("*.pt"))) or "none"
             raise BidexError(f"There is no {path}. Checkpoints in {self.folder}: {there}.")
         content = _read(path, "name another")
@@ -96,16 +102,18 @@ class Checkpoints:
     def load(self) -> tuple[dict[str, Any], int] | None:
         """The newest readable checkpoint as ``(state, step)`` with tensors on the CPU; None where there is none yet.
 
-        A torn file is passed over with a line on stderr.
+        A damaged file is passed over with a line on stderr, which names the one that is taken in its place.
 
         Raises:
             BidexError: There are checkpoints, but none of them can be read.
         """
         # last.pt comes last: a process that died between the two renames leaves it older than the newest step_<N>.pt.
-        candidates = [path for path in [*self._step_files(), self.last] if path.exists()]
+        candidates = [path for path in [*self._step_files(), self.last] if exists(path)]
         for path in candidates:
             loaded = _read(path)
             if loaded is not None:
+                if path != candidates[0]:
+                    print(f"Taking {path}, of {loaded['step']:,} steps.", file=sys.stderr)
                 return loaded["state"], loaded["step"]
         if candidates:
             raise BidexError(
@@ -115,21 +123,16 @@ class Checkpoints:
 
     def _step_files(self) -> list[Path]:
         """``step_<N>.pt``, newest first."""
-        found = [(int(match[1]), path) for path in self.folder.iterdir() if (match := _STEP_FILE.fullmatch(path.name))]
+        paths = self.folder.iterdir() if self.folder.is_dir() else ()
+        found = [(int(match[1]), path) for path in paths if (match := _STEP_FILE.fullmatch(path.name))]
         return [path for _, path in sorted(found, reverse=True)]
 
 
 def _read(path: Path, then: str = "trying an older one") -> dict[str, Any] | None:
-    import torch
-
     try:
-        # weights_only: a checkpoint from somebody else must not be able to run code.
-        content = torch.load(path, map_location="cpu", weights_only=True)
-        return {**content, "state": content["state"], "step": int(content["step"])}
+        return opened(path)
     except Exception as error:  # torch raises a dozen kinds for a damaged file; each means "try the one before"
-        reason = (str(error).splitlines() or [""])[0][:100]
-        print(
-            f"Checkpoint {path} cannot be read ({type(error).__name__}: {reason}); {then}.",
-            file=sys.stderr,
-        )
+        reason = one_line(error)[:100].rstrip(".")
+        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+        print(f"Checkpoint {path} cannot be read ({kind}{reason}); {then}.", file=sys.stderr)
         return None

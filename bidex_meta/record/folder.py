@@ -11,19 +11,26 @@
         videos/         <name>_<N>.mp4
 """
 
-import json
+import contextlib
+import os
+from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from bidex_meta.errors import BidexError
-from bidex_meta.record.atomic import remove_leftovers, write_json
+from bidex_meta.reading import exists, is_file
+from bidex_meta.record.atomic import TEMPORARY_SUFFIX, check_writable, refuse_links, remove_leftovers, write_json
 from bidex_meta.record.checkpoints import Checkpoints
+from bidex_meta.record.schemas import read_config
 from bidex_meta.record.versions import collect_versions
 
-_KEYS = ("suite", "task", "algo", "seed")
-"""What every run's config holds."""
+_ENTRIES = ("checkpoints", "videos", "metrics.jsonl", "versions.json")
+"""What stands in a run folder before its ``config.json`` does."""
+_MOST_LOOKED_AT = 2000
+"""Entries that are looked at to find runs below a folder that is none."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +53,8 @@ class RunFolder:
             BidexError: ``path`` exists and is not empty.
         """
         folder = cls(_new_folder(config, root) if path is None else _given_folder(path))
-        folder.checkpoints_path.mkdir()
-        folder.videos_path.mkdir()
+        for made in (folder.checkpoints_path, folder.videos_path):
+            made.mkdir(exist_ok=True)  # there where a start was killed before its config stood
         folder.metrics_path.touch()
         write_json(folder.path / "versions.json", collect_versions())
         write_json(folder.config_path, config)  # last: a folder with a config.json is a complete one
@@ -61,9 +68,11 @@ class RunFolder:
             BidexError: There is no readable ``config.json``.
         """
         folder = cls(Path(path))
-        if not folder.config_path.is_file():
-            near = sorted(str(found.parent) for found in folder.path.glob("**/config.json"))[:3]
+        if not is_file(folder.config_path):
+            near = sorted(map(str, _runs_below(folder.path)))[:3]
             hint = f" There are runs below it: {', '.join(near)}." if near else ""
+            if not near and _torn_start(folder.path):
+                hint = f" Its run was killed as it began. Begin again: --run-dir {path}"
             raise BidexError(f"{path} is not a run folder: it has no config.json.{hint}")
         return folder
 
@@ -90,28 +99,84 @@ class RunFolder:
     @property
     def checkpoints(self) -> Checkpoints:
         """The run's checkpoints."""
-        self.checkpoints_path.mkdir(exist_ok=True)
         return Checkpoints(self.checkpoints_path)
 
-    def config(self) -> dict[str, Any]:
+    def config(self, *needed: str) -> dict[str, Any]:
         """The resolved config.
 
+        Args:
+            needed: Entries that must be there beside those of every run.
+
         Raises:
-            BidexError: ``config.json`` is not valid JSON, or not a run's.
+            BidexError: ``config.json`` cannot be read, is not valid JSON, or not a run's.
         """
-        try:
-            config = json.loads(self.config_path.read_text())
-        except json.JSONDecodeError as error:
-            raise BidexError(f"{self.config_path} is not valid JSON: {error}.") from None
-        missing = [name for name in _KEYS if not isinstance(config, dict) or name not in config]
-        if missing:
-            raise BidexError(f"{self.config_path} is not a run's config: it lacks {', '.join(missing)}. Name a run.")
-        return config
+        return read_config(self.config_path, needed)
 
     def change_config(self, config: dict[str, Any]) -> None:
         """Replace ``config.json``, atomically."""
         remove_leftovers(self.path)
         write_json(self.config_path, config)
+
+    def check_own(self) -> None:
+        """Makes sure that the run can go on here, before anything is built.
+
+        Raises:
+            BidexError: A part of it is a link that leads elsewhere, or the folder cannot be written.
+        """
+        refuse_links(self.checkpoints_path, self.videos_path, self.metrics_path, self.path / "wandb-id")
+        for folder in (self.path, self.checkpoints_path):
+            if folder == self.path or folder.exists():
+                check_writable(folder / "last.pt")
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keeps other processes from training in this folder; the lock dies with its process, and leaves no file.
+
+        Raises:
+            BidexError: Another process does.
+        """
+        handle = os.open(self.path, os.O_RDONLY)
+        try:
+            with contextlib.suppress(ImportError):  # Windows has no such locks
+                import fcntl
+
+                try:
+                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    raise BidexError(f"Another process trains in {self.path}. Wait for its end, or stop it.") from None
+                except OSError:
+                    pass  # a network's file system may lock no folders
+            yield
+        finally:
+            os.close(handle)
+
+
+def _runs_below(path: Path) -> Iterator[Path]:
+    """Run folders up to three levels below: as deep as runs/SUITE/ALGO/RUN, and no walk over a whole disk."""
+    waiting, looked_at = deque([(path, 0)]), 0
+    while waiting:
+        folder, depth = waiting.popleft()
+        with contextlib.suppress(OSError, ValueError), os.scandir(folder) as entries:
+            for entry in entries:
+                looked_at += 1
+                if looked_at > _MOST_LOOKED_AT:
+                    return
+                if entry.name == "config.json" and entry.is_file():
+                    yield folder
+                elif depth < 3 and entry.is_dir(follow_symlinks=False):
+                    waiting.append((Path(entry.path), depth + 1))
+
+
+def _torn_start(path: Path) -> bool:
+    """Whether a folder holds nothing but what ``create`` makes before the config, and no result."""
+    try:
+        found = [entry for entry in path.iterdir() if not entry.name.endswith(TEMPORARY_SUFFIX)]
+        folders = [entry for entry in found if entry.name in _ENTRIES[:2]]
+        known = all(entry.name in _ENTRIES and not entry.is_symlink() for entry in found)
+        empty = not any(any(folder.iterdir()) for folder in folders)
+        return bool(found) and known and empty and all(e.stat().st_size == 0 for e in found if e.name == _ENTRIES[2])
+    except OSError:
+        return False
 
 
 def flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -122,11 +187,16 @@ def flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return found
 
 
-def _new_folder(config: dict[str, Any], root: Path) -> Path:
+def new_folder_name(config: dict[str, Any], root: Path = Path("runs")) -> Path:
+    """Where a run is kept that is given no folder, by its config and the present time."""
     subject = Path(str(config.get("suite") or config.get("task"))).stem  # a suite may be a path to a TOML file
     now = datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S")
     algo = str(config["algo"]).rpartition(":")[2]  # of package.module:Class the class
-    base = root / subject / algo / f"{now}_seed{config['seed']}"
+    return root / subject / algo / f"{now}_seed{config['seed']}"
+
+
+def _new_folder(config: dict[str, Any], root: Path) -> Path:
+    base = new_folder_name(config, root)
     base.parent.mkdir(parents=True, exist_ok=True)
     path, count = base, 1
     while True:
@@ -139,9 +209,19 @@ def _new_folder(config: dict[str, Any], root: Path) -> Path:
 
 
 def _given_folder(path: Path) -> Path:
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+    check_new(path)
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def check_new(path: Path) -> None:
+    """Makes sure that a run can begin in a folder.
+
+    Raises:
+        BidexError: There is something in it, or it cannot be made or written.
+    """
+    if exists(path) and not (path.is_dir() and (_torn_start(path) or not any(path.iterdir()))):
         raise BidexError(
             f"--run-dir {path} exists and is not empty. Name a new folder, or continue it by --resume {path}."
         )
-    path.mkdir(parents=True, exist_ok=True)
-    return path
+    check_writable(path / "config.json")

@@ -2,13 +2,19 @@
 
 import json
 import math
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from bidex_meta.errors import BidexError
+from bidex_meta.reading import bounded, exists, read_bytes, whole
 from bidex_meta.record.atomic import write_atomic
 from bidex_meta.record.writers import Writer, make_writer
+
+_MOST_BYTES = 4_000_000_000
+"""Of a ``metrics.jsonl``; a line an iteration is some kilobytes."""
 
 
 class MetricsWriter:
@@ -52,18 +58,15 @@ class MetricsWriter:
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """The lines of a ``metrics.jsonl``, without a last one torn by a crash.
+    """The lines of a ``metrics.jsonl``, without those that cannot be read, such as a last one torn by a crash.
 
     Args:
         path: The file.
+
+    Raises:
+        BidexError: There is no such file, or something else in its place.
     """
-    rows = []
-    for line in path.read_text().splitlines():
-        try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError:
-            break  # lines are only ever appended: what follows a torn one was never completed
-    return rows
+    return [row for _, row in _lines(path) if row is not None]
 
 
 def training_seconds(rows: Sequence[Mapping[str, Any]]) -> float:
@@ -71,14 +74,63 @@ def training_seconds(rows: Sequence[Mapping[str, Any]]) -> float:
 
     Of runs that did not yet log it: the time of the iterations alone, without that of checkpoints.
     """
-    logged = [row["Perf/training_time"] for row in rows if "Perf/training_time" in row]
+    logged = [row["Perf/training_time"] for row in rows if row.get("Perf/training_time") is not None]
     parts = ("Perf/collection_time", "Perf/learning_time")
-    unlogged = [row.get(part, 0.0) for row in rows if "Perf/training_time" not in row for part in parts]
+    unlogged = [row.get(part) or 0.0 for row in rows if "Perf/training_time" not in row for part in parts]
     return max(logged, default=sum(unlogged))
 
 
+def mend(path: Path, step: int) -> list[dict[str, Any]]:
+    """The lines up to ``step`` of the run that goes on from there, whatever has become of its metrics.
+
+    What stands in the file's place without being one, and a file with lines that cannot be read beside a torn last one,
+    is kept as ``metrics.jsonl.damaged``, and told: a good checkpoint shall not wait for its metrics.
+    """
+    if not exists(path):
+        return []
+    try:
+        lines = _lines(path)
+    except BidexError as error:
+        _set_aside(path, str(error))
+        return []
+    bad = sum(row is None for _, row in lines[:-1])
+    if bad:
+        # A copy: the good lines go on in the file itself.
+        write_atomic(path.with_name(f"{path.name}.damaged"), lambda file: file.write(path.read_bytes()))
+        print(f"{path}: {bad} lines cannot be read; all are kept in {path.name}.damaged.", file=sys.stderr)
+        _keep(path, [line for line, row in lines if row is not None])
+    return [row for _, row in lines if row is not None and row["step"] <= step]
+
+
 def drop_after(path: Path, step: int) -> None:
-    """Keep only the lines of ``path`` with a step up to ``step``; a missing file becomes an empty one."""
-    rows = [row for row in read_metrics(path) if row["step"] <= step] if path.exists() else []
-    text = "".join(json.dumps(row) + "\n" for row in rows)
-    write_atomic(path, lambda file: file.write(text.encode()))
+    """Keep only the lines of ``path`` with a step up to ``step``, as they are; a missing file becomes an empty one."""
+    lines = _lines(path) if exists(path) else []
+    _keep(path, [line for line, row in lines if row is not None and row["step"] <= step])
+
+
+def _keep(path: Path, lines: Sequence[bytes]) -> None:
+    write_atomic(path, lambda file: file.write(b"".join(line + b"\n" for line in lines)))
+
+
+def _set_aside(path: Path, reason: str) -> None:
+    damaged = path.with_name(f"{path.name}.damaged")
+    print(f"{reason} It is kept as {damaged.name}, and metrics begin anew.", file=sys.stderr)
+    path.rename(damaged)
+
+
+def _lines(path: Path) -> list[tuple[bytes, dict[str, Any] | None]]:
+    """Every line that is not empty, and what it says; None where it cannot be read."""
+    lines = read_bytes(path, "a run's metrics", _MOST_BYTES).split(b"\n")
+    return [(line, _row(line)) for line in lines if line.strip()]
+
+
+def _row(line: bytes) -> dict[str, Any] | None:
+    """A line's numbers by name; None where it holds anything else."""
+    try:
+        row = bounded(json.loads(line, parse_constant=lambda _: None))
+    except (ValueError, RecursionError):  # ValueError: also bytes that are no text
+        return None
+    if not isinstance(row, dict) or not whole(0).fits(row.get("step")):
+        return None
+    numbers = [value for value in row.values() if value is not None]
+    return row if all(type(value) in (int, float) and math.isfinite(value) for value in numbers) else None

@@ -1,14 +1,15 @@
 """Curves and points of runs as figures: learning, metrics, adaptation, comparison. Needs the extra ``plot``."""
 
 import io
-import json
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from bidex_meta.errors import BidexError
+from bidex_meta.reading import exists, read_json
 from bidex_meta.record.curves import Curve
+from bidex_meta.record.schemas import check_evaluation
 
 Group = tuple[str, Mapping[str, Curve]]
 """Runs that are drawn in one colour: their label, and curves by tag."""
@@ -134,6 +135,7 @@ def draw_adaptation(found: Any, where: object) -> Any:
         raise BidexError(
             f"{where} holds no meta-test: its learner does not adapt, or it is older. {_AGAIN.format(where)}"
         )
+    check_evaluation(found, Path(str(where)))
     grids = {split: _grid(len(part["before"]["classes"])) for split, part in splits.items()}
     columns, blocks = max(grid[0] for grid in grids.values()), sum(grid[1] for grid in grids.values())
     figure = make_figure(figsize=(3.2 * columns, 4.0 * blocks), layout="constrained")
@@ -162,12 +164,9 @@ def read_evaluation(path: Path) -> Any:
     Raises:
         BidexError: There is none, or it is not JSON.
     """
-    if not path.is_file():
+    if not exists(path):
         raise BidexError(f"There is no {path}. {_AGAIN.format(path)}")
-    try:
-        return json.loads(path.read_text())
-    except ValueError:
-        raise BidexError(f"{path} is not JSON. {_AGAIN.format(path)}") from None
+    return read_json(path, "an evaluation")
 
 
 def _draw_shots(axis: Any, rows: list[dict[str, Any]], measure: str, colour: str | None) -> None:

@@ -8,6 +8,7 @@ from typing import TextIO, TypeVar
 
 from rich.console import Console
 from rich.live import Live
+from rich.markup import escape
 from rich.progress import track
 from rich.table import Table
 
@@ -81,7 +82,9 @@ class Progress:
         for column in ("success", "return"):
             table.add_column(column, justify="right")
         for name in self._tasks():
-            table.add_row(name, _percent(self._shown.get(_SUCCESS + name)), _number(self._shown.get(_RETURN + name)))
+            table.add_row(
+                escape(name), _percent(self._shown.get(_SUCCESS + name)), _number(self._shown.get(_RETURN + name))
+            )
         return table
 
     def _speed(self, step: int) -> str:

@@ -15,8 +15,10 @@ from typing import Any
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import Estimate, Group, estimates, iqm, iqm_difference, read_groups
 from bidex_meta.evaluation.histories import History, read_histories
+from bidex_meta.reading import is_file
 from bidex_meta.record import RunFolder, plots, read_metrics, training_seconds
 from bidex_meta.record.folder import flat
+from bidex_meta.record.schemas import read_versions
 
 FILM_BYTES = 40_000_000
 """Films of a page together at most; what is above is named alone."""
@@ -83,8 +85,7 @@ def _names(histories: Sequence[History], short: Sequence[str]) -> dict[Path, str
 
 def _run(folder: RunFolder, name: str) -> dict[str, Any]:
     config, rows = folder.config(), read_metrics(folder.metrics_path)
-    path = folder.path / "versions.json"
-    versions = json.loads(path.read_text()) if path.is_file() else {}
+    versions = read_versions(folder.path)
     speeds = [row["Perf/steps_per_second"] for row in rows if row.get("Perf/steps_per_second") is not None]
     hardware = ", ".join(versions.get("gpus") or []) or f"{versions.get('cpus', '?')} processors"
     git = versions.get("git") or {}
@@ -103,7 +104,7 @@ def _run(folder: RunFolder, name: str) -> dict[str, Any]:
 
 def _final(folders: Sequence[RunFolder], short: dict[Path, str]) -> dict[str, Any]:
     """The groups' final evaluations as rows, and why runs are missing; groups are called as ``short`` says."""
-    evaluated = [folder for folder in folders if (folder.path / "evaluation.json").is_file()]
+    evaluated = [folder for folder in folders if is_file(folder.path / "evaluation.json")]
     found: dict[str, Any] = {"missing": len(folders) - len(evaluated), "reason": "", "rows": [], "classes": []}
     found |= {"names": [], "picture": None}
     try:
@@ -154,7 +155,7 @@ def _adaptation(folders: Sequence[RunFolder], names: dict[Path, str]) -> Iterato
     """Name and picture of each run that ended with a meta-test."""
     for folder in folders:
         path = folder.path / "evaluation.json"
-        found = plots.read_evaluation(path) if path.is_file() else {}
+        found = plots.read_evaluation(path) if is_file(path) else {}
         if isinstance(found, dict) and found.get("splits"):
             picture = _picture(lambda found=found, path=path: plots.draw_adaptation(found, path))
             if picture is not None:
@@ -165,8 +166,7 @@ def _differences(folders: Sequence[RunFolder], names: dict[Path, str]) -> dict[s
     """What of config and versions is not the same in all runs."""
     columns = []
     for folder in folders:
-        path = folder.path / "versions.json"
-        versions = json.loads(path.read_text()) if path.is_file() else {}
+        versions = read_versions(folder.path)
         columns.append(flat(folder.config()) | flat({"versions": versions}))
     keys = dict.fromkeys(key for column in columns for key in column)
     differing = [key for key in keys if len({json.dumps(column.get(key)) for column in columns}) > 1]
@@ -183,7 +183,8 @@ def _films(folders: Sequence[RunFolder], names: dict[Path, str]) -> Iterator[tup
     room = FILM_BYTES
     for folder in folders:
         newest: dict[str, Path] = {}
-        for path in sorted(folder.videos_path.glob("*.mp4"), key=lambda path: path.stat().st_mtime):
+        films = filter(is_file, folder.videos_path.glob("*.mp4"))  # a pipe of that name would never end
+        for path in sorted(films, key=lambda path: path.stat().st_mtime):
             kind, _, step = path.stem.rpartition("_")
             newest[kind if step.isdigit() and kind else path.stem] = path
         for path in newest.values():

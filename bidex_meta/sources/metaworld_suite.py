@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from bidex_meta.clients.metaworld import SUITES, TASKS_PER_CLASS, class_names
 from bidex_meta.errors import BidexError
+from bidex_meta.memory import check_memory
 from bidex_meta.sources.source import Source
 
 if TYPE_CHECKING:
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 
 # Of each class. A row is an environment of some 10 MB; 2 M steps a class is the budget of published results.
 _TRAINING_ROWS, _TRAINING_STEPS = 4, 2_000_000
+_ROW_BYTES = 10_000_000
 # Its tasks are played in turns, and 5 divides 50.
 _EVALUATION_ROWS = 5
 
@@ -41,6 +43,7 @@ class MetaWorldSuite(Source):
         from bidex_meta.clients.metaworld_world import MetaWorldWorld
 
         rows = rows or _EVALUATION_ROWS * len(self.class_names)
+        check_memory(rows * _ROW_BYTES, f"{rows:,} rows", "Lower --num-envs.")
         return MetaWorldWorld(self.name, rows, seed=self.seed, autoreset_mode=mode)
 
     def tasks(self, split: str) -> dict[str, list[str]]:

@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass
 
+from bidex_meta.errors import BidexError
+from bidex_meta.fields import check_fields
+
 
 @dataclass(frozen=True)
 class PlannerConfig:
@@ -43,3 +46,25 @@ class PlannerConfig:
     free, a hand soon presses on its table so hard that nothing moves it any more."""
     seed: int = 0
     """Of the samples."""
+
+    def __post_init__(self) -> None:
+        """Rejects values that could only fail later.
+
+        Raises:
+            BidexError: A field is out of its range.
+        """
+        check_fields(self, "planner")
+        for name in ("samples", "copies", "rounds", "first_rounds", "rounds_after", "kept_elites", "execute"):
+            if getattr(self, name) < 1:
+                raise BidexError(f"planner: {name} must be at least 1, got {getattr(self, name)}.")
+        for name in ("knots", "horizon"):
+            if getattr(self, name) < 2:
+                raise BidexError(f"planner: {name} must be at least 2, got {getattr(self, name)}.")
+        for name, low, high in (("elite_share", 0.0, 1.0), ("mutants", 0.0, 1.0), ("mutated", 0.0, 1.0)):
+            if not low <= getattr(self, name) <= high:
+                raise BidexError(f"planner: {name} must lie in [{low:g}, {high:g}], got {getattr(self, name)}.")
+        for name in ("std", "min_std", "gamma", "effort"):
+            if getattr(self, name) < 0.0:
+                raise BidexError(f"planner: {name} must be at least 0, got {getattr(self, name)}.")
+        if self.samples % self.copies:
+            raise BidexError(f"Expected samples that copies divide, got {self.samples} and {self.copies}.")

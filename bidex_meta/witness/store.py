@@ -1,6 +1,8 @@
 """Witnesses on disk: one small file a class under ``assets/witnesses/``."""
 
+import io
 import json
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,8 +10,14 @@ from typing import Any
 import numpy as np
 
 from bidex_meta import paths
-from bidex_meta.errors import BidexError
+from bidex_meta.errors import BidexError, one_line
+from bidex_meta.reading import bounded, check, number, read_bytes, whole
+from bidex_meta.record.atomic import write_atomic
 from bidex_meta.witness.planner import LEVELS
+
+_MOST_BYTES, _MOST_STEPS = 50_000_000, 100_000
+_MADE = {"return": number(), "first_success": whole(0).or_none(), "rival": number().or_none()}
+"""What is read again of how a witness was made."""
 
 
 @dataclass(frozen=True)
@@ -31,22 +39,40 @@ def load_witness(name: str, path: Path | None = None) -> Witness:
     """The witness of a class, or the one in a file.
 
     Raises:
-        BidexError: There is none.
+        BidexError: There is none, or it is damaged.
     """
     if path is not None and not path.is_file():
         raise BidexError(f"Expected a file that `bidex-meta witness --find --file` wrote, got {path}, which is none.")
     path = path or witness_path(name)
     if not path.is_file():
         raise BidexError(f"{name} has no witness yet. Search one: bidex-meta witness --task {name} --find")
-    with np.load(path, allow_pickle=False) as stored:
-        actions = stored["actions"].astype(np.float32) / LEVELS
-        return Witness(actions, json.loads(str(stored["made"])))
+    return _read(path)
 
 
 def save_witness(path: Path, actions: np.ndarray, made: dict[str, Any]) -> Path:
     """Writes a witness; actions (T, action_size) must be multiples of 1/127."""
     path.parent.mkdir(parents=True, exist_ok=True)
     levels = np.rint(actions * LEVELS).astype(np.int8)
-    with path.open("wb") as file:
-        np.savez_compressed(file, actions=levels, made=np.array(json.dumps(made)))
+    write_atomic(path, lambda file: np.savez_compressed(file, actions=levels, made=np.array(json.dumps(made))))
     return path
+
+
+def _read(path: Path) -> Witness:
+    content = io.BytesIO(read_bytes(path, "a witness", _MOST_BYTES))
+    try:
+        with zipfile.ZipFile(content) as archive:
+            # A small archive may unpack to anything.
+            if sum(part.file_size for part in archive.infolist()) > _MOST_BYTES:
+                raise ValueError("it unpacks to too much")
+        content.seek(0)
+        with np.load(content, allow_pickle=False) as stored:
+            levels, made = stored["actions"], bounded(json.loads(str(stored["made"])))
+    except Exception as error:  # zipfile, zlib and numpy raise a dozen kinds for a damaged file
+        reason = one_line(error)[:150].rstrip(".")
+        raise BidexError(f"Expected a witness at {path}, but {reason}. Search it anew: witness --find.") from None
+    if levels.dtype != np.int8 or levels.ndim != 2 or not 1 <= len(levels) <= _MOST_STEPS:
+        raise BidexError(
+            f"{path}: expected actions as bytes, (steps, actions), got {levels.dtype} of shape {levels.shape}."
+        )
+    check(made, _MADE, path)
+    return Witness(levels.astype(np.float32) / LEVELS, made)

@@ -1,12 +1,13 @@
 """When rows start anew: within the step that ended them (training), or when they are told to (evaluation)."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
-from bidex_meta.errors import BidexError, unknown_name, whole_number
+from bidex_meta.errors import BidexError, shortened, unknown_name, whole_number
 
 _MODES = {"SAME_STEP": AutoresetMode.SAME_STEP, "DISABLED": AutoresetMode.DISABLED}
 
@@ -33,6 +34,8 @@ def reset_mask(options: dict[str, Any] | None, num_envs: int, device: torch.devi
         BidexError: Another option, a mask of another shape or dtype, or one with false entries before the first full
             reset.
     """
+    if options is not None and not isinstance(options, Mapping):
+        raise BidexError(f"Expected reset options as a dict, got {shortened(options)}. Leave options out.")
     if unknown := sorted(map(str, (options or {}).keys() - {"reset_mask"})):
         raise BidexError(
             f"Expected no reset option but reset_mask, got {', '.join(unknown)}. To start some rows alone give a bool "

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.engine.health import checked_state
-from bidex_meta.errors import BidexError, unknown_name, whole_number
+from bidex_meta.errors import BidexError, shortened, unknown_name, whole_number
 from bidex_meta.world.groups import Slot, with_pool
 from bidex_meta.world.observations import Rule
 
@@ -106,6 +106,10 @@ def state(given: Any, own: Mapping[str, Any], slots: Sequence[Slot], task_id: Te
 
 
 def _alike(own: Mapping[str, Any], given: Mapping[str, Any]) -> None:
+    if not isinstance(given["slots"], list) or not all(isinstance(name, str) for name in given["slots"]):
+        raise BidexError(
+            f"Expected the names of a world's slots in its state, got {shortened(given['slots'])}; {_AGAIN}"
+        )
     there = given["slots"], tuple(getattr(given["observation"], "shape", ()))
     here = own["slots"], tuple(own["observation"].shape)
     if here != there or not isinstance(given["episodes"], Mapping):
@@ -119,5 +123,7 @@ def _tensor(name: str, given: object, own: Tensor) -> None:
     if not isinstance(given, Tensor) or given.shape != own.shape or given.dtype != own.dtype:
         got = f"{given.dtype} {tuple(given.shape)}" if isinstance(given, Tensor) else type(given).__name__
         raise BidexError(f"Expected {name} of a world's state as {own.dtype} {tuple(own.shape)}, got {got}; {_AGAIN}")
+    if given.requires_grad:
+        raise BidexError(f"Expected {name} of a world's state without gradients; detach it.")
     if not bool(given.isfinite().all()):
         raise BidexError(f"Expected finite numbers in {name} of a world's state, got others; take an older state.")

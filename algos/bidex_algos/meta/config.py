@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
-from bidex_algos.checks import at_least, between, positive, rising
+from bidex_algos.checks import at_least, between, network_bytes, positive, rising, types
 from bidex_algos.choices import Activation, Adapted
 
 
@@ -53,12 +53,23 @@ class MetaConfig:
         Raises:
             BidexError: A field is out of its range.
         """
+        types(self)
         at_least(self, 1, "tasks_per_class", "max_adapt_steps", "inner_steps")
         if self.slice_steps is not None:
             at_least(self, 1, "slice_steps")
         between(self, 0.0, 1.0, "gamma", "lam")
         positive(self, "inner_learning_rate", "init_std")
         rising(self, "std_range")
+
+    def bytes_held(self, rows: int, width: int) -> int:
+        """About how much memory a learner takes on so many rows.
+
+        Args:
+            rows: Rows of its world.
+            width: Numbers that are kept of a step of a row.
+        """
+        steps = (self.slice_steps or self.max_adapt_steps) * (1 + self.inner_steps)
+        return 4 * rows * width * steps + network_bytes(self.hidden, width, 2)
 
 
 class OuterConfig(MetaConfig):

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from bidex_algos.checks import at_least, between, positive, rising
+from bidex_algos.checks import at_least, between, network_bytes, positive, rising, types
 from bidex_algos.choices import Activation
 from bidex_algos.onpolicy.ppo_config import PPOConfig
 from bidex_meta.errors import BidexError
@@ -64,6 +64,7 @@ class RL2Config(PPOConfig, TrialConfig):
         Raises:
             BidexError: A field is out of its range.
         """
+        types(self)
         self._check_ppo()
         at_least(self, 1, "memory", "episodes_per_trial", "max_adapt_steps", "chunk")
         between(self, 0.0, 1.0, "gamma", "lam", "blind_share")
@@ -71,6 +72,17 @@ class RL2Config(PPOConfig, TrialConfig):
         rising(self, "std_range")
         if not self.hidden:
             raise BidexError("rl2: hidden must name at least one layer, got none.")
+
+    def bytes_held(self, rows: int, width: int) -> int:
+        """About how much memory a learner takes on so many rows.
+
+        Args:
+            rows: Rows of its world.
+            width: Numbers that are kept of a step of a row.
+        """
+        steps = self.episodes_per_trial * self.max_adapt_steps
+        memory = 4 * 4 * 2 * 3 * self.memory * (self.memory + (self.hidden[-1]))
+        return 4 * rows * width * steps + network_bytes(self.hidden, width, 2) + memory
 
 
 PRESETS: dict[str, RL2Config] = {

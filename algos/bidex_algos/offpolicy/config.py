@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from bidex_algos.checks import at_least, between, positive
+from bidex_algos.checks import at_least, between, network_bytes, positive, types
 from bidex_algos.choices import Activation, Autocast
 from bidex_meta.errors import BidexError
 
@@ -72,6 +72,7 @@ class OffPolicyConfig:
         Raises:
             BidexError: A field is out of its range.
         """
+        types(self)
         at_least(self, 1, "replay_steps", "steps_per_iteration", "updates_per_step", "batch_size")
         if self.batch_per_task is not None:
             at_least(self, 1, "batch_per_task")
@@ -80,3 +81,13 @@ class OffPolicyConfig:
             raise BidexError(f"{self.algo}: gamma must lie in [0, 1), got {self.gamma}.")
         between(self, 0.0, 1.0, "tau", "cut_share")
         positive(self, "tau", "cut_share", "replay_memory", "max_grad_norm")
+
+    def bytes_held(self, rows: int, width: int) -> int:
+        """About how much memory a learner takes on so many rows.
+
+        Args:
+            rows: Rows of its world.
+            width: Numbers that are kept of a step of a row.
+        """
+        replay = min(self.replay_memory * 1e9, 4 * rows * width * self.replay_steps)
+        return int(replay) + network_bytes(self.hidden, width, 3)

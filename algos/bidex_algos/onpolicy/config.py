@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from bidex_algos.checks import at_least, between, positive, rising
+from bidex_algos.checks import at_least, between, network_bytes, positive, rising, types
 from bidex_algos.choices import Activation, Autocast
 
 
@@ -52,11 +52,21 @@ class OnPolicyConfig:
         Raises:
             BidexError: A field is out of its range.
         """
+        types(self)
         at_least(self, 1, "rollout_steps")
         at_least(self, 0, "task_embedding")
         between(self, 0.0, 1.0, "gamma", "lam")
         rising(self, "std_range")
         positive(self, "init_std", "value_horizon")
+
+    def bytes_held(self, rows: int, width: int) -> int:
+        """About how much memory a learner takes on so many rows.
+
+        Args:
+            rows: Rows of its world.
+            width: Numbers that are kept of a step of a row.
+        """
+        return 4 * rows * width * self.rollout_steps + network_bytes(self.hidden, width, 2)
 
 
 TABLE_47: dict[str, Any] = {

@@ -1,0 +1,55 @@
+"""What a world, a replay or a network will take, told before it is taken: a system out of memory ends others' work."""
+
+import os
+from pathlib import Path
+
+from bidex_meta.errors import BidexError
+
+ROW_BYTES = 500_000
+"""Of a row of a world on the CPU: measured 0.39 MB on MT4 and 0.48 on MT20, with 1000 rows each."""
+
+
+def available() -> int | None:
+    """Bytes that can still be had, by the system and by the container's limit; None where neither is told."""
+    found = [amount for amount in (_of_system(), _of_container()) if amount is not None]
+    return min(found, default=None)
+
+
+def check_memory(needed: float, what: str, mend: str) -> None:
+    """Refuses what does not fit.
+
+    Args:
+        needed: Bytes, estimated.
+        what: What takes them: ``"1,000 rows"``.
+        mend: What to ask for instead, after the error's sentence.
+
+    Raises:
+        BidexError: There are fewer.
+    """
+    there = available()
+    if there is not None and needed > there:
+        raise BidexError(f"{what} would take about {needed / 1e9:,.1f} GB, and {there / 1e9:,.1f} are free. {mend}")
+
+
+def _of_system() -> int | None:
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        kilobytes = {line.split(":")[0]: int(line.split()[1]) for line in lines if line.split()}
+        return 1024 * (kilobytes["MemAvailable"] + kilobytes.get("SwapFree", 0))
+    except (OSError, KeyError, ValueError, IndexError):
+        pass
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):
+        return None
+
+
+def _of_container() -> int | None:
+    """What a control group still gives (version 2)."""
+    group = Path("/sys/fs/cgroup")
+    try:
+        limit, used = (int((group / f"memory.{name}").read_text()) for name in ("max", "current"))
+        stat = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+        return limit - used + int(stat.get("inactive_file", 0))  # pages of files are given back
+    except (OSError, ValueError):
+        return None

@@ -1,0 +1,208 @@
+"""The one door for files that somebody else may have written or damaged: opened, bounded, parsed and checked here.
+
+Whatever is wrong with a file is one line: it is a folder, a pipe, a loop of links, too large, not UTF-8, cut off,
+nested too deep, or its numbers cannot be. Nothing is read that is larger than its kind can be, and nothing waits for a
+writer.
+"""
+
+import json
+import os
+import stat
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+from bidex_meta.errors import BidexError, one_line, shortened
+
+MOST_TEXT = 64_000_000
+"""Bytes of a file of JSON or TOML: far above the largest evaluation."""
+_DEEPEST = 64
+_LARGEST = 2**63 - 1
+"""Whole numbers beyond are no count, step or seed of ours; and Python takes long for some thousand digits."""
+
+
+def expanded(path: str | Path) -> Path:
+    """A path with ``~`` and ``~name`` replaced.
+
+    Raises:
+        BidexError: There is no such user, or nobody knows the home folder.
+    """
+    try:
+        return Path(path).expanduser()
+    except RuntimeError as error:
+        raise BidexError(f"{shortened(str(path))}: {error}. Write the whole path.") from None
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is a regular file; false, not an error, for a path that cannot be one."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def exists(path: Path) -> bool:
+    """Whether there is anything, a link that leads nowhere too; false for a path that cannot be one."""
+    try:
+        return os.path.lexists(path)
+    except (OSError, ValueError):
+        return False
+
+
+def open_regular(path: Path, what: str, most: int | None = None) -> IO[bytes]:
+    """Opens a regular file for reading.
+
+    Args:
+        path: The file.
+        what: What it should be, for messages: ``"a run's config"``.
+        most: Bytes that it may have at most.
+
+    Raises:
+        BidexError: There is none, it cannot be read, it is something else than a file, or it is too large.
+    """
+    try:
+        # Opening a pipe would wait for somebody to write into it.
+        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0))
+    except (OSError, ValueError) as error:  # ValueError: a path with a zero byte
+        reason = getattr(error, "strerror", None) or str(error)
+        raise BidexError(f"Expected {what} at {path}, but {reason}. Mend the path or the file.") from None
+    try:
+        found = os.fstat(handle)
+        if not stat.S_ISREG(found.st_mode):
+            kind = "a folder" if stat.S_ISDIR(found.st_mode) else "a pipe or a device"
+            raise BidexError(f"Expected {what} at {path}, got {kind}. Name a file.")
+        if most is not None and found.st_size > most:
+            raise BidexError(f"Expected {what} of at most {most:,} bytes at {path}, got {found.st_size:,}.")
+        return os.fdopen(handle, "rb")
+    except BaseException:
+        os.close(handle)
+        raise
+
+
+def read_bytes(path: Path, what: str, most: int = MOST_TEXT) -> bytes:
+    """A file's content; see :func:`open_regular`."""
+    with open_regular(path, what, most) as file:
+        try:
+            return file.read(most + 1)
+        except OSError as error:
+            raise BidexError(f"{path}: {what} cannot be read ({error.strerror or error}).") from None
+
+
+def read_text(path: Path, what: str) -> str:
+    """A file's content in UTF-8.
+
+    Raises:
+        BidexError: As :func:`open_regular`, or it is not UTF-8.
+    """
+    try:
+        return read_bytes(path, what).decode()
+    except UnicodeDecodeError as error:
+        raise BidexError(f"{path}: expected {what} in UTF-8, but {error.reason} at byte {error.start}.") from None
+
+
+def read_json(path: Path, what: str) -> Any:
+    """What a file of JSON holds.
+
+    Raises:
+        BidexError: As :func:`read_text`, or it is not JSON, is nested too deep or holds a number that cannot be.
+    """
+    return _parsed(path, what, "JSON", json.loads)
+
+
+def read_toml(path: Path, what: str) -> dict[str, Any]:
+    """What a file of TOML holds; errors as of :func:`read_json`."""
+    return _parsed(path, what, "TOML", tomllib.loads)
+
+
+def _parsed(path: Path, what: str, language: str, parse: Callable[[str], Any]) -> Any:
+    text = read_text(path, what)
+    try:
+        return bounded(parse(text))
+    except RecursionError:
+        raise BidexError(f"{path}: expected {what}, but it is nested more than {_DEEPEST} deep.") from None
+    except ValueError as error:  # both parsers' errors are; so is Python's refusal of numbers with too many digits
+        raise BidexError(f"{path}: expected {what} in {language}, but {one_line(error)[:200].rstrip('.')}.") from None
+
+
+def bounded(content: Any) -> Any:
+    """The same content.
+
+    Raises:
+        ValueError: It is nested too deep, or holds a whole number beyond 64 bits.
+    """
+    level = [content]
+    for _ in range(_DEEPEST):
+        if not level:
+            return content
+        for value in level:
+            if isinstance(value, int) and abs(value) > _LARGEST:
+                raise ValueError(f"a number has more than {len(str(_LARGEST)) - 1} digits")
+        inner = [value for value in level if isinstance(value, dict | list)]
+        level = [each for value in inner for each in (value.values() if isinstance(value, dict) else value)]
+    raise ValueError(f"it is nested more than {_DEEPEST} deep")
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What a value in a file must be."""
+
+    told: str
+    """In words, after "expected"."""
+    fits: Callable[[Any], bool]
+    """Whether a value is so."""
+
+    def or_none(self) -> "Rule":
+        """The same, or null."""
+        return Rule(f"{self.told} or null", lambda value: value is None or self.fits(value))
+
+    def each(self) -> "Rule":
+        """A table whose values are all so."""
+        return Rule(
+            f"a table of which each value is {self.told}",
+            lambda value: isinstance(value, dict) and all(map(self.fits, value.values())),
+        )
+
+
+def whole(least: int, most: int = _LARGEST) -> Rule:
+    """A whole number within bounds."""
+    return Rule(f"a whole number from {least} to {most}", lambda value: type(value) is int and least <= value <= most)
+
+
+def number(low: float = -float("inf"), high: float = float("inf")) -> Rule:
+    """A number within bounds, finite where they are."""
+    told = "a number" if low == -high == -float("inf") else f"a number from {low:g} to {high:g}"
+    return Rule(told, lambda value: type(value) in (int, float) and low <= value <= high)
+
+
+def choice(*choices: str) -> Rule:
+    """One of these texts."""
+    return Rule(" or ".join(choices), lambda value: isinstance(value, str) and value in choices)
+
+
+TEXT = Rule("a text", lambda value: isinstance(value, str) and 0 < len(value) <= 4096 and "\0" not in value)
+TABLE = Rule("a table", lambda value: isinstance(value, dict))
+
+
+def check(content: Any, rules: Mapping[str, Rule], path: Path, needed: tuple[str, ...] = (), place: str = "") -> None:
+    """Refuses content whose entries are not what they must be.
+
+    Args:
+        content: A table as it was read.
+        rules: What its entries must be, where they are there.
+        path: Its file, for messages.
+        needed: Entries that must be there.
+        place: Where in the file the table stands, ending in a dot, for messages.
+
+    Raises:
+        BidexError: Told of the first that is not so.
+    """
+    if not isinstance(content, dict):
+        raise BidexError(f"{path}: {place.rstrip('.') or 'content'}: expected a table, got {shortened(content)}.")
+    missing = [name for name in needed if name not in content]
+    if missing:
+        raise BidexError(f"{path}: {place}{missing[0]}: expected it to be there, found none.")
+    for name, rule in rules.items():
+        if name in content and not rule.fits(content[name]):
+            raise BidexError(f"{path}: {place}{name}: expected {rule.told}, got {shortened(content[name])}.")

@@ -1,0 +1,53 @@
+"""Command lines in this process, in a folder with a few things in it, where no world can be built."""
+
+import contextlib
+import io
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from bidex_meta.cli import main
+from bidex_meta.clients import metaworld_world
+from bidex_meta.world import world as world_module
+
+
+class Built(BaseException):
+    """A world was asked for: nothing was wrong with the command line, as far as can be told before."""
+
+
+def working_folder(folder: Path, patch: pytest.MonkeyPatch) -> Path:
+    """Fills a folder and goes there; until the patch ends no command builds a world, draws or takes long."""
+    (folder / "loop.toml").symlink_to("loop.toml")
+    (folder / "folder.toml").mkdir()
+    (folder / "empty.toml").touch()
+    (folder / "empty").mkdir()
+    (folder / "torn" / "checkpoints").mkdir(parents=True)
+    (folder / "torn" / "metrics.jsonl").touch()
+    for name, run in (("run", "mtppo"), ("meta", "promp")):
+        shutil.copytree(Path(__file__).parents[1] / "data" / "old_runs" / run, folder / name)
+
+    def built(*_: object, **__: object) -> None:
+        raise Built
+
+    patch.chdir(folder)
+    patch.setattr(world_module.World, "__init__", built)
+    patch.setattr(metaworld_world.MetaWorldWorld, "__init__", built)
+    for what in ("draw_learning", "draw_adaptation", "missing"):  # drawing takes a second
+        patch.setattr(f"bidex_meta.record.plots.{what}", built)
+    # What these measure is another project's, or trains on made-up numbers.
+    patch.setattr("bidex_meta.commands.bench._measurement", lambda what: lambda suite=None, num_envs=1, steps=1: {})
+    return folder
+
+
+def called(arguments: list[str]) -> SimpleNamespace:
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code: object = main(arguments)
+        except SystemExit as stop:
+            code = stop.code
+        except Built:
+            code = "built"
+    return SimpleNamespace(code=code, out=out.getvalue(), err=err.getvalue())

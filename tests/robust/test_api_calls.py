@@ -1,0 +1,125 @@
+"""Odd arguments of the public functions, drawn by hypothesis: a result, or one line that says what is wrong."""
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from bidex_meta import Benchmark
+from bidex_meta.benchmark import Task, make_task_world
+from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.play import evaluate
+from bidex_meta.evaluation.untrained import ZeroAgent
+from bidex_meta.suite import load_suite
+
+ROWS = 2
+NAN = float("nan")
+ODD = (
+    None, True, -1, 0, 1, 2.5, NAN, 1e308, 10**30, "", "x" * 300, "\0", "cpu", "cuda:7", "MT4", "a\nb", b"x", [],
+    [1, "a"], {}, {"a": 1}, (), object(), np.zeros(3), np.full((ROWS, 2), NAN), torch.zeros(0),
+    torch.full((ROWS, 3), NAN), torch.ones(ROWS, 40), torch.full((ROWS, 40), NAN),
+    torch.zeros(ROWS, 40, requires_grad=True), torch.zeros(ROWS, 40, dtype=torch.int8), range(3), np.float32(1),
+    np.int64(2), np.array("x"), [NAN], [[0.0] * 40] * ROWS,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def world():
+    made = make_task_world("HandOver", ROWS, "cpu", autoreset_mode="DISABLED", threads=1)
+    made.reset(seed=0)
+    yield made
+    made.close()
+
+
+def draws(count: int, check: Callable[..., None], *strategies: st.SearchStrategy[Any]) -> None:
+    @settings(max_examples=count, database=None, suppress_health_check=list(HealthCheck))
+    @given(st.tuples(*strategies))
+    def run(drawn: tuple[Any, ...]) -> None:
+        try:
+            check(*drawn)
+        except BidexError as error:
+            assert str(error).strip() and "\n" not in str(error)
+
+    run()
+
+
+odd = st.sampled_from(ODD)
+
+
+def test_benchmarks_and_suites() -> None:
+    draws(100, lambda name, seed: Benchmark(name, seed=seed), odd, odd)
+    draws(60, lambda seed: Benchmark("MT1", seed=seed), odd)
+    draws(40, load_suite, odd)
+
+
+def test_making_worlds() -> None:
+    names = ("num_envs", "device", "seed", "autoreset_mode", "threads", "engine", "split")
+    benchmark = Benchmark("MT1")
+
+    def make(name: str, value: Any) -> None:
+        given = {"num_envs": 5, "device": "cpu", "threads": 1, name: value}
+        if (type(value) in (int, np.int64) and name == "num_envs" and 0 < value < 100) or value in (None, True):
+            return
+        benchmark.make_world(**given).close()
+
+    def safe(name: str, value: Any) -> None:
+        if isinstance(value, np.ndarray | torch.Tensor) or value is None:
+            value = str(value)
+        make(name, value)
+
+    draws(80, safe, st.sampled_from(names), odd)
+    draws(40, lambda name: make_task_world(name, 1, "cpu", threads=1).close(), odd)
+
+
+def test_steps_resets_and_pools(world: Any) -> None:
+    draws(150, lambda actions: world.step(actions), odd)
+    draws(80, lambda seed: world.reset(seed=seed), odd)
+    draws(50, lambda options: world.reset(seed=0, options=options), odd)
+    draws(120, lambda tasks: world.set_tasks(tasks), odd)
+    draws(60, lambda tasks: world.set_tasks([tasks]), odd)
+    world.reset(seed=0)
+    obs, reward, *_ = world.step(torch.zeros(ROWS, 40))
+    assert torch.isfinite(obs).all() and torch.isfinite(reward).all()
+
+
+def test_saved_states(world: Any) -> None:
+    world.reset(seed=0)
+    good = world.state_dict()
+
+    def load(which: float, value: Any, gone: bool) -> None:
+        state = copy.deepcopy(good)
+        places = list(_places(state))
+        inside, key = places[int(which * len(places))]
+        if gone and isinstance(inside, dict):
+            del inside[key]
+        else:
+            inside[key] = value
+        world.load_state_dict(state)
+
+    draws(150, load, st.floats(0, 1, exclude_max=True), odd, st.booleans())
+    draws(30, world.load_state_dict, odd)
+    world.load_state_dict(good)
+    assert torch.isfinite(world.step(torch.zeros(ROWS, 40))[0]).all()
+
+
+def _places(content: Any):
+    for key in content if isinstance(content, dict) else range(len(content)):
+        yield content, key
+        if isinstance(content[key], dict | list) and len(content[key]):
+            yield from _places(content[key])
+
+
+def test_evaluations_and_tasks(world: Any) -> None:
+    agent = ZeroAgent(world.action_space)
+    draws(40, lambda n: evaluate(agent, world, n), odd.filter(_no_real_count))
+    draws(40, lambda seed: evaluate(agent, object(), 1, seed=seed), odd)
+    draws(40, lambda data: Task("HandOver", data).variation, odd)
+
+
+def _no_real_count(value: Any) -> bool:
+    return not isinstance(value, int | np.integer)

@@ -1,0 +1,120 @@
+"""Odd command lines, drawn by hypothesis: exit code 0, or one line and 2 before a world is built; nothing is left."""
+
+import os
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from tests.robust.damage import listing
+from tests.robust.lines import called, working_folder
+
+VALUES = (
+    "", "0", "1", "2", "-1", "1.5", "1e9", "-1e9", "nan", "inf", "-inf", "9" * 30, "9" * 5000, "1e400", "0x10",
+    "None", "true", "[/x]", "\x1b[31mred", "\udc80", "näme", "x" * 256, "x" * 5000, "/", "..", ".", "~",
+    "~nobody/x.toml", "/dev/null", "/dev/zero", "/proc/self/mem", "no/such/folder/x", "-", "--", "=", "MT4", "mt20",
+    "ML4", "MT5", "metaworld/MT3", "HandOver", "handover", "mtppo", "rl2", "os:system", "nowhere.x:Y", ":", "auto",
+    "cpu", "cuda:7", "c", "warp", "paper", "laptop", "random", "zero", "train", "test", "last", "best", "front",
+    "suites", "expert", "world", "gpu", "loop.toml", "folder.toml", "empty.toml", "x.png", "x.mp4", "x.json",
+    "a/b.png", "run", "meta", "torn", "empty",
+)  # fmt: skip
+FLAGS = {
+    "run": "suite task base algo preset num-envs steps minutes seed device engine threads start-from run-dir resume "
+    "episodes evaluate-every video-every logger learner.hidden learner.gamma learner.std-range learner.rollout-steps "
+    "learner.learning-rate learner.clip learner.activation learner.num-minibatches learner.replay-memory",
+    "evaluate": "checkpoint episodes split shots rollouts tasks trials seed num-envs device engine",
+    "control": "trials episodes shots rollouts num-envs seed device engine",
+    "compare": "out json",
+    "plot": "evaluation out",
+    "report": "out",
+    "render": "task out policy checkpoint suite seed steps every width height camera",
+    "witness": "task tries file improve steady out camera threads planner.samples planner.horizon planner.std",
+    "baseline": "suite episodes seed threads runs out",
+    "list": "",
+    "completion": "",
+    "bench": "suite task tasks sizes out num-envs steps repeats threads device engine seed",
+}
+SWITCHES = {
+    "run": ["--print-config", "--no-evaluate"],
+    "evaluate": ["--random", "--json"],
+    "plot": ["--adaptation"],
+    "render": ["--tiled"],
+    "witness": ["--all", "--find", "--script", "--json"],
+    "bench": ["--learning", "--classes", "--json"],
+}
+PLACED = {"list": 1, "bench": 1, "baseline": 1, "evaluate": 1, "control": 1, "compare": 2, "plot": 1, "report": 1}
+"""Words before the flags."""
+
+
+NAMED = ("list", "bench", "baseline")
+"""Commands whose first word is no run folder."""
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory):
+    with pytest.MonkeyPatch.context() as patch:
+        yield working_folder(tmp_path_factory.mktemp("fuzz"), patch)
+
+
+def lines(command: str) -> st.SearchStrategy[list[str]]:
+    value = st.sampled_from(VALUES)
+    flags = [f"--{name}" for name in FLAGS[command].split()]
+    parts = [st.builds(lambda text: [text], value)]
+    if flags:
+        flag = st.sampled_from(flags)
+        parts += [st.tuples(flag, value).map(list), st.tuples(flag, value).map(lambda pair: ["=".join(pair)])] * 2
+    if command in SWITCHES:
+        parts.append(st.sampled_from(SWITCHES[command]).map(lambda word: [word]))
+    odd = st.lists(st.one_of(parts), max_size=4).map(lambda chosen: [word for part in chosen for word in part])
+    place = (
+        st.one_of(st.sampled_from(("run", "meta")), value) if PLACED.get(command) and command not in NAMED else value
+    )
+    first = st.lists(place, min_size=PLACED.get(command, 0), max_size=PLACED.get(command, 0))
+    base = ["--print-config", "--suite", "MT4", "--device", "cpu"] if command == "run" else []
+    return st.tuples(first, odd).map(lambda words: [command, *words[0], *base, *words[1]])
+
+
+def judge(arguments: list[str], place: Path) -> None:
+    before, began = listing(place), time.monotonic()
+    done = called(arguments)
+    told = done.err.strip().splitlines()
+    assert time.monotonic() - began < 20.0, arguments
+    assert done.code in (0, None, 2, "built"), (arguments, done)
+    assert "Traceback" not in done.err
+    if done.code == 2:
+        assert told and told[-1].startswith("bidex-meta: "), (arguments, done)
+        assert len(told) == 1 and len(told[0]) < 3000, (arguments, told)
+        assert "\x1b" not in done.err
+        assert listing(place) == before, arguments
+
+
+# So many of each, 2,000 in all; those that cost most least.
+COUNTS = {
+    "run": 400, "evaluate": 250, "control": 150, "compare": 150, "plot": 150, "report": 100, "render": 250,
+    "witness": 250, "baseline": 150, "list": 50, "completion": 20, "bench": 80,
+}  # fmt: skip
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs pipes and links")
+@pytest.mark.parametrize("command", COUNTS)
+def test_odd_command_lines(command: str, place: Path) -> None:
+    @settings(max_examples=COUNTS[command], database=None, suppress_health_check=list(HealthCheck))
+    @given(lines(command))
+    @example([command, ""])
+    def run(arguments: list[str]) -> None:
+        judge(arguments, place)
+
+    run()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", COUNTS)
+def test_many_odd_command_lines(command: str, place: Path) -> None:
+    @settings(max_examples=10 * COUNTS[command], database=None, suppress_health_check=list(HealthCheck))
+    @given(lines(command))
+    def run(arguments: list[str]) -> None:
+        judge(arguments, place)
+
+    run()

@@ -1,0 +1,266 @@
+"""Damaged and foreign files, drawn by hypothesis: each is told in one line, or read as it was; no line is lost."""
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from bidex_meta.benchmark import Benchmark
+from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.references import load_from
+from bidex_meta.paths import assets_dir, suites_dir
+from bidex_meta.record import Checkpoints, RunFolder, mend
+from bidex_meta.record.schemas import read_evaluation, read_versions
+from bidex_meta.witness.store import load_witness
+from tests.robust.damage import NO_FILES, listing, of_bytes, of_values, remove, replace
+from tests.robust.lines import called, working_folder
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs pipes and links")
+RUN = Path(__file__).parents[1] / "data" / "old_runs" / "mtppo"
+ROW = {"success": 0.5, "success_interval": [0.1, 0.9], "return": 1.0, "return_interval": None, "score": 3.0}
+PART = {"classes": {"A": ROW, "B": ROW}}
+META = {"steps": 8, "splits": {"test": {"before": PART, "after": PART, "by_shot": [PART, PART]}}}
+
+
+def draws(count: int, damage: st.SearchStrategy[Any], check: Callable[[Any], None]) -> None:
+    @settings(max_examples=count, database=None, suppress_health_check=list(HealthCheck))
+    @given(damage)
+    def run(drawn: Any) -> None:
+        check(drawn)
+
+    run()
+
+
+def one_line_or(read: Callable[[], Any]) -> Any:
+    """What a reader gives, or None where it refuses in one line."""
+    try:
+        return read()
+    except BidexError as error:
+        assert str(error).strip() and "\n" not in str(error) and len(str(error)) < 3000
+        return None
+
+
+def test_configs_of_a_run_that_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    place = working_folder(tmp_path, monkeypatch)
+    path = place / "run" / "config.json"
+    whole = path.read_bytes()
+
+    def check(drawn: Any) -> None:
+        remove(path)
+        if isinstance(drawn, str):
+            replace(path, drawn)
+        else:
+            path.write_bytes(drawn[1](whole))
+        before = listing(place)
+        for words in (
+            ["run", "--resume", "run", "--print-config"],
+            ["evaluate", "run"],
+            ["compare", "run"],
+            ["plot", "run"],
+        ):
+            done = called(words)
+            assert done.code in (0, 2, "built"), (words, done)
+            assert done.code != 2 or len(done.err.strip().splitlines()) == 1, done
+        assert listing(place) == before
+
+    try:
+        draws(300, st.one_of(of_bytes(), of_values(), st.sampled_from(NO_FILES)), check)
+    finally:
+        remove(path)
+        path.write_bytes(whole)
+
+
+@pytest.mark.parametrize("content", [META, {"steps": 8, "policy": PART}], ids=["meta-test", "policy"])
+def test_evaluations(content: dict[str, Any], tmp_path: Path) -> None:
+    path, whole = tmp_path / "evaluation.json", json.dumps(content).encode()
+
+    def check(drawn: Any) -> None:
+        if isinstance(drawn, str):
+            replace(path, drawn)
+        else:
+            remove(path)
+            path.write_bytes(drawn[1](whole))
+        found = one_line_or(lambda: read_evaluation(path, "again"))
+        if found is not None:  # then all that is read of it has its type
+            parts = found["splits"].values() if "splits" in found else [{"after": found.get("policy", found)}]
+            for part in parts:
+                for row in part["after"]["classes"].values():
+                    assert all(type(row[name]) in (int, float) for name in ("success", "return"))
+                    assert row["score"] is None or type(row["score"]) in (int, float)
+
+    draws(150, st.one_of(of_bytes(), of_values(), st.sampled_from(NO_FILES)), check)
+
+
+def test_versions_and_references(tmp_path: Path) -> None:
+    sources = {"versions.json": (RUN / "versions.json").read_bytes()}
+    sources["random.json"] = (assets_dir() / "references" / "random.json").read_bytes()
+    readers = {"versions.json": lambda path: read_versions(path.parent), "random.json": load_from}
+
+    def check(drawn: Any) -> None:
+        for name, whole in sources.items():
+            path = tmp_path / name
+            if isinstance(drawn, str):
+                replace(path, drawn)
+            else:
+                remove(path)
+                path.write_bytes(drawn[1](whole))
+            assert (
+                one_line_or(lambda path=path, name=name: readers[name](path)) is None
+                or path.is_file()
+                or drawn == "gone"
+            )
+
+    draws(150, st.one_of(of_bytes(), of_values(), st.sampled_from(NO_FILES)), check)
+
+
+def test_no_good_line_of_metrics_is_lost(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    lines = [json.dumps({"step": 10 * i, "time": 1.0, "Perf/training_time": 0.5 * i}).encode() for i in range(1, 9)]
+
+    def check(drawn: Any) -> None:
+        shutil.rmtree(tmp_path)
+        tmp_path.mkdir()
+        if isinstance(drawn, str):
+            replace(path, drawn)
+            good: list[bytes] = []
+        else:
+            path.write_bytes(drawn[1](b"\n".join(lines) + b"\n"))
+            present = path.read_bytes().split(b"\n")
+            good = [line for line in lines if line in present]
+        rows = mend(path, 80)
+        steps = [row["step"] for row in rows]
+        assert set(steps) >= {json.loads(line)["step"] for line in good}
+        if path.exists():
+            assert set(path.read_bytes().split(b"\n")) >= set(good)
+
+    draws(300, st.one_of(of_bytes(), st.sampled_from(NO_FILES)), check)
+
+
+def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, torch.Tensor):
+        return isinstance(b, torch.Tensor) and a.dtype == b.dtype and torch.equal(a, b)
+    if isinstance(a, dict):
+        return isinstance(b, dict) and a.keys() == b.keys() and all(_same(a[key], b[key]) for key in a)
+    if isinstance(a, list | tuple):
+        return type(a) is type(b) and len(a) == len(b) and all(map(_same, a, b))
+    return a == b
+
+
+def test_a_damaged_checkpoint_is_refused_or_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    checkpoints = Checkpoints(tmp_path)
+    state = {"w": torch.arange(300.0), "b": [torch.tensor(True), 3, "x"], "o": {"lr": 0.1, 0: (None, 2)}}
+    checkpoints.save(state, 7)
+    path, whole = tmp_path / "step_7.pt", (tmp_path / "step_7.pt").read_bytes()
+    checkpoints.last.unlink()
+    refused = 0
+
+    def check(drawn: Any) -> None:
+        nonlocal refused
+        if isinstance(drawn, str):
+            replace(path, drawn)
+        else:
+            remove(path)
+            path.write_bytes(drawn[1](whole))
+        found = one_line_or(checkpoints.load)
+        assert found is None or (found[1] == 7 and _same(found[0], state))
+        refused += found is None
+        assert capsys.readouterr().err.count("\n") <= 1
+
+    draws(500, st.one_of(of_bytes(), st.sampled_from(NO_FILES)), check)
+    assert refused > 200
+
+
+def test_an_unsealed_checkpoint_is_held_to_its_archives_checksums(tmp_path: Path) -> None:
+    checkpoints = Checkpoints(tmp_path)
+    state = {"w": torch.arange(3000.0)}
+    torch.save({"step": 7, "state": state}, tmp_path / "step_7.pt")
+    found = checkpoints.load()
+    assert found is not None and _same(found[0], state)
+    whole = (tmp_path / "step_7.pt").read_bytes()
+    first = whole.index(state["w"].numpy().tobytes()[400:800])
+    for place in range(first, first + 400, 7):
+        (tmp_path / "step_7.pt").write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
+        with pytest.raises(BidexError, match="None of the 1 checkpoints"):
+            checkpoints.load()
+
+
+def test_suites(tmp_path: Path) -> None:
+    path = tmp_path / "s.toml"
+    whole = (suites_dir() / "ML4.toml").read_bytes() + (suites_dir() / "MT1.toml").read_bytes()[:0]
+    words = [
+        b"1e308",
+        b"-1",
+        b"nan",
+        b"inf",
+        b"9" * 400,
+        b'"\\u001b[2J"',
+        b'"[/x]"',
+        b'""',
+        b"[]",
+        b"{}",
+        b"true",
+        b"x",
+    ]
+
+    def change(which: float, word: bytes) -> bytes:
+        lines = whole.split(b"\n")
+        places = [i for i, line in enumerate(lines) if b"=" in line]
+        place = places[int(which * len(places))]
+        lines[place] = lines[place].split(b"=")[0] + b"= " + word
+        return b"\n".join(lines)
+
+    values = st.builds(
+        lambda w, v: ("value", lambda _: change(w, v)), st.floats(0, 1, exclude_max=True), st.sampled_from(words)
+    )
+
+    def check(drawn: Any) -> None:
+        if isinstance(drawn, str):
+            replace(path, drawn)
+        else:
+            remove(path)
+            path.write_bytes(drawn[1](whole))
+        found = one_line_or(lambda: Benchmark(path))
+        if found is not None:
+            assert all(np.isfinite(task.variation).all() for task in found.train_tasks + found.test_tasks)
+
+    draws(300, st.one_of(of_bytes(), values, st.sampled_from(NO_FILES)), check)
+
+
+def test_witnesses(tmp_path: Path) -> None:
+    path, whole = tmp_path / "w.npz", (assets_dir() / "witnesses" / "HandOver.npz").read_bytes()
+    good = load_witness("HandOver")
+
+    def check(drawn: Any) -> None:
+        if isinstance(drawn, str):
+            replace(path, drawn)
+        else:
+            remove(path)
+            path.write_bytes(drawn[1](whole))
+        found = one_line_or(lambda: load_witness("HandOver", path))
+        # The archive's checksums hold what is inside.
+        assert found is None or (found.made == good.made and np.array_equal(found.actions, good.actions))
+
+    draws(150, st.one_of(of_bytes(), st.sampled_from(NO_FILES)), check)
+
+
+def test_links_in_a_run_folder_lead_nowhere(tmp_path: Path) -> None:
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    for name in (".a.tmp", "step_1.pt", "step_2.pt", "step_3.pt", "step_4.pt"):
+        (outside / name).write_text("precious")
+    run = Path(shutil.copytree(RUN, tmp_path / "run"))
+    shutil.rmtree(run / "checkpoints")
+    (run / "checkpoints").symlink_to(outside)
+    before = listing(outside)
+    for action in (RunFolder(run).check_own, lambda: RunFolder(run).checkpoints.save({}, 9)):
+        with pytest.raises(BidexError, match="is a link"):
+            action()
+    assert listing(outside) == before

@@ -1,0 +1,154 @@
+"""What happens to a run when its folder, its machine or its training goes wrong."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from bidex_meta.cli import main
+from bidex_meta.record import RunFolder
+from bidex_meta.sources.source import OwnSuite
+from tests.fakes import ToyWorld
+
+SMALL = ["--suite", "MT4", "--num-envs", "6", "--threads", "1", "--device", "cpu", "--learner.hidden", "8"]
+SMALL += ["--learner.rollout-steps", "4", "--no-evaluate"]
+
+
+@pytest.fixture
+def toy(monkeypatch: pytest.MonkeyPatch) -> None:
+    make = lambda source, split="train", rows=None, mode="DISABLED": ToyWorld(rows or 6, mode, source.seed)  # noqa: E731
+    monkeypatch.setattr(OwnSuite, "world", make)
+
+
+@pytest.fixture
+def run(toy: None, tmp_path: Path) -> Path:
+    assert main(["run", *SMALL, "--steps", "48", "--run-dir", str(tmp_path / "r")]) == 0
+    return tmp_path / "r"
+
+
+def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    capsys.readouterr()
+    assert main([str(word) for word in words]) in (1, 2)
+    return capsys.readouterr().err
+
+
+def test_a_failed_resume_changes_nothing(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for path in (run / "checkpoints").iterdir():
+        content = torch.load(path, weights_only=True)
+        content["state"]["learner"]["policy"]["weights"].popitem()
+        content.pop("digest"), content.pop("format")
+        torch.save(content, path)
+    before = (run / "config.json").read_text()
+    assert "does not fit its config" in refused(capsys, "run", "--resume", run, "--steps", "9999")
+    assert (run / "config.json").read_text() == before
+
+
+def test_two_processes_do_not_train_in_one_folder(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with RunFolder(run).locked():
+        assert "Another process trains in" in refused(capsys, "run", "--resume", run, "--steps", "96")
+    assert main(["run", "--resume", str(run), "--steps", "96", "--no-evaluate"]) == 0
+    assert not list(run.glob("*lock*"))
+
+
+def test_a_start_that_was_torn_begins_again(toy: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("checkpoints", "videos"):
+        (tmp_path / "r" / name).mkdir(parents=True)
+    (tmp_path / "r" / "metrics.jsonl").touch()
+    assert f"Begin again: --run-dir {tmp_path / 'r'}" in refused(capsys, "run", "--resume", tmp_path / "r")
+    assert main(["run", *SMALL, "--steps", "24", "--run-dir", str(tmp_path / "r")]) == 0
+
+
+def test_damaged_metrics_do_not_stop_a_run(run: Path) -> None:
+    path = run / "metrics.jsonl"
+    first, second = path.read_bytes().splitlines()
+    path.write_bytes(first + b"\n\xff{torn\nnull\n" + second + b"\n")
+    assert main(["run", "--resume", str(run), "--steps", "72", "--no-evaluate"]) == 0
+    assert path.read_bytes().splitlines()[:2] == [first, second] and len(path.read_bytes().splitlines()) == 3
+    assert b"null" in (run / "metrics.jsonl.damaged").read_bytes()
+
+
+def test_places_that_cannot_be_written_are_told_before_a_world_is_built(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(OwnSuite, "world", lambda *_: pytest.fail("a world was built"))
+    (tmp_path / "file").touch()
+    for folder in (tmp_path / "file" / "r", Path("/proc/r"), tmp_path / ("x" * 256), Path("/dev/null")):
+        assert refused(capsys, "run", *SMALL, "--run-dir", folder).count("\n") == 1
+    assert "would take about" in refused(capsys, "run", *SMALL, "--num-envs", "9000000")
+    assert "would take about" in refused(capsys, "run", *SMALL, "--learner.rollout-steps", "1000000000")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_divergence_ends_in_one_line(run: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+    from bidex_algos.onpolicy.mtppo import MTPPO
+
+    def diverge(learner: object) -> None:
+        raise FloatingPointError("mtppo: the loss is not finite after 48 steps; lower the step size.")
+
+    monkeypatch.setattr(MTPPO, "_iterate", diverge)
+    told = refused(capsys, "run", "--resume", run, "--steps", "96").splitlines()[-1]
+    assert told.startswith("bidex-meta: mtppo: the loss is not finite after 48 steps; lower the step size. What was")
+
+
+def test_a_full_disk_is_one_line(run: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device", "checkpoints/step_96.pt")
+
+    monkeypatch.setattr("bidex_meta.record.checkpoints.write_atomic", full)
+    told = refused(capsys, "run", "--resume", run, "--steps", "96").splitlines()[-1]
+    assert told.startswith("bidex-meta: checkpoints/step_96.pt: No space left on device.")
+
+
+def test_a_deleted_run_folder_is_one_line(run: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+    import shutil
+
+    from bidex_meta.record import Recorder
+
+    save = Recorder.save
+    monkeypatch.setattr(Recorder, "save", lambda *a: (shutil.rmtree(run), save(*a)))
+    told = refused(capsys, "run", "--resume", run, "--steps", "96").splitlines()[-1]
+    assert told.startswith("bidex-meta: ") and "No such file" in told
+
+
+_WAIT = """
+import sys, time
+from bidex_meta.cli import main
+from bidex_meta.sources.source import OwnSuite
+def world(*_):
+    print("building", flush=True)
+    time.sleep(60)
+OwnSuite.world = world
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_signal_before_training_is_one_line_and_leaves_nothing(number: int, code: int, tmp_path: Path) -> None:
+    command = [sys.executable, "-c", _WAIT, "run", *SMALL, "--run-dir", str(tmp_path / "r")]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None and process.stdout.readline() == "building\n"
+    time.sleep(0.1)
+    process.send_signal(number)
+    _, errors = process.communicate()
+    assert process.returncode == code and "Traceback" not in errors
+    assert errors.splitlines()[-1] in ("bidex-meta: stopped by SIGTERM.", "bidex-meta: interrupted.")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_names_are_text(tmp_path: Path, capsys: pytest.CaptureFixture[str], toy: None) -> None:
+    names = ["[/x]", "[red]", "a\x1b[2J"]
+    for seed in (0, 1):
+        config = {"suite": "MT4", "task": None, "algo": "mtppo", "seed": seed, "steps": 8, "num_envs": 4, "learner": {}}
+        folder = RunFolder.create(config, tmp_path / str(seed))
+        classes = {name: {"success": 0.5, "return": 1.0, "score": None} for name in names}
+        (folder.path / "evaluation.json").write_text(json.dumps({"policy": {"classes": classes}}))
+    assert main(["compare", str(tmp_path / "0"), str(tmp_path / "1")]) == 0
+    shown = capsys.readouterr().out
+    assert "[/x]" in shown and "[red]" in shown and "\x1b" not in shown
