@@ -12,7 +12,7 @@ from torch.testing import assert_close
 
 from bidex_algos.experience.n_step import Stretches
 from bidex_algos.experience.replay import Replay
-from bidex_algos.nets.categorical import Atoms
+from bidex_algos.nets.atoms import Atoms
 from bidex_algos.nets.encoders.task_embedding import TaskEmbedding
 from bidex_algos.nets.networks import MLP
 from bidex_algos.nets.residual import ResidualMLP

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.experience.replay import Transitions
-from bidex_algos.nets.categorical import Atoms
+from bidex_algos.nets.atoms import Atoms
 from bidex_algos.nets.encoders.inputs import Inputs
 from bidex_algos.nets.networks import MLP
 from bidex_algos.nets.precision import autocast
