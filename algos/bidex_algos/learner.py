@@ -68,7 +68,9 @@ class Learner(ABC):
         self.env_steps = 0
         self.shape = Shape.of(world)
         for option in ("policy_heads", "task_embedding"):
-            if getattr(config, option, False) and self.shape.num_id_columns != world.num_tasks:
+            # One task needs no embedding; heads it cannot have.
+            needed = world.num_tasks > 1 or option == "policy_heads"
+            if needed and getattr(config, option, False) and self.shape.num_id_columns != world.num_tasks:
                 raise BidexError(
                     f"{self.name}: {option} needs the one-hot of {world.num_tasks} tasks in the observation (an MT "
                     f"suite), this world shows {self.shape.num_id_columns} such entries. Leave {option} off."
@@ -91,7 +93,12 @@ class Learner(ABC):
     @classmethod
     def _inputs(cls, config: Any, shape: Shape) -> Inputs:
         """How its networks read an observation: the place for encoders of its groups."""
-        return with_task_embedding(Inputs(shape.groups), getattr(config, "task_embedding", 0))
+        return with_task_embedding(Inputs(shape.groups), cls._embedded(config, shape))
+
+    @staticmethod
+    def _embedded(config: Any, shape: Shape) -> int:
+        """Size of a task's embedding, 0 where there is none."""
+        return getattr(config, "task_embedding", 0) if shape.num_id_columns else 0
 
     @abstractmethod
     def _iterate(self) -> dict[str, float]:

@@ -32,6 +32,8 @@ ALGOS: dict[str, str] = {
     "mttrpo": "bidex_algos.onpolicy.mttrpo:MTTRPO",
     "mtsac": "bidex_algos.offpolicy.mtsac:MTSAC",
     "mttd3": "bidex_algos.offpolicy.td3:TD3",
+    "fasttd3": "bidex_algos.offpolicy.fasttd3:FastTD3",
+    "brc": "bidex_algos.offpolicy.brc:BRC",
     "promp": "bidex_algos.meta.promp:ProMP",
     "maml": "bidex_algos.meta.maml:MAML",
     "rl2": "bidex_algos.meta.rl2:RL2",

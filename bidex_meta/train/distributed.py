@@ -122,11 +122,20 @@ def on_loss(function: Callable[[], None]) -> None:
 
 def all_sum(x: Tensor) -> Tensor:
     """Sum of ``x`` (any shape, the same in all processes) over the processes."""
+    return _reduced(x, dist.ReduceOp.SUM)
+
+
+def all_max(x: Tensor) -> Tensor:
+    """The largest of each entry of ``x`` (any shape, the same in all processes) over the processes."""
+    return _reduced(x, dist.ReduceOp.MAX)
+
+
+def _reduced(x: Tensor, operation: Any) -> Tensor:
     if world_size() == 1:
         return x
     total = x.detach().clone()
     with _collective():
-        dist.all_reduce(total)
+        dist.all_reduce(total, operation)
     return total
 
 

@@ -133,8 +133,8 @@ def test_the_critics_target_is_that_of_the_definition():
         learner.log_alpha[1] = 0.4  # temperatures that differ
         for weight in learner.target_critic.parameters():
             weight.add_(0.05 * torch.randn(weight.shape, generator=torch.Generator().manual_seed(3)))
-    learner.return_stats.mean.copy_(torch.tensor([0.0, 10.0]))
-    learner.return_stats.var.copy_(torch.tensor([4.0, 0.0]))
+    learner.returns.stats.mean.copy_(torch.tensor([0.0, 10.0]))
+    learner.returns.stats.var.copy_(torch.tensor([4.0, 0.0]))
     first, following, final = torch.randn(3, 6, 3, generator=torch.Generator().manual_seed(1))
     learner.policy.observations.update(10 * first)
     reward = torch.arange(6.0) + 1
@@ -239,11 +239,11 @@ def test_rewards_are_scaled_by_the_deviation_of_discounted_returns():
     rewards = torch.tensor([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], [-1.0, 0.0, 1.0]])
     ended = torch.tensor([[False, True, False], [False] * 3, [False] * 3])
     for r, e in zip(rewards, ended, strict=True):
-        learner._note_returns(r, e, torch.ones(3, dtype=torch.bool))
+        learner.returns.note(r, e, torch.zeros(3).bool(), torch.zeros(3).bool())
     returns = torch.tensor([[1.0, 2.0, 3.0], [4.5, 5.0, 7.5], [1.25, 2.5, 4.75]]).double()
     scale = (returns.var(correction=0) + (0.1 * returns.mean()).square()).sqrt()
     assert_close(learner._reward_scale().double(), scale[None], rtol=1e-5, atol=0)
-    assert torch.equal(learner.discounted.double(), returns[2])
+    assert torch.equal(learner.returns.discounted.double(), returns[2])
 
 
 # Checkpoints.

@@ -29,6 +29,8 @@ class Transitions:
     """Observations after the step, of the same episode (B, d); read only where not terminated."""
     terminated: Tensor
     """Whether nothing follows, bool (B,). A time limit is not such an end."""
+    steps: Tensor | int = 1
+    """Steps from ``obs`` to ``next_obs``, one for all or (B,); ``rewards`` is then their discounted sum."""
 
 
 class Replay:
@@ -141,25 +143,31 @@ class Replay:
 
     def weights(self, places: Tensor) -> Tensor:
         """1, or 0 where physics broke or the last observation is no longer kept. Shape of ``places``, float32."""
-        cut = self._at("cut", places)
+        cut = self.at("cut", places)
         kept = (cut == 0) | (cut > self._cuts - self.cuts_kept)
-        return (self._at("valid", places) & kept).float()
+        return (self.at("valid", places) & kept).float()
 
-    def take(self, places: Tensor) -> Transitions:
-        """The transitions at ``places`` (B,)."""
+    def after(self, places: Tensor) -> Tensor:
+        """Where the row's next transition lies, in the shape of ``places``."""
+        return (places + self.rows) % (self.slots * self.rows)
+
+    def take(self, places: Tensor, last: Tensor | None = None) -> Transitions:
+        """The transitions at ``places`` (B,); with ``last`` they begin there and end as the ones at ``last``."""
+        last = places if last is None else last
         everything = self._obs.flatten(0, 1)
-        following = everything.index_select(0, (places + self.rows) % len(everything))
-        cut = self._at("cut", places)
+        following = everything.index_select(0, self.after(last))
+        cut = self.at("cut", last)
         final = self._final_obs.index_select(0, (cut - 1) % self.cuts_kept)
         return Transitions(
             obs=everything.index_select(0, places),
-            actions=self._at("actions", places),
-            rewards=self._at("rewards", places),
+            actions=self.at("actions", places),
+            rewards=self.at("rewards", places),
             next_obs=torch.where((cut > 0)[:, None], final, following),
-            terminated=self._at("terminated", places),
+            terminated=self.at("terminated", last),
         )
 
-    def _at(self, name: str, places: Tensor) -> Tensor:
+    def at(self, name: str, places: Tensor) -> Tensor:
+        """What was stored under a name at ``places``, in their shape: rewards, terminated, valid, cut."""
         return self._steps[name].flatten(0, 1)[places]
 
     # Checkpoints hold what is filled and no more.

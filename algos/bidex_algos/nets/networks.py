@@ -43,13 +43,13 @@ class MLP(nn.Module):
         layers: list[nn.Module] = []
         before = self.encoder.size
         for width in hidden:
-            layers.append(_linear(before, width, math.sqrt(2.0), generator))
+            layers.append(linear(before, width, math.sqrt(2.0), generator))
             if layer_norm:
                 layers.append(nn.LayerNorm(width))
             layers.append(ACTIVATIONS[activation]())
             before = width
         self.body = nn.Sequential(*layers)
-        self.head = _linear(before, outputs, output_gain, generator)
+        self.head = linear(before, outputs, output_gain, generator)
 
     def forward(self, x: Tensor) -> Tensor:
         """Maps (batch, inputs) to float32 (batch, outputs)."""
@@ -73,7 +73,7 @@ def stacked_forward(network: MLP, params: Mapping[str, Tensor], prefix: str, x: 
             network's serve all.
     """
 
-    def linear(name: str, x: Tensor) -> Tensor:
+    def stacked(name: str, x: Tensor) -> Tensor:
         weight, bias = params[f"{prefix}{name}.weight"], params[f"{prefix}{name}.bias"]
         if not f"{prefix}{name}.".startswith(own):
             return nn.functional.linear(x, weight[0], bias[0])
@@ -83,11 +83,12 @@ def stacked_forward(network: MLP, params: Mapping[str, Tensor], prefix: str, x: 
     for name, layer in network.body.named_children():
         if isinstance(layer, nn.LayerNorm):
             raise TypeError("stacked_forward knows no layer norm")
-        x = linear(f"body.{name}", x) if isinstance(layer, nn.Linear) else layer(x)
-    return linear("head", x)
+        x = stacked(f"body.{name}", x) if isinstance(layer, nn.Linear) else layer(x)
+    return stacked("head", x)
 
 
-def _linear(inputs: int, outputs: int, gain: float, generator: torch.Generator) -> nn.Linear:
+def linear(inputs: int, outputs: int, gain: float, generator: torch.Generator) -> nn.Linear:
+    """A layer with orthogonal weights of this gain, drawn from a CPU generator, and zero biases."""
     # Made without memory first: the default initialisation would draw from (and so disturb) the global generator.
     layer = nn.Linear(inputs, outputs, device="meta").to_empty(device="cpu")
     nn.init.orthogonal_(layer.weight, gain, generator=generator)

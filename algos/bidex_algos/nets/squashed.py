@@ -59,6 +59,7 @@ class SquashedActor(nn.Module):
         std_range: Its bounds.
         generator: CPU generator of the initial weights.
         activation: Name of the non-linearity.
+        network: What computes both.
     """
 
     def __init__(
@@ -71,13 +72,14 @@ class SquashedActor(nn.Module):
         std_range: tuple[float, float],
         generator: torch.Generator,
         activation: Activation,
+        network: type[MLP] = MLP,
     ):
         super().__init__()
         self.heads = heads
         self.one_hot = Inputs.of(inputs).columns(*["task_id"] * (heads > 1))
         low, high = (math.log(std) for std in std_range)
         self.middle, self.reach = 0.5 * (low + high), 0.5 * (high - low)
-        self.net = MLP(inputs, hidden, heads * 2 * actions, 0.01, generator, activation)
+        self.net = network(inputs, hidden, heads * 2 * actions, 0.01, generator, activation)
         with torch.no_grad():
             start = math.atanh((math.log(init_std) - self.middle) / self.reach)
             self.net.head.bias.view(heads, 2, actions)[:, 1] = start

@@ -18,15 +18,16 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.experience.advantages import task_moments
 from bidex_algos.experience.episodes import EpisodeStatistics
+from bidex_algos.experience.n_step import Stretches
 from bidex_algos.experience.replay import Transitions
 from bidex_algos.learner import Learner
-from bidex_algos.nets.normalise import RunningStats
+from bidex_algos.nets.encoders.inputs import Inputs
 from bidex_algos.nets.precision import autocast, use_bfloat16
 from bidex_algos.offpolicy.config import OffPolicyConfig
 from bidex_algos.offpolicy.critics import Critics
 from bidex_algos.offpolicy.replay_within import replay_within
+from bidex_algos.offpolicy.return_scale import ReturnScale
 from bidex_algos.reports import as_numbers
 from bidex_meta.train.distributed import all_sum, sum_gradients, world_size
 from bidex_meta.world.contract import VectorWorld
@@ -41,6 +42,7 @@ class OffPolicy(Learner):
     Attributes:
         policy: Has ``observations`` (normaliser) and ``actor`` (network), beside the methods of an agent.
         critic: ``num_critics`` networks (:class:`Critics`); ``target_critic`` follows them.
+        returns: How large those of each task are.
         adams: Optimisers by name; an algorithm may add some.
         batch_per_task: Transitions of each task in an update; B is ``num_tasks`` times as many, task after task.
         task_of_draw: Their tasks, int64 (B,).
@@ -52,13 +54,14 @@ class OffPolicy(Learner):
     config: OffPolicyConfig
     per_process = ("generator", "episodes", "replay", "discounted")
     num_critics: ClassVar[int] = 2
+    returns_type: ClassVar[type[ReturnScale]] = ReturnScale
 
     def __init__(self, world: VectorWorld, config: OffPolicyConfig, seed: int):
         super().__init__(world, config, seed)
         self.low_precision = use_bfloat16(config.autocast, self.device)
         judged = self.inputs.extended("action", self.shape.actions)
         heads = world.num_tasks if config.value_heads else 1
-        self.critic = Critics(judged, heads, config, self.initial, self.num_critics).to(self.device)
+        self.critic = self._make_critics(judged, heads).to(self.device)
         self.target_critic = copy.deepcopy(self.critic)
         self.adams = {
             "actor": self._adam(self.policy.actor.parameters(), config.learning_rate),
@@ -69,12 +72,17 @@ class OffPolicy(Learner):
         self.task_of_draw = torch.arange(world.num_tasks, device=self.device).repeat_interleave(self.batch_per_task)
         # Rewards that have left the replay fade from the statistics too.
         horizon = self.replay.steps * world.num_envs * world_size() / world.num_tasks
-        self.return_stats = RunningStats((world.num_tasks,), max_count=horizon).to(self.device)
-        self.discounted = torch.zeros(world.num_envs, device=self.device)
+        self.returns = self.returns_type(world, config.gamma, horizon)
         self.episodes = EpisodeStatistics(world.task_id, world.task_names)
 
-    def _adam(self, parameters: Iterable[nn.Parameter], rate: float) -> torch.optim.Adam:
-        return torch.optim.Adam(parameters, lr=rate, eps=self.config.adam_eps, fused=True)
+    def _make_critics(self, inputs: Inputs, heads: int) -> Any:
+        """Fresh critics of observation and action together, with so many outputs of values each."""
+        return Critics(inputs, heads, self.config, self.initial, self.num_critics)
+
+    def _adam(self, parameters: Iterable[nn.Parameter], rate: float, decay: float | None = None) -> torch.optim.Adam:
+        decay = self.config.weight_decay if decay is None else decay
+        kind = torch.optim.AdamW if decay else torch.optim.Adam
+        return kind(parameters, lr=rate, eps=self.config.adam_eps, weight_decay=decay, fused=True)
 
     # What a learner adds.
 
@@ -131,30 +139,20 @@ class OffPolicy(Learner):
         obs, reward, terminated, truncated, info = self.world.step(actions)
         self.replay.add(actions, reward, terminated, truncated, obs, info)
         broken = info["unstable"]
-        self._note_returns(reward, terminated | truncated | broken, ~broken)
+        self.returns.note(reward, terminated, truncated, broken)
         self.policy.observations.update(obs)
         self.episodes.update(info)
         return broken.sum()
 
     def _act(self, obs: Tensor) -> Tensor:
         if self.replay.added < self.config.warmup_steps:
-            shape = (len(obs), self.shape.actions)
-            return torch.rand(shape, generator=self.generator, device=self.device) * 2.0 - 1.0
+            return torch.rand(len(obs), self.shape.actions, generator=self.generator, device=self.device) * 2.0 - 1.0
         return self._explore(obs)
 
-    def _note_returns(self, reward: Tensor, ended: Tensor, valid: Tensor) -> None:
-        """Follows the discounted sum of rewards since each episode began."""
-        self.discounted = self.config.gamma * self.discounted + reward
-        moments = task_moments(self.discounted[None], self.world.task_id, self.world.num_tasks, valid[None])
-        self.return_stats.merge(*moments)
-        self.discounted = self.discounted.masked_fill(ended, 0.0)
-
     def _reward_scale(self) -> Tensor:
-        """What rewards of each task are divided by (num_tasks,)."""
-        if not self.config.per_task_rewards:
-            return torch.ones(self.world.num_tasks, device=self.device)
-        # Where all returns are about the same, their deviation alone would blow them up.
-        return (self.return_stats.std().square() + (0.1 * self.return_stats.mean).square()).sqrt().float()
+        """What rewards of each task are divided by (num_tasks,); 1 unless ``per_task_rewards``."""
+        scale = self.returns.deviation()
+        return scale if self.config.per_task_rewards else torch.ones_like(scale)
 
     # Learning.
 
@@ -162,36 +160,45 @@ class OffPolicy(Learner):
         """The updates that follow one vector step; what each measured."""
         updates, tasks = self.config.updates_per_step, self.world.num_tasks
         places = self.replay.draw(updates, self.batch_per_task, self.generator)
-        weights = self.replay.weights(places)
+        stretches = Stretches(self.replay, places, self.config.n_steps, self.config.gamma)
+        weights = self.replay.weights(stretches.last)
         # Divided by the draws of all processes, losses and gradients become means by being summed over them.
         counts = all_sum(weights.view(updates, tasks, -1).sum(2))
-        return [self._update(self.replay.take(places[i]), weights[i], counts[i]) for i in range(updates)]
+        return [self._update(stretches.take(i), weights[i], counts[i]) for i in range(updates)]
 
-    def _values(self, critic: Critics, obs: Tensor, actions: Tensor) -> Tensor:
+    def _values(self, critic: Any, obs: Tensor, actions: Tensor) -> Tensor:
         """The critics' values of a draw (num_critics, B), in scaled units of reward."""
         with autocast(self.device, self.low_precision):
             return critic(obs, actions, self.task_of_draw)
 
+    def _pooled(self, values: Tensor) -> Tensor:
+        """One value (B,) of those of all critics (num_critics, B)."""
+        return values.amin(0)
+
     def _bootstrapped(self, draw: Transitions, following: Tensor) -> Tensor:
-        """Targets (B,): scaled reward + gamma * ``following`` (B,), the value of the state after the transition.
+        """Targets (B,): scaled reward + gamma^steps * ``following`` (B,), the value of the state after the transition.
 
         Nothing follows a true end. After a time limit the episode could have gone on: the replay has its last state.
         """
         rewards = draw.rewards / self._reward_scale()[self.task_of_draw]
-        return rewards + self.config.gamma * following.masked_fill(draw.terminated, 0.0)
+        return rewards + self.config.gamma**draw.steps * following.masked_fill(draw.terminated, 0.0)
 
     def _fit_critics(
         self, obs: Tensor, draw: Transitions, target: Tensor, weights: Tensor, counts: Tensor
     ) -> dict[str, Tensor]:
-        """One step of all critics towards ``target`` (B,), of normalised observations (B, d)."""
-        values = self._values(self.critic, obs, draw.actions)
-        loss = (weights / counts.sum().clamp_min(1.0) * (values - target).square()).sum()
-        value = self._per_task(weights * values[0].detach()) / counts.clamp_min(1.0)
-        weightless = (1.0 - weights).mean() / world_size()
-        numbers = torch.stack([loss.detach(), weightless, *value])
+        """One step of all critics towards ``target`` (B, ...), of normalised observations (B, d)."""
+        losses, values = self._critic_losses(obs, draw.actions, target)
+        loss = (weights / counts.sum().clamp_min(1.0) * losses).sum()
+        value = self._per_task(weights * values) / counts.clamp_min(1.0)
+        numbers = torch.stack([loss.detach(), (1.0 - weights).mean() / world_size(), *value])
         numbers = self._descend(loss, numbers, "critic", critic=list(self.critic.parameters()))
         names = [f"Value/q/{name}" for name in self.world.task_names]
         return dict(zip(["Loss/critic", "Train/weightless", *names], numbers, strict=True))
+
+    def _critic_losses(self, obs: Tensor, actions: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        """How far the critics are from the targets (num_critics, B), and the first one's values (B,)."""
+        values = self._values(self.critic, obs, actions)
+        return (values - target).square(), values[0].detach()
 
     def _descend(self, loss: Tensor, numbers: Tensor, clipped: str, **parameters: list[nn.Parameter]) -> Tensor:
         """One step of the optimisers named, down the sum of ``loss`` over all processes; no other weight gets a slope.
@@ -215,12 +222,6 @@ class OffPolicy(Learner):
             self.adams[name].step()
         return numbers
 
-    @torch.no_grad()
-    def _follow(self, target: nn.Module, network: nn.Module) -> None:
-        """Moves a target network a share ``tau`` of the way to its network (Polyak averaging)."""
-        for behind, ahead in zip(target.parameters(), network.parameters(), strict=True):
-            behind.lerp_(ahead, self.config.tau)
-
     def _per_task(self, x: Tensor) -> Tensor:
         """Sums (num_tasks,) of what a draw holds (B,)."""
         return x.view(self.world.num_tasks, -1).sum(1)
@@ -233,8 +234,7 @@ class OffPolicy(Learner):
             "target_critic": self.target_critic,
             **self._own_parts(),
             "adams": self.adams,
-            "return_stats": self.return_stats,
-            "discounted": self.discounted,
+            **self.returns.parts(),
             "generator": self.generator,
             "episodes": self.episodes,
         }

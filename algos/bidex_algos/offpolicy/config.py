@@ -49,12 +49,16 @@ class OffPolicyConfig:
     """Take this many of each task instead."""
     gamma: float = 0.93
     """Discount per step."""
+    n_steps: int = 1
+    """Steps whose rewards a target takes as they came, before it asks for the value of what follows."""
     tau: float = 0.02
     """Share of the critics that enters the target critics in each update (1 - Polyak's factor)."""
     learning_rate: float = 3e-4
     """Adam's step size for the actor."""
     critic_learning_rate: float = 1e-3
     """Adam's step size for the critics."""
+    weight_decay: float = 0.0
+    """Share of its step size by which each step shortens all weights of actor and critics (AdamW)."""
     adam_eps: float = 1e-8
     """What Adam adds to its denominators."""
     max_grad_norm: float = 1.0
@@ -73,10 +77,10 @@ class OffPolicyConfig:
             BidexError: A field is out of its range.
         """
         types(self)
-        at_least(self, 1, "replay_steps", "steps_per_iteration", "updates_per_step", "batch_size")
+        at_least(self, 1, "replay_steps", "steps_per_iteration", "updates_per_step", "batch_size", "n_steps")
         if self.batch_per_task is not None:
             at_least(self, 1, "batch_per_task")
-        at_least(self, 0, "warmup_steps", "task_embedding")
+        at_least(self, 0, "warmup_steps", "task_embedding", "weight_decay")
         if not 0.0 <= self.gamma < 1.0:
             raise BidexError(f"{self.algo}: gamma must lie in [0, 1), got {self.gamma}.")
         between(self, 0.0, 1.0, "tau", "cut_share")

@@ -1,4 +1,4 @@
-"""The critics of the off-policy learners: values of actions."""
+"""The critics of the off-policy learners, values of actions, and how target networks follow."""
 
 import torch
 from torch import Tensor, nn
@@ -36,3 +36,10 @@ class Critics(nn.Module):
         if self.heads == 1:
             return all_values.squeeze(2)
         return all_values.gather(2, task_id.expand(len(self.nets), -1)[..., None]).squeeze(2)
+
+
+@torch.no_grad()
+def follow(target: nn.Module, network: nn.Module, tau: float) -> None:
+    """Moves a target network a share ``tau`` of the way to its network (Polyak averaging)."""
+    for behind, ahead in zip(target.parameters(), network.parameters(), strict=True):
+        behind.lerp_(ahead, tau)

@@ -28,6 +28,7 @@ from bidex_algos.nets.normalise import ObservationNormaliser
 from bidex_algos.nets.precision import autocast, use_bfloat16
 from bidex_algos.nets.shape import Shape
 from bidex_algos.offpolicy.base import OffPolicy
+from bidex_algos.offpolicy.critics import follow
 from bidex_algos.offpolicy.ddpg_config import PRESETS, DDPGConfig
 from bidex_meta.world.contract import VectorWorld
 
@@ -69,8 +70,8 @@ class DDPG(OffPolicy):
         told = self._fit_critics(obs, draw, self._target(draw, next_obs), weights, counts)
         if self._actor_is_due():
             self._policy_step(obs, weights, counts)
-            self._follow(self.target_actor, self.policy.actor)
-            self._follow(self.target_critic, self.critic)
+            follow(self.target_actor, self.policy.actor, self.config.tau)
+            follow(self.target_critic, self.critic, self.config.tau)
         return told
 
     def _actor_is_due(self) -> bool:
@@ -81,7 +82,7 @@ class DDPG(OffPolicy):
     def _target(self, draw: Transitions, next_obs: Tensor) -> Tensor:
         """What the critics shall say of the drawn transitions (B,); ``next_obs`` are normalised."""
         following = self._values(self.target_critic, next_obs, self._target_action(next_obs))
-        return self._bootstrapped(draw, following.amin(0))
+        return self._bootstrapped(draw, self._pooled(following))
 
     def _target_action(self, next_obs: Tensor) -> Tensor:
         """What the target actor does (B, a) with normalised observations (B, d)."""
@@ -89,13 +90,17 @@ class DDPG(OffPolicy):
             return self.target_actor(next_obs)
 
     def _policy_step(self, obs: Tensor, weights: Tensor, counts: Tensor) -> None:
-        """One step of the actor up the first critic, on normalised observations (B, d)."""
+        """One step of the actor up the critics, on normalised observations (B, d)."""
         raw = self.policy.raw(obs)
-        value = self._values(self.critic, obs, torch.tanh(raw))[0]
+        value = self._climbed(self._values(self.critic, obs, torch.tanh(raw)))
         price = self.config.squash_price * raw.square().mean(1)
         loss = (weights / counts.sum().clamp_min(1.0) * (price - value)).sum()
         actor = list(self.policy.actor.parameters())
         self.actor_loss = self._descend(loss, loss.detach()[None], "actor", actor=actor)[0]
+
+    def _climbed(self, values: Tensor) -> Tensor:
+        """What the actor climbs (B,): the first critic's values."""
+        return values[0]
 
     def _told(self) -> dict[str, Tensor]:
         return {"Loss/actor": self.actor_loss}

@@ -16,17 +16,19 @@ gradient is the gap in entropy whatever alpha is. Deviations stand in ``docs/lea
 """
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from bidex_algos.experience.replay import Transitions
+from bidex_algos.nets.networks import MLP
 from bidex_algos.nets.normalise import ObservationNormaliser
 from bidex_algos.nets.precision import use_bfloat16
 from bidex_algos.nets.shape import Shape
 from bidex_algos.nets.squashed import SquashedActor, SquashedPolicy
 from bidex_algos.offpolicy.base import OffPolicy
+from bidex_algos.offpolicy.critics import follow
 from bidex_algos.offpolicy.mtsac_config import PRESETS, MTSACConfig
 from bidex_meta.world.contract import VectorWorld
 
@@ -47,12 +49,13 @@ class MTSAC(OffPolicy):
     config_type = MTSACConfig
     config: MTSACConfig
     policy: SquashedPolicy
+    actor_network: ClassVar[type[MLP]] = MLP
 
     def __init__(self, world: VectorWorld, config: MTSACConfig, seed: int):
         super().__init__(world, config, seed)
         self.log_alpha = nn.Parameter(torch.full((world.num_tasks,), math.log(config.init_alpha), device=self.device))
         self.target_entropy = config.target_entropy_per_action * self.shape.actions
-        self.adams["alpha"] = self._adam([self.log_alpha], config.alpha_learning_rate)
+        self.adams["alpha"] = self._adam([self.log_alpha], config.alpha_learning_rate, decay=0.0)
 
     def _explore(self, obs: Tensor) -> Tensor:
         return self.policy.sample(self.policy.observations(obs), self.generator)[0]
@@ -62,14 +65,14 @@ class MTSAC(OffPolicy):
         obs, next_obs = self.policy.observations(draw.obs), self.policy.observations(draw.next_obs)
         told = self._fit_critics(obs, draw, self._target(draw, next_obs), weights, counts)
         told |= self._policy_step(obs, weights, counts)
-        self._follow(self.target_critic, self.critic)
+        follow(self.target_critic, self.critic, self.config.tau)
         return told
 
     @torch.no_grad()
     def _target(self, draw: Transitions, next_obs: Tensor) -> Tensor:
         """What the critics shall say of the drawn transitions (B,); ``next_obs`` are normalised."""
         next_actions, log_prob = self.policy.sample(next_obs, self.generator)
-        following = self._values(self.target_critic, next_obs, next_actions).amin(0)
+        following = self._pooled(self._values(self.target_critic, next_obs, next_actions))
         return self._bootstrapped(draw, following - self.log_alpha.exp()[self.task_of_draw] * log_prob)
 
     def _policy_step(self, obs: Tensor, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
@@ -77,14 +80,18 @@ class MTSAC(OffPolicy):
         weight = weights / counts.sum().clamp_min(1.0)
         actions, log_prob = self.policy.sample(obs, self.generator)
         alpha = self.log_alpha.detach().exp()[self.task_of_draw]
-        actor_loss = (weight * (alpha * log_prob - self._values(self.critic, obs, actions).amin(0))).sum()
+        actor_loss = (weight * (alpha * log_prob - self._pooled(self._values(self.critic, obs, actions)))).sum()
         gap = self._per_task(weights * (log_prob.detach() + self.target_entropy)) / counts.clamp_min(1.0)
-        alpha_loss = -(self.log_alpha * gap).sum()
+        alpha_loss = -(self.log_alpha * self._gap_that_counts(gap)).sum()
         entropy = -(weight * log_prob.detach()).sum()
         numbers = torch.stack([actor_loss.detach(), entropy])
         actor = list(self.policy.actor.parameters())
         numbers = self._descend(actor_loss + alpha_loss, numbers, "actor", actor=actor, alpha=[self.log_alpha])
         return dict(zip(["Loss/actor", "Policy/entropy"], numbers, strict=True))
+
+    def _gap_that_counts(self, gap: Tensor) -> Tensor:
+        """The gap in entropy that each task's temperature follows, of the tasks' own (num_tasks,)."""
+        return gap
 
     def _told(self) -> dict[str, Tensor]:
         alphas = self.log_alpha.detach().exp()
@@ -96,8 +103,9 @@ class MTSAC(OffPolicy):
     ) -> SquashedPolicy:
         inputs, heads = cls._inputs(config, shape), shape.num_id_columns if config.policy_heads else 1
         actor = SquashedActor(
-            inputs, config.hidden, shape.actions, heads, config.init_std, config.std_range, init, config.activation
-        )
+            inputs, config.hidden, shape.actions, heads, config.init_std, config.std_range, init, config.activation,
+            cls.actor_network,
+        )  # fmt: skip
         observations = ObservationNormaliser(inputs, config.normalise_observations)
         return SquashedPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
 

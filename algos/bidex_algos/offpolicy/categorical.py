@@ -1,0 +1,114 @@
+"""What FastTD3 and BRC share: critics that give a distribution of the return, taught by cross-entropy.
+
+    Z      the return of (s, a), as probabilities of fixed values ("atoms"); Q = E Z
+    y = r + gamma (1 - terminated) Z'(s', a')    a distribution too, projected back on the atoms (C51)
+    Z_i    towards y, down on -sum_j y_j log p_ij
+
+Bellemare et al. 2017 (arXiv 1707.06887). A regression's gradient grows with the scale of a task's returns and its
+errors, a classification's does not. The price: the atoms span a fixed range, so that rewards must be scaled into it;
+what each task's rewards are divided by follows its largest return so far (``ReturnBound``).
+"""
+
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from bidex_algos.experience.replay import Transitions
+from bidex_algos.nets.atoms import Atoms
+from bidex_algos.nets.encoders.inputs import Inputs
+from bidex_algos.nets.networks import MLP
+from bidex_algos.nets.precision import autocast
+from bidex_algos.offpolicy.base import OffPolicy
+from bidex_algos.offpolicy.categorical_config import CategoricalConfig
+from bidex_algos.offpolicy.return_scale import ReturnBound
+
+
+class CategoricalCritics(nn.Module):
+    """Networks of observation and action that give distributions, alike but for their initial weights.
+
+    Args:
+        inputs: The groups of observation and action together, or their width.
+        heads: Distributions of each network: one per task, or 1 for all.
+        config: Layers and atoms.
+        generator: CPU generator of the initial weights.
+        count: How many networks.
+        network: What they are.
+    """
+
+    def __init__(
+        self,
+        inputs: int | Inputs,
+        heads: int,
+        config: CategoricalConfig,
+        generator: torch.Generator,
+        count: int,
+        network: type[MLP],
+    ):
+        super().__init__()
+        self.heads = heads
+        self.atoms = Atoms(-config.value_bound, config.value_bound, config.atoms)
+        outputs, norm = heads * config.atoms, config.critic_layer_norm
+        # Small weights of the last layer: at first all values are about as likely, which makes 0 on average.
+        self.nets = nn.ModuleList(
+            network(inputs, config.critic_hidden, outputs, 0.01, generator, config.activation, norm)
+            for _ in range(count)
+        )
+
+    def log_probs(self, obs: Tensor, actions: Tensor, task_id: Tensor) -> Tensor:
+        """Of each atom: normalised observations (B, d), actions (B, a), tasks (B,) to (count, B, atoms)."""
+        x = torch.cat([obs, actions], dim=1)
+        logits = torch.stack([net(x) for net in self.nets])
+        if self.heads > 1:
+            head = task_id.view(1, -1, 1, 1).expand(len(logits), -1, 1, self.atoms.count)
+            logits = logits.unflatten(2, (self.heads, -1)).gather(2, head).squeeze(2)
+        return torch.log_softmax(logits, dim=2)
+
+    def forward(self, obs: Tensor, actions: Tensor, task_id: Tensor) -> Tensor:
+        """Expected values (count, B); arguments as for :meth:`log_probs`."""
+        return self.atoms.mean(self.log_probs(obs, actions, task_id).exp())
+
+
+class Categorical(OffPolicy):
+    """The part of a learner with such critics that knows no actor; stands before the learner whose actor it takes."""
+
+    config: Any
+    per_process = (*OffPolicy.per_process, "discounted_ones")
+    critic_network: ClassVar[type[MLP]] = MLP
+    returns_type = ReturnBound
+    returns: ReturnBound
+
+    def _make_critics(self, inputs: Inputs, heads: int) -> CategoricalCritics:
+        return CategoricalCritics(inputs, heads, self.config, self.initial, self.num_critics, self.critic_network)
+
+    def _log_probs(self, critic: CategoricalCritics, obs: Tensor, actions: Tensor) -> Tensor:
+        with autocast(self.device, self.low_precision):
+            return critic.log_probs(obs, actions, self.task_of_draw)
+
+    def _pooled(self, values: Tensor) -> Tensor:
+        return values.amin(0) if self.config.clipped_double_q else values.mean(0)
+
+    def _following(self, next_obs: Tensor, next_actions: Tensor) -> Tensor:
+        """Distribution of the return (B, atoms) from where a draw leads, by the target critics."""
+        probs = self._log_probs(self.target_critic, next_obs, next_actions).exp()
+        if not self.config.clipped_double_q:
+            return probs.mean(0)
+        lower = self.critic.atoms.mean(probs).argmin(0)
+        return probs.gather(0, lower.view(1, -1, 1).expand(1, -1, probs.shape[2]))[0]
+
+    def _projected(self, draw: Transitions, following: Tensor, bonus: Tensor) -> Tensor:
+        """Targets (B, atoms): the distribution of scaled reward + gamma^steps * (bonus + Z), Z as ``following``.
+
+        Args:
+            draw: Transitions; after a true end nothing follows.
+            following: Shape (B, atoms).
+            bonus: What is added to the value of the state after the transition, (B,).
+        """
+        shift = self._bootstrapped(draw, bonus)
+        factor = (self.config.gamma**draw.steps) * (~draw.terminated).to(shift.dtype)
+        return self.critic.atoms.projected(following, shift, factor)
+
+    def _critic_losses(self, obs: Tensor, actions: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        log_probs = self._log_probs(self.critic, obs, actions)
+        values = self.critic.atoms.mean(log_probs[0].detach().exp())
+        return -(target * log_probs).sum(2), values

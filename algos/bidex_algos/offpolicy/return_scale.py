@@ -1,0 +1,82 @@
+"""How large returns are, task by task, so that no task outweighs another."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bidex_algos.experience.advantages import task_moments
+from bidex_algos.nets.normalise import RunningStats
+from bidex_meta.train.distributed import all_max
+from bidex_meta.world.contract import VectorWorld
+
+
+class ReturnScale:
+    """Running statistics of the discounted sum of rewards since an episode began.
+
+    Args:
+        world: Whose rewards they are.
+        gamma: Discount per step.
+        horizon: Returns of a task after which older ones fade.
+
+    Attributes:
+        stats: Mean and variance of each task (num_tasks,).
+        discounted: The sum in each row so far (N,).
+    """
+
+    def __init__(self, world: VectorWorld, gamma: float, horizon: float):
+        self.gamma, self.task_id, self.num_tasks = gamma, world.task_id, world.num_tasks
+        self.stats = RunningStats((world.num_tasks,), max_count=horizon).to(world.device)
+        self.discounted = torch.zeros(world.num_envs, device=world.device)
+
+    def note(self, reward: Tensor, terminated: Tensor, truncated: Tensor, broken: Tensor) -> None:
+        """Takes one step of all rows: rewards (N,) and how it ended, bool (N,); broken ones do not count."""
+        self.discounted = self.gamma * self.discounted + reward
+        self._take(truncated & ~terminated, ~broken)
+        self.discounted = self.discounted.masked_fill(terminated | truncated | broken, 0.0)
+
+    def _take(self, cut: Tensor, valid: Tensor) -> None:
+        self.stats.merge(*task_moments(self.discounted[None], self.task_id, self.num_tasks, valid[None]))
+
+    def deviation(self) -> Tensor:
+        """The deviation of each task's returns, at least a tenth of their mean (num_tasks,)."""
+        # Where all returns are about the same, their deviation alone would blow them up.
+        return (self.stats.std().square() + (0.1 * self.stats.mean).square()).sqrt().float()
+
+    def parts(self) -> dict[str, Any]:
+        """What a checkpoint holds, by name."""
+        return {"return_stats": self.stats, "discounted": self.discounted}
+
+
+class ReturnBound(ReturnScale):
+    """Beside the statistics the largest return of each task, without its sign: what a fixed range of values must hold.
+
+    The sum is discounted towards the episode's beginning and not, as a return is, towards its end: that one is known
+    only when the episode is over. Both weigh any stretch of rewards alike. At a time limit the episode is taken to go
+    on as it went, since that is what a critic is taught there.
+
+    Attributes:
+        bound: Of each task (num_tasks,); it never falls.
+        mass: The sum in each row, had all rewards been 1 (N,).
+    """
+
+    def __init__(self, world: VectorWorld, gamma: float, horizon: float):
+        super().__init__(world, gamma, horizon)
+        self.bound = torch.zeros(world.num_tasks, device=world.device)
+        self.mass = torch.zeros(world.num_envs, device=world.device)
+
+    def note(self, reward: Tensor, terminated: Tensor, truncated: Tensor, broken: Tensor) -> None:
+        """As in the base."""
+        self.mass = self.gamma * self.mass + 1.0
+        super().note(reward, terminated, truncated, broken)
+        self.mass = self.mass.masked_fill(terminated | truncated | broken, 0.0)
+
+    def _take(self, cut: Tensor, valid: Tensor) -> None:
+        super()._take(cut, valid)
+        size = self.discounted.abs().masked_fill(~valid, 0.0)
+        size = torch.where(cut, size / ((1.0 - self.gamma) * self.mass), size)
+        self.bound = all_max(self.bound.scatter_reduce(0, self.task_id, size, "amax"))
+
+    def parts(self) -> dict[str, Any]:
+        """As in the base."""
+        return super().parts() | {"return_bound": self.bound, "discounted_ones": self.mass}

@@ -1,0 +1,207 @@
+"""What FastTD3 and BRC are made of: projection, n-step returns, the bound of returns, residual networks."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.testing import assert_close
+
+from bidex_algos.experience.n_step import Stretches
+from bidex_algos.experience.replay import Replay
+from bidex_algos.nets.atoms import Atoms
+from bidex_algos.nets.encoders.task_embedding import TaskEmbedding
+from bidex_algos.nets.networks import MLP
+from bidex_algos.nets.residual import ResidualMLP
+from bidex_algos.offpolicy.return_scale import ReturnBound
+from tests.algos.toy import ToyWorld, nearness
+
+# The projection.
+
+
+def test_a_distribution_is_projected_as_by_hand() -> None:
+    atoms = Atoms(-2.0, 2.0, 5)  # -2 -1 0 1 2
+    probs = torch.tensor([[0.0, 0.0, 0.5, 0.5, 0.0], [0.1, 0.2, 0.3, 0.2, 0.2], [0.0, 0.0, 0.0, 0.0, 1.0]])
+    # 0.25 + Z / 2: halves at 0.25 and 0.75. No bootstrap: all at 1.5. Beyond the end: all at 2.
+    out = atoms.projected(probs, torch.tensor([0.25, 1.5, 3.0]), torch.tensor([0.5, 0.0, 1.0]))
+    expected = [[0.0, 0.0, 0.375 + 0.125, 0.125 + 0.375, 0.0], [0.0, 0.0, 0.0, 0.5, 0.5], [0.0, 0.0, 0.0, 0.0, 1.0]]
+    assert_close(out, torch.tensor(expected))
+    assert_close(atoms.mean(out), torch.tensor([0.5, 1.5, 2.0]))
+
+
+def slow_projection(low: float, high: float, probs: np.ndarray, shift: float, factor: float) -> np.ndarray:
+    """Each atom's mass in its turn, given to its two neighbours by their distance, in float64."""
+    values = np.linspace(low, high, len(probs))
+    out = np.zeros(len(probs))
+    for value, mass in zip(values, probs, strict=True):
+        moved = min(max(shift + factor * value, low), high)
+        upper = int(np.clip(np.searchsorted(values, moved), 1, len(values) - 1))
+        width = values[upper] - values[upper - 1]
+        out[upper] += mass * (moved - values[upper - 1]) / width
+        out[upper - 1] += mass * (values[upper] - moved) / width
+    return out
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    low=st.floats(-20, 0), width=st.floats(0.5, 40), count=st.integers(2, 60), shift=st.floats(-50, 50),
+    factor=st.floats(0, 1), seed=st.integers(0, 2**31),
+)  # fmt: skip
+def test_the_projection_is_that_of_a_slow_loop(
+    low: float, width: float, count: int, shift: float, factor: float, seed: int
+) -> None:
+    probs = torch.rand(1, count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    probs /= probs.sum()
+    atoms = Atoms(low, low + width, count).double()
+    out = atoms.projected(probs, torch.tensor([shift]).double(), torch.tensor([factor]).double())[0]
+    expected = slow_projection(low, low + width, probs[0].numpy(), shift, factor)
+    assert_close(out, torch.from_numpy(expected), rtol=0, atol=1e-5)
+    assert_close(out.sum(), torch.tensor(1.0).double())
+
+
+def test_what_is_not_a_number_stays_so() -> None:
+    out = Atoms(-1.0, 1.0, 5).projected(torch.full((1, 5), 0.2), torch.tensor([float("nan")]), torch.ones(1))
+    assert out.isnan().any()
+
+
+# Returns of several steps.
+
+ROWS = 3
+
+
+class Diary:
+    """Random steps of three rows, in a replay and in a list."""
+
+    def __init__(self, steps: int, kept: int, seed: int = 0):
+        generator = torch.Generator().manual_seed(seed)
+        self.replay = Replay(kept, torch.tensor([0, 0, 1]), 2, 1, 1, torch.device("cpu"), 1.0)
+        self.entries: list[dict[str, Tensor]] = []
+        self.replay.begin(self._mark(0))
+        for t in range(steps):
+            draw = torch.rand(ROWS, generator=generator)
+            flags = {"terminated": draw < 0.1, "truncated": (draw > 0.08) & (draw < 0.25), "unstable": draw > 0.9}
+            step = {**flags, "reward": torch.randn(ROWS, generator=generator), "final": self._mark(t + 0.5)}
+            self.entries.append(step)
+            self.replay.add(
+                torch.zeros(ROWS, 1), step["reward"], step["terminated"], step["truncated"] | step["unstable"],
+                self._mark(t + 1), {"unstable": step["unstable"], "final_obs": step["final"]},
+            )  # fmt: skip
+
+    def _mark(self, t: float) -> Tensor:
+        return 100 * t + torch.arange(ROWS)[:, None].float()
+
+    def slow(self, t: int, row: int, n: int, gamma: float) -> tuple[float, int, float | None]:
+        """Sum of rewards, steps taken, and the observation after them (None after a true end), step by step."""
+        total, taken = 0.0, 0
+        while True:
+            step = self.entries[t]
+            total, taken = total + gamma**taken * float(step["reward"][row]), taken + 1
+            if step["terminated"][row]:
+                return total, taken, None
+            if step["truncated"][row]:
+                return total, taken, float(step["final"][row])
+            t += 1
+            if taken == n or t == len(self.entries) or self.entries[t]["unstable"][row]:
+                return total, taken, float(self._mark(t)[row])
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 8])
+@pytest.mark.parametrize("steps", [4, 60])
+def test_n_steps_are_those_of_a_slow_loop_up_to_the_episodes_end(n: int, steps: int) -> None:
+    diary = Diary(steps, kept=25)
+    replay = diary.replay
+    valid = [
+        (t, row)
+        for t in range(steps - replay.filled, steps)
+        for row in range(ROWS)
+        if not diary.entries[t]["unstable"][row]
+    ]
+    places = torch.tensor([[t % replay.slots * ROWS + row for t, row in valid]])
+    stretches = Stretches(replay, places, n, 0.9)
+    taken = stretches.take(0)
+    assert replay.weights(stretches.last).eq(1).all()
+    took = torch.as_tensor(taken.steps).expand(len(valid))
+    for i, (t, row) in enumerate(valid):
+        total, count, following = diary.slow(t, row, n, 0.9)
+        assert float(taken.obs[i]) == 100 * t + row
+        assert float(taken.rewards[i]) == pytest.approx(total, abs=1e-5) and int(took[i]) == count
+        assert bool(taken.terminated[i]) == (following is None)
+        assert following is None or float(taken.next_obs[i]) == following
+
+
+def test_a_stretch_that_begins_with_broken_physics_has_no_weight() -> None:
+    diary = Diary(25, kept=25)
+    broken = [t * ROWS + row for t in range(25) for row in range(ROWS) if diary.entries[t]["unstable"][row]]
+    stretches = Stretches(diary.replay, torch.tensor([broken]), 3, 0.9)
+    assert broken and diary.replay.weights(stretches.last).eq(0).all()
+
+
+# The bound of returns.
+
+
+def bound_after(gamma: float, rewards: list[list[float]], **ends: list[list[bool]]) -> ReturnBound:
+    """What one row of each of two tasks leaves; ``ends`` names terminated, truncated, broken."""
+    bound = ReturnBound(ToyWorld([nearness(0.0), nearness(0.0)], rows=1), gamma, 1e9)
+    for t, reward in enumerate(rewards):
+        flags = [torch.tensor(ends[name][t] if name in ends else [False] * 2) for name in ("terminated", "truncated")]
+        bound.note(torch.tensor(reward), *flags, torch.tensor(ends["broken"][t] if "broken" in ends else [False] * 2))
+    return bound
+
+
+def test_the_bound_is_the_largest_discounted_sum_of_each_task() -> None:
+    ends = [[False, False], [True, False], [False, False]]
+    bound = bound_after(0.5, [[1.0, -8.0], [2.0, 4.0], [1.0, 0.0]], terminated=ends)
+    assert_close(bound.bound, torch.tensor([2.5, 8.0]))
+    assert_close(bound.discounted, torch.tensor([1.0, 0.0]))
+
+
+def test_a_time_limit_counts_as_if_the_episode_went_on() -> None:
+    never, last = [False, False], [True, False]
+    bound = bound_after(0.8, [[1.0, 1.0]] * 3, truncated=[never, never, last], terminated=[never, never, never])
+    # One reward after the other without end is worth 1 / (1 - 0.8); three of them 1 + 0.8 + 0.64.
+    assert_close(bound.bound, torch.tensor([5.0, 2.44]))
+    both = bound_after(0.8, [[1.0, 1.0]], truncated=[[True, True]], terminated=[[True, False]])
+    assert_close(both.bound, torch.tensor([1.0, 5.0]))
+
+
+@pytest.mark.parametrize("garbage", [1e9, float("nan")])
+def test_broken_physics_moves_no_bound(garbage: float) -> None:
+    bound = bound_after(0.5, [[1.0, 1.0], [garbage, 1.0], [1.0, 1.0]], broken=[[False] * 2, [True, False], [False] * 2])
+    assert_close(bound.bound, torch.tensor([1.0, 1.75]))
+
+
+# Networks.
+
+
+def test_a_residual_network_adds_normalised_layers() -> None:
+    net = ResidualMLP(3, (8, 8, 8), 2, 1.0, torch.Generator().manual_seed(0), "relu")
+    x = torch.randn(5, 3, generator=torch.Generator().manual_seed(1))
+
+    def normal(y: Tensor) -> Tensor:
+        return (y - y.mean(1, keepdim=True)) / (y.var(1, correction=0, keepdim=True) + 1e-5).sqrt()
+
+    weights = [layer.weight for layer in net.modules() if isinstance(layer, torch.nn.Linear)]
+    assert [tuple(w.shape) for w in weights] == [(8, 3), (8, 8), (8, 8), (8, 8), (8, 8), (2, 8)]
+    y = normal(x @ weights[0].T).relu()
+    for first, second in (weights[1:3], weights[3:5]):
+        y = y + normal(normal(y @ first.T).relu() @ second.T)
+    assert_close(net(x), y @ weights[5].T, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("network", [MLP, ResidualMLP])
+def test_weights_are_those_of_the_generator_alone(network: Any) -> None:
+    nets = []
+    for seed in (3, 4):
+        torch.manual_seed(seed)
+        before = torch.get_rng_state()
+        nets.append(network(3, (4, 4), 1, 1.0, torch.Generator().manual_seed(0)))
+        assert torch.equal(before, torch.get_rng_state())
+    assert all(map(torch.equal, nets[0].parameters(), nets[1].parameters()))
+
+
+def test_an_embedding_of_unit_length() -> None:
+    embedding = TaskEmbedding(4, torch.Generator().manual_seed(0), 7, unit=True)
+    assert_close(embedding(torch.eye(4)).norm(dim=1), torch.ones(4))

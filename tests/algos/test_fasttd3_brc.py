@@ -1,0 +1,294 @@
+"""FastTD3 and BRC: known optima, targets by hand, resume; what they are made of is in ``test_categorical.py``."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from bidex_algos.experience.replay import Transitions
+from bidex_algos.offpolicy.brc import BRC, BRCConfig
+from bidex_algos.offpolicy.fasttd3 import FastTD3, FastTD3Config
+from bidex_meta.commands.learners import learner_kind
+from bidex_meta.errors import BidexError
+from bidex_meta.train import distributed
+from bidex_meta.world.contract import plain_groups
+from tests.algos.problems import LQR, discounted_return, one_step_bandit, opposite_bandits
+from tests.algos.ranks import in_two_processes
+from tests.algos.resume import resumed
+from tests.algos.test_categorical import slow_projection
+from tests.algos.toy import ToyWorld, nearness
+
+SHARED: dict[str, Any] = {
+    "hidden": (32, 32),
+    "critic_hidden": (32, 32),
+    "replay_steps": 200,
+    "cut_share": 0.3,
+    "warmup_steps": 4,
+    "updates_per_step": 2,
+    "batch_size": 128,
+    "gamma": 0.8,
+    "tau": 0.1,
+    "learning_rate": 3e-3,
+    "critic_learning_rate": 5e-3,
+    "autocast": "off",
+    "atoms": 51,
+}
+FAST = FastTD3Config(**SHARED | {"updates_per_step": 4}, critic_layer_norm=False, n_steps=1)
+SMALL = BRCConfig(**SHARED, task_embedding=4, init_alpha=0.01, target_entropy_per_action=-2.0)
+both = pytest.mark.parametrize(("kind", "config"), [(FastTD3, FAST), (BRC, SMALL)], ids=["fasttd3", "brc"])
+
+
+def trained(kind: Any, world: Any, config: Any, iterations: int) -> Any:
+    learner = kind(world, config, seed=0)
+    for _ in range(iterations):
+        learner.iterate()
+    return learner
+
+
+def errors(learner: Any, *targets: float) -> list[float]:
+    """Mean distance of the action from each task's target."""
+    obs, _ = learner.world.reset(seed=1)
+    action = learner.eval_action(obs)
+    return [float((action[learner.world.task_id == k] - target).abs().mean()) for k, target in enumerate(targets)]
+
+
+# Problems with a known optimum.
+
+
+@both
+@pytest.mark.parametrize("heads", [True, False])
+def test_two_tasks_at_odds_are_learned_though_one_pays_a_thousandfold(kind: Any, config: Any, heads: bool) -> None:
+    config = replace(config, policy_heads=heads, value_heads=heads)
+    learner = trained(kind, opposite_bandits(0.5, scale=1000.0), config, 12)
+    assert max(errors(learner, 0.5, -0.5)) < 0.15
+
+
+@pytest.mark.parametrize(
+    ("kind", "config"), [(FastTD3, FAST), (FastTD3, replace(FAST, n_steps=3)), (BRC, SMALL)],
+    ids=["fasttd3", "fasttd3-3", "brc"],
+)  # fmt: skip
+def test_lqr_comes_close_to_the_riccati_optimum(kind: Any, config: Any) -> None:
+    learner, test = trained(kind, LQR(), config, 20), LQR(rows=256)
+    best = discounted_return(test, test.best(0.8), 0.8, 40)
+    nothing = discounted_return(test, lambda obs: torch.zeros(len(obs), 2), 0.8, 40)
+    assert nothing < 2.5 * best
+    assert discounted_return(test, learner.eval_action, 0.8, 40) > 1.35 * best
+
+
+@both
+@pytest.mark.parametrize(("terminal", "value"), [(False, 5.0), (True, 1.0)])
+def test_a_time_limit_is_bootstrapped_and_a_true_end_is_not(
+    kind: Any, config: Any, terminal: bool, value: float
+) -> None:
+    # Reward 1 at each step and gamma 0.8: worth 1 / (1 - 0.8) = 5 where only the clock stops an episode of one step.
+    world = ToyWorld([lambda action: torch.ones(len(action))], horizon=1, terminal=terminal)
+    config = replace(config, cut_share=1.0, per_task_rewards=False, updates_per_step=4, batch_size=64)
+    config = replace(config, init_alpha=1e-6) if kind is BRC else config
+    learner = trained(kind, world, config, 12)
+    values = learner.critic(learner.policy.observations(learner.replay.obs), torch.zeros(32, 2), world.task_id)
+    assert_close(values.detach(), torch.full_like(values, value), rtol=0.05, atol=0)
+
+
+# One update, against an independent computation.
+
+
+def a_draw() -> Transitions:
+    """Three transitions of each of two tasks, some of several steps."""
+    generator = torch.Generator().manual_seed(1)
+    obs, following = torch.randn(2, 6, 3, generator=generator)
+    ends, steps = torch.tensor([False, True, False, False, True, False]), torch.tensor([1, 2, 3, 1, 1, 3])
+    return Transitions(obs, torch.zeros(6, 2), torch.arange(6.0) - 3, following, ends, steps)
+
+
+def shaken(learner: Any) -> None:
+    """Target networks with distributions that differ."""
+    noise = torch.Generator().manual_seed(3)
+    with torch.no_grad():
+        for weight in learner.target_critic.parameters():
+            weight.add_(0.3 * torch.randn(weight.shape, generator=noise))
+
+
+def distributions(learner: Any, obs: Tensor, actions: Tensor) -> Tensor:
+    """Of both target critics, (2, 6, atoms), in float64."""
+    x = torch.cat([obs, actions], dim=1)
+    return torch.stack([net(x).detach().double().softmax(1) for net in learner.target_critic.nets])
+
+
+def projected(learner: Any, draw: Transitions, rewards: Tensor, following: Tensor, bonus: Tensor) -> Tensor:
+    """Target distributions, one transition after the other."""
+    rows = []
+    for i in range(6):
+        factor = 0.0 if draw.terminated[i] else 0.7 ** int(torch.as_tensor(draw.steps)[i])
+        shift = float(rewards[i]) + factor * float(bonus[i])
+        rows.append(slow_projection(-10.0, 10.0, following[i].numpy(), shift, factor))
+    return torch.from_numpy(np.stack(rows))
+
+
+TWO: dict[str, Any] = {"gamma": 0.7, "batch_per_task": 3, "cut_share": 1.0}
+
+
+@pytest.mark.parametrize("lower", [True, False])
+def test_fasttd3s_target_is_that_of_the_definition(lower: bool) -> None:
+    world = ToyWorld([nearness(0.5), nearness(-0.5)], rows=3)
+    learner, draw = FastTD3(world, replace(FAST, **TWO, clipped_double_q=lower), seed=0), a_draw()
+    shaken(learner)
+    learner.returns.stats.var.copy_(torch.tensor([4.0, 0.25]))
+    learner.returns.bound.copy_(torch.tensor([1.0, 50.0]))  # deviation 2 counts, and 50 / 10
+    again = learner.generator.clone_state()
+    target = learner._target(draw, draw.next_obs)
+    noise = (0.2 * torch.randn(6, 2, generator=again)).clamp(-0.5, 0.5)
+    actions = (learner.target_actor(draw.next_obs) + noise).clamp(-1, 1)
+    probs = distributions(learner, draw.next_obs, actions.detach())
+    means = (probs * torch.linspace(-10, 10, 51).double()).sum(2)
+    choice = (means[1] < means[0]).long()
+    assert 0 < choice.sum() < 6
+    following = probs[choice, torch.arange(6)] if lower else probs.mean(0)
+    rewards = draw.rewards / torch.tensor([2.0] * 3 + [5.0] * 3)
+    expected = projected(learner, draw, rewards, following, torch.zeros(6))
+    assert_close(target.double(), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_brcs_target_is_that_of_the_definition() -> None:
+    world = ToyWorld([nearness(0.5), nearness(-0.5)], rows=3)
+    learner, draw = BRC(world, replace(SMALL, **TWO), seed=0), a_draw()
+    shaken(learner)
+    with torch.no_grad():
+        learner.log_alpha.copy_(torch.tensor([0.1, 0.9]).log())
+    learner.returns.bound.copy_(torch.tensor([4.0, 50.0]))
+    again = learner.generator.clone_state()
+    target = learner._target(draw, draw.next_obs)
+    actions, log_prob = learner.policy.sample(draw.next_obs, again)
+    following = distributions(learner, draw.next_obs, actions.detach()).mean(0)
+    # An entropy of 2 actions times 2 at each step to come; of the second task more than half of the range.
+    rooms = [10.0 - 0.1 * 4.0 / 0.3, 5.0]
+    rewards = draw.rewards / torch.tensor([4.0 / rooms[0]] * 3 + [50.0 / rooms[1]] * 3)
+    bonus = -torch.tensor([0.1] * 3 + [0.9] * 3) * log_prob.detach()
+    assert_close(target.double(), projected(learner, draw, rewards, following, bonus), rtol=1e-4, atol=1e-5)
+
+
+@both
+def test_critics_go_down_their_cross_entropy(kind: Any, config: Any) -> None:
+    learner, draw = kind(opposite_bandits(rows=6), replace(config, batch_per_task=3), seed=0), a_draw()
+    target = torch.rand(6, 51, generator=torch.Generator().manual_seed(2)).softmax(1)
+    losses, values = learner._critic_losses(draw.obs, draw.actions, target)
+    x = torch.cat([draw.obs, draw.actions], dim=1)
+    logs = torch.stack([net(x).double().log_softmax(1) for net in learner.critic.nets])
+    assert_close(losses.double(), -(target * logs).sum(2), rtol=1e-4, atol=1e-5)
+    assert_close(values.double(), (logs[0].exp() * torch.linspace(-10, 10, 51)).sum(1), rtol=1e-4, atol=1e-5)
+    for _ in range(20):
+        learner._fit_critics(draw.obs, draw, target, torch.ones(6), torch.full((2,), 3.0))
+    assert learner._critic_losses(draw.obs, draw.actions, target)[0].sum() < losses.sum()
+
+
+@pytest.mark.parametrize("lower", [True, False])
+def test_the_actor_climbs_the_lower_critic_or_their_mean(lower: bool) -> None:
+    values = torch.tensor([[1.0, 5.0], [3.0, 2.0]])
+    expected = torch.tensor([1.0, 2.0] if lower else [2.0, 3.5])
+    fast = FastTD3(opposite_bandits(rows=1), replace(FAST, clipped_double_q=lower), seed=0)
+    brc = BRC(opposite_bandits(rows=1), replace(SMALL, clipped_double_q=lower), seed=0)
+    assert torch.equal(fast._climbed(values), expected) and torch.equal(brc._pooled(values), expected)
+
+
+@pytest.mark.parametrize("one", [True, False])
+def test_one_temperature_or_one_for_each_task(one: bool) -> None:
+    learner = trained(BRC, opposite_bandits(rows=8), replace(SMALL, one_temperature=one), 2)
+    first, second = learner.log_alpha.tolist()
+    assert (first == second) == one and first != pytest.approx(torch.tensor(0.01).log().item())
+
+
+@both
+def test_weights_decay_but_no_temperature(kind: Any, config: Any) -> None:
+    learner = kind(opposite_bandits(rows=6), replace(config, weight_decay=0.5), seed=0)
+    decays = {name: adam.param_groups[0]["weight_decay"] for name, adam in learner.adams.items()}
+    assert decays == {"actor": 0.5, "critic": 0.5} | ({"alpha": 0.0} if kind is BRC else {})
+    before = [p.detach().clone() for p in learner.critic.parameters()]
+    for p in learner.critic.parameters():
+        p.grad = torch.zeros_like(p)
+    learner.adams["critic"].step()
+    for p, was in zip(learner.critic.parameters(), before, strict=True):
+        assert_close(p.detach(), was * (1.0 - 0.5 * 5e-3))
+
+
+# Several processes, checkpoints, metrics, errors.
+
+
+def _bounds(rank: int) -> Tensor:
+    distributed.init_from_environment()
+    learner = BRC(opposite_bandits(rows=3 + rank, scale=10.0), replace(SMALL, batch_size=16), seed=0)
+    learner.iterate()
+    weights = torch.cat([p.detach().flatten() for p in learner.critic.parameters()])
+    return torch.cat([learner.returns.bound, learner._reward_scale(), weights])
+
+
+def test_processes_share_the_bound_and_the_networks(tmp_path: Path) -> None:
+    one, other = in_two_processes(_bounds, tmp_path)
+    assert torch.equal(one, other) and one[0] > 0.5
+
+
+@both
+def test_save_load_resume_is_bit_equal(kind: Any, config: Any) -> None:
+    config = replace(config, updates_per_step=3, n_steps=2, replay_steps=20, steps_per_iteration=5, batch_size=32)
+    resumed(lambda seed: kind(opposite_bandits(rows=8), config, seed), iterations=2)
+
+
+@both
+def test_the_policy_alone_is_loaded(kind: Any, config: Any) -> None:
+    learner = trained(kind, opposite_bandits(), replace(config, policy_heads=True), 2)
+    policy, obs = kind.load_policy(learner.policy_state_dict()), learner.replay.obs
+    assert torch.equal(policy.eval_action(obs), learner.eval_action(obs))
+
+
+@both
+def test_metrics_and_errors_carry_its_name(kind: Any, config: Any) -> None:
+    learner = trained(kind, one_step_bandit(), config, 1)
+    assert {"Loss/critic", "Loss/actor", "Value/q/task0", "Train/weightless"} <= learner.iterate().keys()
+    with torch.no_grad():
+        next(learner.critic.parameters()).fill_(float("nan"))
+    with pytest.raises(FloatingPointError, match=rf"{kind.name}: the loss is not finite after \d+ steps; lower crit"):
+        learner.iterate()
+    for wrong in ({"tau": 0.0}, {"atoms": 1}, {"value_bound": 0.0}, {"n_steps": 0}, {"weight_decay": -0.1}):
+        with pytest.raises(BidexError, match=f"{kind.name}: {next(iter(wrong))}"):
+            replace(config, **wrong)
+
+
+def test_brc_refuses_widths_that_differ() -> None:
+    with pytest.raises(BidexError, match=r"brc: critic_hidden must be one width, once or more often, got \(8, 16\)"):
+        replace(SMALL, critic_hidden=(8, 16))
+    with pytest.raises(BidexError, match="brc: hidden must be one width"):
+        replace(SMALL, hidden=())
+
+
+def test_one_task_needs_no_embedding_and_several_need_their_one_hot() -> None:
+    assert LQR().num_id_columns == 0
+    trained(BRC, LQR(rows=4), SMALL, 1)
+    world = opposite_bandits()
+    world.num_id_columns, world.observation_groups = 0, plain_groups(3, 0)
+    with pytest.raises(BidexError, match="brc: task_embedding needs the one-hot of 2 tasks"):
+        BRC(world, SMALL, seed=0)
+
+
+@pytest.mark.parametrize("name", ["fasttd3", "brc"])
+@pytest.mark.parametrize("preset", ["paper", "laptop"])
+def test_they_are_found_by_name_and_every_preset_runs(name: str, preset: str) -> None:
+    kind = learner_kind(name)
+    assert kind.make is {"fasttd3": FastTD3, "brc": BRC}[name] and list(kind.presets) == ["paper", "laptop"]
+    small: dict[str, Any] = {"hidden": (16, 16), "critic_hidden": (16, 16), "replay_steps": 50, "batch_size": 64}
+    config = replace(kind.presets[preset], **small, warmup_steps=1, steps_per_iteration=3)
+    assert "Loss/critic" in kind.make(opposite_bandits(), config, seed=0).iterate()
+
+
+def test_configs_are_shown_without_importing_torch() -> None:
+    code = (
+        "import sys, bidex_algos.offpolicy.fasttd3_config as f, bidex_algos.offpolicy.brc_config as b; "
+        "assert f.PRESETS and b.PRESETS; sys.exit('torch' in sys.modules)"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    assert subprocess.run([sys.executable, "-c", code], env=environment).returncode == 0
