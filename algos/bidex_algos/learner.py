@@ -46,7 +46,7 @@ class Learner(ABC):
         agent: What evaluation plays; the policy itself, but for RL².
 
     Raises:
-        BidexError: A world in another mode, or policy heads or a task embedding for one that does not show the task.
+        BidexError: A world in another mode, or an architecture, policy heads or a task embedding for one that does not show the task.
     """
 
     name: ClassVar[str]
@@ -67,8 +67,11 @@ class Learner(ABC):
         self.device = torch.device(world.device)
         self.env_steps = 0
         self.shape = Shape.of(world)
-        for option in ("policy_heads", "task_embedding"):
-            if getattr(config, option, False) and self.shape.num_id_columns != world.num_tasks:
+        wanted = [option for option in ("policy_heads", "task_embedding") if getattr(config, option, False)]
+        if not getattr(config, "shares_a_trunk", True):
+            wanted.append(f"architecture {config.architecture}")
+        for option in wanted:
+            if self.shape.num_id_columns != world.num_tasks:
                 raise BidexError(
                     f"{self.name}: {option} needs the one-hot of {world.num_tasks} tasks in the observation (an MT "
                     f"suite), this world shows {self.shape.num_id_columns} such entries. Leave {option} off."

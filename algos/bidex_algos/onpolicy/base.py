@@ -20,7 +20,8 @@ from bidex_algos.experience.advantages import (
 from bidex_algos.experience.episodes import EpisodeStatistics
 from bidex_algos.experience.rollout import Rollout, collect
 from bidex_algos.learner import Learner
-from bidex_algos.nets.networks import MLP, GaussianActor, gaussian_log_prob
+from bidex_algos.nets.multitask.architecture import network_of
+from bidex_algos.nets.networks import GaussianActor, gaussian_log_prob
 from bidex_algos.nets.normalise import ObservationNormaliser, RunningStats
 from bidex_algos.nets.policy import GaussianPolicy
 from bidex_algos.nets.precision import autocast, use_bfloat16
@@ -76,7 +77,8 @@ class OnPolicy(Learner):
         self.low_precision = self.policy.low_precision
         self.obs: Tensor | None = None
         value_heads = world.num_tasks if config.value_heads else 1
-        self.critic = MLP(self.inputs, config.hidden, value_heads, 1.0, self.initial, config.activation).to(self.device)
+        critic = network_of(config)(self.inputs, config.hidden, value_heads, 1.0, self.initial, config.activation)
+        self.critic = critic.to(self.device)
         samples = config.rollout_steps * world.num_envs
         horizon = config.value_horizon * samples * world_size() / world.num_tasks
         self.return_stats = RunningStats((world.num_tasks,), max_count=horizon).to(self.device)
@@ -182,7 +184,8 @@ class OnPolicy(Learner):
         cls, config: OnPolicyConfig, shape: Shape, init: torch.Generator, device: torch.device
     ) -> GaussianPolicy:
         inputs, heads = cls._inputs(config, shape), shape.num_id_columns if config.policy_heads else 1
-        actor = GaussianActor(inputs, config.hidden, shape.actions, config.init_std, init, config.activation, heads)
+        sizes, network = (config.hidden, shape.actions, config.init_std), network_of(config)
+        actor = GaussianActor(inputs, *sizes, init, config.activation, heads, network)
         observations = ObservationNormaliser(inputs, config.normalise_observations)
         return GaussianPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
 
