@@ -1,4 +1,4 @@
-"""What becomes of the losses of several tasks on their way to the weights that the tasks share: one interface, a few ways."""
+"""How the losses of several tasks become one gradient of the weights that they share: one interface, a few ways."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -33,8 +33,8 @@ class Balance(ABC):
             A number to be told, divided by the processes that will sum it, as they will the gradients.
         """
 
-    def learn(self, above: Callable[[], Tensor]) -> None:
-        """What follows the step; ``above`` gives what each task's loss, now, is above its least: this process's part."""
+    def learn(self, above: Callable[[], Tensor]) -> None:  # noqa: B027
+        """What follows a step; ``above`` tells how far each loss is above its least now, this process's part."""
 
     def parts(self) -> dict[str, Any]:
         """What a checkpoint holds of it, by name."""

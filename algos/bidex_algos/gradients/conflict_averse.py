@@ -33,8 +33,8 @@ def conflict_averse(gradients: Tensor, radius: float) -> tuple[Tensor, Tensor]:
 def worst_served(gram: Tensor, even: Tensor, reach: Tensor) -> Tensor:
     """The weights w (n,) on the simplex that minimise w'G e + reach sqrt(w'G w), as far as 4 n steps lead.
 
-    A step moves weight between the two tasks where that falls most steeply, exactly as much as is best: of two tasks the
-    first is the solution. It looks at no number, so that a GPU need not be waited for.
+    A step moves weight between the two tasks where that falls most steeply, and exactly as much as is best: of two
+    tasks the first is the solution. It looks at no number, so that a GPU need not be waited for.
 
     Args:
         gram: Products of the gradients (n, n), float64.

@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.experience.advantages import task_moments
+from bidex_algos.experience.advantages import discounts, task_moments
 from bidex_algos.experience.episodes import EpisodeStatistics
 from bidex_algos.experience.replay import Transitions
 from bidex_algos.learner import Learner
@@ -44,12 +44,14 @@ class OffPolicy(Learner):
         adams: Optimisers by name; an algorithm may add some.
         batch_per_task: Transitions of each task in an update; B is ``num_tasks`` times as many, task after task.
         task_of_draw: Their tasks, int64 (B,).
+        gamma_of_rows: Discount of all rows, or of each (N,); ``gamma_of_draw``: of the transitions of an update (B,).
 
     Raises:
         BidexError: A task without rows, or no room for a replay.
     """
 
     config: OffPolicyConfig
+    discounts_by_class = True
     per_process = ("generator", "episodes", "replay", "discounted")
     num_critics: ClassVar[int] = 2
 
@@ -67,6 +69,8 @@ class OffPolicy(Learner):
         self.replay = replay_within(self.name, world, config, self.shape.observations, self.shape.actions)
         self.batch_per_task = config.batch_per_task or math.ceil(config.batch_size / world.num_tasks)
         self.task_of_draw = torch.arange(world.num_tasks, device=self.device).repeat_interleave(self.batch_per_task)
+        self.gamma_of_rows = discounts(world, config.gamma, world.task_id)
+        self.gamma_of_draw = discounts(world, config.gamma, self.task_of_draw)
         # Rewards that have left the replay fade from the statistics too.
         horizon = self.replay.steps * world.num_envs * world_size() / world.num_tasks
         self.return_stats = RunningStats((world.num_tasks,), max_count=horizon).to(self.device)
@@ -144,7 +148,7 @@ class OffPolicy(Learner):
 
     def _note_returns(self, reward: Tensor, ended: Tensor, valid: Tensor) -> None:
         """Follows the discounted sum of rewards since each episode began."""
-        self.discounted = self.config.gamma * self.discounted + reward
+        self.discounted = self.gamma_of_rows * self.discounted + reward
         moments = task_moments(self.discounted[None], self.world.task_id, self.world.num_tasks, valid[None])
         self.return_stats.merge(*moments)
         self.discounted = self.discounted.masked_fill(ended, 0.0)
@@ -178,7 +182,7 @@ class OffPolicy(Learner):
         Nothing follows a true end. After a time limit the episode could have gone on: the replay has its last state.
         """
         rewards = draw.rewards / self._reward_scale()[self.task_of_draw]
-        return rewards + self.config.gamma * following.masked_fill(draw.terminated, 0.0)
+        return rewards + self.gamma_of_draw * following.masked_fill(draw.terminated, 0.0)
 
     def _fit_critics(
         self, obs: Tensor, draw: Transitions, target: Tensor, weights: Tensor, counts: Tensor

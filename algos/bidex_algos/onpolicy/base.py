@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from bidex_algos.experience.advantages import (
+    discounts,
     explained_variance,
     gae,
     normalise_per_task,
@@ -66,10 +67,12 @@ class OnPolicy(Learner):
     Attributes:
         policy: The agent that evaluation uses: mean action, clamped.
         critic: Values of normalised observations, in units of the task's returns.
+        gamma: Discount of all rows, or of each (N,).
     """
 
     config: OnPolicyConfig
     policy: GaussianPolicy
+    discounts_by_class = True
     per_process = ("generator", "episodes", "obs")
 
     def __init__(self, world: VectorWorld, config: OnPolicyConfig, seed: int):
@@ -82,6 +85,7 @@ class OnPolicy(Learner):
         samples = config.rollout_steps * world.num_envs
         horizon = config.value_horizon * samples * world_size() / world.num_tasks
         self.return_stats = RunningStats((world.num_tasks,), max_count=horizon).to(self.device)
+        self.gamma = discounts(world, config.gamma, world.task_id)
         sizes = self.shape.observations, self.shape.actions
         self.rollout = Rollout(config.rollout_steps, world.num_envs, *sizes, self.device)
         self.episodes = EpisodeStatistics(world.task_id, world.task_names)
@@ -149,7 +153,7 @@ class OnPolicy(Learner):
         values = self._in_reward_units(self._critic(obs, flat_task_id), flat_task_id).view(steps, rows)
         last_values = self._final_value(r.last_obs, task_id)
         next_values = successor_values(values, last_values, r.ended, r.final_values)
-        advantages = gae(r.rewards, values, next_values, r.terminated, r.ended, cfg.gamma, cfg.lam, r.valid)
+        advantages = gae(r.rewards, values, next_values, r.terminated, r.ended, self.gamma, cfg.lam, r.valid)
         returns = advantages + values
         explained = explained_variance(values, returns, task_id, num_tasks, r.valid)
         self.return_stats.merge(*task_moments(returns, task_id, num_tasks, r.valid))

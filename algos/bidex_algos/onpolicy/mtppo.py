@@ -90,7 +90,7 @@ class MTPPO(OnPolicy):
             Surrogate loss, value loss, KL, share of clipped ratios and, with surgery, its own number: (4,) or (5,).
         """
         cfg, actor = self.config, self.policy.actor
-        loss = self._loss(b, count, old_log_std)
+        loss = self._loss(b, count, old_log_std, self._critic(b.obs, b.task_id))
         rest = cfg.value_loss_weight * loss.value - cfg.entropy_weight * loss.entropy
         numbers = loss.numbers()
         self.adams.zero_grad()
@@ -102,8 +102,8 @@ class MTPPO(OnPolicy):
             (loss.surrogate + rest).backward()
         return sum_gradients([*actor.parameters(), *self.critic.parameters()], torch.stack(numbers))
 
-    def _loss(self, b: Batch, count: Tensor, old_log_std: Tensor) -> PPOLoss:
-        """What the present networks make of a mini-batch."""
+    def _loss(self, b: Batch, count: Tensor, old_log_std: Tensor, values: Tensor) -> PPOLoss:
+        """What the present actor and ``values`` (B,) make of a mini-batch."""
         actor = self.policy.actor
         with autocast(self.device, self.low_precision):
             means = actor(b.obs)
@@ -115,7 +115,7 @@ class MTPPO(OnPolicy):
             actor.log_std_of(b.obs, old_log_std),
             b.old_log_probs,
             b.advantages,
-            self._critic(b.obs, b.task_id),
+            values,
             b.targets,
             weights=b.weights / count,
             clip=self.config.clip,
@@ -127,7 +127,8 @@ class MTPPO(OnPolicy):
 
     def _above_least(self, b: Batch, count: Tensor, old_log_std: Tensor) -> Tensor:
         """How far each task's surrogate loss is above that, (num_tasks,)."""
-        return self._per_task(-self._loss(b, count, old_log_std).earned - self._least(b, count), b.task_id)
+        loss = self._loss(b, count, old_log_std, b.targets)
+        return self._per_task(-loss.earned - self._least(b, count), b.task_id)
 
     def _per_task(self, x: Tensor, task_id: Tensor) -> Tensor:
         """Sums (num_tasks,) of what each sample has (B,)."""

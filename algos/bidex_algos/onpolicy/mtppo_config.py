@@ -25,9 +25,9 @@ class MTPPOConfig(PPOConfig, OnPolicyConfig):
     clip_apart: bool = True
     """Shorten the gradients of actor and critic apart, so that a large value error leaves the policy's step alone."""
     gradient_surgery: Balancing = "none"
-    """What becomes of the tasks' policy gradients. pcgrad: each loses what points against another task's (Yu et al. 2020).
-    cagrad: their sum is turned towards the task that it serves worst (Liu et al. 2021). famo: losses are weighed so that all
-    fall at one rate (Liu et al. 2023)."""
+    """What becomes of the tasks' policy gradients. pcgrad: each loses what points against another task's (Yu et al.
+    2020). cagrad: their sum is turned towards the task that it serves worst (Liu et al. 2021). famo: losses are weighed
+    so that all fall at one rate (Liu et al. 2023)."""
     cagrad_radius: float = 0.4
     """How far cagrad's direction may leave the mean gradient, in lengths of that; 0: it is the mean."""
     famo_rate: float = 0.025

@@ -13,8 +13,8 @@ class ArchitectureConfig:
     """How actor and critics share weights between tasks. A config made of this has ``hidden`` and the heads too."""
 
     architecture: Architecture = "shared"
-    """shared: one trunk for all tasks. multi_head: that with policy_heads and value_heads. soft_modules, paco, moore: other
-    trunks, each with or without heads; for MT suites, whose observations show the task."""
+    """shared: one trunk for all tasks. multi_head: that with policy_heads and value_heads. soft_modules, paco, moore:
+    other trunks, each with or without heads; for MT suites, whose observations show the task."""
     modules: int = 4
     """Modules of a layer of soft_modules, parameter sets of paco, experts of moore."""
 

@@ -5,11 +5,12 @@
     v = V w_k                        what task k takes of each
     y = head(v)
 
-Orthogonal, no two experts can say the same of a state, so that K of them span K directions. The task's one-hot chooses
-w_k and is not fed to the experts. Heads of tasks (``policy_heads``, ``value_heads``) are the paper's multi-head variant.
+Orthogonal, no two experts can say the same of a state, so that K of them span K directions. The task's one-hot
+chooses w_k and is not fed to the experts. Heads of tasks (``policy_heads``, ``value_heads``) are the paper's multi-head
+variant.
 
-Ours: the mixture is multiplied by the root of its width, so that its entries are as large as those of another layer, and
-goes through the non-linearity of the config; w starts as a random direction of length 1.
+Ours: the mixture is multiplied by the root of its width, so that its entries are as large as those of another layer,
+and goes through the non-linearity of the config; w starts as a random direction of length 1.
 """
 
 import math
@@ -40,7 +41,7 @@ def gram_schmidt(vectors: Tensor) -> Tensor:
 
 
 class Moore(nn.Module):
-    """Stands in the place of :class:`~bidex_algos.nets.networks.MLP` and takes its arguments, and ``modules``: experts."""
+    """Takes the place of :class:`~bidex_algos.nets.networks.MLP` and its arguments, and ``modules``: experts."""
 
     def __init__(
         self,

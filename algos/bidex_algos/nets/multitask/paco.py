@@ -2,14 +2,14 @@
 
     theta_k = Phi w_k        Phi: K parameter sets, shared by all tasks; w_k: K numbers of task k
 
-Every task moves the sets, and its own numbers alone; what tasks have in common can lie in one set and be weighed by many
-tasks. A layer is linear in its parameters, so that the composed layer's output is the mixture of the K layers' outputs;
-that is how it is computed, and its cost is that of K layers. The non-linearity comes after the mixing. The task's
-one-hot chooses w_k and is not fed to the layers.
+Every task moves the sets, and of the numbers its own alone; what tasks have in common can lie in one set that many of
+them weigh. A layer is linear in its parameters, so that the composed layer's output is the mixture of the K layers'
+outputs: that is how it is computed, at the cost of K layers, and the non-linearity comes after. The task's one-hot
+chooses w_k and is not fed to the layers.
 
-Ours, where the paper is silent or does otherwise: actor and each critic have their own w; w starts as a random direction
-of length 1; the biases of the output are not composed, since the actor's hold the standard deviation that it begins with;
-layer normalisation has no weights; there is no masking and no fresh start of tasks whose loss explodes.
+Ours: actor and each critic have their own w; w starts as a random direction of length 1; the biases of the output are
+not composed, since the actor's hold the standard deviation that it begins with; layer normalisation has no weights. Of
+the paper's training, the masking and fresh start of tasks whose loss explodes is left out.
 """
 
 import math
@@ -26,7 +26,7 @@ from bidex_algos.nets.networks import ACTIVATIONS
 
 
 class PaCo(nn.Module):
-    """Stands in the place of :class:`~bidex_algos.nets.networks.MLP` and takes its arguments, and ``modules``: the sets."""
+    """Takes the place of :class:`~bidex_algos.nets.networks.MLP` and its arguments, and ``modules``: the sets."""
 
     def __init__(
         self,

@@ -28,7 +28,7 @@ class StackedLinear(nn.Module):
             nn.init.orthogonal_(layer, gain, generator=generator)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Maps (batch, inputs), the same for all layers, or (K, batch, inputs), one for each, to (K, batch, outputs)."""
+        """Maps (batch, inputs), the same for all, or (K, batch, inputs), one for each, to (K, batch, outputs)."""
         if x.dim() == 2:
             bias = None if self.bias is None else self.bias.flatten()
             out = nn.functional.linear(x, self.weight.flatten(0, 1), bias)

@@ -5,10 +5,11 @@
     p^l+1 = D^l+1 relu(U^l p^l * e)              each further layer of routes knows the one before
     g_i   = sum_j softmax_j(p_ij) relu(W_j g_j)  module i takes its shares of the modules before it
 
-The first of ``hidden`` is the width of f(s), which feeds the first layer; each further one is a layer of ``modules`` modules.
-The task's one-hot enters by h alone. Of the last layer the head takes shares too, where the paper adds the modules up:
-so a single layer is routed as well. f has one layer, the paper's two; the non-linearity is the config's. Its loss weights
-by temperature are no part of a network and are left out.
+The first of ``hidden`` is the width of f(s), which feeds the first layer; each further one is that of a layer of
+``modules`` modules. The task's one-hot enters by h alone.
+
+Ours: the head takes shares of the last layer, where the paper adds its modules up, so that a single layer is routed
+too; f is one layer; modules have the config's non-linearity. The paper's loss weights by temperature are left out.
 """
 
 import math
@@ -25,7 +26,7 @@ from bidex_algos.nets.networks import ACTIVATIONS, linear
 
 
 class SoftModules(nn.Module):
-    """Stands in the place of :class:`~bidex_algos.nets.networks.MLP` and takes its arguments, and ``modules``: of a layer."""
+    """Takes the place of :class:`~bidex_algos.nets.networks.MLP` and its arguments, and ``modules``: of a layer."""
 
     def __init__(
         self,
