@@ -231,11 +231,11 @@ class Benchmark:
             task_class = self._classes[entry.name]
             variations = [task.variation for task in self._tasks[split] if task.env_name == entry.name]
             if self.suite.task_id == "class":
-                slots.append(Slot(entry.name, task_class, np.stack(variations), entry.reward_scale))
+                slots.append(Slot(entry.name, task_class, np.stack(variations), entry.reward_scale, entry.gamma))
                 continue
             names = [f"{entry.name}/{task.name}" for task in entry.tasks if task.split == split]
             for name, variation in zip(names, variations, strict=True):
-                slots.append(Slot(name, task_class, variation[None], entry.reward_scale))
+                slots.append(Slot(name, task_class, variation[None], entry.reward_scale, entry.gamma))
         return slots
 
 

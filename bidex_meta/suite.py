@@ -45,6 +45,8 @@ class SuiteClass:
     """Where it appears: train, test or both."""
     reward_scale: float
     """Factor on the reward the learner sees."""
+    gamma: float | None
+    """Discount per step of this class; None: the learner's own."""
     tasks: tuple[ListedTask, ...]
     """Listed tasks; empty where the tasks are drawn."""
     options: Mapping[str, float]
@@ -135,12 +137,15 @@ def _parse_class(table: "_Table") -> SuiteClass:
         name=table.text("name"),
         splits=SPLITS if split == "both" else (cast(Split, split),),
         reward_scale=table.number("reward_scale", default=1.0),
+        gamma=table.number("gamma") if "gamma" in table.content else None,
         tasks=tuple(_parse_task(task) for task in table.tables("tasks", default=())),
         options=MappingProxyType(_parse_options(table) if "options" in table.content else {}),
     )
     table.finish()
     if entry.reward_scale <= 0.0:
         raise table.error("reward_scale", "a number above 0", entry.reward_scale)
+    if entry.gamma is not None and not 0.0 <= entry.gamma < 1.0:
+        raise table.error("gamma", "a number from 0 to below 1", entry.gamma)
     return entry
 
 

@@ -50,6 +50,7 @@ class FakeWorld(ABC):
         unstable: tuple[tuple[int, int], ...] = (),
     ):
         self.task_names, self.num_tasks, self.num_envs = list(tasks), len(tasks), num_envs
+        self.gammas: tuple[float | None, ...] = (None,) * self.num_tasks
         self.device = torch.device("cpu")
         self.autoreset_mode = checked_mode(mode)
         self.metadata: dict[str, Any] = {"autoreset_mode": self.autoreset_mode}

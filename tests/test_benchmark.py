@@ -178,6 +178,15 @@ def test_reward_scale_reaches_its_slot(asked: None, tmp_path: Path) -> None:
     assert Benchmark(file).make_world().slots[0].reward_scale == 0.1
 
 
+def test_a_discount_reaches_its_slot_and_the_world(tmp_path: Path) -> None:
+    file = own_suite(tmp_path, **{'"HandOver"': '"HandOver"\ngamma = 0.97'})
+    world = Benchmark(file).make_world(num_envs=4, device="cpu")
+    gammas = {slot.name: slot.gamma for slot in world.slots}
+    assert gammas.pop("HandOver") == 0.97 and not any(gammas.values())
+    assert world.gammas == tuple(0.97 if name == "HandOver" else None for name in world.task_names)
+    assert Benchmark("ML1").make_world("train", num_envs=3, device="cpu").gammas == (None,)
+
+
 def test_task_world_has_the_tasks_of_the_suites(asked: None) -> None:
     world = make_task_world("CatchAbreast", num_envs=3, device="cpu", seed=2)
     expected = [t.variation for t in Benchmark("MT4", seed=2).train_tasks if t.env_name == "CatchAbreast"]

@@ -139,6 +139,8 @@ def test_attributes(case: Case) -> None:
     assert world.task_id.shape == (n,) and world.task_id.dtype == torch.int64 and world.task_id.device == world.device
     assert (world.task_id.diff() >= 0).all() and world.task_id.unique().tolist() == list(range(world.num_tasks))
     assert world.num_id_columns in (0, world.num_tasks)
+    assert isinstance(world.gammas, tuple) and len(world.gammas) == world.num_tasks
+    assert all(gamma is None or 0.0 <= gamma < 1.0 for gamma in world.gammas)
 
 
 def test_tasks_of_rows(case: Case) -> None:

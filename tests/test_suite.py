@@ -168,6 +168,12 @@ FAULTS = {
         'split = "test"\nreward_scale = -1',
         "reward_scale: expected a number above 0",
     ),
+    "discount of 1": (
+        META,
+        'split = "test"',
+        'split = "test"\ngamma = 1.0',
+        "gamma: expected a number from 0 to below 1",
+    ),
     "overlap": (
         LISTED,
         "goal_x = 0.1",
@@ -221,7 +227,7 @@ def test_readme_explains_every_key() -> None:
     from bidex_meta.paths import suites_dir
 
     readme = (suites_dir() / "README.md").read_text(encoding="utf-8")
-    for key in [*KEYS[:-1], "description", "split", "reward_scale", "options", "tasks", "fixed"]:
+    for key in [*KEYS[:-1], "description", "split", "reward_scale", "gamma", "options", "tasks", "fixed"]:
         assert f"| `{key}` |" in readme
     for name in suite_names():
         assert f"| {name} |" in readme

@@ -46,7 +46,8 @@ class Learner(ABC):
         agent: What evaluation plays; the policy itself, but for RL².
 
     Raises:
-        BidexError: A world in another mode, or policy heads or a task embedding for one that does not show the task.
+        BidexError: A world in another mode, with discounts of its classes where the learner has one for all, or without
+            the task's one-hot where an option of the config needs it.
     """
 
     name: ClassVar[str]
@@ -57,6 +58,8 @@ class Learner(ABC):
     """Its config, a dataclass."""
     autoreset: ClassVar[Any] = "SAME_STEP"
     """Mode of the world it trains on, or a function of the config (as a dict) that gives it."""
+    discounts_by_class: ClassVar[bool] = False
+    """Whether it takes the discount of each class where a world has some (``world.gammas``)."""
     per_process: ClassVar[tuple[str, ...]] = ()
     """Entries of ``state_dict`` that differ from process to process."""
 
@@ -67,14 +70,23 @@ class Learner(ABC):
         self.device = torch.device(world.device)
         self.env_steps = 0
         self.shape = Shape.of(world)
-        for option in ("policy_heads", "task_embedding"):
-            # One task needs no embedding; heads it cannot have.
-            needed = world.num_tasks > 1 or option == "policy_heads"
-            if needed and getattr(config, option, False) and self.shape.num_id_columns != world.num_tasks:
+        wanted = [option for option in ("policy_heads", "task_embedding") if getattr(config, option, False)]
+        if world.num_tasks == 1 and "task_embedding" in wanted:
+            wanted.remove("task_embedding")  # one task needs none; heads it cannot have
+        if not getattr(config, "shares_a_trunk", True):
+            wanted.append(f"architecture {config.architecture}")
+        for option in wanted:
+            if self.shape.num_id_columns != world.num_tasks:
                 raise BidexError(
                     f"{self.name}: {option} needs the one-hot of {world.num_tasks} tasks in the observation (an MT "
                     f"suite), this world shows {self.shape.num_id_columns} such entries. Leave {option} off."
                 )
+        own = [name for name, gamma in zip(world.task_names, world.gammas, strict=True) if gamma is not None]
+        if own and not self.discounts_by_class:
+            raise BidexError(
+                f"{self.name}: has one discount for all classes, but the suite gives {', '.join(own)} one of its own. "
+                "Leave gamma out of the suite's file."
+            )
         self.inputs = self._inputs(config, self.shape)
         # Weights come from a CPU generator, so that a seed means the same network on every device.
         self.initial = torch.Generator().manual_seed(seed)

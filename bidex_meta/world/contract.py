@@ -92,6 +92,7 @@ class VectorWorld(Protocol):
         num_tasks: Slots.
         task_id: Slot of each row, ascending, int64 (N,).
         task_names: Names of the slots.
+        gammas: Discount per step that learners shall take for each slot, None where their own holds.
         num_id_columns: Trailing entries of an observation that are the one-hot of the slot: ``num_tasks``, or 0 where
             the observation has none.
         observation_groups: The named parts of an observation, in the order of their first entries: each entry is in
@@ -108,6 +109,7 @@ class VectorWorld(Protocol):
     num_tasks: int
     task_id: Tensor
     task_names: list[str]
+    gammas: tuple[float | None, ...]
     num_id_columns: int
     observation_groups: tuple[ObservationGroup, ...]
     metadata: dict[str, Any]

@@ -27,12 +27,14 @@ class Slot:
         task_class: The class.
         tasks: The pool of variations, shape (n, variation_space.size), float64.
         reward_scale: Factor on the reward that the world returns.
+        gamma: Discount that learners shall take for it; None: their own.
     """
 
     name: str
     task_class: TaskClass
     tasks: np.ndarray
     reward_scale: float = 1.0
+    gamma: float | None = None
 
 
 @dataclass(frozen=True)

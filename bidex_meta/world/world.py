@@ -103,6 +103,7 @@ class World(Recreated, RowAttributes, VectorEnv):
         self.render_mode = "rgb_array"
         self.task_names = [slot.name for slot in slots]
         self.num_tasks = len(slots)
+        self.gammas = tuple(slot.gamma for slot in slots)
         self.slot_rows = split_rows(num_envs, len(slots))
         counts = torch.tensor([rows.stop - rows.start for rows in self.slot_rows])
         self.task_id = torch.arange(len(slots)).repeat_interleave(counts).to(self.device)

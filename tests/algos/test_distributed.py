@@ -22,6 +22,7 @@ from tests.algos.toy import ToyWorld, nearness
 CONFIG = MTPPOConfig(hidden=(32, 32), rollout_steps=8, learning_rate_range=(1e-5, 2e-3), autocast="off")
 ONE_BATCH = replace(CONFIG, num_minibatches=1, entropy_weight=0.01)
 SURGERY = replace(ONE_BATCH, gradient_surgery="pcgrad", policy_heads=True)
+CONFLICT_AVERSE, LOSS_WEIGHTS = (replace(SURGERY, gradient_surgery=way) for way in ("cagrad", "famo"))
 TRUST_REGION = MTTRPOConfig(hidden=(32, 32), rollout_steps=8, num_minibatches=1, fisher_stride=1)
 Learner = MTPPO | MTTRPO
 ROWS = 16
@@ -156,7 +157,7 @@ def bad_input(rank: int) -> str:
 def everything(rank: int) -> dict[str, Any]:
     """One start of two processes for all tests, since importing torch takes longer than the rest."""
     updates = {dtype: one_update(rank, dtype, ONE_BATCH) for dtype in (torch.float64, torch.float32)}
-    updates |= {c: one_update(rank, torch.float64, c) for c in (SURGERY, TRUST_REGION)}
+    updates |= {c: one_update(rank, torch.float64, c) for c in (SURGERY, CONFLICT_AVERSE, LOSS_WEIGHTS, TRUST_REGION)}
     distributed.init_from_environment()
     found: dict[Any, Any] = {name: in_two() for name, in_two in updates.items()}
     found |= {"training": training(rank), "stopping": stopping(rank), "bad_input": bad_input(rank)}
@@ -176,7 +177,11 @@ def distances(update: dict[str, Any]) -> dict[str, float]:
     return {name: float((half[name] - whole[name]).norm() / whole[name].norm()) for name in whole}
 
 
-@pytest.mark.parametrize("which", [torch.float64, SURGERY, TRUST_REGION], ids=["ppo", "pcgrad", "trpo"])
+@pytest.mark.parametrize(
+    "which",
+    [torch.float64, SURGERY, CONFLICT_AVERSE, LOSS_WEIGHTS, TRUST_REGION],
+    ids=["ppo", "pcgrad", "cagrad", "famo", "trpo"],
+)
 def test_an_update_of_two_processes_is_that_of_one_with_all_rows(found, which):
     for here in found:
         far = {name: d for name, d in distances(here[which]).items() if not d <= 1e-6}

@@ -41,7 +41,7 @@ SHARED: dict[str, Any] = {
     "autocast": "off",
     "atoms": 51,
 }
-FAST = FastTD3Config(**SHARED | {"updates_per_step": 4}, critic_layer_norm=False, n_steps=1)
+FAST = FastTD3Config(**SHARED | {"updates_per_step": 4}, critic_layer_norm=False, n_steps=1, squash_price=0.0)
 SMALL = BRCConfig(**SHARED, task_embedding=4, init_alpha=0.01, target_entropy_per_action=-2.0)
 both = pytest.mark.parametrize(("kind", "config"), [(FastTD3, FAST), (BRC, SMALL)], ids=["fasttd3", "brc"])
 

@@ -16,7 +16,16 @@ __all__ = ["masked"]
 CONFIG = MTPPOConfig(hidden=(16,), rollout_steps=4, num_minibatches=2, epochs=2, autocast="off")
 
 
-@pytest.mark.parametrize("options", [{}, {"gradient_surgery": "pcgrad", "policy_heads": True}], ids=["ppo", "pcgrad"])
+OPTIONS = {
+    "ppo": {},
+    "pcgrad": {"gradient_surgery": "pcgrad", "policy_heads": True},
+    "cagrad": {"gradient_surgery": "cagrad", "architecture": "paco"},
+    "famo": {"gradient_surgery": "famo", "architecture": "moore"},
+    "soft_modules": {"architecture": "soft_modules", "hidden": (16, 16)},
+}
+
+
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
 def test_collecting_and_learning_look_at_no_number(masked, monkeypatch: pytest.MonkeyPatch, options: dict[str, object]):
     monkeypatch.setattr(rollout, "may_look", lambda device: False)
     learner = MTPPO(suite_world("MT4", 8), replace(CONFIG, **options), seed=0)

@@ -131,6 +131,7 @@ class Noise:
         self.device, self.metadata = torch.device("cpu"), {"autoreset_mode": AutoresetMode.SAME_STEP}
         self.task_id = torch.arange(num_envs) * num_tasks // num_envs
         self.task_names = [f"task{i}" for i in range(num_tasks)]
+        self.gammas: tuple[float | None, ...] = (None,) * num_tasks
         self.generator = torch.Generator().manual_seed(seed)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:

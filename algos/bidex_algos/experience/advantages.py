@@ -4,6 +4,14 @@ import torch
 from torch import Tensor
 
 from bidex_meta.train.distributed import pool_moments
+from bidex_meta.world.contract import VectorWorld
+
+
+def discounts(world: VectorWorld, gamma: float, task_id: Tensor) -> float | Tensor:
+    """A learner's ``gamma``; where classes of the world have their own, that of each entry of ``task_id`` (n,)."""
+    if all(own is None for own in world.gammas):
+        return gamma
+    return torch.tensor([gamma if own is None else own for own in world.gammas], device=task_id.device)[task_id]
 
 
 def successor_values(values: Tensor, last_values: Tensor, ended: Tensor, final_values: Tensor) -> Tensor:
@@ -37,7 +45,7 @@ def gae(
         next_values: V(s'_t) of the true successor (see :func:`successor_values`), shape (T, N).
         terminated: Bool (T, N): nothing follows, V(s') counts as 0. A time limit is not such an end.
         ended: Bool (T, N): the episode ended here, by either flag.
-        gamma: Discount, one for all or one for each transition, (T, N).
+        gamma: Discount, one for all, one for each row, (N,), or one for each transition, (T, N).
         lam: Trace decay.
         valid: Bool (T, N); the advantage of an invalid transition is 0 and nothing flows through it. Default: all.
 

@@ -26,13 +26,13 @@ class Stretches:
         last: Places of the last steps, (batches, B).
     """
 
-    def __init__(self, replay: Replay, places: Tensor, n: int, gamma: float):
+    def __init__(self, replay: Replay, places: Tensor, n: int, gamma: float | Tensor):
         self.replay, self.first, self.last = replay, places, places
         self.rewards: Tensor | None = None
         if n > 1:
             self._walk(n, gamma)
 
-    def _walk(self, n: int, gamma: float) -> None:
+    def _walk(self, n: int, gamma: float | Tensor) -> None:
         replay = self.replay
         newest = replay.added % replay.slots  # the slot of an observation that no step has left yet
         self.rewards, self.steps = replay.at("rewards", self.first), torch.ones_like(self.first)

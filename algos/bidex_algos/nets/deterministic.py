@@ -1,6 +1,7 @@
 """An actor without a distribution, and its agent (Silver et al. 2014)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -22,6 +23,7 @@ class DeterministicActor(nn.Module):
         heads: Output layers; with more than one, the group ``task_id`` is the one-hot that chooses.
         generator: CPU generator of the initial weights.
         activation: Name of the non-linearity.
+        network: What makes the network, by the arguments of ``MLP``.
     """
 
     def __init__(
@@ -32,11 +34,12 @@ class DeterministicActor(nn.Module):
         heads: int,
         generator: torch.Generator,
         activation: Activation,
+        network: Callable[..., Any] = MLP,
     ):
         super().__init__()
         self.heads = heads
         self.one_hot = Inputs.of(inputs).columns(*["task_id"] * (heads > 1))
-        self.net = MLP(inputs, hidden, heads * actions, 0.01, generator, activation)
+        self.net = network(inputs, hidden, heads * actions, 0.01, generator, activation)
 
     def forward(self, x: Tensor) -> Tensor:
         """Actions of normalised observations (batch, d): float32 (batch, a) in [-1, 1]."""

@@ -1,7 +1,8 @@
 """Networks and the diagonal Gaussian that the learners share; knows no loss and no optimiser."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -50,6 +51,11 @@ class MLP(nn.Module):
             before = width
         self.body = nn.Sequential(*layers)
         self.head = linear(before, outputs, output_gain, generator)
+
+    @property
+    def output_bias(self) -> Tensor:
+        """Biases of the output (outputs,)."""
+        return self.head.bias
 
     def forward(self, x: Tensor) -> Tensor:
         """Maps (batch, inputs) to float32 (batch, outputs)."""
@@ -108,6 +114,7 @@ class GaussianActor(nn.Module):
         activation: Name of the non-linearity.
         heads: Output layers and rows of standard deviations; more than one: as many as the group ``task_id`` has
             columns, which choose the head.
+        network: What makes the network of the mean, by the arguments of :class:`MLP`.
 
     Attributes:
         log_std: Logarithms of the standard deviations, (actions,); with more than one head (heads, actions).
@@ -122,11 +129,12 @@ class GaussianActor(nn.Module):
         generator: torch.Generator,
         activation: Activation = "elu",
         heads: int = 1,
+        network: Callable[..., Any] = MLP,
     ):
         super().__init__()
         self.heads = heads
         self.one_hot = Inputs.of(inputs).columns(*["task_id"] * (heads > 1))
-        self.mean = MLP(inputs, hidden, heads * actions, 0.01, generator, activation)
+        self.mean = network(inputs, hidden, heads * actions, 0.01, generator, activation)
         shape = (actions,) if heads == 1 else (heads, actions)
         self.log_std = nn.Parameter(torch.full(shape, math.log(init_std)))
 

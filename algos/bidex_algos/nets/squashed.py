@@ -1,7 +1,8 @@
 """A Gaussian squashed by tanh into (-1, 1) (Haarnoja et al. 2018, appendix C): density, actor and agent."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -59,7 +60,7 @@ class SquashedActor(nn.Module):
         std_range: Its bounds.
         generator: CPU generator of the initial weights.
         activation: Name of the non-linearity.
-        network: What computes both.
+        network: What makes the network, by the arguments of ``MLP``.
     """
 
     def __init__(
@@ -72,7 +73,7 @@ class SquashedActor(nn.Module):
         std_range: tuple[float, float],
         generator: torch.Generator,
         activation: Activation,
-        network: type[MLP] = MLP,
+        network: Callable[..., Any] = MLP,
     ):
         super().__init__()
         self.heads = heads
@@ -82,7 +83,7 @@ class SquashedActor(nn.Module):
         self.net = network(inputs, hidden, heads * 2 * actions, 0.01, generator, activation)
         with torch.no_grad():
             start = math.atanh((math.log(init_std) - self.middle) / self.reach)
-            self.net.head.bias.view(heads, 2, actions)[:, 1] = start
+            self.net.output_bias.view(heads, 2, actions)[:, 1] = start
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and log standard deviation of normalised observations (batch, d): float32 (batch, a) each."""

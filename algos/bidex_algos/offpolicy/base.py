@@ -18,6 +18,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from bidex_algos.experience.advantages import discounts
 from bidex_algos.experience.episodes import EpisodeStatistics
 from bidex_algos.experience.n_step import Stretches
 from bidex_algos.experience.replay import Transitions
@@ -46,12 +47,14 @@ class OffPolicy(Learner):
         adams: Optimisers by name; an algorithm may add some.
         batch_per_task: Transitions of each task in an update; B is ``num_tasks`` times as many, task after task.
         task_of_draw: Their tasks, int64 (B,).
+        gamma_of_rows: Discount of all rows, or of each (N,); ``gamma_of_draw``: of the transitions of an update (B,).
 
     Raises:
         BidexError: A task without rows, or no room for a replay.
     """
 
     config: OffPolicyConfig
+    discounts_by_class = True
     per_process = ("generator", "episodes", "replay", "discounted")
     num_critics: ClassVar[int] = 2
     returns_type: ClassVar[type[ReturnScale]] = ReturnScale
@@ -70,9 +73,11 @@ class OffPolicy(Learner):
         self.replay = replay_within(self.name, world, config, self.shape.observations, self.shape.actions)
         self.batch_per_task = config.batch_per_task or math.ceil(config.batch_size / world.num_tasks)
         self.task_of_draw = torch.arange(world.num_tasks, device=self.device).repeat_interleave(self.batch_per_task)
+        self.gamma_of_rows = discounts(world, config.gamma, world.task_id)
+        self.gamma_of_draw = discounts(world, config.gamma, self.task_of_draw)
         # Rewards that have left the replay fade from the statistics too.
         horizon = self.replay.steps * world.num_envs * world_size() / world.num_tasks
-        self.returns = self.returns_type(world, config.gamma, horizon)
+        self.returns = self.returns_type(world, self.gamma_of_rows, horizon)
         self.episodes = EpisodeStatistics(world.task_id, world.task_names)
 
     def _make_critics(self, inputs: Inputs, heads: int) -> Any:
@@ -160,7 +165,7 @@ class OffPolicy(Learner):
         """The updates that follow one vector step; what each measured."""
         updates, tasks = self.config.updates_per_step, self.world.num_tasks
         places = self.replay.draw(updates, self.batch_per_task, self.generator)
-        stretches = Stretches(self.replay, places, self.config.n_steps, self.config.gamma)
+        stretches = Stretches(self.replay, places, self.config.n_steps, self.gamma_of_draw)
         weights = self.replay.weights(stretches.last)
         # Divided by the draws of all processes, losses and gradients become means by being summed over them.
         counts = all_sum(weights.view(updates, tasks, -1).sum(2))
@@ -181,7 +186,7 @@ class OffPolicy(Learner):
         Nothing follows a true end. After a time limit the episode could have gone on: the replay has its last state.
         """
         rewards = draw.rewards / self._reward_scale()[self.task_of_draw]
-        return rewards + self.config.gamma**draw.steps * following.masked_fill(draw.terminated, 0.0)
+        return rewards + self.gamma_of_draw**draw.steps * following.masked_fill(draw.terminated, 0.0)
 
     def _fit_critics(
         self, obs: Tensor, draw: Transitions, target: Tensor, weights: Tensor, counts: Tensor

@@ -13,6 +13,7 @@ pessimistic. All else is as in ``mtsac.py`` and ``categorical.py``; deviations s
 import torch
 from torch import Tensor
 
+from bidex_algos.experience.advantages import discounts
 from bidex_algos.experience.replay import Transitions
 from bidex_algos.nets.encoders.inputs import Inputs
 from bidex_algos.nets.encoders.task_embedding import with_task_embedding
@@ -50,7 +51,9 @@ class BRC(Categorical, MTSAC):
     def _reward_scale(self) -> Tensor:
         if not self.config.per_task_rewards:
             return super()._reward_scale()
-        bound, each = self.config.value_bound, abs(self.target_entropy) / (1.0 - self.config.gamma)
+        tasks = torch.arange(self.world.num_tasks, device=self.device)
+        gamma = discounts(self.world, self.config.gamma, tasks)
+        bound, each = self.config.value_bound, abs(self.target_entropy) / (1.0 - gamma)
         # Room for the entropy of all steps to come, but half of the atoms are the rewards' in any case.
         room = bound - (self.log_alpha.detach().exp() * each).clamp_max(0.5 * bound)
         return (self.returns.bound / room).clamp_min(1e-8)

@@ -40,6 +40,8 @@ class BRCConfig(CategoricalConfig, MTSACConfig):
             BidexError: A field is out of its range.
         """
         super().__post_init__()
+        if not self.shares_a_trunk:
+            raise BidexError(f"{self.algo}: its networks are residual; architecture must be shared or multi_head.")
         for name in ("hidden", "critic_hidden"):
             widths = getattr(self, name)
             if len(set(widths)) != 1:

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from bidex_algos.experience.replay import Transitions
 from bidex_algos.nets.atoms import Atoms
 from bidex_algos.nets.encoders.inputs import Inputs
+from bidex_algos.nets.multitask.architecture import MakeNetwork, network_of
 from bidex_algos.nets.networks import MLP
 from bidex_algos.nets.precision import autocast
 from bidex_algos.offpolicy.base import OffPolicy
@@ -33,7 +34,7 @@ class CategoricalCritics(nn.Module):
         config: Layers and atoms.
         generator: CPU generator of the initial weights.
         count: How many networks.
-        network: What they are.
+        network: What makes each, by the arguments of ``MLP``.
     """
 
     def __init__(
@@ -43,7 +44,7 @@ class CategoricalCritics(nn.Module):
         config: CategoricalConfig,
         generator: torch.Generator,
         count: int,
-        network: type[MLP],
+        network: MakeNetwork,
     ):
         super().__init__()
         self.heads = heads
@@ -74,12 +75,13 @@ class Categorical(OffPolicy):
 
     config: Any
     per_process = (*OffPolicy.per_process, "discounted_ones")
-    critic_network: ClassVar[type[MLP]] = MLP
+    critic_network: ClassVar[type[MLP] | None] = None
     returns_type = ReturnBound
     returns: ReturnBound
 
     def _make_critics(self, inputs: Inputs, heads: int) -> CategoricalCritics:
-        return CategoricalCritics(inputs, heads, self.config, self.initial, self.num_critics, self.critic_network)
+        network = self.critic_network or network_of(self.config)
+        return CategoricalCritics(inputs, heads, self.config, self.initial, self.num_critics, network)
 
     def _log_probs(self, critic: CategoricalCritics, obs: Tensor, actions: Tensor) -> Tensor:
         with autocast(self.device, self.low_precision):
@@ -105,7 +107,7 @@ class Categorical(OffPolicy):
             bonus: What is added to the value of the state after the transition, (B,).
         """
         shift = self._bootstrapped(draw, bonus)
-        factor = (self.config.gamma**draw.steps) * (~draw.terminated).to(shift.dtype)
+        factor = (self.gamma_of_draw**draw.steps) * (~draw.terminated).to(shift.dtype)
         return self.critic.atoms.projected(following, shift, factor)
 
     def _critic_losses(self, obs: Tensor, actions: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:

@@ -5,11 +5,12 @@ from typing import ClassVar
 
 from bidex_algos.checks import at_least, between, network_bytes, positive, types
 from bidex_algos.choices import Activation, Autocast
+from bidex_algos.nets.multitask.config import ArchitectureConfig
 from bidex_meta.errors import BidexError
 
 
 @dataclass(frozen=True)
-class OffPolicyConfig:
+class OffPolicyConfig(ArchitectureConfig):
     """Networks, replay, updates, statistics; the defaults are the preset ``laptop``.
 
     A vector step is one step in every row of the world.
@@ -77,6 +78,7 @@ class OffPolicyConfig:
             BidexError: A field is out of its range.
         """
         types(self)
+        self._check_architecture()
         at_least(self, 1, "replay_steps", "steps_per_iteration", "updates_per_step", "batch_size", "n_steps")
         if self.batch_per_task is not None:
             at_least(self, 1, "batch_per_task")

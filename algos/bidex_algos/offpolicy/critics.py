@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.nets.encoders.inputs import Inputs
-from bidex_algos.nets.networks import MLP
+from bidex_algos.nets.multitask.architecture import network_of
 from bidex_algos.offpolicy.config import OffPolicyConfig
 
 
@@ -24,8 +24,9 @@ class Critics(nn.Module):
     ):
         super().__init__()
         self.heads = heads
+        network = network_of(config)
         self.nets = nn.ModuleList(
-            MLP(inputs, config.hidden, heads, 1.0, generator, config.activation, config.critic_layer_norm)
+            network(inputs, config.hidden, heads, 1.0, generator, config.activation, config.critic_layer_norm)
             for _ in range(count)
         )
 

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from bidex_algos.experience.replay import Transitions
 from bidex_algos.nets.deterministic import DeterministicActor, DeterministicPolicy
+from bidex_algos.nets.multitask.architecture import network_of
 from bidex_algos.nets.normalise import ObservationNormaliser
 from bidex_algos.nets.precision import autocast, use_bfloat16
 from bidex_algos.nets.shape import Shape
@@ -110,7 +111,8 @@ class DDPG(OffPolicy):
         cls, config: DDPGConfig, shape: Shape, init: torch.Generator, device: torch.device
     ) -> DeterministicPolicy:
         inputs, heads = cls._inputs(config, shape), shape.num_id_columns if config.policy_heads else 1
-        actor = DeterministicActor(inputs, config.hidden, shape.actions, heads, init, config.activation)
+        network = network_of(config)
+        actor = DeterministicActor(inputs, config.hidden, shape.actions, heads, init, config.activation, network)
         observations = ObservationNormaliser(inputs, config.normalise_observations)
         return DeterministicPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
 

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.experience.replay import Transitions
+from bidex_algos.nets.multitask.architecture import network_of
 from bidex_algos.nets.networks import MLP
 from bidex_algos.nets.normalise import ObservationNormaliser
 from bidex_algos.nets.precision import use_bfloat16
@@ -49,7 +50,7 @@ class MTSAC(OffPolicy):
     config_type = MTSACConfig
     config: MTSACConfig
     policy: SquashedPolicy
-    actor_network: ClassVar[type[MLP]] = MLP
+    actor_network: ClassVar[type[MLP] | None] = None
 
     def __init__(self, world: VectorWorld, config: MTSACConfig, seed: int):
         super().__init__(world, config, seed)
@@ -102,10 +103,8 @@ class MTSAC(OffPolicy):
         cls, config: MTSACConfig, shape: Shape, init: torch.Generator, device: torch.device
     ) -> SquashedPolicy:
         inputs, heads = cls._inputs(config, shape), shape.num_id_columns if config.policy_heads else 1
-        actor = SquashedActor(
-            inputs, config.hidden, shape.actions, heads, config.init_std, config.std_range, init, config.activation,
-            cls.actor_network,
-        )  # fmt: skip
+        sizes, network = (config.hidden, shape.actions, heads), cls.actor_network or network_of(config)
+        actor = SquashedActor(inputs, *sizes, config.init_std, config.std_range, init, config.activation, network)
         observations = ObservationNormaliser(inputs, config.normalise_observations)
         return SquashedPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
 

@@ -16,7 +16,7 @@ class ReturnScale:
 
     Args:
         world: Whose rewards they are.
-        gamma: Discount per step.
+        gamma: Discount per step, of all rows or of each (N,).
         horizon: Returns of a task after which older ones fade.
 
     Attributes:
@@ -24,7 +24,7 @@ class ReturnScale:
         discounted: The sum in each row so far (N,).
     """
 
-    def __init__(self, world: VectorWorld, gamma: float, horizon: float):
+    def __init__(self, world: VectorWorld, gamma: float | Tensor, horizon: float):
         self.gamma, self.task_id, self.num_tasks = gamma, world.task_id, world.num_tasks
         self.stats = RunningStats((world.num_tasks,), max_count=horizon).to(world.device)
         self.discounted = torch.zeros(world.num_envs, device=world.device)
@@ -60,7 +60,7 @@ class ReturnBound(ReturnScale):
         mass: The sum in each row, had all rewards been 1 (N,).
     """
 
-    def __init__(self, world: VectorWorld, gamma: float, horizon: float):
+    def __init__(self, world: VectorWorld, gamma: float | Tensor, horizon: float):
         super().__init__(world, gamma, horizon)
         self.bound = torch.zeros(world.num_tasks, device=world.device)
         self.mass = torch.zeros(world.num_envs, device=world.device)

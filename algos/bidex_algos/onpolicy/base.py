@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from bidex_algos.experience.advantages import (
+    discounts,
     explained_variance,
     gae,
     normalise_per_task,
@@ -20,7 +21,8 @@ from bidex_algos.experience.advantages import (
 from bidex_algos.experience.episodes import EpisodeStatistics
 from bidex_algos.experience.rollout import Rollout, collect
 from bidex_algos.learner import Learner
-from bidex_algos.nets.networks import MLP, GaussianActor, gaussian_log_prob
+from bidex_algos.nets.multitask.architecture import network_of
+from bidex_algos.nets.networks import GaussianActor, gaussian_log_prob
 from bidex_algos.nets.normalise import ObservationNormaliser, RunningStats
 from bidex_algos.nets.policy import GaussianPolicy
 from bidex_algos.nets.precision import autocast, use_bfloat16
@@ -65,10 +67,12 @@ class OnPolicy(Learner):
     Attributes:
         policy: The agent that evaluation uses: mean action, clamped.
         critic: Values of normalised observations, in units of the task's returns.
+        gamma: Discount of all rows, or of each (N,).
     """
 
     config: OnPolicyConfig
     policy: GaussianPolicy
+    discounts_by_class = True
     per_process = ("generator", "episodes", "obs")
 
     def __init__(self, world: VectorWorld, config: OnPolicyConfig, seed: int):
@@ -76,10 +80,12 @@ class OnPolicy(Learner):
         self.low_precision = self.policy.low_precision
         self.obs: Tensor | None = None
         value_heads = world.num_tasks if config.value_heads else 1
-        self.critic = MLP(self.inputs, config.hidden, value_heads, 1.0, self.initial, config.activation).to(self.device)
+        critic = network_of(config)(self.inputs, config.hidden, value_heads, 1.0, self.initial, config.activation)
+        self.critic = critic.to(self.device)
         samples = config.rollout_steps * world.num_envs
         horizon = config.value_horizon * samples * world_size() / world.num_tasks
         self.return_stats = RunningStats((world.num_tasks,), max_count=horizon).to(self.device)
+        self.gamma = discounts(world, config.gamma, world.task_id)
         sizes = self.shape.observations, self.shape.actions
         self.rollout = Rollout(config.rollout_steps, world.num_envs, *sizes, self.device)
         self.episodes = EpisodeStatistics(world.task_id, world.task_names)
@@ -147,7 +153,7 @@ class OnPolicy(Learner):
         values = self._in_reward_units(self._critic(obs, flat_task_id), flat_task_id).view(steps, rows)
         last_values = self._final_value(r.last_obs, task_id)
         next_values = successor_values(values, last_values, r.ended, r.final_values)
-        advantages = gae(r.rewards, values, next_values, r.terminated, r.ended, cfg.gamma, cfg.lam, r.valid)
+        advantages = gae(r.rewards, values, next_values, r.terminated, r.ended, self.gamma, cfg.lam, r.valid)
         returns = advantages + values
         explained = explained_variance(values, returns, task_id, num_tasks, r.valid)
         self.return_stats.merge(*task_moments(returns, task_id, num_tasks, r.valid))
@@ -182,7 +188,8 @@ class OnPolicy(Learner):
         cls, config: OnPolicyConfig, shape: Shape, init: torch.Generator, device: torch.device
     ) -> GaussianPolicy:
         inputs, heads = cls._inputs(config, shape), shape.num_id_columns if config.policy_heads else 1
-        actor = GaussianActor(inputs, config.hidden, shape.actions, config.init_std, init, config.activation, heads)
+        sizes, network = (config.hidden, shape.actions, config.init_std), network_of(config)
+        actor = GaussianActor(inputs, *sizes, init, config.activation, heads, network)
         observations = ObservationNormaliser(inputs, config.normalise_observations)
         return GaussianPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
 

@@ -5,10 +5,11 @@ from typing import Any, ClassVar
 
 from bidex_algos.checks import at_least, between, network_bytes, positive, rising, types
 from bidex_algos.choices import Activation, Autocast
+from bidex_algos.nets.multitask.config import ArchitectureConfig
 
 
 @dataclass(frozen=True)
-class OnPolicyConfig:
+class OnPolicyConfig(ArchitectureConfig):
     """Networks, rollouts, statistics; the defaults are the preset ``laptop``."""
 
     algo: ClassVar[str] = "on-policy"
@@ -53,6 +54,7 @@ class OnPolicyConfig:
             BidexError: A field is out of its range.
         """
         types(self)
+        self._check_architecture()
         at_least(self, 1, "rollout_steps")
         at_least(self, 0, "task_embedding")
         between(self, 0.0, 1.0, "gamma", "lam")

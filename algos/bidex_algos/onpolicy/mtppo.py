@@ -11,14 +11,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from bidex_algos.gradients.balancing import balance_of
 from bidex_algos.gradients.step_size import AdaptiveAdams
-from bidex_algos.gradients.surgery import per_task_gradients, project_conflicting
 from bidex_algos.nets.precision import autocast
 from bidex_algos.onpolicy.base import Batch, OnPolicy
 from bidex_algos.onpolicy.mtppo_config import PRESETS, MTPPOConfig
-from bidex_algos.onpolicy.ppo_loss import NAMES, ppo_loss
+from bidex_algos.onpolicy.ppo_loss import NAMES, PPOLoss, ppo_loss
 from bidex_meta.errors import BidexError
-from bidex_meta.train.distributed import all_sum, sum_gradients, world_size
+from bidex_meta.train.distributed import all_sum, sum_gradients
 from bidex_meta.world.contract import VectorWorld
 
 __all__ = ["MTPPO", "PRESETS", "Batch", "MTPPOConfig"]
@@ -47,9 +47,10 @@ class MTPPO(OnPolicy):
             )
         super().__init__(world, config, seed)
         self.adams = AdaptiveAdams(self.policy.actor.parameters(), self.critic.parameters(), config, self.device)
+        self.balance = balance_of(config, world.num_tasks, self.device)
 
     def _optimisers(self) -> dict[str, Any]:
-        return self.adams.parts()
+        return self.adams.parts() | (self.balance.parts() if self.balance is not None else {})
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
         """PPO's update: returns the means over all mini-batches of what it measured."""
@@ -63,7 +64,8 @@ class MTPPO(OnPolicy):
             # Divided by the samples of all processes, losses and gradients become means by being summed over them.
             counts = all_sum(torch.stack([batch.weights[index].sum() for index in parts])).clamp_min(1.0)
             for number, (index, count) in enumerate(zip(parts, counts, strict=True)):
-                measured.append(self._gradients(batch.select(index), count, old_log_std))
+                part = batch.select(index)
+                measured.append(self._gradients(part, count, old_log_std))
                 # The first mini-batch compares the sampling policy with itself and says nothing about the step.
                 if (epoch, number) != (0, 0):
                     self.adams.follow(measured[-1][2])
@@ -73,9 +75,11 @@ class MTPPO(OnPolicy):
                 self.adams.step()
                 with torch.no_grad():
                     actor.log_std.clamp_(low, high)
+                    if self.balance is not None:
+                        self.balance.learn(lambda b=part, n=count: self._above_least(b, n, old_log_std))
         names = list(NAMES)
-        if cfg.gradient_surgery == "pcgrad":
-            names.append("Policy/conflicts")
+        if self.balance is not None:
+            names.append(self.balance.tag)
         means = torch.stack(measured).mean(0)
         return {**dict(zip(names, means, strict=True)), "Policy/lr": self.adams.rate}
 
@@ -83,12 +87,27 @@ class MTPPO(OnPolicy):
         """Puts the gradients of a mini-batch into the parameters; ``count`` samples are in it, over all processes.
 
         Returns:
-            Surrogate loss, value loss, KL, share of clipped ratios and, with surgery, of conflicts: (4,) or (5,).
+            Surrogate loss, value loss, KL, share of clipped ratios and, with surgery, its own number: (4,) or (5,).
         """
         cfg, actor = self.config, self.policy.actor
+        loss = self._loss(b, count, old_log_std, self._critic(b.obs, b.task_id))
+        rest = cfg.value_loss_weight * loss.value - cfg.entropy_weight * loss.entropy
+        numbers = loss.numbers()
+        self.adams.zero_grad()
+        if self.balance is not None:
+            losses, least = self._per_task(-loss.earned, b.task_id), self._per_task(self._least(b, count), b.task_id)
+            numbers.append(self.balance.backward(losses, least, list(actor.parameters())))
+            rest.backward()
+        else:
+            (loss.surrogate + rest).backward()
+        return sum_gradients([*actor.parameters(), *self.critic.parameters()], torch.stack(numbers))
+
+    def _loss(self, b: Batch, count: Tensor, old_log_std: Tensor, values: Tensor) -> PPOLoss:
+        """What the present actor and ``values`` (B,) make of a mini-batch."""
+        actor = self.policy.actor
         with autocast(self.device, self.low_precision):
             means = actor(b.obs)
-        loss = ppo_loss(
+        return ppo_loss(
             b.actions,
             means,
             actor.log_std_of(b.obs),
@@ -96,31 +115,21 @@ class MTPPO(OnPolicy):
             actor.log_std_of(b.obs, old_log_std),
             b.old_log_probs,
             b.advantages,
-            self._critic(b.obs, b.task_id),
+            values,
             b.targets,
             weights=b.weights / count,
-            clip=cfg.clip,
+            clip=self.config.clip,
         )
-        rest = cfg.value_loss_weight * loss.value - cfg.entropy_weight * loss.entropy
-        numbers = loss.numbers()
-        self.adams.zero_grad()
-        if cfg.gradient_surgery == "pcgrad":
-            numbers.append(self._operate(-loss.earned, b.task_id))
-            rest.backward()
-        else:
-            (loss.surrogate + rest).backward()
-        return sum_gradients([*actor.parameters(), *self.critic.parameters()], torch.stack(numbers))
 
-    def _operate(self, losses: Tensor, task_id: Tensor) -> Tensor:
-        """Puts the actor's gradient of the summed ``losses`` (B,), after surgery between tasks, into its parameters.
+    def _least(self, b: Batch, count: Tensor) -> Tensor:
+        """The least that each sample's surrogate loss can become (B,): no ratio earns more than the clip allows."""
+        return -b.weights / count * (b.advantages + self.config.clip * b.advantages.abs())
 
-        Returns:
-            The share of pairs of tasks in conflict, divided by the processes that will sum it.
-        """
-        weights = list(self.policy.actor.parameters())
-        per_task = losses.new_zeros(self.world.num_tasks).index_add(0, task_id, losses)
-        gradient, apart = project_conflicting(all_sum(per_task_gradients(per_task, weights)))
-        for parameter, part in zip(weights, gradient.split([p.numel() for p in weights]), strict=True):
-            # All processes have the whole of it, and sum it.
-            parameter.grad = part.view_as(parameter) / world_size()
-        return apart / world_size()
+    def _above_least(self, b: Batch, count: Tensor, old_log_std: Tensor) -> Tensor:
+        """How far each task's surrogate loss is above that, (num_tasks,)."""
+        loss = self._loss(b, count, old_log_std, b.targets)
+        return self._per_task(-loss.earned - self._least(b, count), b.task_id)
+
+    def _per_task(self, x: Tensor, task_id: Tensor) -> Tensor:
+        """Sums (num_tasks,) of what each sample has (B,)."""
+        return x.new_zeros(self.world.num_tasks).index_add(0, task_id, x)

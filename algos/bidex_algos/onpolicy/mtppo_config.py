@@ -1,11 +1,13 @@
 """What can be set about MT-PPO, and its presets; imports no torch, so that a command line can show it at once."""
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar
 
-from bidex_algos.checks import positive
+from bidex_algos.checks import at_least, positive
+from bidex_algos.choices import Balancing
 from bidex_algos.onpolicy.config import TABLE_47, OnPolicyConfig
 from bidex_algos.onpolicy.ppo_config import PPOConfig
+from bidex_meta.errors import BidexError
 
 
 @dataclass(frozen=True)
@@ -22,8 +24,16 @@ class MTPPOConfig(PPOConfig, OnPolicyConfig):
     """Gradients longer than this are shortened to it."""
     clip_apart: bool = True
     """Shorten the gradients of actor and critic apart, so that a large value error leaves the policy's step alone."""
-    gradient_surgery: Literal["none", "pcgrad"] = "none"
-    """pcgrad: take from each task's policy gradient what points against another task's (Yu et al. 2020)."""
+    gradient_surgery: Balancing = "none"
+    """What becomes of the tasks' policy gradients. pcgrad: each loses what points against another task's (Yu et al.
+    2020). cagrad: their sum is turned towards the task that it serves worst (Liu et al. 2021). famo: losses are weighed
+    so that all fall at one rate (Liu et al. 2023)."""
+    cagrad_radius: float = 0.4
+    """How far cagrad's direction may leave the mean gradient, in lengths of that; 0: it is the mean."""
+    famo_rate: float = 0.025
+    """Adam's step size of famo's weights."""
+    famo_decay: float = 0.01
+    """By which these weights are drawn back to even ones."""
 
     def __post_init__(self) -> None:
         """Rejects values that could only fail later.
@@ -33,7 +43,10 @@ class MTPPOConfig(PPOConfig, OnPolicyConfig):
         """
         super().__post_init__()
         self._check_ppo()
-        positive(self, "max_grad_norm")
+        positive(self, "max_grad_norm", "famo_rate")
+        at_least(self, 0, "famo_decay")
+        if not 0.0 <= self.cagrad_radius < 1.0:
+            raise BidexError(f"mtppo: cagrad_radius must lie in [0, 1), got {self.cagrad_radius}.")
 
 
 PRESETS: dict[str, MTPPOConfig] = {

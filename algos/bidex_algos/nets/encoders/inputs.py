@@ -64,6 +64,11 @@ class Inputs:
         unscaled = self.unscaled if scaled else self.unscaled | {name}
         return replace(self, encoders={**self.encoders, name: make}, unscaled=unscaled)
 
+    def without(self, *names: str) -> "Inputs":
+        """With some groups hidden besides."""
+        self.columns(*names)
+        return replace(self, hidden=self.hidden | {*names})
+
     def only(self, *names: str) -> "Inputs":
         """With all other groups hidden: what an agent sees that has a view of its own."""
         self.columns(*names)

@@ -1,0 +1,197 @@
+"""Losses of several tasks on the way to shared weights: CAGrad and FAMO against closed forms, and in MT-PPO."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+import torch
+from hypothesis import assume, given, settings
+from scipy.optimize import minimize
+from torch.testing import assert_close
+
+from bidex_algos.experience.rollout import collect
+from bidex_algos.gradients.balancing import balance_of
+from bidex_algos.gradients.conflict_averse import conflict_averse, worst_served
+from bidex_algos.gradients.famo import Famo
+from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
+from bidex_meta.errors import BidexError
+from tests.algos.problems import opposite_bandits
+from tests.algos.resume import resumed
+from tests.algos.toy import ToyWorld, nearness
+
+SMALL = MTPPOConfig(
+    hidden=(32, 32), rollout_steps=8, learning_rate=1e-3, learning_rate_range=(1e-5, 2e-3), std_range=(0.05, 1.0),
+    autocast="off",
+)  # fmt: skip
+seeds = st.integers(0, 2**31)
+
+
+def draw(seed: int, tasks: int, entries: int = 5) -> torch.Tensor:
+    return torch.randn(tasks, entries, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def of_two(first: np.ndarray, second: np.ndarray, c: float) -> np.ndarray:
+    """CAGrad's direction for two gradients, from its primal: the best worst case within a ball about the mean.
+
+    Either one gradient alone is served worst at the best point of the ball, which then lies straight along it; or both
+    are served alike, on the cut of the ball with the plane <g_1 - g_2, d> = 0, and the best point there lies along what
+    the gradients have in that plane.
+    """
+    mean = (first + second) / 2
+    radius = c * np.linalg.norm(mean)
+    for one, other in ((first, second), (second, first)):
+        straight = mean + radius * one / np.linalg.norm(one)
+        if one @ straight <= other @ straight:
+            return straight
+    normal = (first - second) / np.linalg.norm(first - second)
+    centre = mean - (mean @ normal) * normal
+    along = first - (first @ normal) * normal
+    return centre + math.sqrt(radius**2 - (mean @ normal) ** 2) * along / np.linalg.norm(along)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seeds, st.floats(0.05, 0.95), st.floats(-2, 2))
+def test_cagrad_of_two_gradients_is_the_closed_form(seed: int, c: float, size: float):
+    gradients = draw(seed, 2)
+    gradients[1] *= 10.0**size
+    assume(float(gradients.sum(0).norm()) > 1e-3)
+    found, apart = conflict_averse(gradients, c)
+    expected = 2 * of_two(gradients[0].numpy(), gradients[1].numpy(), c)
+    assert_close(found, torch.from_numpy(expected), rtol=1e-5, atol=1e-6 * float(gradients.norm()))
+    assert apart == float(gradients[0] @ gradients[1] < 0)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seeds, st.integers(3, 8))
+def test_cagrad_of_more_solves_the_dual(seed: int, tasks: int):
+    gradients = draw(seed, tasks, 12) * torch.logspace(0, 1, tasks, dtype=torch.float64)[:, None]
+    gram, even = gradients @ gradients.T, torch.full((tasks,), 1 / tasks, dtype=torch.float64)
+    reach = 0.5 * (even @ gram @ even).sqrt()
+
+    def dual(w: np.ndarray) -> float:
+        return float(w @ gram.numpy() @ even.numpy() + float(reach) * np.sqrt(w @ gram.numpy() @ w))
+
+    found = worst_served(gram, even, reach)
+    assert found.min() >= 0 and found.sum() == pytest.approx(1)
+    sums_to_one: Any = {"type": "eq", "fun": lambda w: w.sum() - 1}
+    best = minimize(dual, even.numpy(), bounds=[(0, 1)] * tasks, constraints=sums_to_one, options={"ftol": 1e-12})
+    assert dual(found.numpy()) <= best.fun + 1e-4 * abs(best.fun)
+
+
+def test_cagrad_without_a_radius_or_a_conflict_is_the_sum():
+    gradients = draw(0, 4)
+    assert_close(conflict_averse(gradients, 0.0)[0], gradients.sum(0))
+    same = gradients[:1].expand(3, -1)
+    assert_close(conflict_averse(same, 0.4)[0], 1.4 * same.sum(0))
+    assert torch.equal(conflict_averse(torch.zeros(3, 5), 0.4)[0], torch.zeros(5))
+    assert_close(conflict_averse(gradients[:1], 0.4)[0], 1.4 * gradients[0])
+
+
+def test_famo_of_two_losses_is_the_closed_form():
+    # l_i = a_i x_i^2 about the least 0, each with a coordinate of its own.
+    famo, a, x = Famo(2, rate=0.1, decay=0.0, device=torch.device("cpu")), torch.tensor([1.0, 8.0]), torch.ones(2)
+    with torch.no_grad():
+        famo.logits.copy_(torch.tensor([0.3, -0.2]))
+    z = [1 / (1 + math.exp(-0.5)), 1 / (1 + math.exp(0.5))]
+    losses = a * x.square()
+    weights = famo.weights(losses)
+    total = z[0] / 1.0 + z[1] / 8.0
+    assert weights.tolist() == pytest.approx([2 * z[0] / 1.0 / total, 2 * z[1] / 8.0 / total])
+    # The direction is the gradient of the mean of log l_i, weighted by z, but for its length.
+    slope = weights * 2 * a * x
+    assert float(slope[0] / slope[1]) == pytest.approx(z[0] / z[1])
+    # The first loss falls to a quarter, the second stays: the second shall weigh more, by J' (log 4, 0).
+    famo.learn(lambda: losses * torch.tensor([0.25, 1.0]))
+    fallen = math.log(4.0)
+    expected = [z[0] * (1 - z[0]) * fallen, -z[1] * z[0] * fallen]
+    gradient = famo.logits.grad
+    assert gradient is not None and gradient.tolist() == pytest.approx(expected)
+    # Adam's first step is its rate long, against the gradient.
+    assert famo.logits.tolist() == pytest.approx([0.3 - 0.1, -0.2 + 0.1], abs=1e-5)
+
+
+def test_famo_leaves_out_a_task_without_samples():
+    famo = Famo(3, rate=0.1, decay=0.0, device=torch.device("cpu"))
+    weights = famo.weights(torch.tensor([1.0, 0.0, 1.0]))
+    assert_close(weights, torch.tensor([1.5, 0.0, 1.5]))
+    famo.learn(lambda: torch.tensor([0.5, 3.0, 0.5]))
+    assert famo.logits[1] > famo.logits[0] == famo.logits[2]
+
+
+def test_famo_lets_losses_of_very_different_size_fall_at_one_rate():
+    a = torch.tensor([1.0, 1000.0, 30.0])
+    x = torch.nn.Parameter(torch.ones(3))
+    famo = Famo(3, rate=0.05, decay=0.0, device=torch.device("cpu"))
+    for _ in range(100):
+        losses = a * x.square()
+        x.grad = None
+        (famo.weights(losses) * losses).sum().backward()
+        with torch.no_grad():
+            slope = x.grad
+            assert slope is not None
+            x -= 0.01 * slope / slope.norm()
+            left = a * x.square()
+        famo.learn(lambda now=left: now)
+    shares = x.detach()
+    assert shares.max() < 0.6 and shares.max() / shares.min() < 1.1
+
+
+# In MT-PPO.
+
+
+@pytest.mark.parametrize("way", ["cagrad", "famo"])
+def test_two_tasks_at_odds_are_learned(way: Any):
+    world = ToyWorld([nearness(0.4), nearness(-0.4, scale=1000.0)], rows=16)
+    learner = MTPPO(world, replace(SMALL, gradient_surgery=way), seed=0)
+    metrics = [learner.iterate() for _ in range(30)]
+    obs, _ = world.reset(seed=1)
+    action = learner.eval_action(obs)
+    assert [float(action[world.task_id == k].mean()) for k in range(2)] == pytest.approx([0.4, -0.4], abs=0.2)
+    assert {"cagrad": "Policy/conflicts", "famo": "Policy/largest_weight"}[way] in metrics[0]
+
+
+def test_famo_begins_as_the_plain_sum_where_tasks_have_as_much_to_gain():
+    found = []
+    for way in ("none", "famo"):
+        learner = MTPPO(opposite_bandits(rows=8), replace(SMALL, gradient_surgery=way, num_minibatches=1), seed=0)
+        learner.obs = learner._first_observations()
+        collect(
+            learner.world, learner.rollout, learner.obs, learner._sample, learner._final_value, learner.episodes
+        )  # no update yet: all ratios are 1
+        batch, _ = learner._prepare()
+        batch.advantages = batch.actions[:, 0].sign()  # as much to gain in each
+        learner._gradients(batch, batch.weights.sum(), learner.policy.actor.log_std.detach().clone())
+        found.append(torch.cat([p.grad.flatten() for p in learner.policy.actor.parameters() if p.grad is not None]))
+    assert found[0].norm() > 0
+    assert_close(*found)
+
+
+def test_no_ratio_earns_more_than_the_least_loss_says():
+    learner = MTPPO(opposite_bandits(rows=8), SMALL, seed=0)
+    learner.iterate()
+    batch, _ = learner._prepare()
+    old = learner.policy.actor.log_std.detach().clone()
+    with torch.no_grad():
+        for _ in range(20):
+            for weight in learner.policy.actor.parameters():
+                weight.add_(0.3 * torch.randn(weight.shape, generator=learner.generator))
+            above = learner._above_least(batch, batch.weights.sum(), old)
+            assert (above >= 0).all()
+
+
+@pytest.mark.parametrize("way", ["cagrad", "famo"])
+def test_save_load_resume_is_bit_equal(way: Any):
+    config = replace(SMALL, gradient_surgery=way)
+    _, again = resumed(lambda seed: MTPPO(opposite_bandits(rows=8), config, seed), iterations=2)
+    assert ("famo_logits" in again.state_dict()) == (way == "famo")
+    if way == "famo":
+        assert again.balance.famo.logits.abs().max() > 0
+
+
+def test_nothing_is_balanced_by_default():
+    assert balance_of(SMALL, 2, torch.device("cpu")) is None
+    with pytest.raises(BidexError, match=r"cagrad_radius must lie in \[0, 1\), got 1.0"):
+        replace(SMALL, cagrad_radius=1.0)
