@@ -17,6 +17,8 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
     "mttrpo": [{}],
     "mtsac": [{"warmup_steps": 2, "batch_size": 16}],
     "mttd3": [{"warmup_steps": 2, "batch_size": 16}],
+    "fasttd3": [{"warmup_steps": 2, "batch_size": 16}],
+    "brc": [{"warmup_steps": 2, "batch_size": 16}],
     "ddpg": [{"warmup_steps": 2, "batch_size": 16}],
     "maml": [{}, {"outer": "adam"}],
     "promp": [{}],
