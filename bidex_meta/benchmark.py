@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, cast
 
 import numpy as np
 
-from bidex_meta.errors import BidexError, known_name, shortened, unknown_name
+from bidex_meta.errors import BidexError, shortened, unknown_name
 from bidex_meta.memory import ROW_BYTES, check_memory
 from bidex_meta.suite import SPLITS, ListedTask, Split, Suite, SuiteClass, load_suite
 from bidex_meta.tasks import registry
@@ -254,7 +254,8 @@ def make_task_world(
     """A world of one class as it is on its own: goal visible, no one-hot, no padding, 50 tasks drawn by the seed.
 
     Args:
-        task_name: A task class, e.g. `"HandOver"` (which alone has a fixed base: 398 observations, 40 actions).
+        task_name: A task class, e.g. `"HandOver"` (which alone has a fixed base: 398 observations, 40 actions), or
+            `"package.module:Class"` of your own (docs/own-task.md).
         num_envs: Rows; left out, 1024 on the CPU and 8192 on an accelerator.
         device: As in `Benchmark.make_world`.
         seed: Chooses the tasks, the starts and the task draws.
@@ -272,7 +273,7 @@ def make_task_world(
     from bidex_meta.world import Slot
     from bidex_meta.world.autoreset import checked_mode
 
-    task_name = known_name("task class", task_name, registry.names())
+    task_name = registry.resolve(task_name)
     task_class = registry.get(task_name, moving_base)
     tasks = _drawn(task_class.variation_space, _checked_seed(seed), task_name, "train", _TASKS_ALONE)
     slot = Slot(task_name, task_class, np.stack([task.variation for task in tasks]))

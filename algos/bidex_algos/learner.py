@@ -142,7 +142,7 @@ class Learner(ABC):
         """Collects experience and learns from it.
 
         Returns:
-            Metrics under TensorBoard-like tags; ``docs/learners/`` explains each.
+            Metrics under TensorBoard-like tags; ``docs/metrics.md`` explains each.
 
         Raises:
             FloatingPointError: A loss, or what is told of the policy, is no longer finite.

@@ -19,12 +19,11 @@ Beside the class the module holds ``PRESETS``: a dict from preset name to an ins
 
 import dataclasses
 import importlib
-import os
-import sys
 from dataclasses import dataclass
 from typing import Any
 
 from bidex_meta.errors import BidexError, known_name
+from bidex_meta.outside import is_outside, outside_class
 from bidex_meta.train.launch import launch
 
 ALGOS: dict[str, str] = {
@@ -90,7 +89,7 @@ def learner_kind(name: str, task: str | None = None) -> LearnerKind:
     Raises:
         BidexError: There is none of this name, its package is not installed, or it is no learner.
     """
-    if ":" in name:
+    if is_outside(name):
         return _from_elsewhere(name)
     name = known_name("algo", name, ALGOS)
     module_name, _, class_name = ALGOS[name].partition(":")
@@ -105,19 +104,8 @@ def learner_kind(name: str, task: str | None = None) -> LearnerKind:
 
 def _from_elsewhere(name: str) -> LearnerKind:
     """The learner ``package.module:Class``, of an installed package or of the working folder."""
-    module_name, _, class_name = name.partition(":")
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # a console script does not look there by itself
-    try:
-        module = importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        raise BidexError(
-            f"--algo {name}: expected a module that can be imported, but there is no {error.name}. Install its "
-            "package, or start in the folder that holds it."
-        ) from error
-    presets, make = getattr(module, "PRESETS", None), getattr(module, class_name, None)
-    if not isinstance(make, type):
-        raise BidexError(f"--algo {name}: expected a class {class_name} in {module.__file__}, found none.")
+    make, module = outside_class(name, "--algo")
+    presets = getattr(module, "PRESETS", None)
     if not isinstance(presets, dict) or not presets or not all(map(dataclasses.is_dataclass, presets.values())):
         raise BidexError(
             f"--algo {name}: expected PRESETS in {module.__file__}, a dict from a preset's name to an instance of the "
@@ -125,7 +113,9 @@ def _from_elsewhere(name: str) -> LearnerKind:
         )
     missing = [needed for needed in _NEEDED if not hasattr(make, needed)]
     if missing:
-        raise BidexError(f"--algo {name}: expected {class_name} to have {', '.join(_NEEDED)}; {missing[0]} is missing.")
+        raise BidexError(
+            f"--algo {name}: expected {make.__name__} to have {', '.join(_NEEDED)}; {missing[0]} is missing."
+        )
     return LearnerKind(name, make, presets)
 
 

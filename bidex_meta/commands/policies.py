@@ -78,9 +78,9 @@ def load_policy(folder: RunFolder, device: str, which: str = "last") -> tuple[Ag
 
 
 def policy_shape(state: dict[str, Any]) -> dict[str, Any]:
-    """Numbers of ``observations`` and ``actions`` of the policy in a run's ``checkpoint``, and more that it keeps."""
+    """Numbers of ``observations`` and ``actions`` of a checkpoint's policy; empty where its learner tells none."""
     with fitting(Path("the policy")):
-        return dict(_checked(state)["shape"])
+        return dict(_checked(state).get("shape", {}))
 
 
 def policy_of(folder: RunFolder, state: dict[str, Any], device: str) -> Agent:

@@ -9,6 +9,7 @@ import tyro
 
 from bidex_meta.commands.parsing import StepCount, Switch, parse
 from bidex_meta.errors import BidexError, known_name
+from bidex_meta.outside import short_name
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ def _out(flags: RenderFlags, policy: str) -> Path:
         return flags.out
     if policy in ("zero", "random"):
         raise BidexError("Name the file to write: --out film.mp4, or --out picture.png.")
-    name = "tiled" if flags.tiled else flags.task or "film"
+    name = "tiled" if flags.tiled else short_name(flags.task or "film")
     return Path(policy) / "videos" / f"{name}.mp4"
 
 

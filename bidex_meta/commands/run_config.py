@@ -35,12 +35,12 @@ class RunFlags:
     suite: str | None = None
     """Suite to train on: a name (see `bidex-meta list suites`) or the path of a TOML file."""
     task: str | None = None
-    """Train on this task class alone, instead of a suite."""
+    """Train on this task class alone, instead of a suite; or on package.module:Class of your own (docs/own-task.md)."""
     base: Literal["own", "moving", "fixed"] = "own"
     """With --task: whether the hands' bases move; own: as the class has it alone. Suites move them, HandOver alone
     does not."""
     algo: str = "mtppo"
-    """Learner (see `bidex-meta list algos`), or package.module:Class of your own (CONTRIBUTING.md)."""
+    """Learner (see `bidex-meta list algos`), or package.module:Class of your own (docs/own-learner.md)."""
     preset: str = "auto"
     """Values of the learner's config that no flag sets; auto: metaworld for a suite of Meta-World's, else laptop on a
     CPU, on a GPU paper (of maml and promp laptop there too)."""

@@ -62,7 +62,7 @@ class Source(ABC):
 
         suite = config.get("suite")
         if suite is None:
-            return SingleClass(known_name("task", config["task"], registry.names()), config)
+            return SingleClass(registry.resolve(config["task"], "task"), config)
         if not suite.endswith(".toml"):
             suite = known_name("suite", suite, source_names())
         return (MetaWorldSuite if suite in METAWORLD_SUITES else OwnSuite)(suite, config)

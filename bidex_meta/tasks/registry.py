@@ -1,10 +1,11 @@
-"""The task classes by name: one dict."""
+"""The task classes by name: one dict; ``package.module:Class`` names one of the user's own."""
 
 import importlib
 import inspect
 from typing import TYPE_CHECKING
 
-from bidex_meta.errors import unknown_name
+from bidex_meta.errors import BidexError, known_name, unknown_name
+from bidex_meta.outside import is_outside, outside_class
 
 if TYPE_CHECKING:
     from bidex_meta.tasks.base import TaskClass
@@ -39,23 +40,56 @@ def names() -> list[str]:
     return list(_MODULES)
 
 
+def resolve(name: str, kind: str = "task class") -> str:
+    """The name by which ``get`` knows a class: any case will do; ``package.module:Class`` stays as it is.
+
+    Args:
+        name: A name, as the user gave it.
+        kind: What is looked up, for messages.
+
+    Raises:
+        BidexError: There is no such class.
+    """
+    if not is_outside(name):
+        return known_name(kind, name, names())
+    _outside(name)
+    return name
+
+
 def get(name: str, moving_base: bool | None = None, **options: float) -> "TaskClass":
     """A task class.
 
     Args:
-        name: Its name, e.g. ``CatchUnderarm``.
+        name: Its name, e.g. ``CatchUnderarm``, or ``package.module:Class`` (docs/own-task.md).
         moving_base: Drive the hands' bases (52 actions) or fix them (40); None takes the class's own.
         options: What else the class lets one choose, e.g. ``water=30`` for PourWater.
 
     Raises:
         BidexError: There is no such class or option; the message gives the nearest name and the list.
     """
-    if name not in _MODULES:
-        raise unknown_name("task class", name, _MODULES)
-    module = importlib.import_module(f"bidex_meta.tasks.{_MODULES[name]}")
-    task_class = getattr(module, name)
+    task_class = _outside(name) if is_outside(name) else _shipped(name)
     known = list(inspect.signature(task_class).parameters)[1:]
     for option in options:
         if option not in known:
             raise unknown_name(f"option of {name}", option, known)
     return task_class(moving_base, **options)
+
+
+def _shipped(name: str) -> "type[TaskClass]":
+    if name not in _MODULES:
+        raise unknown_name("task class", name, _MODULES)
+    return getattr(importlib.import_module(f"bidex_meta.tasks.{_MODULES[name]}"), name)
+
+
+def _outside(name: str) -> "type[TaskClass]":
+    from bidex_meta.tasks.base import TaskClass  # torch and mujoco: not where names are listed
+
+    found, _ = outside_class(name, "task")
+    if not issubclass(found, TaskClass):
+        raise BidexError(f"task {name}: expected a subclass of bidex_meta.tasks.base.TaskClass, got {found!r}.")
+    missing = sorted(found.__abstractmethods__) + [
+        each for each in TaskClass.__annotations__ if not hasattr(found, each)
+    ]
+    if missing:
+        raise BidexError(f"task {name}: expected the class to have {', '.join(missing)}. See docs/own-task.md.")
+    return found

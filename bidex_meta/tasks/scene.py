@@ -27,8 +27,8 @@ class SceneObject:
 
     Attributes:
         name: Prefix of its sensors and joints in the scene.
-        asset: File under assets/objects/ without its ending. Its body is called ``object``; the joint of a free one is
-            called ``free``.
+        asset: File under assets/objects/, or an absolute path, without its ending. Its body is called ``object``; the
+            joint of a free one is called ``free``.
         position: Nominal start in the world, metres.
         rpy: Nominal roll, pitch, yaw, radians; R = Rz(yaw) Ry(pitch) Rx(roll).
         colour: Red, green, blue, alpha of its materials, or None to keep the asset's.
@@ -47,6 +47,7 @@ class SceneObject:
 
     def add_to(self, scene: mujoco.MjSpec) -> None:
         """Puts the object into a scene at its nominal start."""
+        # An absolute path takes the place of what stands before it.
         part = mujoco.MjSpec.from_file(str(paths.assets_dir() / "objects" / f"{self.asset}.xml"))
         set_contact_bits(part.geoms, OBJECT)
         if self.colour is not None:

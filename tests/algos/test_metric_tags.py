@@ -1,0 +1,58 @@
+"""docs/metrics.md lists what the learners tell: no tag is missing, none is told by nobody."""
+
+import re
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from bidex_meta.commands.learners import learner_kind
+from tests.algos.families import PointGoals
+from tests.algos.toy import ToyWorld, nearness
+from tests.pages import ROOT
+
+SMALL: dict[str, Any] = {"hidden": (8,), "autocast": "off"}
+VARIANTS: dict[str, list[dict[str, Any]]] = {
+    "mtppo": [{}, {"gradient_surgery": "pcgrad"}],
+    "mttrpo": [{}],
+    "mtsac": [{"warmup_steps": 2, "batch_size": 16}],
+    "mttd3": [{"warmup_steps": 2, "batch_size": 16}],
+    "fasttd3": [{"warmup_steps": 2, "batch_size": 16}],
+    "brc": [{"warmup_steps": 2, "batch_size": 16}],
+    "ddpg": [{"warmup_steps": 2, "batch_size": 16}],
+    "maml": [{}, {"outer": "adam"}],
+    "promp": [{}],
+    "rl2": [{}],
+}
+
+
+def told(algo: str) -> set[str]:
+    """Tags of some iterations on a toy, names of tasks as ``<task>``."""
+    kind, tags = learner_kind(algo), set()
+    for options in VARIANTS[algo]:
+        config = kind.presets["laptop"]
+        known = {**SMALL, **options}
+        config = replace(config, **{name: value for name, value in known.items() if hasattr(config, name)})
+        world = PointGoals(rows=16) if kind.adapts else ToyWorld([nearness(0.5), nearness(-0.5)], rows=8)
+        learner = kind.make(world, config, seed=0)
+        for _ in range(3):
+            found = learner.iterate()
+        names = "|".join(map(re.escape, world.task_names))
+        tags |= {re.sub(rf"/(?:{names})$", "/<task>", tag) for tag in found}
+    return tags
+
+
+def listed() -> dict[str, set[str]]:
+    """The page's tags of each learner."""
+    page: dict[str, set[str]] = {algo: set() for algo in VARIANTS}
+    text = (ROOT / "docs" / "metrics.md").read_text(encoding="utf-8").partition("## What the run adds")[0]
+    for row in re.findall(r"^\| (`.*?) \| (.*?) \|", text, re.MULTILINE):
+        learners = list(VARIANTS) if row[1] == "all" else re.findall(r"\w+", row[1])
+        for algo in learners:
+            page[algo] |= set(re.findall(r"`([^`]+)`", row[0]))
+    return page
+
+
+@pytest.mark.parametrize("algo", VARIANTS)
+def test_the_page_has_what_the_learner_tells(algo: str) -> None:
+    assert listed()[algo] == told(algo)

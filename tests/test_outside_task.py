@@ -1,0 +1,96 @@
+"""Task classes from elsewhere, by their ``package.module:Class``: that of docs/own-task.md, alone and in a suite."""
+
+import copy
+from pathlib import Path
+
+import pytest
+import torch
+
+from bidex_meta import Benchmark, BidexError, make_task_world, paths
+from bidex_meta.cli import main
+from bidex_meta.tasks.scene import compile_scene
+from tests.pages import ROOT, files_of
+
+NAME = "my_tasks:SlideBlock"
+SUITE = f"""
+name = "Slides"
+version = 1
+kind = "meta"
+description = "Slide a block; throw on the way"
+observation = "masked"
+task_id = "class"
+reward = "paper"
+base = "moving"
+tasks_per_class = 2
+[[classes]]
+name = "{NAME}"
+split = "both"
+[[classes]]
+name = "CatchUnderarm"
+"""
+
+
+@pytest.fixture(autouse=True)
+def working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    source = files_of(ROOT / "docs" / "own-task.md")["my_tasks.py"]
+    (tmp_path / "my_tasks.py").write_text(source)
+    # The same with an object of its own, whose file lies beside it.
+    own = source.replace('"cube"', 'str(__import__("pathlib").Path(__file__).with_name("wedge"))')
+    assert own != source
+    (tmp_path / "with_own_object.py").write_text(own)
+    cube = (paths.assets_dir() / "objects" / "cube.xml").read_text()
+    (tmp_path / "wedge.xml").write_text(cube.replace('mass="0.0709"', 'mass="0.2"'))
+    (tmp_path / "no_task.py").write_text(
+        "from bidex_meta.tasks.base import TaskClass\nclass Half(TaskClass): ...\nclass Other: ...\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    return tmp_path
+
+
+def test_a_class_of_the_working_folder_trains_and_is_evaluated(
+    working_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = ["run", "--task", NAME, "--algo", "ppo", "--num-envs", "4", "--steps", "64", "--threads", "1"]
+    assert main([*run, "--no-evaluate"]) == 0
+    (folder,) = (working_folder / "runs" / "SlideBlock" / "ppo").iterdir()
+    assert main(["evaluate", str(folder), "--episodes", "1", "--json"]) == 0
+    assert NAME in capsys.readouterr().out
+
+
+def test_a_suite_names_it_and_hides_its_goal(working_folder: Path) -> None:
+    (working_folder / "slides.toml").write_text(SUITE)
+    benchmark = Benchmark("slides.toml")
+    assert list(benchmark.train_classes) == [NAME, "CatchUnderarm"] and list(benchmark.test_classes) == [NAME]
+    world = benchmark.make_world("test", 2, device="cpu", threads=1)
+    obs, _ = world.reset(seed=0)
+    task_class = world.slots[0].task_class
+    assert obs.shape == (2, 422) and not obs[:, task_class.layout.goal_indices()].any()
+    twin, action = copy.deepcopy(world), torch.zeros(2, 52)
+    assert torch.equal(twin.step(action)[0], world.step(action)[0])
+    env = benchmark.train_classes[NAME]()
+    env.set_task(benchmark.train_tasks[0])
+    assert env.reset(seed=0)[0].shape == (422,)
+
+
+def test_an_object_of_its_own_lies_beside_the_file() -> None:
+    world = make_task_world("with_own_object:SlideBlock", 2, device="cpu", threads=1)
+    assert world.reset(seed=0)[0].shape == (2, 422)
+    task = world.slots[0].task_class
+    assert float(compile_scene(task).model.body("block/object").mass[0]) == 0.2
+
+
+@pytest.mark.parametrize(
+    "name, told",
+    [
+        ("nowhere:Task", "there is no nowhere"),
+        ("no_task:Missing", "expected a class Missing"),
+        ("no_task:Other", "expected a subclass of bidex_meta.tasks.base.TaskClass"),
+        ("no_task:Half", "expected the class to have add_objects"),
+        (":Task", "expected a module"),
+    ],
+)
+def test_what_is_no_task_is_told_in_one_line(name: str, told: str) -> None:
+    with pytest.raises(BidexError, match=told) as raised:
+        make_task_world(name, 2)
+    assert "\n" not in str(raised.value)

@@ -1,0 +1,139 @@
+"""Code in the pages: Python blocks run on tiny worlds, command lines are parsed, links lead somewhere."""
+
+import contextlib
+import importlib
+import io
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from bidex_meta.cli import main
+from bidex_meta.commands import COMMANDS
+from bidex_meta.commands.parsing import flags_of, parse
+from bidex_meta.evaluation.untrained import RandomAgent
+from tests.pages import PAGES, ROOT, blocks, files_of
+
+SMALLER = (
+    # Rows and steps of the examples, as few as their worlds allow; what the pages say of shapes stays out of it.
+    (r"num_envs=(256|1024)\b", "num_envs=4"),
+    (r"num_envs=(300|40)\b", "num_envs=15"),
+    (r"\.learn\(\S+\)", ".learn(64)"),
+    (r"shots=3", "shots=1"),
+    (r"adaptation_episodes=\d+", "adaptation_episodes=1"),
+)
+
+
+class Adapting(RandomAgent):
+    """Stands for the ``agent`` that a page supposes: it adapts to nothing."""
+
+    def adapt_action(self, obs: torch.Tensor) -> tuple[torch.Tensor, dict[str, Any]]:
+        return self.eval_action(obs), {}
+
+    def eval_action(self, obs: torch.Tensor) -> torch.Tensor:
+        return torch.zeros(len(obs), 52)
+
+    def assign(self, task_of_row: object) -> None: ...
+    def init(self) -> None: ...
+    def step(self, timestep: object) -> None: ...
+    def adapt(self) -> None: ...
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working folder with every file that the pages show."""
+    for page in PAGES:
+        for name, text in files_of(page).items():
+            (tmp_path / name).write_text(text)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    return tmp_path
+
+
+PYTHON = [page for page in PAGES if any(block.language == "python" for block in blocks(page))]
+
+
+@pytest.mark.parametrize("page", PYTHON, ids=lambda page: str(page.relative_to(ROOT)))
+def test_python_blocks_run(page: Path, folder: Path) -> None:
+    import gymnasium
+
+    names: dict[str, Any] = {"agent": Adapting(gymnasium.spaces.Box(-1.0, 1.0, (1, 52))), "__name__": "page"}
+    with contextlib.redirect_stdout(io.StringIO()):
+        for block in blocks(page):
+            if block.mark.startswith("needs "):
+                pytest.importorskip(block.mark.split()[1])
+            if block.language == "python" and not block.mark.startswith(("file ", "skip ")):
+                text = block.text
+                for pattern, fewer in SMALLER:
+                    text = re.sub(pattern, fewer, text)
+                exec(compile(text, str(page), "exec"), names)
+
+
+@pytest.mark.parametrize("name", ["test_my_tasks.py", "test_my_learner.py"])
+def test_tests_that_pages_show_pass(name: str, folder: Path) -> None:
+    module = importlib.import_module(name.removesuffix(".py"))
+    found = [value for key, value in vars(module).items() if key.startswith("test_")]
+    assert found
+    for test in found:
+        test(**({"tmp_path": folder} if test.__code__.co_argcount else {}))
+
+
+def _lines() -> Iterator[tuple[str, str]]:
+    for page in PAGES:
+        for block in blocks(page):
+            if block.language or block.mark.startswith("skip"):
+                continue
+            for line in block.text.replace("\\\n", " ").splitlines():
+                if found := re.match(r"(?:torchrun .* -m bidex_meta\.cli|bidex-meta) (?P<rest>[^#]*)", line):
+                    yield str(page.relative_to(ROOT)), found["rest"].strip()
+
+
+LINES = sorted({rest: page for page, rest in _lines()}.items())
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder with a config, for lines that resume one."""
+    path = tmp_path_factory.mktemp("run")
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        assert main(["run", "--suite", "MT4", "--algo", "mtppo", "--print-config"]) == 0
+    (path / "config.json").write_text(printed.getvalue())
+    return path
+
+
+@pytest.mark.parametrize("line, page", LINES, ids=[line for line, _ in LINES])
+def test_command_lines_parse(line: str, page: str, run: Path, folder: Path) -> None:
+    plain = re.sub(r"\|\d+", "", line.partition(" > ")[0]).replace("cuda:0", "cpu")
+    plain = re.sub(r"runs/\S+|<[^>]*>|\bRUN\b", str(run), plain)
+    name, *arguments = [word for word in shlex.split(plain) if word != "--help"]
+    assert name in COMMANDS, f"{page}: there is no bidex-meta {name}"
+    command = importlib.import_module(COMMANDS[name].module).main
+    found = flags_of(command, arguments)
+    parse(found.options, arguments, name, found.default)
+
+
+LINK = re.compile(r"\]\((?!https?://|#)(?P<path>[^)#\s]+)?(?:#(?P<anchor>[^)\s]+))?\)")
+
+
+def _anchors(page: Path) -> set[str]:
+    """Anchors of a page's headings, as GitHub makes them."""
+    text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    titles = [re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", title) for title in re.findall(r"^#+ (.*)$", text, re.MULTILINE)]
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path) -> None:
+    for found in LINK.finditer(page.read_text(encoding="utf-8")):
+        target = page.parent / (found["path"] or page.name)
+        assert target.exists(), f"{page.name}: {found[0]} leads nowhere"
+        if found["anchor"] and target.suffix == ".md":
+            assert found["anchor"] in _anchors(target), f"{page.name}: {target.name} has no {found['anchor']}"
+
+
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) < 900
