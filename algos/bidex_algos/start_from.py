@@ -45,7 +45,8 @@ def start_from(learner: PolicyLearner, state: dict[str, Any]) -> None:
     if _shapes(learner.policy.state_dict()) != _shapes(state["weights"]):
         raise BidexError(
             "Expected a policy to start from of the same kind (mtppo, mttrpo, promp and maml share one; mtsac and rl2 "
-            "have their own, policy heads and a task embedding others), got one with other weights. Name another run."
+            "have their own, other architectures, policy heads and a task embedding others), got one with other "
+            "weights. Name another run."
         )
     if isinstance(getattr(learner.policy, "actor", None), SquashedActor):
         # Its network speaks of a place between these bounds; a Gaussian one has its deviation as a weight.

@@ -92,9 +92,8 @@ def test_moores_experts_are_orthogonal_and_mixed_by_the_tasks_weights():
     experts = network.experts(x)
     assert_close(torch.einsum("ibn,jbn->bij", experts, experts), torch.eye(4).expand(8, -1, -1), rtol=0, atol=1e-5)
     weights = network.weights.rows[TASKS]
-    hidden = torch.nn.functional.elu(
-        10**0.5 * sum((weights[:, k, None] * experts[k] for k in range(4)), torch.zeros(8, 10))
-    )
+    together = sum((weights[:, k, None] * experts[k] for k in range(4)), torch.zeros(8, 10))
+    hidden = torch.nn.functional.elu(10**0.5 * together)
     assert_close(network(x), network.head(hidden))
 
 
