@@ -188,6 +188,17 @@ def test_critics_go_down_their_cross_entropy(kind: Any, config: Any) -> None:
     assert learner._critic_losses(draw.obs, draw.actions, target)[0].sum() < losses.sum()
 
 
+@both
+def test_distributions_begin_narrow_about_zero(kind: Any, config: Any) -> None:
+    learner = kind(opposite_bandits(rows=4), replace(config, value_heads=True, value_bound=20.0), seed=0)
+    obs, _ = learner.world.reset(seed=1)
+    probs = learner.critic.log_probs(obs, torch.zeros(8, 2), learner.world.task_id).detach().exp()
+    mean = learner.critic.atoms.mean(probs)
+    deviation = ((probs * learner.critic.atoms.values.square()).sum(2) - mean.square()).sqrt()
+    assert_close(deviation, torch.full((2, 8), 2.0), rtol=0.05, atol=0)
+    assert mean.abs().max() < 0.5
+
+
 @pytest.mark.parametrize("lower", [True, False])
 def test_the_actor_climbs_the_lower_critic_or_their_mean(lower: bool) -> None:
     values = torch.tensor([[1.0, 5.0], [3.0, 2.0]])

@@ -24,6 +24,10 @@ from bidex_algos.offpolicy.base import OffPolicy
 from bidex_algos.offpolicy.categorical_config import CategoricalConfig
 from bidex_algos.offpolicy.return_scale import ReturnBound
 
+FIRST_DEVIATION = 0.1
+"""Of the distributions before the first update, as a share of the values' bound; their mean is 0. From an even
+distribution, which is much wider, means move slowly: a cross-entropy pulls at them with its inverse variance."""
+
 
 class CategoricalCritics(nn.Module):
     """Networks of observation and action that give distributions, alike but for their initial weights.
@@ -50,11 +54,14 @@ class CategoricalCritics(nn.Module):
         self.heads = heads
         self.atoms = Atoms(-config.value_bound, config.value_bound, config.atoms)
         outputs, norm = heads * config.atoms, config.critic_layer_norm
-        # Small weights of the last layer: at first all values are about as likely, which makes 0 on average.
         self.nets = nn.ModuleList(
             network(inputs, config.critic_hidden, outputs, 0.01, generator, config.activation, norm)
             for _ in range(count)
         )
+        with torch.no_grad():
+            place = self.atoms.values / (FIRST_DEVIATION * config.value_bound)
+            for net in self.nets:
+                net.head.bias.view(heads, -1).copy_(-0.5 * place.square())
 
     def log_probs(self, obs: Tensor, actions: Tensor, task_id: Tensor) -> Tensor:
         """Of each atom: normalised observations (B, d), actions (B, a), tasks (B,) to (count, B, atoms)."""

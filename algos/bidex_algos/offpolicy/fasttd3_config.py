@@ -15,10 +15,6 @@ class FastTD3Config(CategoricalConfig, TD3Config):
 
     value_heads: bool = False
     """Give each critic one distribution per task instead of one for all."""
-    updates_per_step: int = 2
-    """Updates of all networks after each vector step."""
-    batch_size: int = 2048
-    """Transitions of an update, split evenly over the tasks."""
     n_steps: int = 3
     """Steps whose rewards a target takes as they came, before it asks for the value of what follows."""
     tau: float = 0.05
