@@ -90,7 +90,7 @@ def test_refusals_name_the_mend():
         evaluate(Seeker(), ToyWorld(6, "SAME_STEP"), 1)
     with pytest.raises(BidexError, match="num_envs=6"):
         evaluate(Seeker(), ToyWorld(4, "DISABLED"), 1)
-    with pytest.raises(BidexError, match="at least 1"):
+    with pytest.raises(BidexError, match="whole number from 1"):
         evaluate(Seeker(), ToyWorld(6, "DISABLED"), 0)
 
 

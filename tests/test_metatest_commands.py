@@ -115,7 +115,7 @@ def test_compare_takes_what_is_reached_after_adaptation(run):
 @pytest.mark.parametrize(
     ("flags", "expected"),
     [
-        (["--shots", "-1"], "Shots must be 0 or more"),
+        (["--shots", "-1"], "--shots must be at least 0"),
         (["--rollouts", "0"], "--rollouts must be at least 1"),
         (["--random"], "Leave --random out"),
         (["--split", "tets"], "both"),
