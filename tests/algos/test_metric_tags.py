@@ -13,7 +13,7 @@ from tests.pages import ROOT
 
 SMALL: dict[str, Any] = {"hidden": (8,), "autocast": "off"}
 VARIANTS: dict[str, list[dict[str, Any]]] = {
-    "mtppo": [{}, {"gradient_surgery": "pcgrad"}],
+    "mtppo": [{}, {"gradient_surgery": "pcgrad"}, {"gradient_surgery": "famo"}],
     "mttrpo": [{}],
     "mtsac": [{"warmup_steps": 2, "batch_size": 16}],
     "mttd3": [{"warmup_steps": 2, "batch_size": 16}],
