@@ -79,7 +79,7 @@ class MetaWorldWorld(Recreated, VectorEnv):
         self.suite, self.num_envs, self.device = suite, num_envs, torch.device("cpu")
         self.task_names = list(class_names(suite))
         self.num_tasks = self.num_id_columns = len(self.task_names)
-        self.gammas = (None,) * self.num_tasks
+        self.gammas: tuple[float | None, ...] = (None,) * self.num_tasks
         if num_envs < self.num_tasks:
             raise BidexError(f"Expected at least {self.num_tasks} rows, one for each class of {suite}, got {num_envs}.")
         self.autoreset_mode = checked_mode(autoreset_mode)
