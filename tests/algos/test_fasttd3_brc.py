@@ -270,6 +270,13 @@ def test_metrics_and_errors_carry_its_name(kind: Any, config: Any) -> None:
             replace(config, **wrong)
 
 
+@both
+def test_wide_critics_are_counted_as_memory(kind: Any, config: Any) -> None:
+    wide = replace(config, critic_hidden=(4096, 4096, 4096))
+    # Two critics of two more matrices of 4096 by 4096 each, with gradient and two moments, in float32.
+    assert wide.bytes_held(64, 500) - config.bytes_held(64, 500) > 2 * 2 * 4096**2 * 4 * 4
+
+
 def test_brc_refuses_widths_that_differ() -> None:
     with pytest.raises(BidexError, match=r"brc: critic_hidden must be one width, once or more often, got \(8, 16\)"):
         replace(SMALL, critic_hidden=(8, 16))

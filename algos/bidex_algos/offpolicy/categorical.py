@@ -54,14 +54,15 @@ class CategoricalCritics(nn.Module):
         self.heads = heads
         self.atoms = Atoms(-config.value_bound, config.value_bound, config.atoms)
         outputs, norm = heads * config.atoms, config.critic_layer_norm
-        self.nets = nn.ModuleList(
+        nets = [
             network(inputs, config.critic_hidden, outputs, 0.01, generator, config.activation, norm)
             for _ in range(count)
-        )
+        ]
+        place = self.atoms.values / (FIRST_DEVIATION * config.value_bound)
         with torch.no_grad():
-            place = self.atoms.values / (FIRST_DEVIATION * config.value_bound)
-            for net in self.nets:
+            for net in nets:
                 net.head.bias.view(heads, -1).copy_(-0.5 * place.square())
+        self.nets = nn.ModuleList(nets)
 
     def log_probs(self, obs: Tensor, actions: Tensor, task_id: Tensor) -> Tensor:
         """Of each atom: normalised observations (B, d), actions (B, a), tasks (B,) to (count, B, atoms)."""

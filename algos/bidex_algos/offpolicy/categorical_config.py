@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from bidex_algos.checks import at_least, positive
+from bidex_algos.checks import at_least, network_bytes, positive
 from bidex_algos.offpolicy.config import OffPolicyConfig
 
 
@@ -28,3 +28,12 @@ class CategoricalConfig(OffPolicyConfig):
         super().__post_init__()
         at_least(self, 2, "atoms")
         positive(self, "value_bound")
+
+    def bytes_held(self, rows: int, width: int) -> int:
+        """About how much memory a learner takes: as in the base, where ``hidden`` is of all networks, and the critics'.
+
+        Args:
+            rows: Rows of its world.
+            width: Numbers that are kept of a step of a row.
+        """
+        return super().bytes_held(rows, width) + network_bytes((*self.critic_hidden, self.atoms), width, 2)
