@@ -61,7 +61,7 @@ class CategoricalCritics(nn.Module):
         place = self.atoms.values / (FIRST_DEVIATION * config.value_bound)
         with torch.no_grad():
             for net in nets:
-                net.head.bias.view(heads, -1).copy_(-0.5 * place.square())
+                net.output_bias.view(heads, -1).copy_(-0.5 * place.square())
         self.nets = nn.ModuleList(nets)
 
     def log_probs(self, obs: Tensor, actions: Tensor, task_id: Tensor) -> Tensor:
