@@ -115,6 +115,44 @@ def test_two_tasks_by_two_agents(kind: str) -> None:
         assert means.tolist() == pytest.approx([target] * 2, abs=0.15)
 
 
+LARGE: dict[str, Any] = {
+    "clip": 5.0, "epochs": 15, "num_minibatches": 1, "adaptive_learning_rate": False, "learning_rate": 1e-2,
+    "max_grad_norm": 100.0, "critic_learning_rate": 1e-2,
+}  # fmt: skip
+
+
+def exclusive_or(action: Tensor) -> Tensor:
+    """A matrix game: 1 if one agent alone goes (its action is positive), else 0."""
+    return (action > 0).sum(1).eq(1).float()
+
+
+@pytest.mark.parametrize("seed", range(3))
+@every
+def test_a_matrix_game_needs_turns(kind: str, seed: int) -> None:
+    """Both go at first, and for each it would be better to stop, unless the other does.
+
+    With large steps agents that move at once both stop, then both go; in turns the second sees what the first has done.
+    """
+    make, config = KINDS[kind]
+    in_turns = kind in ("happo", "hatrpo")
+    steps = (
+        LARGE
+        if kind != "hatrpo"
+        else {"max_kl": 1.5, "damping": 0.01, "fisher_stride": 1, "accept_ratio": 0.0, "critic_epochs": 2}
+    )
+    world = ToyWorld([exclusive_or], rows=512, horizon=1, terminal=True)
+    learner = make(world, replace(config, std_range=(0.5, 0.5), **steps), seed=seed)
+    with torch.no_grad():
+        for net in learner.policy.actor.nets:
+            net.head.bias.fill_(0.4)
+    paid = []
+    for _ in range(5):
+        learner.iterate()
+        paid.append(float(learner.rollout.rewards.mean()))
+    assert paid[0] < 0.4
+    assert (sum(paid[1:4]) / 3 > 0.75 and paid[-1] > 0.85) if in_turns else sum(paid[1:4]) / 3 < 0.55
+
+
 @pytest.mark.parametrize("share", [False, True])
 def test_agents_of_one_form_in_one_pass(share: bool) -> None:
     config = MAPPOConfig(agents="a=action/3;b=action/0;c=action/1+action/2", share_parameters=share, **SMALL)

@@ -16,7 +16,7 @@ EXTRAS = {"sb3": "stable_baselines3", "rsl-rl": "rsl_rl", "skrl": "skrl", "torch
 
 def test_the_page_names_extras_adapters_and_examples() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    assert set(re.findall(r"bidex-meta\[([\w-]+)\]", PAGE)) == set(EXTRAS) <= extras.keys()
+    assert set(re.findall(r"bidex-meta\[([\w-]+)\]", PAGE)) == {*EXTRAS, "marl"} <= extras.keys()
     named = re.findall(r"`(bidex_meta\.clients\.\w+)\.(\w+)` \| \[(\w+\.py)\]", PAGE)
     assert len(named) == len(EXTRAS)
     for (module, adapter, example), package in zip(named, EXTRAS.values(), strict=True):
@@ -29,9 +29,16 @@ def test_the_page_names_extras_adapters_and_examples() -> None:
             assert package in str(error)
 
 
-def test_the_pages_code_runs() -> None:
-    pytest.importorskip("stable_baselines3", reason="needs the extra sb3")
-    (code,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
-    short = code.replace("num_envs=256", "num_envs=4").replace("100_000", "64")
-    assert short != code
-    exec(compile(short, "docs/clients.md", "exec"), {})
+SHORT = {"stable_baselines3": (("num_envs=256", "num_envs=4"), ("100_000", "64")), "pettingzoo": ()}
+
+
+@pytest.mark.parametrize(("place", "package"), list(enumerate(SHORT)))
+def test_the_pages_code_runs(place: int, package: str) -> None:
+    pytest.importorskip(package)
+    blocks = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    assert len(blocks) == len(SHORT)
+    code = blocks[place]
+    for long, short in SHORT[package]:
+        assert long in code
+        code = code.replace(long, short)
+    exec(compile(code, "docs/clients.md", "exec"), {})

@@ -1,12 +1,17 @@
 """What can be set about the on-policy learners of several agents; imports no torch."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
+
+import tyro
 
 from bidex_algos.checks import at_least, positive
 from bidex_algos.onpolicy.config import OnPolicyConfig
 from bidex_algos.onpolicy.ppo_config import PPOConfig
 from bidex_meta.hands.units import partition_line
+
+Partition = Annotated[str, tyro.conf.arg(aliases=("--agents",))]
+"""A partition of the hands' units, on the command line by a short name too."""
 
 
 def keep_partition(config: Any) -> None:
@@ -20,7 +25,7 @@ class MultiAgentConfig(OnPolicyConfig):
 
     algo: ClassVar[str] = "multi-agent"
 
-    agents: str = "hands"
+    agents: Partition = "hands"
     """Who acts: hands (two agents), fingers (twelve: five fingers and the palm of each hand), single, a TOML file with
     a table [agents], or name=unit+unit;name=unit (docs/learners/multiagent.md)."""
     huber_delta: float = 10.0

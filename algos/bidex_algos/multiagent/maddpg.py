@@ -52,12 +52,16 @@ class DeterministicTeam(Team):
 
     def forward(self, x: Tensor) -> Tensor:
         """Joint actions of normalised observations (B, d): float32 (B, a) in [-1, 1]."""
+        return torch.tanh(self.raw(x))
+
+    def raw(self, x: Tensor) -> Tensor:
+        """The same before the squashing: float32 (B, a)."""
         outputs = self.outputs(x)
         if self.heads > 1:
             head = self.one_hot(x).argmax(1)
             rows = torch.arange(len(x), device=x.device)
             outputs = [out.unflatten(1, (self.heads, -1))[rows, head] for out in outputs]
-        return torch.tanh(torch.cat(outputs, dim=-1).index_select(-1, self._order))
+        return torch.cat(outputs, dim=-1).index_select(-1, self._order)
 
 
 class MADDPG(DDPG):
@@ -81,12 +85,15 @@ class MADDPG(DDPG):
 
     def _policy_step(self, obs: Tensor, draw: Transitions, weights: Tensor, counts: Tensor) -> None:
         """One step of every agent up the critic, the others' actions as they were, on normalised observations."""
-        actions, share = self.policy.act(obs), weights / counts.sum().clamp_min(1.0)
-        values = []
-        for agent in range(len(self.views)):
-            joint = torch.where(self.owner == agent, actions, draw.actions)
-            values.append((share * self._values(self.critic, obs, joint)[0]).sum())
-        loss = -torch.stack(values).sum()
+        raw, share = self.policy.raw(obs), weights / counts.sum().clamp_min(1.0)
+        actions, losses = torch.tanh(raw), []
+        for agent, view in enumerate(self.views):
+            value = self._climbed(
+                self._values(self.critic, obs, torch.where(self.owner == agent, actions, draw.actions))
+            )
+            price = self.config.squash_price * raw[:, list(view.actions)].square().mean(1)
+            losses.append((share * (price - value)).sum())
+        loss = torch.stack(losses).sum()
         told = loss.detach()[None] / len(self.views)
         self.actor_loss = self._descend(loss, told, "actor", actor=list(self.policy.actor.parameters()))[0]
 

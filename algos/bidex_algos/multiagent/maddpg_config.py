@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from bidex_algos.multiagent.config import keep_partition
+from bidex_algos.multiagent.config import Partition, keep_partition
 from bidex_algos.offpolicy.ddpg_config import DDPGConfig, of_paper
 
 
@@ -13,7 +13,7 @@ class MADDPGConfig(DDPGConfig):
 
     algo: ClassVar[str] = "maddpg"
 
-    agents: str = "hands"
+    agents: Partition = "hands"
     """Who acts: hands (two agents), fingers (twelve: five fingers and the palm of each hand), single, a TOML file with
     a table [agents], or name=unit+unit;name=unit (docs/learners/multiagent.md)."""
 
