@@ -16,7 +16,7 @@ from tests.algos.toy import ToyWorld
 PAIR = "a=action/1;b=action/0"
 SMALL: dict[str, Any] = {
     "hidden": (32, 32), "autocast": "off", "batch_size": 128, "learning_rate": 2e-3, "critic_learning_rate": 3e-3,
-    "warmup_steps": 8, "replay_steps": 200, "policy_heads": False, "tau": 0.05,
+    "warmup_steps": 8, "replay_steps": 200, "policy_heads": False, "tau": 0.05, "squash_price": 0.0,
 }  # fmt: skip
 
 
@@ -37,7 +37,7 @@ def test_two_agents_find_a_coupled_optimum() -> None:
 
 @pytest.mark.parametrize("heads", [False, True])
 def test_one_agent_is_ddpg(heads: bool) -> None:
-    options = SMALL | {"policy_heads": heads}
+    options = SMALL | {"policy_heads": heads, "squash_price": 0.5}
     one, other = (
         DDPG(opposite_bandits(), DDPGConfig(**options), seed=1),
         MADDPG(opposite_bandits(), MADDPGConfig(agents="single", **options), seed=1),
