@@ -6,6 +6,8 @@ Imports no torch. ``PRESETS`` holds what is meant for any class, ``OF_TASK`` wha
 from dataclasses import replace
 from typing import Any
 
+from bidex_algos.multiagent import happo_config, hatrpo_config, ippo_config, mappo_config
+from bidex_algos.multiagent.config import LIFT
 from bidex_algos.offpolicy import mtsac_config
 from bidex_algos.onpolicy import mtppo_config, mttrpo_config
 
@@ -26,6 +28,15 @@ OF_TASK: dict[str, dict[str, dict[str, Any]]] = {
     "ppo": {
         "LiftUnderarm": {"paper": replace(_PPO, rollout_steps=20, epochs=10)},
         "StackBlock": {"paper": replace(_PPO, num_minibatches=8, epochs=2, gamma=0.9)},
+    },
+    # Tables 44 and 45, whose column for StackBlock is that for other tasks.
+    "happo": {"LiftUnderarm": {"paper": replace(happo_config.PRESETS["paper"], **LIFT)}},
+    "mappo": {"LiftUnderarm": {"paper": replace(mappo_config.PRESETS["paper"], **LIFT)}},
+    "ippo": {"LiftUnderarm": {"paper": replace(ippo_config.PRESETS["paper"], **LIFT)}},
+    "hatrpo": {
+        "LiftUnderarm": {
+            "paper": replace(hatrpo_config.PRESETS["paper"], rollout_steps=LIFT["rollout_steps"], critic_epochs=10)
+        }
     },
 }
 """Presets that hold for one class alone, by learner, class and name."""

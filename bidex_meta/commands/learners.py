@@ -36,6 +36,11 @@ ALGOS: dict[str, str] = {
     "promp": "bidex_algos.meta.promp:ProMP",
     "maml": "bidex_algos.meta.maml:MAML",
     "rl2": "bidex_algos.meta.rl2:RL2",
+    "ippo": "bidex_algos.multiagent.ippo:IPPO",
+    "mappo": "bidex_algos.multiagent.mappo:MAPPO",
+    "happo": "bidex_algos.multiagent.happo:HAPPO",
+    "hatrpo": "bidex_algos.multiagent.hatrpo:HATRPO",
+    "maddpg": "bidex_algos.multiagent.maddpg:MADDPG",
     # On a single task they are the plain ones, with presets of their own (bidex_algos.single_task).
     "ppo": "bidex_algos.onpolicy.mtppo:MTPPO",
     "trpo": "bidex_algos.onpolicy.mttrpo:MTTRPO",

@@ -14,7 +14,7 @@ EXTRAS = {"sb3": "stable_baselines3", "rsl-rl": "rsl_rl", "skrl": "skrl", "torch
 
 def test_the_page_names_extras_adapters_and_examples() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    assert set(re.findall(r"bidex-meta\[([\w-]+)\]", PAGE)) == set(EXTRAS) <= extras.keys()
+    assert set(re.findall(r"bidex-meta\[([\w-]+)\]", PAGE)) == {*EXTRAS, "marl"} <= extras.keys()
     named = re.findall(r"`(bidex_meta\.clients\.\w+)\.(\w+)` \| \[(\w+\.py)\]", PAGE)
     assert len(named) == len(EXTRAS)
     for (module, adapter, example), package in zip(named, EXTRAS.values(), strict=True):

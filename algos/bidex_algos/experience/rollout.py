@@ -13,7 +13,7 @@ Sampler = Callable[[Tensor], tuple[Tensor, Tensor]]
 """Raw observations (N, d) to a sampled action and the mean action, both (N, a) and not clamped."""
 
 FinalValue = Callable[[Tensor, Tensor], Tensor]
-"""Raw observations (n, d) and task ids (n,) to values (n,), in units of reward."""
+"""Raw observations (n, d) and task ids (n,) to values (n,), in units of reward; of several critics (n, critics)."""
 
 
 class Rollout:
@@ -27,11 +27,14 @@ class Rollout:
         terminated: Bool (T, N), the episode came to a true end.
         ended: Bool (T, N), terminated, truncated or not valid.
         valid: Bool (T, N), False where physics broke: such a transition teaches nothing.
-        final_values: Value of the last observation of episodes cut by a time limit, 0 elsewhere, (T, N).
+        final_values: Value of the last observation of episodes cut by a time limit, 0 elsewhere, (T, N); of several
+            critics (T, N, critics).
         last_obs: Raw observations after the last step, (N, d).
     """
 
-    def __init__(self, steps: int, num_envs: int, observations: int, actions: int, device: torch.device):
+    def __init__(
+        self, steps: int, num_envs: int, observations: int, actions: int, device: torch.device, critics: int = 1
+    ):
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros(*shape, dtype=dtype, device=device)
 
@@ -43,7 +46,7 @@ class Rollout:
         self.terminated = zeros(steps, num_envs, dtype=torch.bool)
         self.ended = zeros(steps, num_envs, dtype=torch.bool)
         self.valid = zeros(steps, num_envs, dtype=torch.bool)
-        self.final_values = zeros(steps, num_envs)
+        self.final_values = zeros(steps, num_envs, *([critics] if critics > 1 else []))
         self.last_obs = zeros(num_envs, observations)
 
 
@@ -65,7 +68,9 @@ def collect(
         rollout.rewards[t] = reward.masked_fill(~valid, 0.0)
         rollout.terminated[t], rollout.ended[t], rollout.valid[t] = terminated, terminated | truncated | ~valid, valid
         cut = truncated & ~terminated & valid
-        rollout.final_values[t] = _values_where(cut, info["final_obs"], world.task_id, final_value)
+        rollout.final_values[t] = _values_where(
+            cut, info["final_obs"], world.task_id, final_value, rollout.final_values[t]
+        )
         episodes.update(info)
     rollout.last_obs.copy_(obs)
     return obs
@@ -90,12 +95,12 @@ def may_look(device: torch.device) -> bool:
     return device.type == "cpu"
 
 
-def _values_where(cut: Tensor, final_obs: Tensor, task_id: Tensor, final_value: FinalValue) -> Tensor:
-    """Values (N,) of ``final_obs`` in the rows ``cut``, 0 elsewhere."""
-    values = torch.zeros(cut.shape, device=cut.device)
+def _values_where(cut: Tensor, final_obs: Tensor, task_id: Tensor, final_value: FinalValue, like: Tensor) -> Tensor:
+    """Values of ``final_obs`` in the rows ``cut``, 0 elsewhere; of the shape of ``like``."""
+    values = torch.zeros_like(like)
     if not may_look(cut.device):
         # A forward of all rows is cheaper than the wait for which rows there are.
-        return torch.where(cut, final_value(final_obs, task_id), values)
+        return torch.where(cut.view(-1, *[1] * (like.dim() - 1)), final_value(final_obs, task_id), values)
     rows = cut.nonzero().squeeze(-1)
     if len(rows):
         values[rows] = final_value(final_obs[rows], task_id[rows])

@@ -23,47 +23,73 @@ class _Adam(torch.optim.Adam):
             group["lr"] = rate
 
 
-class AdaptiveAdams:
-    """Two optimisers; the actor's step size is divided by 1.5 above twice the desired KL, multiplied below half of it.
+class AdaptiveAdam:
+    """Adam whose step size is divided by 1.5 above twice the desired KL, multiplied below half of it.
 
     The step size is a tensor: adapting it needs no wait for the device.
 
     Args:
+        parameters: What it moves.
+        config: Of a learner. It has ``learning_rate``, the step size at the start, and, if ``adaptive_learning_rate``,
+            ``desired_kl`` and ``learning_rate_range``, what it aims at and its bounds.
+        device: Where the parameters lie.
+        eps: What Adam adds to its denominators.
+    """
+
+    def __init__(self, parameters: Iterable[nn.Parameter], config: Any, device: torch.device, eps: float = 1e-8):
+        self.desired_kl = config.desired_kl if config.adaptive_learning_rate else None
+        self.bounds = config.learning_rate_range
+        self.rate = torch.tensor(config.learning_rate, device=device)
+        self.actor = _Adam(parameters, lr=self.rate, eps=eps, fused=True)
+
+    def zero_grad(self) -> None:
+        """Forgets the gradients."""
+        self.actor.zero_grad()
+
+    def step(self) -> None:
+        """One step."""
+        self.actor.step()
+
+    def follow(self, kl: Tensor) -> None:
+        """Adapts the step size to the KL of its last step, a scalar."""
+        if self.desired_kl is None:
+            return
+        self.rate.mul_(factor_of(kl, self.desired_kl)).clamp_(*self.bounds)
+
+    def parts(self) -> dict[str, Any]:
+        """Optimiser and step size, by their names in a checkpoint."""
+        return {"actor_adam": self.actor, "learning_rate": self.rate}
+
+
+class AdaptiveAdams(AdaptiveAdam):
+    """An adaptive one for the actor, and one for its critic.
+
+    Args:
         actor: The actor's parameters.
         critic: The critic's.
-        config: Of a learner. It has ``learning_rate``, the step size at the start; ``critic_learning_rate``, a fixed
-            one for the critic (None makes it follow the actor's); and, if ``adaptive_learning_rate``, ``desired_kl``
-            and ``learning_rate_range``, what the actor's aims at and its bounds.
+        config: Of a learner: as for :class:`AdaptiveAdam`, and ``critic_learning_rate``, a fixed step size for the
+            critic (None makes it follow the actor's).
         device: Where the parameters lie.
     """
 
     def __init__(
         self, actor: Iterable[nn.Parameter], critic: Iterable[nn.Parameter], config: Any, device: torch.device
     ):
-        self.desired_kl = config.desired_kl if config.adaptive_learning_rate else None
-        self.bounds = config.learning_rate_range
-        self.rate = torch.tensor(config.learning_rate, device=device)
+        super().__init__(actor, config, device)
         fixed = config.critic_learning_rate
         self.critic_rate = self.rate if fixed is None else torch.tensor(fixed, device=device)
-        self.actor = _Adam(actor, lr=self.rate, fused=True)
         self.critic = _Adam(critic, lr=self.critic_rate, fused=True)
 
     def zero_grad(self) -> None:
         """Forgets the gradients of both."""
-        self.actor.zero_grad()
+        super().zero_grad()
         self.critic.zero_grad()
 
     def step(self) -> None:
         """One step of both."""
-        self.actor.step()
+        super().step()
         self.critic.step()
-
-    def follow(self, kl: Tensor) -> None:
-        """Adapts the actor's step size to the KL of its last step, a scalar."""
-        if self.desired_kl is None:
-            return
-        self.rate.mul_(factor_of(kl, self.desired_kl)).clamp_(*self.bounds)
 
     def parts(self) -> dict[str, Any]:
         """Both optimisers and the step size, by their names in a checkpoint."""
-        return {"actor_adam": self.actor, "critic_adam": self.critic, "learning_rate": self.rate}
+        return super().parts() | {"critic_adam": self.critic}

@@ -90,7 +90,8 @@ def stacked_forward(network: MLP, params: Mapping[str, Tensor], prefix: str, x: 
         if isinstance(layer, nn.LayerNorm):
             raise TypeError("stacked_forward knows no layer norm")
         x = stacked(f"body.{name}", x) if isinstance(layer, nn.Linear) else layer(x)
-    return stacked("head", x)
+    with torch.autocast(x.device.type, enabled=False):
+        return stacked("head", x.to(params[f"{prefix}head.weight"].dtype))
 
 
 def linear(inputs: int, outputs: int, gain: float, generator: torch.Generator) -> nn.Linear:

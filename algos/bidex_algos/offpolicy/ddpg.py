@@ -70,7 +70,7 @@ class DDPG(OffPolicy):
         obs, next_obs = self.policy.observations(draw.obs), self.policy.observations(draw.next_obs)
         told = self._fit_critics(obs, draw, self._target(draw, next_obs), weights, counts)
         if self._actor_is_due():
-            self._policy_step(obs, weights, counts)
+            self._policy_step(obs, draw, weights, counts)
             follow(self.target_actor, self.policy.actor, self.config.tau)
             follow(self.target_critic, self.critic, self.config.tau)
         return told
@@ -90,8 +90,8 @@ class DDPG(OffPolicy):
         with autocast(self.device, self.low_precision):
             return self.target_actor(next_obs)
 
-    def _policy_step(self, obs: Tensor, weights: Tensor, counts: Tensor) -> None:
-        """One step of the actor up the critics, on normalised observations (B, d)."""
+    def _policy_step(self, obs: Tensor, draw: Transitions, weights: Tensor, counts: Tensor) -> None:
+        """One step of the actor up the critics, on normalised observations (B, d) of ``draw``."""
         raw = self.policy.raw(obs)
         value = self._climbed(self._values(self.critic, obs, torch.tanh(raw)))
         price = self.config.squash_price * raw.square().mean(1)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from bidex_algos.experience.advantages import (
     discounts,
@@ -48,9 +48,9 @@ class Batch:
     old_log_probs: Tensor
     """Log-density of the actions under the sampling policy (B,)."""
     advantages: Tensor
-    """Normalised advantages (B,)."""
+    """Normalised advantages (B,); of several critics (B, critics)."""
     targets: Tensor
-    """What the critic shall predict, in its own units (B,)."""
+    """What the critic shall predict, in its own units (B,); of several (B, critics)."""
     weights: Tensor
     """1, or 0 for a transition where physics broke (B,)."""
 
@@ -68,29 +68,34 @@ class OnPolicy(Learner):
         policy: The agent that evaluation uses: mean action, clamped.
         critic: Values of normalised observations, in units of the task's returns.
         gamma: Discount of all rows, or of each (N,).
+        num_critics: How many values a state has: more than one where each of several agents has a critic of its own.
     """
 
     config: OnPolicyConfig
     policy: GaussianPolicy
     discounts_by_class = True
     per_process = ("generator", "episodes", "obs")
+    num_critics = 1
 
     def __init__(self, world: VectorWorld, config: OnPolicyConfig, seed: int):
         super().__init__(world, config, seed)
         self.low_precision = self.policy.low_precision
         self.obs: Tensor | None = None
-        value_heads = world.num_tasks if config.value_heads else 1
-        critic = network_of(config)(self.inputs, config.hidden, value_heads, 1.0, self.initial, config.activation)
-        self.critic = critic.to(self.device)
+        self.critic = self._make_critic(world.num_tasks if config.value_heads else 1).to(self.device)
         samples = config.rollout_steps * world.num_envs
         horizon = config.value_horizon * samples * world_size() / world.num_tasks
-        self.return_stats = RunningStats((world.num_tasks,), max_count=horizon).to(self.device)
+        self.return_stats = RunningStats((self.num_critics * world.num_tasks,), max_count=horizon).to(self.device)
         self.gamma = discounts(world, config.gamma, world.task_id)
         sizes = self.shape.observations, self.shape.actions
-        self.rollout = Rollout(config.rollout_steps, world.num_envs, *sizes, self.device)
+        self.rollout = Rollout(config.rollout_steps, world.num_envs, *sizes, self.device, self.num_critics)
         self.episodes = EpisodeStatistics(world.task_id, world.task_names)
 
     # What a learner adds.
+
+    def _make_critic(self, heads: int) -> nn.Module:
+        """The critic, with one output per task or one for all."""
+        make = network_of(self.config)
+        return make(self.inputs, self.config.hidden, heads, 1.0, self.initial, self.config.activation)
 
     @abstractmethod
     def _update(self, batch: Batch) -> dict[str, Tensor]:
@@ -132,11 +137,17 @@ class OnPolicy(Learner):
             return out.gather(1, task_id[:, None]).squeeze(1)
         return out.squeeze(1)
 
+    def _element(self, task_id: Tensor) -> Tensor:
+        """Where the returns of a task (B,) stand in the statistics: (B,), of several critics (B, critics)."""
+        if self.num_critics == 1:
+            return task_id
+        return task_id[:, None] + self.world.num_tasks * torch.arange(self.num_critics, device=self.device)
+
     def _in_reward_units(self, values: Tensor, task_id: Tensor) -> Tensor:
-        return self.return_stats.restore(values, task_id) if self.config.per_task_values else values
+        return self.return_stats.restore(values, self._element(task_id)) if self.config.per_task_values else values
 
     def _in_critic_units(self, returns: Tensor, task_id: Tensor) -> Tensor:
-        return self.return_stats.normalise(returns, task_id) if self.config.per_task_values else returns
+        return self.return_stats.normalise(returns, self._element(task_id)) if self.config.per_task_values else returns
 
     @torch.no_grad()
     def _prepare(self) -> tuple[Batch, Tensor]:
@@ -150,15 +161,22 @@ class OnPolicy(Learner):
             # Autocast would make this cast in every mini-batch; the result is the same.
             obs = obs.bfloat16()
 
-        values = self._in_reward_units(self._critic(obs, flat_task_id), flat_task_id).view(steps, rows)
-        last_values = self._final_value(r.last_obs, task_id)
-        next_values = successor_values(values, last_values, r.ended, r.final_values)
-        advantages = gae(r.rewards, values, next_values, r.terminated, r.ended, self.gamma, cfg.lam, r.valid)
+        # Several critics make several columns of a row, each like a row of its own.
+        def each(x: Tensor) -> Tensor:
+            return x if self.num_critics == 1 else x.repeat_interleave(self.num_critics, 1)
+
+        judged = self._in_reward_units(self._critic(obs, flat_task_id), flat_task_id)
+        values, last_values = judged.view(steps, -1), self._final_value(r.last_obs, task_id).view(-1)
+        rewards, terminated, ended, valid = map(each, (r.rewards, r.terminated, r.ended, r.valid))
+        element, elements = self._element(task_id).reshape(-1), self.num_critics * num_tasks
+        next_values = successor_values(values, last_values, ended, r.final_values.flatten(1))
+        gamma = self.gamma if isinstance(self.gamma, float) else each(self.gamma[None])
+        advantages = gae(rewards, values, next_values, terminated, ended, gamma, cfg.lam, valid)
         returns = advantages + values
-        explained = explained_variance(values, returns, task_id, num_tasks, r.valid)
-        self.return_stats.merge(*task_moments(returns, task_id, num_tasks, r.valid))
-        group = task_id if cfg.per_task_advantages else torch.zeros_like(task_id)
-        advantages = normalise_per_task(advantages, group, num_tasks, r.valid)
+        explained = explained_variance(values, returns, element, elements, valid).view(-1, num_tasks).mean(0)
+        self.return_stats.merge(*task_moments(returns, element, elements, valid))
+        group = element if cfg.per_task_advantages else element // num_tasks * num_tasks
+        advantages = normalise_per_task(advantages, group, elements, valid)
 
         actions, old_means = r.actions.flatten(0, 1), r.means.flatten(0, 1)
         batch = Batch(
@@ -167,8 +185,8 @@ class OnPolicy(Learner):
             actions=actions,
             old_means=old_means,
             old_log_probs=gaussian_log_prob(actions, old_means, self.policy.actor.log_std_of(obs)),
-            advantages=advantages.flatten(),
-            targets=self._in_critic_units(returns.flatten(), flat_task_id),
+            advantages=advantages.reshape(judged.shape),
+            targets=self._in_critic_units(returns.reshape(judged.shape), flat_task_id),
             weights=r.valid.flatten().float(),
         )
         return batch, explained

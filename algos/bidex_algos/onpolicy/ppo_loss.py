@@ -8,6 +8,16 @@ from torch import Tensor
 from bidex_algos.nets.networks import gaussian_entropy, gaussian_kl, gaussian_log_prob
 
 
+class PolicyLoss(NamedTuple):
+    """The policy's share of a loss; as :class:`PPOLoss`."""
+
+    surrogate: Tensor
+    entropy: Tensor
+    kl: Tensor
+    outside: Tensor
+    earned: Tensor
+
+
 class PPOLoss(NamedTuple):
     """Losses and what is told of them; scalars but for ``earned``. With weights that sum to 1 they are means."""
 
@@ -61,12 +71,30 @@ def ppo_loss(
         weights: Of each sample (...); 0 for those that teach nothing.
         clip: How far the ratio may leave 1 before it earns nothing more.
     """
+    policy = policy_loss(
+        actions, means, log_std, old_means, old_log_std, old_log_probs, advantages, weights=weights, clip=clip
+    )
+    value = (weights * (values - targets).square()).sum()
+    return PPOLoss(policy.surrogate, value, policy.entropy, policy.kl, policy.outside, policy.earned)
+
+
+def policy_loss(
+    actions: Tensor,
+    means: Tensor,
+    log_std: Tensor,
+    old_means: Tensor,
+    old_log_std: Tensor,
+    old_log_probs: Tensor,
+    advantages: Tensor,
+    weights: Tensor,
+    clip: float,
+) -> PolicyLoss:
+    """The loss of the policy alone; arguments are those of :func:`ppo_loss`."""
     ratio = torch.exp(gaussian_log_prob(actions, means, log_std) - old_log_probs)
     clipped = ratio.clamp(1.0 - clip, 1.0 + clip)
     earned = weights * torch.minimum(ratio * advantages, clipped * advantages)
-    value = (weights * (values - targets).square()).sum()
     entropy = (weights * gaussian_entropy(log_std)).sum()
     with torch.no_grad():
         kl = (weights * gaussian_kl(old_means, old_log_std, means, log_std)).sum()
         outside = (weights * ((ratio - 1.0).abs() > clip)).sum()
-    return PPOLoss(-earned.sum(), value, entropy, kl, outside, earned)
+    return PolicyLoss(-earned.sum(), entropy, kl, outside, earned)

@@ -1,0 +1,164 @@
+"""What the on-policy learners of several agents share: the agents' policy, a critic of all, its loss.
+
+To the base below it the agents are one policy, whose action is put together of theirs; an update takes it apart again.
+"""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from bidex_algos.multiagent.config import MultiAgentConfig
+from bidex_algos.multiagent.team import TeamActor
+from bidex_algos.nets.encoders.inputs import Inputs
+from bidex_algos.nets.networks import gaussian_log_prob
+from bidex_algos.nets.normalise import ObservationNormaliser
+from bidex_algos.nets.policy import GaussianPolicy
+from bidex_algos.nets.precision import autocast, use_bfloat16
+from bidex_algos.nets.shape import Shape
+from bidex_algos.onpolicy.base import Batch, OnPolicy
+from bidex_meta.errors import BidexError
+from bidex_meta.train.distributed import all_sum, sum_gradients
+from bidex_meta.world.agent_views import agent_views
+from bidex_meta.world.contract import VectorWorld
+
+
+class TeamPolicy(GaussianPolicy):
+    """All agents as one Gaussian policy of the world's action."""
+
+    actor: TeamActor  # type: ignore[assignment]
+
+
+class MultiAgent(OnPolicy):
+    """Agents that share a reward, each with a policy on what it sees.
+
+    Arguments and attributes are those of :class:`~bidex_algos.onpolicy.base.OnPolicy`.
+
+    Attributes:
+        views: The agents.
+        critic_adam: Moves the critic.
+
+    Raises:
+        BidexError: A partition that is none of this world's, policy heads where the world does not show the task, or
+            fewer samples in a rollout than mini-batches.
+    """
+
+    config: MultiAgentConfig
+    policy: TeamPolicy
+
+    def __init__(self, world: VectorWorld, config: MultiAgentConfig, seed: int):
+        self.views = agent_views(world.observation_groups, int(world.single_action_space.shape[0]), config.agents)
+        samples = config.rollout_steps * world.num_envs
+        if samples < config.num_minibatches:
+            raise BidexError(
+                f"{self.name}: {config.num_minibatches} mini-batches need as many samples, but {world.num_envs} rows x "
+                f"{config.rollout_steps} steps give {samples}. Raise num_envs or lower num_minibatches."
+            )
+        super().__init__(world, config, seed)
+        rate, eps = config.critic_learning_rate, config.adam_eps
+        self.critic_adam = torch.optim.Adam(self.critic.parameters(), lr=rate, eps=eps, fused=True)
+
+    @classmethod
+    def _make_policy(
+        cls, config: MultiAgentConfig, shape: Shape, init: torch.Generator, device: torch.device
+    ) -> TeamPolicy:
+        views, inputs = agent_views(shape.groups, shape.actions, config.agents), Inputs(shape.groups)
+        heads, share = shape.num_id_columns if config.policy_heads else 1, getattr(config, "share_parameters", False)
+        actor = TeamActor(views, config, inputs, init, heads, share)
+        observations = ObservationNormaliser(inputs, config.normalise_observations)
+        policy: Any = TeamPolicy(observations, actor, use_bfloat16(config.autocast, device))  # type: ignore[arg-type]
+        return policy.to(device)
+
+    def _log_prob(self, agent: int, actions: Tensor, means: Tensor, log_std: Tensor) -> Tensor:
+        """Log-density (B,) of an agent's part of joint actions (B, a) under its part of joint Gaussians."""
+        own = self.policy.actor.own[agent]
+        return gaussian_log_prob(*(x.index_select(-1, own) for x in (actions, means, log_std)))
+
+    # The critic.
+
+    def _old_values(self, batch: Batch) -> Tensor:
+        """What the critic says of a batch before it is moved, where the loss asks for it."""
+        if not self.config.value_clip:
+            return batch.targets
+        with torch.no_grad():
+            return self._critic(batch.obs, batch.task_id)
+
+    def _value_loss(self, b: Batch, old_values: Tensor, weights: Tensor) -> Tensor:
+        """The critics' loss, a scalar: twice Huber's of the errors, so that small ones are squared; of several the sum.
+
+        With ``value_clip`` the larger of two: of the value, and of the old value moved towards it as far as that.
+        """
+        delta, reach = self.config.huber_delta, self.config.value_clip
+        values = self._critic(b.obs, b.task_id)
+
+        def huber(values: Tensor) -> Tensor:
+            return 2.0 * nn.functional.huber_loss(values, b.targets, reduction="none", delta=delta)
+
+        loss = huber(values)
+        if reach:
+            loss = torch.maximum(loss, huber(old_values + (values - old_values).clamp(-reach, reach)))
+        return (weights.view(-1, *[1] * (loss.dim() - 1)) * loss).sum()
+
+    def _critic_step(self, clipped: list[list[nn.Parameter]] | None = None) -> None:
+        """One step along the gradients that are there, each network's shortened."""
+        for parameters in clipped or [list(self.critic.parameters())]:
+            nn.utils.clip_grad_norm_(parameters, self.config.max_grad_norm)
+        self.critic_adam.step()
+
+    def _critic_epochs(self, batch: Batch, epochs: int, num_minibatches: int, weight: float = 1.0) -> Tensor:
+        """Fits the critic to its targets; the mean loss over all mini-batches, a scalar."""
+        old_values, losses = self._old_values(batch), list[Tensor]()
+        parameters = list(self.critic.parameters())
+        for _ in range(epochs):
+            order = torch.randperm(len(batch.obs), generator=self.generator, device=self.device)
+            for index in order.chunk(num_minibatches):
+                b = batch.select(index)
+                count = all_sum(b.weights.sum()).clamp_min(1.0)
+                loss = self._value_loss(b, old_values[index], b.weights / count)
+                self.critic_adam.zero_grad()
+                (weight * loss).backward()
+                losses.append(sum_gradients(parameters, loss.detach()[None])[0])
+                self._critic_step()
+        return torch.stack(losses).mean()
+
+    def _optimisers(self) -> dict[str, Any]:
+        return {"critic_adam": self.critic_adam}
+
+
+class Sequential(MultiAgent):
+    """Agents that are updated one after another, in a random order (Kuba et al. 2022).
+
+    Each sees the advantage times the ratio, new over old, of all that were before it. The order is drawn alike in all
+    processes.
+    """
+
+    def __init__(self, world: VectorWorld, config: MultiAgentConfig, seed: int):
+        super().__init__(world, config, seed)
+        self.order = torch.Generator().manual_seed(seed)
+
+    def _in_turn(self, batch: Batch) -> Any:
+        """Gives each agent, its old log-densities (B,) and the advantages it shall climb (B,); updates the product.
+
+        Yields:
+            (agent, old log-density, advantages); the product is that of the policies when the next one is asked for.
+        """
+        actor = self.policy.actor
+        old_log_std = actor.log_std_of(batch.obs).detach().clone()
+        factor = torch.ones_like(batch.advantages)
+        for agent in torch.randperm(len(self.views), generator=self.order).tolist():
+            old = self._log_prob(agent, batch.actions, batch.old_means, old_log_std)
+            yield agent, old, batch.advantages * factor
+            factor = factor * self._ratio(agent, batch, old)
+
+    @torch.no_grad()
+    def _ratio(self, agent: int, batch: Batch, old: Tensor) -> Tensor:
+        """The ratio (B,) of an agent's present policy over the sampling one."""
+        actor = self.policy.actor
+        with autocast(self.device, self.low_precision):
+            mean = actor.mean_of(agent, batch.obs)
+        own = actor.own[agent]
+        log_std = actor.log_std_of(batch.obs).index_select(-1, own)
+        return torch.exp(gaussian_log_prob(batch.actions.index_select(-1, own), mean, log_std) - old)
+
+    def _parts(self) -> dict[str, Any]:
+        return super()._parts() | {"order": self.order}

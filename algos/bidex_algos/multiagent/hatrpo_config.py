@@ -1,0 +1,28 @@
+"""What can be set about HATRPO, and its presets; imports no torch."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from bidex_algos.multiagent.config import PAPER, MultiAgentConfig
+from bidex_algos.onpolicy.mttrpo_config import MTTRPOConfig
+
+
+@dataclass(frozen=True)
+class HATRPOConfig(MTTRPOConfig, MultiAgentConfig):
+    """Everything that can be set about HATRPO; the defaults are the preset ``laptop``. ``max_kl`` is each agent's."""
+
+    algo: ClassVar[str] = "hatrpo"
+
+    max_kl: float = 0.05
+    """Mean KL of an agent's new policy from its sampling one that an update may not exceed."""
+
+
+PRESETS: dict[str, HATRPOConfig] = {
+    # There is no table for HATRPO: HAPPO's (44), with the trust region of our TRPO's preset of this name.
+    "paper": HATRPOConfig(
+        **PAPER, max_kl=0.01, damping=0.1, cg_iterations=10, fisher_stride=1, backtracks=10, backtrack_factor=0.5,
+        accept_ratio=0.1, critic_learning_rate=1e-4, critic_epochs=5, num_minibatches=1, max_grad_norm=1.0,
+        init_std=1.0,
+    ),
+    "laptop": HATRPOConfig(),
+}  # fmt: skip

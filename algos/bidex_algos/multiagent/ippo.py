@@ -1,0 +1,43 @@
+"""IPPO: PPO of several agents, each with a critic that sees no more than it does (de Witt et al. 2020; appendix B.2.1).
+
+MAPPO but for the critics: each agent has its own values, returns and advantages, normalised per task.
+"""
+
+from torch import Tensor, nn
+
+from bidex_algos.multiagent.ippo_config import PRESETS, IPPOConfig
+from bidex_algos.multiagent.mappo import MAPPO
+from bidex_algos.multiagent.team import TeamCritic
+from bidex_algos.nets.precision import autocast
+from bidex_meta.world.agent_views import agent_views
+from bidex_meta.world.contract import VectorWorld
+
+__all__ = ["IPPO", "PRESETS", "IPPOConfig"]
+
+
+class IPPO(MAPPO):
+    """Independent PPO on a batched world; arguments, attributes and errors are those of its base."""
+
+    name = "ippo"
+    config_type = IPPOConfig
+    config: IPPOConfig
+    critic: TeamCritic  # type: ignore[assignment]
+
+    def __init__(self, world: VectorWorld, config: IPPOConfig, seed: int):
+        actions = int(world.single_action_space.shape[0])
+        self.num_critics = len(agent_views(world.observation_groups, actions, config.agents))
+        super().__init__(world, config, seed)
+
+    def _make_critic(self, heads: int) -> nn.Module:
+        return TeamCritic(self.views, self.config, heads, self.initial, self.config.share_parameters)
+
+    def _critic_networks(self) -> list[list[nn.Parameter]]:
+        return [list(net.parameters()) for net in self.critic.nets]
+
+    def _critic(self, obs: Tensor, task_id: Tensor) -> Tensor:
+        """Values (B, agents); of one agent alone (B,)."""
+        with autocast(self.device, self.low_precision):
+            out = self.critic(obs)
+        if self.config.value_heads:
+            out = out.gather(1, task_id[:, None, None].expand(-1, 1, out.shape[2]))
+        return out.squeeze(1) if self.num_critics > 1 else out.view(-1)

@@ -1,0 +1,108 @@
+"""MADDPG: DDPG of several agents with a critic that sees everything (Lowe et al. 2017; appendix B.2.5).
+
+For each update of :class:`~bidex_algos.offpolicy.ddpg.DDPG`::
+
+    y    = r + gamma (1 - terminated) Q'(x', mu'_1(o'_1), ..., mu'_n(o'_n))
+    Q    towards y
+    mu_i up on Q(x, a_1, ..., mu_i(o_i), ..., a_n), the others' actions from the replay; for each agent i
+
+The original has a critic for each agent, since rewards may differ. Here they are shared, so that all critics would have
+the same targets: there is one.
+"""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bidex_algos.experience.replay import Transitions
+from bidex_algos.multiagent.maddpg_config import PRESETS, MADDPGConfig
+from bidex_algos.multiagent.team import Team
+from bidex_algos.nets.deterministic import DeterministicPolicy
+from bidex_algos.nets.encoders.inputs import Inputs
+from bidex_algos.nets.normalise import ObservationNormaliser
+from bidex_algos.nets.precision import use_bfloat16
+from bidex_algos.nets.shape import Shape
+from bidex_algos.offpolicy.ddpg import DDPG
+from bidex_meta.world.agent_views import AgentView, agent_views
+from bidex_meta.world.contract import VectorWorld
+
+__all__ = ["MADDPG", "PRESETS", "MADDPGConfig"]
+
+
+class DeterministicTeam(Team):
+    """All agents as one actor without a distribution: in the place of a ``DeterministicActor``.
+
+    Args:
+        views: The agents.
+        config: As for :class:`Team`.
+        groups: The groups of the world's observation.
+        generator: CPU generator of the initial weights.
+        heads: Output layers of each agent; the group ``task_id`` chooses.
+    """
+
+    def __init__(
+        self, views: tuple[AgentView, ...], config: Any, groups: Inputs, generator: torch.Generator, heads: int
+    ):
+        super().__init__(views, config, [heads * len(view.actions) for view in views], 0.01, generator)
+        self.heads, self.one_hot = heads, groups.columns(*["task_id"] * (heads > 1))
+        self._order: Tensor
+        order = torch.tensor([action for view in views for action in view.actions]).argsort()
+        self.register_buffer("_order", order, persistent=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Joint actions of normalised observations (B, d): float32 (B, a) in [-1, 1]."""
+        return torch.tanh(self.raw(x))
+
+    def raw(self, x: Tensor) -> Tensor:
+        """The same before the squashing: float32 (B, a)."""
+        outputs = self.outputs(x)
+        if self.heads > 1:
+            head = self.one_hot(x).argmax(1)
+            rows = torch.arange(len(x), device=x.device)
+            outputs = [out.unflatten(1, (self.heads, -1))[rows, head] for out in outputs]
+        return torch.cat(outputs, dim=-1).index_select(-1, self._order)
+
+
+class MADDPG(DDPG):
+    """Multi-agent DDPG on a batched world; arguments, attributes and errors are those of its base.
+
+    Attributes:
+        views: The agents.
+        owner: The agent of each action, int64 (a,).
+    """
+
+    name = "maddpg"
+    config_type = MADDPGConfig
+    config: MADDPGConfig
+
+    def __init__(self, world: VectorWorld, config: MADDPGConfig, seed: int):
+        actions = int(world.single_action_space.shape[0])
+        self.views = agent_views(world.observation_groups, actions, config.agents)
+        super().__init__(world, config, seed)
+        owner = [next(i for i, view in enumerate(self.views) if action in view.actions) for action in range(actions)]
+        self.owner = torch.tensor(owner, device=self.device)
+
+    def _policy_step(self, obs: Tensor, draw: Transitions, weights: Tensor, counts: Tensor) -> None:
+        """One step of every agent up the critic, the others' actions as they were, on normalised observations."""
+        raw, share = self.policy.raw(obs), weights / counts.sum().clamp_min(1.0)
+        actions, losses = torch.tanh(raw), []
+        for agent, view in enumerate(self.views):
+            value = self._climbed(
+                self._values(self.critic, obs, torch.where(self.owner == agent, actions, draw.actions))
+            )
+            price = self.config.squash_price * raw[:, list(view.actions)].square().mean(1)
+            losses.append((share * (price - value)).sum())
+        loss = torch.stack(losses).sum()
+        told = loss.detach()[None] / len(self.views)
+        self.actor_loss = self._descend(loss, told, "actor", actor=list(self.policy.actor.parameters()))[0]
+
+    @classmethod
+    def _make_policy(
+        cls, config: MADDPGConfig, shape: Shape, init: torch.Generator, device: torch.device
+    ) -> DeterministicPolicy:
+        views, inputs = agent_views(shape.groups, shape.actions, config.agents), Inputs(shape.groups)
+        heads = shape.num_id_columns if config.policy_heads else 1
+        actor = DeterministicTeam(views, config, inputs, init, heads)
+        observations = ObservationNormaliser(inputs, config.normalise_observations)
+        return DeterministicPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)

@@ -1,0 +1,118 @@
+"""MAPPO: PPO of several agents with one critic that sees everything (Yu et al. 2022; appendix B.2.4).
+
+An iteration is MT-PPO's, and with one agent the update is too: in each mini-batch every agent climbs its own clipped
+surrogate, the critic its targets. The advantage is of all agents together, normalised per task like the returns.
+"""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from bidex_algos.gradients.step_size import AdaptiveAdam
+from bidex_algos.multiagent.base import MultiAgent
+from bidex_algos.multiagent.mappo_config import PRESETS, MAPPOConfig
+from bidex_algos.nets.precision import autocast
+from bidex_algos.onpolicy.base import Batch
+from bidex_algos.onpolicy.ppo_loss import NAMES, PolicyLoss, policy_loss
+from bidex_meta.train.distributed import all_sum, sum_gradients
+from bidex_meta.world.contract import VectorWorld
+
+__all__ = ["MAPPO", "PRESETS", "MAPPOConfig"]
+
+
+class MAPPO(MultiAgent):
+    """Multi-agent PPO on a batched world; arguments, attributes and errors are those of its base.
+
+    Attributes:
+        adams: An optimiser of each network of the actors.
+    """
+
+    name, remedy = "mappo", "lower learning_rate"
+    config_type = MAPPOConfig
+    config: MAPPOConfig
+
+    def __init__(self, world: VectorWorld, config: MAPPOConfig, seed: int):
+        super().__init__(world, config, seed)
+        actor = self.policy.actor
+        self.adams = [
+            AdaptiveAdam(actor.parameters_of(k), config, self.device, config.adam_eps) for k in range(len(actor.nets))
+        ]
+
+    def _optimisers(self) -> dict[str, Any]:
+        return super()._optimisers() | {"agents": [adam.parts() for adam in self.adams]}
+
+    def _critic_networks(self) -> list[list[nn.Parameter]]:
+        """The parameters of each critic, whose gradients are shortened apart."""
+        return [list(self.critic.parameters())]
+
+    def _update(self, batch: Batch) -> dict[str, Tensor]:
+        """One pass after another: returns the means over all mini-batches and agents of what it measured."""
+        cfg, actor = self.config, self.policy.actor
+        old_log_std, old_values = actor.log_std_of(batch.obs).detach().clone(), self._old_values(batch)
+        if old_log_std.dim() == 1:
+            old_log_std = old_log_std.expand(len(batch.obs), -1)
+        measured: list[Tensor] = []
+        for epoch in range(cfg.epochs):
+            order = torch.randperm(len(batch.obs), generator=self.generator, device=self.device)
+            parts = order.chunk(cfg.num_minibatches)
+            counts = all_sum(torch.stack([batch.weights[index].sum() for index in parts])).clamp_min(1.0)
+            for number, (index, count) in enumerate(zip(parts, counts, strict=True)):
+                told = self._gradients(batch.select(index), count, old_log_std[index], old_values[index])
+                measured.append(told[:4])
+                for k, adam in enumerate(self.adams):
+                    # The first mini-batch compares the sampling policy with itself and says nothing about the step.
+                    if (epoch, number) != (0, 0):
+                        adam.follow(told[4 + k])
+                    nn.utils.clip_grad_norm_(actor.parameters_of(k), cfg.max_grad_norm)
+                    adam.step()
+                self._critic_step(self._critic_networks())
+                actor.clamp_std(*cfg.std_range)
+        rate = torch.stack([adam.rate for adam in self.adams]).mean()
+        return {**dict(zip(NAMES, torch.stack(measured).mean(0), strict=True)), "Policy/lr": rate}
+
+    def _gradients(self, b: Batch, count: Tensor, old_log_std: Tensor, old_values: Tensor) -> Tensor:
+        """Puts the gradients of a mini-batch into the parameters; ``count`` samples are in it, over all processes.
+
+        Returns:
+            Surrogate loss, value loss, KL, share of clipped ratios, each the mean over agents, and the KL of the
+            agents of each network (4 + networks,).
+        """
+        cfg, actor = self.config, self.policy.actor
+        weights = b.weights / count
+        losses = self._agent_losses(b, weights, old_log_std)
+        value = self._value_loss(b, old_values, weights)
+        # Of agents that share a network the mean (B.2.4), else each its own loss.
+        share = [1.0 / actor.net_of.count(net) for net in actor.net_of]
+        surrogate = torch.stack([part * loss.surrogate for part, loss in zip(share, losses, strict=True)]).sum()
+        entropy = torch.stack([part * loss.entropy for part, loss in zip(share, losses, strict=True)]).sum()
+        kls = [loss.kl for loss in losses]
+        of_nets = [[kl for kl, k in zip(kls, actor.net_of, strict=True) if k == net] for net in range(len(self.adams))]
+        outside = torch.stack([loss.outside for loss in losses]).mean()
+        earned = torch.stack([loss.surrogate.detach() for loss in losses]).mean()
+        numbers = [earned, value.detach() / self.num_critics, torch.stack(kls).mean(), outside]
+        numbers += [torch.stack(of_net).mean() for of_net in of_nets]
+        for adam in self.adams:
+            adam.zero_grad()
+        self.critic_adam.zero_grad()
+        (surrogate - cfg.entropy_weight * entropy + cfg.value_loss_weight * value).backward()
+        return sum_gradients([*actor.parameters(), *self.critic.parameters()], torch.stack(numbers))
+
+    def _agent_losses(self, b: Batch, weights: Tensor, old_log_std: Tensor) -> list[PolicyLoss]:
+        """The loss of each agent."""
+        actor = self.policy.actor
+        with autocast(self.device, self.low_precision):
+            means = actor(b.obs)
+        log_std = actor.log_std_of(b.obs)
+        log_std = log_std if log_std.dim() == 2 else log_std.expand(len(b.obs), -1)
+        advantages = b.advantages if b.advantages.dim() == 2 else b.advantages[:, None].expand(-1, len(self.views))
+        losses = []
+        for agent, own in enumerate(actor.own):
+            old = self._log_prob(agent, b.actions, b.old_means, old_log_std)
+            actions, mean, std = (x.index_select(1, own) for x in (b.actions, means, log_std))
+            old_mean, old_std = (x.index_select(1, own) for x in (b.old_means, old_log_std))
+            gain = advantages[:, agent]
+            losses.append(
+                policy_loss(actions, mean, std, old_mean, old_std, old, gain, weights=weights, clip=self.config.clip)
+            )
+        return losses

@@ -1,0 +1,198 @@
+"""A network for each agent on what it sees; agents of one form are computed in one pass."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from bidex_algos.nets.encoders.columns import Columns
+from bidex_algos.nets.encoders.inputs import Inputs
+from bidex_algos.nets.encoders.task_embedding import with_task_embedding
+from bidex_algos.nets.networks import MLP, stacked_forward
+from bidex_meta.world.agent_views import AgentView
+
+
+class Team(nn.Module):
+    """One :class:`MLP` an agent; with ``share`` one for all agents of one form, which reads who acts.
+
+    Args:
+        views: The agents.
+        config: Of a learner; it has ``hidden``, ``activation`` and ``task_embedding``.
+        outputs: Outputs of each agent.
+        output_gain: Gain of the output layers.
+        generator: CPU generator of the initial weights.
+        share: Whether agents of one form (as many columns of each group, as many actions) have a network together.
+
+    Attributes:
+        nets: The networks.
+        net_of: Which of them each agent has.
+        families: The agents of each form.
+    """
+
+    def __init__(
+        self,
+        views: Sequence[AgentView],
+        config: Any,
+        outputs: Sequence[int],
+        output_gain: float,
+        generator: torch.Generator,
+        share: bool = False,
+    ):
+        super().__init__()
+        forms = [(tuple(group.size for group in view.own_groups()), len(view.actions)) for view in views]
+        self.families = [[i for i, other in enumerate(forms) if other == form] for form in dict.fromkeys(forms)]
+        self.columns = nn.ModuleList(Columns(part for g in view.groups for part in g.where) for view in views)
+        self.share, made, self.net_of = share, list[MLP](), [0] * len(views)
+        for i, view in enumerate(views):
+            family = next(family for family in self.families if i in family)
+            inputs = Inputs(view.own_groups())
+            if share and family[0] != i:
+                self.net_of[i] = self.net_of[family[0]]
+                continue
+            if share and len(family) > 1:
+                inputs = inputs.extended("agent", len(family))
+            inputs = with_task_embedding(inputs, config.task_embedding)
+            self.net_of[i] = len(made)
+            made.append(MLP(inputs, config.hidden, outputs[i], output_gain, generator, config.activation))
+        self.nets = nn.ModuleList(made)
+
+    def output(self, agent: int, x: Tensor) -> Tensor:
+        """What one agent's network says of normalised observations (B, d): float32 (B, its outputs)."""
+        return self.nets[self.net_of[agent]](self._seen(agent, x))
+
+    def outputs(self, x: Tensor) -> list[Tensor]:
+        """What every agent's network says of normalised observations (B, d)."""
+        found: dict[int, Tensor] = {}
+        for family in self.families:
+            if len(family) == 1:
+                found[family[0]] = self.output(family[0], x)
+                continue
+            together = torch.stack([self._seen(i, x) for i in family])
+            found.update(zip(family, self._family(family, together), strict=True))
+        return [found[i] for i in range(len(self.net_of))]
+
+    def _family(self, family: list[int], x: Tensor) -> Tensor:
+        """Outputs (M, B, outputs) of the agents of one form for what they see (M, B, inputs)."""
+        nets: list[Any] = [self.nets[self.net_of[i]] for i in family]
+        if self.share:
+            return nets[0](x.flatten(0, 1)).unflatten(0, x.shape[:2])
+        if not nets[0].encoder.identity:  # encoders are each agent's own
+            return torch.stack([net(own) for net, own in zip(nets, x, strict=True)])
+        parameters = [dict(net.named_parameters()) for net in nets]
+        stacked = {name: torch.stack([each[name] for each in parameters]) for name in parameters[0]}
+        return stacked_forward(nets[0], stacked, "", x)
+
+    def _seen(self, agent: int, x: Tensor) -> Tensor:
+        seen = self.columns[agent](x)
+        family = next(family for family in self.families if agent in family)
+        if not self.share or len(family) == 1:
+            return seen
+        who = seen.new_zeros(len(family))
+        who[family.index(agent)] = 1.0
+        return torch.cat([seen, who.expand(*seen.shape[:-1], -1)], dim=-1)
+
+
+class TeamActor(Team):
+    """Diagonal Gaussians of all agents, together one of the world's action: in the place of a ``GaussianActor``.
+
+    Args:
+        views: The agents.
+        config: Of a learner: as for :class:`Team`, and ``init_std``.
+        groups: The groups of the world's observation.
+        generator: CPU generator of the initial weights.
+        heads: Output layers and rows of standard deviations of each agent; the group ``task_id`` chooses.
+        share: As for :class:`Team`.
+
+    Attributes:
+        own: The world's actions that are each agent's, int64 (a_i,).
+        log_stds: Of each network: logarithms of standard deviations, (a_i,) or (heads, a_i).
+    """
+
+    def __init__(
+        self,
+        views: Sequence[AgentView],
+        config: Any,
+        groups: Inputs,
+        generator: torch.Generator,
+        heads: int = 1,
+        share: bool = False,
+    ):
+        super().__init__(views, config, [heads * len(view.actions) for view in views], 0.01, generator, share)
+        self.heads, self.one_hot = heads, groups.columns(*["task_id"] * (heads > 1))
+        order = torch.tensor([action for view in views for action in view.actions])
+        self._order: Tensor
+        self.register_buffer("_order", order.argsort(), persistent=False)
+        self._sizes = [len(view.actions) for view in views]
+        sizes = [len(views[self.net_of.index(k)].actions) for k in range(len(self.nets))]
+        self.log_stds = nn.ParameterList(
+            torch.full((n,) if heads == 1 else (heads, n), math.log(config.init_std)) for n in sizes
+        )
+        self._taken: Tensor
+        self.register_buffer("_taken", order, persistent=False)
+
+    @property
+    def own(self) -> list[Tensor]:
+        """The world's actions that are each agent's."""
+        return list(self._taken.split(self._sizes))
+
+    @property
+    def log_std(self) -> Tensor:
+        """Logarithms of the standard deviations in the order of the world's actions, (a,) or (heads, a)."""
+        return torch.cat([self.log_stds[k] for k in self.net_of], dim=-1).index_select(-1, self._order)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Mean joint action of normalised observations (B, d), float32 (B, a), not clamped."""
+        means = [self._chosen(x, out) for out in self.outputs(x)]
+        return torch.cat(means, dim=-1).index_select(-1, self._order)
+
+    def mean_of(self, agent: int, x: Tensor) -> Tensor:
+        """One agent's mean action (B, a_i)."""
+        return self._chosen(x, self.output(agent, x))
+
+    def log_std_of(self, x: Tensor, log_std: Tensor | None = None) -> Tensor:
+        """The joint ``log_std`` that holds for observations (B, d): (a,) with one head, else (B, a)."""
+        log_std = self.log_std if log_std is None else log_std
+        if self.heads == 1:
+            return log_std
+        with torch.autocast(x.device.type, enabled=False):
+            return self.one_hot(x).to(log_std.dtype) @ log_std
+
+    def parameters_of(self, net: int) -> list[nn.Parameter]:
+        """The parameters of a network and its standard deviations."""
+        return [*self.nets[net].parameters(), self.log_stds[net]]
+
+    @torch.no_grad()
+    def clamp_std(self, low: float, high: float) -> None:
+        """Keeps all standard deviations within bounds."""
+        for log_std in self.log_stds:
+            log_std.clamp_(math.log(low), math.log(high))
+
+    def _chosen(self, x: Tensor, out: Tensor) -> Tensor:
+        if self.heads == 1:
+            return out
+        with torch.autocast(x.device.type, enabled=False):
+            heads = out.unflatten(-1, (self.heads, -1))
+            return torch.einsum("...h,...ha->...a", self.one_hot(x).to(out.dtype), heads)
+
+
+class TeamCritic(Team):
+    """A critic for each agent, on what it sees.
+
+    Args:
+        views: The agents.
+        config: As for :class:`Team`.
+        heads: Outputs of each: one per task, or 1 for all.
+        generator: CPU generator of the initial weights.
+        share: As for :class:`Team`.
+    """
+
+    def __init__(
+        self, views: Sequence[AgentView], config: Any, heads: int, generator: torch.Generator, share: bool = False
+    ):
+        super().__init__(views, config, [heads] * len(views), 1.0, generator, share)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Values of normalised observations (B, d): float32 (B, heads, agents)."""
+        return torch.stack(self.outputs(x), dim=-1)

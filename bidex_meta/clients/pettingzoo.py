@@ -1,0 +1,130 @@
+"""A task class as PettingZoo's parallel environment: fingers, hands or any of them as agents. Extra: `marl`."""
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from bidex_meta.clients.gymnasium_env import TaskEnv
+from bidex_meta.clients.needs import extra
+from bidex_meta.errors import BidexError
+from bidex_meta.hands.units import Agents
+from bidex_meta.world.agent_views import agent_views
+
+with extra("marl"):
+    from gymnasium.spaces import Box, Space
+    from pettingzoo import ParallelEnv
+
+
+class HandsEnv(ParallelEnv):
+    """One row of a task class with several agents; they share reward, ends and `info`.
+
+    Args:
+        task: E.g. `"CatchUnderarm"`.
+        agents: The partition: `"hands"`, `"fingers"`, `"single"`, a TOML file, or units by agent
+            (docs/learners/multiagent.md).
+        render_mode: None or `"rgb_array"`.
+        seed: Chooses the 50 tasks, and the starts until `reset(seed=...)` says otherwise.
+        device: Where the physics runs.
+
+    Raises:
+        BidexError: Unknown task class or render mode, or a bad partition.
+    """
+
+    metadata = {"name": "bidex_meta", "render_modes": ["rgb_array"], "render_fps": 60}  # noqa: RUF012  (PettingZoo's)
+
+    def __init__(
+        self,
+        task: str,
+        agents: Agents = "hands",
+        render_mode: str | None = None,
+        seed: int = 0,
+        device: str | torch.device = "cpu",
+    ) -> None:
+        self._env, self.render_mode = TaskEnv(task, render_mode, seed, device), render_mode
+        whole, size = self._env.world.single_observation_space, self._env.world.single_action_space.shape[0]
+        views = agent_views(self._env.world.observation_groups, size, agents)
+        self.possible_agents = [view.name for view in views]
+        self.agents: list[str] = []
+        self._columns = {view.name: np.array(view.columns) for view in views}
+        self._actions = {view.name: np.array(view.actions) for view in views}
+        self.observation_spaces = {
+            name: Box(whole.low[columns], whole.high[columns], dtype=np.float32)
+            for name, columns in self._columns.items()
+        }
+        self.action_spaces = {name: Box(-1.0, 1.0, own.shape, np.float32) for name, own in self._actions.items()}
+        self.state_space = whole
+        self._state = np.zeros(whole.shape, np.float32)
+
+    def observation_space(self, agent: str) -> Space:
+        """Of an agent, the same object each time."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> Space:
+        """Of an agent, the same object each time."""
+        return self.action_spaces[agent]
+
+    def reset(self, seed: int | None = None, options: dict | None = None) -> tuple[dict[str, np.ndarray], dict]:
+        """Starts an episode of all agents; with a seed, the same one every time. There are no options: they do nothing.
+
+        Returns:
+            Observations by agent, and empty infos.
+        """
+        self._state, _ = self._env.reset(seed=seed)
+        self.agents = list(self.possible_agents)
+        return self._seen(self.agents), {name: {} for name in self.agents}
+
+    def step(self, actions: dict[str, np.ndarray]) -> tuple[dict, dict, dict, dict, dict]:
+        """One control step of 1/60 s.
+
+        Args:
+            actions: Of every agent, in [-1, 1], in ascending order of the world's actions.
+
+        Returns:
+            Observations, rewards, terminated, truncated and infos (`TaskEnv.step`), each by agent; empty once the
+            episode is over.
+
+        Raises:
+            BidexError: An agent without an action, or of another shape.
+        """
+        if not self.agents:
+            return {}, {}, {}, {}, {}
+        joint = np.zeros(sum(map(len, self._actions.values())), np.float32)
+        for name in self.agents:
+            given, expected = actions.get(name), self.action_spaces[name].shape
+            if given is None or np.shape(given) != expected:
+                got = "nothing" if given is None else f"shape {np.shape(given)}"
+                raise BidexError(f"Expected an action of shape {expected} of agent {name}, got {got}.")
+            joint[self._actions[name]] = given
+        self._state, reward, terminated, truncated, info = self._env.step(joint)
+        every = self.agents
+        if terminated or truncated:
+            self.agents = []
+        rewards, ends, cuts = (dict.fromkeys(every, value) for value in (reward, terminated, truncated))
+        return self._seen(every), rewards, ends, cuts, {name: dict(info) for name in every}
+
+    def state(self) -> np.ndarray:
+        """The full observation, for critics of all agents."""
+        return self._state.copy()
+
+    def render(self) -> np.ndarray | None:
+        """The picture of the scene, shape (height, width, 3), uint8; None without a render mode."""
+        return self._env.render()
+
+    def close(self) -> None:
+        """Frees the world."""
+        self._env.close()
+
+    def _seen(self, agents: list[str]) -> dict[str, np.ndarray]:
+        return {name: self._state[self._columns[name]] for name in agents}
+
+
+def parallel_env(task: str, agents: Agents = "hands", **options: Any) -> HandsEnv:
+    """A task class as a parallel environment, as PettingZoo's packages name it.
+
+    Args:
+        task: E.g. `"CatchUnderarm"`.
+        agents: The partition.
+        options: `render_mode`, `seed` and `device` of :class:`HandsEnv`.
+    """
+    return HandsEnv(task, agents, **options)

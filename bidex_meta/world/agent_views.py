@@ -1,0 +1,143 @@
+"""What each of several agents sees of a world and which actions are its own (appendix A.2).
+
+The smallest agents are a hand's fingers and its palm, which has the wrist and the base; any of them together are one.
+An agent sees the whole block of each hand it has a unit of, and everything that is of no hand: object, goal, task id.
+Its actions stand in ascending order of the world's, whatever the order of its units. All share the reward; a critic of
+all sees the full observation.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.hands.hand import hand
+from bidex_meta.hands.pair import SIDES
+from bidex_meta.hands.units import UNITS, Agents, partition_line, units_by_agent
+from bidex_meta.tasks.layout import hand_blocks
+from bidex_meta.world.contract import ObservationGroup
+
+
+@dataclass(frozen=True)
+class AgentView:
+    """One agent of a world.
+
+    Attributes:
+        name: E.g. ``right`` or ``right/thumb``.
+        groups: The groups of the world's observation that it sees, as they stand there.
+        actions: Its entries of the world's action, ascending.
+    """
+
+    name: str
+    groups: tuple[ObservationGroup, ...]
+    actions: tuple[int, ...]
+
+    @property
+    def columns(self) -> tuple[int, ...]:
+        """The entries of the world's observation that it sees, ascending."""
+        return tuple(sorted(i for group in self.groups for part in group.where for i in range(part.start, part.stop)))
+
+    def own_groups(self) -> tuple[ObservationGroup, ...]:
+        """The groups as they stand in its own observation, which is :attr:`columns` side by side."""
+        place = {column: i for i, column in enumerate(self.columns)}
+        found = []
+        for group in self.groups:
+            where = (slice(place[part.start], place[part.stop - 1] + 1) for part in group.where)
+            found.append(ObservationGroup(group.name, _joined(where)))
+        return tuple(found)
+
+
+def agent_views(groups: Sequence[ObservationGroup], num_actions: int, agents: Agents) -> tuple[AgentView, ...]:
+    """The agents of a world.
+
+    Args:
+        groups: The world's ``observation_groups``.
+        num_actions: Entries of its action.
+        agents: The partition: ``single``, ``hands``, ``fingers``, a TOML file, or units by agent. A world without hands
+            has a unit for each action, ``action/0``, ``action/1``, ..., and shows every agent everything.
+
+    Returns:
+        In the order of the partition; ``hands`` and ``fingers`` begin with the right hand.
+
+    Raises:
+        BidexError: A unit that is unknown, missing, or there twice; hands of which some bases move and some do not.
+    """
+    units = _units(groups, num_actions)
+    views = []
+    for name, own in _units_of_agents(units, partition_line(agents)).items():
+        hands = {f"{unit.partition('/')[0]}_hand" for unit in own}
+        others = {f"{side}_hand" for side in SIDES} - hands
+        seen = tuple(group for group in groups if group.name not in others or not _has_hands(groups))
+        views.append(AgentView(name, seen, tuple(sorted(action for unit in own for action in units[unit]))))
+    return tuple(views)
+
+
+def joint_action(views: Sequence[AgentView], actions: Sequence[Tensor]) -> Tensor:
+    """The world's action (..., a), put together of what the agents do, (..., a_i) each in the order of ``views``."""
+    order = torch.tensor([entry for view in views for entry in view.actions], device=actions[0].device)
+    return torch.cat(list(actions), dim=-1)[..., order.argsort()]
+
+
+def _joined(parts: Iterable[slice]) -> tuple[slice, ...]:
+    """Ascending ranges, those side by side as one."""
+    found: list[slice] = []
+    for part in parts:
+        if found and found[-1].stop == part.start:
+            found[-1] = slice(found[-1].start, part.stop)
+        else:
+            found.append(part)
+    return tuple(found)
+
+
+def _has_hands(groups: Sequence[ObservationGroup]) -> bool:
+    return any(group.name == f"{side}_hand" for group in groups for side in SIDES)
+
+
+def _units(groups: Sequence[ObservationGroup], num_actions: int) -> dict[str, list[int]]:
+    """The actions of each unit of a world."""
+    if not _has_hands(groups):
+        return {f"action/{i}": [i] for i in range(num_actions)}
+    share, found = num_actions // len(SIDES), dict[str, list[int]]()
+    sizes = {group.name: group.size for group in groups}
+    whole = sum(block.size for block in hand_blocks("right", moving=share > len(hand().actuated)))
+    if any(sizes.get(f"{side}_hand") != whole for side in SIDES):
+        raise BidexError(
+            f"agents: expected a world that shows each hand as {whole} entries, got {sizes}: its classes have moving "
+            "and fixed bases. Name a suite or a task of one kind."
+        )
+    joints = [hand().joints[i] for i in hand().actuated]
+    for number, side in enumerate(SIDES):
+        for unit, begin in UNITS.items():
+            own = [i for i, joint in enumerate(joints) if joint.startswith(begin)]
+            own += range(len(joints), share) if unit == "palm" else []
+            found[f"{side}/{unit}"] = [number * share + i for i in own]
+    return found
+
+
+def _units_of_agents(units: dict[str, list[int]], line: str) -> dict[str, list[str]]:
+    """The units that each agent has, each of the world's once."""
+    if line == "single":
+        return {"single": list(units)}
+    if line in ("hands", "fingers") and not any(unit.startswith(SIDES) for unit in units):
+        raise BidexError(f"agents: {line} needs a world with hands; this one has the units {', '.join(units)}.")
+    if line == "fingers":
+        return {unit: [unit] for unit in units}
+    if line == "hands":
+        return {side: [unit for unit in units if unit.startswith(f"{side}/")] for side in SIDES}
+    found = units_by_agent(line)
+    owners: dict[str, str] = {}
+    for name, own in found.items():
+        for unit in own:
+            if unit not in units:
+                raise unknown_name(f"unit of agent {name}", unit, units)
+            if unit in owners:
+                raise BidexError(
+                    f"agents: expected each unit once, but {unit} is of {owners[unit]} and of {name}. Take one out."
+                )
+            owners[unit] = name
+    missing = [unit for unit in units if unit not in owners]
+    if missing:
+        raise BidexError(f"agents: expected each unit of the world, but {', '.join(missing)} is of no agent. Add it.")
+    return found

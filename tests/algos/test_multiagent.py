@@ -1,0 +1,211 @@
+"""Learners of several agents: as one agent the single-agent's own; the product of ratios; a game that needs turns."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.distributions import Normal
+
+from bidex_algos.experience.rollout import collect
+from bidex_algos.multiagent.happo import HAPPO, HAPPOConfig
+from bidex_algos.multiagent.hatrpo import HATRPO, HATRPOConfig
+from bidex_algos.multiagent.ippo import IPPO, IPPOConfig
+from bidex_algos.multiagent.mappo import MAPPO, MAPPOConfig
+from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
+from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig
+from bidex_meta.errors import BidexError
+from tests.algos.problems import LQR, opposite_bandits
+from tests.algos.resume import resumed
+from tests.algos.toy import ToyWorld, nearness
+
+PAIR = "a=action/0;b=action/1"
+SMALL: dict[str, Any] = {"hidden": (16, 16), "rollout_steps": 8, "init_std": 0.5, "autocast": "off"}
+KINDS: dict[str, tuple[Any, Any]] = {
+    "ippo": (IPPO, IPPOConfig(agents=PAIR, **SMALL)),
+    "mappo": (MAPPO, MAPPOConfig(agents=PAIR, **SMALL)),
+    "happo": (HAPPO, HAPPOConfig(agents=PAIR, **SMALL)),
+    "hatrpo": (HATRPO, HATRPOConfig(agents=PAIR, **SMALL)),
+}
+every = pytest.mark.parametrize("kind", KINDS)
+
+
+def weights_of(learner: Any) -> Tensor:
+    """All weights of actor and critic in one order."""
+    actor = learner.policy.actor
+    net, log_std = (actor.nets[0], actor.log_stds[0]) if hasattr(actor, "nets") else (actor.mean, actor.log_std)
+    return torch.cat([p.detach().flatten() for p in (*net.parameters(), log_std, *learner.critic.parameters())])
+
+
+def assert_alike(one: Any, other: Any, iterations: int = 3) -> None:
+    torch.testing.assert_close(weights_of(one), weights_of(other), rtol=0, atol=0)
+    start = weights_of(one)
+    for _ in range(iterations):
+        told = [learner.iterate() for learner in (one, other)]
+        for name in ("Loss/value", "Loss/surrogate", "Policy/kl"):
+            assert told[0][name] == pytest.approx(told[1][name], abs=1e-5)
+        torch.testing.assert_close(weights_of(one), weights_of(other), rtol=0, atol=1e-5)
+    assert (weights_of(one) - start).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("more", [{}, {"policy_heads": True, "entropy_weight": 0.01}])
+def test_mappo_of_one_agent_is_mt_ppo(more: dict[str, Any]) -> None:
+    plain = MTPPO(opposite_bandits(), MTPPOConfig(**SMALL, **more), seed=1)
+    config = MAPPOConfig(**SMALL, **more, agents="single", value_loss_weight=plain.config.value_loss_weight)
+    assert_alike(plain, MAPPO(opposite_bandits(), config, seed=1))
+
+
+def test_hatrpo_of_one_agent_is_mt_trpo() -> None:
+    shared: dict[str, Any] = {**SMALL, "max_kl": 0.05, "fisher_stride": 2}
+    plain = MTTRPO(opposite_bandits(), MTTRPOConfig(**shared), seed=1)
+    assert_alike(plain, HATRPO(opposite_bandits(), HATRPOConfig(**shared, agents="single"), seed=1))
+
+
+def test_the_factor_is_the_product_of_the_ratios_before() -> None:
+    """Against torch.distributions on networks called one by one; agents are moved by hand between their turns."""
+    config = HAPPOConfig(agents="a=action/2;b=action/3+action/0;c=action/1", **SMALL)
+    learner = HAPPO(ToyWorld([nearness(0.3)], actions=4), config, seed=0)
+    learner.iterate()
+    batch, _ = learner._prepare()
+    actor, own = learner.policy.actor, ([2], [0, 3], [1])
+
+    def log_prob(agent: int) -> Tensor:
+        mean, std = actor.nets[agent](batch.obs).detach(), actor.log_stds[agent].detach().exp()
+        return Normal(mean, std).log_prob(batch.actions[:, own[agent]]).sum(1)
+
+    orders = set()
+    for _ in range(12):
+        old, moved = [log_prob(i) for i in range(3)], []
+        fresh, _ = learner._prepare()
+        batch = replace(batch, old_means=actor(batch.obs).detach(), advantages=fresh.advantages)
+        expected = batch.advantages.clone()
+        for agent, old_log_prob, gain in learner._in_turn(batch):
+            torch.testing.assert_close(old_log_prob, old[agent], rtol=0, atol=1e-4)
+            torch.testing.assert_close(gain, expected, rtol=1e-3, atol=1e-4)
+            with torch.no_grad():
+                for weight in actor.parameters_of(agent):
+                    weight += 0.02 * torch.randn(weight.shape, generator=learner.generator)
+            expected = expected * torch.exp(log_prob(agent) - old[agent])
+            moved.append(agent)
+        assert sorted(moved) == [0, 1, 2] and not torch.allclose(expected, batch.advantages, rtol=0.1)
+        orders.add(tuple(moved))
+    assert len(orders) > 2
+
+
+@every
+def test_a_saved_learner_goes_on_bit_for_bit(kind: str) -> None:
+    make, config = KINDS[kind]
+    unbroken, again = resumed(lambda seed: make(opposite_bandits(), config, seed=seed))
+    loaded = make.load_policy(again.policy_state_dict())
+    obs, _ = unbroken.world.reset(seed=2)
+    assert torch.equal(loaded.eval_action(obs), unbroken.eval_action(obs))
+
+
+@every
+def test_two_tasks_by_two_agents(kind: str) -> None:
+    make, config = KINDS[kind]
+    faster = {"learning_rate": 3e-3} if kind != "hatrpo" else {"fisher_stride": 1}
+    learner = make(opposite_bandits(0.5), replace(config, **faster), seed=0)
+    for _ in range(30):
+        learner.iterate()
+    obs, _ = learner.world.reset(seed=1)
+    for task, target in enumerate((0.5, -0.5)):
+        means = learner.eval_action(obs)[learner.world.task_id == task].mean(0)
+        assert means.tolist() == pytest.approx([target] * 2, abs=0.15)
+
+
+LARGE: dict[str, Any] = {
+    "clip": 5.0, "epochs": 15, "num_minibatches": 1, "adaptive_learning_rate": False, "learning_rate": 1e-2,
+    "max_grad_norm": 100.0, "critic_learning_rate": 1e-2,
+}  # fmt: skip
+
+
+def exclusive_or(action: Tensor) -> Tensor:
+    """A matrix game: 1 if one agent alone goes (its action is positive), else 0."""
+    return (action > 0).sum(1).eq(1).float()
+
+
+@pytest.mark.parametrize("seed", range(3))
+@every
+def test_a_matrix_game_needs_turns(kind: str, seed: int) -> None:
+    """Both go at first, and for each it would be better to stop, unless the other does.
+
+    With large steps agents that move at once both stop, then both go; in turns the second sees what the first has done.
+    """
+    make, config = KINDS[kind]
+    in_turns = kind in ("happo", "hatrpo")
+    steps = (
+        LARGE
+        if kind != "hatrpo"
+        else {"max_kl": 1.5, "damping": 0.01, "fisher_stride": 1, "accept_ratio": 0.0, "critic_epochs": 2}
+    )
+    world = ToyWorld([exclusive_or], rows=512, horizon=1, terminal=True)
+    learner = make(world, replace(config, std_range=(0.5, 0.5), **steps), seed=seed)
+    with torch.no_grad():
+        for net in learner.policy.actor.nets:
+            net.head.bias.fill_(0.4)
+    paid = []
+    for _ in range(5):
+        learner.iterate()
+        paid.append(float(learner.rollout.rewards.mean()))
+    assert paid[0] < 0.4
+    assert (sum(paid[1:4]) / 3 > 0.75 and paid[-1] > 0.85) if in_turns else sum(paid[1:4]) / 3 < 0.55
+
+
+@pytest.mark.parametrize("share", [False, True])
+def test_agents_of_one_form_in_one_pass(share: bool) -> None:
+    config = MAPPOConfig(agents="a=action/3;b=action/0;c=action/1+action/2", share_parameters=share, **SMALL)
+    actor = MAPPO(ToyWorld([nearness(0.3)], actions=4), config, seed=0).policy.actor
+    assert len(actor.nets) == (2 if share else 3)
+    x = torch.randn(7, 2)
+    joint = actor(x)
+    for agent, own in enumerate(([3], [0], [1, 2])):
+        torch.testing.assert_close(joint[:, own], actor.mean_of(agent, x))
+    if share:
+        assert not torch.allclose(joint[:, 3], joint[:, 0])  # it reads who acts
+    joint.sum().backward()
+    assert all(weight.grad is not None for weight in actor.nets.parameters())
+
+
+def test_ippos_critics_see_no_more_than_their_agents() -> None:
+    from bidex_algos.multiagent.team import TeamCritic
+    from bidex_meta.tasks import registry
+    from bidex_meta.world.agent_views import agent_views
+    from bidex_meta.world.observation_groups import observation_groups
+
+    layout = registry.get("CatchUnderarm").layout
+    views = agent_views(observation_groups([layout], layout.size, 0), 52, "hands")
+    critic = TeamCritic(views, IPPOConfig(**SMALL), 1, torch.Generator().manual_seed(0))
+    x = torch.randn(3, layout.size, requires_grad=True)
+    critic(x)[:, 0, 0].sum().backward()
+    assert x.grad is not None and x.grad.ne(0).any(0).nonzero().flatten().tolist() == list(views[0].columns)
+
+
+def test_ippo_estimates_apart() -> None:
+    """With critics alike it says of each agent what MAPPO says of all, cut episodes and all."""
+    learners = [make(LQR(rows=8, horizon=5), config, seed=0) for make, config in (KINDS["ippo"], KINDS["mappo"])]
+    ippo, mappo = learners
+    first, second = ippo.critic.nets
+    second.load_state_dict(first.state_dict())
+    mappo.critic.load_state_dict(first.state_dict())
+    batches = []
+    for learner in learners:
+        obs = learner._first_observations()
+        collect(learner.world, learner.rollout, obs, learner._sample, learner._final_value, learner.episodes)
+        batches.append(learner._prepare()[0])
+    assert mappo.rollout.final_values.count_nonzero() > 4
+    for name in ("advantages", "targets"):
+        own, shared = (getattr(batch, name) for batch in batches)
+        torch.testing.assert_close(own, shared[:, None].expand(-1, 2))
+
+
+def test_bad_configs_are_one_line() -> None:
+    with pytest.raises(BidexError, match="is of no agent"):
+        MAPPO(LQR(), MAPPOConfig(agents="a=action/0", **SMALL), seed=0)
+    with pytest.raises(BidexError, match="agents: expected single"):
+        HAPPOConfig(agents="thumbs")
+    with pytest.raises(BidexError, match="mappo: huber_delta must be positive"):
+        MAPPOConfig(huber_delta=0.0)
+    with pytest.raises(BidexError, match="200 mini-batches need as many samples"):
+        HAPPO(LQR(rows=2), HAPPOConfig(agents=PAIR, num_minibatches=200, **SMALL), seed=0)
