@@ -170,7 +170,7 @@ class OnPolicy(Learner):
         rewards, terminated, ended, valid = map(each, (r.rewards, r.terminated, r.ended, r.valid))
         element, elements = self._element(task_id).reshape(-1), self.num_critics * num_tasks
         next_values = successor_values(values, last_values, ended, r.final_values.flatten(1))
-        gamma = self.gamma if isinstance(self.gamma, float) else each(self.gamma[None])
+        gamma = each(self.gamma[None]) if isinstance(self.gamma, Tensor) else self.gamma
         advantages = gae(rewards, values, next_values, terminated, ended, gamma, cfg.lam, valid)
         returns = advantages + values
         explained = explained_variance(values, returns, element, elements, valid).view(-1, num_tasks).mean(0)
