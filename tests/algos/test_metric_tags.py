@@ -24,12 +24,15 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
     "promp": [{}],
     "rl2": [{}],
 }
+TEAM = {"agents": "a=action/0;b=action/1"}
+OF_AGENTS = {"ippo": "mtppo", "mappo": "mtppo", "happo": "mtppo", "hatrpo": "mttrpo", "maddpg": "ddpg"}
+"""Learners of several agents, and those whose tags they have."""
 
 
-def told(algo: str) -> set[str]:
+def told(algo: str, variants: list[dict[str, Any]]) -> set[str]:
     """Tags of some iterations on a toy, names of tasks as ``<task>``."""
     kind, tags = learner_kind(algo), set()
-    for options in VARIANTS[algo]:
+    for options in variants:
         config = kind.presets["laptop"]
         known = {**SMALL, **options}
         config = replace(config, **{name: value for name, value in known.items() if hasattr(config, name)})
@@ -55,4 +58,10 @@ def listed() -> dict[str, set[str]]:
 
 @pytest.mark.parametrize("algo", VARIANTS)
 def test_the_page_has_what_the_learner_tells(algo: str) -> None:
-    assert listed()[algo] == told(algo)
+    assert listed()[algo] == told(algo, VARIANTS[algo])
+
+
+@pytest.mark.parametrize("algo", OF_AGENTS)
+def test_learners_of_several_agents_tell_what_their_like_does(algo: str) -> None:
+    like = VARIANTS[OF_AGENTS[algo]][0]
+    assert told(algo, [like | TEAM]) == told(OF_AGENTS[algo], [like])
