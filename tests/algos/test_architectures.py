@@ -15,6 +15,7 @@ from bidex_algos.nets.multitask.moore import Moore, gram_schmidt
 from bidex_algos.nets.multitask.paco import PaCo
 from bidex_algos.nets.multitask.soft_modules import SoftModules
 from bidex_algos.nets.networks import MLP
+from bidex_algos.offpolicy.fasttd3_config import FastTD3Config
 from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_algos.offpolicy.td3 import TD3, TD3Config
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
@@ -246,10 +247,16 @@ def test_an_architecture_needs_the_one_hot(kind: str):
     [
         ({"architecture": "paco", "task_embedding": 4}, "task_embedding goes with architecture shared"),
         ({"architecture": "soft_modules", "hidden": (32,)}, "at least two widths"),
-        ({"architecture": "moore", "hidden": (32, 3)}, "at most 3 modules"),
+        ({"architecture": "moore", "hidden": (32, 3)}, "no more modules than the last width"),
+        ({"architecture": "moore", "hidden": ()}, "no more modules than the last width"),
         ({"modules": 0}, "modules must be at least 1"),
     ],
 )
 def test_what_does_not_go_together_is_refused(options: dict[str, Any], message: str):
     with pytest.raises(BidexError, match=message):
         replace(PPO, **options)
+
+
+def test_the_critics_own_widths_are_checked_too():
+    with pytest.raises(BidexError, match="two widths in critic_hidden"):
+        FastTD3Config(architecture="soft_modules", critic_hidden=(64,))

@@ -37,13 +37,15 @@ class ArchitectureConfig:
                 f"{config.algo}: task_embedding goes with architecture shared or multi_head, got {self.architecture}, "
                 "which has task weights of its own. Leave task_embedding off."
             )
-        if self.architecture == "soft_modules" and len(config.hidden) < 2:
-            raise BidexError(
-                f"{config.algo}: soft_modules needs at least two widths in hidden, one of the embedding and one for "
-                f"each layer of modules; got {config.hidden}."
-            )
-        if self.architecture == "moore" and self.modules > config.hidden[-1]:
-            raise BidexError(
-                f"{config.algo}: moore needs at most {config.hidden[-1]} modules, the last width of hidden: no more "
-                f"directions are orthogonal there. Got {self.modules}."
-            )
+        for name in ("hidden", "critic_hidden"):
+            widths = getattr(self, name, config.hidden)
+            if self.architecture == "soft_modules" and len(widths) < 2:
+                raise BidexError(
+                    f"{config.algo}: soft_modules needs at least two widths in {name}, one of the embedding and one "
+                    f"for each layer of modules; got {widths}."
+                )
+            if self.architecture == "moore" and not (widths and self.modules <= widths[-1]):
+                raise BidexError(
+                    f"{config.algo}: moore needs no more modules than the last width of {name}, since no more "
+                    f"directions are orthogonal there; got {self.modules} and {widths}."
+                )
