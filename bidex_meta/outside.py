@@ -8,9 +8,9 @@ from typing import Any
 from bidex_meta.errors import BidexError
 
 
-def is_outside(name: str) -> bool:
+def is_outside(name: object) -> bool:
     """Whether a name is of the form ``package.module:Class``."""
-    return ":" in name
+    return isinstance(name, str) and ":" in name
 
 
 def short_name(name: str) -> str:

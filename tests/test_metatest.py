@@ -238,7 +238,7 @@ def test_intervals_know_that_episodes_of_an_adaptation_share_its_luck():
         (Still(), world(), {"tasks": 0}, "Tasks of each class must be at least 1"),
         (Still(), world(), {"trials": 0}, "Trials must be at least 1"),
         (Still(), world(), {"max_adapt_steps": 0}, "at least 1, not 0"),
-        (Still(), world(), {"episodes_per_task": 0}, "at least 1"),
+        (Still(), world(), {"episodes_per_task": 0}, "from 1 to"),
         (Still(), world(), {"evaluated": (2,)}, "from 0 to 1 shots"),
         (RandomAgent(world().action_space), world(), {}, "RandomAgent has no init, adapt_action, step, adapt"),
         (Still(), world(), {"adapt_world": world(14)}, "rows, observations and actions"),

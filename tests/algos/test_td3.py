@@ -152,7 +152,7 @@ def test_the_actor_climbs_the_first_critic(kind: Any, config: Any) -> None:
 
     before, critic = value(), copy.deepcopy(learner.critic.state_dict())
     for _ in range(5):
-        learner._policy_step(draw.obs, torch.ones(6), torch.full((2,), 3.0))
+        learner._policy_step(draw.obs, draw, torch.ones(6), torch.full((2,), 3.0))
     assert value() > before
     assert all(torch.equal(critic[name], weight) for name, weight in learner.critic.state_dict().items())
 
