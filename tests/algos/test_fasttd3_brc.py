@@ -20,6 +20,7 @@ from bidex_meta.commands.learners import learner_kind
 from bidex_meta.errors import BidexError
 from bidex_meta.train import distributed
 from bidex_meta.world.contract import plain_groups
+from tests.algos.off_policy import errors, trained
 from tests.algos.problems import LQR, discounted_return, one_step_bandit, opposite_bandits
 from tests.algos.ranks import in_two_processes
 from tests.algos.resume import resumed
@@ -44,20 +45,6 @@ SHARED: dict[str, Any] = {
 FAST = FastTD3Config(**SHARED | {"updates_per_step": 4}, critic_layer_norm=False, n_steps=1, squash_price=0.0)
 SMALL = BRCConfig(**SHARED, task_embedding=4, init_alpha=0.01, target_entropy_per_action=-2.0)
 both = pytest.mark.parametrize(("kind", "config"), [(FastTD3, FAST), (BRC, SMALL)], ids=["fasttd3", "brc"])
-
-
-def trained(kind: Any, world: Any, config: Any, iterations: int) -> Any:
-    learner = kind(world, config, seed=0)
-    for _ in range(iterations):
-        learner.iterate()
-    return learner
-
-
-def errors(learner: Any, *targets: float) -> list[float]:
-    """Mean distance of the action from each task's target."""
-    obs, _ = learner.world.reset(seed=1)
-    action = learner.eval_action(obs)
-    return [float((action[learner.world.task_id == k] - target).abs().mean()) for k, target in enumerate(targets)]
 
 
 # Problems with a known optimum.

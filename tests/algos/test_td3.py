@@ -14,6 +14,7 @@ from bidex_algos.offpolicy.ddpg import DDPG, DDPGConfig, spread
 from bidex_algos.offpolicy.td3 import TD3, TD3Config
 from bidex_meta.commands.learners import learner_kind
 from bidex_meta.errors import BidexError
+from tests.algos.off_policy import errors, trained
 from tests.algos.problems import LQR, PointMass, discounted_return, one_step_bandit, opposite_bandits
 from tests.algos.resume import resumed
 from tests.algos.toy import ToyWorld, nearness
@@ -34,20 +35,6 @@ SHARED: dict[str, Any] = {
 }
 SMALL = TD3Config(**SHARED)
 both = pytest.mark.parametrize(("kind", "config"), [(DDPG, DDPGConfig(**SHARED)), (TD3, SMALL)], ids=["ddpg", "td3"])
-
-
-def trained(kind: Any, world: Any, config: Any, iterations: int) -> Any:
-    learner = kind(world, config, seed=0)
-    for _ in range(iterations):
-        learner.iterate()
-    return learner
-
-
-def errors(learner: Any, *targets: float) -> list[float]:
-    """Mean distance of the action from each task's target."""
-    obs, _ = learner.world.reset(seed=1)
-    action = learner.eval_action(obs)
-    return [float((action[learner.world.task_id == k] - target).abs().mean()) for k, target in enumerate(targets)]
 
 
 # Problems with a known optimum.

@@ -1,0 +1,72 @@
+"""Names, hints and completion: the words of the command line."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from bidex_meta.cli import main
+from bidex_meta.commands import COMMANDS
+
+
+def test_lists_of_suites_need_no_torch():
+    heavy = {"torch", "mujoco", "metaworld", "scipy", "tensorboard"}
+    code = f"import sys; from bidex_meta.cli import main; main(['list', 'suites']); print({heavy} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "metaworld/MT10" in done.stdout and done.stdout.rstrip().endswith("set()")
+
+
+def test_names_are_taken_in_any_case_and_kept_as_they_are_written(capsys):
+    for flags, expected in (
+        (["--suite", "mt4", "--algo", "MTPPO", "--preset", "Paper"], ("MT4", None, "mtppo", "paper")),
+        (["--suite", "MetaWorld/mt3", "--algo", "mtsac"], ("metaworld/MT3", None, "mtsac", "metaworld")),
+        (["--task", "handover", "--algo", "PPO"], (None, "HandOver", "ppo", "laptop")),
+    ):
+        assert main(["Run", *flags, "--device", "cpu", "--print-config"]) == 0
+        config = json.loads(capsys.readouterr().out)
+        assert (config["suite"], config["task"], config["algo"], config["preset"]) == expected
+    assert main(["list", "SUITES", "--json"]) == 0
+
+
+def test_hints_name_extras_that_there_are():
+    root = Path(__file__).parents[1]
+    extras = tomllib.loads((root / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    sources = [*root.glob("bidex_meta/**/*.py"), *root.glob("algos/**/*.py"), *root.glob("docs/**/*.md")]
+    named = {found for path in sources for found in re.findall(r"bidex-meta\[([\w-]+)\]", path.read_text())}
+    assert named and named <= set(extras)
+
+
+# A line of bash that completes the last of its words with the script that is read from a file.
+_COMPLETE = """
+source "$1"; shift; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); COMPREPLY=()
+_tyro_bidex_meta bidex-meta "${COMP_WORDS[$COMP_CWORD]}" ""; echo "${COMPREPLY[*]}"
+"""
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+def test_bash_completes_commands_flags_and_names(tmp_path, capsys):
+    assert main(["completion", "bash"]) == 0
+    (tmp_path / "script").write_text(capsys.readouterr().out)
+    for words, expected in (
+        ("ru", {"run"}),
+        ("run --learner.gam", {"--learner.gamma"}),
+        ("run --suite MT", {"MT1", "MT4", "MT20"}),
+        ("run --algo mtp", {"mtppo"}),
+        ("witness --task Hand", {"HandOver"}),
+        ("run --base ", {"own", "moving", "fixed"}),
+    ):
+        command = ["bash", "-c", _COMPLETE, "bash", str(tmp_path / "script"), "bidex-meta", *words.split(" ")]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        assert set(done.stdout.split()) == expected, words
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_other_shells_get_a_script_too(shell, capsys):
+    assert main(["completion", shell]) == 0
+    script = capsys.readouterr().out
+    assert all(f"'{name}'" in script for name in COMMANDS)
