@@ -5,6 +5,8 @@ from importlib import import_module
 import mujoco
 import numpy as np
 
+from bidex_meta.errors import BidexError
+
 _TYPE = mujoco.mjtGeom
 _SHOWN_GROUPS = 3
 """Groups from here on are hidden, as in MuJoCo's own viewer."""
@@ -29,7 +31,11 @@ def colour(model: mujoco.MjModel, geom: int) -> tuple[float, float, float, float
 
 
 def shape(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3), metres, in the geom's frame, and triangles (m, 3) of a geom."""
+    """Points (n, 3), metres, in the geom's frame, and triangles (m, 3) of a geom.
+
+    Raises:
+        BidexError: A height field or the like.
+    """
     make = import_module("trimesh.creation")  # of viser's packages
     kind, size = model.geom_type[geom], model.geom_size[geom]
     if kind == _TYPE.mjGEOM_MESH:
@@ -52,5 +58,8 @@ def shape(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
     elif kind == _TYPE.mjGEOM_BOX:
         made = make.box(extents=2.0 * size)
     else:
-        raise NotImplementedError(f"geom {model.geom(geom).name!r} of type {kind} has no shape here")
+        raise BidexError(
+            f"Expected geoms that the browser can show (primitives, meshes), got {model.geom(geom).name!r} of type "
+            f"{_TYPE(int(kind)).name}. Make a film of it: bidex-meta render."
+        )
     return np.asarray(made.vertices), np.asarray(made.faces)

@@ -15,7 +15,7 @@ from bidex_algos.multiagent.mappo_config import PRESETS, MAPPOConfig
 from bidex_algos.nets.precision import autocast
 from bidex_algos.onpolicy.base import Batch
 from bidex_algos.onpolicy.ppo_loss import NAMES, PolicyLoss, policy_loss
-from bidex_meta.train.distributed import all_sum, sum_gradients
+from bidex_meta.train.distributed import sum_gradients
 from bidex_meta.world.contract import VectorWorld
 
 __all__ = ["MAPPO", "PRESETS", "MAPPOConfig"]
@@ -53,21 +53,17 @@ class MAPPO(MultiAgent):
         if old_log_std.dim() == 1:
             old_log_std = old_log_std.expand(len(batch.obs), -1)
         measured: list[Tensor] = []
-        for epoch in range(cfg.epochs):
-            order = torch.randperm(len(batch.obs), generator=self.generator, device=self.device)
-            parts = order.chunk(cfg.num_minibatches)
-            counts = all_sum(torch.stack([batch.weights[index].sum() for index in parts])).clamp_min(1.0)
-            for number, (index, count) in enumerate(zip(parts, counts, strict=True)):
-                told = self._gradients(batch.select(index), count, old_log_std[index], old_values[index])
-                measured.append(told[:4])
-                for k, adam in enumerate(self.adams):
-                    # The first mini-batch compares the sampling policy with itself and says nothing about the step.
-                    if (epoch, number) != (0, 0):
-                        adam.follow(told[4 + k])
-                    nn.utils.clip_grad_norm_(actor.parameters_of(k), cfg.max_grad_norm)
-                    adam.step()
-                self._critic_step(self._critic_networks())
-                actor.clamp_std(*cfg.std_range)
+        for first, index, count in self._mini_batches(batch, cfg.epochs, cfg.num_minibatches):
+            told = self._gradients(batch.select(index), count, old_log_std[index], old_values[index])
+            measured.append(told[:4])
+            for k, adam in enumerate(self.adams):
+                # The first mini-batch compares the sampling policy with itself and says nothing about the step.
+                if not first:
+                    adam.follow(told[4 + k])
+                nn.utils.clip_grad_norm_(actor.parameters_of(k), cfg.max_grad_norm)
+                adam.step()
+            self._critic_step(self._critic_networks())
+            actor.clamp_std(*cfg.std_range)
         rate = torch.stack([adam.rate for adam in self.adams]).mean()
         return {**dict(zip(NAMES, torch.stack(measured).mean(0), strict=True)), "Policy/lr": rate}
 

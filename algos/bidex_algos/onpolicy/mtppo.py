@@ -18,7 +18,7 @@ from bidex_algos.onpolicy.base import Batch, OnPolicy
 from bidex_algos.onpolicy.mtppo_config import PRESETS, MTPPOConfig
 from bidex_algos.onpolicy.ppo_loss import NAMES, PPOLoss, ppo_loss
 from bidex_meta.errors import BidexError
-from bidex_meta.train.distributed import all_sum, sum_gradients
+from bidex_meta.train.distributed import sum_gradients
 from bidex_meta.world.contract import VectorWorld
 
 __all__ = ["MTPPO", "PRESETS", "Batch", "MTPPOConfig"]
@@ -58,25 +58,20 @@ class MTPPO(OnPolicy):
         old_log_std = actor.log_std.detach().clone()
         low, high = (math.log(std) for std in cfg.std_range)
         measured: list[Tensor] = []
-        for epoch in range(cfg.epochs):
-            order = torch.randperm(len(batch.obs), generator=self.generator, device=self.device)
-            parts = order.chunk(cfg.num_minibatches)
-            # Divided by the samples of all processes, losses and gradients become means by being summed over them.
-            counts = all_sum(torch.stack([batch.weights[index].sum() for index in parts])).clamp_min(1.0)
-            for number, (index, count) in enumerate(zip(parts, counts, strict=True)):
-                part = batch.select(index)
-                measured.append(self._gradients(part, count, old_log_std))
-                # The first mini-batch compares the sampling policy with itself and says nothing about the step.
-                if (epoch, number) != (0, 0):
-                    self.adams.follow(measured[-1][2])
-                actor_weights, critic_weights = list(actor.parameters()), list(self.critic.parameters())
-                for weights in [actor_weights, critic_weights] if cfg.clip_apart else [actor_weights + critic_weights]:
-                    nn.utils.clip_grad_norm_(weights, cfg.max_grad_norm)
-                self.adams.step()
-                with torch.no_grad():
-                    actor.log_std.clamp_(low, high)
-                    if self.balance is not None:
-                        self.balance.learn(lambda b=part, n=count: self._above_least(b, n, old_log_std))
+        for first, index, count in self._mini_batches(batch, cfg.epochs, cfg.num_minibatches):
+            part = batch.select(index)
+            measured.append(self._gradients(part, count, old_log_std))
+            # The first mini-batch compares the sampling policy with itself and says nothing about the step.
+            if not first:
+                self.adams.follow(measured[-1][2])
+            actor_weights, critic_weights = list(actor.parameters()), list(self.critic.parameters())
+            for weights in [actor_weights, critic_weights] if cfg.clip_apart else [actor_weights + critic_weights]:
+                nn.utils.clip_grad_norm_(weights, cfg.max_grad_norm)
+            self.adams.step()
+            with torch.no_grad():
+                actor.log_std.clamp_(low, high)
+                if self.balance is not None:
+                    self.balance.learn(lambda b=part, n=count: self._above_least(b, n, old_log_std))
         names = list(NAMES)
         if self.balance is not None:
             names.append(self.balance.tag)
