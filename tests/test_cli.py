@@ -366,6 +366,7 @@ def test_list_suites_and_algos_as_json(capsys):
     assert main(["list", "algos", "--json"]) == 0
     algos = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
     assert {"paper", "laptop"} <= set(algos["mtppo"]["presets"])
+    assert [name for name, row in algos.items() if "arXiv" not in row["summary"]] == []
     assert main(["list", "algos"]) == 0
     assert "mtppo" in capsys.readouterr().out
 

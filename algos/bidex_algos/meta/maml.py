@@ -22,7 +22,10 @@ __all__ = ["MAML", "PRESETS", "MAMLConfig"]
 
 
 class MAML(MetaLearner):
-    """Model-agnostic meta-learning with a trust region; arguments and attributes are those of its base."""
+    """MAML (Finn et al. 2017, arXiv 1703.03400) with a trust region.
+
+    Arguments and attributes are those of its base.
+    """
 
     name, objective = "maml", "likelihood"
     config_type = MAMLConfig

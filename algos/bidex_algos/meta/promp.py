@@ -24,7 +24,7 @@ __all__ = ["PRESETS", "ProMP", "ProMPConfig"]
 
 
 class ProMP(MetaLearner):
-    """Proximal meta-policy search.
+    """ProMP, proximal meta-policy search (Rothfuss et al. 2019, arXiv 1810.06784).
 
     Arguments and attributes are those of :class:`~bidex_algos.meta.base.MetaLearner`.
     """

@@ -34,7 +34,7 @@ __all__ = ["PRESETS", "RL2", "RL2Config"]
 
 
 class RL2(Learner):
-    """A policy with a memory that adapts to a task while it plays it, on a batched world.
+    """RL² (Duan et al. 2016, arXiv 1611.02779): a policy with a memory that adapts to a task while it plays it.
 
     Arguments and attributes are those of :class:`~bidex_algos.learner.Learner`.
 

@@ -26,7 +26,9 @@ __all__ = ["HAPPO", "PRESETS", "HAPPOConfig"]
 
 
 class HAPPO(Sequential):
-    """Heterogeneous-agent PPO on a batched world; arguments, attributes and errors are those of its base.
+    """HAPPO, agents in turn (Kuba et al. 2022, arXiv 2109.11251).
+
+    Arguments, attributes and errors are those of its base.
 
     Attributes:
         adams: An optimiser of each agent.

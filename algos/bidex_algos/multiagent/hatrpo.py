@@ -19,7 +19,10 @@ __all__ = ["HATRPO", "PRESETS", "HATRPOConfig"]
 
 
 class HATRPO(Sequential):
-    """Heterogeneous-agent TRPO on a batched world; arguments, attributes and errors are those of its base."""
+    """HATRPO, agents in turn (Kuba et al. 2022, arXiv 2109.11251).
+
+    Arguments, attributes and errors are those of its base.
+    """
 
     name, remedy = "hatrpo", "lower max_kl or critic_learning_rate"
     config_type = HATRPOConfig

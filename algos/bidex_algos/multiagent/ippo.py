@@ -16,7 +16,10 @@ __all__ = ["IPPO", "PRESETS", "IPPOConfig"]
 
 
 class IPPO(MAPPO):
-    """Independent PPO on a batched world; arguments, attributes and errors are those of its base."""
+    """IPPO, independent PPO (de Witt et al. 2020, arXiv 2011.09533).
+
+    Arguments, attributes and errors are those of its base.
+    """
 
     name = "ippo"
     config_type = IPPOConfig

@@ -65,7 +65,9 @@ class DeterministicTeam(Team):
 
 
 class MADDPG(DDPG):
-    """Multi-agent DDPG on a batched world; arguments, attributes and errors are those of its base.
+    """MADDPG, multi-agent DDPG (Lowe et al. 2017, arXiv 1706.02275).
+
+    Arguments, attributes and errors are those of its base.
 
     Attributes:
         views: The agents.

@@ -22,7 +22,9 @@ __all__ = ["MAPPO", "PRESETS", "MAPPOConfig"]
 
 
 class MAPPO(MultiAgent):
-    """Multi-agent PPO on a batched world; arguments, attributes and errors are those of its base.
+    """MAPPO, multi-agent PPO (Yu et al. 2022, arXiv 2103.01955).
+
+    Arguments, attributes and errors are those of its base.
 
     Attributes:
         adams: An optimiser of each network of the actors.

@@ -37,7 +37,7 @@ __all__ = ["DDPG", "PRESETS", "DDPGConfig"]
 
 
 class DDPG(OffPolicy):
-    """Multi-task DDPG on a batched world.
+    """Multi-task DDPG (Lillicrap et al. 2016, arXiv 1509.02971) on a batched world.
 
     Arguments and errors are those of :class:`~bidex_algos.offpolicy.base.OffPolicy`, so are the attributes.
 

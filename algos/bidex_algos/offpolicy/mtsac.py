@@ -37,7 +37,7 @@ __all__ = ["MTSAC", "PRESETS", "MTSACConfig"]
 
 
 class MTSAC(OffPolicy):
-    """Multi-task SAC on a batched world.
+    """Multi-task SAC (Haarnoja et al. 2018, arXiv 1812.05905) on a batched world.
 
     Arguments and errors are those of :class:`~bidex_algos.offpolicy.base.OffPolicy`, so are the attributes.
 

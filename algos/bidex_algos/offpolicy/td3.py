@@ -19,7 +19,7 @@ __all__ = ["PRESETS", "TD3", "TD3Config"]
 
 
 class TD3(DDPG):
-    """Multi-task TD3 on a batched world.
+    """Multi-task TD3 (Fujimoto et al. 2018, arXiv 1802.09477) on a batched world.
 
     Arguments, errors and attributes are those of :class:`~bidex_algos.offpolicy.ddpg.DDPG`.
 

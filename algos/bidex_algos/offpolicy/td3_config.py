@@ -32,4 +32,13 @@ class TD3Config(DDPGConfig):
 
 
 # Smoothing and delay of "paper" are those of Fujimoto et al. (2018, section 6.1), as are the defaults.
-PRESETS: dict[str, TD3Config] = {"paper": TD3Config(**of_paper()), "laptop": TD3Config()}
+PRESETS: dict[str, TD3Config] = {
+    "paper": TD3Config(**of_paper()),
+    "laptop": TD3Config(),
+    # Meta-World's suites: discount, Polyak, layers, replay and batches are those of MT-SAC's preset of that name.
+    "metaworld": TD3Config(
+        hidden=(400, 400, 400), replay_steps=100_000, warmup_steps=500, steps_per_iteration=500, updates_per_step=1,
+        batch_per_task=128, gamma=0.99, tau=0.005, learning_rate=3e-4, critic_learning_rate=3e-4,
+        exploration_std=(0.1, 0.4), squash_price=0.1,
+    ),
+}  # fmt: skip

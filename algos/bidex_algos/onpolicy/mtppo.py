@@ -25,7 +25,7 @@ __all__ = ["MTPPO", "PRESETS", "Batch", "MTPPOConfig"]
 
 
 class MTPPO(OnPolicy):
-    """Multi-task PPO on a batched world.
+    """Multi-task PPO (Schulman et al. 2017, arXiv 1707.06347) on a batched world.
 
     Arguments and attributes are those of :class:`~bidex_algos.onpolicy.base.OnPolicy`. Several processes make a
     mini-batch as many times larger.

@@ -27,7 +27,7 @@ __all__ = ["MTTRPO", "PRESETS", "MTTRPOConfig"]
 
 
 class MTTRPO(OnPolicy):
-    """Multi-task TRPO on a batched world.
+    """Multi-task TRPO (Schulman et al. 2015, arXiv 1502.05477) on a batched world.
 
     Arguments and attributes are those of :class:`~bidex_algos.onpolicy.base.OnPolicy`.
 
