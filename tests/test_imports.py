@@ -27,6 +27,7 @@ ORDER = (
     ("clients", "witness"),
     ("sources",),
     ("bench", "gallery", "viewer", "report"),  # the first two replay witnesses; bench measures clients too
+    ("results",),
     ("bidex_algos.checks", "bidex_algos.choices", "bidex_algos.reports"),
     ("bidex_algos.gradients", "bidex_algos.experience"),
     ("bidex_algos.nets",),

@@ -25,7 +25,7 @@ class CompareFlags:
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
-    """Run folders."""
+    """Run folders, or their files of JSON (`bidex-meta collect`)."""
     json: Switch = False
     """Print JSON."""
     out: Path | None = None
@@ -43,9 +43,9 @@ def main(arguments: Sequence[str]) -> None:
         raise BidexError("Name the run folders to compare: bidex-meta compare RUN RUN...")
     from bidex_meta.commands.tables import plain_table, print_table
     from bidex_meta.evaluation.comparison import estimates, read_groups
-    from bidex_meta.record import RunFolder
+    from bidex_meta.record.stored import open_run
 
-    groups = read_groups([RunFolder.open(path) for path in flags.runs])
+    groups = read_groups([open_run(path) for path in flags.runs])
     if flags.out is not None:
         from bidex_meta.record import plots
 

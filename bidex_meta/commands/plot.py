@@ -21,7 +21,7 @@ class PlotFlags:
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
-    """Run folders."""
+    """Run folders, or their files of JSON (`bidex-meta collect`)."""
     adaptation: Switch = False
     """Against shots of adaptation, from the meta-test in the run's evaluation.json; of one run."""
     evaluation: Path | None = None
@@ -40,24 +40,28 @@ def main(arguments: Sequence[str]) -> None:
     if not flags.runs:
         raise BidexError("Name the run folders to draw: bidex-meta plot RUN...")
 
-    from bidex_meta.record import RunFolder, plots
+    from bidex_meta.record import plots
     from bidex_meta.record.atomic import check_writable, refuse_links
+    from bidex_meta.record.stored import StoredRun, open_run
 
-    folders = [RunFolder.open(path) for path in flags.runs]
-    home = folders[0].path if len(folders) == 1 else Path()
+    runs = [open_run(path) for path in flags.runs]
+    home = runs[0].path if len(runs) == 1 and runs[0].path.is_dir() else Path()
     if flags.out is None:
         refuse_links(home / "curves.png", home / "adaptation.png")
     else:
         check_writable(flags.out)
     if flags.adaptation or flags.evaluation:
-        if len(folders) > 1:
-            raise BidexError(f"--adaptation draws one run, got {len(folders)}. bidex-meta report shows all.")
+        if len(runs) > 1:
+            raise BidexError(f"--adaptation draws one run, got {len(runs)}. bidex-meta report shows all.")
         out, source = flags.out or home / "adaptation.png", flags.evaluation or home / "evaluation.json"
-        figure = plots.draw_adaptation(plots.read_evaluation(source), source)
+        if isinstance(runs[0], StoredRun) and flags.evaluation is None:
+            figure = plots.draw_adaptation(runs[0].evaluation(), runs[0].path)
+        else:
+            figure = plots.draw_adaptation(plots.read_evaluation(source), source)
     else:
         from bidex_meta.evaluation.histories import read_histories
 
         out = flags.out or home / "curves.png"
-        figure = plots.draw_learning([(history.label, history.curves) for history in read_histories(folders)])
+        figure = plots.draw_learning([(history.label, history.curves) for history in read_histories(runs)])
     plots.save(figure, out)
     print(out)

@@ -21,7 +21,7 @@ class ReportFlags:
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
-    """Run folders."""
+    """Run folders, or their files of JSON (`bidex-meta collect`)."""
     out: Path | None = None
     """The page; None: report.html, in the run folder or, of several, here."""
 
@@ -35,15 +35,15 @@ def main(arguments: Sequence[str]) -> None:
     flags = parse(ReportFlags, arguments, "report")
     if not flags.runs:
         raise BidexError("Name the run folders to show: bidex-meta report RUN...")
-    from bidex_meta.record import RunFolder
     from bidex_meta.record.atomic import check_writable, refuse_links, write_atomic
+    from bidex_meta.record.stored import open_run
     from bidex_meta.report import page
 
-    folders = [RunFolder.open(path) for path in flags.runs]
-    out = flags.out or (folders[0].path if len(folders) == 1 else Path()) / "report.html"
+    runs = [open_run(path) for path in flags.runs]
+    out = flags.out or (runs[0].path if len(runs) == 1 and runs[0].path.is_dir() else Path()) / "report.html"
     refuse_links(*([] if flags.out else [out]))
     check_writable(out)
-    text = page.render(folders)
+    text = page.render(runs)
     out.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(out, lambda file: file.write(text.encode()))
     print(out)

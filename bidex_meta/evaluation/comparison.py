@@ -10,10 +10,8 @@ import numpy as np
 
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.statistics import Interval, bootstrap_interval
-from bidex_meta.reading import exists
-from bidex_meta.record.folder import RunFolder
-from bidex_meta.record.metrics import read_metrics, training_seconds
-from bidex_meta.record.schemas import read_evaluation
+from bidex_meta.record.metrics import training_seconds
+from bidex_meta.record.stored import Run
 
 
 @dataclass(frozen=True)
@@ -37,7 +35,7 @@ class Group:
     hours: float
     """Mean time of a seed's training, over all its runs, without evaluation."""
     paths: list[Path]
-    """Its run folders."""
+    """Its run folders, or files of JSON."""
 
 
 @dataclass(frozen=True)
@@ -50,13 +48,13 @@ class Estimate:
     """95 % bootstrap interval, seeds resampled; None with a single one."""
 
 
-def read_groups(folders: Sequence[RunFolder]) -> list[Group]:
-    """Runs, with their ``evaluation.json``, by group, in the order they are named.
+def read_groups(runs: Sequence[Run]) -> list[Group]:
+    """Evaluated runs by group, in the order they are named.
 
     Raises:
         BidexError: A run is not evaluated, two are the same, or a group's seeds do not cover the same classes.
     """
-    return [_group(label, members) for label, members in by_kind([_read(folder) for folder in folders])]
+    return [_group(label, members) for label, members in by_kind([_read(run) for run in runs])]
 
 
 def run_kind(config: dict[str, Any], split: str = "train") -> dict[str, Any]:
@@ -122,26 +120,18 @@ def _along(i: np.ndarray, j: np.ndarray, statistic: Any) -> Any:
     return np.array([statistic(p.astype(int), q.astype(int)) for p, q in zip(i, j, strict=True)])
 
 
-def _read(folder: RunFolder) -> dict[str, Any]:
-    path = folder.path / "evaluation.json"
-    if not exists(path):
-        raise BidexError(
-            f"{folder.path} has no evaluation.json. Let the run end, or write one: bidex-meta evaluate {folder.path} "
-            f"--json > {path}"
-        )
-    config = folder.config("learner", "num_envs", "steps")
-    found = read_evaluation(path, f"bidex-meta evaluate {folder.path} --json > {path}")
-    minutes, rows = config.get("minutes"), read_metrics(folder.metrics_path)
+def _read(run: Run) -> dict[str, Any]:
+    config, found, rows = run.config("learner", "num_envs", "steps"), run.evaluation(), run.metrics()
     # Where time ends a run, its last line tells how far it came.
-    goal = config["steps"] if minutes is None else max((row["step"] for row in rows), default=0)
+    goal = config["steps"] if config.get("minutes") is None else max((row["step"] for row in rows), default=0)
     steps = found.get("steps", goal)
     if steps < goal:
         raise BidexError(
-            f"{path} is of {steps:,} steps, but the run goes on to {goal:,}. Let it end, or write "
-            f"it anew: bidex-meta evaluate {folder.path} --json > {path}"
+            f"The evaluation of {run.path} is of {steps:,} steps, but the run goes on to {goal:,}. Let it end, or "
+            f"write it anew: {run.again}"
         )
     return {
-        "path": folder.path,
+        "path": run.path,
         "kind": run_kind(config, found.get("split", "train")),
         "seed": config["seed"],
         "classes": _classes(found),

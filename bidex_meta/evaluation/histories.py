@@ -10,8 +10,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import by_kind, run_kind
 from bidex_meta.evaluation.statistics import bootstrap_band
 from bidex_meta.record.curves import Curve
-from bidex_meta.record.folder import RunFolder
-from bidex_meta.record.metrics import read_metrics
+from bidex_meta.record.stored import Run
 
 _POINTS = 200
 
@@ -22,13 +21,13 @@ class History:
 
     label: str
     """The algo, and what tells the group from others of that algo."""
-    folders: list[RunFolder]
+    folders: list[Run]
     """Its runs."""
     curves: dict[str, Curve]
     """Of each tag that a run has logged."""
 
 
-def read_histories(folders: Sequence[RunFolder]) -> list[History]:
+def read_histories(folders: Sequence[Run]) -> list[History]:
     """Runs, evaluated or not, by group, in the order they are named.
 
     Raises:
@@ -37,13 +36,13 @@ def read_histories(folders: Sequence[RunFolder]) -> list[History]:
     runs = [{"kind": run_kind(folder.config("learner", "num_envs", "steps")), "folder": folder} for folder in folders]
     histories = []
     for label, members in by_kind(runs):
-        logged = [read_metrics(run["folder"].metrics_path) for run in members]
+        logged = [run["folder"].metrics() for run in members]
         tags = dict.fromkeys(tag for rows in logged for row in rows for tag in row if tag not in ("step", "time"))
         curves = {tag: over_runs([_series(rows, tag) for rows in logged]) for tag in tags}
         known = {tag: curve for tag, curve in curves.items() if curve is not None}
         histories.append(History(label, [run["folder"] for run in members], known))
     if not any(history.curves for history in histories):
-        raise BidexError(f"{folders[0].metrics_path} holds nothing yet: nothing to draw. Let the run go on.")
+        raise BidexError(f"{folders[0].path} holds nothing yet: nothing to draw. Let the run go on.")
     return histories
 
 

@@ -9,6 +9,7 @@
         events.out...   the same for TensorBoard
         checkpoints/    step_<N>.pt (the last few), last.pt, best.pt
         videos/         <name>_<N>.mp4
+        evaluation.json what the trained policy reaches
 """
 
 import contextlib
@@ -25,7 +26,8 @@ from bidex_meta.outside import short_name
 from bidex_meta.reading import exists, is_file
 from bidex_meta.record.atomic import TEMPORARY_SUFFIX, check_writable, refuse_links, remove_leftovers, write_json
 from bidex_meta.record.checkpoints import Checkpoints
-from bidex_meta.record.schemas import read_config
+from bidex_meta.record.metrics import read_metrics
+from bidex_meta.record.schemas import read_config, read_evaluation, read_versions
 from bidex_meta.record.versions import collect_versions
 
 _ENTRIES = ("checkpoints", "videos", "metrics.jsonl", "versions.json")
@@ -112,6 +114,39 @@ class RunFolder:
             BidexError: ``config.json`` cannot be read, is not valid JSON, or not a run's.
         """
         return read_config(self.config_path, needed)
+
+    @property
+    def evaluation_path(self) -> Path:
+        """``evaluation.json``, which stands there when a run has ended and was evaluated."""
+        return self.path / "evaluation.json"
+
+    @property
+    def again(self) -> str:
+        """The command that writes its evaluation anew, for messages."""
+        return f"bidex-meta evaluate {self.path} --json > {self.evaluation_path}"
+
+    @property
+    def evaluated(self) -> bool:
+        """Whether there is an ``evaluation.json``."""
+        return is_file(self.evaluation_path)
+
+    def metrics(self) -> list[dict[str, Any]]:
+        """The rows of ``metrics.jsonl`` that can be read."""
+        return read_metrics(self.metrics_path)
+
+    def versions(self) -> dict[str, Any]:
+        """``versions.json``; empty where there is none."""
+        return read_versions(self.path)
+
+    def evaluation(self) -> dict[str, Any]:
+        """The final evaluation, or the meta-test of what adapts.
+
+        Raises:
+            BidexError: There is none, or ``evaluation.json`` holds something else.
+        """
+        if not exists(self.evaluation_path):
+            raise BidexError(f"{self.path} has no evaluation.json. Let the run end, or write one: {self.again}")
+        return read_evaluation(self.evaluation_path, self.again)
 
     def change_config(self, config: dict[str, Any]) -> None:
         """Replace ``config.json``, atomically."""

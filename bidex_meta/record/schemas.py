@@ -46,14 +46,29 @@ def read_config(path: Path, needed: tuple[str, ...] = ()) -> dict[str, Any]:
         BidexError: The file cannot be read, is not JSON, or is not a run's.
     """
     config = read_json(path, "a run's config")
+    check_config(config, path, needed)
+    return config
+
+
+def check_config(config: Any, path: Path, needed: tuple[str, ...] = (), place: str = "") -> None:
+    """Refuses what is no run's config.
+
+    Args:
+        config: As it was read.
+        path: Its file, for messages.
+        needed: Entries that must be there beside those of every run.
+        place: Where in the file it stands, ending in a dot, for messages.
+
+    Raises:
+        BidexError: Told of the first entry that is not what it must be.
+    """
     missing = [name for name in NAMES if not isinstance(config, dict) or name not in config]
     missing = missing or [name for name in needed if name not in config]
     if missing:
         raise BidexError(f"{path} is not a run's config: it lacks {', '.join(missing)}. Name a run.")
-    check(config, CONFIG, path)
+    check(config, CONFIG, path, (), place)
     if (config["suite"] is None) == (config["task"] is None):
         raise BidexError(f"{path}: expected either a suite or a task, the other null. Name a run.")
-    return config
 
 
 _VERSIONS = {
@@ -72,11 +87,20 @@ def read_versions(folder: Path) -> dict[str, Any]:
     if not exists(path):
         return {}
     found = read_json(path, "a run's versions")
-    check(found, _VERSIONS, path)
+    check_versions(found, path)
+    return found
+
+
+def check_versions(found: Any, path: Path, place: str = "") -> None:
+    """Refuses what are no versions of a run; ``place`` as in :func:`check_config`.
+
+    Raises:
+        BidexError: Told of the first entry that is not what it must be.
+    """
+    check(found, _VERSIONS, path, (), place)
     commit = (found.get("git") or {}).get("commit")
     if commit is not None and not TEXT.fits(commit):
-        raise BidexError(f"{path}: git.commit: expected a text.")
-    return found
+        raise BidexError(f"{path}: {place}git.commit: expected a text.")
 
 
 def read_evaluation(path: Path, again: str) -> dict[str, Any]:
@@ -97,18 +121,18 @@ def read_evaluation(path: Path, again: str) -> dict[str, Any]:
     return found
 
 
-def check_evaluation(found: Any, path: Path) -> None:
-    """Refuses what is no evaluation.
+def check_evaluation(found: Any, path: Path, within: str = "") -> None:
+    """Refuses what is no evaluation; ``within`` says where in the file it stands, ending in a dot.
 
     Raises:
         BidexError: Told of the first entry that is not what it must be.
     """
-    check(found, {"steps": whole(0), "split": TEXT, "splits": TABLE, "policy": TABLE}, path)
+    check(found, {"steps": whole(0), "split": TEXT, "splits": TABLE, "policy": TABLE}, path, (), within)
     for name, part in found.get("splits", {}).items():
-        _check_meta_test(part, path, f"splits.{name}.")
+        _check_meta_test(part, path, f"{within}splits.{name}.")
     if "splits" not in found:
         of_policy = "policy" in found
-        place = "policy." if of_policy else ""
+        place = f"{within}policy." if of_policy else within
         _check_classes(found["policy"] if of_policy else found, path, place)
 
 

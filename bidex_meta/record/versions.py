@@ -10,10 +10,17 @@ from typing import Any
 
 _PACKAGES = ("bidex-meta", "mujoco", "mujoco-warp", "warp-lang", "torch", "gymnasium", "metaworld", "numpy", "scipy")
 
+PHYSICS_PROFILE = 2
+"""Of contacts and time steps (bidex_meta/hands/README.md); raised where numbers of all classes move with it.
+
+1: time steps of 1/240 and 1/480 s.
+"""
+
 
 def collect_versions() -> dict[str, Any]:
-    """Python, packages (None where not installed), platform, processors, GPUs and git state, ready for JSON."""
+    """Python, packages (None where not installed), physics, machine, GPUs and git state, ready for JSON."""
     return {
+        "physics_profile": PHYSICS_PROFILE,
         "python": sys.version.split()[0],
         "packages": {name: _installed(name) for name in _PACKAGES},
         "platform": platform.platform(),

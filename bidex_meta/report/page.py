@@ -7,6 +7,7 @@ extra ``plot``.
 import base64
 import json
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
@@ -16,16 +17,16 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import Estimate, Group, estimates, iqm, iqm_difference, read_groups
 from bidex_meta.evaluation.histories import History, read_histories
 from bidex_meta.reading import is_file
-from bidex_meta.record import RunFolder, plots, read_metrics, training_seconds
+from bidex_meta.record import plots, training_seconds
 from bidex_meta.record.folder import flat
-from bidex_meta.record.schemas import read_versions
+from bidex_meta.record.stored import Run
 
 FILM_BYTES = 40_000_000
 """Films of a page together at most; what is above is named alone."""
 _SPEED = {"Perf/steps_per_second": "environment steps / s", "Perf/training_time": "training time (s)"}
 
 
-def render(folders: Sequence[RunFolder]) -> str:
+def render(folders: Sequence[Run]) -> str:
     """The page of some runs.
 
     Raises:
@@ -58,7 +59,7 @@ def render(folders: Sequence[RunFolder]) -> str:
     )
 
 
-def _title(folders: Sequence[RunFolder]) -> str:
+def _title(folders: Sequence[Run]) -> str:
     configs = [folder.config() for folder in folders]
     algos = ", ".join(dict.fromkeys(config["algo"] for config in configs))
     subjects = ", ".join(dict.fromkeys(Path(config["suite"] or config["task"]).stem for config in configs))
@@ -83,9 +84,9 @@ def _names(histories: Sequence[History], short: Sequence[str]) -> dict[Path, str
     return names
 
 
-def _run(folder: RunFolder, name: str) -> dict[str, Any]:
-    config, rows = folder.config(), read_metrics(folder.metrics_path)
-    versions = read_versions(folder.path)
+def _run(folder: Run, name: str) -> dict[str, Any]:
+    config, rows = folder.config(), folder.metrics()
+    versions = folder.versions()
     speeds = [row["Perf/steps_per_second"] for row in rows if row.get("Perf/steps_per_second") is not None]
     hardware = ", ".join(versions.get("gpus") or []) or f"{versions.get('cpus', '?')} processors"
     git = versions.get("git") or {}
@@ -102,9 +103,9 @@ def _run(folder: RunFolder, name: str) -> dict[str, Any]:
     }
 
 
-def _final(folders: Sequence[RunFolder], short: dict[Path, str]) -> dict[str, Any]:
+def _final(folders: Sequence[Run], short: dict[Path, str]) -> dict[str, Any]:
     """The groups' final evaluations as rows, and why runs are missing; groups are called as ``short`` says."""
-    evaluated = [folder for folder in folders if is_file(folder.path / "evaluation.json")]
+    evaluated = [folder for folder in folders if folder.evaluated]
     found: dict[str, Any] = {"missing": len(folders) - len(evaluated), "reason": "", "rows": [], "classes": []}
     found |= {"names": [], "picture": None}
     try:
@@ -151,22 +152,22 @@ def _ranged(estimate: Estimate, factor: float = 1.0, form: str = ".1f") -> str:
     return f"{factor * estimate.value:{form}}" + (f" [{ends}]" if ends else "")
 
 
-def _adaptation(folders: Sequence[RunFolder], names: dict[Path, str]) -> Iterator[tuple[str, str]]:
+def _adaptation(folders: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[str, str]]:
     """Name and picture of each run that ended with a meta-test."""
-    for folder in folders:
-        path = folder.path / "evaluation.json"
-        found = plots.read_evaluation(path) if is_file(path) else {}
-        if isinstance(found, dict) and found.get("splits"):
-            picture = _picture(lambda found=found, path=path: plots.draw_adaptation(found, path))
-            if picture is not None:
-                yield names[folder.path], picture
+    for folder in filter(lambda folder: folder.evaluated, folders):
+        with suppress(BidexError):  # of a damaged one the final table has told
+            found = folder.evaluation()
+            if found.get("splits"):
+                picture = _picture(lambda found=found, path=folder.path: plots.draw_adaptation(found, path))
+                if picture is not None:
+                    yield names[folder.path], picture
 
 
-def _differences(folders: Sequence[RunFolder], names: dict[Path, str]) -> dict[str, Any]:
+def _differences(folders: Sequence[Run], names: dict[Path, str]) -> dict[str, Any]:
     """What of config and versions is not the same in all runs."""
     columns = []
     for folder in folders:
-        versions = read_versions(folder.path)
+        versions = folder.versions()
         columns.append(flat(folder.config()) | flat({"versions": versions}))
     keys = dict.fromkeys(key for column in columns for key in column)
     differing = [key for key in keys if len({json.dumps(column.get(key)) for column in columns}) > 1]
@@ -178,7 +179,7 @@ def _cell(value: Any) -> str:
     return "–" if value is None else value if isinstance(value, str) else json.dumps(value)
 
 
-def _films(folders: Sequence[RunFolder], names: dict[Path, str]) -> Iterator[tuple[str, str, str | None]]:
+def _films(folders: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[str, str, str | None]]:
     """Run, file and content of the newest film of each kind (its name before ``_<step>``); None where it is large."""
     room = FILM_BYTES
     for folder in folders:

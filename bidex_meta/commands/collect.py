@@ -1,0 +1,86 @@
+"""``bidex-meta collect``: evaluated runs as files of JSON, small enough for a repository."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from bidex_meta.commands.parsing import parse
+from bidex_meta.errors import BidexError
+
+if TYPE_CHECKING:
+    from bidex_meta.record import RunFolder
+
+
+@dataclass(frozen=True)
+class CollectFlags:
+    """Keep of each evaluated run a file of JSON: config, versions, thinned curves, evaluation, parameters.
+
+    Example: bidex-meta collect runs/MT4/mtppo/* --into results/data/mystudy
+
+    `bidex-meta compare`, `plot` and `report` take such files like run folders. A file is at most 40 kB.
+    """
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
+    """Run folders, or the files of sweeps, of which every run must have ended."""
+    into: Path | None = None
+    """Folder of the files; each is called as its run folder."""
+    arm: str | None = None
+    """What tables call these runs; None: of a sweep its arms, else the folder's name without suite and seed."""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Write the files and print their names; all of them or none.
+
+    Raises:
+        BidexError: No run is named, one is not evaluated or not of ours, or two would be the same file.
+    """
+    flags = parse(CollectFlags, arguments, "collect")
+    if not flags.runs or flags.into is None:
+        raise BidexError("Name runs and a folder: bidex-meta collect RUN RUN... --into results/data/STUDY")
+    from bidex_meta.record import RunFolder
+    from bidex_meta.record.atomic import check_writable, write_atomic
+    from bidex_meta.results.condensing import arm_of, condensed, told
+
+    made: dict[Path, bytes] = {}
+    for path in flags.runs:
+        folder = RunFolder.open(path)
+        name = folder.path.resolve().name
+        out = flags.into / f"{name}.json"
+        if out in made:
+            raise BidexError(f"Two runs are called {name}, and so would be their files. Rename one's folder.")
+        config = folder.config("learner", "num_envs", "steps")
+        _refuse_another(out, config)
+        content = condensed(folder, flags.arm or arm_of(folder.path, config), _parameters(folder))
+        check_writable(out)
+        made[out] = told(content)
+    flags.into.mkdir(parents=True, exist_ok=True)
+    for out, text in made.items():
+        write_atomic(out, lambda file, text=text: file.write(text))
+        print(out)
+
+
+def _refuse_another(out: Path, config: dict[str, Any]) -> None:
+    """Refuses to put a run in the place of another one of the same name."""
+    from bidex_meta.reading import exists
+    from bidex_meta.record.stored import StoredRun
+
+    if not exists(out):
+        return
+    known = StoredRun.open(out).config()
+    for name in ("task", "algo", "seed", "learner"):
+        if known.get(name) != config[name]:
+            raise BidexError(f"{out} is of another run: {name} differs. Rename the run's folder, or remove the file.")
+
+
+def _parameters(folder: "RunFolder") -> int | None:
+    """Numbers that the newest policy has learned, the critic not among them; None of what is no module of torch."""
+    from torch import nn
+
+    from bidex_meta.commands.policies import load_policy
+
+    agent, _ = load_policy(folder, "cpu")
+    module = agent if isinstance(agent, nn.Module) else getattr(agent, "policy", None)
+    return sum(each.numel() for each in module.parameters()) if isinstance(module, nn.Module) else None

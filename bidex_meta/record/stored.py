@@ -1,0 +1,177 @@
+"""A run as one file of JSON: what is left of it for tables and pictures when its folder, with the weights, is gone.
+
+::
+
+    {"format": 1, "name": ..., "arm": ..., "suite": {"name", "version"}, "config": {...}, "versions": {...},
+     "steps": N, "seconds": S, "parameters": P,
+     "curves": {"step": [...], "Train/return/<class>": [...], ...},
+     "evaluation": {...}}
+
+``bidex-meta collect`` writes such files (:mod:`bidex_meta.results.condensing`); :func:`open_run` reads them and run
+folders alike, so that whatever reads an evaluated run need not know which of the two it has.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Protocol
+
+from bidex_meta.errors import BidexError
+from bidex_meta.reading import TABLE, TEXT, Rule, check, number, read_json, whole
+from bidex_meta.record.folder import RunFolder
+from bidex_meta.record.schemas import check_config, check_evaluation, check_versions
+
+FORMAT = 1
+"""Of the files; raised where an older reader would misread them."""
+
+_COLUMN = Rule(
+    "a list of numbers or nulls",
+    lambda value: isinstance(value, list) and all(each is None or number().fits(each) for each in value),
+)
+_RULES = {
+    "format": whole(FORMAT, FORMAT),
+    "name": TEXT,
+    "arm": TEXT,
+    "suite": TABLE.or_none(),
+    "config": TABLE,
+    "versions": TABLE,
+    "steps": whole(0),
+    "seconds": number(0.0, 1e12),
+    "parameters": whole(0).or_none(),
+    "curves": _COLUMN.each(),
+    "evaluation": TABLE,
+}
+
+
+class Run(Protocol):
+    """What tables, curves and reports ask of a run, be it a folder or a file."""
+
+    @property
+    def path(self) -> Path:
+        """The folder or the file."""
+        ...
+
+    @property
+    def again(self) -> str:
+        """The command that writes its evaluation anew, for messages."""
+        ...
+
+    @property
+    def evaluated(self) -> bool:
+        """Whether there is an evaluation."""
+        ...
+
+    @property
+    def videos_path(self) -> Path:
+        """Where its films lie, if it has any."""
+        ...
+
+    def config(self, *needed: str) -> dict[str, Any]:
+        """The resolved config; see :meth:`RunFolder.config`."""
+        ...
+
+    def metrics(self) -> list[dict[str, Any]]:
+        """Logged rows, each with ``step``, rising; of a file thinned."""
+        ...
+
+    def versions(self) -> dict[str, Any]:
+        """What it was made with."""
+        ...
+
+    def evaluation(self) -> dict[str, Any]:
+        """The final evaluation; see :meth:`RunFolder.evaluation`."""
+        ...
+
+
+@dataclass(frozen=True)
+class StoredRun:
+    """A run as one file of JSON. Made by ``open``."""
+
+    path: Path
+
+    @classmethod
+    def open(cls, path: Path) -> "StoredRun":
+        """An existing file.
+
+        Raises:
+            BidexError: It cannot be read, or is no run.
+        """
+        stored = cls(Path(path))
+        _ = stored.content
+        return stored
+
+    @cached_property
+    def content(self) -> dict[str, Any]:
+        """All of the file, checked.
+
+        Raises:
+            BidexError: It cannot be read, or is no run.
+        """
+        found = read_json(self.path, "a run's data")
+        check(found, _RULES, self.path, tuple(_RULES))
+        check_config(found["config"], self.path, ("learner", "num_envs", "steps"), "config.")
+        check_versions(found["versions"], self.path, "versions.")
+        check_evaluation(found["evaluation"], self.path, "evaluation.")
+        curves = found["curves"]
+        steps = curves.get("step", [])
+        if not steps or not all(type(step) is int for step in steps) or steps != sorted(steps):
+            raise BidexError(f"{self.path}: curves.step: expected rising whole numbers. Collect the run again.")
+        odd = [tag for tag, column in curves.items() if len(column) != len(steps)]
+        if odd:
+            raise BidexError(
+                f"{self.path}: curves.{odd[0]}: expected {len(steps)} values as in curves.step, got "
+                f"{len(curves[odd[0]])}. Collect the run again."
+            )
+        return found
+
+    @property
+    def again(self) -> str:
+        """As in :class:`Run`."""
+        return f"bidex-meta collect RUN --into {self.path.parent}"
+
+    @property
+    def evaluated(self) -> bool:
+        """Always: what is not is never collected."""
+        return True
+
+    @property
+    def videos_path(self) -> Path:
+        """As in :class:`Run`: a folder that is not there."""
+        return self.path.with_suffix("") / "videos"
+
+    @property
+    def arm(self) -> str:
+        """What its study calls it."""
+        return self.content["arm"]
+
+    def config(self, *needed: str) -> dict[str, Any]:
+        """As in :class:`Run`; paths of own suites and of other runs are names alone."""
+        missing = [name for name in needed if name not in self.content["config"]]
+        if missing:
+            raise BidexError(f"{self.path}: config.{missing[0]}: expected it to be there, found none.")
+        return self.content["config"]
+
+    def metrics(self) -> list[dict[str, Any]]:
+        """As in :class:`Run`: means over stretches of about equal length, told at their ends."""
+        curves = self.content["curves"]
+        return [dict(zip(curves, row, strict=True)) for row in zip(*curves.values(), strict=True)]
+
+    def versions(self) -> dict[str, Any]:
+        """As in :class:`Run`."""
+        return self.content["versions"]
+
+    def evaluation(self) -> dict[str, Any]:
+        """As in :class:`Run`."""
+        return self.content["evaluation"]
+
+
+def open_run(path: Path) -> RunFolder | StoredRun:
+    """A run by its folder, or by its file of JSON.
+
+    Raises:
+        BidexError: It is neither.
+    """
+    # A folder may be called so too.
+    if path.suffix == ".json" and not path.is_dir():
+        return StoredRun.open(path)
+    return RunFolder.open(path)

@@ -1,0 +1,160 @@
+"""Runs as files of JSON: what they keep, that tables and pictures take them like folders, and what is refused."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from bidex_meta.cli import main
+from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.comparison import read_groups
+from bidex_meta.record import RunFolder
+from bidex_meta.record.stored import StoredRun, open_run
+from bidex_meta.results import condensing
+from tests.test_comparison import run
+from tests.test_histories import log
+
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
+
+
+def evaluated(root: Path, seed: int, success: float, name: str | None = None, rows: int = 500, **learner) -> Path:
+    """A run of two classes with a curve, as the commands leave it; without weights."""
+    path = run(root, seed, {"A": success, "B": 0.25}, **learner)
+    lines = [
+        {"step": 2 * i, "time": 1.0, "Train/success/A": i / rows, "Train/return/B": 1.0, "Perf/training_time": 3.0 * i}
+        for i in range(1, rows + 1)
+    ]
+    folder = log(path, *lines)
+    folder.change_config({**folder.config(), "steps": 2 * rows})
+    (path / "versions.json").write_text(json.dumps({"git": {"commit": COMMIT, "dirty": False}}))
+    return path if name is None else path.rename(root / name)
+
+
+@pytest.fixture(autouse=True)
+def no_weights(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bidex_meta.commands.collect._parameters", lambda folder: 12345)
+
+
+def collect(*words: object) -> int:
+    return main(["collect", *map(str, words)])
+
+
+def test_tables_of_files_are_those_of_the_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    paths = [evaluated(tmp_path, seed, 0.5 + seed / 7, f"MT4-arm-x-seed{seed}", gamma=0.9) for seed in (0, 1)]
+    assert collect(*paths, "--into", tmp_path / "data") == 0
+    files = capsys.readouterr().out.split()
+    assert files == [str(tmp_path / "data" / f"MT4-arm-x-seed{seed}.json") for seed in (0, 1)]
+    found = []
+    for names in (map(str, paths), files):
+        assert main(["compare", *names, "--json"]) == 0
+        found.append(json.loads(capsys.readouterr().out))
+    (folder,), (stored,) = found
+    assert stored["success_iqm"]["value"] == pytest.approx(folder["success_iqm"]["value"], rel=1e-4)
+    assert stored["hours"] == folder["hours"] > 0 and stored["seeds"] == [0, 1] and stored["steps"] == 1000
+    assert main(["compare", str(paths[0]), files[1]]) == 0, "folders and files beside each other"
+    assert main(["plot", *files, "--out", str(tmp_path / "c.png")]) == 0
+    assert main(["report", *files, "--out", str(tmp_path / "r.html")]) == 0
+    assert COMMIT[:10] in (tmp_path / "r.html").read_text()
+
+
+def test_what_a_file_keeps(tmp_path: Path) -> None:
+    folder = RunFolder.open(evaluated(tmp_path, 0, 1 / 3))
+    content = condensing.condensed(folder, "x", 7)
+    curves = content["curves"]
+    assert len(curves["step"]) == 60 and curves["step"][-1] == 1000 == content["steps"]
+    assert curves["Perf/training_time"][-1] == 1500.0 == content["seconds"]
+    # Each point is the mean of the stretch that ends with it.
+    first = curves["step"][0] // 2
+    assert curves["Train/success/A"][0] == pytest.approx((first + 1) / 2 / 500, rel=1e-3)
+    assert content["evaluation"]["policy"]["classes"]["A"]["success"] == 0.33333
+    assert (content["suite"], content["parameters"]) == ({"name": "MT4", "version": 1}, 7)
+    path = tmp_path / "x.json"
+    path.write_bytes(condensing.told(content))
+    assert json.loads(path.read_bytes()) == content and len(path.read_bytes()) < condensing.MOST_BYTES
+    assert open_run(path).metrics()[-1] == {"step": 1000, **{t: c[-1] for t, c in curves.items() if t != "step"}}
+
+
+def test_curves_give_way_where_there_are_many_classes(tmp_path: Path) -> None:
+    path = evaluated(tmp_path, 0, 0.5)
+    rows = [{"step": 10 * i, **{f"Train/return/class{n}": 1.2345 * i for n in range(100)}} for i in range(1, 101)]
+    log(path, *rows)
+    classes = {f"class{n}": {"success": 0.5, "return": 1.0, "score": None} for n in range(100)}
+    (path / "evaluation.json").write_text(json.dumps({"policy": {"classes": classes}}))
+    content = condensing.condensed(RunFolder.open(path), "x", None)
+    assert len(content["curves"]["step"]) < 60 and len(condensing.told(content)) <= condensing.MOST_BYTES
+
+
+def test_no_folder_of_this_machine_stays(tmp_path: Path) -> None:
+    path, suite = evaluated(tmp_path, 0, 0.5), tmp_path / "own.toml"
+    suite.write_text((Path(__file__).parents[1] / "suites" / "MT4.toml").read_text().replace('"MT4"', '"own"'))
+    folder = RunFolder.open(path)
+    folder.change_config({**folder.config(), "suite": str(suite), "start_from": str(tmp_path / "other")})
+    found = json.loads((path / "evaluation.json").read_text())
+    (path / "evaluation.json").write_text(json.dumps({"run": str(path), **found}))
+    content = condensing.condensed(folder, "x", None)
+    assert str(tmp_path) not in json.dumps(content)
+    assert content["suite"]["name"] == "own" and "CatchUnderarm" in content["suite"]["file"]
+    assert content["config"]["suite"] == "own.toml"
+
+
+@pytest.mark.parametrize(
+    "name, arm",
+    [("MT4-soft modules-seed0", "soft modules"), ("mt4_gamma_s12", "gamma"), ("2026-11-21_10-00-00_seed0", "mtppo"),
+     ("MT4", "mtppo"), ("again", "again")],
+)  # fmt: skip
+def test_an_arm_is_the_name_without_suite_and_seed(name: str, arm: str) -> None:
+    assert condensing.arm_of(Path("runs") / name, {"suite": "MT4", "task": None, "algo": "mtppo"}) == arm
+
+
+def test_what_is_refused_is_one_line_and_nothing_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    good, into = evaluated(tmp_path, 0, 0.5, "good"), tmp_path / "data"
+    bad = evaluated(tmp_path, 1, 0.5, "bad")
+
+    def refused(told: str) -> None:
+        assert collect(good, bad, "--into", into) == 2
+        error = capsys.readouterr().err
+        assert told in error and error.count("\n") == 1
+        assert not into.exists()
+
+    evaluation = (bad / "evaluation.json").read_text()
+    (bad / "evaluation.json").write_text(json.dumps({"steps": 500, **json.loads(evaluation)}))
+    refused("is evaluated at 500 steps, but goes on to 1,000")
+    (bad / "evaluation.json").write_text(json.dumps({"policy": {"classes": {"A": {"success": 1, "return": 1, "score": None}}}}))  # fmt: skip  # noqa: E501
+    refused("is of another run: it lacks B")
+    (bad / "evaluation.json").unlink()
+    refused("no evaluation.json")
+    (bad / "evaluation.json").write_text(evaluation)
+    (bad / "versions.json").write_text('{"git": null}')
+    refused("names no commit")
+    (bad / "versions.json").write_text(json.dumps({"git": {"commit": COMMIT}}))
+    (bad / "metrics.jsonl").write_text("")
+    refused("holds nothing")
+    (bad / "config.json").write_text("{}")
+    refused("is not a run's config")
+    assert collect(good) == 2 and "--into" in capsys.readouterr().err
+    assert collect(good, "--into", into) == 0 and collect(good, "--into", into) == 0, "once more is no harm"
+    folder = RunFolder.open(good)
+    folder.change_config({**folder.config(), "seed": 5})
+    assert collect(good, "--into", into) == 2 and "is of another run: seed differs" in capsys.readouterr().err
+
+
+def test_a_damaged_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.json"
+    content = condensing.condensed(RunFolder.open(evaluated(tmp_path, 0, 0.5)), "x", 7)
+    for change, told in (
+        ({"format": 2}, "format: expected a whole number from 1 to 1"),
+        ({"curves": {"step": [1, 2], "a": [1.0]}}, "curves.a: expected 2 values"),
+        ({"curves": {"step": [2, 1]}}, "expected rising"),
+        ({"evaluation": {"policy": {"classes": {}}}}, "evaluation.policy.classes: expected at least one"),
+        ({"config": {"seed": 0}}, "it lacks suite"),
+        ({"versions": {"git": 3}}, "versions.git: expected a table"),
+    ):
+        path.write_text(json.dumps({**content, **change}))
+        with pytest.raises(BidexError, match=told):
+            StoredRun.open(path)
+    path.write_bytes(condensing.told(content)[:-40])
+    with pytest.raises(BidexError, match="in JSON"):
+        open_run(path)
+    path.write_bytes(condensing.told(content))
+    [group] = read_groups([StoredRun.open(path)])
+    assert group.paths == [path]
