@@ -15,7 +15,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c const
 SOURCES := bidex_meta algos examples tests docs/site
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-all test-parity bench-gpu-compile bench-gpu-sweep bench-gpu-train lint format docs clean
+.PHONY: help run results test test-all test-parity bench-gpu-compile bench-gpu-sweep bench-gpu-train lint format docs clean
 .DELETE_ON_ERROR:
 
 help:
@@ -23,6 +23,7 @@ help:
 	@echo "make test      format, lint, types, tests (what CI runs)"
 	@echo "make test-all  the same with the slow tests"
 	@echo "make test-parity  compare both engines on every class (what CI runs too)"
+	@echo "make results   fill the tables and pictures of README.md and docs/results/ from results/data/"
 	@echo "make docs      build the documentation site into site/ (open site/index.html)"
 	@echo "make format    format the code and mend what ruff can mend"
 	@echo "make bench-gpu-compile, bench-gpu-sweep, bench-gpu-train  measure a GPU (docs/gpu.md)"
@@ -64,6 +65,9 @@ bench-gpu-train: $(INSTALLED)
 		else what="--suite $$suite --algo mtppo --device $(DEVICE) --engine warp --num-envs $(ROWS) --run-dir $(OUT)/$$suite"; fi; \
 		timeout --signal=INT --kill-after=30 225 $(CLI) run $$what --steps $(TRAIN_STEPS) || test $$? = 124 || exit 1; \
 	done
+
+results: .venv/.installed-dev
+	$(BIN)/python -m bidex_meta.results
 
 lint: .venv/.installed-dev
 	$(BIN)/ruff format --check $(SOURCES)

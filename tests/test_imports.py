@@ -26,7 +26,7 @@ ORDER = (
     ("bidex_meta",),  # the package's own names
     ("clients", "witness"),
     ("sources",),
-    ("bench", "gallery", "viewer", "report"),  # the first two replay witnesses; bench measures clients too
+    ("bench", "gallery", "viewer", "report", "sweep"),  # the first two replay witnesses; bench measures clients too
     ("results",),
     ("bidex_algos.checks", "bidex_algos.choices", "bidex_algos.reports"),
     ("bidex_algos.gradients", "bidex_algos.experience"),

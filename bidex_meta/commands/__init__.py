@@ -15,6 +15,7 @@ class Command(NamedTuple):
 
 COMMANDS: dict[str, Command] = {
     "run": Command("bidex_meta.commands.run", "train a learner on a suite or a task, then evaluate it"),
+    "sweep": Command("bidex_meta.commands.sweep", "many runs from one file, resumed where they were stopped"),
     "evaluate": Command("bidex_meta.commands.evaluate", "success and return of a trained run, per task class"),
     "compare": Command("bidex_meta.commands.compare", "several runs beside each other, intervals over seeds"),
     "collect": Command("bidex_meta.commands.collect", "evaluated runs as small files of JSON, to keep as data"),

@@ -27,6 +27,8 @@ class CollectFlags:
     """Run folders, or the files of sweeps, of which every run must have ended."""
     into: Path | None = None
     """Folder of the files; each is called as its run folder."""
+    out: Path = Path("runs")
+    """Where a sweep's folder lies, as `bidex-meta sweep` was told."""
     arm: str | None = None
     """What tables call these runs; None: of a sweep its arms, else the folder's name without suite and seed."""
 
@@ -45,7 +47,7 @@ def main(arguments: Sequence[str]) -> None:
     from bidex_meta.results.condensing import arm_of, condensed, told
 
     made: dict[Path, bytes] = {}
-    for path in flags.runs:
+    for path, arm in _named(flags):
         folder = RunFolder.open(path)
         name = folder.path.resolve().name
         out = flags.into / f"{name}.json"
@@ -53,13 +55,24 @@ def main(arguments: Sequence[str]) -> None:
             raise BidexError(f"Two runs are called {name}, and so would be their files. Rename one's folder.")
         config = folder.config("learner", "num_envs", "steps")
         _refuse_another(out, config)
-        content = condensed(folder, flags.arm or arm_of(folder.path, config), _parameters(folder))
+        content = condensed(folder, arm or arm_of(folder.path, config), _parameters(folder))
         check_writable(out)
         made[out] = told(content)
     flags.into.mkdir(parents=True, exist_ok=True)
     for out, text in made.items():
         write_atomic(out, lambda file, text=text: file.write(text))
         print(out)
+
+
+def _named(flags: CollectFlags) -> list[tuple[Path, str | None]]:
+    """Run folders, and what each is called: of a sweep by its arms."""
+    from bidex_meta.sweep.plan import read_sweep
+
+    found: list[tuple[Path, str | None]] = []
+    for path in flags.runs:
+        of_sweep = path.suffix == ".toml" and not path.is_dir()
+        found += [(run.path, run.arm) for run in read_sweep(path, flags.out).runs] if of_sweep else [(path, flags.arm)]
+    return found
 
 
 def _refuse_another(out: Path, config: dict[str, Any]) -> None:

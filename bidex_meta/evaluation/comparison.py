@@ -57,6 +57,15 @@ def read_groups(runs: Sequence[Run]) -> list[Group]:
     return [_group(label, members) for label, members in by_kind([_read(run) for run in runs])]
 
 
+def group_of(label: str, runs: Sequence[Run]) -> Group:
+    """Evaluated runs that the caller takes as seeds of one group.
+
+    Raises:
+        BidexError: As :func:`read_groups`.
+    """
+    return _group(label, [_read(run) for run in runs])
+
+
 def run_kind(config: dict[str, Any], split: str = "train") -> dict[str, Any]:
     """What runs that are compared as one have in common: all of the config that matters but the seed."""
     kind = {"algo": config["algo"], "on": config["suite"] or "one class at a time", "steps": config["steps"]}
@@ -134,13 +143,13 @@ def _read(run: Run) -> dict[str, Any]:
         "path": run.path,
         "kind": run_kind(config, found.get("split", "train")),
         "seed": config["seed"],
-        "classes": _classes(found),
+        "classes": classes_of(found),
         "seconds": training_seconds(rows),
         "steps": goal,
     }
 
 
-def _classes(found: dict[str, Any]) -> dict[str, Any]:
+def classes_of(found: dict[str, Any]) -> dict[str, Any]:
     """Of a meta-test the classes after adaptation, train and test apart: ML1's splits hold the same class."""
     if "splits" in found:
         parts = found["splits"].items()

@@ -36,14 +36,19 @@ def read_histories(folders: Sequence[Run]) -> list[History]:
     runs = [{"kind": run_kind(folder.config("learner", "num_envs", "steps")), "folder": folder} for folder in folders]
     histories = []
     for label, members in by_kind(runs):
-        logged = [run["folder"].metrics() for run in members]
-        tags = dict.fromkeys(tag for rows in logged for row in rows for tag in row if tag not in ("step", "time"))
-        curves = {tag: over_runs([_series(rows, tag) for rows in logged]) for tag in tags}
-        known = {tag: curve for tag, curve in curves.items() if curve is not None}
-        histories.append(History(label, [run["folder"] for run in members], known))
+        of_label = [run["folder"] for run in members]
+        histories.append(History(label, of_label, curves_of(of_label)))
     if not any(history.curves for history in histories):
         raise BidexError(f"{folders[0].path} holds nothing yet: nothing to draw. Let the run go on.")
     return histories
+
+
+def curves_of(runs: Sequence[Run]) -> dict[str, Curve]:
+    """Of each tag that one of the runs has logged: see :func:`over_runs`."""
+    logged = [run.metrics() for run in runs]
+    tags = dict.fromkeys(tag for rows in logged for row in rows for tag in row if tag not in ("step", "time"))
+    curves = {tag: over_runs([_series(rows, tag) for rows in logged]) for tag in tags}
+    return {tag: curve for tag, curve in curves.items() if curve is not None}
 
 
 def over_runs(series: Sequence[tuple[np.ndarray, np.ndarray]]) -> Curve | None:

@@ -201,12 +201,13 @@ def _figure() -> Any:
     return Figure
 
 
-def save(figure: Any, out: Path) -> None:
+def save(figure: Any, out: Path, metadata: Mapping[str, str] | None = None) -> None:
     """Write a figure.
 
     Args:
         figure: One of those drawn here.
         out: The picture to write; its ending names the format.
+        metadata: What the file says of itself.
 
     Raises:
         BidexError: matplotlib does not know the ending.
@@ -215,7 +216,7 @@ def save(figure: Any, out: Path) -> None:
     if out.suffix[1:].lower() not in known:
         raise BidexError(f"Expected a picture's ending ({', '.join(sorted(known))}), got {out.name!r}. Name it .png.")
     out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out, dpi=120)
+    figure.savefig(out, dpi=120, metadata=metadata)
 
 
 def svg(figure: Any) -> bytes:

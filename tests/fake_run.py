@@ -1,0 +1,46 @@
+"""Stands for ``bidex-meta run`` in tests of sweeps: the same folder, lock and files, a checkpoint a step, no physics.
+
+Its seed says what becomes of it: 13 always fails.
+"""
+
+import json
+import os
+import sys
+import time
+from pathlib import Path
+
+from bidex_meta.record import RunFolder
+
+STEPS = 6
+
+
+def main(words: list[str]) -> int:
+    """As ``bidex-meta run``, of the flags that a sweep gives."""
+    given = dict(word[2:].split("=", 1) for word in words if "=" in word)
+    if "resume" in given:
+        folder = RunFolder.open(Path(given["resume"]))
+    else:
+        config = {"suite": None, "task": "HandOver", "algo": "ppo", "seed": int(given["seed"]), "steps": STEPS}
+        config |= {"num_envs": 8, "minutes": None, "learner": {}}
+        folder = RunFolder.create(config, Path(given["run-dir"]))
+    with folder.locked():
+        with (folder.path / "starts").open("a") as starts:
+            cores = sorted(os.sched_getaffinity(0)) if sys.platform == "linux" else []
+            starts.write(json.dumps({"at": time.time(), "cores": cores, "resumed": "resume" in given}) + "\n")
+        if folder.config()["seed"] == 13:
+            print("some warning\nbidex-meta: the physics broke.\n", file=sys.stderr)
+            return 2
+        saved = folder.checkpoints_path / "step"
+        done = int(saved.read_text()) if saved.is_file() else 0
+        for step in range(done + 1, STEPS + 1):
+            time.sleep(float(os.environ.get("FAKE_SECONDS", "0.01")))
+            with folder.metrics_path.open("a") as metrics:
+                metrics.write(json.dumps({"step": step, "time": 1.0, "Perf/training_time": 0.5 * step}) + "\n")
+            saved.write_text(str(step))
+        row = {"success": 0.5, "return": 1.0, "score": None}
+        (folder.path / "evaluation.json").write_text(json.dumps({"steps": STEPS, "classes": {"HandOver": row}}))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[2:]))

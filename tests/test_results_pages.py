@@ -1,0 +1,129 @@
+"""Pages made of results as data: what their blocks show, and that the repository's are as its data say."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from bidex_meta.cli import main
+from bidex_meta.errors import BidexError
+from bidex_meta.results.pages import fill
+from bidex_meta.results.studies import read_studies
+from tests import test_collect
+from tests.pages import ROOT
+from tests.test_collect import collect, evaluated
+from tests.test_histories import log
+
+no_weights = test_collect.no_weights
+
+
+def test_pages_of_the_repository_are_as_its_data_say() -> None:
+    """Where this fails: make results."""
+    pages = [ROOT / "README.md", *sorted((ROOT / "docs" / "results").glob("*.md"))]
+    assert sum("<!-- results:" in page.read_text() for page in pages) >= 2
+    assert not [str(path) for page in pages for path in fill(page, ROOT / "results" / "data", check=True)]
+
+
+def test_every_file_of_data_is_read_and_small() -> None:
+    files = sorted((ROOT / "results" / "data").rglob("*.json"))
+    shown = {run.path for folder in {file.parent for file in files} for s in read_studies(folder.parent, folder.name) for run in s.runs}  # fmt: skip  # noqa: E501
+    assert shown == set(files) and all(file.stat().st_size < 40_000 for file in files)
+
+
+@pytest.fixture
+def page(tmp_path: Path) -> Path:
+    """A page of a study with two arms of two seeds."""
+    runs = [evaluated(tmp_path, seed, 0.5 + seed / 10, f"MT4-base-seed{seed}", gamma=0.9) for seed in (0, 1)]
+    runs += [evaluated(tmp_path, seed, 0.9, f"MT4-long | sight-seed{seed}", gamma=0.99) for seed in (0, 1)]
+    random = {name: {"success": 0.0, "return": 0.125} for name in "AB"}
+    for run in runs:
+        found = json.loads((run / "evaluation.json").read_text())
+        (run / "evaluation.json").write_text(json.dumps({**found, "random": {"classes": random}}))
+    assert collect(*runs, "--into", tmp_path / "data" / "tiny") == 0
+    path = tmp_path / "page.md"
+    path.write_text("# Page\n\n<!-- results: study=tiny -->\nold\n<!-- end -->\n\nafter\n")
+    return path
+
+
+def data(page: Path) -> Path:
+    return page.parent / "data"
+
+
+def cells(line: str) -> list[str]:
+    return [cell.strip() for cell in line.replace("\\|", "/").strip("|").split("|")]
+
+
+def test_a_block_shows_what_compare_computes(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert fill(page, data(page)) == [page]
+    assert fill(page, data(page)) == [] == fill(page, data(page), check=True)
+    text = page.read_text()
+    assert text.startswith("# Page\n\n<!-- results: study=tiny -->") and text.endswith("<!-- end -->\n\nafter\n")
+    assert "old" not in text
+    head, _, *rows = [cells(line) for line in text.splitlines() if line.startswith("|")]
+    rows = [dict(zip(head, row, strict=True)) for row in rows]
+    assert [row["arm"] for row in rows] == ["long / sight", "base", "uniform actions"], "the best first"
+    capsys.readouterr()
+    assert main(["compare", *map(str, sorted(data(page).glob("tiny/*base*"))), "--json"]) == 0
+    [known] = json.loads(capsys.readouterr().out)
+    value, ends = known["success_iqm"]["value"], known["success_iqm"]["interval"]
+    assert rows[1]["success, IQM"] == f"{100 * value:.1f} % [{100 * ends[0]:.1f}, {100 * ends[1]:.1f}]"
+    assert (rows[1]["seeds"], rows[1]["steps"], rows[1]["parameters"]) == ("2", "1,000", "12,345")
+    assert rows[1]["A"] == "5.5" and rows[1]["hours"] == f"{known['hours']:.2f}" and rows[2]["A"] == "0.125"
+
+
+def test_pictures_are_drawn_anew_where_the_data_changed(page: Path) -> None:
+    page.write_text("".join(f"<!-- results: study=tiny show={s} -->\n<!-- end -->\n" for s in ("curves", "points", "classes")))  # fmt: skip  # noqa: E501
+    written = fill(page, data(page))
+    assert [path.name for path in written] == ["tiny-curves.png", "tiny-points.png", "page.md"]
+    assert "![Return and success over training: tiny, MT4](tiny-curves.png)" in page.read_text()
+    assert "55 % (50 to 60)" in page.read_text()
+    assert fill(page, data(page), check=True) == []
+    changed = sorted(data(page).glob("tiny/*"))[0]
+    changed.write_text(changed.read_text().replace('"parameters": 12345', '"parameters": 12346'))
+    assert fill(page, data(page), check=True) == written[:2]
+
+
+def test_suites_of_the_same_classes_and_classes_alone_stand_beside_each_other(tmp_path: Path) -> None:
+    whole = evaluated(tmp_path, 0, 0.5, "MT4-base-seed0")
+    alone = [test_collect.run(tmp_path, 0, {name: 0.7}, "ppo", task=name) for name in "AB"]
+    other = test_collect.run(tmp_path, 0, {"C": 0.7}, "ppo", task="C", gamma=0.3)
+    for path in (*alone, other):
+        log(path, {"step": 1000, "Perf/training_time": 7.0})
+        shutil.copy(whole / "versions.json", path)
+    assert collect(whole, "--into", tmp_path / "data" / "x") == 0
+    assert collect(*alone, "--arm", "apart", "--into", tmp_path / "data" / "x") == 0
+    assert collect(other, "--arm", "other", "--into", tmp_path / "data" / "x") == 0
+    studies = read_studies(tmp_path / "data", "x")
+    assert [(study.on, [arm.group.label for arm in study.arms]) for study in studies] == [
+        ("C", ["other"]),
+        ("MT4", ["apart", "base"]),
+    ]
+    assert studies[1].arms[0].group.steps == 2000
+    assert [study.on for study in read_studies(tmp_path / "data", "x", on="C")] == ["C"]
+
+
+def test_an_arm_of_two_kinds_is_refused(page: Path, tmp_path: Path) -> None:
+    third = evaluated(tmp_path, 2, 0.5, "MT4-base-seed2", gamma=0.7)
+    assert collect(third, "--into", data(page) / "tiny") == 0
+    with pytest.raises(BidexError, match=r"both of the arm 'base', but learner.gamma is 0.7 and 0.9"):
+        fill(page, data(page))
+
+
+def test_bad_blocks_are_one_line(page: Path) -> None:
+    for words, told in (
+        ("show=table", "name its study"),
+        ("study=../up", "name its study"),
+        ("study=tiny show=tabel", "table"),
+        ("study=tiny colour=red", "option of a block"),
+        ("study", "name=value"),
+    ):
+        page.write_text(f"<!-- results: {words} -->\n<!-- end -->\n")
+        with pytest.raises(BidexError, match=told):
+            fill(page, data(page))
+    page.write_text("<!-- results: study=tiny -->\n")
+    with pytest.raises(BidexError, match="ends with"):
+        fill(page, data(page))
+    page.write_text("<!-- results: study=none -->\n<!-- end -->\n")
+    fill(page, data(page))
+    assert "No runs yet." in page.read_text()

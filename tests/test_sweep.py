@@ -1,0 +1,251 @@
+"""The queue: what a file asks for, order and pins, failures, a SIGKILL of everything, how long the rest takes."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bidex_meta.cli import main
+from bidex_meta.errors import BidexError
+from bidex_meta.sweep import workers
+from bidex_meta.sweep.plan import PlannedRun, read_sweep
+from bidex_meta.sweep.states import State, seconds_left, span, state_of
+from tests.pages import ROOT
+
+FILE = """
+name = "tiny"
+tasks = ["HandOver"]
+algos = ["ppo"]
+seeds = [0, 1]
+overrides = { steps = 6, num_envs = 8 }
+"""
+FAKE = (sys.executable, str(Path(__file__).with_name("fake_run.py")))
+CONFIG = {"steps": 6, "minutes": None, "num_envs": 8}
+
+
+@pytest.fixture
+def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(workers, "COMMAND", FAKE)
+    # Configs are `bidex-meta run`'s matter; the stand-in has but a few entries.
+    monkeypatch.setattr(
+        "bidex_meta.commands.sweep._configs", lambda sweep, _: {run.words: CONFIG for run in sweep.runs}
+    )
+    path = tmp_path / "sweep.toml"
+    path.write_text(FILE)
+    return path
+
+
+def starts(root: Path) -> dict[str, list[dict[str, Any]]]:
+    found = sorted(root.glob("runs/tiny/*/starts"))
+    return {path.parent.name: [json.loads(line) for line in path.read_text().splitlines()] for path in found}
+
+
+def through(run: PlannedRun) -> bool:
+    return state_of(run, CONFIG).state == "done"
+
+
+def test_seeds_are_outermost_and_words_are_those_of_run(tmp_path: Path) -> None:
+    path = tmp_path / "s.toml"
+    path.write_text(
+        'name = "two words"\nsuites = ["MT4", "own.toml"]\nalgos = ["mtppo"]\nseeds = [3, 1]\n'
+        "[overrides]\nsteps = 1_000\nlearner.hidden = [64, 32]\n[grid]\nlearner.gamma = [0.9, 0.99]\n"
+        '[[arms]]\nname = "my arm"\nalgo = "mtsac"\ntasks = ["HandOver"]\noverrides = { learner = { policy_heads = false } }\n'
+    )
+    sweep = read_sweep(path)
+    names = [run.name for run in sweep.runs]
+    half = len(names) // 2
+    assert all("seed3" in name for name in names[:half]) and all("seed1" in name for name in names[half:])
+    assert names[:5] == [
+        "MT4-mtppo-gamma=0.9-seed3", "own-mtppo-gamma=0.9-seed3", "MT4-mtppo-gamma=0.99-seed3",
+        "own-mtppo-gamma=0.99-seed3", "HandOver-my-arm-gamma=0.9-seed3",
+    ]  # fmt: skip
+    assert sweep.runs[1].words[0] == f"--suite={tmp_path / 'own.toml'}" and sweep.out == Path("runs/two-words")
+    assert sweep.runs[4].begin == [
+        "run", "--task=HandOver", "--algo=mtsac", "--steps=1000", "--learner.hidden", "64", "32", "--learner.gamma=0.9",
+        "--learner.no-policy-heads", "--seed=3", "--threads=1", "--run-dir=runs/two-words/HandOver-my-arm-gamma=0.9-seed3",
+    ]  # fmt: skip
+    assert sweep.runs[4].go_on == ["run", f"--resume={sweep.runs[4].path}", "--steps=1000"]
+
+
+@pytest.mark.parametrize(
+    "change, told",
+    [
+        (("seeds = [0, 1]", "seeds = []"), "seeds: expected a list, each entry a whole number"),
+        (("seeds = [0, 1]", "seeds = [0, 0]"), "two runs are called HandOver-ppo-seed0"),
+        (("algos", "algoss"), "algoss: Unknown entry 'algoss'"),
+        (('algos = ["ppo"]', ""), "expected algos"),
+        (('tasks = ["HandOver"]', ""), "expected suites or tasks"),
+        (('"tiny"', '"../up"'), "name: expected letters, digits"),
+        (("steps = 6", "seed = 6"), "overrides.seed: the file's"),
+        (("steps = 6", "threads = 6"), "overrides.threads: the file's"),
+        (("[0, 1]", "[0, 1]\ngrid = { num_envs = 3 }"), "grid.num_envs: expected a list of values"),
+        (("[0, 1]", '[0, 1]\narms = [{ name = "x" }]'), r"arms\[1\].algo: expected it to be there"),
+        (("[0, 1]", "[0, 1"), "expected a sweep in TOML"),
+    ],
+)
+def test_a_bad_file_is_one_line(file: Path, change: tuple[str, str], told: str) -> None:
+    file.write_text(FILE.replace(*change))
+    with pytest.raises(BidexError, match=told):
+        read_sweep(file)
+
+
+def test_what_run_would_refuse_is_told_before_anything_begins(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    for change, told in (
+        (('["ppo"]', '["ppoo"]'), "ppoo on HandOver: Unknown algo 'ppoo'"),
+        (('"HandOver"', '"HandOvr"'), "Unknown task 'HandOvr'"),
+        (("steps = 6", 'learner = { gama = "x" }'), "Unknown flag --learner.gama of bidex-meta run"),
+        (("steps = 6", "learner = { gamma = 3.0 }"), "gamma"),
+    ):
+        Path("s.toml").write_text(FILE.replace(*change))
+        assert main(["sweep", "s.toml"]) == 2
+        error = capsys.readouterr().err
+        assert told in error and error.count("\n") == 1 and not Path("runs").exists()
+
+
+def test_the_sweeps_of_the_repository_are_what_run_takes(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    for path in sorted((ROOT / "results" / "sweeps").glob("*.toml")):
+        if "seeds" in path.read_text():
+            assert main(["sweep", str(path), "--dry-run"]) == 0
+            assert f"--run-dir=runs/{path.stem}/" in capsys.readouterr().out
+    assert not (tmp_path / "runs").exists()
+
+
+def test_all_runs_end_in_order_and_on_their_core(file: Path, tmp_path: Path, capsys) -> None:
+    core = sorted(os.sched_getaffinity(0))[-1] if sys.platform == "linux" else 0
+    assert main(["sweep", str(file), "--cores", str(core)]) == 0
+    out = capsys.readouterr().out
+    assert out.count(" done ") == 2 and "2 done, 0 runs, 0 failed, 0 left" in out
+    begun = starts(tmp_path)
+    assert [len(each) for each in begun.values()] == [1, 1]
+    first, second = (each[0] for each in begun.values())
+    assert first["at"] < second["at"]
+    if sys.platform == "linux":
+        assert first["cores"] == second["cores"] == [core]
+        assert len(os.sched_getaffinity(0)) > 1 or os.cpu_count() == 1, "the sweep itself stays free"
+    assert main(["sweep", str(file)]) == 0 and starts(tmp_path) == begun, "nothing is run twice"
+    assert main(["sweep", str(file), "--dry-run"]) == 0
+
+
+def test_a_failure_is_told_stops_no_other_and_is_tried_again(file: Path, tmp_path: Path, capsys) -> None:
+    file.write_text(FILE.replace("[0, 1]", "[13, 1]"))
+    assert main(["sweep", str(file)]) == 1
+    told = capsys.readouterr()
+    assert "HandOver-ppo-seed13 failed: bidex-meta: the physics broke." in told.err
+    assert "1 done, 0 runs, 1 failed, 0 left" in told.out
+    assert main(["sweep", str(file), "--status"]) == 0
+    assert "the physics broke." in capsys.readouterr().out
+    assert main(["sweep", str(file)]) == 1
+    assert [len(each) for each in starts(tmp_path).values()] == [1, 2], "seed 1 once, seed 13 again"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="processes are found by /proc")
+@pytest.mark.parametrize("with_workers", [True, False])
+def test_a_sweep_that_was_killed_loses_no_run(file: Path, tmp_path: Path, with_workers: bool) -> None:
+    """SIGKILL for the sweep, and for its runs or not, which then go on and are waited for."""
+    code = (
+        "import sys; from pathlib import Path; from bidex_meta.sweep import workers; from bidex_meta.sweep.plan import "
+        f"read_sweep; from tests.test_sweep import through; workers.COMMAND = {FAKE!r}; "
+        "sys.exit(workers.work(read_sweep(Path('sweep.toml')).runs, [None, None], through, print))"
+    )
+    environment = {**os.environ, "FAKE_SECONDS": "0.4", "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "algos")])}
+    sweep = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL)
+    _wait(lambda: len(list(tmp_path.glob("runs/tiny/*/checkpoints/step"))) == 2)
+    runs = [int(path.name) for path in Path("/proc").iterdir() if path.name.isdigit() and _parent(path) == sweep.pid]
+    assert len(runs) == 2
+    sweep.kill()
+    sweep.wait()
+    for pid in runs if with_workers else ():
+        os.kill(pid, signal.SIGKILL)
+    _wait(lambda: not with_workers or not any(Path(f"/proc/{pid}/cwd").exists() for pid in runs))
+    assert main(["sweep", str(file), "--workers", "1"]) == 0
+    begun = starts(tmp_path)
+    assert [[start["resumed"] for start in each] for each in begun.values()] == [[False, True] if with_workers else [False]] * 2  # fmt: skip  # noqa: E501
+    for run in read_sweep(file).runs:
+        assert through(run) and [row["step"] for row in run.folder.metrics()] == [1, 2, 3, 4, 5, 6]
+
+
+def _parent(process: Path) -> int | None:
+    try:
+        return int((process / "stat").read_text().rpartition(")")[2].split()[1])
+    except OSError:
+        return None
+
+
+def _wait(so: Any, seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not so():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def test_one_sweep_works_in_a_folder_and_a_changed_file_is_noticed(file: Path, tmp_path: Path, capsys) -> None:
+    with workers.alone(tmp_path / "runs" / "tiny"):
+        assert main(["sweep", str(file)]) == 2
+        assert "Another sweep works in" in capsys.readouterr().err
+    assert main(["sweep", str(file)]) == 0
+    with pytest.raises(BidexError, match="num_envs is 8 there, not 16"):
+        state_of(read_sweep(file).runs[0], {**CONFIG, "num_envs": 16})
+    more = state_of(read_sweep(file).runs[0], {**CONFIG, "steps": 12})
+    assert (more.state, more.step, more.speed) == ("left", 6, 2.0), "more steps: the run goes on"
+
+
+@pytest.mark.parametrize(
+    "asked, count, told",
+    [("x", None, "expected numbers"), ("0-1-2", None, "expected numbers"), ("99999", None, "expected some of"),
+     (None, 100_000, "expected at most")],
+)  # fmt: skip
+def test_cores_that_are_not_there(asked: str | None, count: int | None, told: str) -> None:
+    with pytest.raises(BidexError, match=told):
+        workers.choose_cores(asked, count)
+
+
+def test_how_long_the_rest_takes() -> None:
+    def state(
+        arm: str, subject: str, step: int, seconds: float, goal: int = 100, minutes: float | None = None
+    ) -> State:
+        run = PlannedRun(Path("x"), arm, subject, 0, ())
+        return State(run, "done" if step == goal else "left", step, goal, minutes, seconds)
+
+    states = [
+        state("a", "MT4", 100, 10.0),  # 10 steps/s
+        state("a", "MT4", 0, 0.0),  # as its like: 10 s
+        state("b", "MT4", 50, 10.0),  # its own 5 steps/s: 10 s
+        state("c", "MT4", 0, 0.0),  # mean of the suite's: 13.3 s
+        state("a", "MT20", 0, 0.0, minutes=0.1),  # time ends it: 6 s
+    ]
+    left = seconds_left(states)
+    assert left == [0.0, 10.0, 10.0, pytest.approx(100 / 7.5), 6.0]
+    assert span(left, 1) == pytest.approx(26 + 100 / 7.5) and span(left, 2) == pytest.approx(10 + 100 / 7.5)
+    assert seconds_left([state("a", "MT4", 0, 0.0)]) == [None]
+
+
+def test_submit_without_submitit_is_one_line(file: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setitem(sys.modules, "submitit", None)
+    assert main(["sweep", str(file), "--submit", "slurm"]) == 2
+    assert "bidex-meta[slurm]" in capsys.readouterr().err
+
+
+def test_jobs_of_the_local_executor(file: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+    submitit = pytest.importorskip("submitit", reason="needs the extra slurm")
+    from bidex_meta.sweep import cluster
+
+    sweep = read_sweep(file)
+    monkeypatch.setattr(submitit, "__version__", submitit.__version__)
+    monkeypatch.setenv("BIDEX_FAKE", "1")
+    jobs = cluster.submit(sweep.runs, sweep.out, "local", {"timeout_min": 2})
+    for job in jobs.values():
+        assert job.result() is None
+    assert all(through(run) for run in sweep.runs)
+    with pytest.raises(BidexError, match="submitit: "):
+        cluster.submit(sweep.runs, sweep.out, "local", {"timeout": 2})
+    again = cluster.Job(sweep.runs[0]).checkpoint()
+    assert again.function.run == sweep.runs[0]
