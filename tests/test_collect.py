@@ -68,6 +68,7 @@ def test_what_a_file_keeps(tmp_path: Path) -> None:
     assert curves["Train/success/A"][0] == pytest.approx((first + 1) / 2 / 500, rel=1e-3)
     assert content["evaluation"]["policy"]["classes"]["A"]["success"] == 0.33333
     assert (content["suite"], content["parameters"]) == ({"name": "MT4", "version": 1}, 7)
+    assert content["engine"] == "c"
     path = tmp_path / "x.json"
     path.write_bytes(condensing.told(content))
     assert json.loads(path.read_bytes()) == content and len(path.read_bytes()) < condensing.MOST_BYTES

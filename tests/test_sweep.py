@@ -56,7 +56,8 @@ def test_seeds_are_outermost_and_words_are_those_of_run(tmp_path: Path) -> None:
     path.write_text(
         'name = "two words"\nsuites = ["MT4", "own.toml"]\nalgos = ["mtppo"]\nseeds = [3, 1]\n'
         "[overrides]\nsteps = 1_000\nlearner.hidden = [64, 32]\n[grid]\nlearner.gamma = [0.9, 0.99]\n"
-        '[[arms]]\nname = "my arm"\nalgo = "mtsac"\ntasks = ["HandOver"]\noverrides = { learner = { policy_heads = false } }\n'
+        '[[arms]]\nname = "my arm"\nalgo = "mtsac"\ntasks = ["HandOver"]\n'
+        "overrides = { learner = { policy_heads = false } }\n"
     )
     sweep = read_sweep(path)
     names = [run.name for run in sweep.runs]
@@ -69,7 +70,8 @@ def test_seeds_are_outermost_and_words_are_those_of_run(tmp_path: Path) -> None:
     assert sweep.runs[1].words[0] == f"--suite={tmp_path / 'own.toml'}" and sweep.out == Path("runs/two-words")
     assert sweep.runs[4].begin == [
         "run", "--task=HandOver", "--algo=mtsac", "--steps=1000", "--learner.hidden", "64", "32", "--learner.gamma=0.9",
-        "--learner.no-policy-heads", "--seed=3", "--threads=1", "--run-dir=runs/two-words/HandOver-my-arm-gamma=0.9-seed3",
+        "--learner.no-policy-heads", "--seed=3", "--threads=1",
+        "--run-dir=runs/two-words/HandOver-my-arm-gamma=0.9-seed3",
     ]  # fmt: skip
     assert sweep.runs[4].go_on == ["run", f"--resume={sweep.runs[4].path}", "--steps=1000"]
 
@@ -137,13 +139,15 @@ def test_all_runs_end_in_order_and_on_their_core(file: Path, tmp_path: Path, cap
 
 def test_a_failure_is_told_stops_no_other_and_is_tried_again(file: Path, tmp_path: Path, capsys) -> None:
     file.write_text(FILE.replace("[0, 1]", "[13, 1]"))
-    assert main(["sweep", str(file)]) == 1
+    with pytest.raises(SystemExit, match="1"):
+        main(["sweep", str(file)])
     told = capsys.readouterr()
     assert "HandOver-ppo-seed13 failed: bidex-meta: the physics broke." in told.err
     assert "1 done, 0 runs, 1 failed, 0 left" in told.out
     assert main(["sweep", str(file), "--status"]) == 0
     assert "the physics broke." in capsys.readouterr().out
-    assert main(["sweep", str(file)]) == 1
+    with pytest.raises(SystemExit, match="1"):
+        main(["sweep", str(file)])
     assert [len(each) for each in starts(tmp_path).values()] == [1, 2], "seed 1 once, seed 13 again"
 
 
@@ -235,12 +239,10 @@ def test_submit_without_submitit_is_one_line(file: Path, monkeypatch, capsys) ->
 
 
 def test_jobs_of_the_local_executor(file: Path, tmp_path: Path, monkeypatch, capsys) -> None:
-    submitit = pytest.importorskip("submitit", reason="needs the extra slurm")
+    pytest.importorskip("submitit", reason="needs the extra slurm")
     from bidex_meta.sweep import cluster
 
     sweep = read_sweep(file)
-    monkeypatch.setattr(submitit, "__version__", submitit.__version__)
-    monkeypatch.setenv("BIDEX_FAKE", "1")
     jobs = cluster.submit(sweep.runs, sweep.out, "local", {"timeout_min": 2})
     for job in jobs.values():
         assert job.result() is None
@@ -249,3 +251,27 @@ def test_jobs_of_the_local_executor(file: Path, tmp_path: Path, monkeypatch, cap
         cluster.submit(sweep.runs, sweep.out, "local", {"timeout": 2})
     again = cluster.Job(sweep.runs[0]).checkpoint()
     assert again.function.run == sweep.runs[0]
+
+
+@pytest.mark.slow
+def test_real_runs_survive_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two small runs of PPO, killed with their sweep while they train, end as if nothing had been."""
+    monkeypatch.chdir(tmp_path)
+    Path("s.toml").write_text(
+        FILE.replace("steps = 6, num_envs = 8", 'steps = 20_000, num_envs = 64, episodes = 1, logger = "none"')
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "algos")])}
+    command = [sys.executable, "-m", "bidex_meta.cli", "sweep", "s.toml"]
+    sweep = subprocess.Popen(command, env=environment, start_new_session=True)
+    first, second = read_sweep(Path("s.toml")).runs
+    _wait(lambda: first.folder.metrics_path.is_file() and len(first.folder.metrics()) > 5, 300)
+    runs = [int(path.name) for path in Path("/proc").iterdir() if path.name.isdigit() and _parent(path) == sweep.pid]
+    sweep.kill()
+    sweep.wait()
+    for pid in runs:
+        os.kill(pid, signal.SIGKILL)
+    assert len(runs) == 1 and not first.folder.evaluated
+    subprocess.run(command, env=environment, check=True)
+    for run in (first, second):
+        steps = [row["step"] for row in run.folder.metrics()]
+        assert run.folder.evaluated and steps == sorted(set(steps)) and steps[-1] >= 20_000

@@ -3,7 +3,7 @@
 ::
 
     {"format": 1, "name": ..., "arm": ..., "suite": {"name", "version"}, "config": {...}, "versions": {...},
-     "steps": N, "seconds": S, "parameters": P,
+     "engine": "c", "steps": N, "seconds": S, "parameters": P,
      "curves": {"step": [...], "Train/return/<class>": [...], ...},
      "evaluation": {...}}
 
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from bidex_meta.errors import BidexError
-from bidex_meta.reading import TABLE, TEXT, Rule, check, number, read_json, whole
+from bidex_meta.reading import TABLE, TEXT, Rule, check, choice, number, read_json, whole
 from bidex_meta.record.folder import RunFolder
 from bidex_meta.record.schemas import check_config, check_evaluation, check_versions
 
@@ -35,6 +35,7 @@ _RULES = {
     "suite": TABLE.or_none(),
     "config": TABLE,
     "versions": TABLE,
+    "engine": choice("c", "warp"),
     "steps": whole(0),
     "seconds": number(0.0, 1e12),
     "parameters": whole(0).or_none(),

@@ -58,6 +58,7 @@ def condensed(folder: RunFolder, arm: str, parameters: int | None) -> dict[str, 
         "suite": _suite(config),
         "config": _without_places(config),
         "versions": versions,
+        "engine": _engine(config),
         "steps": steps,
         "seconds": _rounded(training_seconds(rows), 6),
         "parameters": parameters,
@@ -118,6 +119,14 @@ def _suite(config: dict[str, Any]) -> dict[str, Any] | None:
         return {"name": name, "version": load_suite(name).version if name in suite_names() else None}
     suite = load_suite(Path(name))
     return {"name": suite.name, "version": suite.version, "file": read_text(Path(name), "a suite file")}
+
+
+def _engine(config: dict[str, Any]) -> str:
+    """The physics that stepped it: what auto means by the run's device (bidex_meta.engine.choice)."""
+    asked = config.get("engine", "auto")
+    if asked != "auto":
+        return asked
+    return "warp" if str(config.get("device", "cpu")).startswith("cuda") else "c"
 
 
 def _without_places(config: dict[str, Any]) -> dict[str, Any]:

@@ -8,8 +8,8 @@ from typing import Any, Literal
 
 from bidex_meta.errors import BidexError, one_line
 from bidex_meta.reading import is_file, read_text
+from bidex_meta.sweep import workers
 from bidex_meta.sweep.plan import PlannedRun
-from bidex_meta.sweep.workers import ended, start
 
 Where = Literal["slurm", "local"]
 _DEFAULTS = {"timeout_min": 24 * 60, "cpus_per_task": 1}
@@ -23,13 +23,13 @@ class Job:
     """
 
     def __init__(self, run: PlannedRun) -> None:
-        self.run = run
+        self.run, self.command = run, workers.COMMAND  # of the machine that submits: the same environment
         self._process: subprocess.Popen[bytes] | None = None
 
     def __call__(self) -> str | None:
         """Run to the end; why it failed, or None."""
-        self._process = start(self.run)
-        return ended(self.run, self._process.wait(), self.run.folder.evaluated)
+        self._process = workers.start(self.run, command=self.command)
+        return workers.ended(self.run, self._process.wait(), self.run.folder.evaluated)
 
     def checkpoint(self) -> Any:
         """What submitit queues again when it is told that the job must end."""

@@ -22,19 +22,20 @@ COMMAND = (sys.executable, "-m", "bidex_meta.cli")
 """What a run's words are given to."""
 
 
-def start(run: PlannedRun, core: int | None = None) -> subprocess.Popen[bytes]:
+def start(run: PlannedRun, core: int | None = None, command: Sequence[str] | None = None) -> subprocess.Popen[bytes]:
     """Begins or continues a run, in a session of its own: what stops the sweep need not stop it.
 
     Args:
         run: The run.
         core: The core that it shall keep to, where the system can bind processes.
+        command: What its words are given to; None: ``COMMAND``.
     """
     words = run.go_on if exists(run.folder.config_path) else run.begin
     run.path.parent.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     with log_path(run).open("ab") as log, _bound(core):
         return subprocess.Popen(
-            [*COMMAND, *words],
+            [*(command or COMMAND), *words],
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
