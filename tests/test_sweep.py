@@ -191,6 +191,23 @@ def _wait(so: Any, seconds: float = 60.0) -> None:
         time.sleep(0.05)
 
 
+def test_a_sweep_that_is_not_through_is_collected_as_far_as_it_is(
+    file: Path, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    monkeypatch.setattr("bidex_meta.commands.collect._parameters", lambda folder: 1)
+    collect = ["collect", "sweep.toml", "--into", "data"]
+    assert main(collect) == 2 and "no run of it has ended" in capsys.readouterr().err
+    assert main(["sweep", str(file)]) == 0
+    file.write_text(FILE.replace("[0, 1]", "[0, 1, 2]"))
+    runs = read_sweep(file).runs[:2]
+    for run in runs:
+        (run.path / "versions.json").write_text('{"git": {"commit": "0123456789"}}')
+    assert main(collect) == 0
+    told = capsys.readouterr()
+    assert told.out.split() == [f"data/{run.name}.json" for run in runs] and "1 of 3 runs have not ended" in told.err
+    assert json.loads(Path(told.out.split()[0]).read_text())["arm"] == "ppo"
+
+
 def test_one_sweep_works_in_a_folder_and_a_changed_file_is_noticed(file: Path, tmp_path: Path, capsys) -> None:
     with workers.alone(tmp_path / "runs" / "tiny"):
         assert main(["sweep", str(file)]) == 2

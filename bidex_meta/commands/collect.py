@@ -1,5 +1,6 @@
 """``bidex-meta collect``: evaluated runs as files of JSON, small enough for a repository."""
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +25,7 @@ class CollectFlags:
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
-    """Run folders, or the files of sweeps, of which every run must have ended."""
+    """Run folders, or the files of sweeps, of which the runs that have ended are taken."""
     into: Path | None = None
     """Folder of the files; each is called as its run folder."""
     out: Path = Path("runs")
@@ -71,7 +72,16 @@ def _named(flags: CollectFlags) -> list[tuple[Path, str | None]]:
     found: list[tuple[Path, str | None]] = []
     for path in flags.runs:
         of_sweep = path.suffix == ".toml" and not path.is_dir()
-        found += [(run.path, run.arm) for run in read_sweep(path, flags.out).runs] if of_sweep else [(path, flags.arm)]
+        if not of_sweep:
+            found.append((path, flags.arm))
+            continue
+        runs = read_sweep(path, flags.out).runs
+        ended = [(run.path, flags.arm or run.arm) for run in runs if run.folder.evaluated]
+        if not ended:
+            raise BidexError(f"{path}: no run of it has ended under {flags.out}. Run it: bidex-meta sweep {path}")
+        if len(ended) < len(runs):
+            print(f"{path}: {len(runs) - len(ended)} of {len(runs)} runs have not ended: left out.", file=sys.stderr)
+        found += ended
     return found
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -9,12 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from bidex_meta.errors import BidexError
-from bidex_meta.reading import bounded, exists, read_bytes, whole
+from bidex_meta.reading import bounded, exists, open_regular, read_bytes, whole
 from bidex_meta.record.atomic import write_atomic
 from bidex_meta.record.writers import Writer, make_writer
 
 _MOST_BYTES = 4_000_000_000
 """Of a ``metrics.jsonl``; a line an iteration is some kilobytes."""
+_TAIL = 65_536
 
 
 class MetricsWriter:
@@ -67,6 +69,14 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
         BidexError: There is no such file, or something else in its place.
     """
     return [row for _, row in _lines(path) if row is not None]
+
+
+def last_rows(path: Path) -> list[dict[str, Any]]:
+    """The last lines of a ``metrics.jsonl`` that can be read, without reading all of a long file; errors as there."""
+    with open_regular(path, "a run's metrics", _MOST_BYTES) as file:
+        file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL))
+        rows = [_row(line) for line in file.read().split(b"\n") if line.strip()]
+    return [row for row in rows if row is not None]  # a first one that was cut in two cannot be read
 
 
 def training_seconds(rows: Sequence[Mapping[str, Any]]) -> float:

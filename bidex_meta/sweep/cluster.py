@@ -58,6 +58,7 @@ def submit(runs: Sequence[PlannedRun], out: Path, where: Where, parameters: Mapp
     """
     try:
         import submitit
+        from submitit.core.utils import FailedJobError
     except ImportError:
         raise BidexError("--submit needs submitit: pip install 'bidex-meta[slurm]'.") from None
     folder = (out / "jobs").resolve()
@@ -77,7 +78,7 @@ def submit(runs: Sequence[PlannedRun], out: Path, where: Where, parameters: Mapp
         TypeError,
         ValueError,
         AssertionError,
-        submitit.core.utils.FailedJobError,
+        FailedJobError,
     ) as error:
         raise BidexError(
             f"submitit: {one_line(error)[:300].rstrip('.')}. Mend the file's [slurm], or --submit."

@@ -11,7 +11,7 @@ from typing import Any
 from bidex_meta.errors import BidexError, one_line
 from bidex_meta.reading import exists, is_file
 from bidex_meta.record.folder import flat
-from bidex_meta.record.metrics import training_seconds
+from bidex_meta.record.metrics import last_rows, training_seconds
 from bidex_meta.sweep.plan import PlannedRun
 
 _FREE = ("steps", "minutes", "evaluate_every", "video_every", "logger", "threads", "seed", "device")
@@ -60,7 +60,9 @@ def state_of(run: PlannedRun, config: Mapping[str, Any]) -> State:
         return State(run, "failed" if why else "left", 0, goal, minutes, 0.0, why)
     _refuse_another(run, config)
     if is_file(run.folder.metrics_path):
-        rows = run.folder.metrics()
+        rows = last_rows(run.folder.metrics_path)
+        if rows and rows[-1].get("Perf/training_time") is None:
+            rows = run.folder.metrics()  # of an older version
         step, seconds = (rows[-1]["step"] if rows else 0), training_seconds(rows)
     why = ""
     if locked(run):

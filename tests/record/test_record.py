@@ -9,6 +9,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.record import MetricsWriter, Progress, RunFolder, read_metrics, training_seconds
 from bidex_meta.record import progress as progress_module
 from bidex_meta.record.curves import Curve
+from bidex_meta.record.metrics import last_rows
 from bidex_meta.record.plots import draw_adaptation, draw_learning, read_evaluation, save, svg
 from bidex_meta.record.video import check_suffix, write_image, write_video
 
@@ -207,3 +208,12 @@ def test_endings_and_the_missing_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "imageio_ffmpeg", None)
     with pytest.raises(BidexError, match=r"bidex-meta\[video\]"):
         write_video(tmp_path / "a.mp4", [], fps=60)
+
+
+def test_the_last_rows_are_those_of_the_whole_file(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    path.write_text("".join(json.dumps({"step": i, "x": 0.1234567}) + "\n" for i in range(5000)) + '{"torn')
+    found = last_rows(path)
+    assert 100 < len(found) < 5000 and found == read_metrics(path)[-len(found) :]
+    path.write_text('{"step": 1}\n')
+    assert last_rows(path) == [{"step": 1}]
