@@ -202,6 +202,7 @@ def test_a_sweep_that_is_not_through_is_collected_as_far_as_it_is(
     runs = read_sweep(file).runs[:2]
     for run in runs:
         (run.path / "versions.json").write_text('{"git": {"commit": "0123456789"}}')
+    capsys.readouterr()
     assert main(collect) == 0
     told = capsys.readouterr()
     assert told.out.split() == [f"data/{run.name}.json" for run in runs] and "1 of 3 runs have not ended" in told.err
