@@ -14,6 +14,7 @@ import numpy as np
 
 from bidex_meta.errors import BidexError, shortened, unknown_name
 from bidex_meta.memory import ROW_BYTES, check_memory
+from bidex_meta.outside import name_with_object
 from bidex_meta.suite import SPLITS, ListedTask, Split, Suite, SuiteClass, load_suite
 from bidex_meta.tasks import registry
 
@@ -199,11 +200,12 @@ class Benchmark:
         )
 
     def _draw(self, entry: SuiteClass, split: Split) -> list[Task]:
-        space = self._classes[entry.name].variation_space
+        # By the class's name, so that all objects of a class have the same goals.
+        space, key = self._classes[entry.name].variation_space, entry.class_name
         if entry.tasks:
             listed = [task for task in entry.tasks if task.split == split]
-            return [Task.from_variation(entry.name, _listed(space, self.seed, entry.name, task)) for task in listed]
-        return _drawn(space, self.seed, entry.name, split, self.suite.tasks_per_class or 0)
+            return [Task.from_variation(entry.name, _listed(space, self.seed, key, task)) for task in listed]
+        return _drawn(space, self.seed, key, split, self.suite.tasks_per_class or 0, entry.name)
 
     def _env_classes(self, split: Split) -> "dict[str, type[SuiteEnv]]":
         from bidex_meta.envs.suite_env import EnvRecipe
@@ -211,7 +213,13 @@ class Benchmark:
         moving, hides = True if self.suite.base == "moving" else None, self.suite.observation == "masked"
         return {
             entry.name: EnvRecipe(
-                entry.name, moving, tuple(entry.options.items()), self.padded_size, hides, entry.reward_scale
+                entry.name,
+                moving,
+                tuple(entry.options.items()),
+                self.padded_size,
+                hides,
+                entry.reward_scale,
+                entry.class_name,
             ).make_class()
             for entry in self.suite.split_classes(split)
         }
@@ -250,6 +258,7 @@ def make_task_world(
     moving_base: bool | None = None,
     engine: str = "auto",
     stagger: bool = True,
+    object: str | None = None,  # noqa: A002  (as in suite files)
 ) -> "World":
     """A world of one class as it is on its own: goal visible, no one-hot, no padding, 50 tasks drawn by the seed.
 
@@ -266,17 +275,19 @@ def make_task_world(
         moving_base: Drive the hands' bases or fix them; left out, as the class has it on its own.
         engine: As in `Benchmark.make_world`.
         stagger: As in `Benchmark.make_world`.
+        object: What the class has in the place of its own object: a name, or the path of an MJCF file
+            (docs/objects.md); its slot is then called e.g. `CatchUnderarm-block`.
 
     Raises:
-        BidexError: Unknown class, too few rows, an unknown mode, device or engine.
+        BidexError: Unknown class or object, too few rows, an unknown mode, device or engine.
     """
     from bidex_meta.world import Slot
     from bidex_meta.world.autoreset import checked_mode
 
     task_name = registry.resolve(task_name)
-    task_class = registry.get(task_name, moving_base)
+    task_class = registry.get(task_name, moving_base, **registry.with_object(object))
     tasks = _drawn(task_class.variation_space, _checked_seed(seed), task_name, "train", _TASKS_ALONE)
-    slot = Slot(task_name, task_class, np.stack([task.variation for task in tasks]))
+    slot = Slot(name_with_object(task_name, object), task_class, np.stack([task.variation for task in tasks]))
     if task_sampling is None:
         task_sampling = "fixed" if checked_mode(autoreset_mode).name == "DISABLED" else "uniform"
     return _make_world(
@@ -337,7 +348,7 @@ def _make_world(
 
 def _task_class(suite: Suite, entry: SuiteClass) -> "TaskClass":
     try:
-        task_class = registry.get(entry.name, True if suite.base == "moving" else None, **entry.options)
+        task_class = registry.get(entry.class_name, True if suite.base == "moving" else None, **entry.options)
         for task in entry.tasks:
             for component in task.fixed:
                 if component not in task_class.variation_space.names:
@@ -353,9 +364,11 @@ def _generator(*key: object) -> np.random.Generator:
     return np.random.Generator(np.random.Philox(np.random.SeedSequence(int.from_bytes(digest, "little"))))
 
 
-def _drawn(space: "VariationSpace", seed: int, name: str, split: Split, count: int) -> list[Task]:
+def _drawn(
+    space: "VariationSpace", seed: int, name: str, split: Split, count: int, called: str | None = None
+) -> list[Task]:
     variations = space.sample(_generator(seed, name, split), count)
-    return [Task.from_variation(name, variation) for variation in variations]
+    return [Task.from_variation(called or name, variation) for variation in variations]
 
 
 def _listed(space: "VariationSpace", seed: int, name: str, task: ListedTask) -> np.ndarray:
