@@ -258,7 +258,7 @@ def make_task_world(
     moving_base: bool | None = None,
     engine: str = "auto",
     stagger: bool = True,
-    object: str | None = None,  # noqa: A002  (as in suite files)
+    object: str | None = None,
 ) -> "World":
     """A world of one class as it is on its own: goal visible, no one-hot, no padding, 50 tasks drawn by the seed.
 

@@ -137,7 +137,7 @@ def _parse(file: Path) -> Suite:
 def _parse_classes(table: "_Table") -> list[SuiteClass]:
     """A class, or with `objects` one for each of them."""
     entry = _parse_class(table)
-    objects = table.objects("objects") if "objects" in table.content else []
+    objects = table.things("objects") if "objects" in table.content else []
     table.finish()
     given = entry.options.get("object")
     if objects and given is not None:
@@ -178,7 +178,7 @@ def _parse_options(table: "_Table") -> dict[str, float | str]:
 
     def parsed(key: str) -> float | str:
         if key == "object":
-            return options.object(key)
+            return options.thing(key)
         # A whole number stays one: it may count something.
         return options.number(key) if isinstance(options.content[key], float) else options.count(key)
 
@@ -257,11 +257,11 @@ class _Table:
             raise self.error(key, f"printable text of at most {_LONGEST_TEXT} letters", value)
         return value
 
-    def object(self, key: str) -> str:
+    def thing(self, key: str) -> str:
         """An object's name; of a file its path, which is relative to the suite file's folder."""
         return self._placed(self.text(key))
 
-    def objects(self, key: str) -> list[str]:
+    def things(self, key: str) -> list[str]:
         values = self._get(key, "a list of objects", _REQUIRED)
         fits = isinstance(values, list) and 0 < len(values) <= _MOST_TABLES
         if not fits or not all(isinstance(value, str) and value.strip() and value.isprintable() for value in values):

@@ -142,9 +142,7 @@ def acting(policy: str, world: Any, seed: int, which: str = "last") -> Agent:
     return policy_of(folder, state, "cpu")
 
 
-def looked_at(
-    policy: str, suite: str | None, task: str | None, seed: int, thing: str | None = None
-) -> Source:
+def looked_at(policy: str, suite: str | None, task: str | None, seed: int, thing: str | None = None) -> Source:
     """The worlds in which a policy is looked at: those of its run, or of a suite or a task that is named.
 
     Args:

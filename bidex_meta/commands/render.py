@@ -26,8 +26,8 @@ class RenderFlags:
     task: str | None = None
     """Task class; None: the run's first one."""
     object: str | None = None
-    """With --task alone: another object of the class, of the shelf or an MJCF file (docs/objects.md); None: the run's, or
-    the class's own."""
+    """With --task alone: another object of the class, of the shelf or an MJCF file (docs/objects.md); None: the run's,
+    or the class's own."""
     out: Path | None = None
     """File to write: .png for a picture, .mp4 for a film, .webp for one that web pages show; None, of a run: a film in
     its folder videos/."""

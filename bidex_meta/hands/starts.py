@@ -153,9 +153,7 @@ def _in_palm(position: Tensor, joints: Tensor, axes: tuple[Tensor, Tensor, Tenso
     return torch.stack([dot(relative, a) for a in axes], dim=1)
 
 
-def _clear(
-    joints: Tensor, centre: Tensor, y_axis: Tensor, reach: Tensor, support: _Support
-) -> tuple[Tensor, Tensor]:
+def _clear(joints: Tensor, centre: Tensor, y_axis: Tensor, reach: Tensor, support: _Support) -> tuple[Tensor, Tensor]:
     """Joints with opened fingers and the shift off the palm; ``reach`` is the support towards it, (n,)."""
     lift = (reach + _PALM_HALF_THICKNESS - _SLACK + centre[:, 1]).clamp(min=0.0)
     centre = torch.stack((centre[:, 0], centre[:, 1] - lift, centre[:, 2]), dim=1)
@@ -172,9 +170,7 @@ def _clear(
     return joints, -lift[:, None] * y_axis
 
 
-def _gap(
-    centre: Tensor, support: _Support, start: Tensor, along: Tensor, length: Tensor
-) -> Tensor:
+def _gap(centre: Tensor, support: _Support, start: Tensor, along: Tensor, length: Tensor) -> Tensor:
     """Lower bound of the distance between a body and line segments, by its support towards the nearest point."""
     to_centre = centre - start
     t = dot(to_centre, along).clamp(min=0.0).minimum(length)

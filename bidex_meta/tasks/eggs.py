@@ -142,7 +142,7 @@ class OneEgg(TaskClass):
     start_draws: ClassVar[int] = JOINT_DRAWS + 5
     solver = LIGHT
 
-    def __init__(self, moving_base: bool | None = None, object: str = EGG) -> None:  # noqa: A002  (as users write it)
+    def __init__(self, moving_base: bool | None = None, object: str = EGG) -> None:
         """Chooses base and object.
 
         Args:

@@ -43,7 +43,7 @@ class TwoCatchUnderarm(TaskClass):
     start_draws = eggs.JOINT_DRAWS + 5
     solver = LIGHT
 
-    def __init__(self, moving_base: bool | None = None, object: str = EGG) -> None:  # noqa: A002  (as users write it)
+    def __init__(self, moving_base: bool | None = None, object: str = EGG) -> None:
         """Chooses base and object, of which there are two.
 
         Args:
@@ -94,9 +94,7 @@ class TwoCatchUnderarm(TaskClass):
         """Noisy hands with an egg on each."""
         eggs.start_hands(draws[:, : eggs.JOINT_DRAWS], 0.2, qpos)
         for name, side, pose in (("object1", "right", self.right), ("object2", "left", self.left)):
-            eggs.put_down(
-                qpos[name], self.held, draws[:, eggs.JOINT_DRAWS :], _NOISE, qpos[f"{side}/joints"], pose
-            )
+            eggs.put_down(qpos[name], self.held, draws[:, eggs.JOINT_DRAWS :], _NOISE, qpos[f"{side}/joints"], pose)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         """The goal blocks of both eggs."""

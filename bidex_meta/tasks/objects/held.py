@@ -19,7 +19,7 @@ from bidex_meta.hands.starts import make_room_for
 from bidex_meta.maths import conjugate, constant, multiply, rotate, wxyz, xyzw
 from bidex_meta.reading import expanded
 from bidex_meta.tasks.objects.outline import extents, outline
-from bidex_meta.tasks.objects.own_file import compiled, read_own
+from bidex_meta.tasks.objects.own_file import compiled, read_own, set_contacts
 from bidex_meta.tasks.scene import attach
 
 EGG = "egg"
@@ -28,8 +28,6 @@ _MASS = (0.002, 2.0)
 _LONGEST, _SHORTEST = 0.25, 0.01
 """The longest edge of the box around an object, metres: a hand is 20 cm long from the wrist to the middle fingertip."""
 _MOST_GEOMS = 32
-_CONTACT = {"solref": (0.0084, 1.0), "solimp": (0.95, 0.99, 0.001), "margin": 0.002}
-"""As those of the files under assets/objects: as stiff as the time step allows (bidex_meta/hands/README.md)."""
 _MOST_FRICTION = 5.0
 _PALM_UP = HandPose((0.0, 0.0, 0.0), PALM_UP_AWAY)
 
@@ -85,9 +83,9 @@ class HeldObject:
         for joint in body.joints:
             part.delete(joint)
         body.add_freejoint(name="free")
+        set_contacts(part)
         for geom in part.geoms:
-            geom.solref[:2], geom.solimp[:3] = _CONTACT["solref"], _CONTACT["solimp"]
-            geom.margin, geom.gap, geom.priority, geom.condim = _CONTACT["margin"], 0.0, 0, 3
+            geom.condim = 3
         for sensor, kind in _SENSORS.items():
             part.add_sensor(name=sensor, type=kind, objtype=mujoco.mjtObj.mjOBJ_XBODY, objname="object")
         attach(scene, part, name, position, (1.0, 0.0, 0.0, 0.0), colour)
@@ -218,10 +216,14 @@ def _loaded(file: Path, _state: tuple[int, int]) -> HeldObject:
 def _check_figures(file: Path, model: mujoco.MjModel, low: np.ndarray, high: np.ndarray) -> None:
     mass, longest = float(model.body_mass[1]), float((high - low).max())
     if not _MASS[0] <= mass <= _MASS[1]:
-        raise BidexError(f"{file}: expected a mass of {_MASS[0]:g} to {_MASS[1]:g} kg, got {mass:.4g}. Mend mass or density.")
+        raise BidexError(
+            f"{file}: expected a mass of {_MASS[0]:g} to {_MASS[1]:g} kg, got {mass:.4g}. Mend mass or density."
+        )
     if not _SHORTEST <= longest <= _LONGEST:
         told = f"{100 * _SHORTEST:g} to {100 * _LONGEST:g} cm on its longest side, which fits a hand"
-        raise BidexError(f"{file}: expected an object of {told}, got {100 * longest:.4g} cm. Scale it (MJCF is in metres).")
+        raise BidexError(
+            f"{file}: expected an object of {told}, got {100 * longest:.4g} cm. Scale it (MJCF is in metres)."
+        )
     if (low > 0.0).any() or (high < 0.0).any():
         raise BidexError(f"{file}: expected the body's origin inside its shape, got it outside. Shift the geoms.")
     if max(-low.min(), high.max()) > 0.5 * _LONGEST:

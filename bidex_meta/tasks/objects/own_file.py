@@ -17,10 +17,13 @@ _MOST_BYTES, _MOST_MESH_BYTES = 1_000_000, 20_000_000
 _MOST_TAGS = 2_000
 _DEEPEST = 32
 _TAGS = frozenset(
-    "mujoco compiler default asset material texture mesh worldbody body inertial geom joint freejoint site".split()
+    ("mujoco", "compiler", "default", "asset", "material", "texture", "mesh", "worldbody", "body", "inertial", "geom")
+    + ("joint", "freejoint", "site")
 )
 """What a file may hold; sensors may stand in a file that names points (``points=True``)."""
-_SENSOR_TAGS = frozenset("sensor framepos framequat framelinvel frameangvel".split())
+_SENSOR_TAGS = frozenset(["sensor", "framepos", "framequat", "framelinvel", "frameangvel", "jointpos"])
+_SOLREF, _SOLIMP, _MARGIN = (0.0084, 1.0), (0.95, 0.99, 0.001), 0.002
+"""As those of the files under assets/objects: as stiff as the time step allows (bidex_meta/hands/README.md)."""
 _FOLDERS = ("meshdir", "texturedir", "assetdir")
 
 
@@ -65,6 +68,13 @@ def compiled(path: Path, spec: mujoco.MjSpec) -> mujoco.MjModel:
     if not math.isfinite(float(model.body_mass.sum() + model.body_inertia.sum() + model.geom_size.sum())):
         raise BidexError(f"{path}: expected finite sizes and masses, got others. Mend the file.")
     return model
+
+
+def set_contacts(spec: mujoco.MjSpec) -> None:
+    """Gives geoms the softness and the margin that the world's time steps need; friction stays the file's."""
+    for geom in spec.geoms:
+        geom.solref[:2], geom.solimp[:3] = _SOLREF, _SOLIMP
+        geom.margin, geom.gap = _MARGIN, 0.0
 
 
 def _reason(error: Exception) -> str:
