@@ -19,8 +19,8 @@ def described(source: Source, world: Any, kind: str, policies: Sequence[dict[str
 
     Returns:
         ``suite`` and ``suite_version``, or ``task``, ``base`` and ``object``, the others None; ``tasks``, names of the
-        slots; ``reward_scales``, factor on the printed reward by slot; ``hides_goals``; ``observation_groups``, [name, index
-        ranges]; ``kind``, ``policies``, ``seed`` of the tasks, ``references`` ({class: {random, zero, expert}},
+        slots; ``reward_scales``, factor on the printed reward by slot; ``hides_goals``; ``observation_groups``, [name,
+        index ranges]; ``kind``, ``policies``, ``seed`` of the tasks, ``references`` ({class: {random, zero, expert}},
         unscaled returns), ``versions`` and ``commit``; all ready for JSON.
     """
     suite = getattr(source, "suite", None)

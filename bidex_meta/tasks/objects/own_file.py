@@ -16,10 +16,8 @@ from bidex_meta.reading import is_file, read_bytes
 _MOST_BYTES, _MOST_MESH_BYTES = 1_000_000, 20_000_000
 _MOST_TAGS = 2_000
 _DEEPEST = 32
-_TAGS = frozenset(
-    ("mujoco", "compiler", "default", "asset", "material", "texture", "mesh", "worldbody", "body", "inertial", "geom")
-    + ("joint", "freejoint", "site")
-)
+_OUTER_TAGS = frozenset(("mujoco", "compiler", "default", "asset", "material", "texture", "mesh", "worldbody"))
+_TAGS = _OUTER_TAGS | {"body", "inertial", "geom", "joint", "freejoint", "site"}
 """What a file may hold; sensors may stand in a file that names points (``points=True``)."""
 _SENSOR_TAGS = frozenset(["sensor", "framepos", "framequat", "framelinvel", "frameangvel", "jointpos"])
 _SOLREF, _SOLIMP, _MARGIN = (0.0084, 1.0), (0.95, 0.99, 0.001), 0.002
