@@ -66,7 +66,7 @@ def soak(
         seed: Seed of world, actions and learner.
         device: Where the world lives.
         engine: As in ``Benchmark.make_world``.
-        out: File that takes each sample as it is taken.
+        out: File that takes each sample as it is taken, with what all of them say.
         make_learner: Makes a learner that trains on the world; None: uniform random actions.
         mode: Autoreset mode of that learner's world.
 
@@ -99,12 +99,11 @@ def soak(
         if clock.is_due(world.steps) or clock.is_over(world.steps):
             result["table"].append(_sample(clock, world))
             print(_line(result["table"][-1]), file=sys.stderr, flush=True)
+            # Each time, so that the file of a soak that is broken off has its verdict too.
+            result |= judge(result["table"], "steps_per_s" if world.device.type == "cuda" else "steps_per_cpu_s")
             if out is not None:
                 write_json(out, result)
     world.close()
-    result |= judge(result["table"], "steps_per_s" if torch.device(device).type == "cuda" else "steps_per_cpu_s")
-    if out is not None:
-        write_json(out, result)
     return result
 
 

@@ -40,10 +40,12 @@ class BenchFlags:
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="|".join(_KINDS))]
     """world, scaling, mixing, stability, capacity, gpu, kernels; soak: memory, speed and broken rows of a world that is
-    stepped for long; field: beside Meta-World and gymnasium-robotics; learner: MT-PPO's update against rsl-rl-lib's; adapt: all tasks' adaptation at once against a loop over them;
-    clients: another library's PPO through its adapter against the world's own loop."""
+    stepped for long; field: beside Meta-World and gymnasium-robotics; learner: MT-PPO's update against rsl-rl-lib's;
+    adapt: all tasks' adaptation at once against a loop over them; clients: another library's PPO through its adapter
+    against the world's own loop."""
     suite: str | None = None
-    """Suite to measure: by default world and scaling take MT4, mixing, soak, gpu and kernels MT20, the others every class."""
+    """Suite to measure: by default world and scaling take MT4, mixing, soak, gpu and kernels MT20, the others every
+    class."""
     task: str | None = None
     """For stability, capacity and clients: this task class alone."""
     client: str | None = None
