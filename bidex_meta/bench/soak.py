@@ -83,7 +83,8 @@ def soak(
         raise BidexError(f"--minutes must be more than 0, not {minutes:g}.")
     minutes = _MINUTES if minutes is None and steps is None else minutes
     source = Source.open({"suite": suite, "seed": seed, "threads": threads, "device": device, "engine": engine})
-    world = _Counting(source.world("train", num_envs, mode))
+    # The wrapper asks the world for what the protocol declares.
+    world = _Counting(source.world("train", num_envs, mode))  # pyright: ignore[reportAbstractUsage]
     act = _learning(make_learner(world)) if make_learner is not None else _random(world, seed)
     result: dict[str, Any] = {
         "suite": suite,
@@ -212,17 +213,18 @@ def _drift(table: list[dict[str, Any]], name: str) -> dict[str, Any]:
     found: dict[str, Any] = {"mean": round(float(values.mean()), 1), "drift_percent": None, "drift_interval": None}
     if len(values) < 5 or np.ptp(minutes) == 0:
         return found | {"noise_percent": None}
-    from scipy.stats import linregress, t
+    from scipy.stats import t
 
-    line = linregress(minutes, values)
-    rest = values - line.intercept - line.slope * minutes
+    centred = minutes - minutes.mean()
+    slope = float(centred @ values / (centred @ centred))
+    rest = values - values.mean() - slope * centred
     # Neighbouring minutes are alike on a machine that others use too: they count as fewer.
     alike = float(np.clip((rest[1:] @ rest[:-1]) / max(rest @ rest, 1e-300), 0.0, 0.9))
     freedom = max(len(values) * (1.0 - alike) / (1.0 + alike), 3.0) - 2.0
-    error = line.stderr * np.sqrt((1.0 + alike) / (1.0 - alike))
+    error = np.sqrt(rest @ rest / (len(values) - 2) / (centred @ centred) * (1.0 + alike) / (1.0 - alike))
     scale = 100.0 * np.ptp(minutes) / values.mean()
     half = float(t.ppf(0.975, freedom) * error * scale)
-    drift = float(line.slope * scale)
+    drift = float(slope * scale)
     return found | {
         "drift_percent": round(drift, 3),
         "drift_interval": [round(drift - half, 3), round(drift + half, 3)],

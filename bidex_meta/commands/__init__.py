@@ -16,6 +16,7 @@ class Command(NamedTuple):
 COMMANDS: dict[str, Command] = {
     "run": Command("bidex_meta.commands.run", "train a learner on a suite or a task, then evaluate it"),
     "evaluate": Command("bidex_meta.commands.evaluate", "success and return of a trained run, per task class"),
+    "verify": Command("bidex_meta.commands.verify", "evaluate a run again and compare with what it recorded"),
     "compare": Command("bidex_meta.commands.compare", "several runs beside each other, intervals over seeds"),
     "control": Command("bidex_meta.commands.control", "held-out tasks, adapted to their own data and to others'"),
     "list": Command("bidex_meta.commands.list", "the suites, tasks or algos there are"),

@@ -1,6 +1,7 @@
 """A physics profile in twelve letters: what two models must have in common for their trajectories to be comparable."""
 
 import hashlib
+from collections.abc import Mapping
 
 import mujoco
 import numpy as np
@@ -39,6 +40,12 @@ def model_identity(model: mujoco.MjModel) -> str:
             if isinstance(value, int | float | np.ndarray | np.number):
                 digest.update(name.encode() + _rounded(np.atleast_1d(np.asarray(value, np.float64))))
     return digest.hexdigest()[:12]
+
+
+def common_identity(models: Mapping[str, mujoco.MjModel]) -> str:
+    """The same of several models, by name."""
+    texts = [f"{name} {model_identity(models[name])}" for name in sorted(models)]
+    return hashlib.sha256("\n".join(texts).encode()).hexdigest()[:12]
 
 
 def _names(model: mujoco.MjModel) -> list[str]:

@@ -15,12 +15,17 @@ def collect_versions() -> dict[str, Any]:
     """Python, packages (None where not installed), platform, processors, GPUs and git state, ready for JSON."""
     return {
         "python": sys.version.split()[0],
-        "packages": {name: _installed(name) for name in _PACKAGES},
+        "packages": package_versions(),
         "platform": platform.platform(),
         "cpus": os.cpu_count(),
         "gpus": _gpus(),
         "git": git_state(Path(__file__).parent),
     }
+
+
+def package_versions() -> dict[str, str | None]:
+    """Of all packages that results depend on; None where one is not installed."""
+    return {name: _installed(name) for name in _PACKAGES}
 
 
 def git_state(folder: Path) -> dict[str, Any] | None:
