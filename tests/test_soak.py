@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from bidex_meta import bench
-from bidex_meta.bench.soak import judge
+from bidex_meta.bench.drift import judge
 from bidex_meta.cli import main
 from bidex_meta.memory import resident
 

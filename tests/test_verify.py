@@ -183,7 +183,7 @@ def _rows(generator, classes, episodes, shift=0.0):
 
 
 def test_honest_repetitions_are_within_and_a_worse_policy_is_not():
-    """Independent samples are the worst case: of 40 pairs of twenty classes, 60 episodes each, three to four have one."""
+    """Independent samples are the worst case: of 40 pairs of twenty classes, 60 episodes each, some three have one."""
     generator = np.random.default_rng(0)
     beyond = sum(
         any(each.outcome == "differs" for each in agreements(_rows(generator, 20, 60), _rows(generator, 20, 60)))

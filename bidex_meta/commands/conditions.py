@@ -36,12 +36,14 @@ def recorded_conditions(evaluation: dict[str, Any], versions: dict[str, Any], co
     """
     found = {"device": config.get("device", "cpu"), "engine": config.get("engine", "auto"), "num_envs": None}
     found |= {name: versions.get(name) for name in ("packages", "physics", "suite_version")}
-    return found | evaluation.get("conditions", {})
+    found |= evaluation.get("conditions", {})
+    packages = found["packages"]
+    return found | {"packages": packages if isinstance(packages, dict) else {}}
 
 
 def others(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
     """What is not now as it was then, a text each, in words; of what nobody recorded it says so once."""
-    packages = then.get("packages") or {}
+    packages = then["packages"]
     pairs = [(name, packages.get(name), version) for name, version in now["packages"].items()]
     pairs += [(name, then.get(name), now[name]) for name in ("device", "engine", "threads")]
     pairs += [(name.replace("_", " "), then.get(name), now[name]) for name in ("physics", "suite_version")]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from bidex_meta.commands.parsing import RunPath, Switch, parse
-from bidex_meta.errors import EXIT_FAILED, BidexError
+from bidex_meta.errors import EXIT_FAILED, BidexError, one_line
 from bidex_meta.reading import exists
 from bidex_meta.sources import Source
 
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str]) -> None:
 
     folder = RunFolder.open(flags.run)
     config = folder.config("learner", "num_envs", "threads")
-    recorded = _recorded(folder, flags.evaluation)
+    recorded = recorded_evaluation(folder.path, flags.evaluation)
     then = recorded_conditions(recorded, read_versions(folder.path), config)
     config |= _place(flags, then, config)
     source = Source.open(config)
@@ -62,7 +62,7 @@ def main(arguments: Sequence[str]) -> None:
     state, step = _checkpoint(folder, recorded["steps"])
     apart = others(then, conditions(source, rows))
     for line in apart:
-        print(f"Conditions: {line}.", file=sys.stderr, flush=True)
+        print(f"Conditions: {one_line(line)}.", file=sys.stderr, flush=True)
     again = _again(folder, config, source, recorded, rows, state)
     found = agreements(classes_of(recorded), classes_of(again))
     counts = {outcome: sum(each.outcome == outcome for each in found) for outcome in (EQUAL, WITHIN, DIFFERS)}
@@ -79,15 +79,23 @@ def main(arguments: Sequence[str]) -> None:
         raise SystemExit(EXIT_FAILED)
 
 
-def _recorded(folder: Any, named: Path | None) -> dict[str, Any]:
-    """The evaluation to compare with, all that is read of it checked."""
+def recorded_evaluation(run: Path, named: Path | None = None) -> dict[str, Any]:
+    """The evaluation to compare with, all that is read of it checked.
+
+    Args:
+        run: The run folder.
+        named: A file in the place of its ``evaluation.json``.
+
+    Raises:
+        BidexError: There is none, or it is damaged, or does not say how it was made.
+    """
     from bidex_meta.reading import TABLE, TEXT, check, choice, number, whole
     from bidex_meta.record.schemas import read_evaluation
 
-    path = named or folder.path / "evaluation.json"
-    again = f"bidex-meta evaluate {folder.path} --json > {path}"
+    path = named or run / "evaluation.json"
+    again = f"bidex-meta evaluate {run} --json > {path}"
     if named is None and not exists(path):
-        raise BidexError(f"{folder.path} has no evaluation.json to be verified. Let the run end, or write one: {again}")
+        raise BidexError(f"{run} has no evaluation.json to be verified. Let the run end, or write one: {again}")
     found = read_evaluation(path, again)
     many = whole(1, 1_000_000)
     check(found, {"seed": whole(0), "conditions": TABLE}, path, ("steps", "seed"))
@@ -110,19 +118,18 @@ def _place(flags: VerifyFlags, then: dict[str, Any], config: dict[str, Any]) -> 
     """Device and engine to evaluate with."""
     from bidex_meta.commands.learners import resolve_device
 
-    device = flags.device
-    if device == "auto":
-        try:
-            device = resolve_device(then["device"], Source.open(config).on_gpu)
-        except BidexError:
-            device = "cpu"
-    else:
-        device = resolve_device(device, Source.open(config).on_gpu)
-    same = torch_type(device) == torch_type(then["device"])
+    on_gpu = Source.open(config).on_gpu
+    try:
+        device = resolve_device(then["device"] if flags.device == "auto" else flags.device, on_gpu)
+    except BidexError:
+        if flags.device != "auto":
+            raise
+        device = "cpu"
+    same = _kind(device) == _kind(then["device"])
     return {"device": device, "engine": flags.engine or (then["engine"] if same else "auto")}
 
 
-def torch_type(device: str) -> str:
+def _kind(device: str) -> str:
     """``cuda`` of ``cuda:0``."""
     return device.partition(":")[0]
 
