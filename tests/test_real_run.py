@@ -121,7 +121,7 @@ def test_threads_change_nothing_in_a_small_run_resumed_or_not(tmp_path: Path) ->
 
 
 def test_a_run_of_two_threads_resumes_to_its_own_bits(tmp_path: Path) -> None:
-    """A tensor of more than 32,768 numbers is summed in parts by torch's threads: only then do last digits differ."""
+    """Of layers that are large enough for torch and MKL to split among threads; of one thread's they may differ."""
     large = ("--learner.hidden", "128")
     whole = trained(tmp_path / "whole", 2, *large)
     assert max(weight.numel() for weight in whole[0]["learner"]["policy"]["weights"].values()) > 32_768
