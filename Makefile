@@ -15,7 +15,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c const
 SOURCES := bidex_meta algos examples tests docs/site
 
 .DEFAULT_GOAL := help
-.PHONY: help run results test test-all test-parity bench-gpu-compile bench-gpu-sweep bench-gpu-train lint format docs clean
+.PHONY: help run results test test-all test-parity goldens bench-gpu-compile bench-gpu-sweep bench-gpu-train lint format docs clean
 .DELETE_ON_ERROR:
 
 help:
@@ -24,6 +24,7 @@ help:
 	@echo "make test-all  the same with the slow tests"
 	@echo "make test-parity  compare both engines on every class (what CI runs too)"
 	@echo "make results   fill the tables and pictures of README.md and docs/results/ from results/data/"
+	@echo "make goldens   record the golden trajectories anew: a change of results (docs/reliability.md)"
 	@echo "make docs      build the documentation site into site/ (open site/index.html)"
 	@echo "make format    format the code and mend what ruff can mend"
 	@echo "make bench-gpu-compile, bench-gpu-sweep, bench-gpu-train  measure a GPU (docs/gpu.md)"
@@ -40,6 +41,9 @@ test-all: lint
 
 test-parity: .venv/.installed-dev
 	$(BIN)/python -m pytest -q -n 2 -m parity
+
+goldens: .venv/.installed-dev
+	$(BIN)/python -m tests.goldens write
 
 # What to measure on a GPU; each target goes on where it stopped. On a machine that has the packages already, name its
 # interpreter: make bench-gpu-sweep CLI="python3 -m bidex_meta.cli".

@@ -4,7 +4,7 @@
 
     runs/<suite>/<algo>/<UTC date-time>_seed<seed>/
         config.json     the resolved config: every value, also the defaults
-        versions.json   Python, packages, machine, git commit
+        versions.json   Python, packages, machine, git commit; physics profile and version of the suite
         metrics.jsonl   one line a log call: {"step": ..., "time": ..., "Train/mean_return": ...}
         events.out...   the same for TensorBoard
         checkpoints/    step_<N>.pt (the last few), last.pt, best.pt
@@ -43,7 +43,13 @@ class RunFolder:
     path: Path
 
     @classmethod
-    def create(cls, config: dict[str, Any], path: Path | None = None, root: Path = Path("runs")) -> "RunFolder":
+    def create(
+        cls,
+        config: dict[str, Any],
+        path: Path | None = None,
+        root: Path = Path("runs"),
+        identity: dict[str, Any] | None = None,
+    ) -> "RunFolder":
         """Make a new, complete run folder: after this call only metrics, checkpoints and videos are added.
 
         Args:
@@ -51,6 +57,7 @@ class RunFolder:
                 ``seed`` name the folder.
             path: The folder itself, instead of one under ``root`` named after the config.
             root: Where runs are collected.
+            identity: What tells the run's worlds from others of their name; kept in ``versions.json``.
 
         Raises:
             BidexError: ``path`` exists and is not empty.
@@ -59,7 +66,7 @@ class RunFolder:
         for made in (folder.checkpoints_path, folder.videos_path):
             made.mkdir(exist_ok=True)  # there where a start was killed before its config stood
         folder.metrics_path.touch()
-        write_json(folder.path / "versions.json", collect_versions())
+        write_json(folder.path / "versions.json", collect_versions() | (identity or {}))
         write_json(folder.config_path, config)  # last: a folder with a config.json is a complete one
         return folder
 

@@ -25,6 +25,7 @@ FLAGS = {
     "episodes evaluate-every video-every logger learner.hidden learner.gamma learner.std-range learner.rollout-steps "
     "learner.learning-rate learner.clip learner.activation learner.num-minibatches learner.replay-memory",
     "evaluate": "checkpoint episodes split shots rollouts tasks trials seed num-envs device engine",
+    "verify": "evaluation num-envs device engine",
     "control": "trials episodes shots rollouts num-envs seed device engine",
     "compare": "out json",
     "plot": "evaluation out",
@@ -34,17 +35,28 @@ FLAGS = {
     "baseline": "suite episodes seed threads runs out",
     "list": "",
     "completion": "",
-    "bench": "suite task tasks sizes out num-envs steps repeats threads device engine seed",
+    "bench": "suite task tasks sizes out num-envs steps repeats threads device engine seed minutes algo",
 }
 SWITCHES = {
     "run": ["--print-config", "--no-evaluate"],
     "evaluate": ["--random", "--json"],
+    "verify": ["--json"],
     "plot": ["--adaptation"],
     "render": ["--tiled"],
     "witness": ["--all", "--find", "--script", "--json"],
     "bench": ["--learning", "--classes", "--json"],
 }
-PLACED = {"list": 1, "bench": 1, "baseline": 1, "evaluate": 1, "control": 1, "compare": 2, "plot": 1, "report": 1}
+PLACED = {
+    "list": 1,
+    "bench": 1,
+    "baseline": 1,
+    "evaluate": 1,
+    "verify": 1,
+    "control": 1,
+    "compare": 2,
+    "plot": 1,
+    "report": 1,
+}
 """Words before the flags."""
 
 
