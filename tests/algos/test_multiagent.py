@@ -138,7 +138,7 @@ def test_a_matrix_game_needs_turns(kind: str, seed: int) -> None:
     steps = (
         LARGE
         if kind != "hatrpo"
-        else {"max_kl": 1.5, "damping": 0.01, "fisher_stride": 1, "accept_ratio": 0.0, "critic_epochs": 2}
+        else {"max_kl": 3.0, "damping": 0.01, "fisher_stride": 1, "accept_ratio": 0.0, "critic_epochs": 2}
     )
     world = ToyWorld([exclusive_or], rows=512, horizon=1, terminal=True)
     learner = make(world, replace(config, std_range=(0.5, 0.5), **steps), seed=seed)

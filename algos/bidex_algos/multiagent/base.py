@@ -37,6 +37,7 @@ class MultiAgent(OnPolicy):
     Attributes:
         views: The agents.
         critic_adam: Moves the critic.
+        kl_share: Each agent's part of the KL that all may have together: the KL of independent agents is the sum of theirs.
 
     Raises:
         BidexError: A partition that is none of this world's, policy heads where the world does not show the task, or
@@ -48,6 +49,7 @@ class MultiAgent(OnPolicy):
 
     def __init__(self, world: VectorWorld, config: MultiAgentConfig, seed: int):
         self.views = agent_views(world.observation_groups, int(world.single_action_space.shape[0]), config.agents)
+        self.kl_share = 1.0 / len(self.views)
         samples = config.rollout_steps * world.num_envs
         if samples < config.num_minibatches:
             raise BidexError(

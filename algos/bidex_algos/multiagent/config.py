@@ -70,6 +70,9 @@ class MultiAgentPPOConfig(PPOConfig, MultiAgentConfig):
     """Factor of the value loss. Adam undoes it; it matters only beside max_grad_norm."""
     entropy_weight: float = 0.0
     """Factor of the entropy bonus."""
+    desired_kl: float = 0.03
+    """KL of the sampling policy from the current one, of all agents together, that the adaptive step sizes aim at; each
+    agent's has an even share."""
 
     def __post_init__(self) -> None:
         """Rejects values that could only fail later.

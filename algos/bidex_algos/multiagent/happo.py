@@ -40,8 +40,11 @@ class HAPPO(Sequential):
 
     def __init__(self, world: VectorWorld, config: HAPPOConfig, seed: int):
         super().__init__(world, config, seed)
-        agents, actor = range(len(self.views)), self.policy.actor
-        self.adams = [AdaptiveAdam(actor.parameters_of(i), config, self.device, config.adam_eps) for i in agents]
+        actor = self.policy.actor
+        self.adams = [
+            AdaptiveAdam(actor.parameters_of(i), config, self.device, config.adam_eps, self.kl_share)
+            for i in range(len(self.views))
+        ]
 
     def _optimisers(self) -> dict[str, Any]:
         return super()._optimisers() | {"agents": [adam.parts() for adam in self.adams]}

@@ -1,8 +1,11 @@
 """HATRPO: agents that take TRPO's step one after another (Kuba et al. 2022; appendix B.2.2).
 
-For each agent, in an order drawn anew in each iteration, MT-TRPO's step on its own parameters, within a trust region of
-its own, with the advantage times the ratios of the agents before it. Then the critic of all.
+For each agent, in an order drawn anew in each iteration, MT-TRPO's step on its own parameters, within its share of the
+trust region, with the advantage times the ratios of the agents before it. Then the critic of all.
 """
+
+from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,6 +17,7 @@ from bidex_algos.nets.networks import gaussian_kl, gaussian_log_prob
 from bidex_algos.nets.precision import autocast
 from bidex_algos.onpolicy.base import Batch
 from bidex_meta.train.distributed import all_sum
+from bidex_meta.world.contract import VectorWorld
 
 __all__ = ["HATRPO", "PRESETS", "HATRPOConfig"]
 
@@ -22,11 +26,18 @@ class HATRPO(Sequential):
     """HATRPO, agents in turn (Kuba et al. 2022, arXiv 2109.11251).
 
     Arguments, attributes and errors are those of its base.
+
+    Attributes:
+        region: The config with an agent's share of ``max_kl``.
     """
 
     name, remedy = "hatrpo", "lower max_kl or critic_learning_rate"
     config_type = HATRPOConfig
     config: HATRPOConfig  # type: ignore[assignment]
+
+    def __init__(self, world: VectorWorld, config: Any, seed: int):
+        super().__init__(world, config, seed)
+        self.region = replace(config, max_kl=self.kl_share * config.max_kl)
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
         """All agents in turn, then the critic; returns means over agents of what it measured."""
@@ -60,7 +71,7 @@ class HATRPO(Sequential):
         objective, _ = surrogate_and_kl()
         kl = self._kl_from_itself(agent, batch)
         stepped = trust_region_step(
-            actor.parameters_of(agent), objective, kl, measure, cfg, accept_ratio=cfg.accept_ratio
+            actor.parameters_of(agent), objective, kl, measure, self.region, accept_ratio=cfg.accept_ratio
         )
         return stepped.told("Policy/kl", self.device)
 

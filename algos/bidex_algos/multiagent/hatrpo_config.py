@@ -9,12 +9,13 @@ from bidex_algos.onpolicy.mttrpo_config import MTTRPOConfig
 
 @dataclass(frozen=True)
 class HATRPOConfig(MTTRPOConfig, MultiAgentConfig):
-    """Everything that can be set about HATRPO; the defaults are the preset ``laptop``. ``max_kl`` is each agent's."""
+    """Everything that can be set about HATRPO; the defaults are the preset ``laptop``."""
 
     algo: ClassVar[str] = "hatrpo"
 
-    max_kl: float = 0.05
-    """Mean KL of an agent's new policy from its sampling one that an update may not exceed."""
+    max_kl: float = 0.1
+    """Mean KL of the new policy from the sampling one, of all agents together, that an update may not exceed; each agent's
+    has an even share."""
 
 
 PRESETS: dict[str, HATRPOConfig] = {

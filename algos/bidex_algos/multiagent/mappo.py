@@ -38,7 +38,8 @@ class MAPPO(MultiAgent):
         super().__init__(world, config, seed)
         actor = self.policy.actor
         self.adams = [
-            AdaptiveAdam(actor.parameters_of(k), config, self.device, config.adam_eps) for k in range(len(actor.nets))
+            AdaptiveAdam(actor.parameters_of(k), config, self.device, config.adam_eps, self.kl_share)
+            for k in range(len(actor.nets))
         ]
 
     def _optimisers(self) -> dict[str, Any]:
