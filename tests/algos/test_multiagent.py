@@ -62,9 +62,10 @@ def test_hatrpo_of_one_agent_is_mt_trpo() -> None:
     assert_alike(plain, HATRPO(opposite_bandits(), HATRPOConfig(**shared, agents="single"), seed=1))
 
 
-def test_the_factor_is_the_product_of_the_ratios_before() -> None:
+@pytest.mark.parametrize("max_factor", [0.0, 1.1])
+def test_the_factor_is_the_product_of_the_ratios_before(max_factor: float) -> None:
     """Against torch.distributions on networks called one by one; agents are moved by hand between their turns."""
-    config = HAPPOConfig(agents="a=action/2;b=action/3+action/0;c=action/1", **SMALL)
+    config = HAPPOConfig(agents="a=action/2;b=action/3+action/0;c=action/1", max_factor=max_factor, **SMALL)
     learner = HAPPO(ToyWorld([nearness(0.3)], actions=4), config, seed=0)
     learner.iterate()
     batch, _ = learner._prepare()
@@ -79,16 +80,17 @@ def test_the_factor_is_the_product_of_the_ratios_before() -> None:
         old, moved = [log_prob(i) for i in range(3)], []
         fresh, _ = learner._prepare()
         batch = replace(batch, old_means=actor(batch.obs).detach(), advantages=fresh.advantages)
-        expected = batch.advantages.clone()
-        for agent, old_log_prob, gain in learner._in_turn(batch):
-            torch.testing.assert_close(old_log_prob, old[agent], rtol=0, atol=1e-4)
-            torch.testing.assert_close(gain, expected, rtol=1e-3, atol=1e-4)
+        factor = torch.ones_like(batch.advantages)
+        for agent, share in learner._in_turn(batch):
+            torch.testing.assert_close(share.old_log_probs, old[agent], rtol=0, atol=1e-4)
+            bounded = factor.clamp(max=max_factor) if max_factor else factor
+            torch.testing.assert_close(share.gain, bounded * batch.advantages, rtol=1e-3, atol=1e-4)
             with torch.no_grad():
                 for weight in actor.parameters_of(agent):
                     weight += 0.02 * torch.randn(weight.shape, generator=learner.generator)
-            expected = expected * torch.exp(log_prob(agent) - old[agent])
+            factor = factor * torch.exp(log_prob(agent) - old[agent])
             moved.append(agent)
-        assert sorted(moved) == [0, 1, 2] and not torch.allclose(expected, batch.advantages, rtol=0.1)
+        assert sorted(moved) == [0, 1, 2] and factor.max() > 1.2
         orders.add(tuple(moved))
     assert len(orders) > 2
 
@@ -161,7 +163,7 @@ def test_agents_of_one_form_in_one_pass(share: bool) -> None:
     x = torch.randn(7, 2)
     joint = actor(x)
     for agent, own in enumerate(([3], [0], [1, 2])):
-        torch.testing.assert_close(joint[:, own], actor.mean_of(agent, x))
+        torch.testing.assert_close(joint[:, own], actor.distribution_of(agent, actor.seen(agent, x), x[:, :0])[0])
     if share:
         assert not torch.allclose(joint[:, 3], joint[:, 0])  # it reads who acts
     joint.sum().backward()
@@ -207,5 +209,7 @@ def test_bad_configs_are_one_line() -> None:
         HAPPOConfig(agents="thumbs")
     with pytest.raises(BidexError, match="mappo: huber_delta must be positive"):
         MAPPOConfig(huber_delta=0.0)
+    with pytest.raises(BidexError, match="max_factor: expected 0 or at least 1"):
+        HATRPOConfig(max_factor=0.5)
     with pytest.raises(BidexError, match="200 mini-batches need as many samples"):
         HAPPO(LQR(rows=2), HAPPOConfig(agents=PAIR, num_minibatches=200, **SMALL), seed=0)

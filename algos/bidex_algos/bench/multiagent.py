@@ -1,4 +1,4 @@
-"""The training speed of learners of several agents beside MT-PPO's: physics, rollouts, update, in turns in one process."""
+"""The training speed of learners of several agents beside MT-PPO's: physics, rollouts and update, in one process."""
 
 import statistics
 import time
@@ -34,8 +34,8 @@ def multiagent(
 ) -> dict[str, Any]:
     """Training steps a CPU second of HAPPO, MAPPO, IPPO and HATRPO, with two and with twelve agents, over MT-PPO's.
 
-    All take whole iterations in turns on one world, each from where the one before it stopped, so that they meet the same
-    physics. CPU seconds are those of the process: other work on the machine sways them less than it does the clock.
+    All take whole iterations in turns on one world, each from where the one before it stopped, so that they meet the
+    same physics. CPU seconds are the process's: other work on the machine sways them less than the clock.
 
     Args:
         task: The class.
@@ -46,9 +46,9 @@ def multiagent(
         preset: Of all learners.
 
     Returns:
-        The setting, and ``table``: for each learner its number of ``agents``, medians of the ``steps_per_cpu_s`` and of the
-        CPU seconds of an iteration and of its ``update`` alone, and the median ``ratio`` of an iteration of MT-PPO to
-        the learner's iteration beside it (1: as fast; more: faster), with the least and the most.
+        The setting, and ``table``: for each learner the median of its training ``steps_per_cpu_s``, of the CPU seconds
+        of an iteration and of its update alone, and the median ``ratio`` of MT-PPO's iteration over the learner's
+        beside it (1: as fast; more: faster), with the least and the most.
 
     Raises:
         BidexError: No such task or preset.
@@ -81,9 +81,7 @@ def _learners(world: VectorWorld, preset: str, seed: int) -> dict[str, OnPolicy]
     return found
 
 
-def _in_turns(
-    world: VectorWorld, learners: list[OnPolicy], repeats: int, seed: int
-) -> list[list[tuple[float, float]]]:
+def _in_turns(world: VectorWorld, learners: list[OnPolicy], repeats: int, seed: int) -> list[list[tuple[float, float]]]:
     """CPU seconds of each learner's iterations, and of their updates."""
     taken: list[list[tuple[float, float]]] = [[] for _ in learners]
     updates = [_timed(learner) for learner in learners]

@@ -84,6 +84,21 @@ class MultiAgentPPOConfig(PPOConfig, MultiAgentConfig):
         self._check_ppo()
 
 
+@dataclass(frozen=True)
+class InTurnConfig:
+    """What HAPPO and HATRPO share. A config that is made of this and others puts its fields behind theirs."""
+
+    max_factor: float = 4.0
+    """The most that the ratios of the agents before it, new policy over old, may multiply an agent's advantage with; 0:
+    as much as it comes to."""
+
+    def _check_turns(self) -> None:
+        """Refuses a factor that is out of its range."""
+        at_least(self, 0, "max_factor")
+        if 0 < self.max_factor < 1:
+            raise BidexError(f"max_factor: expected 0 or at least 1, which is no change at all, got {self.max_factor}.")
+
+
 PAPER: dict[str, Any] = {
     "hidden": (1024, 1024, 512),
     "value_heads": False,
