@@ -202,7 +202,27 @@ def test_ippo_estimates_apart() -> None:
         torch.testing.assert_close(own, shared[:, None].expand(-1, 2))
 
 
+@pytest.mark.parametrize("popart", [True, False])
+@every
+def test_popart_keeps_values_when_statistics_change(kind: str, popart: bool) -> None:
+    """Returns grow and move away from 0: the critic's units change, what it says in units of reward does not."""
+    make, config = KINDS[kind]
+    learner = make(opposite_bandits(scale=1000.0), replace(config, popart=popart), seed=0)
+    learner.iterate()
+    obs, task_id = learner.rollout.last_obs, learner.world.task_id
+    before = learner._final_value(obs, task_id).detach()
+    stats = learner.return_stats
+    learner._merge_returns(stats.mean * 3.0 + 50.0, stats.var * 9.0 + 1.0, torch.full_like(stats.mean, 1e4))
+    same = torch.allclose(learner._final_value(obs, task_id), before, rtol=1e-4, atol=1e-3)
+    assert same == popart
+    assert float(before.std()) > 0.0
+
+
 def test_bad_configs_are_one_line() -> None:
+    with pytest.raises(BidexError, match="popart needs a critic for each agent"):
+        IPPOConfig(popart=True, share_parameters=True)
+    with pytest.raises(BidexError, match="leave per_task_values and value_heads on"):
+        MAPPOConfig(popart=True, value_heads=False)
     with pytest.raises(BidexError, match="is of no agent"):
         MAPPO(LQR(), MAPPOConfig(agents="a=action/0", **SMALL), seed=0)
     with pytest.raises(BidexError, match="agents: expected single"):

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from bidex_algos.multiagent.agent_batch import AgentBatch
 from bidex_algos.multiagent.config import MultiAgentConfig
+from bidex_algos.multiagent.popart import keep_values
 from bidex_algos.multiagent.team import TeamActor
 from bidex_algos.nets.encoders.inputs import Inputs
 from bidex_algos.nets.networks import gaussian_log_prob
@@ -76,6 +77,17 @@ class MultiAgent(OnPolicy):
 
     # The critic.
 
+    def _critics(self) -> list[Any]:
+        """The networks of the critic: one for all, or one an agent."""
+        return [self.critic]
+
+    def _merge_returns(self, mean: Tensor, var: Tensor, count: Tensor) -> None:
+        stats = self.return_stats
+        before = stats.mean.clone(), stats.std()
+        super()._merge_returns(mean, var, count)
+        if self.config.popart:
+            keep_values(self._critics(), before, (stats.mean, stats.std()))
+
     def _old_values(self, batch: Batch) -> Tensor:
         """What the critic says of a batch before it is moved, where the loss asks for it."""
         if not self.config.value_clip:
@@ -99,10 +111,10 @@ class MultiAgent(OnPolicy):
             loss = torch.maximum(loss, huber(old_values + (values - old_values).clamp(-reach, reach)))
         return (weights.view(-1, *[1] * (loss.dim() - 1)) * loss).sum()
 
-    def _critic_step(self, clipped: list[list[nn.Parameter]] | None = None) -> None:
+    def _critic_step(self) -> None:
         """One step along the gradients that are there, each network's shortened."""
-        for parameters in clipped or [list(self.critic.parameters())]:
-            nn.utils.clip_grad_norm_(parameters, self.config.max_grad_norm)
+        for critic in self._critics():
+            nn.utils.clip_grad_norm_(critic.parameters(), self.config.max_grad_norm)
         self.critic_adam.step()
 
     def _critic_epochs(self, batch: Batch, epochs: int, num_minibatches: int, weight: float = 1.0) -> Tensor:

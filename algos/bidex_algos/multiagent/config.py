@@ -39,6 +39,8 @@ class MultiAgentConfig(OnPolicyConfig):
     """Error of the critic, in its own units, beyond which its loss grows no faster than the error."""
     value_clip: float = 0.0
     """How far a value may leave the old one before it earns nothing more; 0: as far as it likes."""
+    popart: bool = False
+    """When the statistics of returns change, move the critic's output layer so that its values stay as they were."""
     max_grad_norm: float = 1.0
     """Gradients longer than this are shortened to it: each agent's, and the critic's."""
     critic_learning_rate: float = 1e-3
@@ -58,6 +60,10 @@ class MultiAgentConfig(OnPolicyConfig):
         keep_partition(self)
         positive(self, "huber_delta", "max_grad_norm", "critic_learning_rate", "adam_eps")
         at_least(self, 0.0, "value_clip")
+        if self.popart and not (self.per_task_values and self.value_heads):
+            raise BidexError(
+                f"{self.algo}: popart moves the critic's output of each task; leave per_task_values and value_heads on."
+            )
 
 
 @dataclass(frozen=True)
@@ -101,7 +107,7 @@ class InTurnConfig:
 
 PAPER: dict[str, Any] = {
     "hidden": (1024, 1024, 512),
-    "value_heads": False,
+    "popart": True,
     "rollout_steps": 8,
     "gamma": 0.96,
     "lam": 0.95,

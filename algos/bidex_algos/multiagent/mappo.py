@@ -46,10 +46,6 @@ class MAPPO(MultiAgent):
     def _optimisers(self) -> dict[str, Any]:
         return super()._optimisers() | {"agents": [adam.parts() for adam in self.adams]}
 
-    def _critic_networks(self) -> list[list[nn.Parameter]]:
-        """The parameters of each critic, whose gradients are shortened apart."""
-        return [list(self.critic.parameters())]
-
     def _update(self, batch: Batch) -> dict[str, Tensor]:
         """One pass after another: returns the means over all mini-batches and agents of what it measured."""
         cfg, actor = self.config, self.policy.actor
@@ -69,7 +65,7 @@ class MAPPO(MultiAgent):
                     adam.follow(told[4 + k])
                 nn.utils.clip_grad_norm_(actor.parameters_of(k), cfg.max_grad_norm)
                 adam.step()
-            self._critic_step(self._critic_networks())
+            self._critic_step()
             actor.clamp_std(*cfg.std_range)
         rate = torch.stack([adam.rate for adam in self.adams]).mean()
         return {**dict(zip(NAMES, torch.stack(measured).mean(0), strict=True)), "Policy/lr": rate}

@@ -150,6 +150,10 @@ class OnPolicy(Learner):
     def _in_critic_units(self, returns: Tensor, task_id: Tensor) -> Tensor:
         return self.return_stats.normalise(returns, self._element(task_id)) if self.config.per_task_values else returns
 
+    def _merge_returns(self, mean: Tensor, var: Tensor, count: Tensor) -> None:
+        """Takes a rollout's moments of returns into the statistics, which are the critic's units from now on."""
+        self.return_stats.merge(mean, var, count)
+
     def _mini_batches(self, batch: Any, epochs: int, number: int) -> Iterator[tuple[bool, Tensor, Tensor]]:
         """Some passes over a batch, shuffled anew in each: whether it is the very first, samples (b,), and their count.
 
@@ -188,7 +192,7 @@ class OnPolicy(Learner):
         advantages = gae(rewards, values, next_values, terminated, ended, gamma, cfg.lam, valid)
         returns = advantages + values
         explained = explained_variance(values, returns, element, elements, valid).view(-1, num_tasks).mean(0)
-        self.return_stats.merge(*task_moments(returns, element, elements, valid))
+        self._merge_returns(*task_moments(returns, element, elements, valid))
         group = element if cfg.per_task_advantages else element // num_tasks * num_tasks
         advantages = normalise_per_task(advantages, group, elements, valid)
 
