@@ -83,10 +83,13 @@ class MultiAgent(OnPolicy):
 
     def _merge_returns(self, mean: Tensor, var: Tensor, count: Tensor) -> None:
         stats = self.return_stats
-        before = stats.mean.clone(), stats.std()
+        known, before = stats.count > 0, (stats.mean.clone(), stats.std())
         super()._merge_returns(mean, var, count)
         if self.config.popart:
-            keep_values(self._critics(), before, (stats.mean, stats.std()))
+            after = stats.mean, stats.std()
+            # Before the first returns of a task its values are none.
+            old_mean, old_std = (torch.where(known, *pair) for pair in zip(before, after, strict=True))
+            keep_values(self._critics(), (old_mean, old_std), after)
 
     def _old_values(self, batch: Batch) -> Tensor:
         """What the critic says of a batch before it is moved, where the loss asks for it."""
