@@ -164,9 +164,10 @@ class Sequential(MultiAgent):
         bound, factor = self.config.max_factor or math.inf, torch.ones_like(batch.advantages)
         order = torch.randperm(len(self.views), generator=self.order).tolist()
         for agent in order:
-            own = [parts[agent] for parts in columns]
-            old_log_probs, gain = gaussian_log_prob(*own), batch.advantages * factor.clamp(max=bound)
-            share = AgentBatch(actor.seen(agent, batch.obs), task, *own, old_log_probs, gain, batch.weights)
+            actions, means, log_std = (parts[agent] for parts in columns)
+            old_log_probs, gain = gaussian_log_prob(actions, means, log_std), batch.advantages * factor.clamp(max=bound)
+            seen = actor.seen(agent, batch.obs)
+            share = AgentBatch(seen, task, actions, means, log_std, old_log_probs, gain, batch.weights)
             yield agent, share
             if agent != order[-1]:
                 factor = factor * self._ratio(agent, share)
