@@ -193,6 +193,7 @@ def test_ippo_estimates_apart() -> None:
     mappo.critic.load_state_dict(first.state_dict())
     batches = []
     for learner in learners:
+        learner.return_stats.count.fill_(1e-9)  # known, so that critics are asked, but for next to nothing
         obs = learner._first_observations()
         collect(learner.world, learner.rollout, obs, learner._sample, learner._final_value, learner.episodes)
         batches.append(learner._prepare()[0])

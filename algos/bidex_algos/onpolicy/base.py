@@ -145,15 +145,7 @@ class OnPolicy(Learner):
         return task_id[:, None] + self.world.num_tasks * torch.arange(self.num_critics, device=self.device)
 
     def _in_reward_units(self, values: Tensor, task_id: Tensor) -> Tensor:
-        """What a critic says, as returns; 0 of a task whose returns are not known yet.
-
-        An untrained critic says numbers about 1, which may be a hundred times a return. As bootstraps of the first
-        rollout they would make the first statistics, and a hundred iterations would have to forget them.
-        """
-        if not self.config.per_task_values:
-            return values
-        element = self._element(task_id)
-        return self.return_stats.restore(values, element) * (self.return_stats.count > 0)[element]
+        return self.return_stats.restore(values, self._element(task_id)) if self.config.per_task_values else values
 
     def _in_critic_units(self, returns: Tensor, task_id: Tensor) -> Tensor:
         return self.return_stats.normalise(returns, self._element(task_id)) if self.config.per_task_values else returns
