@@ -1,0 +1,80 @@
+"""Runs that are killed again and again end as the unbroken ones do: files, weights, worlds, metrics, bit for bit."""
+
+import random
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+if sys.platform != "linux":
+    pytest.skip("forks, and reads /proc", allow_module_level=True)
+
+from bidex_meta.commands.learners import ALGOS
+from tests.robust.kills import KILLED, Victim, outcome, quick_folder, server, unequal
+from tests.robust.victims import FLAGS, arguments
+
+ITERATIONS = 12
+
+
+@pytest.fixture(scope="module")
+def place() -> Iterator[Path]:
+    with quick_folder() as folder:
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def killer() -> Iterator[subprocess.Popen[str]]:
+    with server() as process:
+        yield process
+
+
+def killed_often(algo: str, seed: int, killer: subprocess.Popen[str], place: Path) -> None:
+    draw = random.Random(f"{algo} {seed}")
+    often = draw.random() < 0.5
+    whole = Victim(killer, arguments(algo, ITERATIONS), place / f"{algo}{seed}whole")
+    answer = whole.go_on()
+    assert answer["code"] == 0, whole.log.read_text()
+    run = Victim(killer, whole.arguments, place / f"{algo}{seed}", 0.0 if often else 0.02)
+    run.kill_often(whole.counts(), answer["cpu"], draw)
+    print(f"kills: {algo} {dict(run.fell)}")
+    assert unequal(outcome(run.path, often), outcome(whole.path, often)) == []
+
+
+def test_every_learner_can_be_killed() -> None:
+    assert FLAGS.keys() == ALGOS.keys()
+
+
+@pytest.mark.parametrize("algo", ["mtppo", "mtsac", "rl2"])
+def test_killed_runs_end_as_unbroken_ones(algo: str, killer: subprocess.Popen[str], place: Path) -> None:
+    killed_often(algo, 0, killer, place)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("algo", FLAGS)
+def test_killed_runs_of_every_learner(algo: str, seed: int, killer: subprocess.Popen[str], place: Path) -> None:
+    killed_often(algo, seed, killer, place)
+
+
+def _each_operation(killer: subprocess.Popen[str], place: Path, name: str, stride: int) -> int:
+    """Kills runs of three iterations, each before another operation on a file of its folder."""
+    whole = Victim(killer, arguments("mtppo", 4), place / f"{name}whole")
+    assert whole.go_on()["code"] == 0
+    expected, operations = outcome(whole.path), whole.counts()["operations"]
+    for number in range(1, operations + 1, stride):
+        run = Victim(killer, whole.arguments, place / f"{name}{number}")
+        assert run.go_on(aim=("operations", number))["code"] == KILLED
+        assert run.go_on()["code"] == 0, run.log.read_text()
+        assert unequal(outcome(run.path), expected) == [], f"killed before operation {number} of {operations}"
+    return len(range(1, operations + 1, stride))
+
+
+def test_killed_before_operations_on_files(killer: subprocess.Popen[str], place: Path) -> None:
+    _each_operation(killer, place, "some", 9)
+
+
+@pytest.mark.slow
+def test_killed_before_each_operation_on_files(killer: subprocess.Popen[str], place: Path) -> None:
+    print(f"kills: {_each_operation(killer, place, 'each', 1)} operations")
