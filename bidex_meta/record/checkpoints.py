@@ -54,7 +54,28 @@ class Checkpoints:
         remove_leftovers(self.folder)
         path, content = self.folder / f"step_{step}.pt", sealed({"step": step, "state": state})
         write_atomic(path, lambda file: torch.save(content, file))
-        with path.open("rb") as source:
+        self._follow(path)
+
+    def finish(self, step: int) -> None:
+        """Does what a :meth:`save` that was killed left undone.
+
+        Args:
+            step: Of the checkpoint that was loaded. Where a newer one is there, which was then damaged, all stay.
+        """
+        if not self.folder.is_dir():
+            return
+        refuse_links(self.folder)
+        remove_leftovers(self.folder)
+        path = self.folder / f"step_{step}.pt"
+        if self.newest_step() != step:
+            return
+        behind = not exists(self.last) or self.last.stat().st_mtime_ns <= path.stat().st_mtime_ns
+        if behind or len(self._step_files()) > self.keep:
+            self._follow(path)
+
+    def _follow(self, newest: Path) -> None:
+        """Makes ``last.pt`` a copy of the newest, then forgets the oldest."""
+        with newest.open("rb") as source:
             write_atomic(self.last, lambda file: shutil.copyfileobj(source, file))
         for old in self._step_files()[self.keep :]:
             old.unlink(missing_ok=True)

@@ -26,12 +26,14 @@ class Marks:
     Args:
         path: The file of the counts.
         aim: Phase and number of the event, from 1, before which the process dies; None: it lives.
+        end: What it gets then; SIGSTOP where somebody else shall kill it, with others.
     """
 
-    def __init__(self, path: Path, aim: tuple[str, int] | None = None):
+    def __init__(self, path: Path, aim: tuple[str, int] | None = None, end: int = signal.SIGKILL):
         path.write_bytes(bytes(8 * (1 + len(COUNTED))))
         with path.open("r+b") as file:
             self._memory = memoryview(mmap.mmap(file.fileno(), 0)).cast("q")
+        self._end = end
         self._aim = (COUNTED.index(aim[0]), aim[1]) if aim else None
 
     def event(self, before: Callable[[], object] = lambda: None) -> None:
@@ -42,7 +44,7 @@ class Marks:
         self._memory[1 + what] += 1
         if self._aim == (what, self._memory[1 + what]):
             before()
-            os.kill(os.getpid(), signal.SIGKILL)
+            os.kill(os.getpid(), self._end)
 
     def phase(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         """``function``, during which the run is in a phase."""

@@ -54,15 +54,12 @@ ADAPTS = ("promp", "maml", "rl2")
 ROWS = 8
 
 
-def arguments(algo: str, iterations: int, looks: bool = True) -> list[str]:
-    """A run of about so many iterations of a learner, without its folder."""
-    adapts = algo in ADAPTS
-    # A meta-batch of the gradient-based ones is two phases of whole episodes.
-    steps = iterations * ROWS * 4
+def arguments(algo: str, iterations: int, processes: int = 1) -> list[str]:
+    """A run of so many iterations of a learner (half as many of one that adapts), without its folder."""
+    adapts, steps = algo in ADAPTS, iterations * ROWS * 4 * processes
     words = ["run", "--suite", "ML4" if adapts else "MT4", "--algo", algo, "--num-envs", str(ROWS), "--seed", "5"]
     words += ["--steps", str(steps), "--threads", "1", "--device", "cpu", "--logger", "none", *FLAGS[algo].split()]
-    words += ["--episodes", "1"]
-    return [*words, "--evaluate-every", "4"] if looks else words
+    return [*words, "--episodes", "1", "--evaluate-every", "4"]
 
 
 class Points(FakePools):
@@ -123,7 +120,8 @@ def _has(source: Any, split: str) -> bool:
 
 def run(job: dict[str, Any]) -> int:
     """The job, in this process; its exit code unless it is killed."""
-    marks = Marks(Path(job["marks"]), tuple(job["aim"]) if job.get("aim") else None)  # type: ignore[arg-type]
+    aim = tuple(job["aim"]) if job.get("aim") else None
+    marks = Marks(Path(job["marks"]), aim, signal.SIGSTOP if job.get("together") else signal.SIGKILL)  # type: ignore[arg-type]
     runner._SAVING_SHARE = 1.0
     runner.train = functools.partial(runner.train, checkpoint_seconds=job.get("checkpoint_seconds", 0.0))  # type: ignore[assignment]
     instrument(marks)
