@@ -30,7 +30,7 @@ def environment() -> dict[str, str]:
 
 @contextmanager
 def quick_folder() -> Iterator[Path]:
-    """A folder in memory where there is one: what SIGKILL leaves does not depend on the disk, which syncing waits for."""
+    """A folder in memory where there is one: what SIGKILL leaves does not depend on the disk, which syncs slowly."""
     memory = Path("/dev/shm")
     with tempfile.TemporaryDirectory(dir=memory if os.access(memory, os.W_OK) else None) as name:
         yield Path(name)
@@ -138,7 +138,7 @@ def outcome(path: Path, names: bool = True) -> dict[str, Any]:
 
     Args:
         path: The run folder.
-        names: Whether the older checkpoints count, too; which there are is a matter of time unless each iteration has one.
+        names: Whether older checkpoints count too; which there are is a matter of time unless each iteration saves.
     """
     folder = RunFolder.open(path)
     files = sorted(str(file.relative_to(path)) for file in path.rglob("*") if not file.name.startswith("events."))
@@ -158,7 +158,9 @@ def unequal(one: dict[str, Any], other: dict[str, Any], where: str = "") -> list
     """Where two outcomes differ."""
     if isinstance(one, dict) and isinstance(other, dict):
         missing = [f"{where}/{key}" for key in one.keys() ^ other.keys()]
-        return missing + [d for key in one.keys() & other.keys() for d in unequal(one[key], other[key], f"{where}/{key}")]
+        return missing + [
+            d for key in one.keys() & other.keys() for d in unequal(one[key], other[key], f"{where}/{key}")
+        ]
     if isinstance(one, list) and isinstance(other, list) and len(one) == len(other) and where != "/files":
         return [d for i, (a, b) in enumerate(zip(one, other, strict=True)) for d in unequal(a, b, f"{where}/{i}")]
     told = f"{where}: {one} {other}" if where == "/files" else where

@@ -1,8 +1,8 @@
 """Where a run stands, told from within it, and its death at a chosen moment.
 
 A run passes phases; in each it makes events: a step of a world, an operation on a file of its folder, a piece of a file
-that is written. The process ends itself by SIGKILL at the event it is aimed at, a piece then being written by half. What
-it has counted stands in a file that outlives it.
+that is written. The process ends itself by SIGKILL at the event it is aimed at, a piece then being written by half.
+What it has counted stands in a file that outlives it.
 """
 
 import functools
@@ -64,10 +64,10 @@ class Marks:
         inside = str(folder)
 
         def hear(event: str, arguments: tuple[Any, ...]) -> None:
-            if event in _OPERATIONS and isinstance(arguments[0], str | os.PathLike):
-                if str(arguments[0]).startswith(inside):
-                    self._count(COUNTED.index("operations"))
-                    self.event()
+            named = event in _OPERATIONS and isinstance(arguments[0], str | os.PathLike)
+            if named and str(arguments[0]).startswith(inside):
+                self._count(COUNTED.index("operations"))
+                self.event()
 
         sys.addaudithook(hear)
 

@@ -1,4 +1,4 @@
-"""Runs of two processes by torchrun: one of them is killed, or both with torchrun; resumed, they end as unbroken ones."""
+"""Runs of two processes by torchrun: one is killed, or both with torchrun; resumed, they end as unbroken ones."""
 
 import json
 import os

@@ -63,7 +63,7 @@ def arguments(algo: str, iterations: int, processes: int = 1) -> list[str]:
 
 
 class Points(FakePools):
-    """Points in the plane look for a goal; what they see is noisy by the world's own generator, so that its state counts.
+    """Points in the plane look for a goal; what they see is noisy by the world's generator, so that its state counts.
 
     Args:
         rows: Rows over both classes.
