@@ -91,7 +91,10 @@ class Torn:
 
 
 def instrument(marks: Marks) -> None:
-    """Puts the marks into the commands of this process, for good. A phase that a run learns anew gets a line here."""
+    """Puts the marks into the commands of this process, for good.
+
+    What else a run may do one day (recording data, say) gets a line here and in ``PHASES``.
+    """
     from bidex_meta.commands import run, watching
     from bidex_meta.record import atomic, checkpoints, metrics
     from bidex_meta.train import runner
