@@ -110,9 +110,10 @@ class Checkpoints:
         if not is_file(path):
             there = ", ".join(sorted(found.name for found in self.folder.glob("*.pt"))) or "none"
             raise BidexError(f"There is no {path}. Checkpoints in {self.folder}: {there}.")
-        content = _read(path, "name another")
-        if content is None:
-            raise BidexError(f"{path} is no checkpoint that can be read. Name another.")
+        try:
+            content = opened(path)
+        except Exception as error:
+            raise BidexError(f"{path} is no checkpoint that can be read ({_reason(error)}). Name another.") from None
         return content["state"], content["step"]
 
     def newest_step(self) -> int | None:
@@ -153,7 +154,10 @@ def _read(path: Path, then: str = "trying an older one") -> dict[str, Any] | Non
     try:
         return opened(path)
     except Exception as error:  # torch raises a dozen kinds for a damaged file; each means "try the one before"
-        reason = one_line(error)[:100].rstrip(".")
-        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
-        print(f"Checkpoint {path} cannot be read ({kind}{reason}); {then}.", file=sys.stderr)
+        print(f"Checkpoint {path} cannot be read ({_reason(error)}); {then}.", file=sys.stderr)
         return None
+
+
+def _reason(error: Exception) -> str:
+    kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+    return kind + one_line(error)[:100].rstrip(".")

@@ -81,7 +81,7 @@ def place() -> Iterator[Path]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algo", ["mtppo", "mtsac", "happo", "promp", "rl2"])
+@pytest.mark.parametrize("algo", ["mtppo", "mtsac", "happo", "rl2"])
 def test_two_processes_are_killed_and_resume(algo: str, place: Path) -> None:
     whole, run, draw = Pair(algo, place / f"{algo}whole"), Pair(algo, place / algo), random.Random(algo)
     code, said = whole.go_on()
