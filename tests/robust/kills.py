@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from bidex_meta.data import open_dataset
 from bidex_meta.record import RunFolder, read_metrics
 from tests.robust.marks import PHASES, read
 
@@ -112,10 +113,12 @@ class Victim:
             seconds: Of CPU, which that took.
             draw: Of the moments.
         """
-        self.go_on(after=draw.uniform(0.0, seconds / 3))
+        self.go_on(after=draw.uniform(0.0, seconds / 4))
         for phase in PHASES[1:]:
-            # In the evaluation one kill; what goes before it shall not be over yet: each takes a fifth at most.
-            most = counts[phase] if phase == PHASES[-1] else max(1, counts[phase] // 5)
+            if not counts[phase]:
+                continue
+            # Before the last of them the run shall not be over: none goes further than an eighth of it.
+            most = counts[phase] if phase == PHASES[-1] else max(1, counts[phase] // 8)
             answer = self.go_on(aim=(phase, draw.randint(1, most)))
             assert answer["code"] == KILLED, (phase, self.log.read_text())
         assert self.go_on()["code"] == 0
@@ -126,6 +129,8 @@ def bits(value: Any) -> Any:
     if isinstance(value, torch.Tensor):
         flat = value.detach().cpu().contiguous().flatten()
         return str(value.dtype), tuple(value.shape), np.asarray(flat.view(torch.uint8)).tobytes() if len(flat) else b""
+    if isinstance(value, np.ndarray):
+        return str(value.dtype), value.shape, value.tobytes()
     if isinstance(value, dict):
         return {key: bits(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
@@ -148,6 +153,8 @@ def outcome(path: Path, names: bool = True) -> dict[str, Any]:
     found["newest"], found["best"] = bits(folder.checkpoints.load()), folder.checkpoints.found_of_best()
     rows = read_metrics(path / "metrics.jsonl")
     found["metrics"] = [{k: v for k, v in r.items() if k != "time" and not k.startswith("Perf/")} for r in rows]
+    if (path / "replay").exists():
+        found["recorded"] = [bits(vars(episode)) for episode in open_dataset(path / "replay").episodes()]
     if (path / "evaluation.json").exists():
         found["evaluation"] = json.loads((path / "evaluation.json").read_text())
         found["evaluation"].pop("run", None)

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-PHASES = ("starting", "training", "saving", "watching", "evaluating")
+PHASES = ("starting", "training", "saving", "watching", "recording", "evaluating")
 _OPERATIONS = ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.chmod", "os.truncate", "os.link")
 COUNTED = (*PHASES, "operations")
 """What an aim may name: a phase, or the operations on files alone, of all phases."""
@@ -91,11 +91,9 @@ class Torn:
 
 
 def instrument(marks: Marks) -> None:
-    """Puts the marks into the commands of this process, for good.
-
-    What else a run may do one day (recording data, say) gets a line here and in ``PHASES``.
-    """
-    from bidex_meta.commands import run, watching
+    """Puts the marks into the commands of this process, for good; what else a run learns to do gets a line here."""
+    from bidex_meta.commands import run, run_recording, watching
+    from bidex_meta.data.writer import DatasetWriter
     from bidex_meta.record import atomic, checkpoints, metrics
     from bidex_meta.train import runner
 
@@ -103,6 +101,8 @@ def instrument(marks: Marks) -> None:
         (runner, "train", "training"),
         (checkpoints.Checkpoints, "save", "saving"),
         (watching.Watch, "__call__", "watching"),
+        (DatasetWriter, "commit", "recording"),
+        (run_recording, "complete", "recording"),
         (run, "_evaluate", "evaluating"),
     ):
         setattr(module, name, marks.phase(phase, getattr(module, name)))

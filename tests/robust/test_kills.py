@@ -31,16 +31,21 @@ def killer() -> Iterator[subprocess.Popen[str]]:
         yield process
 
 
-def killed_often(algo: str, seed: int, killer: subprocess.Popen[str], place: Path) -> None:
+def killed_often(
+    algo: str, seed: int, killer: subprocess.Popen[str], place: Path, record: bool = False
+) -> dict[str, object]:
+    """The unbroken run's outcome, which the killed one's equals."""
     draw = random.Random(f"{algo} {seed}")
-    often = draw.random() < 0.5
-    whole = Victim(killer, arguments(algo, ITERATIONS), place / f"{algo}{seed}whole")
+    often = draw.random() < 0.5 or record  # each checkpoint begins another part of what is recorded
+    whole = Victim(killer, arguments(algo, ITERATIONS, record=record), place / f"{algo}{seed}whole{record}")
     answer = whole.go_on()
     assert answer["code"] == 0, whole.log.read_text()
-    run = Victim(killer, whole.arguments, place / f"{algo}{seed}", 0.0 if often else 0.02)
+    run = Victim(killer, whole.arguments, place / f"{algo}{seed}{record}", 0.0 if often else 0.02)
     run.kill_often(whole.counts(), answer["cpu"], draw)
     print(f"kills: {algo} {dict(run.fell)}")
-    assert unequal(outcome(run.path, often), outcome(whole.path, often)) == []
+    expected = outcome(whole.path, often)
+    assert unequal(outcome(run.path, often), expected) == []
+    return expected
 
 
 def test_every_learner_can_be_killed() -> None:
@@ -57,6 +62,14 @@ def test_killed_runs_end_as_unbroken_ones(algo: str, killer: subprocess.Popen[st
 @pytest.mark.parametrize("algo", FLAGS)
 def test_killed_runs_of_every_learner(algo: str, seed: int, killer: subprocess.Popen[str], place: Path) -> None:
     killed_often(algo, seed, killer, place)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("algo", ["mtppo", "mtsac", "promp", "rl2"])
+def test_killed_runs_that_record(algo: str, seed: int, killer: subprocess.Popen[str], place: Path) -> None:
+    pytest.importorskip("h5py")
+    assert killed_often(algo, seed, killer, place, record=True)["recorded"]
 
 
 def killed_before_operations(killer: subprocess.Popen[str], place: Path, name: str, stride: int) -> int:

@@ -54,12 +54,14 @@ ADAPTS = ("promp", "maml", "rl2")
 ROWS = 8
 
 
-def arguments(algo: str, iterations: int, processes: int = 1) -> list[str]:
-    """A run of so many iterations of a learner (half as many of one that adapts), without its folder."""
-    adapts, steps = algo in ADAPTS, iterations * ROWS * 4 * processes
+def arguments(algo: str, iterations: int, processes: int = 1, record: bool = False) -> list[str]:
+    """A run of so many iterations of a learner, without its folder."""
+    # One that adapts plays two phases of four steps.
+    adapts = algo in ADAPTS
+    steps = iterations * ROWS * processes * (8 if adapts else 4)
     words = ["run", "--suite", "ML4" if adapts else "MT4", "--algo", algo, "--num-envs", str(ROWS), "--seed", "5"]
     words += ["--steps", str(steps), "--threads", "1", "--device", "cpu", "--logger", "none", *FLAGS[algo].split()]
-    return [*words, "--episodes", "1", "--evaluate-every", "4"]
+    return [*words, "--episodes", "1", "--evaluate-every", "4", *(["--record", str(steps)] if record else [])]
 
 
 class Points(FakePools):
