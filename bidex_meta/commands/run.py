@@ -209,6 +209,7 @@ def _train(plan: RunPlan, folder: Any, world: "VectorWorld", learner: Any, loade
         return runner.train(
             learner, world, **budget, record=None, enough=run_recording.enough(plan.config)
         )  # process 0's clock decides
+    folder.finish(resume_step)
     if plan.folder is not None and folder.config() != plan.config:
         folder.change_config(plan.config)  # more steps, say; not before it is known that the run goes on
     done = mend(folder.metrics_path, resume_step or 0)
