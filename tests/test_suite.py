@@ -121,7 +121,10 @@ def test_listed_goals(name: str, distance: float) -> None:
 
 
 def test_unknown_name_names_the_nearest_and_all() -> None:
-    with pytest.raises(BidexError, match=r"Did you mean 'MT4'\? Known: ML1, ML1-objects, ML1-wide, ML20, ML4, MT1, MT1-objects, MT20, MT4"):
+    with pytest.raises(
+        BidexError,
+        match=r"Did you mean 'MT4'\? Known: ML1, ML1-objects, ML1-wide, ML20, ML4, MT1, MT1-objects, MT20, MT4",
+    ):
         load_suite("MT44")
 
 

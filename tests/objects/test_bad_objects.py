@@ -16,9 +16,13 @@ def mjcf(inside: str, before: str = "", body: str = "<body>{}</body>") -> str:
     return f"<mujoco>{before}<worldbody>{body.format(inside)}</worldbody></mujoco>"
 
 
-BOMB = '<!DOCTYPE m [<!ENTITY a "' + "x" * 1000 + '">' + "".join(
-    f'<!ENTITY b{i} "{"&b%d;" % (i - 1) * 10 if i else "&a;" * 10}">' for i in range(9)
-) + f"]><mujoco model='&b8;'><worldbody><body>{GEOM}</body></worldbody></mujoco>"
+BOMB = (
+    '<!DOCTYPE m [<!ENTITY a "'
+    + "x" * 1000
+    + '">'
+    + "".join(f'<!ENTITY b{i} "{"&b%d;" % (i - 1) * 10 if i else "&a;" * 10}">' for i in range(9))
+    + f"]><mujoco model='&b8;'><worldbody><body>{GEOM}</body></worldbody></mujoco>"
+)
 
 BAD = {
     "no body": (mjcf(GEOM, body="{}"), "one <body> with geoms, got 0"),

@@ -51,12 +51,15 @@ def test_a_held_out_object_is_a_test_split() -> None:
     assert not obs[env.task_class.layout.goal_indices()].any()
 
 
-def test_success_is_told_by_object() -> None:
-    source = Source.open({"suite": "MT1-objects", "threads": 1})
+def test_success_is_told_by_object(tmp_path: Path) -> None:
+    text = load_suite("MT1-objects").file.read_text()
+    (tmp_path / "one.toml").write_text(text.replace("tasks_per_class = 50", "tasks_per_class = 1"))
+    source = Source.open({"suite": str(tmp_path / "one.toml"), "threads": 1})
     assert list(source.tasks("train")) == FOUR
     world = source.world("train", 4)
     found = evaluate(RandomAgent(world.action_space), world, 1, seed=0, references=source.references())
-    assert list(found.to_json()["classes"]) == FOUR
+    classes = found.to_json()["classes"]
+    assert list(classes) == FOUR and all(classes[name]["episodes"] == 1 for name in FOUR)
 
 
 def test_a_class_on_its_own_with_an_object_trains_and_is_evaluated(
@@ -88,7 +91,9 @@ def test_a_suite_names_files_beside_it(tmp_path: Path) -> None:
     assert list(Benchmark(tmp_path / "stones.toml").train_classes)[3] == "CatchUnderarm-stone"
 
 
-@pytest.mark.parametrize("name", ["HandOver", "CatchUnderarm", "CatchOver2Underarm", "CatchAbreast", "TwoCatchUnderarm"])
+@pytest.mark.parametrize(
+    "name", ["HandOver", "CatchUnderarm", "CatchOver2Underarm", "CatchAbreast", "TwoCatchUnderarm"]
+)
 def test_every_throwing_class_takes_an_object_and_the_egg_is_the_default(name: str) -> None:
     usual, named, other = (registry.get(name, True, **more) for more in ({}, {"object": "Egg"}, {"object": "mug"}))
     assert usual.scene_key == named.scene_key != other.scene_key

@@ -87,12 +87,16 @@ def test_own_pots_bottles_and_cups_name_their_points(name: str, tmp_path: Path) 
 @pytest.mark.parametrize(
     "old, new, told",
     [
-        ('<site name="right_handle"', '<site name="ear"', "MuJoCo says"),
+        ('<site name="right_handle"', '<site name="ear"', "right_handle"),
         ('name="right_handle_position"', 'name="ear_position"', "the sensors of assets/objects/pot.xml"),
         ('<joint name="slide"', '<joint name="lift"', "the joints of assets/objects/pot.xml"),
-        ('<body name="object">', '<body name="pan">', "MuJoCo says"),
+        ('<body name="object">', '<body name="pan">', 'a body called "object"'),
         ('mass="0.8" friction', 'mass="80" friction', "at most 10 kg"),
-        ('size="0.116 0.002" pos="0 0 -0.0545" mass="0" contype="0"', 'size="0.116 0.04" pos="0 0 -0.0545" mass="0"', "stands"),
+        (
+            'size="0.116 0.002" pos="0 0 -0.0545" mass="0" contype="0"',
+            'size="0.116 0.04" pos="0 0 -0.0545" mass="0"',
+            "stands",
+        ),
         ("</mujoco>", '<actuator><motor joint="slide"/></actuator></mujoco>', "<actuator>"),
     ],
 )
