@@ -63,6 +63,7 @@ class BottleCap(OwnObjectClass):
     start_draws = DRAWS
     solver = FIRM
     usual = _BOTTLE
+    usual_stands = False
     camera_target = (0.0, -0.62, 0.52)
 
     @property
