@@ -58,6 +58,7 @@ def test_bash_completes_commands_flags_and_names(tmp_path, capsys):
         ("run --suite MT", {"MT1", "MT1-objects", "MT4", "MT20"}),
         ("run --algo mtp", {"mtppo"}),
         ("witness --task Hand", {"HandOver"}),
+        ("run --object ha", {"hammer"}),
         ("run --base ", {"own", "moving", "fixed"}),
     ):
         command = ["bash", "-c", _COMPLETE, "bash", str(tmp_path / "script"), "bidex-meta", *words.split(" ")]

@@ -10,6 +10,7 @@ import torch
 from bidex_meta import BidexError, make_task_world, paths
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import compile_scene
+from tests.tasks.worlds import Lens, depths, engine_of, scene_of
 
 OBJ = "\n".join(f"v {x} {y} {z}" for x in (-0.02, 0.02) for y in (-0.03, 0.03) for z in (-0.04, 0.04)) + (
     "\nf 1 2 4\nf 1 4 3\nf 5 8 6\nf 5 7 8\nf 1 5 6\nf 1 6 2\nf 3 4 8\nf 3 8 7\nf 1 3 7\nf 1 7 5\nf 2 6 8\nf 2 8 4\n"
@@ -82,6 +83,53 @@ def test_own_pots_bottles_and_cups_name_their_points(name: str, tmp_path: Path) 
     world = make_task_world(name, 2, "cpu", threads=1, object=str(tmp_path / "own.xml"))
     world.reset(seed=0)
     assert torch.isfinite(world.step(torch.zeros(2, 52))[1]).all() and world.task_names == [f"{name}-own"]
+
+
+EXAMPLES = {"LiftUnderarm": "roasting_tin", "BottleCap": "flask", "SwingCup": "tankard"}
+_MOVED = {"LiftUnderarm": 0.01, "BottleCap": 0.1, "SwingCup": 0.01}
+"""Metres in a second of doing nothing: two stand on a table, a bottle sinks with the hand that yields under it."""
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_the_examples_start_clear_stay_and_do_not_blow_up(name: str) -> None:
+    file = paths.assets_dir().parent / "examples" / "objects" / f"{EXAMPLES[name]}.xml"
+    world = make_task_world(name, 8, "cpu", threads=1, object=str(file), autoreset_mode="DISABLED", stagger=False)
+    world.reset(seed=0)
+    scene, engine = scene_of(world), engine_of(world)
+    lens = Lens(scene.model)
+    assert max(float(depths(lens.look(row)).max()) for row in engine.placement().numpy()) < 0.005
+    columns, rng = scene.qpos[scene.task.own.name], torch.Generator().manual_seed(0)  # type: ignore[attr-defined]
+    before = engine.qpos[:, columns].clone()
+    for _ in range(60):
+        assert not world.step(torch.zeros(8, 52))[-1]["unstable"].any()
+    assert (engine.qpos[:, columns] - before)[:, :3].norm(dim=1).max() < _MOVED[name]
+    world.reset(seed=1)
+    for _ in range(75):
+        obs, _, _, _, info = world.step(2 * torch.rand(8, 52, generator=rng) - 1)
+        assert obs.isfinite().all() and not info["unstable"].any()
+
+
+def test_a_bottle_that_starts_in_the_palm_is_one_line_and_a_changed_file_another_object(tmp_path: Path) -> None:
+    text = (paths.assets_dir().parent / "examples" / "objects" / "flask.xml").read_text()
+    file = tmp_path / "flask.xml"
+    file.write_text(text)
+    first = registry.get("BottleCap", True, object=str(file))
+    file.write_text(text.replace('mass="0.38"', 'mass="0.3"'))
+    second = registry.get("BottleCap", True, object=str(file))
+    assert first.scene_key != second.scene_key
+    file.write_text(text.replace('size="0.03"', 'size="0.06"'))
+    with pytest.raises(BidexError, match=r"starts clear of hands and table, got one \d+ mm deep in right/\w+\. Make"):
+        registry.get("BottleCap", True, object=str(file))
+
+
+def test_more_geoms_get_more_room(tmp_path: Path) -> None:
+    text = (paths.assets_dir().parent / "examples" / "objects" / "tankard.xml").read_text()
+    rivets = "".join(f'<geom size="0.002" pos="0 0 {0.002 * i}" mass="0.001"/>' for i in range(20))
+    (tmp_path / "riveted.xml").write_text(
+        text.replace('<site name="right_handle"', f'{rivets}<site name="right_handle"')
+    )
+    usual, own = (registry.get("SwingCup", True, **more) for more in ({}, {"object": str(tmp_path / "riveted.xml")}))
+    assert own.needs.contacts > usual.needs.contacts and own.needs.rows > usual.needs.rows
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,13 @@
 """Every thing of the shelf: published size and mass, starts, stability, and that a hand holds it."""
 
+import json
+
 import mujoco
 import numpy as np
 import pytest
 import torch
 
+from bidex_meta.cli import main
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.objects.held import held_object, shelf
 from bidex_meta.tasks.scene import compile_scene
@@ -17,6 +20,13 @@ each_thing = pytest.mark.parametrize("thing", shelf())
 
 def test_the_shelf_is_what_the_page_lists() -> None:
     assert set(shelf()) == {*PUBLISHED, *LONG}
+
+
+def test_the_command_lists_it(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["list", "objects", "--json"]) == 0
+    rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
+    assert set(rows) == {"egg", *shelf()}
+    assert rows["tuna_can"] == {"name": "tuna_can", "mass_g": 171.0, "box_mm": "85 x 85 x 33", "geoms": 1}
 
 
 @pytest.mark.parametrize("thing", PUBLISHED)

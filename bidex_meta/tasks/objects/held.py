@@ -207,7 +207,7 @@ def _loaded(file: Path, _state: tuple[int, int]) -> HeldObject:
         raise BidexError(f"{file}: expected geoms that collide, got contype 0 in all. Leave contype out.")
     if collide > _MOST_GEOMS:
         raise BidexError(f"{file}: expected at most {_MOST_GEOMS} geoms that collide, got {collide}. Simplify it.")
-    low, high = extents(centres, radii)
+    low, high = extents(model, 1)
     _check_figures(file, model, low, high)
     corners = tuple(map(float, low)), tuple(map(float, high))
     return HeldObject(file.stem, file, float(model.body_mass[1]), *corners, collide, centres, radii)  # type: ignore[arg-type]

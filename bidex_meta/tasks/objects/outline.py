@@ -27,9 +27,22 @@ def outline(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(centres), np.concatenate(radii)
 
 
-def extents(centres: np.ndarray, radii: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corner of the box around an outline, body frame, metres, each (3,)."""
-    return (centres - radii[:, None]).min(axis=0), (centres + radii[:, None]).max(axis=0)
+def extents(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner of the box around what collides of a body, body frame, metres, each (3,).
+
+    The outline's box and that of the geoms' own boxes both hold it; a cylinder stands out of neither in one of them.
+    """
+    centres, radii = outline(model, body)
+    low, high = (centres - radii[:, None]).min(axis=0), (centres + radii[:, None]).max(axis=0)
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    turn, corners = np.zeros(9), []
+    for geom in np.flatnonzero(model.geom_bodyid == body):
+        if model.geom_contype[geom] or model.geom_conaffinity[geom]:
+            mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
+            box = model.geom_aabb[geom, :3] + signs * model.geom_aabb[geom, 3:]
+            corners.append(box @ turn.reshape(3, 3).T + model.geom_pos[geom])
+    found = np.concatenate(corners)
+    return np.maximum(low, found.min(axis=0)), np.minimum(high, found.max(axis=0))
 
 
 def _own_frame(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
