@@ -21,7 +21,8 @@ def short_name(name: str) -> str:
 
 def name_with_object(name: str, thing: str | None) -> str:
     """What a task class with another object is called: ``CatchUnderarm-block``; of a file its name without ``.xml``."""
-    return name if thing is None else f"{name}-{Path(thing).stem if thing.endswith('.xml') else thing}"
+    # Names of the shelf are taken in any case, and written in one.
+    return name if thing is None else f"{name}-{Path(thing).stem if thing.endswith('.xml') else thing.lower()}"
 
 
 def name_without_object(name: str) -> str:

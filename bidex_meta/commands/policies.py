@@ -155,6 +155,8 @@ def looked_at(policy: str, suite: str | None, task: str | None, seed: int, thing
     Raises:
         BidexError: Nothing is named, or what is not there.
     """
+    if thing is not None and (suite is not None or task is None):
+        raise BidexError("--object goes with --task alone: bidex-meta render --task CatchUnderarm --object mug ...")
     config: dict[str, Any] = {"suite": suite, "task": task, "object": thing, "threads": 1}
     if policy not in ("zero", "random"):
         stored = RunFolder.open(Path(policy)).config()

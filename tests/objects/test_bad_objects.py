@@ -83,7 +83,7 @@ def test_a_bad_file_is_one_line(case: str, tmp_path: Path) -> None:
     assert str(file) in str(raised.value)
 
 
-@pytest.mark.parametrize("name", ["crate", "", 3, None, "/no/such/file.xml", "a\0.xml"])
+@pytest.mark.parametrize("name", ["crate", "", 3, None, "/no/such/file.xml", "a\0.xml", "a\nb.xml"])
 def test_a_bad_name_is_one_line(name: object) -> None:
     with pytest.raises(BidexError):
         registry.get("CatchUnderarm", True, object=name)  # type: ignore[arg-type]
@@ -122,6 +122,9 @@ def test_the_command_says_so_and_writes_nothing(
         assert main([*run, *more]) == 2
         error = capsys.readouterr().err
         assert told in error and len(error.strip().splitlines()) == 1, error
+    for look in (["--suite", "MT4", "--task", "CatchUnderarm"], []):
+        assert main(["render", *look, "--object", "mug", "--out", "mug.png"]) == 2
+        assert "--object goes with --task alone" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["heavy.xml"]
 
 

@@ -105,3 +105,4 @@ def test_every_throwing_class_takes_an_object_and_the_egg_is_the_default(name: s
     world.reset(seed=0)
     assert torch.isfinite(world.step(torch.zeros(6, 52))[1]).all()
     assert world.task_names == [f"{name}-mug"]
+    assert make_task_world(name, 1, "cpu", threads=1, object="MUG").task_names == [f"{name}-mug"]

@@ -171,7 +171,7 @@ def held_object(name: object) -> HeldObject | None:
     Raises:
         BidexError: Unknown name, or a file that holds no object for a hand.
     """
-    if not isinstance(name, str) or "\0" in name:
+    if not isinstance(name, str) or not name.isprintable():
         raise BidexError(f"object: expected a name or the path of an .xml file, got {shortened(name)}.")
     if name.endswith(".xml"):
         file = expanded(name)

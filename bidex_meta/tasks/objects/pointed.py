@@ -70,7 +70,7 @@ class OwnObjectClass(TaskClass):
         self.own = self.usual
         if object is None:
             return
-        if not isinstance(object, str) or not object.endswith(".xml"):
+        if not isinstance(object, str) or not object.endswith(".xml") or not object.isprintable():
             told = f"the path of an MJCF file that takes the place of the {self.usual.asset}"
             raise BidexError(f"object: expected {told}, which ends in .xml; got {shortened(object)}.")
         file = expanded(object).resolve()
