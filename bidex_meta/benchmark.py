@@ -211,18 +211,11 @@ class Benchmark:
         from bidex_meta.envs.suite_env import EnvRecipe
 
         moving, hides = True if self.suite.base == "moving" else None, self.suite.observation == "masked"
-        return {
-            entry.name: EnvRecipe(
-                entry.name,
-                moving,
-                tuple(entry.options.items()),
-                self.padded_size,
-                hides,
-                entry.reward_scale,
-                entry.class_name,
-            ).make_class()
-            for entry in self.suite.split_classes(split)
-        }
+        found = {}
+        for entry in self.suite.split_classes(split):
+            look = (moving, tuple(entry.options.items()), self.padded_size, hides)
+            found[entry.name] = EnvRecipe(entry.name, *look, entry.reward_scale, entry.class_name).make_class()
+        return found
 
     def _checked_split(self, split: str) -> Split:
         if not isinstance(split, str) or split not in self.suite.splits:
