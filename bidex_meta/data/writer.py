@@ -2,6 +2,8 @@
 
 import json
 import math
+import os
+import shutil
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,7 @@ from bidex_meta.data.dataset import valid_name
 from bidex_meta.data.episode import Episode
 from bidex_meta.errors import BidexError
 from bidex_meta.reading import is_file, read_json
-from bidex_meta.record.atomic import write_atomic, write_json
+from bidex_meta.record.atomic import check_writable, write_atomic, write_json
 
 _MINARI = "0.5.0"
 """The version of Minari whose layout is written."""
@@ -68,7 +70,14 @@ class DatasetWriter:
 
 
 def begin(folder: Path, plan: dict[str, Any]) -> None:
-    """Writes down what is recorded, so that the same command goes on with it and no other one does.
+    """Writes down what is recorded; arguments and errors as of ``check_place``."""
+    if not check_place(folder, plan):
+        (folder / "data").mkdir(parents=True, exist_ok=True)
+        write_json(folder / "data" / part_files.RECORDING, plan)
+
+
+def check_place(folder: Path, plan: dict[str, Any]) -> bool:
+    """Whether the same recording has begun here, so that the same command goes on with it and no other one does.
 
     Args:
         folder: The data set's folder.
@@ -90,11 +99,11 @@ def begin(folder: Path, plan: dict[str, Any]) -> None:
                 f"{folder} is a recording that has not ended, with {name} {before.get(name)}, not {plan.get(name)}. "
                 "Give its own command to go on, or name another place by --out."
             )
-        return
+        return True
     if folder.exists() and any(folder.iterdir()) and not (inner.is_dir() and not any(inner.iterdir())):
         raise BidexError(f"{folder} exists and is not empty. Name another place by --out.")
-    inner.mkdir(parents=True, exist_ok=True)
-    write_json(path, plan)
+    check_writable(path)
+    return False
 
 
 def finish(folder: Path, name: str, observations: Box, actions: Box, metadata: dict[str, Any]) -> None:
@@ -133,6 +142,31 @@ def finish(folder: Path, name: str, observations: Box, actions: Box, metadata: d
     }
     write_json_compact(inner / part_files.METADATA, content)
     (inner / part_files.RECORDING).unlink(missing_ok=True)
+
+
+def adopt(inner: Path, folder: Path, name: str) -> None:
+    """Makes a complete data set of another one's files: links to them, or copies on another disk.
+
+    Args:
+        inner: The folder ``data`` of the other one.
+        folder: The new data set's folder.
+        name: Its name.
+
+    Raises:
+        BidexError: There is something in the folder already, or Minari would not take the name.
+    """
+    if not valid_name(name):
+        raise BidexError(f"Expected a name such as CatchUnderarm/replay-v0, got {name!r}. Name another place by --out.")
+    check_place(folder, {})
+    new = folder / "data"
+    new.mkdir(parents=True, exist_ok=True)
+    content = read_json(inner / part_files.METADATA, "a data set's metadata")
+    for path in [*part_files.parts_of(inner), inner / part_files.MAIN]:
+        try:
+            os.link(path, new / path.name)
+        except OSError:
+            shutil.copyfile(path, new / path.name)
+    write_json_compact(new / part_files.METADATA, content | {"dataset_id": name})
 
 
 def left_out(inner: Path) -> dict[str, int]:
