@@ -4,9 +4,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from bidex_meta.data import part_files
 from bidex_meta.data.episode_recorder import EpisodeRecorder
 from bidex_meta.data.writer import DatasetWriter
 from bidex_meta.errors import BidexError
+from bidex_meta.record.atomic import write_json
 from bidex_meta.world.contract import VectorWorld
 
 _KEY = "recorder"
@@ -20,16 +22,28 @@ class RunRecorder(EpisodeRecorder):
     plays, and records, them again.
 
     Args:
-        world: In autoreset mode SAME_STEP.
-        folder: The data set's folder.
+        world: In either autoreset mode.
         rows: Which rows to record.
         process: Number of this process.
+
+    Attributes:
+        folder: The data set's folder, after ``open``.
     """
 
-    def __init__(self, world: VectorWorld, folder: Path, rows: Sequence[int], process: int = 0) -> None:
-        self.folder, self.process = folder, process
-        self.writer = DatasetWriter(folder, process)
+    folder: Path
+    writer: DatasetWriter
+
+    def __init__(self, world: VectorWorld, rows: Sequence[int], process: int = 0) -> None:
+        self.process = process
         super().__init__(world, lambda episode: self.writer.add(episode), rows)
+
+    def open(self, folder: Path, parts: int = 0) -> None:
+        """Says where to record, before the first reset; parts of this process from a number on are deleted there."""
+        self.folder = folder
+        self.writer = DatasetWriter(folder, self.process, keep=parts)
+        if self.process == 0:  # no complete data set any longer
+            write_json(folder / "data" / part_files.RECORDING, {"run": folder.parent.name})
+            (folder / "data" / part_files.METADATA).unlink(missing_ok=True)
 
     def state_dict(self) -> dict[str, Any]:
         """The world's state, and where the recording stands; what was recorded is on the disk then."""
@@ -50,12 +64,13 @@ class RunRecorder(EpisodeRecorder):
         self.world.load_state_dict({name: value for name, value in state.items() if name != _KEY})
         parts = int(own.pop("parts"))
         self.writer.close()
-        self.writer = DatasetWriter(self.folder, self.process, keep=parts)
+        self.open(self.folder, parts)
         self.load_recorder_state(own)
 
     def close(self) -> None:
         """Forgets what no checkpoint knows, and frees the world."""
-        self.writer.close()
+        if "folder" in self.__dict__:
+            self.writer.close()
         super().close()
 
 

@@ -81,12 +81,12 @@ def coverage(dataset: Dataset, most: int = 2000) -> dict[str, Any]:
     count, taken = 0, 0
     sums, squares = np.zeros(d + a), np.zeros(d + a)
     low, high, bounds = np.full(d, np.inf), np.full(d, -np.inf), 0
-    first: np.ndarray | None = None
+    first = np.zeros(0)
     for number, episode in enumerate(dataset.episodes()):
         if number % every:
             continue
         values = np.concatenate([episode.observations[:-1], episode.actions], 1).astype(np.float64)
-        if first is None:
+        if len(first) == 0:
             first = values[0].copy()
         values -= first  # sums of squares lose fewer digits
         sums, squares, count = sums + values.sum(0), squares + (values**2).sum(0), count + len(values)
