@@ -129,7 +129,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     # What older runs did not know.
     older = {"engine": "auto", "base": "own", "start_from": None, "minutes": None}
     older |= {"evaluate_every": None, "video_every": None, "logger": "tensorboard"}
-    older |= {"record": 0, "stop_at_return": None, "stop_at_score": None}
+    older |= {"record": 0, "record_share": 0.0, "stop_at_return": None, "stop_at_score": None}
     stored = {**older, **folder.config("learner", "num_envs", "steps")} if folder else {}
     suite, task = (peek(arguments, f"--{name}") or stored.get(name) for name in ("suite", "task"))
     # Where neither is named, `run --help` still has defaults to show; without --help _resolved refuses it.
@@ -205,6 +205,8 @@ def _resolved(flags: Any, names: dict[str, str], device: str, stored: dict[str, 
         "video_every": flags.video_every,
         "logger": flags.logger,
         "record": flags.record,
+        # A resumed run that takes more steps goes on with the rows that it began with.
+        "record_share": stored.get("record_share", flags.record / max(flags.steps, 1)),
         "stop_at_return": flags.stop_at_return,
         "stop_at_score": flags.stop_at_score,
         "processes": launch().count,

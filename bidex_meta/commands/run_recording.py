@@ -16,7 +16,7 @@ def recorded(plan: RunPlan, world: Any) -> Any:
     from bidex_meta.data.run_recorder import RunRecorder, spread_rows
     from bidex_meta.data.writer import estimated_bytes
 
-    rows = spread_rows(world, plan.config["record"] / max(plan.config["steps"], 1))
+    rows = spread_rows(world, plan.config["record_share"])
     sizes = world.single_observation_space.shape[0], world.single_action_space.shape[0]
     needed = estimated_bytes(plan.config["record"], *sizes, 20.0)
     place = plan.folder.path if plan.folder else plan.flags.run_dir or new_folder_name(plan.config)

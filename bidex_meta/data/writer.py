@@ -16,7 +16,7 @@ from bidex_meta.data.dataset import valid_name
 from bidex_meta.data.episode import Episode
 from bidex_meta.errors import BidexError
 from bidex_meta.reading import is_file, read_json
-from bidex_meta.record.atomic import check_writable, write_atomic, write_json
+from bidex_meta.record.atomic import check_writable, remove_leftovers, write_atomic, write_json
 
 _MINARI = "0.5.0"
 """The version of Minari whose layout is written."""
@@ -88,7 +88,8 @@ def check_place(folder: Path, plan: dict[str, Any]) -> bool:
     """
     inner = folder / "data"
     path = inner / part_files.RECORDING
-    if is_file(inner / part_files.METADATA):
+    # With a plan beside it, it was killed between its last two steps, and the index is written once more.
+    if is_file(inner / part_files.METADATA) and not is_file(path):
         raise BidexError(f"{folder} holds a complete data set. Name another by --out, or delete it.")
     if is_file(path):
         before = read_json(path, "a recording's plan")
@@ -100,6 +101,8 @@ def check_place(folder: Path, plan: dict[str, Any]) -> bool:
                 "Give its own command to go on, or name another place by --out."
             )
         return True
+    if inner.is_dir():
+        remove_leftovers(inner)  # of a recording that was killed as it began
     if folder.exists() and any(folder.iterdir()) and not (inner.is_dir() and not any(inner.iterdir())):
         raise BidexError(f"{folder} exists and is not empty. Name another place by --out.")
     check_writable(path)

@@ -24,6 +24,7 @@ CONFIG = {
     "video_every": whole(1).or_none(),
     "logger": TEXT,
     "record": whole(0),
+    "record_share": number(0.0, 1e15),
     "stop_at_return": number(-1e12, 1e12).or_none(),
     "stop_at_score": number(-1e12, 1e12).or_none(),
     "processes": whole(1, 1_000_000),
