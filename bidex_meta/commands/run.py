@@ -89,7 +89,9 @@ def _run(plan: RunPlan, distributed: Any, held: contextlib.ExitStack) -> tuple[A
     _say(f"Run folder: {folder.path}")
     recorder = world if plan.config["record"] else None
     if recorder is not None:
-        distributed.together(lambda: recorder.open(folder.path / "replay"))
+        recorder.folder = folder.path / "replay"
+        if loaded is None:  # a checkpoint knows which parts stay
+            distributed.together(lambda: recorder.open(recorder.folder))
     waits = distributed.LostProcess("this one was asked to stop and waits for it")
     distributed.on_loss(lambda: _say_loss(waits, distributed, folder))
     try:

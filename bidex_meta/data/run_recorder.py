@@ -27,7 +27,7 @@ class RunRecorder(EpisodeRecorder):
         process: Number of this process.
 
     Attributes:
-        folder: The data set's folder, after ``open``.
+        folder: The data set's folder: set by ``open``, or before ``load_state_dict``, which opens it.
     """
 
     folder: Path
@@ -63,13 +63,14 @@ class RunRecorder(EpisodeRecorder):
         own = dict(state[_KEY])
         self.world.load_state_dict({name: value for name, value in state.items() if name != _KEY})
         parts = int(own.pop("parts"))
-        self.writer.close()
+        if "writer" in self.__dict__:
+            self.writer.close()
         self.open(self.folder, parts)
         self.load_recorder_state(own)
 
     def close(self) -> None:
         """Forgets what no checkpoint knows, and frees the world."""
-        if "folder" in self.__dict__:
+        if "writer" in self.__dict__:
             self.writer.close()
         super().close()
 

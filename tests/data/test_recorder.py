@@ -1,6 +1,7 @@
 """What is stored is what a plain loop saw."""
 
 import tempfile
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -134,7 +135,7 @@ def test_a_run_that_goes_on_stores_each_episode_once(tmp_path: Path) -> None:
     drive(first, range(12, 20))
     first.state_dict()  # a part that the checkpoint above does not know
     second = RunRecorder(rough(breaks_at=((9, 1),)), range(5))
-    second.open(tmp_path / "torn", parts=9)
+    second.folder = tmp_path / "torn"
     second.load_state_dict(state)
     drive(second, range(12, 30))
     second.state_dict()
@@ -148,3 +149,38 @@ def test_a_run_that_goes_on_stores_each_episode_once(tmp_path: Path) -> None:
     other.open(tmp_path / "other")
     with pytest.raises(BidexError, match="of other rows"):
         other.load_state_dict(state)
+
+
+def _one_of_two(rank: int, folder: str) -> int:
+    """What a process of a run does: records, saves with the other, and process 0 makes the index."""
+    from bidex_meta.train import distributed
+
+    distributed.init_from_environment()
+    recorder = RunRecorder(rough(seed=rank, breaks_at=((3, rank),)), [0, 2, 4], rank)
+    recorder.open(Path(folder))
+    recorder.reset(seed=rank)
+    for step in range(20):
+        recorder.step(actions(rank, step, 5))
+        if step % 8 == 7:
+            recorder.state_dict()
+    recorder.state_dict()
+    distributed.together(lambda: None)
+    if rank == 0:
+        complete(Path(folder), recorder)
+    return recorder.writer.parts
+
+
+def test_two_processes_write_one_data_set(tmp_path: Path) -> None:
+    from tests.algos.ranks import in_two_processes
+
+    parts = in_two_processes(partial(_one_of_two, folder=str(tmp_path / "set")), tmp_path)
+    seen = []
+    for rank in range(2):
+        plain = Plain(rough(seed=rank, breaks_at=((3, rank),)))
+        plain.reset(seed=rank)
+        for step in range(20):
+            plain.step(actions(rank, step, 5))
+        seen += [episode for episode in plain.whole if episode.row in (0, 2, 4)]
+    found = open_dataset(tmp_path / "set")
+    stored = list(found.episodes())
+    assert parts == [3, 3] and len(stored) == len(seen) > 10 and all(map(same, stored, seen))
