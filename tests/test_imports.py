@@ -24,7 +24,7 @@ ORDER = (
     ("metaworld",),
     ("registration",),
     ("bidex_meta",),  # the package's own names
-    ("clients", "witness"),
+    ("clients", "witness", "data"),
     ("sources",),
     ("bench", "gallery", "viewer", "report", "sweep"),  # the first two replay witnesses; bench measures clients too
     ("results",),

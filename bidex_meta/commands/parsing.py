@@ -120,6 +120,8 @@ _BOUNDS = {
     "shots": (0, 1000),
     "steady": (0, 1_000_000),
     "port": (1, 65_535),
+    "size": (0, 10**12),
+    "record": (0, 10**12),
 }
 """Least and most of whole numbers by the name of their flag; a resumed run may have more threads than cores."""
 _OTHERS = (1, 1_000_000)

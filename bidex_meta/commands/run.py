@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from bidex_meta.commands import run_recording
 from bidex_meta.commands.learners import shared
 from bidex_meta.commands.run_config import RunPlan, plan_run
 from bidex_meta.errors import EXIT_INTERRUPTED, BidexError
@@ -54,7 +55,7 @@ def _main(arguments: Sequence[str], distributed: Any, held: contextlib.ExitStack
     except distributed.LostProcess as loss:
         _say_loss(loss, distributed)
         raise SystemExit(1) from None
-    if not stopped and learner.env_steps < plan.config["steps"]:
+    if not stopped and learner.env_steps < plan.config["steps"] and plan.config["minutes"] is not None:
         _say(f"The {plan.config['minutes']:g} minutes are up after {learner.env_steps:,} steps.")
     if stopped:
         # A batch system's SIGTERM asks for a checkpoint and gets it; Ctrl-C breaks off whatever calls this too.
@@ -86,10 +87,17 @@ def _run(plan: RunPlan, distributed: Any, held: contextlib.ExitStack) -> tuple[A
     world, learner, folder = distributed.together(lambda: _make(plan, loaded is None, held))
     folder = RunFolder(distributed.share(folder and folder.path)[0])
     _say(f"Run folder: {folder.path}")
+    recorder = world if plan.config["record"] else None
+    if recorder is not None:
+        recorder.folder = folder.path / "replay"
+        if loaded is None:  # a checkpoint knows which parts stay
+            distributed.together(lambda: recorder.open(recorder.folder))
     waits = distributed.LostProcess("this one was asked to stop and waits for it")
     distributed.on_loss(lambda: _say_loss(waits, distributed, folder))
     try:
         stopped = _train(plan, folder, world, learner, loaded)
+        if recorder is not None and launch().rank == 0:
+            run_recording.complete(plan, recorder)
         distributed.shut_down()
     except distributed.LostProcess as loss:
         _say_loss(loss, distributed, folder)
@@ -162,6 +170,8 @@ def _make(plan: RunPlan, fresh: bool, held: contextlib.ExitStack) -> tuple[Any, 
     from bidex_meta.record import RunFolder
 
     world = plan.source.world("train", plan.config["num_envs"], plan.kind.autoreset(plan.config["learner"]))
+    if plan.config["record"]:
+        world = run_recording.recorded(plan, world)
     learner = plan.kind.make(world, plan.learner_config, plan.config["seed"])
     if fresh and plan.config["start_from"] is not None:
         start = RunFolder.open(Path(plan.config["start_from"]))
@@ -195,7 +205,9 @@ def _train(plan: RunPlan, folder: Any, world: "VectorWorld", learner: Any, loade
         _say("No checkpoint yet: starting from the beginning.")
     budget = _budget(plan.config)
     if launch().rank > 0:
-        return runner.train(learner, world, **budget, record=None)  # process 0's clock decides
+        return runner.train(
+            learner, world, **budget, record=None, enough=run_recording.enough(plan.config)
+        )  # process 0's clock decides
     if plan.folder is not None and folder.config() != plan.config:
         folder.change_config(plan.config)  # more steps, say; not before it is known that the run goes on
     done = mend(folder.metrics_path, resume_step or 0)
@@ -208,7 +220,9 @@ def _train(plan: RunPlan, folder: Any, world: "VectorWorld", learner: Any, loade
 
             watch = Watch(plan, folder, learner, record, iterations=len(done))
             stack.callback(watch.close)
-        return runner.train(learner, world, **budget, record=record, watch=watch)
+        return runner.train(
+            learner, world, **budget, record=record, watch=watch, enough=run_recording.enough(plan.config)
+        )
 
 
 def _budget(config: dict[str, Any]) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 from bidex_meta.commands.learners import LearnerKind, choose_preset, learner_kind, resolve_device
 from bidex_meta.commands.parsing import StepCount, Switch, parse, peek
+from bidex_meta.data import part_files
 from bidex_meta.errors import BidexError, one_line
 from bidex_meta.memory import ROW_BYTES, check_memory
 from bidex_meta.reading import expanded
@@ -20,7 +21,7 @@ from bidex_meta.record.folder import RunFolder, flat
 from bidex_meta.sources import Source
 from bidex_meta.train.launch import launch, resume_command
 
-_MAY_CHANGE = ("steps", "minutes", "evaluate_every", "video_every", "logger")
+_MAY_CHANGE = ("steps", "minutes", "evaluate_every", "video_every", "logger", "stop_at_return", "stop_at_score")
 """What a resumed run may be given anew: nothing of it changes what is learned."""
 _EXAMPLE = "MT4"  # a suite whose defaults `run --help` shows
 
@@ -75,6 +76,14 @@ class RunFlags:
     """Film every so many iterations, a row of each class, into videos/ and the logger. None: never."""
     logger: Literal["tensorboard", "wandb", "none"] = "tensorboard"
     """Where metrics, config and films go beside metrics.jsonl."""
+    record: StepCount = 0
+    """Keep about so many transitions of the training as the data set replay/ in the run's folder, those of whole
+    episodes in some of the rows (docs/data.md). 0: none."""
+    stop_at_return: float | None = None
+    """End as soon as the mean return reaches this: of the evaluations with --evaluate-every, else of training."""
+    stop_at_score: float | None = None
+    """End as soon as the normalised score of the evaluations reaches this; 33 is a third of the expert's. Needs
+    --evaluate-every."""
     evaluate: bool = True
     """Evaluate at the end."""
     episodes: int | None = None
@@ -120,6 +129,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     # What older runs did not know.
     older = {"engine": "auto", "base": "own", "start_from": None, "minutes": None}
     older |= {"evaluate_every": None, "video_every": None, "logger": "tensorboard"}
+    older |= {"record": 0, "record_share": 0.0, "stop_at_return": None, "stop_at_score": None}
     stored = {**older, **folder.config("learner", "num_envs", "steps")} if folder else {}
     suite, task = (peek(arguments, f"--{name}") or stored.get(name) for name in ("suite", "task"))
     # Where neither is named, `run --help` still has defaults to show; without --help _resolved refuses it.
@@ -171,6 +181,10 @@ def _resolved(flags: Any, names: dict[str, str], device: str, stored: dict[str, 
             raise BidexError(f"--{name.replace('_', '-')} must be at least 1, not {value}.")
     if flags.minutes is not None and not 0.0 < flags.minutes < math.inf:
         raise BidexError(f"--minutes must be a number above 0, such as 4 or 0.5, not {flags.minutes:g}.")
+    if flags.stop_at_score is not None and flags.evaluate_every is None:
+        raise BidexError("--stop-at-score is judged by evaluations while training. Add --evaluate-every 50, say.")
+    if flags.record:
+        part_files.hdf5()  # refuses it where it is not installed
     if device.startswith("cpu") and not flags.print_config:
         _check_memory(flags)
     suite = names["source"] if flags.suite else None
@@ -190,6 +204,11 @@ def _resolved(flags: Any, names: dict[str, str], device: str, stored: dict[str, 
         "evaluate_every": flags.evaluate_every,
         "video_every": flags.video_every,
         "logger": flags.logger,
+        "record": flags.record,
+        # A resumed run that takes more steps goes on with the rows that it began with.
+        "record_share": stored.get("record_share", flags.record / max(flags.steps, 1)),
+        "stop_at_return": flags.stop_at_return,
+        "stop_at_score": flags.stop_at_score,
         "processes": launch().count,
         "seed": flags.seed,
         "device": device,

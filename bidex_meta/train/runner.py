@@ -69,6 +69,7 @@ def train(
     spent_seconds: float = 0.0,
     checkpoint_seconds: float = 60.0,
     watch: Callable[[], dict[str, float]] | None = None,
+    enough: Callable[[dict[str, float]], bool] | None = None,
 ) -> int:
     """Trains until ``total_steps`` environment steps are done or ``total_seconds`` are up, whichever comes first.
 
@@ -89,6 +90,8 @@ def train(
             save: a replay makes them large. 0 saves after every iteration. One more is always saved at the end.
         watch: Looks at the learner after each iteration and changes nothing of it; what it returns joins the metrics,
             and its time is no time of training. None in processes other than 0.
+        enough: Whether metrics of an iteration, the watch's too, end the training; process 0's decide. None in no
+            process or in all.
 
     Returns:
         Number of the signal that ended the training early, 0 if none did; where another process got it, SIGTERM's.
@@ -118,6 +121,8 @@ def train(
                 began_at += time.monotonic() - paused_at
             if record is not None:
                 record.log(metrics, learner.env_steps)
+            if enough is not None and any_process(is_main() and enough(metrics)):
+                break
             if any_process(is_main() and time.monotonic() - saved_at >= pause):
                 began = time.monotonic()
                 _save(learner, world, record)

@@ -47,3 +47,9 @@ class GaussianPolicy(ActorPolicy):
     def eval_action(self, obs: Tensor) -> Tensor:
         """Mean action of raw observations (N, d), clamped to [-1, 1]: (N, a)."""
         return self.mean(obs).clamp(-1.0, 1.0)
+
+    def sample_action(self, obs: Tensor, generator: torch.Generator) -> Tensor:
+        """Actions drawn from the distribution for raw observations (N, d), clamped to [-1, 1]: (N, a)."""
+        mean, log_std = self.distribution(obs)
+        noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype)
+        return (mean + log_std.exp() * noise).clamp(-1.0, 1.0)

@@ -114,3 +114,8 @@ class SquashedPolicy(ActorPolicy):
         with autocast(obs.device, self.low_precision):
             mean, _ = self.actor(self.observations(obs))
         return torch.tanh(mean)
+
+    @torch.no_grad()
+    def sample_action(self, obs: Tensor, generator: torch.Generator) -> Tensor:
+        """Actions drawn from the distribution for raw observations (N, d): (N, a) in [-1, 1]."""
+        return self.sample(self.observations(obs), generator)[0]

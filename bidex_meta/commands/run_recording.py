@@ -1,0 +1,60 @@
+"""What ``bidex-meta run`` adds for data sets: a recorder around its world, and an early end at a named return."""
+
+import math
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from bidex_meta.commands.run_config import RunPlan
+from bidex_meta.record.folder import new_folder_name
+from bidex_meta.train.launch import launch
+
+
+def recorded(plan: RunPlan, world: Any) -> Any:
+    """The world with a recorder around it, of as many rows as make the transitions that were asked for."""
+    from bidex_meta.data.place import check_room
+    from bidex_meta.data.run_recorder import RunRecorder, spread_rows
+    from bidex_meta.data.writer import estimated_bytes
+
+    rows = spread_rows(world, plan.config["record_share"])
+    sizes = world.single_observation_space.shape[0], world.single_action_space.shape[0]
+    needed = estimated_bytes(plan.config["record"], *sizes, 20.0)
+    place = plan.folder.path if plan.folder else plan.flags.run_dir or new_folder_name(plan.config)
+    check_room(place, needed, f"{plan.config['record']:,} transitions")
+    _say(f"Recording {len(rows)} of {world.num_envs} rows, at most about {needed / 1e9:.2f} GB.")
+    return RunRecorder(world, rows, launch().rank)  # pyright: ignore[reportAbstractUsage]
+
+
+def complete(plan: RunPlan, recorder: Any) -> None:
+    """Makes what all processes recorded a data set."""
+    from bidex_meta.commands.described import described
+    from bidex_meta.data.place import default_name
+    from bidex_meta.data.writer import finish
+
+    told = {"algo": plan.config["algo"], "run": recorder.folder.parent.name, "actions": "as in training"}
+    about = described(plan.source, recorder, "replay", [told])
+    name = default_name(plan.source.name, "replay")
+    finish(recorder.folder, name, recorder.single_observation_space, recorder.single_action_space, about)
+    _say(f"Recorded: {recorder.folder}")
+
+
+def enough(config: dict[str, Any]) -> Callable[[dict[str, float]], bool] | None:
+    """What ends the training early, by its metrics; None where nothing does."""
+    tag = f"{'Eval' if config['evaluate_every'] else 'Train'}/mean_return"
+    wanted = {tag: config["stop_at_return"], "Eval/score": config["stop_at_score"]}
+    known = {name: value for name, value in wanted.items() if value is not None}
+    if not known:
+        return None
+
+    def reached(metrics: dict[str, float]) -> bool:
+        found = [name for name, value in known.items() if metrics.get(name, -math.inf) >= value]
+        if found:
+            _say(f"Enough: {found[0]} is {metrics[found[0]]:.4g}.")
+        return bool(found)
+
+    return reached
+
+
+def _say(text: str) -> None:
+    if launch().rank == 0:
+        print(text, file=sys.stderr, flush=True)

@@ -1,0 +1,213 @@
+"""A wrapper around any world that hands on every whole episode of chosen rows, exactly as the world played it."""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bidex_meta.data.episode import Episode
+from bidex_meta.errors import BidexError
+from bidex_meta.world.actions import clean
+from bidex_meta.world.contract import PooledWorld, VectorWorld
+from bidex_meta.world.wrapper import PooledWorldWrapper
+
+_FIRST_ROOM = 64
+"""Steps of a row that there is room for where the world tells no time limit; doubled when an episode is longer."""
+BROKEN, SHORTENED, CUT = "broken_transitions", "shortened_episodes", "cut_episodes"
+"""What is left out: transitions in which physics broke; episodes that began somewhere within, as the first ones of a
+training world may; those that a reset broke off."""
+
+
+class EpisodeRecorder(PooledWorldWrapper):
+    """Records whole episodes; the world does what it did without.
+
+    An episode goes from a start to its end. A transition in which physics broke is left out, and the episode ends as
+    truncated before it. Only rows that are told are kept in memory: one step of a row takes 4 (d + a + 2) bytes.
+
+    Args:
+        world: In either autoreset mode. In DISABLED mode a frozen row records nothing until it is reset.
+        sink: Takes each episode when it has ended, those of one step by ascending row.
+        rows: Which rows to record; None: all.
+
+    Attributes:
+        left_out: Counts of what was not recorded, by reason.
+        policy: Number of the policy that acts, for the episodes that end.
+        active: Which of the chosen rows record the episodes that they begin, bool (rows,); all at first.
+    """
+
+    def __init__(self, world: VectorWorld, sink: Callable[[Episode], None], rows: Sequence[int] | None = None) -> None:
+        super().__init__(world)  # type: ignore[arg-type]  # without pools there are no variations
+        chosen = range(world.num_envs) if rows is None else rows
+        if len(set(chosen)) != len(chosen) or not all(0 <= row < world.num_envs for row in chosen):
+            raise BidexError(
+                f"Expected different rows of 0 to {world.num_envs - 1} to record, got {list(chosen)[:10]}."
+            )
+        self.rows, self.policy, self._sink = list(chosen), 0, sink
+        self.left_out: Counter[str] = Counter()
+        self.active = np.ones(len(self.rows), bool)
+        self._where = torch.tensor(self.rows, dtype=torch.int64, device=world.device)
+        self._slots = world.task_id[self._where].tolist()
+        self._pools: list[np.ndarray] = []
+        self._forget()
+
+    def _forget(self) -> None:
+        """No row has begun."""
+        num, room = len(self.rows), _FIRST_ROOM
+        limits = getattr(self.world, "max_episode_steps", None)
+        if limits is not None and num:
+            # Pages of memory that no episode reaches are never taken.
+            room = int(limits[self._where].max())
+        d, a = (int(s.shape[0]) for s in (self.world.single_observation_space, self.world.single_action_space))
+        self._observations = np.empty((num, room + 1, d), np.float32)
+        self._actions = np.empty((num, room, a), np.float32)
+        self._rewards = np.empty((2, num, room), np.float32)  # as given, and unscaled
+        self._running, self._success = np.zeros(num, bool), np.zeros(num, bool)
+        self._length, self._task = np.zeros(num, np.int64), np.zeros(num, np.int64)
+
+    # What the world does, and what is noted of it.
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
+        """Starts episodes; those that run in these rows are broken off and left out."""
+        obs, info = self.world.reset(seed=seed, options=options)
+        mask = (options or {}).get("reset_mask")
+        begun = np.ones(len(self.rows), bool) if mask is None else self._own(torch.as_tensor(mask))
+        if begun.all() or not self._pools:
+            # Other tasks hold from a reset of all rows on.
+            self._pools = list(self.world.pools) if isinstance(self.world, PooledWorld) else []
+        self.left_out[CUT] += int((begun & self._running & (self._length > 0)).sum())
+        self._begin(begun, self._own(obs))
+        return obs, info
+
+    def step(self, action: Tensor, /) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+        """Takes actions (N, a); see ``VectorWorld``."""
+        taken = self._own(clean(torch.as_tensor(action, dtype=torch.float32))[0])
+        result = obs, reward, terminated, _, info = self.world.step(action)
+        if not self._running.any():
+            self._begin_again(info, obs)
+            return result
+        unstable, ended, counted, success = (
+            self._own(info[name]) for name in ("unstable", "_final_obs", "counted", "success")
+        )
+        good = np.flatnonzero(self._running & ~unstable)
+        self._make_room(int(self._length.max()) + 1)
+        at = self._length[good]
+        self._actions[good, at] = taken[good]
+        self._rewards[0, good, at] = self._own(reward)[good]
+        self._rewards[1, good, at] = self._own(info["reward_unscaled"])[good]
+        self._observations[good, at + 1] = self._own(info["final_obs"])[good]
+        self._length[good] += 1
+        self._success[good] |= success[good]
+        self.left_out[BROKEN] += int((self._running & unstable).sum())
+        over = np.flatnonzero(self._running & ended)
+        if len(over):
+            true_end = self._own(terminated)
+            for row in over.tolist():
+                self._end(row, bool(true_end[row]), bool(unstable[row]), bool(counted[row]))
+            self._running[over] = False
+        self._begin_again(info, obs)
+        return result
+
+    def _own(self, of_all: Tensor) -> np.ndarray:
+        """The chosen rows of a tensor of all rows."""
+        return of_all.to(self._where.device)[self._where].detach().cpu().numpy()
+
+    def _begin_again(self, info: dict[str, Any], obs: Tensor) -> None:
+        """New episodes of rows that a world in SAME_STEP mode has started within the step."""
+        if self.world.metadata["autoreset_mode"].name == "SAME_STEP":
+            begun = self._own(info["_final_obs"])
+            if begun.any():
+                self._begin(begun, self._own(obs))
+
+    def _begin(self, mask: np.ndarray, obs: np.ndarray) -> None:
+        self._running &= ~mask
+        mask = mask & self.active
+        self._observations[mask, 0] = obs[mask]
+        self._length[mask], self._success[mask] = 0, False
+        self._running |= mask
+        index = getattr(self.world, "task_index", None)
+        if index is not None:
+            self._task = np.where(mask, self._own(index), self._task)
+
+    def _end(self, row: int, terminated: bool, unstable: bool, counted: bool) -> None:
+        """Hands an episode on, unless it began within or has no good transition."""
+        length, slot, task = int(self._length[row]), self._slots[row], int(self._task[row])
+        if not counted:
+            self.left_out[SHORTENED] += 1
+        if not counted or length == 0:
+            return
+        last = np.arange(length) == length - 1
+        rewards, unscaled = self._rewards[:, row, :length]
+        self._sink(
+            Episode(
+                observations=self._observations[row, : length + 1].copy(),
+                actions=self._actions[row, :length].copy(),
+                rewards=rewards.copy(),
+                terminated=last & terminated,
+                truncated=last & (not terminated),
+                task=slot,
+                task_name=self.world.task_names[slot],
+                task_index=task,
+                variation=self._pools[slot][task].copy() if self._pools else np.zeros(0),
+                success=bool(self._success[row]),
+                broken=unstable,
+                return_unscaled=float(unscaled.sum(dtype=np.float64)),
+                row=self.rows[row],
+                policy=self.policy,
+            )
+        )
+
+    def _make_room(self, steps: int) -> None:
+        room = self._actions.shape[1]
+        if steps <= room:
+            return
+        more = [(0, 0), (0, room), (0, 0)]
+        self._observations, self._actions = np.pad(self._observations, more), np.pad(self._actions, more)
+        self._rewards = np.pad(self._rewards, [(0, 0), (0, 0), (0, room)])
+
+    # From one process to the next.
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Puts the world's state back; episodes that run there began unseen and are not recorded."""
+        self.world.load_state_dict(state)
+        self._forget()
+
+    def recorder_state(self) -> dict[str, Any]:
+        """The episodes that run, for the checkpoint of a run that goes on with them: tensors, copied."""
+        most = int(self._length.max(initial=0))
+        arrays = {
+            "observations": self._observations[:, : most + 1],
+            "actions": self._actions[:, :most],
+            "rewards": self._rewards[:, :, :most],
+            "running": self._running,
+            "success": self._success,
+            "length": self._length,
+            "task": self._task,
+            "rows": np.array(self.rows, np.int64),
+        }
+        return {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
+
+    def load_recorder_state(self, state: dict[str, Any]) -> None:
+        """Goes on with the episodes of ``recorder_state``; the world must have been put back before.
+
+        Raises:
+            BidexError: Other rows were recorded, or observations and actions had other sizes.
+        """
+        given = {name: value.numpy() for name, value in state.items()}
+        self._forget()
+        fits = given["rows"].tolist() == self.rows and all(
+            given[name].shape[-1] == array.shape[-1]
+            for name, array in (("observations", self._observations), ("actions", self._actions))
+        )
+        if not fits:
+            raise BidexError("The episodes in this checkpoint are of other rows or sizes. Start a new run.")
+        most = given["actions"].shape[1]
+        while self._actions.shape[1] < most:
+            self._make_room(self._actions.shape[1] + 1)
+        self._observations[:, : most + 1], self._actions[:, :most] = given["observations"], given["actions"]
+        self._rewards[:, :, :most] = given["rewards"]
+        self._running, self._success = given["running"].copy(), given["success"].copy()
+        self._length, self._task = given["length"].copy(), given["task"].copy()
+        self._pools = list(self.world.pools) if isinstance(self.world, PooledWorld) else []

@@ -1,0 +1,209 @@
+"""The files of a data set: parts of whole episodes, and the index that Minari reads.
+
+::
+
+    <name>/data/
+        recording.json         what is recorded here: written first, compared when the recording goes on
+        part-<p>-<n>.hdf5      part n of process p: episodes, and a table of them
+        main_data.hdf5         Minari's file: episode_0, episode_1, ... as links into the parts
+        metadata.json          Minari's entries, and ours under "bidex"; written last, so that it says "complete"
+
+A part is written beside its place and renamed: it is there wholly or not at all. Names alone say how far a recording
+has come. Each episode is a group in Minari's layout, so that ``minari.load_dataset`` opens what is stored here, and no
+byte of an observation is stored twice.
+"""
+
+import os
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from bidex_meta.data.episode import Episode
+from bidex_meta.errors import BidexError
+from bidex_meta.reading import is_file
+
+MAIN, METADATA, RECORDING = "main_data.hdf5", "metadata.json", "recording.json"
+FORMAT = 1
+"""Raised when older code could no longer read what is written."""
+_PART = re.compile(r"part-(\d{1,4})-(\d{1,6})\.hdf5", re.ASCII)
+EPISODE_BYTES = 3800
+"""What HDF5 takes for an episode beside its numbers: measured 3,675 with five attributes."""
+ARRAYS = {
+    "observations": "observations",
+    "actions": "actions",
+    "rewards": "rewards",
+    "terminations": "terminated",
+    "truncations": "truncated",
+}
+"""Minari's names of an episode's arrays, and ours."""
+TABLE = {
+    "steps": np.int64,
+    "task": np.int64,
+    "task_index": np.int64,
+    "row": np.int64,
+    "policy": np.int64,
+    "success": np.bool_,
+    "broken": np.bool_,
+    "return": np.float64,
+    "return_unscaled": np.float64,
+}
+"""Columns of the table of a part's episodes; ``variation`` (episodes, v) stands beside them, filled up with NaN."""
+
+
+def hdf5() -> ModuleType:
+    """The package ``h5py``.
+
+    Raises:
+        BidexError: It is not installed.
+    """
+    try:
+        import h5py
+    except ModuleNotFoundError:
+        raise BidexError(
+            "Expected h5py for data sets, but it is not installed. Add it: pip install 'bidex-meta[data]'."
+        ) from None
+    return h5py
+
+
+def parts_of(folder: Path, process: int | None = None) -> list[Path]:
+    """The parts in a folder, by process and number.
+
+    Args:
+        folder: The folder ``data`` of a data set.
+        process: Of this one alone.
+    """
+    found = [(int(match[1]), int(match[2]), path) for path in _files(folder) if (match := _PART.fullmatch(path.name))]
+    return [path for owner, _, path in sorted(found) if process in (None, owner)]
+
+
+def part_path(folder: Path, process: int, number: int) -> Path:
+    """Where a part lies."""
+    return folder / f"part-{process}-{number:05d}.hdf5"
+
+
+def remove_parts(folder: Path, process: int, keep: int) -> None:
+    """Deletes a process's parts from number ``keep`` on, and what a killed process left half written."""
+    for path in _files(folder):
+        match = _PART.fullmatch(path.name)
+        if (match and int(match[1]) == process and int(match[2]) >= keep) or path.name.startswith(f".part-{process}-"):
+            path.unlink()
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    return folder.iterdir() if folder.is_dir() else iter(())
+
+
+class PartWriter:
+    """One part, while its episodes come in: they go to the disk at once.
+
+    Args:
+        path: Where it shall lie; nothing is there before ``commit``.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self._h5 = path, hdf5()
+        self._temporary = path.with_name(f".{path.name}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file: Any = self._h5.File(self._temporary, "w")
+        self._rows: list[dict[str, Any]] = []
+        self._variations: list[np.ndarray] = []
+        self.steps = 0
+
+    def add(self, episode: Episode) -> None:
+        """Takes an episode."""
+        group = self._file.create_group(f"episode_{len(self._rows)}")
+        for name, ours in ARRAYS.items():
+            group.create_dataset(name, data=getattr(episode, ours))
+        group.create_group("infos")  # Minari prints its keys
+        row = {
+            "steps": len(episode),
+            "task": episode.task,
+            "task_index": episode.task_index,
+            "row": episode.row,
+            "policy": episode.policy,
+            "success": episode.success,
+            "broken": episode.broken,
+            "return": float(episode.rewards.astype(np.float64).sum()),
+            "return_unscaled": episode.return_unscaled,
+        }
+        told = {"total_steps": len(episode), "task_name": episode.task_name, "variation": episode.variation}
+        group.attrs.update({name: row[name] for name in ("task", "task_index", "policy", "success", "broken")} | told)
+        self._rows.append(row)
+        self._variations.append(np.asarray(episode.variation, np.float64))
+        self.steps += len(episode)
+
+    def commit(self, counts: dict[str, int]) -> None:
+        """Closes the part and puts it in its place.
+
+        Args:
+            counts: What was left out, by reason.
+        """
+        table = self._file.create_group("table")
+        for name, kind in TABLE.items():
+            table.create_dataset(name, data=np.array([row[name] for row in self._rows], kind))
+        width = max(map(len, self._variations), default=0)
+        variations = np.full((len(self._rows), width), np.nan)
+        for place, variation in zip(variations, self._variations, strict=True):
+            place[: len(variation)] = variation
+        table.create_dataset("variation", data=variations)
+        self._file.attrs.update(counts)
+        self._file.close()
+        synchronise(self._temporary)
+        os.replace(self._temporary, self.path)
+        synchronise(self.path.parent)
+
+    def abandon(self) -> None:
+        """Closes the part and forgets it; nothing where it was committed."""
+        if self._file:
+            self._file.close()
+            self._temporary.unlink(missing_ok=True)
+
+
+def synchronise(path: Path) -> None:
+    """Forces a file, or a folder's names, to the disk."""
+    if path.is_dir() and os.name != "posix":
+        return  # Windows cannot open folders, and needs no such call
+    descriptor = os.open(path, os.O_RDONLY if os.name == "posix" else os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_main(folder: Path, parts: Iterable[Path]) -> None:
+    """Writes Minari's file: a link to every episode of the parts, in their order."""
+    h5, temporary = hdf5(), folder / f".{MAIN}"
+    with h5.File(temporary, "w") as main:
+        number = 0
+        for path in parts:
+            for inner in range(len(read_table(path)["steps"])):
+                main[f"episode_{number}"] = h5.ExternalLink(path.name, f"/episode_{inner}")
+                number += 1
+    synchronise(temporary)
+    os.replace(temporary, folder / MAIN)
+
+
+def read_table(path: Path) -> dict[str, np.ndarray]:
+    """The table of a part's episodes, each column (episodes,), ``variation`` (episodes, v).
+
+    Raises:
+        BidexError: It is no part, or a damaged one.
+    """
+    h5 = hdf5()
+    if not is_file(path):
+        raise BidexError(f"Expected a part of a data set at {path}, found none. Record it again.")
+    try:
+        with h5.File(path, "r") as file:
+            return {name: file["table"][name][()] for name in (*TABLE, "variation")}
+    except (OSError, KeyError) as error:
+        raise damaged(path, error) from None
+
+
+def damaged(path: Path, error: Exception) -> BidexError:
+    """What to raise where h5py cannot read a file."""
+    reason = str(error).strip("'\"").split("(")[-1].rstrip(")")
+    return BidexError(f"{path} is damaged or no part of a data set ({reason}). Delete it and record it again.")

@@ -1,0 +1,186 @@
+"""What is stored is what a plain loop saw."""
+
+import tempfile
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bidex_meta.data import open_dataset
+from bidex_meta.data.episode_recorder import BROKEN, CUT, SHORTENED, EpisodeRecorder
+from bidex_meta.data.run_recorder import RunRecorder, spread_rows
+from bidex_meta.data.writer import DatasetWriter, finish
+from bidex_meta.errors import BidexError
+from tests.data.worlds import Plain, rough, same
+
+pytest.importorskip("h5py", reason="needs the extra data")
+
+
+def complete(folder: Path, world: Any) -> None:
+    spaces = world.single_observation_space, world.single_action_space
+    finish(folder, "Points/test-v0", *spaces, {"tasks": world.task_names, "kind": "test"})
+
+
+def actions(seed: int, step: int, num: int) -> torch.Tensor:
+    """Some beyond the bounds; now and then one that is no number."""
+    drawn = 1.5 * torch.randn(num, 2, generator=torch.Generator().manual_seed(1000 * seed + step))
+    if step % 11 == 7:
+        drawn[step % num, 0] = torch.nan
+    return drawn
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 99),
+    steps=st.integers(1, 30),
+    mode=st.sampled_from(["SAME_STEP", "DISABLED"]),
+    breaks_at=st.lists(st.tuples(st.integers(0, 30), st.integers(0, 4)), max_size=12),
+    late=st.lists(st.integers(0, 4), max_size=5),
+    resets=st.lists(st.tuples(st.integers(0, 30), st.lists(st.booleans(), min_size=5, max_size=5)), max_size=6),
+    commits=st.sets(st.integers(0, 30), max_size=5),
+)
+def test_what_is_stored_is_what_a_plain_loop_saw(
+    seed: int,
+    steps: int,
+    mode: str,
+    breaks_at: list[tuple[int, int]],
+    late: list[int],
+    resets: list[tuple[int, list[bool]]],
+    commits: set[int],
+) -> None:
+    """Over resets, time limits and broken rows; two processes write into one data set."""
+    masks = dict(resets)
+    with tempfile.TemporaryDirectory() as place:
+        folder, seen, broken, worlds = Path(place) / "set", [], 0, []
+        for process in range(2):
+            make = lambda number=process: rough(mode=mode, breaks_at=tuple(breaks_at), late=tuple(late), seed=number)  # noqa: E731
+            plain, writer = Plain(make()), DatasetWriter(folder, process)
+            recorder = EpisodeRecorder(make(), writer.add)
+            plain.reset(seed=seed + process)
+            recorder.reset(seed=seed + process)
+            for step in range(steps):
+                action = actions(seed, step, 5)
+                plain.step(action)
+                recorder.step(action.clone())
+                if step in masks:
+                    options = {"reset_mask": torch.tensor(masks[step])}
+                    plain.reset(options=options)
+                    recorder.reset(options=options)
+                if step in commits:
+                    writer.commit()
+            writer.left_out.update(recorder.left_out)
+            writer.commit()
+            seen, broken = seen + plain.whole, broken + plain.broken
+            worlds.append(recorder)
+        complete(folder, worlds[0])
+        dataset = open_dataset(folder)
+        stored = list(dataset.episodes())
+        assert len(stored) == len(seen) == dataset.num_episodes
+        assert all(same(a, b) for a, b in zip(stored, seen, strict=True))
+        assert dataset.metadata["left_out"].get(BROKEN, 0) == broken
+        if stored:
+            held = dataset.transitions()
+            first = np.concatenate([episode.observations[:-1] for episode in seen])
+            after = np.concatenate([episode.observations[1:] for episode in seen])
+            assert np.array_equal(held["observations"], first) and np.array_equal(held["next_observations"], after)
+            assert held["task"].tolist() == [e.task for e in seen for _ in range(len(e))]
+            assert held["terminated"].tolist() == [bool(flag) for e in seen for flag in e.terminated]
+
+
+def test_what_is_left_out_is_counted() -> None:
+    world = rough(mode="SAME_STEP", breaks_at=((1, 0), (2, 3)), late=(0, 2, 0, 0, 0))
+    found: list[Any] = []
+    recorder = EpisodeRecorder(world, found.append, rows=[0, 1, 3])
+    recorder.reset(seed=0)
+    for _ in range(3):
+        recorder.step(torch.zeros(5, 2))
+    assert recorder.left_out == {BROKEN: 2, SHORTENED: 1, CUT: 0}
+    assert [(episode.row, len(episode), episode.broken) for episode in found] == [(0, 1, True), (3, 2, True)]
+    assert all(episode.truncated[-1] and not episode.terminated.any() for episode in found)
+    recorder.reset()
+    assert recorder.left_out[CUT] == 1  # the two others have just begun
+
+
+def test_rows_are_spread_over_slots_and_checked() -> None:
+    world = rough(num_envs=10)
+    assert spread_rows(world, 0.4) == [0, 2, 5, 7] and spread_rows(world, 1e-9) == [0, 5]
+    assert spread_rows(world, 7.0) == list(range(10))
+    for rows in ([0, 0], [10], [-1]):
+        with pytest.raises(BidexError, match="Expected different rows of 0 to 9"):
+            EpisodeRecorder(world, lambda episode: None, rows)
+
+
+def test_a_run_that_goes_on_stores_each_episode_once(tmp_path: Path) -> None:
+    """Saved after 12 steps, ended after 20, taken up at 12: as one that was never ended."""
+
+    def drive(recorder: RunRecorder, steps: range) -> None:
+        for step in steps:
+            recorder.step(actions(3, step, 5))
+
+    whole = RunRecorder(rough(breaks_at=((9, 1),)), range(5))
+    whole.open(tmp_path / "whole")
+    whole.reset(seed=1)
+    drive(whole, range(30))
+    whole.state_dict()
+    first = RunRecorder(rough(breaks_at=((9, 1),)), range(5))
+    first.open(tmp_path / "torn")
+    first.reset(seed=1)
+    drive(first, range(12))
+    state = first.state_dict()
+    drive(first, range(12, 20))
+    first.state_dict()  # a part that the checkpoint above does not know
+    second = RunRecorder(rough(breaks_at=((9, 1),)), range(5))
+    second.folder = tmp_path / "torn"
+    second.load_state_dict(state)
+    drive(second, range(12, 30))
+    second.state_dict()
+    for name in ("whole", "torn"):
+        complete(tmp_path / name, whole)
+    a, b = (list(open_dataset(tmp_path / name).episodes()) for name in ("whole", "torn"))
+    assert len(a) == len(b) > 10 and all(map(same, a, b))
+    with pytest.raises(BidexError, match="saved without a recording"):
+        second.load_state_dict(rough().state_dict())
+    other = RunRecorder(rough(), [0, 1])
+    other.open(tmp_path / "other")
+    with pytest.raises(BidexError, match="of other rows"):
+        other.load_state_dict(state)
+
+
+def _one_of_two(rank: int, folder: str) -> int:
+    """What a process of a run does: records, saves with the other, and process 0 makes the index."""
+    from bidex_meta.train import distributed
+
+    distributed.init_from_environment()
+    recorder = RunRecorder(rough(seed=rank, breaks_at=((3, rank),)), [0, 2, 4], rank)
+    recorder.open(Path(folder))
+    recorder.reset(seed=rank)
+    for step in range(20):
+        recorder.step(actions(rank, step, 5))
+        if step % 8 == 7:
+            recorder.state_dict()
+    recorder.state_dict()
+    distributed.together(lambda: None)
+    if rank == 0:
+        complete(Path(folder), recorder)
+    return recorder.writer.parts
+
+
+def test_two_processes_write_one_data_set(tmp_path: Path) -> None:
+    from tests.algos.ranks import in_two_processes
+
+    parts = in_two_processes(partial(_one_of_two, folder=str(tmp_path / "set")), tmp_path)
+    seen = []
+    for rank in range(2):
+        plain = Plain(rough(seed=rank, breaks_at=((3, rank),)))
+        plain.reset(seed=rank)
+        for step in range(20):
+            plain.step(actions(rank, step, 5))
+        seen += [episode for episode in plain.whole if episode.row in (0, 2, 4)]
+    found = open_dataset(tmp_path / "set")
+    stored = list(found.episodes())
+    assert parts == [3, 3] and len(stored) == len(seen) > 10 and all(map(same, stored, seen))
