@@ -159,6 +159,13 @@ def peek(arguments: Sequence[str], flag: str) -> str | None:
     return found
 
 
+def peek_all(arguments: Sequence[str], flag: str) -> list[str]:
+    """As ``peek``, the values of a flag that may be given several times, in their order."""
+    pairs = zip(arguments, [*arguments[1:], None], strict=True)
+    found = [value if word == flag else word.partition("=")[2] for word, value in pairs if word.split("=")[0] == flag]
+    return [value for value in found if value]
+
+
 def _refuse(word: str, options: Any, command: str) -> NoReturn:
     end = f"See bidex-meta {command} --help."
     if not word.startswith("-"):

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bidex_meta.commands import run_recording
+from bidex_meta.commands import run_offline, run_recording
 from bidex_meta.commands.learners import shared
 from bidex_meta.commands.run_config import RunPlan, plan_run
 from bidex_meta.errors import EXIT_INTERRUPTED, BidexError
@@ -173,6 +173,8 @@ def _make(plan: RunPlan, fresh: bool, held: contextlib.ExitStack) -> tuple[Any, 
     if plan.config["record"]:
         world = run_recording.recorded(plan, world)
     learner = plan.kind.make(world, plan.learner_config, plan.config["seed"])
+    if plan.kind.offline:
+        run_offline.give(plan.config["dataset"], learner)
     if fresh and plan.config["start_from"] is not None:
         start = RunFolder.open(Path(plan.config["start_from"]))
         state, step = checkpoint(start)

@@ -9,8 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+import tyro
+
+from bidex_meta.commands import run_offline
 from bidex_meta.commands.learners import LearnerKind, choose_preset, learner_kind, resolve_device
 from bidex_meta.commands.parsing import StepCount, Switch, parse, peek
 from bidex_meta.data import part_files
@@ -48,7 +51,11 @@ class RunFlags:
     num_envs: int = 0
     """Rows stepped together by each process, over all tasks."""
     steps: StepCount = 0
-    """Environment steps to train for, over all rows of all processes; 2e7 is understood."""
+    """Environment steps to train for, over all rows of all processes; 2e7 is understood. Of what learns from --dataset:
+    gradient updates."""
+    dataset: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    """Learn from this data set (see `bidex-meta data list`; a name or a folder) instead of playing, with --algo bc, bcq,
+    td3bc or iql, for the suite or task that it was recorded of. Given several times: from all of them."""
     minutes: float | None = None
     """Minutes to train for, counted from the first step of the world and without the evaluation; training ends with
     whichever is up first, these or --steps. None: as long as --steps take."""
@@ -130,8 +137,12 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     older = {"engine": "auto", "base": "own", "start_from": None, "minutes": None}
     older |= {"evaluate_every": None, "video_every": None, "logger": "tensorboard"}
     older |= {"record": 0, "record_share": 0.0, "stop_at_return": None, "stop_at_score": None}
+    older |= {"dataset": [], "task_seed": None}
     stored = {**older, **folder.config("learner", "num_envs", "steps")} if folder else {}
     suite, task = (peek(arguments, f"--{name}") or stored.get(name) for name in ("suite", "task"))
+    datasets = run_offline.named(arguments, stored)
+    implied = {} if suite or task else run_offline.implied(datasets)
+    suite, task = suite or implied.get("suite"), task or implied.get("task")
     # Where neither is named, `run --help` still has defaults to show; without --help _resolved refuses it.
     source = Source.open({"suite": suite or (None if task else _EXAMPLE), "task": task})
     alone = source.name if task and not suite else None
@@ -143,8 +154,11 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     if folder:
         learner_default = _stored_learner(type(learner_default), stored, folder)
         stored["learner"] = json.loads(json.dumps(dataclasses.asdict(learner_default)))  # with options it did not know
-    flags = parse(*_options(arguments, learner_default, stored, source.rows_and_steps(device, kind.adapts)))
+    sizes = run_offline.rows_and_steps(source) if kind.offline else source.rows_and_steps(device, kind.adapts)
+    flags = parse(*_options(arguments, learner_default, {**stored, **implied}, sizes))
+    run_offline.check(kind, flags.record, datasets, source)
     names = {"source": source.name, "algo": kind.name, "preset": preset}
+    stored.setdefault("task_seed", run_offline.task_seed(datasets))
     config = _resolved(flags, names, device, stored)
     if folder:
         _refuse_changes(stored, config, folder)
@@ -165,6 +179,8 @@ def _options(
     known = {name: value for name, value in stored.items() if name in names}
     if known.get("start_from") is not None:
         known["start_from"] = Path(known["start_from"])
+    if "dataset" in known:
+        known["dataset"] = tuple(known["dataset"])
     default = options(**{"num_envs": rows, "steps": steps, **known, "learner": learner})
     return options, arguments, "run", default
 
@@ -204,6 +220,8 @@ def _resolved(flags: Any, names: dict[str, str], device: str, stored: dict[str, 
         "evaluate_every": flags.evaluate_every,
         "video_every": flags.video_every,
         "logger": flags.logger,
+        "dataset": run_offline.noted(flags.dataset),
+        "task_seed": stored["task_seed"],
         "record": flags.record,
         # A resumed run that takes more steps goes on with the rows that it began with.
         "record_share": stored.get("record_share", flags.record / max(flags.steps, 1)),

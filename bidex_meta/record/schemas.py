@@ -23,6 +23,8 @@ CONFIG = {
     "evaluate_every": whole(1).or_none(),
     "video_every": whole(1).or_none(),
     "logger": TEXT,
+    "dataset": Rule("a list of texts", lambda value: isinstance(value, list) and all(map(TEXT.fits, value))),
+    "task_seed": whole(0).or_none(),
     "record": whole(0),
     "record_share": number(0.0, 1e15),
     "stop_at_return": number(-1e12, 1e12).or_none(),
