@@ -54,7 +54,7 @@ class RunFlags:
     """Environment steps to train for, over all rows of all processes; 2e7 is understood. Of what learns from --dataset:
     gradient updates."""
     dataset: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """Learn from this data set (see `bidex-meta data list`; a name or a folder) instead of playing, with --algo bc, bcq,
+    """Learn from this data set (a name of `bidex-meta data list`, or a folder) instead of playing, with --algo bc, bcq,
     td3bc or iql, for the suite or task that it was recorded of. Given several times: from all of them."""
     minutes: float | None = None
     """Minutes to train for, counted from the first step of the world and without the evaluation; training ends with
@@ -140,7 +140,8 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     older |= {"dataset": [], "task_seed": None}
     stored = {**older, **folder.config("learner", "num_envs", "steps")} if folder else {}
     suite, task = (peek(arguments, f"--{name}") or stored.get(name) for name in ("suite", "task"))
-    datasets = run_offline.named(arguments, stored)
+    data: dict[str, Any] = {"dataset": run_offline.named(arguments, stored)}
+    datasets = run_offline.opened(data["dataset"])
     implied = {} if suite or task else run_offline.implied(datasets)
     suite, task = suite or implied.get("suite"), task or implied.get("task")
     # Where neither is named, `run --help` still has defaults to show; without --help _resolved refuses it.
@@ -158,8 +159,8 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     flags = parse(*_options(arguments, learner_default, {**stored, **implied}, sizes))
     run_offline.check(kind, flags.record, datasets, source)
     names = {"source": source.name, "algo": kind.name, "preset": preset}
-    stored.setdefault("task_seed", run_offline.task_seed(datasets))
-    config = _resolved(flags, names, device, stored)
+    data["task_seed"] = stored.get("task_seed", run_offline.task_seed(datasets))
+    config = _resolved(flags, names, device, stored, data)
     if folder:
         _refuse_changes(stored, config, folder)
     return RunPlan(flags, kind, flags.learner, config, folder, reason)
@@ -185,8 +186,10 @@ def _options(
     return options, arguments, "run", default
 
 
-def _resolved(flags: Any, names: dict[str, str], device: str, stored: dict[str, Any]) -> dict[str, Any]:
-    """The config, with names as they are written (``MT4`` where ``--suite mt4`` was given)."""
+def _resolved(
+    flags: Any, names: dict[str, str], device: str, stored: dict[str, Any], data: dict[str, Any]
+) -> dict[str, Any]:
+    """The config, with names as they are written (``MT4`` where ``--suite mt4`` was given); ``data``: its data sets."""
     if (flags.suite is None) == (flags.task is None):
         raise BidexError("Name what to train on: either --suite SUITE or --task TASK, for example --suite MT4.")
     if flags.base != "own" and flags.task is None:
@@ -220,8 +223,7 @@ def _resolved(flags: Any, names: dict[str, str], device: str, stored: dict[str, 
         "evaluate_every": flags.evaluate_every,
         "video_every": flags.video_every,
         "logger": flags.logger,
-        "dataset": run_offline.noted(flags.dataset),
-        "task_seed": stored["task_seed"],
+        **data,
         "record": flags.record,
         # A resumed run that takes more steps goes on with the rows that it began with.
         "record_share": stored.get("record_share", flags.record / max(flags.steps, 1)),

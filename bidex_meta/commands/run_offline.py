@@ -19,27 +19,22 @@ UPDATES = 300_000
 _FORM = ("suite", "task", "base")
 
 
-def named(arguments: Sequence[str], stored: Mapping[str, Any]) -> "list[Dataset]":
-    """The data sets of the flags, or of the run to be resumed.
+def named(arguments: Sequence[str], stored: Mapping[str, Any]) -> list[str]:
+    """The data sets that the flags name, or those of the run to be resumed, as a config keeps them.
 
-    Raises:
-        BidexError: One is not there or not complete.
+    A folder stands with its whole path, since a run may be resumed from another one.
     """
-    return opened(peek_all(arguments, "--dataset") or stored.get("dataset", ()))
+    given = peek_all(arguments, "--dataset") or stored.get("dataset", [])
+    return [str(expanded(name).resolve()) if expanded(name).is_dir() else name for name in given]
 
 
 def opened(names: Sequence[str]) -> "list[Dataset]":
-    """Data sets by names or folders; errors as of ``open_dataset``."""
+    """Data sets by names or folders; errors as of ``open_dataset``: one is not there, or not complete."""
     if not names:
         return []
     from bidex_meta.data import open_dataset
 
     return [open_dataset(name) for name in names]
-
-
-def noted(names: Sequence[str]) -> list[str]:
-    """Names as a config keeps them: a folder with its whole path, since a run may be resumed from another one."""
-    return [str(expanded(name).resolve()) if expanded(name).is_dir() else name for name in names]
 
 
 def implied(datasets: "Sequence[Dataset]") -> dict[str, Any]:

@@ -129,13 +129,15 @@ class _Form:
                 f"{dataset.name} has {dataset.action_size} actions, the world {actions}. Record it with the same bases "
                 "(--base), or learn for what it was recorded of."
             )
-        shown = {name: sum(stop - start for start, stop in parts) for name, parts in about.get("observation_groups", ())}
+        shown = {
+            name: sum(stop - start for start, stop in parts) for name, parts in about.get("observation_groups", ())
+        }
         self._plain, self._width = dataset.observation_size - shown.get("task_id", 0), plain
         padded = self._plain < plain and world.num_tasks > 1 and len(names) == 1
         if self._plain != plain and not padded:
             raise BidexError(
-                f"{dataset.name} has observations of {self._plain} entries beside the task id, the world {plain}. Learn "
-                "for what it was recorded of."
+                f"{dataset.name} has observations of {self._plain} entries beside the task id, the world {plain}. "
+                "Learn for what it was recorded of."
             )
         own, theirs = about.get("reward_scales", {}), {s.name: s.reward_scale for s in getattr(world, "slots", ())}
         self._factors = [

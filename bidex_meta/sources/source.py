@@ -31,8 +31,9 @@ class Source(ABC):
 
     Args:
         name: How the user calls it: a suite's name or path, or a task class.
-        config: A run's config, or a part of one; read are ``seed`` (0), ``task_seed`` (None: ``seed``), ``device`` (cpu, of this very process),
-            ``threads`` (None: one per core), ``engine`` (auto) and, by a single class, ``base`` (own).
+        config: A run's config, or a part of one; read are ``seed`` (0), ``task_seed`` (None: ``seed``),
+            ``device`` (cpu, of this very process), ``threads`` (None: one per core), ``engine`` (auto) and, by a single
+            class, ``base`` (own).
     """
 
     hides_goals: bool = False

@@ -37,7 +37,7 @@ class OfflineConfig(ArchitectureConfig):
     max_grad_norm: float | None = None
     """Gradients longer than this are shortened to it, those of each network apart; None: none is."""
     normalise_observations: bool = True
-    """Give observations zero mean and unit variance by the statistics of the data; the task's one-hot stays as it is."""
+    """Give observations zero mean and unit variance by the data's statistics; the task's one-hot stays as it is."""
     autocast: Autocast = "auto"
     """Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX."""
 
