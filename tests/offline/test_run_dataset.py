@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -116,7 +117,7 @@ def alone(slot: int, size: int) -> list[Any]:
 def test_classes_recorded_alone_get_padding_one_hot_and_scale(tmp_path: Path) -> None:
     both, world = [alone(0, 1), alone(1, 3)], opposite_bandits(rows=2)
     world.single_observation_space = Box(-np.inf, np.inf, (5,), np.float32)  # 3 and the one-hot
-    world.slots = [type("Slot", (), {"name": f"task{i}", "reward_scale": 2.0})() for i in (0, 1)]  # type: ignore
+    world.slots = [SimpleNamespace(name=f"task{i}", reward_scale=2.0) for i in (0, 1)]  # type: ignore
     sets = [
         stored(tmp_path, f"{i}-v0", both[i], [f"task{i}"], reward_scales={f"task{i}": 4.0 * i + 1.0}) for i in (0, 1)
     ]

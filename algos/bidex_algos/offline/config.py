@@ -1,7 +1,7 @@
 """What can be set about every offline learner; imports no torch, so that a command line can show it at once."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from bidex_algos.checks import at_least, between, network_bytes, positive, types
 from bidex_algos.choices import Activation, Autocast
@@ -95,5 +95,5 @@ class CriticConfig(OfflineConfig):
         positive(self, "tau", "critic_learning_rate")
 
 
-PAPER = {"value_heads": False, "critic_layer_norm": False, "per_task_rewards": False}
+PAPER: dict[str, Any] = {"value_heads": False, "critic_layer_norm": False, "per_task_rewards": False}
 """What the preset ``paper`` leaves out of all learners with critics: Table 46 and the methods' papers know none."""
