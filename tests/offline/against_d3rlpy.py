@@ -8,6 +8,7 @@ have the preset ``paper``, which is Table 46. The environment needs `pip install
 
 import argparse
 import json
+import os
 import subprocess
 import tempfile
 from collections.abc import Callable, Sequence
@@ -87,12 +88,27 @@ def against(
                     learner.iterate()
                 ours.append(judge(learner))
                 out = Path(folder) / f"{algo}{seed}.pt"
-                subprocess.run([python, TRAIN, path, algo, str(updates), str(seed), out], check=True, stdout=2)
+                _train([python, TRAIN, path, algo, str(updates), str(seed), out])
                 theirs.append(judge(Scripted(out)))
             spans = [_interval(ours), _interval(theirs)]
             overlap = max(span[0] for span in spans) <= min(span[1] for span in spans)
             found[algo] = {"ours": ours, "theirs": theirs, "intervals": spans, "overlap": overlap}
     return found
+
+
+def _train(command: Sequence[Any]) -> None:
+    """Runs d3rlpy on one thread, in an environment that does not know ours."""
+    others = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    done = subprocess.run(
+        [*map(str, command)],
+        env=others | {"OMP_NUM_THREADS": "1"},
+        stderr=subprocess.STDOUT,
+        stdout=subprocess.PIPE,
+        text=True,
+        check=False,
+    )
+    if done.returncode:
+        raise RuntimeError(f"{command} ended with {done.returncode}: {done.stdout[-2000:]}")
 
 
 def _interval(values: Sequence[float]) -> tuple[float, float]:
