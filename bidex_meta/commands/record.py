@@ -94,8 +94,8 @@ def _check(flags: RecordFlags, kind: str) -> None:
 def _record(flags: RecordFlags, kind: str) -> None:
     from bidex_meta.commands.described import described
     from bidex_meta.data import part_files
-    from bidex_meta.data.collect import bytes_held, collect, standing, whole_parts
     from bidex_meta.data.place import check_room, place_of
+    from bidex_meta.data.rounds import bytes_held, collect, standing, whole_parts
     from bidex_meta.data.writer import DatasetWriter, begin, check_place, estimated_bytes, finish
     from bidex_meta.reading import is_file, read_json
     from bidex_meta.world.threads import set_up_torch
@@ -180,7 +180,7 @@ def _actors(flags: RecordFlags, kind: str, device: str) -> tuple[list[Any], list
     """Who acts, and what is told of each."""
     from bidex_meta.commands.learners import learner_kind
     from bidex_meta.commands.policies import load_policy
-    from bidex_meta.data.collect import Actor, can_sample
+    from bidex_meta.data.rounds import Actor, can_sample
     from bidex_meta.record import RunFolder
 
     if kind == "random":

@@ -13,9 +13,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from bidex_meta.data import Dataset, collect, open_dataset, part_files, writer
-from bidex_meta.data.collect import Actor, whole_parts
+from bidex_meta.data import Dataset, open_dataset, part_files, rounds, writer
 from bidex_meta.data.episode_recorder import EpisodeRecorder
+from bidex_meta.data.rounds import Actor, whole_parts
 from bidex_meta.errors import BidexError
 from tests.data.worlds import rough, same
 
@@ -49,7 +49,7 @@ def record(folder: Path, actors: list[Actor] = ACTORS, size: int = SIZE, brittle
     writer.begin(folder, PLAN)
     keep = whole_parts([path.name for path in part_files.parts_of(folder / "data", 0)])
     out = writer.DatasetWriter(folder, keep=keep)
-    collect.collect(world, actors, out, size, 5, lambda now, seconds: None)
+    rounds.collect(world, actors, out, size, 5, lambda now, seconds: None)
     spaces = world.single_observation_space, world.single_action_space
     writer.finish(folder, "Points/test-v0", *spaces, {"tasks": world.task_names, "kind": "test"})
     return open_dataset(folder)
@@ -57,7 +57,7 @@ def record(folder: Path, actors: list[Actor] = ACTORS, size: int = SIZE, brittle
 
 @pytest.fixture(autouse=True)
 def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collect, "PART_BYTES", 2500)
+    monkeypatch.setattr(rounds, "PART_BYTES", 2500)
 
 
 def test_sizes_and_shares(tmp_path: Path) -> None:
@@ -164,7 +164,7 @@ def test_another_recording_or_a_complete_one_is_refused(tmp_path: Path) -> None:
 def test_nothing_to_record_is_said(tmp_path: Path) -> None:
     world = rough(mode="DISABLED", breaks_at=tuple((step, row) for step in range(60) for row in range(5)))
     with pytest.raises(BidexError, match="Physics broke in the first step of all 5"):
-        collect.collect(world, [Actor(None)], writer.DatasetWriter(tmp_path), 100, 0, lambda now, seconds: None)
+        rounds.collect(world, [Actor(None)], writer.DatasetWriter(tmp_path), 100, 0, lambda now, seconds: None)
 
 
 def test_minari_opens_and_samples_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
