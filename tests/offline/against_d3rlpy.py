@@ -2,8 +2,8 @@
 
     python -m tests.offline.against_d3rlpy CatchUnderarm/medium-v0 --python ENV/bin/python --updates 20000
 
-prints the normalised scores (or returns) of each seed, their means and 95 % t-intervals, and whether these overlap. Both
-have the preset ``paper``, which is Table 46. The environment needs `pip install torch d3rlpy`.
+prints the normalised scores (or returns) of each seed, their means and 95 % t-intervals, and whether these overlap.
+Both have the preset ``paper``, which is Table 46. The environment needs `pip install torch d3rlpy`.
 """
 
 import argparse

@@ -2,8 +2,8 @@
 
     python d3rlpy_train.py DATA.npz td3bc|iql UPDATES SEED POLICY.pt
 
-The file holds observations, actions, rewards, terminals and timeouts, a row a step. d3rlpy leaves out the last step of an
-episode that was cut by time: it has no state after it there.
+The file holds observations, actions, rewards, terminals and timeouts, a row a step. d3rlpy leaves out the last step of
+an episode that was cut by time: it has no state after it there.
 """
 
 import sys
