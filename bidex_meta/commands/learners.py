@@ -12,6 +12,8 @@ Beside the class the module holds ``PRESETS``: a dict from preset name to an ins
   nothing of what they learn;
 * where it learns from data sets, ``offline = True`` and ``learn_from(data)``, which takes a ``bidex_meta.data.joined``
   before the first iteration; ``env_steps`` then counts updates, and the world is not stepped;
+* where it may imitate demonstrations beside what it learns by playing, ``learn_from_demonstrations(data)``, which takes
+  the same before the first iteration;
 * of its config, if it is there, `run` asks ``bytes_held(rows, width)``: about what it takes beside the world;
 * where it does not train in autoreset mode SAME_STEP, ``autoreset``: the mode, or a function of the learner's config
   that gives it;
@@ -84,6 +86,11 @@ class LearnerKind:
     def offline(self) -> bool:
         """Whether it learns from data sets and counts updates as steps."""
         return getattr(self.make, "offline", False)
+
+    @property
+    def imitates(self) -> bool:
+        """Whether it takes demonstrations beside what it learns by playing."""
+        return hasattr(self.make, "learn_from_demonstrations")
 
     @property
     def adapts_by_row(self) -> bool:

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from bidex_meta.commands import run_offline
+from bidex_meta.commands import run_demonstrations, run_offline
 from bidex_meta.commands.learners import LearnerKind, choose_preset, learner_kind, resolve_device
 from bidex_meta.commands.parsing import StepCount, Switch, parse, peek
 from bidex_meta.data import part_files
@@ -56,6 +56,9 @@ class RunFlags:
     dataset: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """Learn from this data set (a name of `bidex-meta data list`, or a folder) instead of playing, with --algo bc, bcq,
     td3bc or iql, for the suite or task that it was recorded of. Given several times: from all of them."""
+    demonstrations: str | None = None
+    """Imitate this data set too (as --dataset; see `bidex-meta record demonstrations`), ever less: with --algo mtppo
+    and ppo, see --learner.demonstration-weight."""
     minutes: float | None = None
     """Minutes to train for, counted from the first step of the world and without the evaluation; training ends with
     whichever is up first, these or --steps. None: as long as --steps take."""
@@ -137,7 +140,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     older = {"engine": "auto", "base": "own", "start_from": None, "minutes": None}
     older |= {"evaluate_every": None, "video_every": None, "logger": "tensorboard"}
     older |= {"record": 0, "record_share": 0.0, "stop_at_return": None, "stop_at_score": None}
-    older |= {"dataset": [], "task_seed": None}
+    older |= {"dataset": [], "task_seed": None, "demonstrations": None}
     stored = {**older, **folder.config("learner", "num_envs", "steps")} if folder else {}
     suite, task = (peek(arguments, f"--{name}") or stored.get(name) for name in ("suite", "task"))
     data: dict[str, Any] = {"dataset": run_offline.named(arguments, stored)}
@@ -158,6 +161,8 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     sizes = run_offline.rows_and_steps(source) if kind.offline else source.rows_and_steps(device, kind.adapts)
     flags = parse(*_options(arguments, learner_default, {**stored, **implied}, sizes))
     run_offline.check(kind, flags.record, datasets, source)
+    data["demonstrations"] = run_demonstrations.named(flags.demonstrations)
+    run_demonstrations.check(kind, data["demonstrations"], source)
     names = {"source": source.name, "algo": kind.name, "preset": preset}
     data["task_seed"] = stored.get("task_seed", run_offline.task_seed(datasets))
     config = _resolved(flags, names, device, stored, data)

@@ -48,7 +48,7 @@ class Joined:
         return {"transitions": len(self), **{name: float(each.sum(dtype=torch.float64)) for name, each in sums.items()}}
 
 
-def join(datasets: Sequence[Dataset], world: VectorWorld) -> Joined:
+def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) -> Joined:
     """Reads data sets for a world.
 
     Classes are found by the names of their slots. Of a class recorded on its own, observations get the padding and the
@@ -57,6 +57,7 @@ def join(datasets: Sequence[Dataset], world: VectorWorld) -> Joined:
     Args:
         datasets: At least one.
         world: It is neither stepped nor reset.
+        every: Whether each of the world's classes needs data.
 
     Raises:
         BidexError: Actions or observations of another form, a class that the world does not have, one of the world's
@@ -68,7 +69,7 @@ def join(datasets: Sequence[Dataset], world: VectorWorld) -> Joined:
     steps, episodes = (sum(getattr(each, name) for each in datasets) for name in ("num_steps", "num_episodes"))
     found = {each.slots[task] for each in forms for task in np.unique(each.dataset.table["task"])}
     missing = [name for slot, name in enumerate(world.task_names) if slot not in found]
-    if missing:
+    if missing and every:
         raise BidexError(
             f"Expected data of every class, found none of {', '.join(missing)}. Add a data set, or name a suite of the "
             "others alone."

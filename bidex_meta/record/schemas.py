@@ -25,6 +25,7 @@ CONFIG = {
     "logger": TEXT,
     "dataset": Rule("a list of texts", lambda value: isinstance(value, list) and all(map(TEXT.fits, value))),
     "task_seed": whole(0).or_none(),
+    "demonstrations": TEXT.or_none(),
     "record": whole(0),
     "record_share": number(0.0, 1e15),
     "stop_at_return": number(-1e12, 1e12).or_none(),

@@ -16,7 +16,7 @@ __all__ = ["BC", "PRESETS", "BCConfig"]
 
 
 class BC(Offline):
-    """Behaviour cloning on data sets (Pomerleau 1988).
+    """Behaviour cloning on data sets (Pomerleau 1988): TD3+BC (arXiv 2106.06860) without its critics.
 
     Arguments, errors and attributes are those of :class:`~bidex_algos.offline.base.Offline`.
     """
