@@ -162,10 +162,10 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     flags = parse(*_options(arguments, learner_default, {**stored, **implied}, sizes))
     run_offline.check(kind, flags.record, datasets, source)
     data["demonstrations"] = run_demonstrations.named(flags.demonstrations)
-    run_demonstrations.check(kind, data["demonstrations"], source)
     names = {"source": source.name, "algo": kind.name, "preset": preset}
     data["task_seed"] = stored.get("task_seed", run_offline.task_seed(datasets))
     config = _resolved(flags, names, device, stored, data)
+    run_demonstrations.check(kind, config["demonstrations"], Source.open(config))
     if folder:
         _refuse_changes(stored, config, folder)
     return RunPlan(flags, kind, flags.learner, config, folder, reason)
