@@ -15,7 +15,7 @@ from tests.pages import ROOT
 
 SMALL: dict[str, Any] = {"hidden": (8,), "autocast": "off"}
 VARIANTS: dict[str, list[dict[str, Any]]] = {
-    "mtppo": [{}, {"gradient_surgery": "pcgrad"}, {"gradient_surgery": "famo"}],
+    "mtppo": [{}, {"gradient_surgery": "pcgrad"}, {"gradient_surgery": "famo"}, {"demonstration_weight": 0.1}],
     "mttrpo": [{}],
     "mtsac": [{"warmup_steps": 2, "batch_size": 16}],
     "mttd3": [{"warmup_steps": 2, "batch_size": 16}],
@@ -45,6 +45,10 @@ def told(algo: str, variants: list[dict[str, Any]]) -> set[str]:
         config = replace(config, **{name: value for name, value in known.items() if hasattr(config, name)})
         world = PointGoals(rows=16) if kind.adapts else ToyWorld([nearness(0.5), nearness(-0.5)], rows=8)
         learner = kind.make(world, config, seed=0)
+        if known.get("demonstration_weight"):
+            learner.learn_from_demonstrations(
+                as_data(played(world, noisy(lambda obs: torch.zeros(len(obs), 2), 0.5), 9))
+            )
         if kind.offline:
             learner.learn_from(as_data(played(world, noisy(lambda obs: torch.zeros(len(obs), 2), 0.5), 9)))
         for _ in range(3):

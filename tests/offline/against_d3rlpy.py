@@ -12,6 +12,7 @@ import os
 import subprocess
 import tempfile
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +83,8 @@ def against(
             ours, theirs = [], []
             for seed in range(seeds):
                 kind = learner_kind(algo)
-                learner = kind.make(world, kind.presets["paper"], seed)
+                config = replace(kind.presets["paper"], updates_per_iteration=min(updates, 1000))
+                learner = kind.make(world, config, seed)
                 learner.learn_from(data)
                 while learner.env_steps < updates:
                     learner.iterate()
