@@ -11,7 +11,6 @@ from bidex_meta.errors import BidexError
 from bidex_meta.sources import Source
 
 if TYPE_CHECKING:
-    from bidex_meta.commands.record import RecordFlags
     from bidex_meta.witness.shifted import ShiftedStarts
     from bidex_meta.witness.store import Witness
 
@@ -22,14 +21,14 @@ _PATIENCE = 3
 """Rounds in which nothing has to succeed."""
 
 
-def record_demonstrations(flags: "RecordFlags", say: Callable[[str], None]) -> tuple[Path, str] | None:
+def record_demonstrations(flags: Any, say: Callable[[str], None]) -> tuple[Path, str] | None:
     """Records, or goes on with a recording; folder and name of the complete data set, None after an estimate.
 
     The class is the one with moving bases, as suites have it. A round is a part; all that it draws follows from the
     seed and its number.
 
     Args:
-        flags: With ``task``; read are also ``size``, ``noise``, ``shift``, ``num_envs``, ``seed``, ``out``,
+        flags: ``RecordFlags`` with ``task``; read are also ``size``, ``noise``, ``shift``, ``num_envs``, ``seed``, ``out``,
             ``threads``, ``estimate``.
         say: Takes lines of progress.
 
@@ -56,8 +55,10 @@ def record_demonstrations(flags: "RecordFlags", say: Callable[[str], None]) -> t
     folder, name = place_of(flags.out, source.name, "demonstrations")
     plan = {"kind": "demonstrations", "task": source.name, "size": size, "num_envs": rows, "seed": flags.seed}
     plan |= {"noise": flags.noise, "shift": flags.shift}
-    check_place(folder, plan)
-    world = ShiftedStarts(source.name, rows, flags.shift, flags.threads)
+    if not flags.estimate:
+        check_place(folder, plan)
+    made = source.name, rows, flags.shift, flags.threads
+    world = ShiftedStarts(*made)  # pyright: ignore[reportAbstractUsage]  # the wrapped world has all
     try:
         sizes = world.single_observation_space.shape[0], world.single_action_space.shape[0]
         needed = estimated_bytes(size, *sizes, float(world.max_episode_steps[0]))
@@ -89,7 +90,7 @@ def record_demonstrations(flags: "RecordFlags", say: Callable[[str], None]) -> t
     return folder, name
 
 
-def _round(world: "ShiftedStarts", witness: "Witness", writer: Any, flags: "RecordFlags") -> None:
+def _round(world: "ShiftedStarts", witness: "Witness", writer: Any, flags: Any) -> None:
     """Plays the witness in every row, each with noise of its own; after its end its last action is held."""
     from bidex_meta.data.episode import Episode
     from bidex_meta.data.episode_recorder import EpisodeRecorder
