@@ -28,8 +28,8 @@ def record_demonstrations(flags: Any, say: Callable[[str], None]) -> tuple[Path,
     seed and its number.
 
     Args:
-        flags: ``RecordFlags`` with ``task``; read are also ``size``, ``noise``, ``shift``, ``num_envs``, ``seed``, ``out``,
-            ``threads``, ``estimate``.
+        flags: ``RecordFlags`` with ``task``; read are also ``size``, ``noise``, ``shift``, ``num_envs``, ``seed``,
+            ``out``, ``threads``, ``estimate``.
         say: Takes lines of progress.
 
     Raises:
