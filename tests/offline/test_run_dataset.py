@@ -11,6 +11,7 @@ import torch
 from gymnasium.spaces import Box
 
 from bidex_meta.cli import main
+from bidex_meta.commands.run_offline import implied
 from bidex_meta.data import Dataset, open_dataset
 from bidex_meta.data.joined import join
 from bidex_meta.data.writer import DatasetWriter, begin, finish
@@ -141,3 +142,14 @@ def test_classes_recorded_alone_get_padding_one_hot_and_scale(tmp_path: Path) ->
         join(sets, world)
     with pytest.raises(BidexError, match="entries beside the task id"):
         join(sets, opposite_bandits(rows=2))
+
+
+def test_data_sets_imply_what_they_were_recorded_of():
+    """Suite, task, base and object of a run come from the data; other objects are other data."""
+    told = {"suite": None, "task": "CatchUnderarm", "base": "moving", "object": "mug"}
+    mug, egg = (SimpleNamespace(metadata=told | {"object": name}) for name in ("mug", None))
+    assert implied([mug, mug]) == {"task": "CatchUnderarm", "base": "moving", "object": "mug"}
+    assert implied([egg]) == {"task": "CatchUnderarm", "base": "moving"}
+    assert implied([SimpleNamespace(metadata={})]) == {}
+    with pytest.raises(BidexError, match="--suite NAME"):
+        implied([mug, egg])
