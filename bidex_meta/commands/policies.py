@@ -158,6 +158,7 @@ def looked_at(policy: str, suite: str | None, task: str | None, seed: int) -> So
     if policy not in ("zero", "random"):
         stored = RunFolder.open(Path(policy)).config()
         config |= {"suite": suite or stored["suite"], "base": stored.get("base", "own")}
+        config |= {"points": stored.get("points", 0)}
         config |= {"task": task or stored["task"]}
     if config["suite"] is None and config["task"] is None:
         raise BidexError("Name what to show: a run folder, --task TASK or --suite SUITE.")

@@ -10,9 +10,9 @@ from bidex_meta.points.camera import camera_of
 from bidex_meta.points.cloud import Cloud
 from bidex_meta.points.surfaces import sample
 from bidex_meta.points.told import entries_of_objects
+from bidex_meta.suite import MOST_POINTS
 from bidex_meta.tasks.scene import Scene
 
-MOST_POINTS = 16_384
 _CANDIDATES = 3072
 """Points fixed on a scene at least: fewer leave gaps through which what is hidden shines."""
 

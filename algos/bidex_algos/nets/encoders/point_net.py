@@ -1,0 +1,71 @@
+"""PointNet (Qi et al. 2017, arXiv 1612.00593) without its transforms: a shared network on each point, then the largest.
+
+What it gives does not depend on the order of the points, nor on how often one of them stands there.
+"""
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from bidex_algos.nets.encoders.inputs import Inputs
+
+POINT_GROUPS = {"points": 3, "kind_points": 4}
+"""Observation groups that are clouds, and the numbers of a point."""
+_SPREAD = 0.2
+"""What distances from a cloud's centre are divided by, metres: about a hand's length."""
+
+
+class PointNet(nn.Module):
+    """Maps clouds (..., entries) to features (..., size): the largest of each over all points, and the centre.
+
+    Points enter as what they are away from the centre of their cloud, so that the first layers see shapes rather than
+    where in the room the hands are; the centre itself (metres) stands behind the features.
+
+    Args:
+        entries: Numbers of a cloud, point after point.
+        generator: CPU generator of the initial weights.
+        widths: Of the layers that all points share.
+        channels: Numbers of a point: three of position, then others.
+        read: Read so many points alone, evenly out of the cloud; 0: all of them.
+    """
+
+    def __init__(
+        self, entries: int, generator: torch.Generator, widths: Sequence[int], channels: int = 3, read: int = 0
+    ):
+        super().__init__()
+        self.channels, self.size = channels, widths[-1] + 3
+        points = entries // channels
+        self.step = 1 if read == 0 else max(1, points // read)
+        layers: list[nn.Module] = []
+        for before, after in zip((channels, *widths[:-1]), widths, strict=True):
+            layer = nn.Linear(before, after)
+            nn.init.orthogonal_(layer.weight, math.sqrt(2.0), generator=generator)
+            nn.init.zeros_(layer.bias)
+            layers += [layer, nn.ReLU()]
+        self.shared = nn.Sequential(*layers[:-1])  # the largest is a non-linearity of its own
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Encodes clouds."""
+        cloud = x.unflatten(-1, (-1, self.channels))[..., :: self.step, :]
+        place, rest = cloud[..., :3], cloud[..., 3:]
+        centre = place.mean(dim=-2, keepdim=True)
+        points = torch.cat(((place - centre) / _SPREAD, rest), dim=-1)
+        return torch.cat((self.shared(points).max(dim=-2).values, centre[..., 0, :]), dim=-1)
+
+
+def with_point_net(inputs: Inputs, config: Any) -> Inputs:
+    """The same with clouds, where there are some, read by a PointNet, if the learner's config has ``point_widths``.
+
+    Running statistics leave clouds as they are: each of their columns may be any point.
+    """
+    widths, read = getattr(config, "point_widths", ()), getattr(config, "points_read", 0)
+    for group in inputs.groups:
+        channels = POINT_GROUPS.get(group.name)
+        if channels is not None and widths:
+            make = partial(PointNet, widths=tuple(widths), channels=channels, read=read)
+            inputs = inputs.encoded(group.name, make, scaled=False)
+    return inputs
