@@ -15,7 +15,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c const
 SOURCES := bidex_meta algos examples tests docs/site
 
 .DEFAULT_GOAL := help
-.PHONY: help run results test test-all test-parity bench-gpu-compile bench-gpu-sweep bench-gpu-train lint format docs clean
+.PHONY: help run results test test-all test-parity goldens bench-gpu-compile bench-gpu-sweep bench-gpu-train lint format docs dist clean
 .DELETE_ON_ERROR:
 
 help:
@@ -24,7 +24,9 @@ help:
 	@echo "make test-all  the same with the slow tests"
 	@echo "make test-parity  compare both engines on every class (what CI runs too)"
 	@echo "make results   fill the tables and pictures of README.md and docs/results/ from results/data/"
+	@echo "make goldens   record the golden trajectories anew: a change of results (docs/reliability.md)"
 	@echo "make docs      build the documentation site into site/ (open site/index.html)"
+	@echo "make dist      build wheel and sdist into dist/, check them, try the wheel alone (docs/releasing.md)"
 	@echo "make format    format the code and mend what ruff can mend"
 	@echo "make bench-gpu-compile, bench-gpu-sweep, bench-gpu-train  measure a GPU (docs/gpu.md)"
 	@echo "make clean     remove .venv, caches and built files (never runs/)"
@@ -40,6 +42,9 @@ test-all: lint
 
 test-parity: .venv/.installed-dev
 	$(BIN)/python -m pytest -q -n 2 -m parity
+
+goldens: .venv/.installed-dev
+	$(BIN)/python -m tests.goldens write
 
 # What to measure on a GPU; each target goes on where it stopped. On a machine that has the packages already, name its
 # interpreter: make bench-gpu-sweep CLI="python3 -m bidex_meta.cli".
@@ -89,8 +94,27 @@ docs: .venv-docs/.installed
 	.venv-docs/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -r .venv-docs/needed.txt
 	@touch $@
 
+# The wheel is made from the sdist, as an index would make it. Then it is installed alone, and used outside the checkout.
+dist: .venv-dist/.installed
+	rm -rf dist
+	.venv-dist/bin/python -m build --no-isolation --outdir dist
+	.venv-dist/bin/python -m twine check --strict dist/*
+	rm -rf .venv-dist/tried && $(PYTHON) -m venv .venv-dist/tried && mkdir .venv-dist/tried/outside
+	.venv-dist/tried/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt torch
+	.venv-dist/tried/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt dist/*.whl
+	cd .venv-dist/tried/outside && env -u PYTHONPATH ../bin/bidex-meta list suites
+	cd .venv-dist/tried/outside && env -u PYTHONPATH ../bin/bidex-meta run --suite MT4 --device cpu --num-envs 8 --steps 400 \
+		--learner.hidden 16 --learner.rollout-steps 8 --episodes 1 --run-dir run
+
+.venv-dist/.installed: pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { echo "Expected Python 3.11, 3.12 or 3.13, found none. Install one, or name it: make PYTHON=/path/to/python3.12" >&2; exit 1; }
+	test -x .venv-dist/bin/python || $(PYTHON) -m venv .venv-dist
+	.venv-dist/bin/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["dist"], sep="\n")' > .venv-dist/needed.txt
+	.venv-dist/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -r .venv-dist/needed.txt
+	@touch $@
+
 clean:
-	rm -rf .venv .venv-docs dist build site .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-docs .venv-dist dist build site .pytest_cache .ruff_cache .hypothesis
 	find $(SOURCES) -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # torch goes first and alone: the other packages then meet the build that fits this machine instead of choosing one.

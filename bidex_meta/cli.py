@@ -37,8 +37,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: What follows ``bidex-meta``; the process's own by default.
 
     Returns:
-        The exit code: 0, 1 where training diverged, 2 for bad input or what the system refuses (a full disk, a
-        folder that cannot be written, no memory), 130 after Ctrl-C, 143 after SIGTERM.
+        The exit code: 0, 1 where training diverged or a run differs from what it recorded, 2 for bad input or what the
+        system refuses (a full disk, a folder that cannot be written, no memory), 130 after Ctrl-C, 143 after SIGTERM.
 
     Raises:
         SystemExit: With another exit code, from a subcommand.

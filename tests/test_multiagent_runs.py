@@ -62,6 +62,7 @@ def test_presets_are_the_tables() -> None:
     for config in (happo, mappo):
         assert (config.hidden, config.rollout_steps, config.epochs) == ((1024, 1024, 512), 8, 5)
         assert (config.num_minibatches, config.clip, config.gamma, config.lam) == (1, 0.2, 0.96, 0.95)
+        assert config.popart
         assert (config.huber_delta, config.entropy_weight, config.value_clip) == (10.0, 0.0, 0.2)
     assert (happo.learning_rate, happo.max_grad_norm, happo.init_std) == (1e-4, 1.0, 1.0)
     assert (mappo.learning_rate, mappo.max_grad_norm, mappo.adam_eps) == (5e-4, 10.0, 5e-4)

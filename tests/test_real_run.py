@@ -48,6 +48,12 @@ def final(path: Path) -> tuple[dict[str, Any], int]:
     return loaded
 
 
+def metrics(path: Path) -> list[dict[str, Any]]:
+    """A run's metrics without times."""
+    rows = read_metrics(path / "metrics.jsonl")
+    return [{k: v for k, v in row.items() if k != "time" and not k.startswith("Perf/")} for row in rows]
+
+
 def differences(a: Any, b: Any, where: str = "") -> list[str]:
     """Where two states differ."""
     if isinstance(a, dict):
@@ -90,11 +96,37 @@ def test_a_killed_run_resumes_to_the_end_of_an_unbroken_one(killed: tuple[Path, 
     assert differences(a[0], b[0]) == []
     episodes = b[0]["env"]["episodes"]["number"]
     assert int(episodes.min()) >= 1  # every row was reset on the way
-    rows = [read_metrics(folder / "metrics.jsonl") for folder in (path, whole)]
+    rows = [metrics(folder) for folder in (path, whole)]
     assert [row["step"] for row in rows[0]] == list(range(ITERATION, goal + 1, ITERATION))
-    keep = [[{k: v for k, v in row.items() if k != "time" and not k.startswith("Perf/")} for row in r] for r in rows]
-    assert keep[0] == keep[1]
+    assert rows[0] == rows[1]
     assert {file.name for file in tmp_path.iterdir()} == {"whole"}  # nothing is left beside the run, no MuJoCo log
+
+
+def trained(path: Path, threads: int, *options: str, stop: int | None = None) -> tuple[dict[str, Any], Any]:
+    """Four iterations in this process, broken off and resumed after ``stop``; the end, and the metrics."""
+    words = ["run", *SMALL, *options, "--threads", str(threads), "--run-dir", str(path), "--no-evaluate"]
+    assert main([*words, "--steps", str((stop or 4) * ITERATION)]) == 0
+    if stop is not None:
+        torch.set_num_threads(1)  # whatever the machine, the run keeps its threads
+        assert main(["run", "--resume", str(path), "--steps", str(4 * ITERATION), "--no-evaluate"]) == 0
+        assert torch.get_num_threads() == threads
+    return final(path)[0], metrics(path)
+
+
+def test_threads_change_nothing_in_a_small_run_resumed_or_not(tmp_path: Path) -> None:
+    one = trained(tmp_path / "one", 1)
+    for name, stop in (("two", None), ("two resumed", 2)):
+        two = trained(tmp_path / name, 2, stop=stop)
+        assert differences(one[0], two[0]) == [] and one[1] == two[1]
+
+
+def test_a_run_of_two_threads_resumes_to_its_own_bits(tmp_path: Path) -> None:
+    """Of layers that are large enough for torch and MKL to split among threads; of one thread's they may differ."""
+    large = ("--learner.hidden", "128")
+    whole = trained(tmp_path / "whole", 2, *large)
+    assert max(weight.numel() for weight in whole[0]["learner"]["policy"]["weights"].values()) > 32_768
+    parts = trained(tmp_path / "parts", 2, *large, stop=2)
+    assert differences(whole[0], parts[0]) == [] and whole[1] == parts[1]
 
 
 def test_evaluate_reports_every_class(killed: tuple[Path, int], capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,6 +6,19 @@ from bidex_meta.bench.capacity import capacity
 from bidex_meta.bench.gpu import gpu, kernels
 from bidex_meta.bench.others import field
 from bidex_meta.bench.physics import stability
+from bidex_meta.bench.soak import soak
 from bidex_meta.bench.speed import mixing, scaling, world
 
-__all__ = ["capacity", "clients", "field", "gpu", "kernels", "mixing", "scaling", "stability", "world", "world_against"]
+__all__ = [
+    "capacity",
+    "clients",
+    "field",
+    "gpu",
+    "kernels",
+    "mixing",
+    "scaling",
+    "soak",
+    "stability",
+    "world",
+    "world_against",
+]

@@ -9,6 +9,7 @@ import torch
 
 from bidex_meta.benchmark import Benchmark, make_task_world
 from bidex_meta.errors import BidexError
+from bidex_meta.memory import resident
 from bidex_meta.reading import TABLE, check, exists, read_json
 from bidex_meta.record.atomic import write_json
 from bidex_meta.world import World
@@ -158,8 +159,7 @@ def _memory(device: str) -> int:
         torch.cuda.empty_cache()
         free, total = torch.cuda.mem_get_info(device)
         return total - free
-    pages = int(Path("/proc/self/statm").read_text().split()[1]) if Path("/proc/self/statm").exists() else 0
-    return 4096 * pages
+    return resident() or 0
 
 
 def _machine(device: str) -> str:

@@ -17,6 +17,7 @@ COMMANDS: dict[str, Command] = {
     "run": Command("bidex_meta.commands.run", "train a learner on a suite or a task, then evaluate it"),
     "sweep": Command("bidex_meta.commands.sweep", "many runs from one file, resumed where they were stopped"),
     "evaluate": Command("bidex_meta.commands.evaluate", "success and return of a trained run, per task class"),
+    "verify": Command("bidex_meta.commands.verify", "evaluate a run again and compare with what it recorded"),
     "compare": Command("bidex_meta.commands.compare", "several runs beside each other, intervals over seeds"),
     "collect": Command("bidex_meta.commands.collect", "evaluated runs as small files of JSON, to keep as data"),
     "control": Command("bidex_meta.commands.control", "held-out tasks, adapted to their own data and to others'"),

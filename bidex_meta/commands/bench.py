@@ -8,15 +8,12 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import tyro
 
 from bidex_meta.commands.parsing import StepCount, Switch, parse
 from bidex_meta.errors import BidexError, known_name
-
-if TYPE_CHECKING:
-    from bidex_meta.world.contract import VectorWorld
 
 _KINDS = (
     "world",
@@ -24,11 +21,13 @@ _KINDS = (
     "mixing",
     "field",
     "stability",
+    "soak",
     "capacity",
     "gpu",
     "kernels",
     "learner",
     "adapt",
+    "multiagent",
     "clients",
 )
 
@@ -41,13 +40,15 @@ class BenchFlags:
     """
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="|".join(_KINDS))]
-    """world, scaling, mixing, stability, capacity, gpu, kernels; field: beside Meta-World and gymnasium-robotics;
-    learner: MT-PPO's update against rsl-rl-lib's; adapt: all tasks' adaptation at once against a loop over them;
-    clients: another library's PPO through its adapter against the world's own loop."""
+    """world, scaling, mixing, stability, capacity, gpu, kernels; soak: memory, speed and broken rows of a world that is
+    stepped for long; field: beside Meta-World and gymnasium-robotics; learner: MT-PPO's update against rsl-rl-lib's;
+    adapt: all tasks' adaptation at once against a loop over them; multiagent: training of learners of several agents
+    beside MT-PPO's, in turns; clients: another library's PPO through its adapter against the world's own loop."""
     suite: str | None = None
-    """Suite to measure: by default world and scaling take MT4, mixing, gpu and kernels MT20, the others every class."""
+    """Suite to measure: by default world and scaling take MT4, mixing, soak, gpu and kernels MT20, the others every
+    class."""
     task: str | None = None
-    """For stability, capacity and clients: this task class alone."""
+    """For stability, capacity, clients and multiagent: this task class alone."""
     client: str | None = None
     """For clients: sb3 or rsl-rl."""
     tasks: tuple[str, ...] | None = None
@@ -56,15 +57,19 @@ class BenchFlags:
     """For gpu: numbers of rows."""
     learning: Switch = False
     """For gpu: measure training with MT-PPO too."""
+    algo: str | None = None
+    """For soak: a learner that trains on the world; None: random actions."""
+    minutes: float | None = None
+    """For soak: ends after so long; None: 60, or where --steps are given, never."""
     preset: str | None = None
-    """For learner: the preset of MT-PPO, by default laptop."""
+    """For learner and multiagent: the preset, by default laptop."""
     against: str | None = None
     """For world: measure beside other code in turns: a commit, a folder with a checkout, or what --out took of it."""
     classes: Switch = False
     """For world --against: each class of the suite alone too, with a quarter of the rows."""
     out: Path | None = None
-    """For gpu and world --against: file that takes each row of the table as it is measured; what is in it already,
-    gpu does not measure again."""
+    """For gpu, soak and world --against: file that takes each row of the table as it is measured; what is in it
+    already, gpu does not measure again."""
     num_envs: int | None = None
     """Rows stepped together; for this and the flags below None leaves the measurement its default."""
     steps: StepCount | None = None
@@ -72,7 +77,7 @@ class BenchFlags:
     repeats: int | None = None
     """Interleaved repeats; medians are reported."""
     threads: int | None = None
-    """Threads of the physics, for learner those of torch."""
+    """Threads of the physics, for learner those of torch, for multiagent of both."""
     device: str | None = None
     """auto, cpu or cuda:N."""
     engine: str | None = None
@@ -97,10 +102,14 @@ def main(arguments: Sequence[str]) -> None:
     asked = {
         name: value
         for name, value in asdict(flags).items()
-        if name not in ("what", "json", "learning") and value is not None and value is not False
+        if name not in ("what", "json", "learning", "algo") and value is not None and value is not False
     }
+    if flags.algo is not None:
+        if flags.what != "soak":
+            raise BidexError(f"bench {flags.what} takes no --algo.")
+        asked |= _learner(flags.algo, flags.device or "cpu")
     if flags.learning:
-        asked["make_learner"] = _make_learner
+        asked |= {"make_learner": _learner("mtppo", flags.device or "cuda:0")["make_learner"]}
     understood = inspect.signature(measure).parameters
     for name in asked:
         if name not in understood:
@@ -119,7 +128,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _measurement(what: str) -> Any:
-    if what in ("learner", "adapt"):
+    if what in ("learner", "adapt", "multiagent"):
         from bidex_meta.commands.learners import shared
 
         return getattr(shared(f"bench.{what}"), what)
@@ -128,11 +137,13 @@ def _measurement(what: str) -> Any:
     return getattr(bench, what)
 
 
-def _make_learner(world: "VectorWorld") -> Any:
+def _learner(algo: str, device: str) -> dict[str, Any]:
+    """What makes a learner on a world, by the preset that ``auto`` takes on the device; and the world's mode."""
     from bidex_meta.commands.learners import choose_preset, learner_kind
 
-    kind = learner_kind("mtppo")
-    return kind.make(world, kind.presets[choose_preset(kind, "auto", str(world.device))[0]], 0)
+    kind = learner_kind(algo)
+    config = kind.presets[choose_preset(kind, "auto", device)[0]]
+    return {"make_learner": lambda world: kind.make(world, config, 0), "mode": kind.autoreset(asdict(config))}
 
 
 def _flat(result: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:

@@ -56,6 +56,7 @@ def main(arguments: Sequence[str]) -> None:
     """Evaluate a checkpoint and print a table or JSON."""
     flags = parse(EvaluateFlags, arguments, "evaluate")
 
+    from bidex_meta.commands.conditions import conditions
     from bidex_meta.commands.learners import learner_kind, resolve_device
     from bidex_meta.commands.policies import load_policy
     from bidex_meta.commands.tables import evaluation_table, print_table
@@ -93,6 +94,7 @@ def main(arguments: Sequence[str]) -> None:
     if random is not None:
         differences = {name: asdict(difference) for name, difference in compare(found, random).items()}
         result |= {"random": random.to_json(), "return_above_random": differences}
+    result["conditions"] = conditions(source, flags.num_envs)
     print(json.dumps(result, indent=2))
 
 
@@ -108,6 +110,7 @@ def _meta_test(flags: EvaluateFlags, folder: Any, config: dict[str, Any], source
     import sys
 
     from bidex_meta.commands import metatest
+    from bidex_meta.commands.conditions import conditions
     from bidex_meta.commands.policies import policy_loader
     from bidex_meta.evaluation.play import EVALUATION_SEED
 
@@ -133,4 +136,5 @@ def _meta_test(flags: EvaluateFlags, folder: Any, config: dict[str, Any], source
         metatest.print_tables(f"{config['algo']} on {source.name}, {step:,} steps", found)
         return
     result = {"run": str(folder.path), "steps": step, "seed": seed, "splits": metatest.report(found)}
+    result["conditions"] = conditions(source, flags.num_envs)
     print(json.dumps(result, indent=2))

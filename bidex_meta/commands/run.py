@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bidex_meta.commands import run_recording
+from bidex_meta.commands.conditions import conditions
 from bidex_meta.commands.learners import shared
 from bidex_meta.commands.run_config import RunPlan, plan_run
 from bidex_meta.errors import EXIT_INTERRUPTED, BidexError
@@ -183,7 +184,7 @@ def _make(plan: RunPlan, fresh: bool, held: contextlib.ExitStack) -> tuple[Any, 
         return world, learner, None
     if plan.folder is not None:
         return world, learner, plan.folder
-    folder = RunFolder.create(plan.config, plan.flags.run_dir)
+    folder = RunFolder.create(plan.config, plan.flags.run_dir, identity=plan.source.identity())
     held.enter_context(folder.locked())
     return world, learner, folder
 
@@ -208,6 +209,7 @@ def _train(plan: RunPlan, folder: Any, world: "VectorWorld", learner: Any, loade
         return runner.train(
             learner, world, **budget, record=None, enough=run_recording.enough(plan.config)
         )  # process 0's clock decides
+    folder.finish(resume_step)
     if plan.folder is not None and folder.config() != plan.config:
         folder.change_config(plan.config)  # more steps, say; not before it is known that the run goes on
     done = mend(folder.metrics_path, resume_step or 0)
@@ -268,6 +270,7 @@ def _evaluate(plan: RunPlan, folder: Any, learner: Any) -> None:
     above = {name: asdict(difference) for name, difference in compare(trained, random).items()}
     found = {"run": str(folder.path), "steps": learner.env_steps, "split": "train", "seed": seed}
     found |= {"policy": trained.to_json(), "random": random.to_json(), "return_above_random": above}
+    found["conditions"] = conditions(source)
     write_json(folder.path / "evaluation.json", found)
     title = f"{plan.config['algo']} on {source.name}, {learner.env_steps:,} steps"
     print_table(evaluation_table(title, trained, random))
@@ -283,6 +286,7 @@ def _meta_test(plan: RunPlan, folder: Any, learner: Any) -> None:
     load = partial(plan.kind.make.load_policy, state, device)
     found = metatest.meta_test(source, plan.config, load, options, source.splits, _say)
     report = {"steps": learner.env_steps, "seed": options.seed, "splits": metatest.report(found)}
+    report["conditions"] = conditions(source)
     write_json(folder.path / "evaluation.json", report)
     metatest.print_tables(f"{plan.config['algo']} on {source.name}, {learner.env_steps:,} steps", found)
     _say(f"More: bidex-meta evaluate {folder.path} --shots 3 --tasks 50   See bidex-meta plot --help for curves.")

@@ -9,6 +9,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from bidex_meta.errors import one_line
+from bidex_meta.evaluation.agreement import DIFFERS, Agreement
 from bidex_meta.evaluation.gains import Gains
 from bidex_meta.evaluation.results import Difference, Evaluation, compare
 from bidex_meta.evaluation.statistics import Interval
@@ -102,6 +103,22 @@ def control_table(title: str, by_arm: Mapping[str, Mapping[str, Any]]) -> Table:
             _percent(values["success"]),
         ]
         table.add_row(*cells, *(_gained(values["own_minus"]) if "own_minus" in values else []))
+    return table
+
+
+def agreement_table(title: str, found: Sequence[Agreement]) -> Table:
+    """A recorded evaluation and the same made again, a class a row."""
+    table = Table(title=escape(title), title_justify="left", caption_justify="left")
+    table.caption = "within: apart by no more than both 95 % intervals allow, over all classes together"
+    for header in ("task", "outcome"):
+        table.add_column(header)
+    for header in ("success", "again", "return [95 %]", "again"):
+        table.add_column(header, justify="right")
+    for each in found:
+        was, now = each.recorded, each.again
+        cells = [_name(each.name), each.outcome, _percent(was["success"]), _percent(now["success"])]
+        cells += [_ranged(row["return"], row.get("return_interval")) for row in (was, now)]
+        table.add_row(*cells, style="bold red" if each.outcome == DIFFERS else None)
     return table
 
 

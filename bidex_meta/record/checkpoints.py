@@ -54,7 +54,28 @@ class Checkpoints:
         remove_leftovers(self.folder)
         path, content = self.folder / f"step_{step}.pt", sealed({"step": step, "state": state})
         write_atomic(path, lambda file: torch.save(content, file))
-        with path.open("rb") as source:
+        self._follow(path)
+
+    def finish(self, step: int) -> None:
+        """Does what a :meth:`save` that was killed left undone.
+
+        Args:
+            step: Of the checkpoint that was loaded. Where a newer one is there, which was then damaged, all stay.
+        """
+        if not self.folder.is_dir():
+            return
+        refuse_links(self.folder)
+        remove_leftovers(self.folder)
+        path = self.folder / f"step_{step}.pt"
+        if self.newest_step() != step:
+            return
+        behind = not exists(self.last) or self.last.stat().st_mtime_ns <= path.stat().st_mtime_ns
+        if behind or len(self._step_files()) > self.keep:
+            self._follow(path)
+
+    def _follow(self, newest: Path) -> None:
+        """Makes ``last.pt`` a copy of the newest, then forgets the oldest."""
+        with newest.open("rb") as source:
             write_atomic(self.last, lambda file: shutil.copyfileobj(source, file))
         for old in self._step_files()[self.keep :]:
             old.unlink(missing_ok=True)
@@ -89,9 +110,10 @@ class Checkpoints:
         if not is_file(path):
             there = ", ".join(sorted(found.name for found in self.folder.glob("*.pt"))) or "none"
             raise BidexError(f"There is no {path}. Checkpoints in {self.folder}: {there}.")
-        content = _read(path, "name another")
-        if content is None:
-            raise BidexError(f"{path} is no checkpoint that can be read. Name another.")
+        try:
+            content = opened(path)
+        except Exception as error:
+            raise BidexError(f"{path} is no checkpoint that can be read ({_reason(error)}). Name another.") from None
         return content["state"], content["step"]
 
     def newest_step(self) -> int | None:
@@ -132,7 +154,10 @@ def _read(path: Path, then: str = "trying an older one") -> dict[str, Any] | Non
     try:
         return opened(path)
     except Exception as error:  # torch raises a dozen kinds for a damaged file; each means "try the one before"
-        reason = one_line(error)[:100].rstrip(".")
-        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
-        print(f"Checkpoint {path} cannot be read ({kind}{reason}); {then}.", file=sys.stderr)
+        print(f"Checkpoint {path} cannot be read ({_reason(error)}); {then}.", file=sys.stderr)
         return None
+
+
+def _reason(error: Exception) -> str:
+    kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+    return kind + one_line(error)[:100].rstrip(".")

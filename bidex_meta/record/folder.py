@@ -4,7 +4,7 @@
 
     runs/<suite>/<algo>/<UTC date-time>_seed<seed>/
         config.json     the resolved config: every value, also the defaults
-        versions.json   Python, packages, machine, git commit
+        versions.json   Python, packages, machine, git commit; physics profile and version of the suite
         metrics.jsonl   one line a log call: {"step": ..., "time": ..., "Train/mean_return": ...}
         events.out...   the same for TensorBoard
         checkpoints/    step_<N>.pt (the last few), last.pt, best.pt
@@ -43,7 +43,13 @@ class RunFolder:
     path: Path
 
     @classmethod
-    def create(cls, config: dict[str, Any], path: Path | None = None, root: Path = Path("runs")) -> "RunFolder":
+    def create(
+        cls,
+        config: dict[str, Any],
+        path: Path | None = None,
+        root: Path = Path("runs"),
+        identity: dict[str, Any] | None = None,
+    ) -> "RunFolder":
         """Make a new, complete run folder: after this call only metrics, checkpoints and videos are added.
 
         Args:
@@ -51,6 +57,7 @@ class RunFolder:
                 ``seed`` name the folder.
             path: The folder itself, instead of one under ``root`` named after the config.
             root: Where runs are collected.
+            identity: What tells the run's worlds from others of their name; kept in ``versions.json``.
 
         Raises:
             BidexError: ``path`` exists and is not empty.
@@ -59,7 +66,7 @@ class RunFolder:
         for made in (folder.checkpoints_path, folder.videos_path):
             made.mkdir(exist_ok=True)  # there where a start was killed before its config stood
         folder.metrics_path.touch()
-        write_json(folder.path / "versions.json", collect_versions())
+        write_json(folder.path / "versions.json", collect_versions() | (identity or {}))
         write_json(folder.config_path, config)  # last: a folder with a config.json is a complete one
         return folder
 
@@ -150,8 +157,17 @@ class RunFolder:
 
     def change_config(self, config: dict[str, Any]) -> None:
         """Replace ``config.json``, atomically."""
-        remove_leftovers(self.path)
         write_json(self.config_path, config)
+
+    def finish(self, step: int | None) -> None:
+        """Clears away what a process that was killed in this folder left half done; only where it is locked.
+
+        Args:
+            step: Of the checkpoint that the run goes on from, if any.
+        """
+        remove_leftovers(self.path)
+        if step is not None:
+            self.checkpoints.finish(step)
 
     def check_own(self) -> None:
         """Makes sure that the run can go on here, before anything is built.
@@ -210,13 +226,20 @@ def _runs_below(path: Path) -> Iterator[Path]:
 def _torn_start(path: Path) -> bool:
     """Whether a folder holds nothing but what ``create`` makes before the config, and no result."""
     try:
-        found = [entry for entry in path.iterdir() if not entry.name.endswith(TEMPORARY_SUFFIX)]
+        entries = list(path.iterdir())
+        found = [entry for entry in entries if not entry.name.endswith(TEMPORARY_SUFFIX)]
         folders = [entry for entry in found if entry.name in _ENTRIES[:2]]
         known = all(entry.name in _ENTRIES and not entry.is_symlink() for entry in found)
+        # A file that was to be written alone: the first look at whether the folder can be written was killed.
+        known = known and (bool(found) or all(_is_own_leftover(entry) for entry in entries))
         empty = not any(any(folder.iterdir()) for folder in folders)
-        return bool(found) and known and empty and all(e.stat().st_size == 0 for e in found if e.name == _ENTRIES[2])
+        return bool(entries) and known and empty and all(e.stat().st_size == 0 for e in found if e.name == _ENTRIES[2])
     except OSError:
         return False
+
+
+def _is_own_leftover(path: Path) -> bool:
+    return path.name.startswith(".config.json.") and path.name.endswith(TEMPORARY_SUFFIX) and not path.is_symlink()
 
 
 def flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -10,24 +10,22 @@ from typing import Any
 
 _PACKAGES = ("bidex-meta", "mujoco", "mujoco-warp", "warp-lang", "torch", "gymnasium", "metaworld", "numpy", "scipy")
 
-PHYSICS_PROFILE = 2
-"""Of contacts and time steps (bidex_meta/hands/README.md); raised where numbers of all classes move with it.
-
-1: time steps of 1/240 and 1/480 s.
-"""
-
 
 def collect_versions() -> dict[str, Any]:
-    """Python, packages (None where not installed), physics, machine, GPUs and git state, ready for JSON."""
+    """Python, packages (None where not installed), machine, GPUs and git state, ready for JSON."""
     return {
-        "physics_profile": PHYSICS_PROFILE,
         "python": sys.version.split()[0],
-        "packages": {name: _installed(name) for name in _PACKAGES},
+        "packages": package_versions(),
         "platform": platform.platform(),
         "cpus": os.cpu_count(),
         "gpus": _gpus(),
         "git": git_state(Path(__file__).parent),
     }
+
+
+def package_versions() -> dict[str, str | None]:
+    """Of all packages that results depend on; None where one is not installed."""
+    return {name: _installed(name) for name in _PACKAGES}
 
 
 def git_state(folder: Path) -> dict[str, Any] | None:

@@ -59,6 +59,10 @@ class MetaWorldSuite(Source):
             f"Pictures and references are made of classes of our own, got the suite {self.name}. Name another."
         )
 
+    def identity(self) -> dict[str, Any]:
+        """As in ``Source``: the physics is Meta-World's, known by its package's version."""
+        return {"physics": None, "suite_version": None}
+
     def rows_and_steps(self, device: str, adapts: bool) -> tuple[int, int]:
         """As in ``Source``."""
         return _TRAINING_ROWS * len(self.class_names), _TRAINING_STEPS * len(self.class_names)

@@ -116,6 +116,15 @@ class Source(ABC):
         """Whether the hands move as in the shipped suites, and as where references were measured."""
         return all(task_class.moving_base for task_class in self.task_classes().values())
 
+    def identity(self) -> dict[str, Any]:
+        """What tells its worlds from others of the same name, ready for JSON.
+
+        Returns:
+            ``physics``: twelve letters of the classes' physics (``bidex_meta.engine.identity``), None where they are
+            not ours; ``suite_version``: of the suite's file, None without one.
+        """
+        return {"physics": _physics(self.task_classes()), "suite_version": None}
+
     def references(self) -> "dict[str, Reference]":
         """The references of the normalised score and of broken episodes, of which those of other bases are none."""
         from bidex_meta.evaluation.references import references
@@ -179,6 +188,11 @@ class OwnSuite(Source):
         """As in ``Source``."""
         return self.benchmark.task_classes()
 
+    def identity(self) -> dict[str, Any]:
+        """As in ``Source``; of the classes of both splits."""
+        classes = self.benchmark.task_classes("train") | self.benchmark.task_classes("test")
+        return {"physics": _physics(classes), "suite_version": self.suite.version}
+
 
 class SingleClass(Source):
     """A class on its own: goal visible, no one-hot, no padding."""
@@ -213,6 +227,13 @@ class SingleClass(Source):
     def task_classes(self) -> "dict[str, TaskClass]":
         """As in ``Source``."""
         return {self.name: registry.get(self.name, self.moving_base)}
+
+
+def _physics(classes: "Mapping[str, TaskClass]") -> str:
+    from bidex_meta.engine.identity import common_identity
+    from bidex_meta.tasks.scene import compile_scene
+
+    return common_identity({name: compile_scene(task_class).model for name, task_class in classes.items()})
 
 
 def source_names() -> list[str]:

@@ -7,8 +7,10 @@ import torch
 
 from bidex_algos.bench import learner as bench
 from bidex_algos.bench.adapt import adapt
+from bidex_algos.bench.multiagent import multiagent
 from bidex_algos.onpolicy.mtppo import PRESETS
 from bidex_meta.cli import main
+from bidex_meta.errors import BidexError
 
 TINY = replace(PRESETS["laptop"], hidden=(8, 8), rollout_steps=4, num_minibatches=2, epochs=2, autocast="off")
 
@@ -87,3 +89,17 @@ def test_adapting_together_gives_what_a_loop_gives():
     for name in ("point", "hands"):
         assert found[name]["difference"] < 1e-5
         assert found[name]["whole"]["ratio"] > 0
+
+
+def test_bench_multiagent_has_each_learner_with_each_partition() -> None:
+    before = torch.get_num_threads()
+    found = multiagent("CatchUnderarm", num_envs=4, repeats=1)
+    assert torch.get_num_threads() == before
+    rows = {row["learner"]: row for row in found["table"]}
+    assert len(rows) == 9 and rows["mtppo"]["ratio"] == rows["mtppo"]["least"] == rows["mtppo"]["most"] == 1.0
+    for row in rows.values():
+        assert 0.0 < row["update_cpu_s"] < row["cpu_s"] < 60.0
+        assert row["steps_per_cpu_s"] == pytest.approx(32 / row["cpu_s"], rel=0.05)
+        assert row["ratio"] == pytest.approx(rows["mtppo"]["cpu_s"] / row["cpu_s"], rel=0.05)
+    with pytest.raises(BidexError, match="Unknown preset"):
+        multiagent(preset="none")

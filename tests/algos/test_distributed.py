@@ -11,6 +11,10 @@ import torch
 from torch.testing import assert_close
 
 from bidex_algos.experience.rollout import collect
+from bidex_algos.multiagent.happo import HAPPO, HAPPOConfig
+from bidex_algos.multiagent.hatrpo import HATRPO, HATRPOConfig
+from bidex_algos.multiagent.ippo import IPPO, IPPOConfig
+from bidex_algos.multiagent.mappo import MAPPO, MAPPOConfig
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig
 from bidex_meta.errors import BidexError
@@ -24,6 +28,13 @@ ONE_BATCH = replace(CONFIG, num_minibatches=1, entropy_weight=0.01)
 SURGERY = replace(ONE_BATCH, gradient_surgery="pcgrad", policy_heads=True)
 CONFLICT_AVERSE, LOSS_WEIGHTS = (replace(SURGERY, gradient_surgery=way) for way in ("cagrad", "famo"))
 TRUST_REGION = MTTRPOConfig(hidden=(32, 32), rollout_steps=8, num_minibatches=1, fisher_stride=1)
+PAIR: dict[str, Any] = {"agents": "a=action/1;b=action/0", "num_minibatches": 1, "hidden": (32, 32), "popart": True}
+TEAMS: dict[Any, Any] = {
+    MAPPOConfig(**PAIR, autocast="off"): MAPPO,
+    IPPOConfig(**PAIR, autocast="off"): IPPO,
+    HAPPOConfig(**PAIR, autocast="off"): HAPPO,
+    HATRPOConfig(**PAIR, fisher_stride=1): HATRPO,
+}
 Learner = MTPPO | MTTRPO
 ROWS = 16
 ITERATION = 2 * 2 * ROWS * 8  # processes, tasks, rows, steps
@@ -35,7 +46,8 @@ def toy(rows: int = ROWS, unstable: Any = ()) -> ToyWorld:
 
 
 def make_learner(world: ToyWorld, config: Any) -> Learner:
-    return (MTTRPO if isinstance(config, MTTRPOConfig) else MTPPO)(world, config, seed=0)
+    makes = {MTPPOConfig: MTPPO, MTTRPOConfig: MTTRPO} | {type(config): make for config, make in TEAMS.items()}
+    return makes[type(config)](world, config, seed=0)
 
 
 def facts(learner: Learner) -> dict[str, torch.Tensor]:
@@ -157,7 +169,9 @@ def bad_input(rank: int) -> str:
 def everything(rank: int) -> dict[str, Any]:
     """One start of two processes for all tests, since importing torch takes longer than the rest."""
     updates = {dtype: one_update(rank, dtype, ONE_BATCH) for dtype in (torch.float64, torch.float32)}
-    updates |= {c: one_update(rank, torch.float64, c) for c in (SURGERY, CONFLICT_AVERSE, LOSS_WEIGHTS, TRUST_REGION)}
+    updates |= {
+        c: one_update(rank, torch.float64, c) for c in (SURGERY, CONFLICT_AVERSE, LOSS_WEIGHTS, TRUST_REGION, *TEAMS)
+    }
     distributed.init_from_environment()
     found: dict[Any, Any] = {name: in_two() for name, in_two in updates.items()}
     found |= {"training": training(rank), "stopping": stopping(rank), "bad_input": bad_input(rank)}
@@ -179,8 +193,8 @@ def distances(update: dict[str, Any]) -> dict[str, float]:
 
 @pytest.mark.parametrize(
     "which",
-    [torch.float64, SURGERY, CONFLICT_AVERSE, LOSS_WEIGHTS, TRUST_REGION],
-    ids=["ppo", "pcgrad", "cagrad", "famo", "trpo"],
+    [torch.float64, SURGERY, CONFLICT_AVERSE, LOSS_WEIGHTS, TRUST_REGION, *TEAMS],
+    ids=["ppo", "pcgrad", "cagrad", "famo", "trpo", *(config.algo for config in TEAMS)],
 )
 def test_an_update_of_two_processes_is_that_of_one_with_all_rows(found, which):
     for here in found:

@@ -241,3 +241,12 @@ def test_the_config_is_shown_without_importing_torch():
         ).returncode
         == 0
     )
+
+
+def test_an_untrained_critic_makes_no_statistics_of_returns():
+    """Rewards near 0.001: what the critic says at first, numbers about 1, would make their deviation."""
+    world = ToyWorld([nearness(0.6, scale=1e-3), nearness(-0.3)])
+    learner = MTPPO(world, replace(SMALL, per_task_values=True), seed=0)
+    learner.iterate()
+    small, large = learner.return_stats.std().tolist()
+    assert small < 0.01 and large > 0.1

@@ -199,6 +199,7 @@ def test_advantages_are_those_of_the_definition(end_at_goal: bool):
     learner.iterate()
     t, g, lam = learner.trials, config.gamma, config.lam
     learner.return_stats = RunningStats((1,))  # so that the critic's units are those of the reward
+    learner.return_stats.count.fill_(1e-9)  # as if it knew them, but for next to nothing
     batch, _ = learner._prepare()
     spread = learner.return_stats.std().float()
     returns = batch.targets * spread + learner.return_stats.mean.float()

@@ -3,6 +3,7 @@
 import contextlib
 import io
 import shutil
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -39,6 +40,16 @@ def working_folder(folder: Path, patch: pytest.MonkeyPatch) -> Path:
     # What these measure is another project's, or trains on made-up numbers.
     patch.setattr("bidex_meta.commands.bench._measurement", lambda what: lambda suite=None, num_envs=1, steps=1: {})
     return folder
+
+
+def own_time() -> float:
+    """Seconds of the clock, without those in which this process was ready and others had its core.
+
+    A hang shows whether it computes or waits; a busy machine does not. Where Linux tells no such time, all counts.
+    """
+    told = Path("/proc/self/schedstat")
+    waited = int(told.read_text().split()[1]) / 1e9 if told.exists() else 0.0
+    return time.monotonic() - waited
 
 
 def called(arguments: list[str]) -> SimpleNamespace:

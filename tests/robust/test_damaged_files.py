@@ -14,7 +14,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from bidex_meta.benchmark import Benchmark
+from bidex_meta.commands.conditions import others, recorded_conditions
+from bidex_meta.commands.verify import recorded_evaluation
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.agreement import agreements, classes_of
 from bidex_meta.evaluation.references import load_from
 from bidex_meta.paths import assets_dir, suites_dir
 from bidex_meta.record import Checkpoints, RunFolder, mend
@@ -26,8 +29,10 @@ from tests.robust.lines import called, working_folder
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs pipes and links")
 RUN = Path(__file__).parents[1] / "data" / "old_runs" / "mtppo"
 ROW = {"success": 0.5, "success_interval": [0.1, 0.9], "return": 1.0, "return_interval": None, "score": 3.0}
-PART = {"classes": {"A": ROW, "B": ROW}}
-META = {"steps": 8, "splits": {"test": {"before": PART, "after": PART, "by_shot": [PART, PART]}}}
+PART = {"episodes_per_task": 2, "classes": {"A": ROW | {"tasks": 2, "length": 3.0}, "B": ROW}}
+MADE = {"steps": 8, "seed": 3, "conditions": {"device": "cpu", "packages": {"mujoco": "4.0.0"}, "physics": None}}
+ADAPTED = {"shots": 1, "rollouts": 2, "trials": 1}
+META = MADE | {"splits": {"test": ADAPTED | {"before": PART, "after": PART, "by_shot": [PART, PART]}}}
 
 
 def draws(count: int, damage: st.SearchStrategy[Any], check: Callable[[Any], None]) -> None:
@@ -78,7 +83,7 @@ def test_configs_of_a_run_that_goes_on(tmp_path: Path, monkeypatch: pytest.Monke
         path.write_bytes(whole)
 
 
-@pytest.mark.parametrize("content", [META, {"steps": 8, "policy": PART}], ids=["meta-test", "policy"])
+@pytest.mark.parametrize("content", [META, MADE | {"policy": PART}], ids=["meta-test", "policy"])
 def test_evaluations(content: dict[str, Any], tmp_path: Path) -> None:
     path, whole = tmp_path / "evaluation.json", json.dumps(content).encode()
 
@@ -95,6 +100,11 @@ def test_evaluations(content: dict[str, Any], tmp_path: Path) -> None:
                 for row in part["after"]["classes"].values():
                     assert all(type(row[name]) in (int, float) for name in ("success", "return"))
                     assert row["score"] is None or type(row["score"]) in (int, float)
+        found = one_line_or(lambda: recorded_evaluation(tmp_path, path))
+        if found is not None:  # and what verify makes of it
+            now = {"packages": {"mujoco": "4.1.0"}, "device": "cpu", "engine": "c", "threads": 1}
+            others(recorded_conditions(found, {}, {}), now | {"physics": "x", "suite_version": 1})
+            one_line_or(lambda: agreements(classes_of(found), classes_of(content)))
 
     draws(150, st.one_of(of_bytes(), of_values(), st.sampled_from(NO_FILES)), check)
 

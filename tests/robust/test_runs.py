@@ -64,6 +64,29 @@ def test_a_start_that_was_torn_begins_again(toy: None, tmp_path: Path, capsys: p
     assert main(["run", *SMALL, "--steps", "24", "--run-dir", str(tmp_path / "r")]) == 0
 
 
+def test_a_start_that_was_killed_at_its_first_file_begins_again(toy: None, tmp_path: Path) -> None:
+    (tmp_path / "r").mkdir()
+    (tmp_path / "r" / ".config.json.x1.tmp").touch()
+    assert main(["run", *SMALL, "--steps", "24", "--run-dir", str(tmp_path / "r")]) == 0
+    assert not list(tmp_path.rglob("*.tmp"))
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / ".mine.tmp").touch()
+    assert main(["run", *SMALL, "--steps", "24", "--run-dir", str(tmp_path / "other")]) == 2
+    assert (tmp_path / "other" / ".mine.tmp").exists()
+
+
+def test_a_resume_ends_a_save_that_was_killed(run: Path) -> None:
+    kept = run / "checkpoints"
+    newest = (kept / "last.pt").read_bytes()
+    (kept / "last.pt").write_bytes(b"older")
+    os.utime(kept / "last.pt", (1.0, 1.0))
+    for name in ("checkpoints/.last.pt.x.tmp", ".evaluation.json.x.tmp"):
+        (run / name).touch()
+    assert main(["run", "--resume", str(run), "--no-evaluate"]) == 0
+    assert (kept / "last.pt").read_bytes() == newest
+    assert not list(run.rglob("*.tmp"))
+
+
 def test_damaged_metrics_do_not_stop_a_run(run: Path) -> None:
     path = run / "metrics.jsonl"
     first, second = path.read_bytes().splitlines()
@@ -112,7 +135,8 @@ def test_a_deleted_run_folder_is_one_line(run: Path, capsys: pytest.CaptureFixtu
 
     save = Recorder.save
     monkeypatch.setattr(Recorder, "save", lambda *a: (shutil.rmtree(run), save(*a)))
-    told = refused(capsys, "run", "--resume", run, "--steps", "96").splitlines()[-1]
+    # TensorBoard's thread would open its file anew while the folder is emptied.
+    told = refused(capsys, "run", "--resume", run, "--steps", "96", "--logger", "none").splitlines()[-1]
     assert told.startswith("bidex-meta: ") and "No such file" in told
 
 

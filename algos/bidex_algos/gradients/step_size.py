@@ -34,10 +34,18 @@ class AdaptiveAdam:
             ``desired_kl`` and ``learning_rate_range``, what it aims at and its bounds.
         device: Where the parameters lie.
         eps: What Adam adds to its denominators.
+        share: The part of ``desired_kl`` that is these parameters' own: of several agents', each has one.
     """
 
-    def __init__(self, parameters: Iterable[nn.Parameter], config: Any, device: torch.device, eps: float = 1e-8):
-        self.desired_kl = config.desired_kl if config.adaptive_learning_rate else None
+    def __init__(
+        self,
+        parameters: Iterable[nn.Parameter],
+        config: Any,
+        device: torch.device,
+        eps: float = 1e-8,
+        share: float = 1.0,
+    ):
+        self.desired_kl = share * config.desired_kl if config.adaptive_learning_rate else None
         self.bounds = config.learning_rate_range
         self.rate = torch.tensor(config.learning_rate, device=device)
         self.actor = _Adam(parameters, lr=self.rate, eps=eps, fused=True)

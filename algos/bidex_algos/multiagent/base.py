@@ -3,12 +3,16 @@
 To the base below it the agents are one policy, whose action is put together of theirs; an update takes it apart again.
 """
 
+import math
+from collections.abc import Iterator
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from bidex_algos.multiagent.agent_batch import AgentBatch
 from bidex_algos.multiagent.config import MultiAgentConfig
+from bidex_algos.multiagent.popart import keep_values
 from bidex_algos.multiagent.team import TeamActor
 from bidex_algos.nets.encoders.inputs import Inputs
 from bidex_algos.nets.networks import gaussian_log_prob
@@ -18,7 +22,7 @@ from bidex_algos.nets.precision import autocast, use_bfloat16
 from bidex_algos.nets.shape import Shape
 from bidex_algos.onpolicy.base import Batch, OnPolicy
 from bidex_meta.errors import BidexError
-from bidex_meta.train.distributed import all_sum, sum_gradients
+from bidex_meta.train.distributed import sum_gradients
 from bidex_meta.world.agent_views import agent_views
 from bidex_meta.world.contract import VectorWorld
 
@@ -37,6 +41,7 @@ class MultiAgent(OnPolicy):
     Attributes:
         views: The agents.
         critic_adam: Moves the critic.
+        kl_share: Each agent's part of the KL that all may have together, which is the sum of theirs.
 
     Raises:
         BidexError: A partition that is none of this world's, policy heads where the world does not show the task, or
@@ -48,6 +53,7 @@ class MultiAgent(OnPolicy):
 
     def __init__(self, world: VectorWorld, config: MultiAgentConfig, seed: int):
         self.views = agent_views(world.observation_groups, int(world.single_action_space.shape[0]), config.agents)
+        self.kl_share = 1.0 / len(self.views)
         samples = config.rollout_steps * world.num_envs
         if samples < config.num_minibatches:
             raise BidexError(
@@ -69,12 +75,21 @@ class MultiAgent(OnPolicy):
         policy: Any = TeamPolicy(observations, actor, use_bfloat16(config.autocast, device))  # type: ignore[arg-type]
         return policy.to(device)
 
-    def _log_prob(self, agent: int, actions: Tensor, means: Tensor, log_std: Tensor) -> Tensor:
-        """Log-density (B,) of an agent's part of joint actions (B, a) under its part of joint Gaussians."""
-        own = self.policy.actor.own[agent]
-        return gaussian_log_prob(*(x.index_select(-1, own) for x in (actions, means, log_std)))
-
     # The critic.
+
+    def _critics(self) -> list[Any]:
+        """The networks of the critic: one for all, or one an agent."""
+        return [self.critic]
+
+    def _merge_returns(self, mean: Tensor, var: Tensor, count: Tensor) -> None:
+        stats = self.return_stats
+        known, before = stats.count > 0, (stats.mean.clone(), stats.std())
+        super()._merge_returns(mean, var, count)
+        if self.config.popart:
+            after = stats.mean, stats.std()
+            # Before the first returns of a task its values are none.
+            old_mean, old_std = (torch.where(known, *pair) for pair in zip(before, after, strict=True))
+            keep_values(self._critics(), (old_mean, old_std), after)
 
     def _old_values(self, batch: Batch) -> Tensor:
         """What the critic says of a batch before it is moved, where the loss asks for it."""
@@ -99,26 +114,23 @@ class MultiAgent(OnPolicy):
             loss = torch.maximum(loss, huber(old_values + (values - old_values).clamp(-reach, reach)))
         return (weights.view(-1, *[1] * (loss.dim() - 1)) * loss).sum()
 
-    def _critic_step(self, clipped: list[list[nn.Parameter]] | None = None) -> None:
+    def _critic_step(self) -> None:
         """One step along the gradients that are there, each network's shortened."""
-        for parameters in clipped or [list(self.critic.parameters())]:
-            nn.utils.clip_grad_norm_(parameters, self.config.max_grad_norm)
+        for critic in self._critics():
+            nn.utils.clip_grad_norm_(critic.parameters(), self.config.max_grad_norm)
         self.critic_adam.step()
 
     def _critic_epochs(self, batch: Batch, epochs: int, num_minibatches: int, weight: float = 1.0) -> Tensor:
         """Fits the critic to its targets; the mean loss over all mini-batches, a scalar."""
         old_values, losses = self._old_values(batch), list[Tensor]()
         parameters = list(self.critic.parameters())
-        for _ in range(epochs):
-            order = torch.randperm(len(batch.obs), generator=self.generator, device=self.device)
-            for index in order.chunk(num_minibatches):
-                b = batch.select(index)
-                count = all_sum(b.weights.sum()).clamp_min(1.0)
-                loss = self._value_loss(b, old_values[index], b.weights / count)
-                self.critic_adam.zero_grad()
-                (weight * loss).backward()
-                losses.append(sum_gradients(parameters, loss.detach()[None])[0])
-                self._critic_step()
+        for _, index, count in self._mini_batches(batch, epochs, num_minibatches):
+            b = batch.select(index)
+            loss = self._value_loss(b, old_values.index_select(0, index), b.weights / count)
+            self.critic_adam.zero_grad()
+            (weight * loss).backward()
+            losses.append(sum_gradients(parameters, loss.detach()[None])[0])
+            self._critic_step()
         return torch.stack(losses).mean()
 
     def _optimisers(self) -> dict[str, Any]:
@@ -129,36 +141,47 @@ class Sequential(MultiAgent):
     """Agents that are updated one after another, in a random order (Kuba et al. 2022).
 
     Each sees the advantage times the ratio, new over old, of all that were before it. The order is drawn alike in all
-    processes.
+    processes. All of them learn from the same samples, so that the same few can earn from every one: with twelve agents
+    the largest products grew to 20,000 (HAPPO) and 130,000 within an update. ``max_factor`` bounds them.
     """
+
+    config: Any
 
     def __init__(self, world: VectorWorld, config: MultiAgentConfig, seed: int):
         super().__init__(world, config, seed)
         self.order = torch.Generator().manual_seed(seed)
 
-    def _in_turn(self, batch: Batch) -> Any:
-        """Gives each agent, its old log-densities (B,) and the advantages it shall climb (B,); updates the product.
+    def _in_turn(self, batch: Batch) -> Iterator[tuple[int, AgentBatch]]:
+        """Gives each agent with its share of the batch, and puts what it did with it into the gain of those after it.
 
         Yields:
-            (agent, old log-density, advantages); the product is that of the policies when the next one is asked for.
+            (agent, share), whose ``gain`` is the advantage times the product of the ratios, at most ``max_factor``; a
+            ratio is that of the policy when the next agent is asked for.
         """
-        actor = self.policy.actor
-        old_log_std = actor.log_std_of(batch.obs).detach().clone()
-        factor = torch.ones_like(batch.advantages)
-        for agent in torch.randperm(len(self.views), generator=self.order).tolist():
-            old = self._log_prob(agent, batch.actions, batch.old_means, old_log_std)
-            yield agent, old, batch.advantages * factor
-            factor = factor * self._ratio(agent, batch, old)
+        actor, task = self.policy.actor, self.policy.actor.one_hot(batch.obs)
+        old_log_std = actor.log_std_of(batch.obs).detach().expand(batch.actions.shape)
+        columns = [actor.parts(x) for x in (batch.actions, batch.old_means, old_log_std)]
+        bound, factor = self.config.max_factor or math.inf, torch.ones_like(batch.advantages)
+        order = torch.randperm(len(self.views), generator=self.order).tolist()
+        for agent in order:
+            actions, means, log_std = (parts[agent] for parts in columns)
+            old_log_probs, gain = gaussian_log_prob(actions, means, log_std), batch.advantages * factor.clamp(max=bound)
+            seen = actor.seen(agent, batch.obs)
+            share = AgentBatch(seen, task, actions, means, log_std, old_log_probs, gain, batch.weights)
+            yield agent, share
+            if agent != order[-1]:
+                factor = factor * self._ratio(agent, share)
 
     @torch.no_grad()
-    def _ratio(self, agent: int, batch: Batch, old: Tensor) -> Tensor:
+    def _ratio(self, agent: int, share: AgentBatch) -> Tensor:
         """The ratio (B,) of an agent's present policy over the sampling one."""
-        actor = self.policy.actor
+        mean, log_std = self._distribution(agent, share)
+        return torch.exp(gaussian_log_prob(share.actions, mean, log_std) - share.old_log_probs)
+
+    def _distribution(self, agent: int, share: AgentBatch) -> tuple[Tensor, Tensor]:
+        """Mean (B, a_i) and logarithm of the standard deviation of an agent's present policy, (a_i,) or (B, a_i)."""
         with autocast(self.device, self.low_precision):
-            mean = actor.mean_of(agent, batch.obs)
-        own = actor.own[agent]
-        log_std = actor.log_std_of(batch.obs).index_select(-1, own)
-        return torch.exp(gaussian_log_prob(batch.actions.index_select(-1, own), mean, log_std) - old)
+            return self.policy.actor.distribution_of(agent, share.seen, share.task)
 
     def _parts(self) -> dict[str, Any]:
         return super()._parts() | {"order": self.order}

@@ -39,6 +39,8 @@ class MultiAgentConfig(OnPolicyConfig):
     """Error of the critic, in its own units, beyond which its loss grows no faster than the error."""
     value_clip: float = 0.0
     """How far a value may leave the old one before it earns nothing more; 0: as far as it likes."""
+    popart: bool = False
+    """When the statistics of returns change, move the critic's output layer so that its values stay as they were."""
     max_grad_norm: float = 1.0
     """Gradients longer than this are shortened to it: each agent's, and the critic's."""
     critic_learning_rate: float = 1e-3
@@ -58,6 +60,10 @@ class MultiAgentConfig(OnPolicyConfig):
         keep_partition(self)
         positive(self, "huber_delta", "max_grad_norm", "critic_learning_rate", "adam_eps")
         at_least(self, 0.0, "value_clip")
+        if self.popart and not (self.per_task_values and self.value_heads):
+            raise BidexError(
+                f"{self.algo}: popart moves the critic's output of each task; leave per_task_values and value_heads on."
+            )
 
 
 @dataclass(frozen=True)
@@ -70,6 +76,9 @@ class MultiAgentPPOConfig(PPOConfig, MultiAgentConfig):
     """Factor of the value loss. Adam undoes it; it matters only beside max_grad_norm."""
     entropy_weight: float = 0.0
     """Factor of the entropy bonus."""
+    desired_kl: float = 0.03
+    """KL of the sampling policy from the current one, of all agents together, that the adaptive step sizes aim at; each
+    agent's has an even share."""
 
     def __post_init__(self) -> None:
         """Rejects values that could only fail later.
@@ -81,9 +90,24 @@ class MultiAgentPPOConfig(PPOConfig, MultiAgentConfig):
         self._check_ppo()
 
 
+@dataclass(frozen=True)
+class InTurnConfig:
+    """What HAPPO and HATRPO share. A config that is made of this and others puts its fields behind theirs."""
+
+    max_factor: float = 4.0
+    """The most that the ratios of the agents before it, new policy over old, may multiply an agent's advantage with; 0:
+    as much as it comes to."""
+
+    def _check_turns(self) -> None:
+        """Refuses a factor that is out of its range."""
+        at_least(self, 0, "max_factor")
+        if 0 < self.max_factor < 1:
+            raise BidexError(f"max_factor: expected 0 or at least 1, which is no change at all, got {self.max_factor}.")
+
+
 PAPER: dict[str, Any] = {
     "hidden": (1024, 1024, 512),
-    "value_heads": False,
+    "popart": True,
     "rollout_steps": 8,
     "gamma": 0.96,
     "lam": 0.95,

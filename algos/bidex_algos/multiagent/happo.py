@@ -14,12 +14,12 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.gradients.step_size import AdaptiveAdam
+from bidex_algos.multiagent.agent_batch import AgentBatch
 from bidex_algos.multiagent.base import Sequential
 from bidex_algos.multiagent.happo_config import PRESETS, HAPPOConfig
-from bidex_algos.nets.precision import autocast
 from bidex_algos.onpolicy.base import Batch
 from bidex_algos.onpolicy.ppo_loss import policy_loss
-from bidex_meta.train.distributed import all_sum, sum_gradients
+from bidex_meta.train.distributed import sum_gradients
 from bidex_meta.world.contract import VectorWorld
 
 __all__ = ["HAPPO", "PRESETS", "HAPPOConfig"]
@@ -40,8 +40,11 @@ class HAPPO(Sequential):
 
     def __init__(self, world: VectorWorld, config: HAPPOConfig, seed: int):
         super().__init__(world, config, seed)
-        agents, actor = range(len(self.views)), self.policy.actor
-        self.adams = [AdaptiveAdam(actor.parameters_of(i), config, self.device, config.adam_eps) for i in agents]
+        actor = self.policy.actor
+        self.adams = [
+            AdaptiveAdam(actor.parameters_of(i), config, self.device, config.adam_eps, self.kl_share)
+            for i in range(len(self.views))
+        ]
 
     def _optimisers(self) -> dict[str, Any]:
         return super()._optimisers() | {"agents": [adam.parts() for adam in self.adams]}
@@ -49,44 +52,36 @@ class HAPPO(Sequential):
     def _update(self, batch: Batch) -> dict[str, Tensor]:
         """All agents in turn, then the critic; returns means over agents and mini-batches of what it measured."""
         cfg = self.config
-        measured = [self._agent_epochs(agent, batch, old, gain) for agent, old, gain in self._in_turn(batch)]
+        measured = [self._agent_epochs(agent, share) for agent, share in self._in_turn(batch)]
         value = self._critic_epochs(batch, cfg.epochs, cfg.num_minibatches, cfg.value_loss_weight)
         surrogate, kl, outside = torch.stack(measured).mean(0)
         rate = torch.stack([adam.rate for adam in self.adams]).mean()
         told = {"Loss/surrogate": surrogate, "Loss/value": value, "Policy/kl": kl, "Policy/clip_fraction": outside}
         return told | {"Policy/lr": rate}
 
-    def _agent_epochs(self, agent: int, batch: Batch, old_log_prob: Tensor, gain: Tensor) -> Tensor:
+    def _agent_epochs(self, agent: int, share: AgentBatch) -> Tensor:
         """Some passes over the batch by one agent; the means of surrogate loss, KL and share of clipped ratios (3,)."""
-        cfg, actor, adam = self.config, self.policy.actor, self.adams[agent]
-        own, weights = actor.own[agent], actor.parameters_of(agent)
-        old_log_std = actor.log_std_of(batch.obs).detach().index_select(-1, own)
-        actions, old_means = (x.index_select(1, own) for x in (batch.actions, batch.old_means))
+        cfg, adam, parameters = self.config, self.adams[agent], self.policy.actor.parameters_of(agent)
         measured: list[Tensor] = []
-        for epoch in range(cfg.epochs):
-            order = torch.randperm(len(batch.obs), generator=self.generator, device=self.device)
-            for number, index in enumerate(order.chunk(cfg.num_minibatches)):
-                obs, weight = batch.obs[index], batch.weights[index]
-                with autocast(self.device, self.low_precision):
-                    means = actor.mean_of(agent, obs)
-                loss = policy_loss(
-                    actions[index],
-                    means,
-                    actor.log_std_of(obs).index_select(-1, own),
-                    old_means[index],
-                    old_log_std if old_log_std.dim() == 1 else old_log_std[index],
-                    old_log_prob[index],
-                    gain[index],
-                    weights=weight / all_sum(weight.sum()).clamp_min(1.0),
-                    clip=cfg.clip,
-                )
-                adam.zero_grad()
-                (loss.surrogate - cfg.entropy_weight * loss.entropy).backward(inputs=weights)
-                numbers = torch.stack([loss.surrogate.detach(), loss.kl, loss.outside])
-                measured.append(sum_gradients(weights, numbers))
-                if (epoch, number) != (0, 0):
-                    adam.follow(measured[-1][1])
-                nn.utils.clip_grad_norm_(weights, cfg.max_grad_norm)
-                adam.step()
-                actor.clamp_std(*cfg.std_range)
+        for first, index, count in self._mini_batches(share, cfg.epochs, cfg.num_minibatches):
+            part = share.select(index)
+            loss = policy_loss(
+                part.actions,
+                *self._distribution(agent, part),
+                part.old_means,
+                part.old_log_std,
+                part.old_log_probs,
+                part.gain,
+                weights=part.weights / count,
+                clip=cfg.clip,
+            )
+            adam.zero_grad()
+            (loss.surrogate - cfg.entropy_weight * loss.entropy).backward(inputs=parameters)
+            numbers = torch.stack([loss.surrogate.detach(), loss.kl, loss.outside])
+            measured.append(sum_gradients(parameters, numbers))
+            if not first:
+                adam.follow(measured[-1][1])
+            nn.utils.clip_grad_norm_(parameters, cfg.max_grad_norm)
+            adam.step()
+            self.policy.actor.clamp_std(*cfg.std_range)
         return torch.stack(measured).mean(0)

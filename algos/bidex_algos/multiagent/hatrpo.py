@@ -1,19 +1,23 @@
 """HATRPO: agents that take TRPO's step one after another (Kuba et al. 2022; appendix B.2.2).
 
-For each agent, in an order drawn anew in each iteration, MT-TRPO's step on its own parameters, within a trust region of
-its own, with the advantage times the ratios of the agents before it. Then the critic of all.
+For each agent, in an order drawn anew in each iteration, MT-TRPO's step on its own parameters, within its share of the
+trust region, with the advantage times the ratios of the agents before it. Then the critic of all.
 """
+
+from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from bidex_algos.gradients.trust_region import trust_region_step
+from bidex_algos.multiagent.agent_batch import AgentBatch
 from bidex_algos.multiagent.base import Sequential
 from bidex_algos.multiagent.hatrpo_config import PRESETS, HATRPOConfig
 from bidex_algos.nets.networks import gaussian_kl, gaussian_log_prob
-from bidex_algos.nets.precision import autocast
 from bidex_algos.onpolicy.base import Batch
 from bidex_meta.train.distributed import all_sum
+from bidex_meta.world.contract import VectorWorld
 
 __all__ = ["HATRPO", "PRESETS", "HATRPOConfig"]
 
@@ -22,33 +26,35 @@ class HATRPO(Sequential):
     """HATRPO, agents in turn (Kuba et al. 2022, arXiv 2109.11251).
 
     Arguments, attributes and errors are those of its base.
+
+    Attributes:
+        region: The config with an agent's share of ``max_kl``.
     """
 
     name, remedy = "hatrpo", "lower max_kl or critic_learning_rate"
     config_type = HATRPOConfig
     config: HATRPOConfig  # type: ignore[assignment]
 
+    def __init__(self, world: VectorWorld, config: Any, seed: int):
+        super().__init__(world, config, seed)
+        self.region = replace(config, max_kl=self.kl_share * config.max_kl)
+
     def _update(self, batch: Batch) -> dict[str, Tensor]:
         """All agents in turn, then the critic; returns means over agents of what it measured."""
-        steps = [self._agent_step(agent, batch, old, gain) for agent, old, gain in self._in_turn(batch)]
+        steps = [self._agent_step(agent, share) for agent, share in self._in_turn(batch)]
         told = {name: torch.stack([step[name] for step in steps]).mean() for name in steps[0]}
         return told | {"Loss/value": self._critic_epochs(batch, self.config.critic_epochs, self.config.num_minibatches)}
 
-    def _agent_step(self, agent: int, batch: Batch, old_log_prob: Tensor, gain: Tensor) -> dict[str, Tensor]:
+    def _agent_step(self, agent: int, share: AgentBatch) -> dict[str, Tensor]:
         cfg, actor = self.config, self.policy.actor
-        own = actor.own[agent]
-        old_log_std = actor.log_std_of(batch.obs).detach().index_select(-1, own).clone()
-        actions, old_means = (x.index_select(1, own) for x in (batch.actions, batch.old_means))
-        weight = batch.weights / all_sum(batch.weights.sum()).clamp_min(1.0)
+        weight = share.weights / all_sum(share.weights.sum()).clamp_min(1.0)
 
         def surrogate_and_kl() -> tuple[Tensor, Tensor]:
             """This process's part of the surrogate objective and of the KL from the sampling policy, scalars."""
-            with autocast(self.device, self.low_precision):
-                mean = actor.mean_of(agent, batch.obs)
-            log_std = actor.log_std_of(batch.obs).index_select(-1, own)
-            ratio = torch.exp(gaussian_log_prob(actions, mean, log_std) - old_log_prob)
-            kl = gaussian_kl(old_means, old_log_std, mean, log_std)
-            return (weight * ratio * gain).sum(), (weight * kl).sum()
+            mean, log_std = self._distribution(agent, share)
+            ratio = torch.exp(gaussian_log_prob(share.actions, mean, log_std) - share.old_log_probs)
+            kl = gaussian_kl(share.old_means, share.old_log_std, mean, log_std)
+            return (weight * ratio * share.gain).sum(), (weight * kl).sum()
 
         @torch.no_grad()
         def measure() -> tuple[float, float]:
@@ -58,19 +64,19 @@ class HATRPO(Sequential):
             return objective, kl
 
         objective, _ = surrogate_and_kl()
-        kl = self._kl_from_itself(agent, batch)
+        kl = self._kl_from_itself(agent, share)
         stepped = trust_region_step(
-            actor.parameters_of(agent), objective, kl, measure, cfg, accept_ratio=cfg.accept_ratio
+            actor.parameters_of(agent), objective, kl, measure, self.region, accept_ratio=cfg.accept_ratio
         )
         return stepped.told("Policy/kl", self.device)
 
-    def _kl_from_itself(self, agent: int, batch: Batch) -> Tensor:
+    def _kl_from_itself(self, agent: int, share: AgentBatch) -> Tensor:
         """The part of an agent's mean KL that its Fisher matrix is made of: 0, but with a curvature."""
         actor, rows = self.policy.actor, self.world.num_envs
-        sample = torch.arange(len(batch.obs), device=self.device)
+        sample = torch.arange(len(share.seen), device=self.device)
         # As in MT-TRPO: a later step begins at a later row, else rows between would never be taken.
         taken = (sample + sample // rows) % self.config.fisher_stride == 0
-        obs, weight = batch.obs[taken].to(actor.log_stds[0].dtype), batch.weights[taken]
-        mean, log_std = actor.mean_of(agent, obs), actor.log_std_of(obs).index_select(-1, actor.own[agent])
+        seen, weight = share.seen[taken].to(actor.log_stds[0].dtype), share.weights[taken]
+        mean, log_std = actor.distribution_of(agent, seen, share.task[taken])
         kl = gaussian_kl(mean.detach(), log_std.detach(), mean, log_std)
         return (weight / all_sum(weight.sum()).clamp_min(1.0) * kl).sum()

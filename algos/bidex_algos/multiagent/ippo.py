@@ -3,6 +3,8 @@
 MAPPO but for the critics: each agent has its own values, returns and advantages, normalised per task.
 """
 
+from typing import Any
+
 from torch import Tensor, nn
 
 from bidex_algos.multiagent.ippo_config import PRESETS, IPPOConfig
@@ -34,8 +36,8 @@ class IPPO(MAPPO):
     def _make_critic(self, heads: int) -> nn.Module:
         return TeamCritic(self.views, self.config, heads, self.initial, self.config.share_parameters)
 
-    def _critic_networks(self) -> list[list[nn.Parameter]]:
-        return [list(net.parameters()) for net in self.critic.nets]
+    def _critics(self) -> list[Any]:
+        return list(self.critic.nets)
 
     def _critic(self, obs: Tensor, task_id: Tensor) -> Tensor:
         """Values (B, agents); of one agent alone (B,)."""

@@ -93,7 +93,8 @@ class MADDPG(DDPG):
             value = self._climbed(
                 self._values(self.critic, obs, torch.where(self.owner == agent, actions, draw.actions))
             )
-            price = self.config.squash_price * raw[:, list(view.actions)].square().mean(1)
+            # Of all actions, not of its own: the price of an action shall not depend on the partition.
+            price = self.config.squash_price * raw[:, list(view.actions)].square().sum(1) / raw.shape[1]
             losses.append((share * (price - value)).sum())
         loss = torch.stack(losses).sum()
         told = loss.detach()[None] / len(self.views)

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from bidex_algos.gradients.step_size import AdaptiveAdam
 from bidex_algos.multiagent.base import MultiAgent
 from bidex_algos.multiagent.mappo_config import PRESETS, MAPPOConfig
+from bidex_algos.nets.networks import gaussian_log_prob
 from bidex_algos.nets.precision import autocast
 from bidex_algos.onpolicy.base import Batch
 from bidex_algos.onpolicy.ppo_loss import NAMES, PolicyLoss, policy_loss
@@ -38,25 +39,25 @@ class MAPPO(MultiAgent):
         super().__init__(world, config, seed)
         actor = self.policy.actor
         self.adams = [
-            AdaptiveAdam(actor.parameters_of(k), config, self.device, config.adam_eps) for k in range(len(actor.nets))
+            AdaptiveAdam(actor.parameters_of(k), config, self.device, config.adam_eps, self.kl_share)
+            for k in range(len(actor.nets))
         ]
 
     def _optimisers(self) -> dict[str, Any]:
         return super()._optimisers() | {"agents": [adam.parts() for adam in self.adams]}
 
-    def _critic_networks(self) -> list[list[nn.Parameter]]:
-        """The parameters of each critic, whose gradients are shortened apart."""
-        return [list(self.critic.parameters())]
-
     def _update(self, batch: Batch) -> dict[str, Tensor]:
         """One pass after another: returns the means over all mini-batches and agents of what it measured."""
         cfg, actor = self.config, self.policy.actor
-        old_log_std, old_values = actor.log_std_of(batch.obs).detach().clone(), self._old_values(batch)
-        if old_log_std.dim() == 1:
-            old_log_std = old_log_std.expand(len(batch.obs), -1)
+        old_values = self._old_values(batch)
+        old_log_std = actor.log_std_of(batch.obs).detach().expand(batch.actions.shape)
+        given = zip(*(actor.parts(x) for x in (batch.actions, batch.old_means, old_log_std)), strict=True)
+        old_log_probs = torch.stack([gaussian_log_prob(*each) for each in given], dim=1)  # of each agent
         measured: list[Tensor] = []
         for first, index, count in self._mini_batches(batch, cfg.epochs, cfg.num_minibatches):
-            told = self._gradients(batch.select(index), count, old_log_std[index], old_values[index])
+            part = batch.select(index)
+            part.old_log_probs = old_log_probs.index_select(0, index)
+            told = self._gradients(part, count, old_log_std.index_select(0, index), old_values.index_select(0, index))
             measured.append(told[:4])
             for k, adam in enumerate(self.adams):
                 # The first mini-batch compares the sampling policy with itself and says nothing about the step.
@@ -64,7 +65,7 @@ class MAPPO(MultiAgent):
                     adam.follow(told[4 + k])
                 nn.utils.clip_grad_norm_(actor.parameters_of(k), cfg.max_grad_norm)
                 adam.step()
-            self._critic_step(self._critic_networks())
+            self._critic_step()
             actor.clamp_std(*cfg.std_range)
         rate = torch.stack([adam.rate for adam in self.adams]).mean()
         return {**dict(zip(NAMES, torch.stack(measured).mean(0), strict=True)), "Policy/lr": rate}
@@ -97,20 +98,15 @@ class MAPPO(MultiAgent):
         return sum_gradients([*actor.parameters(), *self.critic.parameters()], torch.stack(numbers))
 
     def _agent_losses(self, b: Batch, weights: Tensor, old_log_std: Tensor) -> list[PolicyLoss]:
-        """The loss of each agent."""
-        actor = self.policy.actor
+        """The loss of each agent; ``b`` has old log-densities and, of several critics, advantages (B, agents)."""
+        actor, task = self.policy.actor, self.policy.actor.one_hot(b.obs)
         with autocast(self.device, self.low_precision):
-            means = actor(b.obs)
-        log_std = actor.log_std_of(b.obs)
-        log_std = log_std if log_std.dim() == 2 else log_std.expand(len(b.obs), -1)
+            means = actor.means(b.obs)
         advantages = b.advantages if b.advantages.dim() == 2 else b.advantages[:, None].expand(-1, len(self.views))
+        given = zip(*(actor.parts(x) for x in (b.actions, b.old_means, old_log_std)), strict=True)
         losses = []
-        for agent, own in enumerate(actor.own):
-            old = self._log_prob(agent, b.actions, b.old_means, old_log_std)
-            actions, mean, std = (x.index_select(1, own) for x in (b.actions, means, log_std))
-            old_mean, old_std = (x.index_select(1, own) for x in (b.old_means, old_log_std))
-            gain = advantages[:, agent]
-            losses.append(
-                policy_loss(actions, mean, std, old_mean, old_std, old, gain, weights=weights, clip=self.config.clip)
-            )
+        for agent, (actions, old_means, old_std) in enumerate(given):
+            log_std, old_log_probs = actor.own_log_std(agent, task), b.old_log_probs[:, agent]
+            old = old_means, old_std, old_log_probs, advantages[:, agent]
+            losses.append(policy_loss(actions, means[agent], log_std, *old, weights=weights, clip=self.config.clip))
         return losses

@@ -60,7 +60,7 @@ class Team(nn.Module):
 
     def output(self, agent: int, x: Tensor) -> Tensor:
         """What one agent's network says of normalised observations (B, d): float32 (B, its outputs)."""
-        return self.nets[self.net_of[agent]](self._seen(agent, x))
+        return self.nets[self.net_of[agent]](self.seen(agent, x))
 
     def outputs(self, x: Tensor) -> list[Tensor]:
         """What every agent's network says of normalised observations (B, d)."""
@@ -69,7 +69,7 @@ class Team(nn.Module):
             if len(family) == 1:
                 found[family[0]] = self.output(family[0], x)
                 continue
-            together = torch.stack([self._seen(i, x) for i in family])
+            together = torch.stack([self.seen(i, x) for i in family])
             found.update(zip(family, self._family(family, together), strict=True))
         return [found[i] for i in range(len(self.net_of))]
 
@@ -84,7 +84,8 @@ class Team(nn.Module):
         stacked = {name: torch.stack([each[name] for each in parameters]) for name in parameters[0]}
         return stacked_forward(nets[0], stacked, "", x)
 
-    def _seen(self, agent: int, x: Tensor) -> Tensor:
+    def seen(self, agent: int, x: Tensor) -> Tensor:
+        """What one agent's network is fed of normalised observations (..., d)."""
         seen = self.columns[agent](x)
         family = next(family for family in self.families if agent in family)
         if not self.share or len(family) == 1:
@@ -144,12 +145,37 @@ class TeamActor(Team):
 
     def forward(self, x: Tensor) -> Tensor:
         """Mean joint action of normalised observations (B, d), float32 (B, a), not clamped."""
-        means = [self._chosen(x, out) for out in self.outputs(x)]
-        return torch.cat(means, dim=-1).index_select(-1, self._order)
+        return torch.cat(self.means(x), dim=-1).index_select(-1, self._order)
 
-    def mean_of(self, agent: int, x: Tensor) -> Tensor:
-        """One agent's mean action (B, a_i)."""
-        return self._chosen(x, self.output(agent, x))
+    def means(self, x: Tensor) -> list[Tensor]:
+        """The mean action (B, a_i) of each agent."""
+        task = self.one_hot(x)
+        return [self._chosen(task, out) for out in self.outputs(x)]
+
+    def distribution_of(self, agent: int, seen: Tensor, task: Tensor) -> tuple[Tensor, Tensor]:
+        """One agent's Gaussian.
+
+        Args:
+            agent: Its number.
+            seen: What its network is fed (B, d_i): :meth:`seen`.
+            task: The tasks' one-hot (B, heads): ``one_hot``.
+
+        Returns:
+            Mean (B, a_i) and logarithm of the standard deviation, (a_i,) with one head, else (B, a_i).
+        """
+        return self._chosen(task, self.nets[self.net_of[agent]](seen)), self.own_log_std(agent, task)
+
+    def own_log_std(self, agent: int, task: Tensor) -> Tensor:
+        """The second of :meth:`distribution_of`."""
+        log_std = self.log_stds[self.net_of[agent]]
+        if self.heads == 1:
+            return log_std
+        with torch.autocast(task.device.type, enabled=False):
+            return task.to(log_std.dtype) @ log_std
+
+    def parts(self, joint: Tensor) -> tuple[Tensor, ...]:
+        """Each agent's entries (..., a_i) of what the world's actions have (..., a)."""
+        return joint.index_select(-1, self._taken).split(self._sizes, dim=-1)
 
     def log_std_of(self, x: Tensor, log_std: Tensor | None = None) -> Tensor:
         """The joint ``log_std`` that holds for observations (B, d): (a,) with one head, else (B, a)."""
@@ -169,12 +195,11 @@ class TeamActor(Team):
         for log_std in self.log_stds:
             log_std.clamp_(math.log(low), math.log(high))
 
-    def _chosen(self, x: Tensor, out: Tensor) -> Tensor:
+    def _chosen(self, task: Tensor, out: Tensor) -> Tensor:
         if self.heads == 1:
             return out
-        with torch.autocast(x.device.type, enabled=False):
-            heads = out.unflatten(-1, (self.heads, -1))
-            return torch.einsum("...h,...ha->...a", self.one_hot(x).to(out.dtype), heads)
+        with torch.autocast(task.device.type, enabled=False):
+            return torch.einsum("...h,...ha->...a", task.to(out.dtype), out.unflatten(-1, (self.heads, -1)))
 
 
 class TeamCritic(Team):

@@ -48,8 +48,12 @@ class RunningStats(nn.Module):
         return (x - self.mean.float()[element]) / self.std().float()[element]
 
     def restore(self, x: Tensor, element: Tensor) -> Tensor:
-        """What :meth:`normalise` made ``x`` of, (..., n)."""
-        return x * self.std().float()[element] + self.mean.float()[element]
+        """What :meth:`normalise` made ``x`` of, (..., n); 0 where the element has no statistics yet.
+
+        An untrained critic says numbers about 1, which may be a hundred times a return. As bootstraps of the first
+        rollout they would make the first statistics, and a hundred iterations would have to forget them.
+        """
+        return (x * self.std().float()[element] + self.mean.float()[element]) * (self.count > 0)[element]
 
 
 class ObservationNormaliser(nn.Module):

@@ -150,13 +150,18 @@ class OnPolicy(Learner):
     def _in_critic_units(self, returns: Tensor, task_id: Tensor) -> Tensor:
         return self.return_stats.normalise(returns, self._element(task_id)) if self.config.per_task_values else returns
 
-    def _mini_batches(self, batch: Batch, epochs: int, number: int) -> Iterator[tuple[bool, Tensor, Tensor]]:
+    def _merge_returns(self, mean: Tensor, var: Tensor, count: Tensor) -> None:
+        """Takes a rollout's moments of returns into the statistics, which are the critic's units from now on."""
+        self.return_stats.merge(mean, var, count)
+
+    def _mini_batches(self, batch: Any, epochs: int, number: int) -> Iterator[tuple[bool, Tensor, Tensor]]:
         """Some passes over a batch, shuffled anew in each: whether it is the very first, samples (b,), and their count.
 
+        Of ``batch`` the weights (B,) are read alone.
         Divided by that count, of all processes, losses and gradients become means by being summed over them.
         """
         for epoch in range(epochs):
-            order = torch.randperm(len(batch.obs), generator=self.generator, device=self.device)
+            order = torch.randperm(len(batch.weights), generator=self.generator, device=self.device)
             parts = order.chunk(number)
             counts = all_sum(torch.stack([batch.weights[index].sum() for index in parts])).clamp_min(1.0)
             for place, (index, count) in enumerate(zip(parts, counts, strict=True)):
@@ -187,7 +192,7 @@ class OnPolicy(Learner):
         advantages = gae(rewards, values, next_values, terminated, ended, gamma, cfg.lam, valid)
         returns = advantages + values
         explained = explained_variance(values, returns, element, elements, valid).view(-1, num_tasks).mean(0)
-        self.return_stats.merge(*task_moments(returns, element, elements, valid))
+        self._merge_returns(*task_moments(returns, element, elements, valid))
         group = element if cfg.per_task_advantages else element // num_tasks * num_tasks
         advantages = normalise_per_task(advantages, group, elements, valid)
 

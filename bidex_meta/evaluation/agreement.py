@@ -1,0 +1,91 @@
+"""Whether an evaluation that was made again says what the recorded one said, class by class."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from bidex_meta.errors import BidexError
+
+EQUAL, WITHIN, DIFFERS = "equal", "within", "differs"
+_BITS = ("success", "return", "length", "episodes", "tasks", "unstable")
+_MEASURES = ("success", "return")
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """One class in both evaluations."""
+
+    name: str
+    """Of the class; of a meta-test with split and shot."""
+    outcome: str
+    """``equal``: each number is the same bit for bit; ``within``: success and return differ by no more than their
+    intervals allow; ``differs``."""
+    recorded: dict[str, Any]
+    """Its row as it was recorded."""
+    again: dict[str, Any]
+    """Its row now."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Ready for JSON."""
+        both = {name: [self.recorded[name], self.again[name]] for name in _MEASURES}
+        return {"outcome": self.outcome, **both}
+
+
+def agreements(recorded: Mapping[str, Any], again: Mapping[str, Any]) -> list[Agreement]:
+    """Compares two evaluations of one policy, of the same tasks and starts.
+
+    What differs in its last digits soon plays other episodes, so that the two are at worst independent samples: their
+    means may differ by the root of the sum of both half intervals' squares. These are widened so that of all measures
+    of all classes together one in twenty honest repetitions has any beyond (Bonferroni; simulated for twenty classes:
+    one in eighteen of 200 episodes a class, one in fourteen of 60, one in seven of 20).
+
+    Args:
+        recorded: Per class its row of ``Evaluation.to_json``.
+        again: The same of the second one.
+
+    Raises:
+        BidexError: They are not of the same classes.
+    """
+    if set(recorded) != set(again):
+        raise BidexError(
+            f"Expected the recorded evaluation to be of {', '.join(again)}, got {', '.join(recorded)}. Evaluate anew."
+        )
+    from scipy.stats import norm
+
+    wider = float(norm.ppf(1 - 0.025 / (len(_MEASURES) * len(recorded))) / norm.ppf(0.975))
+    return [Agreement(name, _outcome(row, again[name], wider), row, again[name]) for name, row in recorded.items()]
+
+
+def classes_of(evaluation: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Every row of an ``evaluation.json`` by the class's name; of a meta-test those of all splits and shots."""
+    if "splits" not in evaluation:
+        return dict(evaluation.get("policy", evaluation)["classes"])
+    rows = {}
+    for split, part in evaluation["splits"].items():
+        shots = part.get("by_shot") or [part["before"], part["after"]]
+        for number, shot in enumerate(shots):
+            rows |= {f"{name} ({split}, shot {number})": row for name, row in shot["classes"].items()}
+    return rows
+
+
+def _outcome(recorded: dict[str, Any], again: dict[str, Any], wider: float) -> str:
+    shared = [name for name in _BITS if name in recorded]
+    if all(recorded[name] == again[name] for name in shared):
+        return EQUAL
+    if recorded.get("episodes", again["episodes"]) != again["episodes"]:
+        return DIFFERS
+    return WITHIN if all(_is_within(recorded, again, name, wider) for name in _MEASURES) else DIFFERS
+
+
+def _is_within(recorded: dict[str, Any], again: dict[str, Any], name: str, wider: float) -> bool:
+    gap = abs(recorded[name] - again[name])
+    halves = [_half(row, f"{name}_interval") for row in (recorded, again)]
+    rounding = 1e-9 * max(1.0, abs(recorded[name]))
+    return gap <= rounding + wider * math.hypot(*halves)
+
+
+def _half(row: dict[str, Any], name: str) -> float:
+    """Half the width of an interval, 0 where there is none: a single episode says nothing of others."""
+    ends = row.get(name)
+    return 0.0 if ends is None else (ends[1] - ends[0]) / 2

@@ -1,0 +1,96 @@
+"""Runs that are killed again and again end as the unbroken ones do: files, weights, worlds, metrics, bit for bit."""
+
+import random
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+if sys.platform != "linux":
+    pytest.skip("forks, and reads /proc", allow_module_level=True)
+
+from bidex_meta.commands.learners import ALGOS
+from tests.robust.kills import KILLED, Victim, outcome, quick_folder, server, unequal
+from tests.robust.victims import FLAGS, arguments
+
+ITERATIONS = 12
+pytestmark = pytest.mark.xdist_group("kills")  # one server for all
+
+
+@pytest.fixture(scope="module")
+def place() -> Iterator[Path]:
+    with quick_folder() as folder:
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def killer() -> Iterator[subprocess.Popen[str]]:
+    with server() as process:
+        yield process
+
+
+def killed_often(
+    algo: str, seed: int, killer: subprocess.Popen[str], place: Path, record: bool = False
+) -> dict[str, object]:
+    """The unbroken run's outcome, which the killed one's equals."""
+    draw = random.Random(f"{algo} {seed}")
+    often = draw.random() < 0.5 or record  # each checkpoint begins another part of what is recorded
+    whole = Victim(killer, arguments(algo, ITERATIONS, record=record), place / f"{algo}{seed}whole{record}")
+    answer = whole.go_on()
+    assert answer["code"] == 0, whole.log.read_text()
+    run = Victim(killer, whole.arguments, place / f"{algo}{seed}{record}", 0.0 if often else 0.02)
+    run.kill_often(whole.counts(), answer["cpu"], draw)
+    print(f"kills: {algo} {dict(run.fell)}")
+    expected = outcome(whole.path, often)
+    assert unequal(outcome(run.path, often), expected) == []
+    return expected
+
+
+def test_every_learner_can_be_killed() -> None:
+    assert FLAGS.keys() == ALGOS.keys()
+
+
+@pytest.mark.parametrize("algo", ["mtsac", "rl2"])
+def test_killed_runs_end_as_unbroken_ones(algo: str, killer: subprocess.Popen[str], place: Path) -> None:
+    killed_often(algo, 0, killer, place)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("algo", FLAGS)
+def test_killed_runs_of_every_learner(algo: str, seed: int, killer: subprocess.Popen[str], place: Path) -> None:
+    killed_often(algo, seed, killer, place)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("algo", ["mtppo", "mtsac", "promp", "rl2"])
+def test_killed_runs_that_record(algo: str, seed: int, killer: subprocess.Popen[str], place: Path) -> None:
+    pytest.importorskip("h5py")
+    assert killed_often(algo, seed, killer, place, record=True)["recorded"]
+
+
+def killed_before_operations(killer: subprocess.Popen[str], place: Path, name: str, stride: int) -> int:
+    """Kills runs of four iterations, each before another operation on a file of its folder; how many."""
+    whole = Victim(killer, arguments("mtppo", 4), place / f"{name}whole")
+    assert whole.go_on()["code"] == 0
+    expected, operations = outcome(whole.path), whole.counts()["operations"]
+    wrong = {}
+    for number in range(1, operations + 1, stride):
+        run = Victim(killer, whole.arguments, place / f"{name}{number}")
+        assert run.go_on(aim=("operations", number))["code"] == KILLED
+        assert run.go_on()["code"] == 0, (number, run.log.read_text())
+        wrong[number] = unequal(outcome(run.path), expected)
+    assert not any(wrong.values()), f"of {operations}: {wrong}"
+    return len(wrong)
+
+
+def test_killed_before_operations_on_files(killer: subprocess.Popen[str], place: Path) -> None:
+    killed_before_operations(killer, place, "some", 15)
+
+
+@pytest.mark.slow
+def test_killed_beforekilled_before_operations_on_files(killer: subprocess.Popen[str], place: Path) -> None:
+    print(f"kills: {killed_before_operations(killer, place, 'each', 1)} operations")

@@ -1,0 +1,216 @@
+"""``bidex-meta verify``: equal bit for bit, within the intervals, different; and what it cannot compare."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from bidex_meta.cli import main
+from bidex_meta.commands import learners
+from bidex_meta.commands.conditions import conditions, others, recorded_conditions
+from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.agreement import agreements, classes_of
+from bidex_meta.evaluation.results import ClassResult
+from bidex_meta.record import RunFolder
+from bidex_meta.sources import Source
+from bidex_meta.sources.source import OwnSuite
+from tests.fakes import ToyWorld
+from tests.test_metatest_commands import COUNTS, points
+
+SMALL = ["--suite", "MT4", "--num-envs", "6", "--threads", "1", "--device", "cpu", "--learner.hidden", "8"]
+
+
+@pytest.fixture(autouse=True)
+def threads():
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
+def run(monkeypatch, tmp_path) -> Path:
+    monkeypatch.setattr(OwnSuite, "world", lambda source, split="train", rows=None, mode="DISABLED": _toy(rows, mode))
+    assert main(["run", *SMALL, "--steps", "96", "--run-dir", str(tmp_path / "r"), "--episodes", "4"]) == 0
+    return tmp_path / "r"
+
+
+def _toy(rows, mode):
+    world = ToyWorld(rows or 6, mode)
+    world.state_dict = dict  # type: ignore[method-assign]
+    return world
+
+
+def verify(capsys, *arguments):
+    capsys.readouterr()
+    code = 0
+    try:
+        code = main(["verify", *map(str, arguments)])
+    except SystemExit as stop:
+        code = stop.code
+    return code, capsys.readouterr()
+
+
+def changed(run: Path, change) -> None:
+    path = run / "evaluation.json"
+    found = json.loads(path.read_text())
+    change(found)
+    path.write_text(json.dumps(found))
+
+
+def test_a_run_is_equal_within_or_different(run, capsys):
+    code, shown = verify(capsys, run)
+    assert code == 0 and "2 classes: 2 equal bit for bit, 0 within, 0 differ" in shown.out and shown.err == ""
+    code, shown = verify(capsys, run, "--json")
+    found = json.loads(shown.out)
+    assert (code, found["equal"], found["steps"], found["conditions"]) == (0, 2, 96, [])
+
+    row = json.loads((run / "evaluation.json").read_text())["policy"]["classes"]["Near"]
+    width = row["return_interval"][1] - row["return_interval"][0]
+    assert width > 0
+    changed(run, lambda found: found["policy"]["classes"]["Near"].update({"return": row["return"] + 0.3 * width}))
+    code, shown = verify(capsys, run, "--json")
+    assert (code, json.loads(shown.out)["classes"]["Near"]["outcome"]) == (0, "within")
+    changed(run, lambda found: found["policy"]["classes"]["Near"].update({"return": row["return"] + 3 * width}))
+    code, shown = verify(capsys, run)
+    assert code == 1 and "1 differ: this run is not what its evaluation says" in shown.out
+
+
+def test_another_policy_is_found(run, capsys):
+    checkpoints = RunFolder.open(run).checkpoints
+    state, step = checkpoints.load()  # type: ignore[misc]
+    weights = state["learner"]["policy"]["weights"]
+    for name, weight in weights.items():
+        if weight.is_floating_point() and weight.ndim == 2:
+            weights[name] = -3.0 * weight
+    checkpoints.save(state, step)
+    code, shown = verify(capsys, run, "--json")
+    assert code == 1, shown
+    assert json.loads(shown.out)["differs"] >= 1
+
+
+def test_conditions_that_changed_are_told(run, capsys):
+    then = json.loads((run / "evaluation.json").read_text())["conditions"]
+    versions = json.loads((run / "versions.json").read_text())
+    assert len(then["physics"]) == 12 and then["physics"] == versions["physics"]
+    assert (then["suite_version"], versions["suite_version"], then["device"]) == (1, 1, "cpu")
+
+    def older(found):
+        found["conditions"]["packages"]["mujoco"] = "3.9.9"
+        found["conditions"] |= {"physics": "0123456789ab", "suite_version": 0, "device": "cuda:0", "engine": "warp"}
+
+    changed(run, older)
+    code, shown = verify(capsys, run)
+    assert code == 0 and "2 equal" in shown.out
+    for told in (
+        "mujoco 3.9.9 then, ",
+        "physics 0123456789ab then, ",
+        "suite version 0 then, 1 now",
+        "cuda:0 then, cpu",
+    ):
+        assert told in shown.err
+    changed(run, lambda found: found.pop("conditions"))  # of an older run: that of versions.json
+    (run / "versions.json").write_text(json.dumps({"packages": versions["packages"]}))
+    code, shown = verify(capsys, run)
+    assert code == 0 and "Conditions: not recorded: physics, suite version." in shown.err
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda found: found.update(steps=95), "no checkpoint of these: its newest is at 96"),
+        (lambda found: found.pop("seed"), "seed: expected it to be there"),
+        (lambda found: found["policy"].update(episodes_per_task="x"), "episodes_per_task: expected a whole number"),
+        (lambda found: found["policy"]["classes"].pop("Near"), "Expected the recorded evaluation to be of Near, Far"),
+        (lambda found: found["conditions"].update(engine="rust"), "conditions.engine: expected auto or c or warp"),
+        (lambda found: found.update(splits={"train": {"before": found["policy"], "after": found["policy"]}}), "shots"),
+    ],
+)
+def test_what_cannot_be_compared_is_one_line(run, capsys, change, told):
+    changed(run, change)
+    code, shown = verify(capsys, run)
+    assert code == 2 and told in shown.err and len(shown.err.strip().splitlines()) == 1
+
+
+def test_no_evaluation_and_another_file(run, capsys, tmp_path):
+    (run / "evaluation.json").rename(tmp_path / "kept.json")
+    code, shown = verify(capsys, run)
+    assert code == 2 and "has no evaluation.json to be verified" in shown.err and "evaluate" in shown.err
+    assert verify(capsys, run, "--evaluation", tmp_path / "kept.json")[0] == 0
+    capsys.readouterr()
+    assert main(["evaluate", str(run), "--json", "--num-envs", "12", "--seed", "5", "--episodes", "3"]) == 0
+    (run / "evaluation.json").write_text(capsys.readouterr().out)
+    code, shown = verify(capsys, run)
+    assert code == 0 and "2 equal" in shown.out
+
+
+def test_a_learner_that_adapts(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(OwnSuite, "world", points)
+    pools = {split: {name: [""] * count for name, count in counts.items()} for split, counts in COUNTS.items()}
+    monkeypatch.setattr(OwnSuite, "tasks", lambda source, split: pools[split])
+    monkeypatch.setitem(learners.ALGOS, "finder", "tests.adapting_learner:Learner")
+    flags = ["--suite", "ML4", "--algo", "finder", "--num-envs", "24", "--steps", "24", "--threads", "1"]
+    path = tmp_path / "r"
+    assert main(["run", *flags, "--device", "cpu", "--run-dir", str(path)]) == 0
+    code, shown = verify(capsys, path)
+    assert code == 0 and "6 classes: 6 equal bit for bit" in shown.out and "Near (test, shot 1)" in shown.out
+    capsys.readouterr()
+    words = ["--shots", "2", "--rollouts", "3", "--tasks", "2", "--trials", "2", "--episodes", "5", "--split", "test"]
+    assert main(["evaluate", str(path), "--json", *words, "--num-envs", "8"]) == 0
+    (tmp_path / "other.json").write_text(capsys.readouterr().out)
+    code, shown = verify(capsys, path, "--evaluation", tmp_path / "other.json")
+    assert code == 0 and "3 classes: 3 equal bit for bit" in shown.out
+
+    def worse(found):
+        found["splits"]["train"]["by_shot"][1]["classes"]["Far"]["return"] -= 100.0
+
+    changed(path, worse)
+    code, shown = verify(capsys, path, "--json")
+    assert code == 1
+    outcomes = {name: row["outcome"] for name, row in json.loads(shown.out)["classes"].items()}
+    assert [name for name, outcome in outcomes.items() if outcome == "differs"] == ["Far (train, shot 1)"]
+
+
+def _rows(generator, classes, episodes, shift=0.0):
+    rows = {}
+    for i in range(classes):
+        returns = generator.normal(5.0 + shift, 2.0, episodes)
+        successes = (generator.random(episodes) < 0.3).astype(float)
+        result = ClassResult(returns, successes, np.ones(episodes, np.int64), np.zeros(episodes, np.int64), 0)
+        rows[f"C{i}"] = result.to_json()
+    return rows
+
+
+def test_honest_repetitions_are_within_and_a_worse_policy_is_not():
+    """Independent samples are the worst case: of 40 pairs of twenty classes, 60 episodes each, some three have one."""
+    generator = np.random.default_rng(0)
+    beyond = sum(
+        any(each.outcome == "differs" for each in agreements(_rows(generator, 20, 60), _rows(generator, 20, 60)))
+        for _ in range(40)
+    )
+    assert beyond <= 8
+    found = agreements(_rows(generator, 20, 60), _rows(generator, 20, 60, shift=2.0))
+    assert all(each.outcome == "differs" for each in found)
+
+
+def test_rows_that_cannot_agree():
+    rows = _rows(np.random.default_rng(1), 2, 20)
+    assert [each.outcome for each in agreements(rows, rows)] == ["equal", "equal"]
+    more = {name: row | {"episodes": 40} for name, row in rows.items()}
+    assert [each.outcome for each in agreements(rows, more)] == ["differs", "differs"]
+    single = {name: row | {"return_interval": None} for name, row in rows.items()}
+    other = {name: row | {"return": row["return"] + 1e-6} for name, row in single.items()}
+    assert [each.outcome for each in agreements(single, other)] == ["differs", "differs"]
+    with pytest.raises(BidexError, match="of C0, got C0, C1"):
+        agreements(rows, {"C0": rows["C0"]})
+    assert list(classes_of({"classes": rows})) == ["C0", "C1"]
+
+
+def test_what_was_not_recorded_is_said_once():
+    now = conditions(Source.open({"suite": "metaworld/MT3", "device": "cpu", "threads": 1}))
+    assert "metaworld" in now["packages"] and now["physics"] is None
+    assert others(now, now) == []
+    assert others(recorded_conditions({}, {}, {"device": "cpu"}), now) == [
+        "not recorded: " + ", ".join(now["packages"])
+    ]
