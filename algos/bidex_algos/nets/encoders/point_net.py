@@ -17,6 +17,8 @@ POINT_GROUPS = {"points": 3, "kind_points": 4}
 """Observation groups that are clouds, and the numbers of a point."""
 _SPREAD = 0.2
 """What distances from a cloud's centre are divided by, metres: about a hand's length."""
+_CACHED = 1 << 19
+"""Numbers of a layer that a CPU computes at once."""
 
 
 class PointNet(nn.Module):
@@ -54,7 +56,24 @@ class PointNet(nn.Module):
         place, rest = cloud[..., :3], cloud[..., 3:]
         centre = place.mean(dim=-2, keepdim=True)
         points = torch.cat(((place - centre) / _SPREAD, rest), dim=-1)
-        return torch.cat((self.shared(points).max(dim=-2).values, centre[..., 0, :]), dim=-1)
+        return torch.cat((self._largest(points.flatten(0, -3)).view(*x.shape[:-1], -1), centre[..., 0, :]), dim=-1)
+
+    def _largest(self, points: Tensor) -> Tensor:
+        """The largest of each feature, (n, features), over points (n, points, channels)."""
+        last = self.shared[-1]
+        if not torch.is_grad_enabled() or last.out_features >= points.shape[1]:
+            return torch.cat([self.shared(part).amax(dim=1) for part in self._parts(points)])
+        # Only the point that is largest in a feature has a gradient: find these without, then go through them alone.
+        with torch.no_grad():
+            found = torch.cat([self.shared(part).argmax(dim=1) for part in self._parts(points)])
+        chosen = points.gather(1, found[..., None].expand(-1, -1, points.shape[2]))
+        return (self.shared[:-1](chosen) * last.weight).sum(dim=2) + last.bias
+
+    def _parts(self, points: Tensor) -> tuple[Tensor, ...]:
+        """On a CPU so many clouds at once that what is computed of them fits its cache."""
+        if points.device.type != "cpu":
+            return (points,)
+        return points.split(max(1, _CACHED // (points.shape[1] * (self.size - 3))))
 
 
 def with_point_net(inputs: Inputs, config: Any) -> Inputs:
