@@ -65,7 +65,7 @@ class PointNet(nn.Module):
             return torch.cat([self.shared(part).amax(dim=1) for part in self._parts(points)])
         # Only the point that is largest in a feature has a gradient: find these without, then go through them alone.
         with torch.no_grad():
-            found = torch.cat([self.shared(part).argmax(dim=1) for part in self._parts(points)])
+            found = torch.cat([_largest_of(self.shared(part)) for part in self._parts(points)])
         chosen = points.gather(1, found[..., None].expand(-1, -1, points.shape[2]))
         return (self.shared[:-1](chosen) * last.weight).sum(dim=2) + last.bias
 
@@ -74,6 +74,16 @@ class PointNet(nn.Module):
         if points.device.type != "cpu":
             return (points,)
         return points.split(max(1, _CACHED // (points.shape[1] * (self.size - 3))))
+
+
+def _largest_of(values: Tensor) -> Tensor:
+    """``values.argmax(dim=1)`` of (n, points, features); five times as fast on a CPU, where argmax is no vector code."""
+    points = values.shape[1]
+    step = next(d for d in range(min(16, points), 0, -1) if points % d == 0)
+    blocks = values.unflatten(1, (-1, step))
+    block = blocks.amax(dim=2).argmax(dim=1)
+    within = blocks.gather(1, block[:, None, None].expand(-1, 1, step, -1))[:, 0].argmax(dim=1)
+    return block * step + within
 
 
 def with_point_net(inputs: Inputs, config: Any) -> Inputs:
