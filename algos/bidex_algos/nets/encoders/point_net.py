@@ -77,12 +77,12 @@ class PointNet(nn.Module):
 
 
 def _largest_of(values: Tensor) -> Tensor:
-    """``values.argmax(dim=1)`` of (n, points, features); five times as fast on a CPU, where argmax is no vector code."""
+    """``values.argmax(dim=1)`` of (n, points, features), faster on a CPU, where argmax and max are no vector code."""
     points = values.shape[1]
     step = next(d for d in range(min(16, points), 0, -1) if points % d == 0)
     blocks = values.unflatten(1, (-1, step))
-    block = blocks.amax(dim=2).argmax(dim=1)
-    within = blocks.gather(1, block[:, None, None].expand(-1, 1, step, -1))[:, 0].argmax(dim=1)
+    block = blocks.amax(dim=2).max(dim=1).indices
+    within = blocks.gather(1, block[:, None, None].expand(-1, 1, step, -1))[:, 0].max(dim=1).indices
     return block * step + within
 
 
