@@ -50,4 +50,6 @@ def widths(config: Any, *names: str) -> None:
     """Refuses layers that are none, or of no width."""
     for name in names:
         if not getattr(config, name) or min(getattr(config, name)) < 1:
-            raise BidexError(f"{config.algo}: {name} must be one or more widths of at least 1, got {getattr(config, name)}.")
+            raise BidexError(
+                f"{config.algo}: {name} must be one or more widths of at least 1, got {getattr(config, name)}."
+            )

@@ -13,7 +13,7 @@ from bidex_meta.points.told import entries_of_objects
 from bidex_meta.suite import MOST_POINTS
 from bidex_meta.tasks.scene import Scene
 
-_CANDIDATES = 3072
+CANDIDATES = 3072
 """Points fixed on a scene at least: fewer leave gaps through which what is hidden shines."""
 
 
@@ -60,7 +60,7 @@ class Sight:
     """
 
     def __init__(self, scene: Scene, rule: PointsRule, first: int, device: torch.device) -> None:
-        surfaces = sample(scene.model, max(_CANDIDATES, 2 * rule.count))
+        surfaces = sample(scene.model, max(CANDIDATES, 2 * rule.count))
         self._cloud = Cloud(surfaces, camera_of(scene.task), rule.count, rule.kinds, device)
         self._columns = slice(first, first + rule.entries)
         self.hidden = entries_of_objects(scene)

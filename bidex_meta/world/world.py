@@ -17,8 +17,8 @@ from torch import Tensor
 
 from bidex_meta.engine.choice import choose_engine
 from bidex_meta.errors import BidexError, whole_number
-from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.points.sight import PointsRule
+from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.layout import CLIP
 from bidex_meta.world import actions, checked
 from bidex_meta.world.attributes import RowAttributes
@@ -114,6 +114,7 @@ class World(Recreated, RowAttributes, VectorEnv):
         self._scale = self._of_rows([slot.reward_scale for slot in slots]).float()
         self._uniform_tasks = task_sampling == "uniform"
         groups = build_groups(self.slots, self.slot_rows, make_engine)
+        self.points = points
         self._make_spaces(observation, pad_to, points, groups)
         self.parts = [Part(g, self.slots, observation, self.observation_size, num_envs, self._sights) for g in groups]
         self._masked = groups[0].engine.masked

@@ -38,8 +38,8 @@ def banish(world: World, shift: float) -> None:
             address, dof = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
             if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
                 start[:, address] += 50.0 + shift
-                start[:, address + 3 : address + 7] = torch.tensor([0.6, 0.8, 0.0, 0.0]) if shift else start.new_tensor(
-                    [1.0, 0.0, 0.0, 0.0]
+                start[:, address + 3 : address + 7] = (
+                    torch.tensor([0.6, 0.8, 0.0, 0.0]) if shift else start.new_tensor([1.0, 0.0, 0.0, 0.0])
                 )
             else:  # a drop of water moves freely by three slides
                 start[:, address] += 50.0 + shift if model.joint(joint).name.endswith("/x") else 0.01 * shift
@@ -92,9 +92,7 @@ def test_hands_goal_and_task_id_stay() -> None:
 
 def _mt4(points: PointsRule | None, rows: int = 8) -> World:
     suite = Benchmark("MT4")
-    return World(
-        suite._slots("train"), rows, observation="one-hot", pad_to=suite.padded_size, points=points, threads=1
-    )
+    return World(suite._slots("train"), rows, observation="one-hot", pad_to=suite.padded_size, points=points, threads=1)
 
 
 def test_a_row_sees_the_same_in_any_company_and_a_step_gives_what_a_refresh_gives() -> None:

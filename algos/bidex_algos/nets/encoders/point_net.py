@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.nets.encoders.inputs import Inputs
+from bidex_meta.errors import BidexError
 
 POINT_GROUPS = {"points": 3, "kind_points": 4}
 """Observation groups that are clouds, and the numbers of a point."""
@@ -87,14 +88,22 @@ def _largest_of(values: Tensor) -> Tensor:
 
 
 def with_point_net(inputs: Inputs, config: Any) -> Inputs:
-    """The same with clouds, where there are some, read by a PointNet, if the learner's config has ``point_widths``.
+    """The same with clouds, where there are some, read by a PointNet.
 
     Running statistics leave clouds as they are: each of their columns may be any point.
+
+    Raises:
+        BidexError: The learner's config has no ``point_widths``: it reads no clouds.
     """
-    widths, read = getattr(config, "point_widths", ()), getattr(config, "points_read", 0)
     for group in inputs.groups:
         channels = POINT_GROUPS.get(group.name)
-        if channels is not None and widths:
-            make = partial(PointNet, widths=tuple(widths), channels=channels, read=read)
+        if channels is not None:
+            if not hasattr(config, "point_widths"):
+                raise BidexError(
+                    f"{config.algo} does not read point clouds. Take another learner, such as mtppo or mtsac, or leave "
+                    "--points (a suite's table [points]) out."
+                )
+            widths, read = tuple(config.point_widths), config.points_read
+            make = partial(PointNet, widths=widths, channels=channels, read=read)
             inputs = inputs.encoded(group.name, make, scaled=False)
     return inputs
