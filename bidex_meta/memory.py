@@ -9,7 +9,7 @@ ROW_BYTES = 500_000
 """Of a row of a world on the CPU: measured 0.39 MB on MT4 and 0.48 on MT20, with 1000 rows each."""
 
 POINT_BYTES = 100
-"""Of a point of a row's cloud: calculated, in the observation, its copies in a step's info and what they are made of."""
+"""Of a point of a row's cloud: calculated, in the observation, its copies in a step's info and what makes them."""
 
 
 def available() -> int | None:

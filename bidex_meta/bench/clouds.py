@@ -35,7 +35,7 @@ def points(
 
     Returns:
         Frames (environment steps of all rows) a second with ``points`` and ``state``, the same per CPU second of the
-        process, their ``ratio`` (of CPU seconds), and ``cloud_ms``: CPU milliseconds that a step of all rows takes more.
+        process, their ``ratio`` (of CPU seconds), and ``cloud_ms``: CPU milliseconds that a step takes more.
     """
     worlds = {
         name: make_task_world(task, num_envs, device, seed=seed, autoreset_mode="SAME_STEP", threads=threads, points=n)

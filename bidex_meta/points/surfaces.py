@@ -7,7 +7,7 @@ import numpy as np
 
 from bidex_meta.errors import BidexError
 from bidex_meta.hands.pair import SIDES
-from bidex_meta.points.shapes import DRAWN, area, inside, surface
+from bidex_meta.points.solids import DRAWN, area, inside, surface
 
 FIXTURE, HAND, OBJECT = -1.0, 0.0, 1.0
 """What a point is of, where a cloud tells it: table and other parts of the world; either hand; anything that moves."""

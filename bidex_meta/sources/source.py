@@ -33,8 +33,8 @@ class Source(ABC):
     Args:
         name: How the user calls it: a suite's name or path, or a task class.
         config: A run's config, or a part of one; read are ``seed`` (0), ``device`` (cpu, of this very process),
-            ``threads`` (None: one per core), ``engine`` (auto), ``points`` (0: as the suite says) and, by a single class,
-            ``base`` (own).
+            ``threads`` (None: one per core), ``engine`` (auto), ``points`` (0: as the suite says) and, by a single
+            class, ``base`` (own).
     """
 
     hides_goals: bool = False

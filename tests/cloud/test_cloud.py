@@ -8,7 +8,7 @@ import torch
 from bidex_meta.errors import BidexError
 from bidex_meta.points.camera import camera_of
 from bidex_meta.points.cloud import Cloud
-from bidex_meta.points.shapes import area, inside, surface
+from bidex_meta.points.solids import area, inside, surface
 from bidex_meta.points.surfaces import sample
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import compile_scene
