@@ -85,7 +85,8 @@ def test_render_puts_the_cloud_beside_the_picture(monkeypatch: pytest.MonkeyPatc
     looked.reset(seed=0)
     pictures = [looked.render(row=row, width=60, height=50) for row in (0, 2)]
     assert pictures[0].shape == (50, 180, 3) and (pictures[0][:, :60] == 0).all()
-    orange = (pictures[0][..., 0].astype(int) > pictures[0][..., 2].astype(int) + 40).any(axis=0)
+    red, blue = (pictures[0][..., i].astype(int) for i in (0, 2))
+    orange = np.asarray((red > blue + 40).any(axis=0))
     assert orange[60:120].any() and orange[120:].any(), "the egg is seen from the camera and from the side"
     for _ in range(20):
         looked.step(torch.zeros(3, looked.action_size))

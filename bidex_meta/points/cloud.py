@@ -121,7 +121,7 @@ class Cloud:
         for i, part in enumerate(self._parts):
             places[:, :, part] = poses[:, i] @ self._places[i]
             facing[:, part] = eye[:, i] @ self._faces[i]
-        return (*places.unbind(1), facing)
+        return places[:, 0], places[:, 1], places[:, 2], facing
 
     def _seen(self, x: Tensor, y: Tensor, depth: Tensor, facing: Tensor) -> Tensor:
         s, camera = self.sharpness, self.camera

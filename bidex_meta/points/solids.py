@@ -66,16 +66,16 @@ def inside(model: mujoco.MjModel, geom: int, points: np.ndarray, margin: float) 
     size = np.asarray(model.geom_size[geom], dtype=np.float64)
     kind = int(model.geom_type[geom])
     if kind == _SPHERE:
-        return np.linalg.norm(points, axis=1) < size[0] - margin
+        return np.asarray(np.linalg.norm(points, axis=1) < size[0] - margin)
     if kind == _ELLIPSOID:
-        return np.linalg.norm(points / (size - margin), axis=1) < 1.0
+        return np.asarray(np.linalg.norm(points / (size - margin), axis=1) < 1.0)
     across, along = np.linalg.norm(points[:, :2], axis=1), np.abs(points[:, 2])
     if kind == _CAPSULE:
         return np.hypot(across, np.maximum(along - size[1], 0.0)) < size[0] - margin
     if kind == _CYLINDER:
         return (across < size[0] - margin) & (along < size[1] - margin)
     if kind == _BOX:
-        return (np.abs(points) < size - margin).all(axis=1)
+        return np.asarray((np.abs(points) < size - margin).all(axis=1))
     return np.zeros(len(points), dtype=bool)
 
 

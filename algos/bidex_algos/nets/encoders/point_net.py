@@ -6,7 +6,7 @@ What it gives does not depend on the order of the points, nor on how often one o
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -61,7 +61,7 @@ class PointNet(nn.Module):
 
     def _largest(self, points: Tensor) -> Tensor:
         """The largest of each feature, (n, features), over points (n, points, channels)."""
-        last = self.shared[-1]
+        last = cast(nn.Linear, self.shared[-1])
         if not torch.is_grad_enabled() or last.out_features >= points.shape[1]:
             return torch.cat([self.shared(part).amax(dim=1) for part in self._parts(points)])
         # Only the point that is largest in a feature has a gradient: find these without, then go through them alone.
