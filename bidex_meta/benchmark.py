@@ -14,6 +14,7 @@ import numpy as np
 
 from bidex_meta.errors import BidexError, shortened, unknown_name
 from bidex_meta.memory import POINT_BYTES, ROW_BYTES, check_memory
+from bidex_meta.outside import name_with_object
 from bidex_meta.suite import SPLITS, ListedTask, Split, Suite, SuiteClass, load_suite
 from bidex_meta.tasks import registry
 
@@ -196,27 +197,26 @@ class Benchmark:
             observation=self.suite.observation,
             pad_to=self.padded_size,
             task_sampling="fixed" if evaluation or self.suite.kind == "meta" else "uniform",
-            points=self.suite.points,
-            point_kinds=self.suite.point_kinds,
+            points=(self.suite.points, self.suite.point_kinds),
         )
 
     def _draw(self, entry: SuiteClass, split: Split) -> list[Task]:
-        space = self._classes[entry.name].variation_space
+        # By the class's name, so that all objects of a class have the same goals.
+        space, key = self._classes[entry.name].variation_space, entry.class_name
         if entry.tasks:
             listed = [task for task in entry.tasks if task.split == split]
-            return [Task.from_variation(entry.name, _listed(space, self.seed, entry.name, task)) for task in listed]
-        return _drawn(space, self.seed, entry.name, split, self.suite.tasks_per_class or 0)
+            return [Task.from_variation(entry.name, _listed(space, self.seed, key, task)) for task in listed]
+        return _drawn(space, self.seed, key, split, self.suite.tasks_per_class or 0, entry.name)
 
     def _env_classes(self, split: Split) -> "dict[str, type[SuiteEnv]]":
         from bidex_meta.envs.suite_env import EnvRecipe
 
         moving, hides = True if self.suite.base == "moving" else None, self.suite.observation == "masked"
-        return {
-            entry.name: EnvRecipe(
-                entry.name, moving, tuple(entry.options.items()), self.padded_size, hides, entry.reward_scale
-            ).make_class()
-            for entry in self.suite.split_classes(split)
-        }
+        found = {}
+        for entry in self.suite.split_classes(split):
+            look = (moving, tuple(entry.options.items()), self.padded_size, hides)
+            found[entry.name] = EnvRecipe(entry.name, *look, entry.reward_scale, entry.class_name).make_class()
+        return found
 
     def _checked_split(self, split: str) -> Split:
         if not isinstance(split, str) or split not in self.suite.splits:
@@ -253,6 +253,7 @@ def make_task_world(
     engine: str = "auto",
     stagger: bool = True,
     points: int = 0,
+    object: str | None = None,
 ) -> "World":
     """A world of one class as it is on its own: goal visible, no one-hot, no padding, 50 tasks drawn by the seed.
 
@@ -269,19 +270,19 @@ def make_task_world(
         moving_base: Drive the hands' bases or fix them; left out, as the class has it on its own.
         engine: As in `Benchmark.make_world`.
         stagger: As in `Benchmark.make_world`.
-        points: Points of the cloud that observations show in the place of the object's state (docs/points.md); 0: they
-            show the state.
+        points: Points of the cloud shown in the place of the object's state (docs/points.md); 0: the state.
+        object: In the place of its own: a name, or an MJCF file (docs/objects.md); in the slot's name behind a dash.
 
     Raises:
-        BidexError: Unknown class, too few rows, an unknown mode, device or engine.
+        BidexError: Unknown class or object, too few rows, an unknown mode, device or engine.
     """
     from bidex_meta.world import Slot
     from bidex_meta.world.autoreset import checked_mode
 
     task_name = registry.resolve(task_name)
-    task_class = registry.get(task_name, moving_base)
+    task_class = registry.get(task_name, moving_base, **registry.with_object(object))
     tasks = _drawn(task_class.variation_space, _checked_seed(seed), task_name, "train", _TASKS_ALONE)
-    slot = Slot(task_name, task_class, np.stack([task.variation for task in tasks]))
+    slot = Slot(name_with_object(task_name, object), task_class, np.stack([task.variation for task in tasks]))
     if task_sampling is None:
         task_sampling = "fixed" if checked_mode(autoreset_mode).name == "DISABLED" else "uniform"
     return _make_world(
@@ -296,7 +297,7 @@ def make_task_world(
         observation="plain",
         pad_to=None,
         task_sampling=task_sampling,
-        points=points,
+        points=(points, False),
     )
 
 
@@ -313,11 +314,9 @@ def _make_world(
     observation: Literal["plain", "one-hot", "masked"],
     pad_to: int | None,
     task_sampling: TaskSampling,
-    points: int = 0,
-    point_kinds: bool = False,
+    points: tuple[int, bool],
 ) -> "World":
-    from bidex_meta.points.sight import PointsRule
-    from bidex_meta.world import World
+    from bidex_meta.world import PointsRule, World
     from bidex_meta.world.autoreset import checked_mode
 
     place = _checked_device(device)
@@ -327,7 +326,7 @@ def _make_world(
         names = ", ".join(slot.name for slot in slots)
         raise BidexError(f"num_envs: expected at least {len(slots)}, a row each for {names}; got {num_envs!r}.")
     if place.type == "cpu":
-        check_memory(int(num_envs) * (ROW_BYTES + points * POINT_BYTES), f"{num_envs:,} rows", "Lower num_envs.")
+        check_memory(int(num_envs) * (ROW_BYTES + points[0] * POINT_BYTES), f"{num_envs:,} rows", "Lower num_envs.")
     keep_freed_memory()
     return World(
         slots,
@@ -341,13 +340,13 @@ def _make_world(
         threads=threads,
         engine=engine,
         stagger=stagger,
-        points=PointsRule(points, point_kinds) if points else None,
+        points=PointsRule(*points) if points[0] else None,
     )
 
 
 def _task_class(suite: Suite, entry: SuiteClass) -> "TaskClass":
     try:
-        task_class = registry.get(entry.name, True if suite.base == "moving" else None, **entry.options)
+        task_class = registry.get(entry.class_name, True if suite.base == "moving" else None, **entry.options)
         for task in entry.tasks:
             for component in task.fixed:
                 if component not in task_class.variation_space.names:
@@ -363,9 +362,11 @@ def _generator(*key: object) -> np.random.Generator:
     return np.random.Generator(np.random.Philox(np.random.SeedSequence(int.from_bytes(digest, "little"))))
 
 
-def _drawn(space: "VariationSpace", seed: int, name: str, split: Split, count: int) -> list[Task]:
+def _drawn(
+    space: "VariationSpace", seed: int, name: str, split: Split, count: int, called: str | None = None
+) -> list[Task]:
     variations = space.sample(_generator(seed, name, split), count)
-    return [Task.from_variation(name, variation) for variation in variations]
+    return [Task.from_variation(called or name, variation) for variation in variations]
 
 
 def _listed(space: "VariationSpace", seed: int, name: str, task: ListedTask) -> np.ndarray:

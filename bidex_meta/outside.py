@@ -3,6 +3,7 @@
 import importlib
 import os
 import sys
+from pathlib import Path
 from typing import Any
 
 from bidex_meta.errors import BidexError
@@ -16,6 +17,17 @@ def is_outside(name: object) -> bool:
 def short_name(name: str) -> str:
     """The class's name of ``package.module:Class``; any other name as it is."""
     return name.rpartition(":")[2]
+
+
+def name_with_object(name: str, thing: str | None) -> str:
+    """What a task class with another object is called: ``CatchUnderarm-block``; of a file its name without ``.xml``."""
+    # Names of the shelf are taken in any case, and written in one.
+    return name if thing is None else f"{name}-{Path(thing).stem if thing.endswith('.xml') else thing.lower()}"
+
+
+def name_without_object(name: str) -> str:
+    """The task class of a name that ``name_with_object`` made."""
+    return name.partition("-")[0]
 
 
 def outside_class(name: str, role: str) -> tuple[type[Any], Any]:

@@ -7,12 +7,13 @@ Names of task classes and of the components of their variations are checked wher
 import math
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, cast
 
 from bidex_meta.errors import BidexError, known_name, shortened, unknown_name
+from bidex_meta.outside import name_with_object
 from bidex_meta.paths import suites_dir
 from bidex_meta.reading import expanded, read_toml
 
@@ -42,7 +43,9 @@ class SuiteClass:
     """One task class of a suite."""
 
     name: str
-    """Name of the task class, e.g. `"CatchUnderarm"`."""
+    """What it is called in the suite, e.g. `"CatchUnderarm"` or, with an object, `"CatchUnderarm-block"`."""
+    class_name: str
+    """The task class, e.g. `"CatchUnderarm"`."""
     splits: tuple[Split, ...]
     """Where it appears: train, test or both."""
     reward_scale: float
@@ -51,7 +54,7 @@ class SuiteClass:
     """Discount per step of this class; None: the learner's own."""
     tasks: tuple[ListedTask, ...]
     """Listed tasks; empty where the tasks are drawn."""
-    options: Mapping[str, float]
+    options: Mapping[str, float | str]
     """What else the class lets one choose, by the names of its constructor's arguments."""
 
 
@@ -130,7 +133,7 @@ def _parse(file: Path) -> Suite:
         reward=table.choice("reward", "paper"),
         base=table.choice("base", "moving", "alone"),
         tasks_per_class=table.count("tasks_per_class") if "tasks_per_class" in content else None,
-        classes=tuple(_parse_class(entry) for entry in table.tables("classes")),
+        classes=tuple(entry for each in table.tables("classes") for entry in _parse_classes(each)),
         file=file,
         points=points,
         point_kinds=kinds,
@@ -148,17 +151,38 @@ def _parse_points(table: "_Table") -> tuple[int, bool]:
     return count, kinds
 
 
+def _parse_classes(table: "_Table") -> list[SuiteClass]:
+    """A class, or with `objects` one for each of them."""
+    entry = _parse_class(table)
+    objects = table.things("objects") if "objects" in table.content else []
+    table.finish()
+    given = entry.options.get("object")
+    if objects and given is not None:
+        raise table.error("objects", "either objects or options.object", "both", "Leave one of them out.")
+    if not objects:
+        return [replace(entry, name=name_with_object(entry.class_name, cast(str | None, given)))]
+    return [
+        replace(
+            entry,
+            name=name_with_object(entry.class_name, thing),
+            options=MappingProxyType({**entry.options, "object": thing}),
+        )
+        for thing in objects
+    ]
+
+
 def _parse_class(table: "_Table") -> SuiteClass:
     split = table.choice("split", "train", "test", "both", default="train")
+    name = table.text("name")
     entry = SuiteClass(
-        name=table.text("name"),
+        name=name,
+        class_name=name,
         splits=SPLITS if split == "both" else (cast(Split, split),),
         reward_scale=table.number("reward_scale", default=1.0),
         gamma=table.number("gamma") if "gamma" in table.content else None,
         tasks=tuple(_parse_task(task) for task in table.tables("tasks", default=())),
         options=MappingProxyType(_parse_options(table) if "options" in table.content else {}),
     )
-    table.finish()
     if entry.reward_scale <= 0.0:
         raise table.error("reward_scale", "a number above 0", entry.reward_scale)
     if entry.gamma is not None and not 0.0 <= entry.gamma < 1.0:
@@ -166,13 +190,16 @@ def _parse_class(table: "_Table") -> SuiteClass:
     return entry
 
 
-def _parse_options(table: "_Table") -> dict[str, float]:
+def _parse_options(table: "_Table") -> dict[str, float | str]:
     options = table.table("options")
-    # A whole number stays one: it may count something.
-    return {
-        key: options.number(key) if isinstance(options.content[key], float) else options.count(key)
-        for key in options.content
-    }
+
+    def parsed(key: str) -> float | str:
+        if key == "object":
+            return options.thing(key)
+        # A whole number stays one: it may count something.
+        return options.number(key) if isinstance(options.content[key], float) else options.count(key)
+
+    return {key: parsed(key) for key in options.content}
 
 
 def _parse_task(table: "_Table") -> ListedTask:
@@ -246,6 +273,20 @@ class _Table:
         if not value.isprintable() or len(value) > _LONGEST_TEXT:
             raise self.error(key, f"printable text of at most {_LONGEST_TEXT} letters", value)
         return value
+
+    def thing(self, key: str) -> str:
+        """An object's name; of a file its path, which is relative to the suite file's folder."""
+        return self._placed(self.text(key))
+
+    def things(self, key: str) -> list[str]:
+        values = self._get(key, "a list of objects", _REQUIRED)
+        fits = isinstance(values, list) and 0 < len(values) <= _MOST_TABLES
+        if not fits or not all(isinstance(value, str) and value.strip() and value.isprintable() for value in values):
+            raise self.error(key, 'a list of objects such as ["egg", "block"]', values)
+        return [self._placed(value) for value in values]
+
+    def _placed(self, value: str) -> str:
+        return str((self.file.parent / expanded(value)).resolve()) if value.endswith(".xml") else value
 
     def choice(self, key: str, *choices: str, default: str = _REQUIRED) -> Any:
         expected = " or ".join(f'"{choice}"' for choice in choices)

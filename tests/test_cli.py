@@ -116,7 +116,7 @@ def test_help_of_run_names_every_field_of_the_learner(capsys):
         ("run --task handove", "Did you mean 'HandOver'?"),
         ("run --resume nowhere", "not a run folder"),
         ("list suits", "Did you mean 'suites'?"),
-        ("list", "suites|tasks|algos"),
+        ("list", "suites|tasks|algos|objects"),
         ("evaluate nowhere", "not a run folder"),
         ("evaluate nowhere --split tets", "'train', 'test'"),
         ("bench speed", "Unknown bench"),

@@ -55,9 +55,10 @@ def test_bash_completes_commands_flags_and_names(tmp_path, capsys):
     for words, expected in (
         ("ru", {"run"}),
         ("run --learner.gam", {"--learner.gamma"}),
-        ("run --suite MT", {"MT1", "MT4", "MT20"}),
+        ("run --suite MT", {"MT1", "MT1-objects", "MT4", "MT20"}),
         ("run --algo mtp", {"mtppo"}),
         ("witness --task Hand", {"HandOver"}),
+        ("run --object ha", {"hammer"}),
         ("run --base ", {"own", "moving", "fixed"}),
     ):
         command = ["bash", "-c", _COMPLETE, "bash", str(tmp_path / "script"), "bidex-meta", *words.split(" ")]

@@ -61,14 +61,14 @@ def write(folder: Path, text: str) -> Path:
 
 
 def test_shipped_suites() -> None:
-    assert suite_names() == ["ML1", "ML1-wide", "ML20", "ML4", "MT1", "MT20", "MT4"]
+    assert suite_names() == ["ML1", "ML1-objects", "ML1-wide", "ML20", "ML4", "MT1", "MT1-objects", "MT20", "MT4"]
 
 
 @pytest.mark.parametrize("name", suite_names())
 def test_shipped_suite_is_sound(name: str) -> None:
     suite = load_suite(name)
     assert suite.name == name
-    assert {entry.name for entry in suite.classes} <= set(registry.names())
+    assert {entry.class_name for entry in suite.classes} <= set(registry.names())
     assert suite.observation == ("masked" if suite.kind == "meta" else "one-hot")
     assert suite.splits == (("train", "test") if suite.kind == "meta" else ("train",))
 
@@ -121,7 +121,10 @@ def test_listed_goals(name: str, distance: float) -> None:
 
 
 def test_unknown_name_names_the_nearest_and_all() -> None:
-    with pytest.raises(BidexError, match=r"Did you mean 'MT4'\? Known: ML1, ML1-wide, ML20, ML4, MT1, MT20, MT4"):
+    with pytest.raises(
+        BidexError,
+        match=r"Did you mean 'MT4'\? Known: ML1, ML1-objects, ML1-wide, ML20, ML4, MT1, MT1-objects, MT20, MT4",
+    ):
         load_suite("MT44")
 
 

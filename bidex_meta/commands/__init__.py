@@ -23,7 +23,7 @@ COMMANDS: dict[str, Command] = {
     "control": Command("bidex_meta.commands.control", "held-out tasks, adapted to their own data and to others'"),
     "record": Command("bidex_meta.commands.record", "record a data set: episodes of a policy, for offline learners"),
     "data": Command("bidex_meta.commands.data", "the data sets there are, one of them, or a check of it"),
-    "list": Command("bidex_meta.commands.list", "the suites, tasks or algos there are"),
+    "list": Command("bidex_meta.commands.list", "the suites, tasks, algos or objects there are"),
     "render": Command("bidex_meta.commands.render", "a picture or a film of a task, or of all of a run"),
     "play": Command("bidex_meta.commands.play_live", "a policy at work, live: in a window or in the browser"),
     "witness": Command("bidex_meta.commands.witness", "find or replay actions that solve a task"),

@@ -15,7 +15,7 @@ from bidex_meta.commands.parsing import flags_of, parse
 
 @dataclass(frozen=True)
 class CompletionFlags:
-    """Print a script that completes commands, flags, suites, tasks and algos of bidex-meta.
+    """Print a script that completes commands, flags, suites, tasks, algos and objects of bidex-meta.
 
     Example: bidex-meta completion bash > ~/.local/share/bash-completion/completions/bidex-meta
 
@@ -51,8 +51,10 @@ def _names() -> dict[str, list[str]]:
     from bidex_meta.commands.learners import ALGOS
     from bidex_meta.sources import source_names
     from bidex_meta.tasks import registry
+    from bidex_meta.tasks.objects.held import EGG, shelf
 
-    return {"suite": source_names(), "task": registry.names(), "algo": list(ALGOS)}
+    things = [EGG, *shelf()]
+    return {"suite": source_names(), "task": registry.names(), "algo": list(ALGOS), "object": things}
 
 
 def _with_names(options: type, names: dict[str, list[str]]) -> type:

@@ -131,7 +131,7 @@ def _info(flags: DataFlags) -> None:
 
 def _check(flags: DataFlags) -> None:
     from bidex_meta.data import open_dataset
-    from bidex_meta.data.verify import verify
+    from bidex_meta.data.checking import verify
 
     found = verify(open_dataset(flags.name), flags.episodes)
     if flags.json:

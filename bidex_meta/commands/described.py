@@ -18,9 +18,9 @@ def described(source: Source, world: Any, kind: str, policies: Sequence[dict[str
         more: What else belongs there.
 
     Returns:
-        ``suite`` and ``suite_version``, or ``task`` and ``base``, the others None; ``tasks``, names of the slots;
-        ``reward_scales``, factor on the printed reward by slot; ``hides_goals``; ``observation_groups``, [name, index
-        ranges]; ``kind``, ``policies``, ``seed`` of the tasks, ``references`` ({class: {random, zero, expert}},
+        ``suite`` and ``suite_version``, or ``task``, ``base`` and ``object``, the others None; ``tasks``, names of the
+        slots; ``reward_scales``, factor on the printed reward by slot; ``hides_goals``; ``observation_groups``, [name,
+        index ranges]; ``kind``, ``policies``, ``seed`` of the tasks, ``references`` ({class: {random, zero, expert}},
         unscaled returns), ``versions`` and ``commit``; all ready for JSON.
     """
     suite = getattr(source, "suite", None)
@@ -31,7 +31,8 @@ def described(source: Source, world: Any, kind: str, policies: Sequence[dict[str
     return {
         "suite": None if alone else source.name,
         "suite_version": getattr(suite, "version", None),
-        "task": source.name if alone else None,
+        "task": getattr(source, "class_name", None),
+        "object": getattr(source, "object", None),
         "base": {None: "own", True: "moving", False: "fixed"}[getattr(source, "moving_base", None)] if alone else None,
         "tasks": list(world.task_names),
         "reward_scales": {slot.name: slot.reward_scale for slot in getattr(world, "slots", ())},

@@ -13,13 +13,13 @@ from bidex_meta.errors import known_name
 
 @dataclass(frozen=True)
 class ListFlags:
-    """The suites, tasks or algos there are.
+    """The suites, tasks, algos or objects there are.
 
     Example: bidex-meta list tasks --json
     """
 
-    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="suites|tasks|algos")]
-    """suites, tasks or algos."""
+    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="suites|tasks|algos|objects")]
+    """suites, tasks, algos or objects (what the throwing classes throw)."""
     json: Switch = False
     """Print JSON."""
 
@@ -27,7 +27,8 @@ class ListFlags:
 def main(arguments: Sequence[str]) -> None:
     """Print a table or JSON, one row for each."""
     flags = parse(ListFlags, arguments, "list")
-    kinds: dict[str, Callable[[], list[dict[str, Any]]]] = {"suites": _suites, "tasks": _tasks, "algos": _algos}
+    kinds: dict[str, Callable[[], list[dict[str, Any]]]]
+    kinds = {"suites": _suites, "tasks": _tasks, "algos": _algos, "objects": _objects}
     rows = kinds[known_name("list", flags.what, kinds)]()
     if flags.json:
         print(json.dumps(rows, indent=2))
@@ -68,6 +69,18 @@ def _algos() -> list[dict[str, Any]]:
         kind = learner_kind(name)
         summary = (kind.make.__doc__ or "").strip().splitlines()[0]
         rows.append({"name": name, "presets": list(kind.presets), "summary": summary})
+    return rows
+
+
+def _objects() -> list[dict[str, Any]]:
+    from bidex_meta.tasks.objects.held import held_object, shelf
+
+    # The egg's figures: docs/figures.md, objects.
+    rows: list[dict[str, Any]] = [{"name": "egg", "mass_g": 75.4, "box_mm": "60 x 60 x 80", "geoms": 1}]
+    for name in shelf():
+        if found := held_object(name):
+            box = " x ".join(f"{1000 * (high - low):.0f}" for low, high in zip(found.low, found.high, strict=True))
+            rows.append({"name": name, "mass_g": round(1000 * found.mass, 1), "box_mm": box, "geoms": found.geoms})
     return rows
 
 

@@ -11,6 +11,7 @@ import tyro
 
 from bidex_meta.commands.parsing import Switch, parse
 from bidex_meta.errors import BidexError, known_name
+from bidex_meta.outside import name_with_object
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,9 @@ class PlayFlags:
     """Run folder; the same as --policy RUN."""
     task: str | None = None
     """Class to look at; None: the first one. In the browser it can be changed."""
+    object: str | None = None
+    """With --task alone: another object of the class, of the shelf or an MJCF file (docs/objects.md); None: the run's,
+    or the class's own."""
     policy: str = "zero"
     """zero, random, or a run folder."""
     checkpoint: str = "last"
@@ -60,9 +64,9 @@ def main(arguments: Sequence[str]) -> None:
     from bidex_meta.viewer.playback import Stage
 
     policy = flags.policy if flags.run is None else str(flags.run)
-    source = looked_at(policy, flags.suite, flags.task, flags.seed)
-    slots = slots_of(source)
-    task = known_name(f"task of {source.name}", flags.task or slots[0], source.task_classes())
+    source = looked_at(policy, flags.suite, flags.task, flags.seed, flags.object)
+    slots, named = slots_of(source), flags.task and name_with_object(flags.task, flags.object)
+    task = known_name(f"task of {source.name}", named or slots[0], source.task_classes())
     world = source.world("train", len(slots))
     stage = Stage(world, acting(policy, world, flags.seed, flags.checkpoint), slots.index(task), flags.seed)
     screen = _screen(flags, stage)

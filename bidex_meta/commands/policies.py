@@ -142,7 +142,7 @@ def acting(policy: str, world: Any, seed: int, which: str = "last") -> Agent:
     return policy_of(folder, state, "cpu")
 
 
-def looked_at(policy: str, suite: str | None, task: str | None, seed: int) -> Source:
+def looked_at(policy: str, suite: str | None, task: str | None, seed: int, thing: str | None = None) -> Source:
     """The worlds in which a policy is looked at: those of its run, or of a suite or a task that is named.
 
     Args:
@@ -150,16 +150,19 @@ def looked_at(policy: str, suite: str | None, task: str | None, seed: int) -> So
         suite: A suite; None: the run's, if it has one.
         task: A class; alone where there is no suite.
         seed: Of the tasks.
+        thing: Object of the class alone; None: the run's, or the class's own.
 
     Raises:
         BidexError: Nothing is named, or what is not there.
     """
-    config: dict[str, Any] = {"suite": suite, "task": task, "threads": 1}
+    if thing is not None and (suite is not None or task is None):
+        raise BidexError("--object goes with --task alone: bidex-meta render --task CatchUnderarm --object mug ...")
+    config: dict[str, Any] = {"suite": suite, "task": task, "object": thing, "threads": 1}
     if policy not in ("zero", "random"):
         stored = RunFolder.open(Path(policy)).config()
         config |= {"suite": suite or stored["suite"], "base": stored.get("base", "own")}
         config |= {"points": stored.get("points", 0)}
-        config |= {"task": task or stored["task"]}
+        config |= {"task": task or stored["task"], "object": thing if task or thing else stored.get("object")}
     if config["suite"] is None and config["task"] is None:
         raise BidexError("Name what to show: a run folder, --task TASK or --suite SUITE.")
     return Source.open({**config, "seed": seed})

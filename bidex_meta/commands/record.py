@@ -113,7 +113,7 @@ def _record(flags: RecordFlags, kind: str) -> None:
     actors, policies = _actors(flags, kind, config["device"])
     rows = flags.num_envs or _rows(source)
     plan = {"kind": kind, "size": size, "num_envs": rows, "noise": flags.noise, "policies": policies}
-    plan |= {key: config[key] for key in ("suite", "task", "base", "seed", "device", "engine", "threads")}
+    plan |= {key: config[key] for key in ("suite", "task", "base", "object", "seed", "device", "engine", "threads")}
     plan |= {"starts": flags.seed}
     if not flags.estimate:
         check_place(folder, plan)
@@ -160,7 +160,7 @@ def _config(flags: RecordFlags) -> dict[str, Any]:
 
     if flags.runs:
         stored = [RunFolder.open(run).config() for run in flags.runs]
-        names = ("suite", "task", "base", "points", "seed")
+        names = ("suite", "task", "base", "object", "points", "seed")
         found = [{name: each.get(name, {"base": "own", "points": 0}.get(name)) for name in names} for each in stored]
         if differ := [name for name in names if found[0][name] != found[-1][name]]:
             raise BidexError(
@@ -169,7 +169,7 @@ def _config(flags: RecordFlags) -> dict[str, Any]:
             )
         config: dict[str, Any] = found[0]
     else:
-        config = {"suite": flags.suite, "task": flags.task, "base": flags.base, "seed": flags.seed}
+        config = {"suite": flags.suite, "task": flags.task, "base": flags.base, "object": None, "seed": flags.seed}
         if flags.suite is not None and flags.suite.endswith(".toml"):
             config["suite"] = str(expanded(flags.suite).resolve())
     on_gpu = Source.open(config).on_gpu

@@ -9,7 +9,7 @@ import tyro
 
 from bidex_meta.commands.parsing import StepCount, Switch, parse
 from bidex_meta.errors import BidexError, known_name
-from bidex_meta.outside import short_name
+from bidex_meta.outside import name_with_object, short_name
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,9 @@ class RenderFlags:
     """Run folder whose policy is shown; the same as --policy RUN."""
     task: str | None = None
     """Task class; None: the run's first one."""
+    object: str | None = None
+    """With --task alone: another object of the class, of the shelf or an MJCF file (docs/objects.md); None: the run's,
+    or the class's own."""
     out: Path | None = None
     """File to write: .png for a picture, .mp4 for a film, .webp for one that web pages show; None, of a run: a film in
     its folder videos/."""
@@ -81,8 +84,8 @@ def main(arguments: Sequence[str]) -> None:
 
     from bidex_meta.commands.policies import acting, looked_at, slots_of
 
-    source = looked_at(policy, flags.suite, flags.task, flags.seed)
-    slots, task = slots_of(source), flags.task
+    source = looked_at(policy, flags.suite, flags.task, flags.seed, flags.object)
+    slots, task = slots_of(source), flags.task and name_with_object(flags.task, flags.object)
     if not flags.tiled:
         task = known_name(f"task of {source.name}", task or slots[0], source.task_classes())
     # One row for each slot is enough to see one of them.

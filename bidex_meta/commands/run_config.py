@@ -44,6 +44,9 @@ class RunFlags:
     points: int = 0
     """Points of the cloud that observations show in the place of objects' states, as a depth camera would (768 in the
     original; docs/points.md); 0: the states, or what the suite's file says."""
+    object: str | None = None
+    """With --task: what is thrown in the place of the class's own object: a name of the shelf or the path of an MJCF
+    file (docs/objects.md)."""
     algo: str = "mtppo"
     """Learner (see `bidex-meta list algos`), or package.module:Class of your own (docs/own-learner.md)."""
     preset: str = "auto"
@@ -131,14 +134,15 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
         raise BidexError("--resume goes on in the run's own folder. Leave --run-dir out, or start a new run there.")
     folder = RunFolder.open(Path(resume)) if resume else None
     # What older runs did not know.
-    older = {"engine": "auto", "base": "own", "start_from": None, "minutes": None}
+    older = {"engine": "auto", "base": "own", "start_from": None, "minutes": None, "object": None}
     older |= {"points": 0, "evaluate_every": None, "video_every": None, "logger": "tensorboard"}
     older |= {"record": 0, "record_share": 0.0, "stop_at_return": None, "stop_at_score": None}
     stored = {**older, **folder.config("learner", "num_envs", "steps")} if folder else {}
     suite, task = (peek(arguments, f"--{name}") or stored.get(name) for name in ("suite", "task"))
     # Where neither is named, `run --help` still has defaults to show; without --help _resolved refuses it.
-    source = Source.open({"suite": suite or (None if task else _EXAMPLE), "task": task})
-    alone = source.name if task and not suite else None
+    thing = peek(arguments, "--object") or stored.get("object")
+    source = Source.open({"suite": suite or (None if task else _EXAMPLE), "task": task, "object": thing})
+    alone = getattr(source, "class_name", None)
     kind = learner_kind(peek(arguments, "--algo") or stored.get("algo", RunFlags.algo), alone)
     device = resolve_device(peek(arguments, "--device") or stored.get("device", RunFlags.device), source.on_gpu)
     asked = peek(arguments, "--preset") or stored.get("preset", RunFlags.preset)
@@ -148,7 +152,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
         learner_default = _stored_learner(type(learner_default), stored, folder)
         stored["learner"] = json.loads(json.dumps(dataclasses.asdict(learner_default)))  # with options it did not know
     flags = parse(*_options(arguments, learner_default, stored, source.rows_and_steps(device, kind.adapts)))
-    names = {"source": source.name, "algo": kind.name, "preset": preset}
+    names = {"source": alone or source.name, "algo": kind.name, "preset": preset}
     config = _resolved(flags, names, device, stored)
     if folder:
         _refuse_changes(stored, config, folder)
@@ -179,6 +183,8 @@ def _resolved(flags: Any, names: dict[str, str], device: str, stored: dict[str, 
         raise BidexError("Name what to train on: either --suite SUITE or --task TASK, for example --suite MT4.")
     if flags.base != "own" and flags.task is None:
         raise BidexError(f"--base {flags.base} goes with --task; a suite's file says whether bases move.")
+    if flags.object is not None and flags.task is None:
+        raise BidexError("--object goes with --task; a suite's file names objects itself (docs/objects.md).")
     for name in ("num_envs", "threads", "episodes", "evaluate_every", "video_every"):
         value = getattr(flags, name)
         if value is not None and value < 1:
@@ -201,6 +207,7 @@ def _resolved(flags: Any, names: dict[str, str], device: str, stored: dict[str, 
         "task": names["source"] if flags.task else None,
         "base": flags.base,
         "points": flags.points,
+        "object": _placed(flags.object),
         "start_from": None if flags.start_from is None else str(expanded(flags.start_from).resolve()),
         "algo": names["algo"],
         "preset": names["preset"],
@@ -223,6 +230,11 @@ def _resolved(flags: Any, names: dict[str, str], device: str, stored: dict[str, 
         "threads": flags.threads or stored.get("threads") or max(1, _cores() // launch().local_count),
     }
     return json.loads(json.dumps(config))  # tuples to lists, so that it equals what is read back
+
+
+def _placed(thing: str | None) -> str | None:
+    """An object's name, of a file its whole path: a run may be resumed from another folder."""
+    return str(expanded(thing).resolve()) if thing is not None and thing.endswith(".xml") else thing
 
 
 _WIDTH = 1200

@@ -40,10 +40,10 @@ class EnvRecipe:
     """A task class as a suite has it: what decides observations and rewards."""
 
     name: str
-    """The task class."""
+    """What it is called in the suite."""
     moving_base: bool | None
     """Whether the hands' bases are driven; None: as the class has it alone."""
-    options: tuple[tuple[str, float], ...]
+    options: tuple[tuple[str, float | str], ...]
     """What else the suite chose of the class."""
     padded_size: int
     """Entries of an observation."""
@@ -51,6 +51,8 @@ class EnvRecipe:
     """Whether the goal entries are zero."""
     reward_scale: float
     """Factor on the reward."""
+    class_name: str | None = None
+    """The task class, where it is called otherwise: with an object."""
 
     def make_class(self) -> type["SuiteEnv"]:
         """The environment's class: the same object for equal recipes."""
@@ -206,7 +208,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 @cache
 def _make_class(recipe: EnvRecipe) -> type[SuiteEnv]:
-    task_class = registry.get(recipe.name, recipe.moving_base, **dict(recipe.options))
+    task_class = registry.get(recipe.class_name or recipe.name, recipe.moving_base, **dict(recipe.options))
     text = f"{task_class.summary}."
     return type(recipe.name, (SuiteEnv,), {"recipe": recipe, "task_class": task_class, "__doc__": text})
 

@@ -1,5 +1,6 @@
 """Joint angles at the start of an episode, and room for what lies on the hand (docs/figures.md, start noise)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -23,6 +24,10 @@ _METACARPAL = ((-0.0335, 0.019, 0.040), (-0.0335, 0.033, 0.068))
 """Ends of the little finger's metacarpal in the palm frame: x and z in metres, between them the height that a radian of
 LFJ4 gives its outer edge (docs/figures.md, hand joints and hand geoms)."""
 _METACARPAL_RADIUS = 0.0111
+_THUMB = ((0.0339, -0.009, 0.0289), (0.1019, -0.009, 0.0969))
+"""Ends of the thumb's centre line in the palm frame, all its joints zero, metres (docs/figures.md, hand geoms)."""
+_THUMB_RADIUS = 0.013
+_THUMB_ABOVE_PALM = _THUMB_RADIUS + 0.009 - _PALM_HALF_THICKNESS
 _LENGTHS = (0.045, 0.025, 0.024)
 _RADII = (0.01, 0.00805, 0.00705)
 """Length and radius of proximal, middle and distal capsules, metres (docs/figures.md, hand geoms)."""
@@ -31,6 +36,10 @@ _SLACK = 0.002
 _MAX_CROSSING = 0.1
 """Largest difference of neighbouring fingers' side angles that leaves their tips apart, rad:
 roots 22 mm apart, tips 94 mm out with radii of 7 mm, 3 mm of overlap allowed."""
+
+
+_Support = Callable[[Tensor, Tensor], Tensor]
+"""How far a body reaches against vectors (n, ..., 3) of these lengths (n, ...), from its origin, metres."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +58,11 @@ def _indices(device: torch.device) -> _Indices:
     find = hand().index
     groups = [find(*(f"{f}J{k}" for f in ("FF", "MF", "RF", "LF"))) for k in (3, 2, 1, 0)]
     return _Indices(*(torch.tensor(group, device=device) for group in groups), cup=find("LFJ4")[0])
+
+
+@lru_cache(maxsize=1)
+def _thumb() -> list[int]:
+    return list(hand().index(*(f"THJ{k}" for k in range(5))))
 
 
 def noisy_joints(draws: Tensor, scale: float) -> Tensor:
@@ -87,41 +101,85 @@ def make_room(joints: Tensor, position: Tensor, axis: Tensor, radius: float, hal
     Returns:
         The joints with opened fingers, shape (n, 24), and the egg's shift in the mount frame, metres, shape (n, 3).
     """
-    x_axis, y_axis, z_axis = _palm_axes(joints)
-    wrist = constant(_WRIST, position)
-    relative = position - wrist - _PALM_OFFSET * _wrist_z(joints)
-    centre = torch.stack([dot(relative, a) for a in (x_axis, y_axis, z_axis)], dim=1)
-    axis = torch.stack([dot(axis, a) for a in (x_axis, y_axis, z_axis)], dim=1)
+    axes = _palm_axes(joints)
+    centre = _in_palm(position, joints, axes)
+    axis = torch.stack([dot(axis, a) for a in axes], dim=1)
     square = half**2 - radius**2
     reach = (radius**2 + square * axis[:, 1] ** 2).sqrt()
+
+    def support(vector: Tensor, length: Tensor) -> Tensor:
+        along = axis.reshape(-1, *(1,) * (vector.dim() - 2), 3)
+        return (radius**2 + square * (dot(vector, along) / length) ** 2).sqrt()
+
+    return _clear(joints, centre, axes[1], reach, support)
+
+
+def make_room_for(joints: Tensor, position: Tensor, points: Tensor, radii: Tensor) -> tuple[Tensor, Tensor]:
+    """As ``make_room`` for whatever is the convex hull of some balls; the thumb is laid flat and cleared too.
+
+    Args:
+        joints: Joint angles, rad, shape (n, 24).
+        position: The object's origin in the mount frame, metres, shape (n, 3).
+        points: The balls' centres relative to it, turned as the object is, mount frame, metres, shape (n, k, 3).
+        radii: Their radii, metres, shape (k,); 0 for corners.
+
+    Returns:
+        As of ``make_room``.
+    """
+    joints = joints.clone()
+    joints[:, _thumb()] = 0.0
+    axes = _palm_axes(joints)
+    centre = _in_palm(position, joints, axes)
+    points = torch.stack([dot(points, a[:, None]) for a in axes], dim=2)
+
+    def support(vector: Tensor, length: Tensor) -> Tensor:
+        towards = (-vector / length[..., None]).reshape(len(vector), -1, 3)
+        return (towards @ points.transpose(1, 2) + radii).amax(dim=2).reshape(length.shape)
+
+    reach = (points[..., 1] + radii).amax(dim=1)
+    # A thumb that lies flat stands out above the palm; what would meet it starts above it.
+    lowest = _SLACK - _PALM_HALF_THICKNESS - reach
+    rest = torch.stack((centre[:, 0], centre[:, 1].minimum(lowest), centre[:, 2]), dim=1)
+    low, high = (constant(end, rest).expand_as(rest) for end in _THUMB)
+    length = norm(high - low)
+    gap = _gap(rest, support, low, (high - low) / length[:, None], length)
+    reach = reach + _THUMB_ABOVE_PALM * (gap < _THUMB_RADIUS)
+    return _clear(joints, centre, axes[1], reach, support)
+
+
+def _in_palm(position: Tensor, joints: Tensor, axes: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+    """A place in the mount frame, seen from the palm, each (n, 3)."""
+    relative = position - constant(_WRIST, position) - _PALM_OFFSET * _wrist_z(joints)
+    return torch.stack([dot(relative, a) for a in axes], dim=1)
+
+
+def _clear(joints: Tensor, centre: Tensor, y_axis: Tensor, reach: Tensor, support: _Support) -> tuple[Tensor, Tensor]:
+    """Joints with opened fingers and the shift off the palm; ``reach`` is the support towards it, (n,)."""
     lift = (reach + _PALM_HALF_THICKNESS - _SLACK + centre[:, 1]).clamp(min=0.0)
     centre = torch.stack((centre[:, 0], centre[:, 1] - lift, centre[:, 2]), dim=1)
 
     start, along, length = _finger_segments(joints)
-    gap = _gap(centre[:, None, None], axis[:, None, None], radius, square, start, along, length)
+    gap = _gap(centre[:, None, None], support, start, along, length)
     touched = (gap - constant(_RADII, gap) < -_SLACK).any(dim=2)
     where = _indices(joints.device)
     joints = joints.clone()
     for group in (where.base, where.middle, where.distal):
         joints[:, group] = joints[:, group].masked_fill(touched, 0.0)
-    raised = touched[:, -1] | _meets_metacarpal(joints[:, where.cup], centre, axis, radius, square)
+    raised = touched[:, -1] | _meets_metacarpal(joints[:, where.cup], centre, support)
     joints[:, where.cup] = joints[:, where.cup].masked_fill(raised, 0.0)
     return joints, -lift[:, None] * y_axis
 
 
-def _gap(
-    centre: Tensor, axis: Tensor, radius: float, square: float, start: Tensor, along: Tensor, length: Tensor
-) -> Tensor:
-    """Lower bound of the distance between an egg and line segments, by its support towards the nearest point."""
+def _gap(centre: Tensor, support: _Support, start: Tensor, along: Tensor, length: Tensor) -> Tensor:
+    """Lower bound of the distance between a body and line segments, by its support towards the nearest point."""
     to_centre = centre - start
     t = dot(to_centre, along).clamp(min=0.0).minimum(length)
     gap_vector = to_centre - t[..., None] * along
     distance = norm(gap_vector)
-    reach = (radius**2 + square * (dot(gap_vector, axis) / distance) ** 2).sqrt()
-    return distance - reach
+    return distance - support(gap_vector, distance)
 
 
-def _meets_metacarpal(cup: Tensor, centre: Tensor, axis: Tensor, radius: float, square: float) -> Tensor:
+def _meets_metacarpal(cup: Tensor, centre: Tensor, support: _Support) -> Tensor:
     """Whether LFJ4, shape (n,), lifts the little finger's metacarpal into an egg. Shape (n,), bool."""
     low, high = (
         torch.stack((torch.full_like(cup, x), -rise * cup, torch.full_like(cup, z)), dim=1)
@@ -129,7 +187,7 @@ def _meets_metacarpal(cup: Tensor, centre: Tensor, axis: Tensor, radius: float, 
     )
     length = norm(high - low)
     along = (high - low) / length[:, None]
-    return _gap(centre, axis, radius, square, low, along, length) < _METACARPAL_RADIUS - _SLACK
+    return _gap(centre, support, low, along, length) < _METACARPAL_RADIUS - _SLACK
 
 
 def _wrist_z(joints: Tensor) -> Tensor:

@@ -122,7 +122,9 @@ def _suite(name: str, observation: Literal["plain", "one-hot", "masked"], classe
         reward="paper",
         base="moving",
         tasks_per_class=_TASKS,
-        classes=tuple(SuiteClass(entry, where, 1.0, None, (), MappingProxyType({})) for entry, where in splits.items()),
+        classes=tuple(
+            SuiteClass(entry, entry, where, 1.0, None, (), MappingProxyType({})) for entry, where in splits.items()
+        ),
         file=Path(f"metaworld.{name}"),
     )
 

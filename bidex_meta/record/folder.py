@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from bidex_meta.errors import BidexError
-from bidex_meta.outside import short_name
+from bidex_meta.outside import name_with_object, short_name
 from bidex_meta.reading import exists, is_file
 from bidex_meta.record.atomic import TEMPORARY_SUFFIX, check_writable, refuse_links, remove_leftovers, write_json
 from bidex_meta.record.checkpoints import Checkpoints
@@ -254,6 +254,7 @@ def new_folder_name(config: dict[str, Any], root: Path = Path("runs")) -> Path:
     """Where a run is kept that is given no folder, by its config and the present time."""
     # A suite may be a path to a TOML file, task and algo package.module:Class.
     subject = short_name(Path(str(config.get("suite") or config.get("task"))).stem)
+    subject = name_with_object(subject, config.get("object"))
     now = datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S")
     algo = short_name(str(config["algo"]))
     return root / subject / algo / f"{now}_seed{config['seed']}"

@@ -14,6 +14,7 @@ CONFIG = {
     "task": TEXT.or_none(),
     "base": choice("own", "moving", "fixed"),
     "points": whole(0),
+    "object": TEXT.or_none(),
     "start_from": TEXT.or_none(),
     "algo": TEXT,
     "preset": TEXT,

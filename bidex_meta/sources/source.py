@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 from bidex_meta.clients.metaworld import SUITES as METAWORLD_SUITES
 from bidex_meta.errors import BidexError, known_name
+from bidex_meta.outside import name_with_object
 from bidex_meta.suite import Split, load_suite, suite_names
 from bidex_meta.tasks import registry
 
@@ -34,7 +35,7 @@ class Source(ABC):
         name: How the user calls it: a suite's name or path, or a task class.
         config: A run's config, or a part of one; read are ``seed`` (0), ``device`` (cpu, of this very process),
             ``threads`` (None: one per core), ``engine`` (auto), ``points`` (0: as the suite says) and, by a single
-            class, ``base`` (own).
+            class, ``base`` (own) and ``object`` (None: its own).
     """
 
     hides_goals: bool = False
@@ -201,6 +202,10 @@ class SingleClass(Source):
         super().__init__(name, config)
         # None: as the class has it alone.
         self.moving_base: bool | None = {"own": None, "moving": True, "fixed": False}[config.get("base", "own")]
+        self.class_name, self.object = name, config.get("object")
+        self.name = name_with_object(name, self.object)
+        if self.object is not None:
+            self.task_classes()  # says now what is wrong with it
 
     def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> "PooledWorld":
         """As in ``Source``."""
@@ -209,7 +214,7 @@ class SingleClass(Source):
         if split != "train":
             raise BidexError(f"A run on the task {self.name} alone has no {split} split. Leave --split out.")
         return make_task_world(
-            self.name,
+            self.class_name,
             rows or _TASKS_ALONE,
             self.device,
             self.seed,
@@ -218,6 +223,7 @@ class SingleClass(Source):
             moving_base=self.moving_base,
             engine=self.engine,
             points=self.points,
+            object=self.object,
         )
 
     def tasks(self, split: str) -> dict[str, list[str]]:
@@ -226,7 +232,7 @@ class SingleClass(Source):
 
     def task_classes(self) -> "dict[str, TaskClass]":
         """As in ``Source``."""
-        return {self.name: registry.get(self.name, self.moving_base)}
+        return {self.name: registry.get(self.class_name, self.moving_base, **registry.with_object(self.object))}
 
 
 def _physics(classes: "Mapping[str, TaskClass]") -> str:

@@ -1,6 +1,7 @@
 """What a task class is: one scene, one variation space, one reward formula, one success test."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Hashable
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -103,6 +104,11 @@ class TaskClass(ABC):
             moving_base: Drive the bases or fix them; None takes the class's own (fixed for HandOver alone).
         """
         self.moving_base = self.moves_by_default if moving_base is None else moving_base
+
+    @property
+    def scene_key(self) -> tuple[Hashable, ...]:
+        """What its compiled scene depends on: classes of one key may share it."""
+        return self.name, self.moving_base
 
     @property
     def observation_size(self) -> int:

@@ -10,8 +10,9 @@ from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.hand import hand
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.maths import constant, dot, indices
-from bidex_meta.tasks.base import FIRM, TaskClass
+from bidex_meta.tasks.base import FIRM
 from bidex_meta.tasks.layout import Layout, both_hands, object_blocks, point_block
+from bidex_meta.tasks.objects.pointed import OwnObjectClass
 from bidex_meta.tasks.placement import DRAWS, SHIFT, TURN, place
 from bidex_meta.tasks.reach import apart, reach
 from bidex_meta.tasks.scene import SceneObject, add_table
@@ -33,7 +34,7 @@ _THUMB = {"THJ4": -1.04, "THJ3": 1.2, "THJ0": -1.57}
 """Joint angles at the start other than 0, rad (docs/figures.md, start noise)."""
 
 
-class BottleCap(TaskClass):
+class BottleCap(OwnObjectClass):
     """Pull the cap off a bottle that lies in the right hand, with the left.
 
     Observation: Table 24 (414). Reward: equation 11, left hand to cap and right hand to bottle as printed; so the two
@@ -61,6 +62,8 @@ class BottleCap(TaskClass):
     orientation_scale = 0.1
     start_draws = DRAWS
     solver = FIRM
+    usual = _BOTTLE
+    usual_stands = False
     camera_target = (0.0, -0.62, 0.52)
 
     @property
@@ -81,7 +84,7 @@ class BottleCap(TaskClass):
     def add_objects(self, scene: mujoco.MjSpec) -> None:
         """A low table and the bottle on the right palm."""
         add_table(scene, (0.3, 0.3, 0.1), (0.0, -0.6, 0.05))
-        _BOTTLE.add_to(scene)
+        self.own.add_to(scene)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """``bottle``: place (n, 3)."""

@@ -3,6 +3,7 @@
 ``OneEgg`` is the part that the four classes with one egg have in common; their files hold the figures.
 """
 
+from collections.abc import Hashable
 from typing import ClassVar
 
 import mujoco
@@ -15,6 +16,7 @@ from bidex_meta.maths import conjugate, constant, norm, random_orientation, rota
 from bidex_meta.tasks.base import LIGHT, TaskClass
 from bidex_meta.tasks.goals import frozen_goal, observe_goal, rotation_difference
 from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks
+from bidex_meta.tasks.objects.held import EGG, HeldObject, held_object
 from bidex_meta.tasks.scene import SceneObject
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace, box, join, orientation
@@ -74,6 +76,33 @@ def lay_egg_on_hand(
     egg[:, :3] += rotate(quaternion, shift).float()
 
 
+def put_down(
+    place: Tensor, held: HeldObject | None, draws: Tensor, noise: float, joints: Tensor | None, pose: HandPose
+) -> None:
+    """The start of an egg, in any orientation, or of what takes its place, on a broad side; clear of the hand.
+
+    Args:
+        place: Its positions (n, 7), written in place.
+        held: What it is; None: an egg.
+        draws: As of ``start_egg``.
+        noise: Half width of the position noise, metres.
+        joints: Joint angles (n, 24) of the hand that it lies on, written in place; None where it lies on none: what
+            reaches further down than an egg then starts so much higher.
+        pose: Start pose of that hand.
+    """
+    if held is None:
+        start_egg(place, draws, noise)
+        if joints is not None:
+            lay_egg_on_hand(place, joints, pose)
+        return
+    place[:, :3] += noise * draws[:, :3]
+    held.turn(place, draws[:, 3:], None if joints is None else pose)
+    if joints is None:
+        place[:, 2] += (held.depth_below(place) - HALF_LENGTH).clamp(min=0.0)
+    else:
+        held.lay_on_hand(place, joints, pose)
+
+
 def distances(state: TaskState, egg: str, goal: str) -> tuple[Tensor, Tensor]:
     """Distance (m) and rotation (rad in [0, pi]) between an egg and its goal, each (n,)."""
     target = state.frozen[goal]
@@ -113,6 +142,26 @@ class OneEgg(TaskClass):
     start_draws: ClassVar[int] = JOINT_DRAWS + 5
     solver = LIGHT
 
+    def __init__(self, moving_base: bool | None = None, object: str = EGG) -> None:
+        """Chooses base and object.
+
+        Args:
+            moving_base: Drive the bases or fix them; None takes the class's own.
+            object: What is thrown: ``"egg"``, a name of the shelf, or the path of an MJCF file (docs/objects.md).
+
+        Raises:
+            BidexError: There is no such object, or its file holds none for a hand.
+        """
+        super().__init__(moving_base)
+        self.held = held_object(object)
+        if self.held is not None:
+            self.needs = self.held.needs(self.needs)
+
+    @property
+    def scene_key(self) -> tuple[Hashable, ...]:
+        """As in ``TaskClass``, and the object."""
+        return (*super().scene_key, self.held)
+
     @property
     def variation_space(self) -> VariationSpace:
         """Goal position (world, metres) and the two draws of its orientation."""
@@ -124,8 +173,11 @@ class OneEgg(TaskClass):
         return Layout((*both_hands(self.moving_base), *object_blocks("object", "object"), *goal_blocks("goal")))
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
-        """One egg."""
-        SceneObject("object", "egg", self.egg_start).add_to(scene)
+        """One egg, or what is thrown in its place."""
+        if self.held is None:
+            SceneObject("object", "egg", self.egg_start).add_to(scene)
+        else:
+            self.held.add_to(scene, "object", self.egg_start)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """``goal``: the goal pose, (n, 7); ``goal_inverse``: the inverse of its rotation, (n, 4)."""
@@ -134,9 +186,8 @@ class OneEgg(TaskClass):
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
         """Noisy hands, the egg on the right one."""
         start_hands(draws[:, :JOINT_DRAWS], self.joint_noise, qpos)
-        start_egg(qpos["object"], draws[:, JOINT_DRAWS:], self.position_noise)
-        if self.lies_on_right_hand:
-            lay_egg_on_hand(qpos["object"], qpos["right/joints"], self.right)
+        joints = qpos["right/joints"] if self.lies_on_right_hand else None
+        put_down(qpos["object"], self.held, draws[:, JOINT_DRAWS:], self.position_noise, joints, self.right)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         """The goal blocks."""
@@ -156,4 +207,4 @@ class OneEgg(TaskClass):
 
     def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
         """The goal."""
-        return [(frozen["goal"], SEMI_AXES)]
+        return [(frozen["goal"], SEMI_AXES if self.held is None else self.held.half_extents)]

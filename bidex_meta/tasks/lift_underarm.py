@@ -9,9 +9,10 @@ from torch import Tensor
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
 from bidex_meta.maths import norm, uprightness
-from bidex_meta.tasks.base import FAST, TaskClass
+from bidex_meta.tasks.base import FAST
 from bidex_meta.tasks.goals import frozen_goal, observe_goal
 from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
+from bidex_meta.tasks.objects.pointed import OwnObjectClass
 from bidex_meta.tasks.placement import DRAWS, place, placed, yaw_quaternion
 from bidex_meta.tasks.reach import reach
 from bidex_meta.tasks.scene import SceneObject, add_table
@@ -26,7 +27,7 @@ _SUCCESS_TILT = math.radians(30.0)
 _SEMI_AXES = (0.12, 0.12, 0.06)
 
 
-class LiftUnderarm(TaskClass):
+class LiftUnderarm(OwnObjectClass):
     """Lift a pot off a table by its two grips.
 
     Observation: Table 18 (428). Reward: equation 6. Success: the pot's origin within 5 cm of the goal,
@@ -54,6 +55,7 @@ class LiftUnderarm(TaskClass):
     orientation_scale = 1.0
     start_draws = DRAWS
     solver = FAST
+    usual = SceneObject("object", "pot", _START)
     camera_target = (0.0, -0.6, 0.55)
     camera_distance = 1.5
 
@@ -77,7 +79,7 @@ class LiftUnderarm(TaskClass):
     def add_objects(self, scene: mujoco.MjSpec) -> None:
         """The pot on its table."""
         add_table(scene, (0.3, 0.3, 0.4), (0.0, -0.6, 0.2), friction=3.0)
-        SceneObject("object", "pot", _START).add_to(scene)
+        self.own.add_to(scene)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """``object``: the pot's placement (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse rotation (n, 4)."""

@@ -56,13 +56,19 @@ def resolve(name: str, kind: str = "task class") -> str:
     return name
 
 
-def get(name: str, moving_base: bool | None = None, **options: float) -> "TaskClass":
+def with_object(thing: str | None) -> dict[str, str]:
+    """The option of ``get`` that chooses an object; none for None."""
+    return {} if thing is None else {"object": thing}
+
+
+def get(name: str, moving_base: bool | None = None, **options: float | str) -> "TaskClass":
     """A task class.
 
     Args:
         name: Its name, e.g. ``CatchUnderarm``, or ``package.module:Class`` (docs/own-task.md).
         moving_base: Drive the hands' bases (52 actions) or fix them (40); None takes the class's own.
-        options: What else the class lets one choose, e.g. ``water=30`` for PourWater.
+        options: What else the class lets one choose, e.g. ``water=30`` for PourWater, ``object="block"`` for
+            CatchUnderarm.
 
     Raises:
         BidexError: There is no such class or option; the message gives the nearest name and the list.

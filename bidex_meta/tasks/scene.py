@@ -49,12 +49,33 @@ class SceneObject:
         """Puts the object into a scene at its nominal start."""
         # An absolute path takes the place of what stands before it.
         part = mujoco.MjSpec.from_file(str(paths.assets_dir() / "objects" / f"{self.asset}.xml"))
-        set_contact_bits(part.geoms, OBJECT)
-        if self.colour is not None:
-            for material in part.materials:
-                material.rgba = self.colour
-        part.body("object").pos, part.body("object").quat = self.position, self.quaternion
-        scene.attach(part, prefix=f"{self.name}/", frame=scene.worldbody.add_frame())
+        attach(scene, part, self.name, self.position, self.quaternion, self.colour)
+
+
+def attach(
+    scene: mujoco.MjSpec,
+    part: mujoco.MjSpec,
+    name: str,
+    position: tuple[float, float, float],
+    quaternion: tuple[float, float, float, float],
+    colour: tuple[float, float, float, float] | None = None,
+) -> None:
+    """Puts an object into a scene.
+
+    Args:
+        scene: The scene.
+        part: The object: a body called ``object``.
+        name: Prefix of its sensors and joints.
+        position: Nominal start in the world, metres.
+        quaternion: Nominal orientation (w, x, y, z).
+        colour: Red, green, blue, alpha of its materials, or None to keep its own.
+    """
+    set_contact_bits(part.geoms, OBJECT)
+    if colour is not None:
+        for material in part.materials:
+            material.rgba = colour
+    part.body("object").pos, part.body("object").quat = position, quaternion
+    scene.attach(part, prefix=f"{name}/", frame=scene.worldbody.add_frame())
 
 
 def add_table(

@@ -9,9 +9,10 @@ from torch import Tensor
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
 from bidex_meta.maths import multiply, norm, rotation_angle, xyzw
-from bidex_meta.tasks.base import FIRM, TaskClass
+from bidex_meta.tasks.base import FIRM
 from bidex_meta.tasks.goals import frozen_goal, observe_goal, rotation_difference
 from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
+from bidex_meta.tasks.objects.pointed import OwnObjectClass
 from bidex_meta.tasks.placement import DRAWS, place, placed, yaw_quaternion
 from bidex_meta.tasks.reach import reach
 from bidex_meta.tasks.scene import SceneObject, add_table
@@ -25,7 +26,7 @@ _SUCCESS_DISTANCE = 0.2
 _GHOST = (0.1, 0.012, 0.012)
 
 
-class SwingCup(TaskClass):
+class SwingCup(OwnObjectClass):
     """Turn a two-handled cup about the vertical, each hand at its ear.
 
     Observation: Table 28 (428). Reward: equation 13. Success: the cup within 45 degrees of its goal and within
@@ -51,6 +52,7 @@ class SwingCup(TaskClass):
     orientation_scale = 0.1
     start_draws = DRAWS
     solver = FIRM
+    usual = _CUP
     camera_target = (0.08, 0.0, 0.68)
 
     @property
@@ -72,7 +74,7 @@ class SwingCup(TaskClass):
     def add_objects(self, scene: mujoco.MjSpec) -> None:
         """The table and the cup, ears towards the hands."""
         add_table(scene, (0.3, 0.3, 0.6), (0.0, 0.0, 0.3))
-        _CUP.add_to(scene)
+        self.own.add_to(scene)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """``cup``: place (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse of its rotation (n, 4)."""

@@ -1,5 +1,7 @@
 """TwoCatchUnderarm: appendix A.2.4; docs/figures.md, classes."""
 
+from collections.abc import Hashable
+
 import mujoco
 from torch import Tensor
 
@@ -9,6 +11,7 @@ from bidex_meta.tasks import eggs
 from bidex_meta.tasks.base import LIGHT, TaskClass
 from bidex_meta.tasks.goals import frozen_goal, observe_goal
 from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks
+from bidex_meta.tasks.objects.held import EGG, held_object
 from bidex_meta.tasks.scene import SceneObject
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace, box, join, orientation
@@ -40,6 +43,26 @@ class TwoCatchUnderarm(TaskClass):
     start_draws = eggs.JOINT_DRAWS + 5
     solver = LIGHT
 
+    def __init__(self, moving_base: bool | None = None, object: str = EGG) -> None:
+        """Chooses base and object, of which there are two.
+
+        Args:
+            moving_base: Drive the bases or fix them; None takes the class's own.
+            object: What is thrown: ``"egg"``, a name of the shelf, or the path of an MJCF file (docs/objects.md).
+
+        Raises:
+            BidexError: There is no such object, or its file holds none for a hand.
+        """
+        super().__init__(moving_base)
+        self.held = held_object(object)
+        if self.held is not None:
+            self.needs = self.held.needs(self.needs, count=2)
+
+    @property
+    def scene_key(self) -> tuple[Hashable, ...]:
+        """As in ``TaskClass``, and the object."""
+        return (*super().scene_key, self.held)
+
     @property
     def variation_space(self) -> VariationSpace:
         """Both goal positions (world, metres) and the two draws of their common orientation."""
@@ -54,8 +77,13 @@ class TwoCatchUnderarm(TaskClass):
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
         """Two eggs: the first on the right hand, the second, of another colour, on the left."""
-        SceneObject("object1", "egg", (0.0, -0.39, 0.54)).add_to(scene)
-        SceneObject("object2", "egg", (0.0, -0.78, 0.54), colour=(0.45, 0.62, 0.30, 1.0)).add_to(scene)
+        first, second, green = (0.0, -0.39, 0.54), (0.0, -0.78, 0.54), (0.45, 0.62, 0.30, 1.0)
+        if self.held is None:
+            SceneObject("object1", "egg", first).add_to(scene)
+            SceneObject("object2", "egg", second, colour=green).add_to(scene)
+        else:
+            self.held.add_to(scene, "object1", first)
+            self.held.add_to(scene, "object2", second, green)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """``goal1``, ``goal2``: poses (n, 7); ``..._inverse``: inverses of their rotations (n, 4)."""
@@ -66,8 +94,7 @@ class TwoCatchUnderarm(TaskClass):
         """Noisy hands with an egg on each."""
         eggs.start_hands(draws[:, : eggs.JOINT_DRAWS], 0.2, qpos)
         for name, side, pose in (("object1", "right", self.right), ("object2", "left", self.left)):
-            eggs.start_egg(qpos[name], draws[:, eggs.JOINT_DRAWS :], _NOISE)
-            eggs.lay_egg_on_hand(qpos[name], qpos[f"{side}/joints"], pose)
+            eggs.put_down(qpos[name], self.held, draws[:, eggs.JOINT_DRAWS :], _NOISE, qpos[f"{side}/joints"], pose)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         """The goal blocks of both eggs."""
@@ -89,4 +116,5 @@ class TwoCatchUnderarm(TaskClass):
 
     def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
         """Both goals."""
-        return [(frozen["goal1"], eggs.SEMI_AXES), (frozen["goal2"], eggs.SEMI_AXES)]
+        size = eggs.SEMI_AXES if self.held is None else self.held.half_extents
+        return [(frozen["goal1"], size), (frozen["goal2"], size)]

@@ -1,6 +1,6 @@
 """Rows of equal structure share one engine batch."""
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -126,13 +126,12 @@ def split_rows(num_envs: int, slots: int) -> list[slice]:
 
 def build_groups(slots: list[Slot], rows: list[slice], make_engine: EngineMaker) -> list[Group]:
     """Compiles the slots' scenes and puts those of equal structure together, in the slots' order."""
-    scenes: dict[tuple[str, bool], Scene] = {}
+    scenes: dict[tuple[Hashable, ...], Scene] = {}
     for slot in slots:
-        key = (slot.task_class.name, slot.task_class.moving_base)
-        if key not in scenes:
-            scenes[key] = compile_scene(slot.task_class)
+        if slot.task_class.scene_key not in scenes:
+            scenes[slot.task_class.scene_key] = compile_scene(slot.task_class)
     pools: list[list[int]] = []
-    by_slot = [scenes[slot.task_class.name, slot.task_class.moving_base] for slot in slots]
+    by_slot = [scenes[slot.task_class.scene_key] for slot in slots]
     for i, scene in enumerate(by_slot):
         home = next((pool for pool in pools if _alike(by_slot[pool[0]], scene)), None)
         if home is None:

@@ -9,7 +9,7 @@ import pytest
 
 from bidex_meta.cli import main
 from bidex_meta.data import Dataset, open_dataset, part_files, place
-from bidex_meta.data.verify import verify
+from bidex_meta.data.checking import verify
 from bidex_meta.errors import BidexError
 from bidex_meta.sources.source import OwnSuite
 from tests.data.worlds import rough

@@ -17,6 +17,7 @@ from torch import Tensor
 from bidex_meta.data.dataset import Dataset
 from bidex_meta.data.episode import Episode
 from bidex_meta.errors import BidexError
+from bidex_meta.outside import name_without_object
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.layout import CLIP, Block
@@ -183,7 +184,7 @@ class _Formulas:
         if name not in self._known:
             self._known[name] = None
             try:
-                task = registry.get(name, self._moving)
+                task = registry.get(name_without_object(name), self._moving)
                 self._known[name] = task, shown_sensors(task)
             except BidexError as error:
                 found.skipped[name] = str(error)

@@ -1,0 +1,234 @@
+"""What the throwing classes throw, if it is no egg: a thing of the shelf, or an MJCF file of the user's."""
+
+import math
+import os
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from bidex_meta import paths
+from bidex_meta.engine.capacity import Capacity
+from bidex_meta.errors import BidexError, known_name, shortened
+from bidex_meta.hands.poses import PALM_UP_AWAY, HandPose
+from bidex_meta.hands.starts import make_room_for
+from bidex_meta.maths import conjugate, constant, multiply, rotate, wxyz, xyzw
+from bidex_meta.reading import expanded
+from bidex_meta.tasks.objects.outline import extents, outline
+from bidex_meta.tasks.objects.own_file import compiled, read_own, set_contacts
+from bidex_meta.tasks.scene import attach
+
+EGG = "egg"
+_MASS = (0.002, 2.0)
+"""Of an object, kg: a hand has 5."""
+_LONGEST, _SHORTEST = 0.25, 0.01
+"""The longest edge of the box around an object, metres: a hand is 20 cm long from the wrist to the middle fingertip."""
+_MOST_GEOMS = 32
+_MOST_FRICTION = 5.0
+_PALM_UP = HandPose((0.0, 0.0, 0.0), PALM_UP_AWAY)
+
+
+@dataclass(frozen=True)
+class HeldObject:
+    """An object that lies on a hand.
+
+    Attributes:
+        name: As the user called it: of the shelf, or the file's name without its ending.
+        file: Its MJCF file.
+        mass: kg.
+        low: Lower corner of the box around its colliding geoms, its own frame, metres.
+        high: Upper corner.
+        geoms: How many geoms of it collide.
+        centres: Balls whose convex hull holds these geoms: their centres, its own frame, metres, shape (k, 3).
+        radii: Their radii, shape (k,).
+    """
+
+    name: str
+    file: Path
+    mass: float
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    geoms: int
+    centres: np.ndarray = field(repr=False, compare=False)
+    radii: np.ndarray = field(repr=False, compare=False)
+
+    @property
+    def half_extents(self) -> tuple[float, float, float]:
+        """How far it reaches from its origin along its axes, metres."""
+        x, y, z = (max(-low, high) for low, high in zip(self.low, self.high, strict=True))
+        return x, y, z
+
+    def add_to(
+        self,
+        scene: mujoco.MjSpec,
+        name: str,
+        position: tuple[float, float, float],
+        colour: tuple[float, float, float, float] | None = None,
+    ) -> None:
+        """Puts it into a scene as a free body.
+
+        Args:
+            scene: The scene.
+            name: Prefix of its joint and sensors.
+            position: Nominal start, metres.
+            colour: Of its materials, or None to keep the file's.
+        """
+        part = read_own(self.file)
+        body = part.worldbody.first_body()
+        body.name = "object"
+        for joint in body.joints:
+            part.delete(joint)
+        body.add_freejoint(name="free")
+        set_contacts(part)
+        for geom in part.geoms:
+            geom.condim = 3
+        for sensor, kind in _SENSORS.items():
+            part.add_sensor(name=sensor, type=kind, objtype=mujoco.mjtObj.mjOBJ_XBODY, objname="object")
+        attach(scene, part, name, position, (1.0, 0.0, 0.0, 0.0), colour)
+
+    def needs(self, egg: Capacity, count: int = 1) -> Capacity:
+        """Room for contacts of a class with so many of it, from what the class needs with eggs.
+
+        A flat face meets what it lies on in four points, and every geom may meet palm and fingers at once.
+        """
+        more = count * (8 + 4 * self.geoms)
+        return Capacity(egg.contacts + 2 * more, egg.convex + more, egg.rows + 6 * more)
+
+    def turn(self, place: Tensor, draws: Tensor, pose: HandPose | None = None) -> None:
+        """Lays it on a broad side: its shortest extent along a palm's normal, turned about it at random.
+
+        Args:
+            place: Its positions (n, 7), quaternion (w, x, y, z), written in place.
+            draws: Numbers in [-1, 1], shape (n, 2): the turn, and which of the two sides lies below.
+            pose: Start pose of the hand; None: as on a level palm.
+        """
+        palm = xyzw(constant((pose or _PALM_UP).quaternion, place))
+        half, zero = 0.5 * math.pi * draws[:, 0], torch.zeros_like(draws[:, 0])
+        about_normal = torch.stack((zero, half.sin(), zero, half.cos()), dim=1)
+        over = (draws[:, 1] < 0.0).to(place)
+        turned_over = torch.stack((zero, zero, over, 1.0 - over), dim=1)
+        laid = multiply(turned_over, constant(self._laid, place).expand(len(place), 4))
+        place[:, 3:] = wxyz(multiply(palm.expand(len(place), 4), multiply(about_normal, laid)))
+
+    @property
+    def _laid(self) -> tuple[float, float, float, float]:
+        """The turn (x, y, z, w) that takes its longest side to z and its shortest to y, the palm's normal."""
+        shortest, middle, longest = np.argsort(np.subtract(self.high, self.low), kind="stable")
+        turn = np.zeros((3, 3))
+        turn[0, middle] = turn[1, shortest] = turn[2, longest] = 1.0
+        turn[0] *= np.linalg.det(turn)
+        found = np.zeros(4)
+        mujoco.mju_mat2Quat(found, turn.ravel())
+        w, x, y, z = map(float, found)
+        return x, y, z, w
+
+    def lay_on_hand(self, place: Tensor, joints: Tensor, pose: HandPose) -> None:
+        """Lifts it off the palm it lies on, opens the fingers that would stick in it and lays the thumb flat.
+
+        Args:
+            place: Its positions (n, 7), quaternion (w, x, y, z), written in place.
+            joints: That hand's joint angles, rad, (n, 24), written in place.
+            pose: Start pose of that hand.
+        """
+        quaternion = xyzw(constant(pose.quaternion, place))
+        inverse = conjugate(quaternion)
+        position = rotate(inverse, place[:, :3] - constant(pose.position, place))
+        orientation = multiply(inverse.expand(len(place), 4), xyzw(place[:, 3:]))
+        points = rotate(orientation[:, None], torch.as_tensor(self.centres).to(place)[None])
+        opened, shift = make_room_for(joints, position, points, torch.as_tensor(self.radii).to(place))
+        joints.copy_(opened.float())
+        place[:, :3] += rotate(quaternion, shift).float()
+
+    def depth_below(self, place: Tensor) -> Tensor:
+        """How far it reaches below its origin, metres, from its positions (n, 7). Shape (n,)."""
+        points = rotate(xyzw(place[:, 3:])[:, None], torch.as_tensor(self.centres).to(place)[None])
+        return (torch.as_tensor(self.radii).to(place) - points[..., 2]).amax(dim=1)
+
+
+_SENSORS = {
+    "position": mujoco.mjtSensor.mjSENS_FRAMEPOS,
+    "quaternion": mujoco.mjtSensor.mjSENS_FRAMEQUAT,
+    "linear_velocity": mujoco.mjtSensor.mjSENS_FRAMELINVEL,
+    "angular_velocity": mujoco.mjtSensor.mjSENS_FRAMEANGVEL,
+}
+
+
+def shelf() -> list[str]:
+    """Names of the shelf, sorted; the egg is not among them."""
+    return sorted(path.stem for path in (paths.assets_dir() / "objects" / "shelf").glob("*.xml"))
+
+
+def held_object(name: object) -> HeldObject | None:
+    """The object of that name; None for the egg.
+
+    Args:
+        name: ``"egg"``, a name of the shelf in any case, or the path of an MJCF file, which ends in ``.xml``.
+
+    Raises:
+        BidexError: Unknown name, or a file that holds no object for a hand.
+    """
+    if not isinstance(name, str) or not name.isprintable():
+        raise BidexError(f"object: expected a name or the path of an .xml file, got {shortened(name)}.")
+    if name.endswith(".xml"):
+        file = expanded(name)
+    else:
+        found = known_name("object", name, [EGG, *shelf()])
+        if found == EGG:
+            return None
+        file = paths.assets_dir() / "objects" / "shelf" / f"{found}.xml"
+    try:
+        state = os.stat(file)
+    except (OSError, ValueError):
+        return _loaded(file, (0, 0))  # which says what is wrong
+    return _loaded(file.resolve(), (state.st_mtime_ns, state.st_size))
+
+
+@lru_cache(maxsize=64)
+def _loaded(file: Path, _state: tuple[int, int]) -> HeldObject:
+    spec = read_own(file)
+    bodies = [body for body in spec.bodies if body.name != "world"]
+    if len(bodies) != 1:
+        raise BidexError(f"{file}: expected one <body> with geoms, got {len(bodies)}. Put all geoms into one body.")
+    joints = [joint for joint in spec.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]
+    if joints:
+        raise BidexError(f"{file}: expected a body without joints, got {joints[0].name or 'one'}. It flies freely.")
+    if list(spec.worldbody.geoms):
+        raise BidexError(f"{file}: expected geoms inside the body, got some beside it. Move them into the body.")
+    if (spec.body("object") or bodies[0]) is not bodies[0] or not list(bodies[0].geoms):
+        raise BidexError(f"{file}: expected a <body> with geoms, got none. Add its shape.")
+    model = compiled(file, spec)
+    centres, radii = outline(model, 1)
+    collide = int(((model.geom_contype != 0) | (model.geom_conaffinity != 0)).sum())
+    if not len(centres):
+        raise BidexError(f"{file}: expected geoms that collide, got contype 0 in all. Leave contype out.")
+    if collide > _MOST_GEOMS:
+        raise BidexError(f"{file}: expected at most {_MOST_GEOMS} geoms that collide, got {collide}. Simplify it.")
+    low, high = extents(model, 1)
+    _check_figures(file, model, low, high)
+    corners = tuple(map(float, low)), tuple(map(float, high))
+    return HeldObject(file.stem, file, float(model.body_mass[1]), *corners, collide, centres, radii)  # type: ignore[arg-type]
+
+
+def _check_figures(file: Path, model: mujoco.MjModel, low: np.ndarray, high: np.ndarray) -> None:
+    mass, longest = float(model.body_mass[1]), float((high - low).max())
+    if not _MASS[0] <= mass <= _MASS[1]:
+        raise BidexError(
+            f"{file}: expected a mass of {_MASS[0]:g} to {_MASS[1]:g} kg, got {mass:.4g}. Mend mass or density."
+        )
+    if not _SHORTEST <= longest <= _LONGEST:
+        told = f"{100 * _SHORTEST:g} to {100 * _LONGEST:g} cm on its longest side, which fits a hand"
+        raise BidexError(
+            f"{file}: expected an object of {told}, got {100 * longest:.4g} cm. Scale it (MJCF is in metres)."
+        )
+    if (low > 0.0).any() or (high < 0.0).any():
+        raise BidexError(f"{file}: expected the body's origin inside its shape, got it outside. Shift the geoms.")
+    if max(-low.min(), high.max()) > 0.5 * _LONGEST:
+        told = f"the body's origin in the middle, at most {50 * _LONGEST:g} cm from its ends"
+        raise BidexError(f"{file}: expected {told}, got {100 * max(-low.min(), high.max()):.4g}. Shift the geoms.")
+    if not (model.geom_friction[:, 0] <= _MOST_FRICTION).all():
+        worst = float(model.geom_friction[:, 0].max())
+        raise BidexError(f"{file}: expected friction of at most {_MOST_FRICTION:g}, got {worst:.4g}. Lower it.")

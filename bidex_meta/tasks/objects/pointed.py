@@ -1,0 +1,187 @@
+"""Own objects for classes that reach for points of theirs, handles or a cap: the file names them as the usual one."""
+
+import hashlib
+from collections.abc import Hashable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+import torch
+
+from bidex_meta import paths
+from bidex_meta.engine.capacity import Capacity
+from bidex_meta.errors import BidexError, shortened
+from bidex_meta.reading import expanded
+from bidex_meta.tasks.base import TaskClass
+from bidex_meta.tasks.objects.outline import outline
+from bidex_meta.tasks.objects.own_file import compiled, read_own, set_contacts
+from bidex_meta.tasks.scene import SceneObject, attach, compile_scene
+
+_MOST_MASS, _LARGEST, _MOST_GEOMS, _MOST_FRICTION = 10.0, 0.6, 64, 5.0
+"""kg, and metres of the box around it: what stands on a table between two hands; geoms that collide; their friction."""
+_LEVEL = 0.003
+"""How far its foot may lie from the usual one's, metres: it starts at rest on the table."""
+_DEEPEST = 0.005
+"""How deep it may stick in hands or table at the start, metres, as for every class (docs/figures.md)."""
+
+
+@dataclass(frozen=True)
+class PointedObject(SceneObject):
+    """An object of the user's in the place of a usual one; ``asset`` is the path of its file.
+
+    Attributes:
+        digest: Of its model, so that a changed file is another object.
+    """
+
+    digest: str = ""
+
+    def add_to(self, scene: mujoco.MjSpec) -> None:
+        """As in ``SceneObject``."""
+        part = read_own(Path(self.asset), points=True)
+        set_contacts(part)
+        attach(scene, part, self.name, self.position, self.quaternion, self.colour)
+
+
+class OwnObjectClass(TaskClass):
+    """A class whose object may be the user's.
+
+    Attributes:
+        usual: Its own object, whose sensors and joints, by name, the reward and the observation read.
+        usual_stands: Whether it stands on its foot at the start.
+    """
+
+    usual: ClassVar[SceneObject]
+    usual_stands: ClassVar[bool] = True
+
+    def __init__(self, moving_base: bool | None = None, object: str | None = None) -> None:
+        """Chooses base and object.
+
+        Args:
+            moving_base: Drive the bases or fix them; None takes the class's own.
+            object: Path of an MJCF file (docs/objects.md); None takes the class's own.
+
+        Raises:
+            BidexError: The file holds no such object, or one that starts inside hands or table.
+        """
+        super().__init__(moving_base)
+        self.own = self.usual
+        if object is None:
+            return
+        if not isinstance(object, str) or not object.endswith(".xml") or not object.isprintable():
+            told = f"the path of an MJCF file that takes the place of the {self.usual.asset}"
+            raise BidexError(f"object: expected {told}, which ends in .xml; got {shortened(object)}.")
+        file = expanded(object).resolve()
+        model, like = _checked(self.usual, file, self.usual_stands), _usual_model(self.usual)
+        self.own = PointedObject(
+            self.usual.name, str(file), self.usual.position, self.usual.rpy, self.usual.colour, _digest(model)
+        )
+        more = 4 * max(0, _colliding(model) - _colliding(like))
+        self.needs = Capacity(self.needs.contacts + more, self.needs.convex + more, self.needs.rows + 3 * more)
+        depth, other = _depth_at_start(self)
+        if depth > _DEEPEST:
+            told = f"an object that starts clear of hands and table, got one {1000 * depth:.0f} mm deep in {other}"
+            raise BidexError(f"{file}: expected {told}. Make it smaller, or shift what is in the body.")
+
+    @property
+    def scene_key(self) -> tuple[Hashable, ...]:
+        """As in ``TaskClass``, and the object."""
+        return (*super().scene_key, self.own)
+
+
+def _checked(usual: SceneObject, file: Path, stands: bool) -> mujoco.MjModel:
+    """The model that a file holds, once it is seen to be like the usual object."""
+    spec, like = read_own(file, points=True), _usual_model(usual)
+    if spec.body("object") is None:
+        raise BidexError(f'{file}: expected a body called "object", got none. Name the outermost one so.')
+    model = compiled(file, spec)
+    for kind, wanted, found in (
+        ("joint", _joints(like), _joints(model)),
+        ("sensor", _sensors(like), _sensors(model)),
+    ):
+        if wanted != found:
+            missing = sorted(set(wanted) - set(found)) or sorted(set(found) - set(wanted)) or list(wanted)
+            told = f"the {kind}s of assets/objects/{usual.asset}.xml in their order ({', '.join(wanted)})"
+            raise BidexError(f"{file}: expected {told}; look at {', '.join(missing)}. See docs/objects.md.")
+    if not 0 < _colliding(model) <= _MOST_GEOMS:
+        raise BidexError(f"{file}: expected 1 to {_MOST_GEOMS} geoms that collide, got {_colliding(model)}. Mend it.")
+    if not (model.geom_friction[:, 0] <= _MOST_FRICTION).all():
+        worst = float(model.geom_friction[:, 0].max())
+        raise BidexError(f"{file}: expected friction of at most {_MOST_FRICTION:g}, got {worst:.4g}. Lower it.")
+    mass, (low, high) = float(model.body_mass.sum()), _box(model)
+    if not 0.0 < mass <= _MOST_MASS:
+        raise BidexError(f"{file}: expected at most {_MOST_MASS:g} kg, got {mass:.4g}. Mend mass or density.")
+    if (high - low).max() > _LARGEST:
+        raise BidexError(f"{file}: expected at most {_LARGEST:g} m, got {(high - low).max():.4g}. Scale it.")
+    foot = _box(like)[0][2]
+    if stands and abs(low[2] - foot) > _LEVEL:
+        told = (
+            f"its lowest point {-foot:.4f} m below its origin, as the {usual.asset}'s, so that it stands at the start"
+        )
+        raise BidexError(f"{file}: expected {told}; got {-low[2]:.4f}. Shift what is in the body.")
+    return model
+
+
+def _depth_at_start(task: OwnObjectClass) -> tuple[float, str]:
+    """The deepest that the object sticks in anything else at the nominal start, metres, and the name of what that is.
+
+    Only here, of all classes, is a scene compiled before a world asks for it: the starts of hands and object are the
+    class's own, and no box tells whether a grip meets a finger.
+    """
+    scene = compile_scene(task)
+    start = torch.from_numpy(scene.start_qpos)[None].clone()
+    space = task.variation_space
+    middle = 0.5 * (torch.tensor([space.low]) + torch.tensor([space.high]))
+    views = {name: start[:, columns] for name, columns in scene.qpos.items()}
+    task.start(torch.zeros(1, task.start_draws, dtype=start.dtype), task.freeze(middle.to(start)), views)
+    model, data = scene.model, mujoco.MjData(scene.model)
+    data.qpos[:] = start[0, : model.nq].numpy()
+    mujoco.mj_forward(model, data)
+    deepest, met = 0.0, ""
+    for contact in data.contact:
+        owners = [model.body(int(model.geom_bodyid[geom])) for geom in contact.geom]
+        own = [body.name.startswith(f"{task.own.name}/") for body in owners]
+        if own[0] != own[1] and -contact.dist > deepest:
+            deepest, met = -float(contact.dist), owners[own[0]].name
+    return deepest, "the table" if met == "world" else met
+
+
+@lru_cache(maxsize=8)
+def _usual_model(usual: SceneObject) -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_path(str(paths.assets_dir() / "objects" / f"{usual.asset}.xml"))
+
+
+def _digest(model: mujoco.MjModel) -> str:
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return hashlib.blake2b(buffer.tobytes(), digest_size=16).hexdigest()
+
+
+def _colliding(model: mujoco.MjModel) -> int:
+    return int(((model.geom_contype != 0) | (model.geom_conaffinity != 0)).sum())
+
+
+def _joints(model: mujoco.MjModel) -> dict[str, int]:
+    """Names and kinds."""
+    return {model.joint(i).name: int(model.jnt_type[i]) for i in range(model.njnt)}
+
+
+def _sensors(model: mujoco.MjModel) -> dict[str, int]:
+    """Names and sizes."""
+    return {model.sensor(i).name: int(model.sensor_dim[i]) for i in range(model.nsensor)}
+
+
+def _box(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of the box around all that collides, from the origin of the body ``object``, metres."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    lows, highs = [], []
+    for body in range(1, model.nbody):
+        centres, radii = outline(model, body)
+        if len(centres):
+            centres = centres @ data.xmat[body].reshape(3, 3).T + data.xpos[body] - data.body("object").xpos
+            lows.append((centres - radii[:, None]).min(axis=0))
+            highs.append((centres + radii[:, None]).max(axis=0))
+    return np.min(lows, axis=0), np.max(highs, axis=0)

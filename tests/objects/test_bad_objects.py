@@ -1,0 +1,168 @@
+"""What is no object for a hand: one line that says so, before a world is built or a folder written."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from bidex_meta import Benchmark, BidexError, make_task_world
+from bidex_meta.cli import main
+from bidex_meta.tasks import registry
+
+GEOM = '<geom type="box" size="0.03 0.03 0.03" mass="0.1"/>'
+
+
+def mjcf(inside: str, before: str = "", body: str = "<body>{}</body>") -> str:
+    return f"<mujoco>{before}<worldbody>{body.format(inside)}</worldbody></mujoco>"
+
+
+BOMB = (
+    '<!DOCTYPE m [<!ENTITY a "'
+    + "x" * 1000
+    + '">'
+    + "".join(f'<!ENTITY b{i} "{f"&b{i - 1};" * 10 if i else "&a;" * 10}">' for i in range(9))
+    + f"]><mujoco model='&b8;'><worldbody><body>{GEOM}</body></worldbody></mujoco>"
+)
+
+BAD = {
+    "no body": (mjcf(GEOM, body="{}"), "one <body> with geoms, got 0"),
+    "an empty body": (mjcf(""), "got none. Add its shape"),
+    "two bodies": (mjcf(GEOM, body="<body>{0}</body><body pos='0 0 1'>{0}</body>"), "one <body> with geoms, got 2"),
+    "a body in a body": (mjcf(f"{GEOM}<body>{GEOM}</body>"), "one <body> with geoms, got 2"),
+    "a geom beside it": (mjcf(GEOM, body=f"<body>{{}}</body>{GEOM}"), "inside the body"),
+    "a hinge": (mjcf(f"<joint name='lid' type='hinge'/>{GEOM}"), "without joints, got lid"),
+    "a hundred kilograms": (mjcf(GEOM.replace("0.1", "100")), "mass of 0.002 to 2 kg, got 100"),
+    "no mass": (mjcf(GEOM.replace("0.1", "1e-9")), "mass of 0.002 to 2 kg"),
+    "larger than a hand": (mjcf(GEOM.replace("0.03 0.03 0.03", "0.03 0.03 0.2")), "fits a hand, got 40 cm"),
+    "in millimetres": (mjcf(GEOM.replace("0.03 0.03 0.03", "30 30 30")), "MJCF is in metres"),
+    "a crumb": (mjcf(GEOM.replace("0.03 0.03 0.03", "0.001 0.001 0.001")), "1 to 25 cm"),
+    "a size below zero": (mjcf(GEOM.replace("0.03 0.03 0.03", "0.03 -0.03 0.03")), "MuJoCo says"),
+    "a size that is none": (mjcf(GEOM.replace("0.03 0.03 0.03", "0.03 nan 0.03")), "expected"),
+    "an infinite mass": (mjcf(GEOM.replace("0.1", "inf")), "expected"),
+    "a mass below zero": (mjcf(GEOM.replace("0.1", "-1")), "MuJoCo says"),
+    "a shape elsewhere": (mjcf(GEOM.replace("<geom", "<geom pos='0.06 0 0'")), "origin inside its shape"),
+    "only to be seen": (mjcf(GEOM.replace("<geom", "<geom contype='0' conaffinity='0'")), "geoms that collide"),
+    "forty geoms": (mjcf(GEOM * 40), "at most 32 geoms"),
+    "glue": (mjcf(GEOM.replace("<geom", "<geom friction='100 1 1'")), "friction of at most 5"),
+    "a mesh that is missing": (
+        mjcf('<geom type="mesh" mesh="m"/>', '<asset><mesh name="m" file="not_there.obj"/></asset>'),
+        "the file not_there.obj beside it",
+    ),
+    "a mesh from elsewhere": (
+        mjcf('<geom type="mesh" mesh="m"/>', '<asset><mesh name="m" file="../outside.obj"/></asset>'),
+        "files in its own folder",
+    ),
+    "a folder from elsewhere": (
+        mjcf(GEOM, '<compiler meshdir="/etc"/>'),
+        "meshdir with an absolute path",
+    ),
+    "an include": (mjcf(GEOM, '<include file="/etc/passwd"/>'), "an object in one file"),
+    "a plugin": (mjcf(GEOM, '<extension><plugin plugin="mujoco.sdf.torus"/></extension>'), "<extension>"),
+    "an actuator": (mjcf(GEOM, "<actuator/>"), "<actuator>"),
+    "a bomb": (BOMB, "document type"),
+    "too deep": (mjcf("<body>" * 40 + GEOM + "</body>" * 40), "32 deep"),
+    "no XML": ("not xml", "no XML"),
+    "cut off": (mjcf(GEOM)[:-20], "no XML"),
+    "nothing": ("", "no XML"),
+    "no MJCF": ("<robot/>", "<robot>"),
+    "an unknown attribute": (mjcf(GEOM.replace("<geom", "<geom weight='3'")), "MuJoCo says"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_file_is_one_line(case: str, tmp_path: Path) -> None:
+    text, told = BAD[case]
+    (tmp_path / "outside.obj").write_text("v 0 0 0\n")
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    file = folder / "thing.xml"
+    file.write_text(text)
+    with pytest.raises(BidexError) as raised:
+        registry.get("CatchUnderarm", True, object=str(file))
+    assert told in str(raised.value) and "\n" not in str(raised.value), raised.value
+    assert str(file) in str(raised.value)
+
+
+@pytest.mark.parametrize("name", ["crate", "", 3, None, "/no/such/file.xml", "a\0.xml", "a\nb.xml"])
+def test_a_bad_name_is_one_line(name: object) -> None:
+    with pytest.raises(BidexError):
+        registry.get("CatchUnderarm", True, object=name)  # type: ignore[arg-type]
+
+
+def test_the_nearest_name_of_the_shelf_is_told() -> None:
+    with pytest.raises(BidexError, match="Did you mean 'hammer'"):
+        registry.get("HandOver", object="hamer")
+
+
+def test_a_pipe_a_folder_and_a_link_that_leads_away(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.xml")
+    (tmp_path / "folder.xml").mkdir()
+    (tmp_path / "inside").mkdir()
+    (tmp_path / "secret.obj").write_text("v 0 0 0\n")
+    (tmp_path / "inside" / "link.obj").symlink_to(tmp_path / "secret.obj")
+    mesh = mjcf('<geom type="mesh" mesh="m"/>', '<asset><mesh name="m" file="link.obj"/></asset>')
+    (tmp_path / "inside" / "linked.xml").write_text(mesh)
+    for name, told in (("pipe.xml", "a pipe"), ("folder.xml", "a folder"), ("inside/linked.xml", "its own folder")):
+        with pytest.raises(BidexError, match=told):
+            registry.get("CatchUnderarm", True, object=str(tmp_path / name))
+
+
+def test_the_command_says_so_and_writes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "heavy.xml").write_text(mjcf(GEOM.replace("0.1", "100")))
+    run = ["run", "--algo", "ppo", "--steps", "8", "--num-envs", "2"]
+    for more, told in (
+        (["--task", "CatchUnderarm", "--object", "heavy.xml"], "got 100"),
+        (["--task", "CatchUnderarm", "--object", "crate"], "Unknown object 'crate'"),
+        (["--task", "PushBlock", "--object", "mug"], "Unknown option of PushBlock 'object'"),
+        (["--suite", "MT4", "--object", "mug"], "--object goes with --task"),
+    ):
+        assert main([*run, *more]) == 2
+        error = capsys.readouterr().err
+        assert told in error and len(error.strip().splitlines()) == 1, error
+    for look in (["--suite", "MT4", "--task", "CatchUnderarm"], []):
+        assert main(["render", *look, "--object", "mug", "--out", "mug.png"]) == 2
+        assert "--object goes with --task alone" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["heavy.xml"]
+
+
+SUITE = """
+name = "Things"
+version = 1
+kind = "multi-task"
+description = "d"
+observation = "one-hot"
+task_id = "class"
+reward = "paper"
+base = "moving"
+tasks_per_class = 2
+[[classes]]
+name = "CatchUnderarm"
+"""
+
+
+@pytest.mark.parametrize(
+    "line, told",
+    [
+        ("objects = []", "a list of objects"),
+        ("objects = 3", "a list of objects"),
+        ('objects = ["egg", 3]', "a list of objects"),
+        ('objects = ["egg", "egg"]', "each name once"),
+        ('objects = ["crate"]', "Unknown object 'crate'"),
+        ('objects = ["egg"]\noptions = { object = "mug" }', "either objects or options.object"),
+        ("options = { object = 3 }", "a text in quotes"),
+        ('objects = ["missing.xml"]', "missing.xml"),
+    ],
+)
+def test_a_bad_suite_is_one_line(line: str, told: str, tmp_path: Path) -> None:
+    (tmp_path / "things.toml").write_text(SUITE + line)
+    with pytest.raises(BidexError, match=r"things\.toml") as raised:
+        Benchmark(tmp_path / "things.toml")
+    assert told in str(raised.value)
+
+
+def test_a_world_of_one_class_refuses_it_too() -> None:
+    with pytest.raises(BidexError, match="Unknown object"):
+        make_task_world("HandOver", 2, "cpu", threads=1, object="crate")
