@@ -34,7 +34,7 @@ ORDER = (
     ("bidex_algos.nets",),
     ("bidex_algos.learner",),
     ("bidex_algos.onpolicy", "bidex_algos.offpolicy"),
-    ("bidex_algos.meta", "bidex_algos.multiagent"),  # RL² takes PPO's loss
+    ("bidex_algos.meta", "bidex_algos.multiagent", "bidex_algos.offline"),  # RL² takes PPO's loss
     ("bidex_algos.single_task", "bidex_algos.start_from", "bidex_algos.bench"),
     ("bidex_algos",),
     ("commands",),

@@ -61,7 +61,7 @@ class Learner(ABC):
     """Mode of the world it trains on, or a function of the config (as a dict) that gives it."""
     discounts_by_class: ClassVar[bool] = False
     """Whether it takes the discount of each class where a world has some (``world.gammas``)."""
-    per_process: ClassVar[tuple[str, ...]] = ()
+    per_process: tuple[str, ...] = ()
     """Entries of ``state_dict`` that differ from process to process."""
 
     def __init__(self, world: VectorWorld, config: Any, seed: int):

@@ -10,6 +10,10 @@ Beside the class the module holds ``PRESETS``: a dict from preset name to an ins
   meta-test reads ``max_adapt_steps`` (longest episode it adapts to) and ``tasks_per_class`` (of a meta-batch, over
   which a class's rows are split: as many rollouts has a task); ``adapts_by_row = True`` where rows of a task share
   nothing of what they learn;
+* where it learns from data sets, ``offline = True`` and ``learn_from(data)``, which takes a ``bidex_meta.data.joined``
+  before the first iteration; ``env_steps`` then counts updates, and the world is not stepped;
+* where it may imitate demonstrations beside what it learns by playing, ``learn_from_demonstrations(data)``, which takes
+  the same before the first iteration;
 * of its config, if it is there, `run` asks ``bytes_held(rows, width)``: about what it takes beside the world;
 * where it does not train in autoreset mode SAME_STEP, ``autoreset``: the mode, or a function of the learner's config
   that gives it;
@@ -47,6 +51,11 @@ ALGOS: dict[str, str] = {
     "sac": "bidex_algos.offpolicy.mtsac:MTSAC",
     "ddpg": "bidex_algos.offpolicy.ddpg:DDPG",
     "td3": "bidex_algos.offpolicy.td3:TD3",
+    # These learn from data sets (`--dataset`), of one class or of many.
+    "bc": "bidex_algos.offline.bc:BC",
+    "bcq": "bidex_algos.offline.bcq:BCQ",
+    "td3bc": "bidex_algos.offline.td3bc:TD3BC",
+    "iql": "bidex_algos.offline.iql:IQL",
 }
 
 _NEEDED = ("iterate", "state_dict", "load_state_dict", "policy_state_dict", "load_policy", "per_process")
@@ -72,6 +81,16 @@ class LearnerKind:
     def adapts(self) -> bool:
         """Whether what it learns adapts to tasks, so that it is judged by the meta-test."""
         return getattr(self.make, "adapts", False)
+
+    @property
+    def offline(self) -> bool:
+        """Whether it learns from data sets and counts updates as steps."""
+        return getattr(self.make, "offline", False)
+
+    @property
+    def imitates(self) -> bool:
+        """Whether it takes demonstrations beside what it learns by playing."""
+        return hasattr(self.make, "learn_from_demonstrations")
 
     @property
     def adapts_by_row(self) -> bool:

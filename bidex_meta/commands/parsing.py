@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
+from itertools import zip_longest
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeVar
 
@@ -158,6 +159,13 @@ def peek(arguments: Sequence[str], flag: str) -> str | None:
         if word.startswith(f"{flag}="):
             found = word.partition("=")[2]
     return found
+
+
+def peek_all(arguments: Sequence[str], flag: str) -> list[str]:
+    """As ``peek``, the values of a flag that may be given several times, in their order."""
+    pairs = zip_longest(arguments, arguments[1:])
+    found = [value if word == flag else word.partition("=")[2] for word, value in pairs if word.split("=")[0] == flag]
+    return [value for value in found if value]
 
 
 def _refuse(word: str, options: Any, command: str) -> NoReturn:

@@ -15,7 +15,7 @@ from bidex_meta.errors import BidexError, known_name
 from bidex_meta.reading import expanded
 from bidex_meta.sources import Source
 
-RUNS = {"random": 0, "medium": 1, "expert": 1, "medium-expert": 2, "replay": 1}
+RUNS = {"random": 0, "medium": 1, "expert": 1, "medium-expert": 2, "replay": 1, "demonstrations": 0}
 """Kinds of data sets, and how many runs each is made of."""
 _SIZE, _SIZE_OF_TWO = 1_000_000, 2_000_000
 _MOST_HELD = 1_200_000_000
@@ -33,23 +33,28 @@ class RecordFlags:
 
     kind: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="|".join(RUNS))]
     """random: uniform actions; medium, expert: the policy of one run; medium-expert: of two runs, half each; replay:
-    what `bidex-meta run --record N` kept of a run's training."""
+    what `bidex-meta run --record N` kept of a run's training; demonstrations: replays of the class's witness from
+    shifted starts, those that succeed."""
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = ()
     """Run folders, as many as the kind takes."""
     suite: str | None = None
     """random: suite to play, a name or the path of a TOML file; otherwise the run's own is played."""
     task: str | None = None
-    """random: class to play on its own, in place of a suite."""
+    """random: class to play on its own, in place of a suite; demonstrations: class of the witness."""
     base: Literal["own", "moving", "fixed"] = "own"
     """With --task: whether the hands' bases move; own: as the class has it alone."""
     size: StepCount = 0
-    """Transitions; 0: 1e6, of medium-expert 2e6. The last episodes are whole, so that there may be a few more."""
+    """Transitions; 0: 1e6, of medium-expert 2e6, of demonstrations 2e4. The last episodes are whole: there may be a few
+    more."""
     checkpoint: str = "last"
     """Which policy of a run: last, best or a file."""
     actions: Literal["sampled", "mean"] = "sampled"
     """sampled: drawn from the policy's distribution, where it has one; mean: its mean action."""
     noise: float = 0.0
-    """Standard deviation of Gaussian noise on a policy's actions, for those that have no distribution."""
+    """Standard deviation of Gaussian noise on a policy's actions, for those that have no distribution, or on a
+    witness's."""
+    shift: float = 1e-4
+    """demonstrations: how far the objects' start is shifted, metres."""
     num_envs: int | None = None
     """Rows stepped together; None: one per task, 200 at least."""
     seed: int = 0
@@ -74,6 +79,12 @@ def main(arguments: Sequence[str]) -> None:
     if kind == "replay":
         _replay(flags, flags.runs[0])
         return
+    if kind == "demonstrations":
+        from bidex_meta.commands.record_demonstrations import record_demonstrations
+
+        if (made := record_demonstrations(flags, _say)) is not None:
+            _say_complete(*made)
+        return
     _record(flags, kind)
 
 
@@ -83,10 +94,14 @@ def _check(flags: RecordFlags, kind: str) -> None:
         raise BidexError(f"record {kind} takes {RUNS[kind] or 'no'} {made}, got {len(flags.runs)}.")
     if kind == "random" and (flags.suite is None) == (flags.task is None):
         raise BidexError("Name what to play: either --suite SUITE or --task TASK, for example --task CatchUnderarm.")
-    if kind != "random" and (flags.suite is not None or flags.task is not None):
+    if kind == "demonstrations" and (flags.task is None or flags.suite is not None):
+        raise BidexError("Name the class whose witness is replayed: --task TASK, for example --task Switch.")
+    if kind not in ("random", "demonstrations") and (flags.suite is not None or flags.task is not None):
         raise BidexError(f"record {kind} plays what its run was trained on. Leave --suite and --task out.")
     if flags.base != "own" and flags.task is None:
         raise BidexError(f"--base {flags.base} goes with --task; a suite's file says whether bases move.")
+    if not 0.0 <= flags.shift <= 0.1:
+        raise BidexError(f"--shift must lie in [0, 0.1] metres, not {flags.shift:g}.")
     if not 0.0 <= flags.noise <= 10.0:
         raise BidexError(f"--noise must lie in [0, 10], not {flags.noise:g}.")
 

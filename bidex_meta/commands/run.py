@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bidex_meta.commands import run_recording
+from bidex_meta.commands import run_demonstrations, run_offline, run_recording
 from bidex_meta.commands.conditions import conditions
 from bidex_meta.commands.learners import shared
 from bidex_meta.commands.run_config import RunPlan, plan_run
@@ -174,6 +174,10 @@ def _make(plan: RunPlan, fresh: bool, held: contextlib.ExitStack) -> tuple[Any, 
     if plan.config["record"]:
         world = run_recording.recorded(plan, world)
     learner = plan.kind.make(world, plan.learner_config, plan.config["seed"])
+    if plan.kind.offline:
+        run_offline.give(plan.config["dataset"], learner)
+    if plan.config["demonstrations"] is not None:
+        run_demonstrations.give(plan.config["demonstrations"], learner)
     if fresh and plan.config["start_from"] is not None:
         start = RunFolder.open(Path(plan.config["start_from"]))
         state, step = checkpoint(start)

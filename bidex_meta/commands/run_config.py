@@ -9,8 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+import tyro
+
+from bidex_meta.commands import run_demonstrations, run_offline
 from bidex_meta.commands.learners import LearnerKind, choose_preset, learner_kind, resolve_device
 from bidex_meta.commands.parsing import StepCount, Switch, parse, peek
 from bidex_meta.data import part_files
@@ -55,7 +58,14 @@ class RunFlags:
     num_envs: int = 0
     """Rows stepped together by each process, over all tasks."""
     steps: StepCount = 0
-    """Environment steps to train for, over all rows of all processes; 2e7 is understood."""
+    """Environment steps to train for, over all rows of all processes; 2e7 is understood. Of what learns from --dataset:
+    gradient updates."""
+    dataset: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    """Learn from this data set (a name of `bidex-meta data list`, or a folder) instead of playing, with --algo bc, bcq,
+    td3bc or iql, for the suite or task that it was recorded of. Given several times: from all of them."""
+    demonstrations: str | None = None
+    """Imitate this data set too (as --dataset; see `bidex-meta record demonstrations`), ever less: with --algo mtppo
+    and ppo, see --learner.demonstration-weight."""
     minutes: float | None = None
     """Minutes to train for, counted from the first step of the world and without the evaluation; training ends with
     whichever is up first, these or --steps. None: as long as --steps take."""
@@ -137,10 +147,15 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     older = {"engine": "auto", "base": "own", "start_from": None, "minutes": None, "object": None}
     older |= {"points": 0, "evaluate_every": None, "video_every": None, "logger": "tensorboard"}
     older |= {"record": 0, "record_share": 0.0, "stop_at_return": None, "stop_at_score": None}
+    older |= {"dataset": [], "task_seed": None, "demonstrations": None}
     stored = {**older, **folder.config("learner", "num_envs", "steps")} if folder else {}
     suite, task = (peek(arguments, f"--{name}") or stored.get(name) for name in ("suite", "task"))
+    data: dict[str, Any] = {"dataset": run_offline.named(arguments, stored)}
+    datasets = run_offline.opened(data["dataset"])
+    implied = {} if suite or task else run_offline.implied(datasets)
+    suite, task = suite or implied.get("suite"), task or implied.get("task")
     # Where neither is named, `run --help` still has defaults to show; without --help _resolved refuses it.
-    thing = peek(arguments, "--object") or stored.get("object")
+    thing = peek(arguments, "--object") or stored.get("object") or implied.get("object")
     source = Source.open({"suite": suite or (None if task else _EXAMPLE), "task": task, "object": thing})
     alone = getattr(source, "class_name", None)
     kind = learner_kind(peek(arguments, "--algo") or stored.get("algo", RunFlags.algo), alone)
@@ -151,9 +166,14 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     if folder:
         learner_default = _stored_learner(type(learner_default), stored, folder)
         stored["learner"] = json.loads(json.dumps(dataclasses.asdict(learner_default)))  # with options it did not know
-    flags = parse(*_options(arguments, learner_default, stored, source.rows_and_steps(device, kind.adapts)))
+    sizes = run_offline.rows_and_steps(source) if kind.offline else source.rows_and_steps(device, kind.adapts)
+    flags = parse(*_options(arguments, learner_default, {**stored, **implied}, sizes))
+    run_offline.check(kind, flags.record, datasets, source)
+    data["demonstrations"] = run_demonstrations.named(flags.demonstrations)
     names = {"source": alone or source.name, "algo": kind.name, "preset": preset}
-    config = _resolved(flags, names, device, stored)
+    data["task_seed"] = stored.get("task_seed", run_offline.task_seed(datasets))
+    config = _resolved(flags, names, device, stored, data)
+    run_demonstrations.check(kind, config["demonstrations"], Source.open(config))
     if folder:
         _refuse_changes(stored, config, folder)
     return RunPlan(flags, kind, flags.learner, config, folder, reason)
@@ -173,12 +193,16 @@ def _options(
     known = {name: value for name, value in stored.items() if name in names}
     if known.get("start_from") is not None:
         known["start_from"] = Path(known["start_from"])
+    if "dataset" in known:
+        known["dataset"] = tuple(known["dataset"])
     default = options(**{"num_envs": rows, "steps": steps, **known, "learner": learner})
     return options, arguments, "run", default
 
 
-def _resolved(flags: Any, names: dict[str, str], device: str, stored: dict[str, Any]) -> dict[str, Any]:
-    """The config, with names as they are written (``MT4`` where ``--suite mt4`` was given)."""
+def _resolved(
+    flags: Any, names: dict[str, str], device: str, stored: dict[str, Any], data: dict[str, Any]
+) -> dict[str, Any]:
+    """The config, with names as they are written (``MT4`` where ``--suite mt4`` was given); ``data``: its data sets."""
     if (flags.suite is None) == (flags.task is None):
         raise BidexError("Name what to train on: either --suite SUITE or --task TASK, for example --suite MT4.")
     if flags.base != "own" and flags.task is None:
@@ -218,6 +242,7 @@ def _resolved(flags: Any, names: dict[str, str], device: str, stored: dict[str, 
         "evaluate_every": flags.evaluate_every,
         "video_every": flags.video_every,
         "logger": flags.logger,
+        **data,
         "record": flags.record,
         # A resumed run that takes more steps goes on with the rows that it began with.
         "record_share": stored.get("record_share", flags.record / max(flags.steps, 1)),

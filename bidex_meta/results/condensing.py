@@ -135,6 +135,11 @@ def _without_places(config: dict[str, Any]) -> dict[str, Any]:
     for name in ("suite", "start_from"):
         if config.get(name) is not None:
             kept[name] = Path(config[name]).name if Path(config[name]).is_absolute() else config[name]
+    for name in ("dataset", "demonstrations"):
+        if config.get(name):
+            many = [config[name]] if isinstance(config[name], str) else config[name]
+            names = ["/".join(Path(each).parts[-2:]) if Path(each).is_absolute() else each for each in many]
+            kept[name] = names[0] if isinstance(config[name], str) else names
     return kept
 
 

@@ -62,7 +62,7 @@ class Study:
         for run in self.runs:
             by_arm.setdefault(run.arm, []).append(run)
         for name, runs in by_arm.items():
-            _refuse_differing(name, runs)
+            refuse_differing(name, runs)
         arms = [Arm(self._only(group_of(name, runs)), runs) for name, runs in by_arm.items()]
         return sorted(arms, key=lambda arm: -iqm(arm.group.success).value)
 
@@ -127,7 +127,7 @@ def read_studies(data: Path, name: str, on: str | None = None, split: str | None
 def arms_table(study: Study) -> Iterator[str]:
     """Lines of Markdown: an arm a row, then uniform actions."""
     classes = study.classes if len(study.classes) <= _FEW else []
-    yield from _head(["arm", "seeds", "steps", "success, IQM", "score, IQM", *classes, "parameters", "hours"])
+    yield from head_of(["arm", "seeds", "steps", "success, IQM", "score, IQM", *classes, "parameters", "hours"])
     for arm in study.arms:
         group = arm.group
         score = "–" if group.scores is None else _ranged(iqm(group.scores))
@@ -139,22 +139,22 @@ def arms_table(study: Study) -> Iterator[str]:
             score,
         ]
         cells += _means(group, classes, group.returns, 1.0, "")
-        yield _row([*cells, "–" if arm.parameters is None else f"{arm.parameters:,}", f"{group.hours:.2f}"])
+        yield row_of([*cells, "–" if arm.parameters is None else f"{arm.parameters:,}", f"{group.hours:.2f}"])
     random = _random(study)
     if random.keys() == set(study.classes):
         success = np.array([[np.mean([row["success"] for row in random[name]]) for name in study.classes]])
         cells = ["uniform actions", "", "", f"{100 * iqm(success).value:.1f} %", "–"]
         cells += [f"{np.mean([row['return'] for row in random[name]]):.4g}" for name in classes]
-        yield _row([*cells, "", ""])
+        yield row_of([*cells, "", ""])
 
 
 def classes_table(study: Study) -> Iterator[str]:
     """Lines of Markdown: success and return of each class, mean over seeds (least to most)."""
-    yield from _head(["arm", "", *study.classes])
+    yield from head_of(["arm", "", *study.classes])
     for arm in study.arms:
         group = arm.group
-        yield _row([group.label, "success", *_means(group, study.classes, group.success, 100.0, " %", True)])
-        yield _row([group.label, "return", *_means(group, study.classes, group.returns, 1.0, "", True)])
+        yield row_of([group.label, "success", *_means(group, study.classes, group.success, 100.0, " %", True)])
+        yield row_of([group.label, "return", *_means(group, study.classes, group.returns, 1.0, "", True)])
 
 
 def figures(study: Study) -> dict[str, Callable[[], Any]]:
@@ -179,7 +179,7 @@ def _covered(run: StoredRun, runs: Sequence[StoredRun]) -> frozenset[str]:
     return frozenset(other.config()["task"] for other in same)
 
 
-def _refuse_differing(name: str, runs: Sequence[StoredRun]) -> None:
+def refuse_differing(name: str, runs: Sequence[StoredRun]) -> None:
     """Seeds of an arm may be of versions that know more or fewer options, but what both know is the same."""
     for run in runs[1:]:
         same = next(known for known in runs if known.config()["task"] == run.config()["task"])
@@ -219,10 +219,12 @@ def _ranged(estimate: Estimate, factor: float = 1.0, unit: str = "") -> str:
     )
 
 
-def _head(names: Sequence[str]) -> Iterator[str]:
-    yield _row(names)
+def head_of(names: Sequence[str]) -> Iterator[str]:
+    """A table's head in Markdown, two lines."""
+    yield row_of(names)
     yield "|" + "---|" * len(names)
 
 
-def _row(cells: Sequence[str]) -> str:
+def row_of(cells: Sequence[str]) -> str:
+    """A table's row in Markdown."""
     return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"

@@ -33,9 +33,9 @@ class Source(ABC):
 
     Args:
         name: How the user calls it: a suite's name or path, or a task class.
-        config: A run's config, or a part of one; read are ``seed`` (0), ``device`` (cpu, of this very process),
-            ``threads`` (None: one per core), ``engine`` (auto), ``points`` (0: as the suite says) and, by a single
-            class, ``base`` (own) and ``object`` (None: its own).
+        config: A run's config, or a part of one; read are ``seed`` (0), ``task_seed`` (None: ``seed``),
+            ``device`` (cpu, of this very process), ``threads`` (None: one per core), ``engine`` (auto), ``points`` (0:
+            as the suite says) and, by a single class, ``base`` (own) and ``object`` (None: its own).
     """
 
     hides_goals: bool = False
@@ -49,7 +49,8 @@ class Source(ABC):
 
     def __init__(self, name: str, config: Mapping[str, Any]) -> None:
         self.name = name
-        self.seed: int = config.get("seed", 0)
+        task_seed = config.get("task_seed")
+        self.seed: int = config.get("seed", 0) if task_seed is None else task_seed
         self.device: str = config.get("device", "cpu")
         self.threads: int | None = config.get("threads")
         self.engine: str = config.get("engine", "auto")

@@ -5,15 +5,17 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+import torch
 
 from bidex_meta.commands.learners import learner_kind
 from tests.algos.families import PointGoals
 from tests.algos.toy import ToyWorld, nearness
+from tests.offline.stored import as_data, noisy, played
 from tests.pages import ROOT
 
 SMALL: dict[str, Any] = {"hidden": (8,), "autocast": "off"}
 VARIANTS: dict[str, list[dict[str, Any]]] = {
-    "mtppo": [{}, {"gradient_surgery": "pcgrad"}, {"gradient_surgery": "famo"}],
+    "mtppo": [{}, {"gradient_surgery": "pcgrad"}, {"gradient_surgery": "famo"}, {"demonstration_weight": 0.1}],
     "mttrpo": [{}],
     "mtsac": [{"warmup_steps": 2, "batch_size": 16}],
     "mttd3": [{"warmup_steps": 2, "batch_size": 16}],
@@ -23,7 +25,12 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
     "maml": [{}, {"outer": "adam"}],
     "promp": [{}],
     "rl2": [{}],
+    "bc": [{"batch_size": 16, "updates_per_iteration": 4}],
+    "bcq": [{"batch_size": 16, "updates_per_iteration": 4, "vae_hidden": (8,)}],
+    "td3bc": [{"batch_size": 16, "updates_per_iteration": 4}],
+    "iql": [{"batch_size": 16, "updates_per_iteration": 4}],
 }
+PLAYING = [algo for algo in VARIANTS if not learner_kind(algo).offline]
 TEAM = {"agents": "a=action/0;b=action/1"}
 OF_AGENTS = {"ippo": "mtppo", "mappo": "mtppo", "happo": "mtppo", "hatrpo": "mttrpo", "maddpg": "ddpg"}
 """Learners of several agents, and those whose tags they have."""
@@ -38,6 +45,12 @@ def told(algo: str, variants: list[dict[str, Any]]) -> set[str]:
         config = replace(config, **{name: value for name, value in known.items() if hasattr(config, name)})
         world = PointGoals(rows=16) if kind.adapts else ToyWorld([nearness(0.5), nearness(-0.5)], rows=8)
         learner = kind.make(world, config, seed=0)
+        if known.get("demonstration_weight"):
+            learner.learn_from_demonstrations(
+                as_data(played(world, noisy(lambda obs: torch.zeros(len(obs), 2), 0.5), 9))
+            )
+        if kind.offline:
+            learner.learn_from(as_data(played(world, noisy(lambda obs: torch.zeros(len(obs), 2), 0.5), 9)))
         for _ in range(3):
             found = learner.iterate()
         names = "|".join(map(re.escape, world.task_names))
@@ -50,7 +63,8 @@ def listed() -> dict[str, set[str]]:
     page: dict[str, set[str]] = {algo: set() for algo in VARIANTS}
     text = (ROOT / "docs" / "metrics.md").read_text(encoding="utf-8").partition("## What the run adds")[0]
     for row in re.findall(r"^\| (`.*?) \| (.*?) \|", text, re.MULTILINE):
-        learners = list(VARIANTS) if row[1] == "all" else re.findall(r"\w+", row[1])
+        groups = {"all": list(VARIANTS), "all that play": PLAYING}
+        learners = groups.get(row[1]) or re.findall(r"\w+", row[1])
         for algo in learners:
             page[algo] |= set(re.findall(r"`([^`]+)`", row[0]))
     return page

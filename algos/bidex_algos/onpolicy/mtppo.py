@@ -15,10 +15,12 @@ from bidex_algos.gradients.balancing import balance_of
 from bidex_algos.gradients.step_size import AdaptiveAdams
 from bidex_algos.nets.precision import autocast
 from bidex_algos.onpolicy.base import Batch, OnPolicy
+from bidex_algos.onpolicy.demonstrations import Demonstrations
 from bidex_algos.onpolicy.mtppo_config import PRESETS, MTPPOConfig
 from bidex_algos.onpolicy.ppo_loss import NAMES, PPOLoss, ppo_loss
+from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
-from bidex_meta.train.distributed import sum_gradients
+from bidex_meta.train.distributed import sum_gradients, world_size
 from bidex_meta.world.contract import VectorWorld
 
 __all__ = ["MTPPO", "PRESETS", "Batch", "MTPPOConfig"]
@@ -37,6 +39,7 @@ class MTPPO(OnPolicy):
     name, remedy = "mtppo", "lower learning_rate"
     config_type = MTPPOConfig
     config: MTPPOConfig
+    demonstrations: Demonstrations | None = None
 
     def __init__(self, world: VectorWorld, config: MTPPOConfig, seed: int):
         samples = config.rollout_steps * world.num_envs
@@ -48,6 +51,19 @@ class MTPPO(OnPolicy):
         super().__init__(world, config, seed)
         self.adams = AdaptiveAdams(self.policy.actor.parameters(), self.critic.parameters(), config, self.device)
         self.balance = balance_of(config, world.num_tasks, self.device)
+
+    def learn_from_demonstrations(self, data: Joined) -> None:
+        """Takes what its policy shall also imitate; before the first iteration and before a checkpoint is loaded.
+
+        Args:
+            data: In the form of the learner's world; some of its tasks may have none.
+        """
+        self.demonstrations = Demonstrations(data, self.config, self.seed, self.device)
+        self.per_process = (*OnPolicy.per_process, "demonstrated")
+
+    def _imitated(self) -> float:
+        """Weight of the demonstrations in this update, 0 without any."""
+        return 0.0 if self.demonstrations is None else self.demonstrations.weight(self.env_steps)
 
     def _optimisers(self) -> dict[str, Any]:
         return self.adams.parts() | (self.balance.parts() if self.balance is not None else {})
@@ -75,19 +91,28 @@ class MTPPO(OnPolicy):
         names = list(NAMES)
         if self.balance is not None:
             names.append(self.balance.tag)
+        if self._imitated():
+            names.append("Loss/demonstrations")
         means = torch.stack(measured).mean(0)
-        return {**dict(zip(names, means, strict=True)), "Policy/lr": self.adams.rate}
+        told = {**dict(zip(names, means, strict=True)), "Policy/lr": self.adams.rate}
+        if self.demonstrations is not None:
+            told["Policy/demonstration_weight"] = means.new_tensor(self._imitated())
+        return told
 
     def _gradients(self, b: Batch, count: Tensor, old_log_std: Tensor) -> Tensor:
         """Puts the gradients of a mini-batch into the parameters; ``count`` samples are in it, over all processes.
 
         Returns:
-            Surrogate loss, value loss, KL, share of clipped ratios and, with surgery, its own number: (4,) or (5,).
+            Surrogate loss, value loss, KL, share of clipped ratios; with surgery its own number; with demonstrations
+            the distance from them: (4,) to (6,).
         """
         cfg, actor = self.config, self.policy.actor
         loss = self._loss(b, count, old_log_std, self._critic(b.obs, b.task_id))
         rest = cfg.value_loss_weight * loss.value - cfg.entropy_weight * loss.entropy
-        numbers = loss.numbers()
+        numbers, imitated = loss.numbers(), None
+        if self.demonstrations is not None and (weight := self._imitated()):
+            imitated = self.demonstrations.loss(self.policy) / world_size()
+            rest = rest + weight * imitated
         self.adams.zero_grad()
         if self.balance is not None:
             losses, least = self._per_task(-loss.earned, b.task_id), self._per_task(self._least(b, count), b.task_id)
@@ -95,6 +120,8 @@ class MTPPO(OnPolicy):
             rest.backward()
         else:
             (loss.surrogate + rest).backward()
+        if imitated is not None:
+            numbers.append(imitated.detach())
         return sum_gradients([*actor.parameters(), *self.critic.parameters()], torch.stack(numbers))
 
     def _loss(self, b: Batch, count: Tensor, old_log_std: Tensor, values: Tensor) -> PPOLoss:
@@ -124,6 +151,21 @@ class MTPPO(OnPolicy):
         """How far each task's surrogate loss is above that, (num_tasks,)."""
         loss = self._loss(b, count, old_log_std, b.targets)
         return self._per_task(-loss.earned - self._least(b, count), b.task_id)
+
+    # Checkpoints.
+
+    def _parts(self) -> dict[str, Any]:
+        more = {} if self.demonstrations is None else {"demonstrated": self.demonstrations.generator}
+        return super()._parts() | more
+
+    def _place(self) -> dict[str, Any]:
+        more = {} if self.demonstrations is None else {"demonstrations": self.demonstrations.fingerprint}
+        return super()._place() | more
+
+    def _check_size(self, state: dict[str, Any]) -> None:
+        super()._check_size(state)
+        if self.demonstrations is not None:
+            self.demonstrations.check(self.name, state.get("demonstrations"))
 
     def _per_task(self, x: Tensor, task_id: Tensor) -> Tensor:
         """Sums (num_tasks,) of what each sample has (B,)."""

@@ -34,6 +34,12 @@ class MTPPOConfig(PPOConfig, OnPolicyConfig):
     """Adam's step size of famo's weights."""
     famo_decay: float = 0.01
     """By which these weights are drawn back to even ones."""
+    demonstration_weight: float = 0.1
+    """With --demonstrations: weight at the start of the policy's distance from them; 0: they count nothing."""
+    demonstration_half_life: float = 500_000.0
+    """Environment steps in which that weight falls to half."""
+    demonstration_batch: int = 256
+    """Transitions of them in each mini-batch, of each process."""
 
     def __post_init__(self) -> None:
         """Rejects values that could only fail later.
@@ -44,7 +50,9 @@ class MTPPOConfig(PPOConfig, OnPolicyConfig):
         super().__post_init__()
         self._check_ppo()
         positive(self, "max_grad_norm", "famo_rate")
-        at_least(self, 0, "famo_decay")
+        at_least(self, 0, "famo_decay", "demonstration_weight")
+        at_least(self, 1, "demonstration_batch")
+        positive(self, "demonstration_half_life")
         if not 0.0 <= self.cagrad_radius < 1.0:
             raise BidexError(f"mtppo: cagrad_radius must lie in [0, 1), got {self.cagrad_radius}.")
 

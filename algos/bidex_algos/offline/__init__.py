@@ -1,0 +1,1 @@
+"""Learners that never act: they learn from stored transitions."""

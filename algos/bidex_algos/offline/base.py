@@ -1,0 +1,172 @@
+"""What the offline learners share: batches of stored transitions, critics and targets, updates, checkpoints.
+
+An iteration is ``updates_per_iteration`` updates, each of equally many transitions of every task. The world tells sizes
+and names and is never stepped. What other learners count as environment steps are updates here.
+"""
+
+import copy
+import math
+from abc import abstractmethod
+from collections.abc import Iterable
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from bidex_algos.experience.advantages import discounts
+from bidex_algos.experience.replay import Transitions
+from bidex_algos.learner import Learner
+from bidex_algos.nets.encoders.inputs import Inputs
+from bidex_algos.nets.precision import autocast, use_bfloat16
+from bidex_algos.offline.batches import Batches, return_deviation
+from bidex_algos.offpolicy.critics import Critics
+from bidex_algos.reports import as_numbers
+from bidex_meta.data.joined import Joined
+from bidex_meta.errors import BidexError
+from bidex_meta.world.contract import VectorWorld
+
+
+class Offline(Learner):
+    """A learner from data. ``learn_from`` comes before the first iteration and before a checkpoint is loaded.
+
+    Arguments, attributes and errors are those of :class:`~bidex_algos.learner.Learner`.
+
+    Attributes:
+        env_steps: Updates so far.
+        generator: Of the draws of transitions alone, so that learners of one seed see the same ones.
+        noise: Of all other draws, on the device.
+        critic: ``num_critics`` networks of observation and action, None without any; ``target_critic`` follows them.
+        adams: Optimisers by name; an algorithm may add some.
+        batch_per_task: Transitions of each task in an update; B is ``num_tasks`` times as many, task after task.
+        task_of_draw: Their tasks, int64 (B,).
+        reward_scale: What rewards of each task are divided by (num_tasks,).
+    """
+
+    offline: ClassVar[bool] = True
+    """Whether it learns from data sets."""
+    num_critics: ClassVar[int] = 2
+    discounts_by_class = True
+
+    def __init__(self, world: VectorWorld, config: Any, seed: int):
+        super().__init__(world, config, seed)
+        self.low_precision = use_bfloat16(config.autocast, self.device)
+        self.noise = torch.Generator(self.device).manual_seed(seed ^ 0x5EED)
+        self.batch_per_task = config.batch_per_task or math.ceil(config.batch_size / world.num_tasks)
+        self.task_of_draw = torch.arange(world.num_tasks, device=self.device).repeat_interleave(self.batch_per_task)
+        self.adams = {"actor": self._adam(self.policy.actor.parameters(), config.learning_rate)}
+        self.reward_scale = torch.ones(world.num_tasks, device=self.device)
+        self.critic: Any = None
+        if self.num_critics:
+            self.critic = self._make_critics()
+            self.target_critic = copy.deepcopy(self.critic)
+            self.adams["critic"] = self._adam(self.critic.parameters(), config.critic_learning_rate)
+            self.gamma_of_draw = discounts(world, config.gamma, self.task_of_draw)
+        self._batches: Batches | None = None
+
+    def learn_from(self, data: Joined) -> None:
+        """Takes the transitions to learn from, and what they say of observations and returns.
+
+        Args:
+            data: In the form of the learner's world.
+        """
+        tasks = self.world.num_tasks
+        self._batches = Batches(data, tasks, self.batch_per_task, self.device)
+        for chunk in self._batches.chunks():
+            self.policy.observations.update(chunk)
+        if self.critic is not None and self.config.per_task_rewards:
+            every = torch.arange(tasks, device=self.device)
+            self.reward_scale = return_deviation(data, tasks, discounts(self.world, self.config.gamma, every))
+            self.reward_scale = self.reward_scale.to(self.device)
+
+    # What a learner adds.
+
+    @abstractmethod
+    def _update(self, draw: Transitions) -> dict[str, Tensor]:
+        """One update of all networks by a batch, task after task; returns scalars to be logged, as means."""
+
+    def _make_critics(self) -> Any:
+        """Fresh critics of observation and action together."""
+        heads = self.world.num_tasks if self.config.value_heads else 1
+        judged = self.inputs.extended("action", self.shape.actions)
+        return self._critics(judged, heads, self.num_critics)
+
+    def _critics(self, inputs: Inputs, heads: int, count: int) -> Critics:
+        return Critics(inputs, heads, self.config, self.initial, count).to(self.device)
+
+    def _own_parts(self) -> dict[str, Any]:
+        """Networks of its own, beside those of the base, by their names in a checkpoint."""
+        return {}
+
+    # Learning.
+
+    def _iterate(self) -> dict[str, float]:
+        """Some updates; the means of what they measured."""
+        if self._batches is None:
+            raise BidexError(f"{self.name}: has no data to learn from. Call learn_from first.")
+        sums: dict[str, Tensor] = {}
+        counts: dict[str, int] = {}
+        for places in self._batches.draw(self.config.updates_per_iteration, self.generator):
+            with self._collecting():
+                draw = self._batches.take(places)
+            self.env_steps += 1
+            for name, value in self._update(draw).items():
+                sums[name] = sums[name] + value if name in sums else value
+                counts[name] = counts.get(name, 0) + 1
+        return as_numbers({name: total / counts[name] for name, total in sums.items()})
+
+    def _values(self, critic: Any, obs: Tensor, actions: Tensor) -> Tensor:
+        """The critics' values of a batch (count, B), in scaled units of reward."""
+        with autocast(self.device, self.low_precision):
+            return critic(obs, actions, self.task_of_draw)
+
+    def _bootstrapped(self, draw: Transitions, following: Tensor) -> Tensor:
+        """Targets (B,): scaled reward + gamma * ``following`` (B,), the value of the next state.
+
+        Nothing follows a true end. After a time limit the episode could have gone on.
+        """
+        rewards = draw.rewards / self.reward_scale[self.task_of_draw]
+        return rewards + self.gamma_of_draw * following.masked_fill(draw.terminated, 0.0)
+
+    def _fit_critics(self, obs: Tensor, draw: Transitions, target: Tensor) -> dict[str, Tensor]:
+        """One step of all critics towards ``target`` (B,), of normalised observations (B, d)."""
+        values = self._values(self.critic, obs, draw.actions)
+        loss = (values - target).square().mean(1).sum()
+        self._descend(loss, "critic", self.critic)
+        of_tasks = values[0].detach().view(self.world.num_tasks, -1).mean(1)
+        told = {f"Value/q/{name}": value for name, value in zip(self.world.task_names, of_tasks, strict=True)}
+        return {"Loss/critic": loss.detach()} | told
+
+    def _descend(self, loss: Tensor, name: str, *modules: nn.Module) -> None:
+        """One step of the optimiser named, down ``loss``; weights of these modules alone get a slope."""
+        weights = [weight for module in modules for weight in module.parameters()]
+        self.adams[name].zero_grad()
+        loss.backward(inputs=weights)
+        if self.config.max_grad_norm is not None:
+            nn.utils.clip_grad_norm_(weights, self.config.max_grad_norm)
+        self.adams[name].step()
+
+    def _adam(self, parameters: Iterable[nn.Parameter], rate: float) -> torch.optim.Adam:
+        return torch.optim.Adam(parameters, lr=rate, eps=self.config.adam_eps, fused=True)
+
+    def _normal(self, like: Tensor) -> Tensor:
+        return torch.randn(like.shape, generator=self.noise, device=self.device)
+
+    # Checkpoints.
+
+    def _parts(self) -> dict[str, Any]:
+        critics = {} if self.critic is None else {"critic": self.critic, "target_critic": self.target_critic}
+        generators = {"generator": self.generator, "noise": self.noise}
+        return {**critics, **self._own_parts(), "adams": self.adams, **generators, "reward_scale": self.reward_scale}
+
+    def _place(self) -> dict[str, Any]:
+        return super()._place() | {"data": self._batches and dict(self._batches.fingerprint)}
+
+    def _check_size(self, state: dict[str, Any]) -> None:
+        super()._check_size(state)
+        here = self._batches and self._batches.fingerprint
+        if here and state["data"] and here != state["data"]:
+            differ = next(name for name in here if here[name] != state["data"].get(name))
+            raise BidexError(
+                f"{self.name}: the checkpoint's data have {differ} {state['data'].get(differ):,.6g}, these "
+                f"{here[differ]:,.6g} (sums; transitions: their number). Resume with the run's own data sets."
+            )

@@ -1,0 +1,105 @@
+"""IQL: values without an action that the data do not hold (Kostrikov et al. 2022; appendix B.3.3).
+
+V   down on |t - 1(u < 0)| u^2,   u = min_i Q'_i(s, a) - V(s)        t-expectile of the data's actions
+pi  up on   min(exp(beta u), bound) log pi(a | s)
+Q_i towards r + gamma (1 - terminated) V(s')
+Q'  a small step towards Q
+"""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bidex_algos.experience.replay import Transitions
+from bidex_algos.nets.multitask.architecture import network_of
+from bidex_algos.nets.networks import GaussianActor, gaussian_log_prob
+from bidex_algos.nets.normalise import ObservationNormaliser
+from bidex_algos.nets.policy import GaussianPolicy
+from bidex_algos.nets.precision import autocast, use_bfloat16
+from bidex_algos.nets.shape import Shape
+from bidex_algos.offline.base import Offline
+from bidex_algos.offline.iql_config import PRESETS, IQLConfig
+from bidex_algos.offpolicy.critics import follow
+from bidex_meta.world.contract import VectorWorld
+
+__all__ = ["IQL", "PRESETS", "IQLConfig"]
+
+
+class BoundedMean(GaussianActor):
+    """A Gaussian whose mean is squashed by tanh; arguments are those of its base."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Mean action of normalised observations (batch, d): float32 (batch, a) in [-1, 1]."""
+        return torch.tanh(super().forward(x))
+
+
+class IQL(Offline):
+    """Implicit Q-learning on data sets (Kostrikov et al. 2022, arXiv 2110.06169).
+
+    Arguments, errors and attributes are those of :class:`~bidex_algos.offline.base.Offline`.
+
+    Attributes:
+        value: Network of the state's value.
+    """
+
+    name, remedy = "iql", "lower beta"
+    config_type = IQLConfig
+    config: IQLConfig
+    policy: GaussianPolicy
+
+    def __init__(self, world: VectorWorld, config: IQLConfig, seed: int):
+        super().__init__(world, config, seed)
+        self.value = self._critics(self.inputs, self.critic.heads, 1)
+        self.adams["value"] = self._adam(self.value.parameters(), config.critic_learning_rate)
+        self.log_bounds = [float(torch.tensor(std).log()) for std in config.std_range]
+
+    def _update(self, draw: Transitions) -> dict[str, Tensor]:
+        obs, next_obs = self.policy.observations(draw.obs), self.policy.observations(draw.next_obs)
+        with torch.no_grad():
+            judged = self._values(self.target_critic, obs, draw.actions).amin(0)
+        ahead = judged - self._worth(obs)
+        loss = expectile_loss(ahead, self.config.expectile).mean()
+        self._descend(loss, "value", self.value)
+        with torch.no_grad():
+            advantage = judged - self._worth(obs)
+            target = self._bootstrapped(draw, self._worth(next_obs))
+        told = {"Loss/value": loss.detach()} | self._fit_actor(obs, draw.actions, advantage)
+        told |= self._fit_critics(obs, draw, target)
+        follow(self.target_critic, self.critic, self.config.tau)
+        return told
+
+    def _worth(self, obs: Tensor) -> Tensor:
+        """Values of states (B,), of normalised observations (B, d)."""
+        return self._values(self.value, obs, obs[:, :0])[0]
+
+    def _fit_actor(self, obs: Tensor, actions: Tensor, advantage: Tensor) -> dict[str, Tensor]:
+        """One step of the actor towards the data's actions (B, a), by the advantage (B,) of each."""
+        weight = (self.config.beta * advantage).exp().clamp_max(self.config.max_weight)
+        with autocast(self.device, self.low_precision):
+            mean, log_std = self.policy.actor(obs), self.policy.actor.log_std_of(obs)
+        log_std = log_std.clamp(*self.log_bounds)
+        loss = -(weight * gaussian_log_prob(actions, mean, log_std)).mean()
+        self._descend(loss, "actor", self.policy.actor)
+        std = log_std.detach().exp().mean()
+        return {"Loss/actor": loss.detach(), "Policy/std": std, "Policy/weight": weight.mean()}
+
+    @classmethod
+    def _make_policy(
+        cls, config: IQLConfig, shape: Shape, init: torch.Generator, device: torch.device
+    ) -> GaussianPolicy:
+        inputs, heads = cls._inputs(config, shape), shape.num_id_columns if config.policy_heads else 1
+        network = network_of(config)
+        actor = BoundedMean(
+            inputs, config.hidden, shape.actions, config.init_std, init, config.activation, heads, network
+        )
+        observations = ObservationNormaliser(inputs, config.normalise_observations)
+        return GaussianPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
+
+    def _own_parts(self) -> dict[str, Any]:
+        return {"value": self.value}
+
+
+def expectile_loss(ahead: Tensor, expectile: float) -> Tensor:
+    """|t - 1(u < 0)| u^2 of each difference u; its mean is least where the t-expectile is subtracted. Shape of u."""
+    return torch.where(ahead < 0.0, 1.0 - expectile, expectile) * ahead.square()

@@ -1,0 +1,69 @@
+"""TD3+BC: TD3 on stored transitions, with an actor that stays near the data (Fujimoto and Gu 2021; appendix B.3.2).
+
+y  = r + gamma (1 - terminated) min_i Q'_i(s', mu'(s') + clip(noise, -c, c))
+Q_i  towards y
+mu   down on (mu(s) - a)^2 - lambda Q_1(s, mu(s)),    lambda = alpha / mean |Q_1(s, mu(s))|
+mu', Q'  a small step towards mu, Q                    mu and the targets at every second update
+"""
+
+import copy
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bidex_algos.experience.replay import Transitions
+from bidex_algos.nets.precision import autocast
+from bidex_algos.offline.bc import BC
+from bidex_algos.offline.td3bc_config import PRESETS, TD3BCConfig
+from bidex_algos.offpolicy.critics import follow
+from bidex_meta.world.contract import VectorWorld
+
+__all__ = ["PRESETS", "TD3BC", "TD3BCConfig"]
+
+
+class TD3BC(BC):
+    """TD3+BC on data sets (Fujimoto and Gu 2021, arXiv 2106.06860).
+
+    Arguments, errors and attributes are those of :class:`~bidex_algos.offline.base.Offline`.
+
+    Attributes:
+        target_actor: Follows the actor.
+    """
+
+    name, remedy = "td3bc", "lower critic_learning_rate"
+    config_type = TD3BCConfig
+    config: TD3BCConfig  # pyright: ignore[reportIncompatibleVariableOverride]
+    num_critics = 2
+
+    def __init__(self, world: VectorWorld, config: TD3BCConfig, seed: int):
+        super().__init__(world, config, seed)
+        self.target_actor = copy.deepcopy(self.policy.actor)
+
+    def _update(self, draw: Transitions) -> dict[str, Tensor]:
+        obs, next_obs = self.policy.observations(draw.obs), self.policy.observations(draw.next_obs)
+        told = self._fit_critics(obs, draw, self._target(draw, next_obs))
+        if self.env_steps % self.config.policy_delay == 0:
+            told |= self._fit_actor(obs, draw)
+            follow(self.target_actor, self.policy.actor, self.config.tau)
+            follow(self.target_critic, self.critic, self.config.tau)
+        return told
+
+    @torch.no_grad()
+    def _target(self, draw: Transitions, next_obs: Tensor) -> Tensor:
+        """What the critics shall say of the drawn transitions (B,); ``next_obs`` are normalised."""
+        with autocast(self.device, self.low_precision):
+            action = self.target_actor(next_obs)
+        bound = self.config.target_bound
+        noise = (self.config.target_std * self._normal(action)).clamp(-bound, bound)
+        following = self._values(self.target_critic, next_obs, (action + noise).clamp(-1.0, 1.0))
+        return self._bootstrapped(draw, following.amin(0))
+
+    def _actor_loss(self, imitation: Tensor, obs: Tensor, actions: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        value = self._values(self.critic, obs, actions)[0]
+        weight = self.config.alpha / value.detach().abs().mean().clamp_min(1e-8)
+        loss = imitation - weight * value.mean()
+        return loss, {"Loss/actor": loss.detach()}
+
+    def _own_parts(self) -> dict[str, Any]:
+        return {"target_actor": self.target_actor}

@@ -1,0 +1,116 @@
+"""``bidex-meta record demonstrations``: replays of a class's witness, of which those that succeed are kept."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from bidex_meta.errors import BidexError
+from bidex_meta.sources import Source
+
+if TYPE_CHECKING:
+    from bidex_meta.witness.shifted import ShiftedStarts
+    from bidex_meta.witness.store import Witness
+
+SIZE, ROWS = 20_000, 32
+"""Transitions, and replays that are played together, where nobody says otherwise."""
+FAILED = "unsuccessful_episodes"
+_PATIENCE = 3
+"""Rounds in which nothing has to succeed."""
+
+
+def record_demonstrations(flags: Any, say: Callable[[str], None]) -> tuple[Path, str] | None:
+    """Records, or goes on with a recording; folder and name of the complete data set, None after an estimate.
+
+    The class is the one with moving bases, as suites have it. A round is a part; all that it draws follows from the
+    seed and its number.
+
+    Args:
+        flags: ``RecordFlags`` with ``task``; read are also ``size``, ``noise``, ``shift``, ``num_envs``, ``seed``,
+            ``out``, ``threads``, ``estimate``.
+        say: Takes lines of progress.
+
+    Raises:
+        BidexError: Flags that do not go together, no witness, no room, or no replay that succeeds.
+    """
+    from bidex_meta.commands.described import described
+    from bidex_meta.data import part_files
+    from bidex_meta.data.place import check_room, place_of
+    from bidex_meta.data.rounds import standing, whole_parts
+    from bidex_meta.data.writer import DatasetWriter, begin, check_place, estimated_bytes, finish
+    from bidex_meta.witness.shifted import ShiftedStarts
+    from bidex_meta.witness.store import load_witness
+
+    part_files.hdf5()
+    if flags.base == "fixed" or flags.engine == "warp" or flags.device not in ("auto", "cpu"):
+        raise BidexError(
+            "Witnesses are of moving bases and of C MuJoCo on the CPU. Leave --base, --engine, --device out."
+        )
+    source = Source.open({"task": flags.task, "base": "moving", "seed": 0, "threads": flags.threads})
+    if source.name not in source.task_classes() or ":" in source.name:
+        raise BidexError(f"{source.name} is none of the classes that have witnesses (bidex-meta witness --all).")
+    witness, size, rows = load_witness(source.name), flags.size or SIZE, flags.num_envs or ROWS
+    folder, name = place_of(flags.out, source.name, "demonstrations")
+    plan = {"kind": "demonstrations", "task": source.name, "size": size, "num_envs": rows, "seed": flags.seed}
+    plan |= {"noise": flags.noise, "shift": flags.shift}
+    if not flags.estimate:
+        check_place(folder, plan)
+    made = source.name, rows, flags.shift, flags.threads
+    world = ShiftedStarts(*made)  # pyright: ignore[reportAbstractUsage]  # the wrapped world has all
+    try:
+        sizes = world.single_observation_space.shape[0], world.single_action_space.shape[0]
+        needed = estimated_bytes(size, *sizes, float(world.max_episode_steps[0]))
+        say(f"{name}: {size:,} transitions, at most about {needed / 1e9:.2f} GB on the disk.")
+        if flags.estimate:
+            return None
+        check_room(folder, needed, f"{size:,} transitions")
+        begin(folder, plan)
+        keep = whole_parts([path.name for path in part_files.parts_of(folder / "data", 0)])
+        writer = DatasetWriter(folder, keep=keep)
+        try:
+            while (now := standing(writer, 1)).steps[0] < size:
+                if not now.steps[0] and writer.parts >= _PATIENCE:
+                    raise BidexError(
+                        f"None of {_PATIENCE * rows} replays of {source.name}'s witness succeeds. Lower --noise or "
+                        "--shift."
+                    )
+                _round(world, witness, writer, flags)
+                after = standing(writer, 1)
+                kept = after.episodes[0] - now.episodes[0]
+                say(f"{after.steps[0]:,} of {size:,} transitions | {kept} of {rows} replays succeed")
+        finally:
+            writer.close()
+        told = {"algo": None, "actions": "witness", "noise": flags.noise, "shift": flags.shift}
+        about = described(source, world, "demonstrations", [told], starts=flags.seed)
+        finish(folder, name, world.single_observation_space, world.single_action_space, about)
+    finally:
+        world.close()
+    return folder, name
+
+
+def _round(world: "ShiftedStarts", witness: "Witness", writer: Any, flags: Any) -> None:
+    """Plays the witness in every row, each with noise of its own; after its end its last action is held."""
+    from bidex_meta.data.episode import Episode
+    from bidex_meta.data.episode_recorder import EpisodeRecorder
+
+    def sink(episode: Episode) -> None:
+        if episode.success and not episode.broken:
+            writer.add(episode)
+        else:
+            writer.left_out[FAILED] += 1
+
+    seeds = np.random.SeedSequence((flags.seed, writer.parts)).generate_state(2, np.uint32).tolist()
+    recorder = EpisodeRecorder(world, sink)  # pyright: ignore[reportAbstractUsage]  # the wrapped world has all
+    recorder.reset(seed=seeds[0])
+    generator = torch.Generator().manual_seed(seeds[1])
+    played, over = torch.from_numpy(witness.actions), torch.zeros(world.num_envs, dtype=torch.bool)
+    step = 0
+    while not bool(over.all()):
+        action = played[min(step, len(played) - 1)].expand(world.num_envs, -1)
+        noise = flags.noise * torch.randn(action.shape, generator=generator)
+        *_, info = recorder.step((action + noise).clamp(-1.0, 1.0))
+        over |= info["_final_obs"]
+        step += 1
+    writer.commit()

@@ -1,0 +1,99 @@
+"""Scores of learners from data sets as a table: kinds of data by learners, beside the expert of the same study.
+
+The score is the paper's (appendix A.3): 100 (R - R_random) / (R_expert - R_random), with the returns that the study's
+own runs found. The expert is the study's run on the same class that plays; without one (a suite) scores are those of
+the evaluations.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from bidex_meta.evaluation.comparison import classes_of
+from bidex_meta.record.stored import StoredRun
+from bidex_meta.results.studies import Study, head_of, refuse_differing, row_of
+
+KINDS = ("random", "replay", "medium", "medium-expert", "expert")
+"""Order of the rows, as in the paper's table; others follow by their names."""
+LEARNERS = ("bc", "bcq", "td3bc", "iql")
+"""Order of the columns, the same."""
+
+
+def offline_table(study: Study) -> Iterator[str]:
+    """Lines of Markdown: data sets by learners, score as mean over seeds (least to most) and mean success.
+
+    Args:
+        study: Runs on data sets; those that play are its experts.
+
+    Raises:
+        BidexError: Seeds of one cell differ in more than the seed.
+    """
+    cells: dict[str, dict[str, list[StoredRun]]] = {}
+    experts = []
+    for run in study.runs:
+        config = run.config()
+        if config.get("dataset"):
+            cells.setdefault(_kind(config["dataset"]), {}).setdefault(config["algo"], []).append(run)
+        else:
+            experts.append(run)
+    learners = _ordered({algo for row in cells.values() for algo in row}, LEARNERS)
+    ends = _ends(study.runs, experts)
+    seeds = sorted({len(runs) for row in cells.values() for runs in row.values()})
+    yield from head_of(["data", *learners])
+    for kind in _ordered(cells, KINDS):
+        yield row_of([kind, *(_cell(cells[kind].get(algo, []), ends) for algo in learners)])
+    updates = []
+    for algo in learners:
+        found = {run.content["steps"] for row in cells.values() for run in row.get(algo, [])}
+        updates.append(f"{algo} {_listed(sorted(found))}")
+    yield ""
+    yield f"Seeds: {_listed(seeds)}. Updates: {'; '.join(updates)}."
+    if ends is not None:
+        success = f"{100 * _mean(experts, 'success'):.3g} %"
+        yield f"Returns: expert {ends[1]:.4g} (success {success}), uniform actions {ends[0]:.4g}."
+
+
+def _kind(names: Sequence[str]) -> str:
+    """What kind of data a run learned from: ``medium`` of ``HandOver/medium-v0``."""
+    return " + ".join(name.rpartition("/")[2].rpartition("-v")[0] or name for name in names)
+
+
+def _ends(runs: Sequence[StoredRun], experts: Sequence[StoredRun]) -> tuple[float, float] | None:
+    """Mean returns of uniform actions and of the experts; None without experts."""
+    random = [run.evaluation()["random"] for run in runs if "random" in run.evaluation()]
+    if not experts or not random:
+        return None
+    return float(np.mean([_of(found, "return") for found in random])), _mean(experts, "return")
+
+
+def _cell(runs: Sequence[StoredRun], ends: tuple[float, float] | None) -> str:
+    if not runs:
+        return "–"
+    refuse_differing(f"{_kind(runs[0].config()['dataset'])} {runs[0].config()['algo']}", runs)
+    if ends is None:
+        scores = np.array([_of(run.evaluation(), "score") for run in runs])
+    else:
+        scores = 100 * (np.array([_of(run.evaluation(), "return") for run in runs]) - ends[0]) / (ends[1] - ends[0])
+    told = f"{scores.mean():.1f}"
+    if len(scores) > 1:
+        told += f" ({scores.min():.1f} to {scores.max():.1f})"
+    return f"{told}; {100 * _mean(runs, 'success'):.3g} %"
+
+
+def _mean(runs: Sequence[StoredRun], name: str) -> float:
+    return float(np.mean([_of(run.evaluation(), name) for run in runs]))
+
+
+def _of(found: dict[str, Any], name: str) -> float:
+    """Mean over the classes of an evaluation; not a number where one has none."""
+    values = [row.get(name) for row in classes_of(found).values()]
+    return float(np.mean([np.nan if value is None else value for value in values]))
+
+
+def _ordered(names: Any, known: Sequence[str]) -> list[str]:
+    return sorted(names, key=lambda name: (known.index(name) if name in known else len(known), name))
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    return " or ".join(f"{number:,}" for number in numbers)

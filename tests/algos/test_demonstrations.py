@@ -1,0 +1,125 @@
+"""Demonstrations beside PPO: the term against its definition, its fading, what it leaves alone, resuming."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch.distributions import Normal
+
+from bidex_algos.onpolicy.demonstrations import Demonstrations, imitation
+from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
+from bidex_meta.errors import BidexError
+from tests.algos.toy import ToyWorld, nearness
+from tests.offline.stored import as_data, noisy, played
+
+SMALL = MTPPOConfig(
+    hidden=(16,), rollout_steps=4, num_minibatches=2, epochs=2, autocast="off", demonstration_half_life=400.0
+)
+NOTHING = [lambda action: torch.zeros(len(action)), lambda action: torch.zeros(len(action))]
+
+
+def world(rewards: Any = None) -> ToyWorld:
+    return ToyWorld(rewards or [nearness(0.5), nearness(-0.5)], rows=8)
+
+
+def shown(action: float = 0.4, seed_rows: int = 8, only: int | None = None) -> Any:
+    """Data of a policy that does ``action``, of both tasks or of one alone."""
+    found = played(ToyWorld(NOTHING, rows=seed_rows), noisy(lambda obs: torch.full((len(obs), 2), action), 0.02), 9)
+    return as_data([episode for episode in found if only in (None, episode.task)])
+
+
+def trained(config: MTPPOConfig, data: Any, iterations: int = 3, rewards: Any = None) -> tuple[MTPPO, dict[str, float]]:
+    learner = MTPPO(world(rewards), config, seed=3)
+    if data is not None:
+        learner.learn_from_demonstrations(data)
+    told = {}
+    for _ in range(iterations):
+        told = learner.iterate()
+    return learner, told
+
+
+def same(one: MTPPO, other: MTPPO) -> bool:
+    pairs = zip(one.policy.state_dict().values(), other.policy.state_dict().values(), strict=True)
+    return all(torch.equal(a, b) for a, b in pairs)
+
+
+def test_the_term_is_the_log_density_and_leaves_deviations_alone() -> None:
+    torch.manual_seed(0)
+    means, log_std, actions = torch.randn(6, 3, requires_grad=True), torch.randn(3), torch.randn(6, 3)
+    normal = Normal(means, log_std.exp())
+    constant = -Normal(torch.zeros(3), log_std.exp()).log_prob(torch.zeros(3)).sum()
+    expected = -normal.log_prob(actions).sum(-1).mean() - constant
+    assert float(imitation(actions, means, log_std).detach()) == pytest.approx(float(expected), rel=1e-5)
+    learner, _ = trained(SMALL, shown(), iterations=1)
+    learner.policy.actor.zero_grad()
+    assert learner.demonstrations is not None
+    learner.demonstrations.loss(learner.policy).backward()
+    slopes = {name: weight.grad for name, weight in learner.policy.actor.named_parameters()}
+    assert slopes.pop("log_std") is None
+    assert all(slope is not None for slope in slopes.values())
+
+
+def test_the_weight_falls_to_half_in_each_half_life() -> None:
+    demonstrations = Demonstrations(shown(), SMALL, 0, torch.device("cpu"))
+    assert [demonstrations.weight(steps) for steps in (0, 400, 1200)] == pytest.approx([0.1, 0.05, 0.0125])
+    learner, told = trained(SMALL, shown(), iterations=3)
+    before = learner.env_steps - learner.env_steps // 3  # the last update came before these steps were counted
+    assert told["Policy/demonstration_weight"] == pytest.approx(0.1 * 0.5 ** (before / 400))
+    assert told["Loss/demonstrations"] > 0.0
+
+
+@pytest.mark.parametrize("surgery", ["none", "pcgrad"])
+def test_weight_0_is_mt_ppo_bit_for_bit(surgery: str) -> None:
+    config = replace(SMALL, demonstration_weight=0.0, gradient_surgery=surgery)
+    plain, told = trained(config, None)
+    with_data, more = trained(config, shown())
+    assert same(plain, with_data)
+    assert more["Policy/demonstration_weight"] == 0.0 and "Loss/demonstrations" not in more
+    assert "Policy/demonstration_weight" not in told
+    assert not same(plain, trained(replace(config, demonstration_weight=0.1), shown())[0])
+
+
+def test_each_task_that_has_some_is_drawn_equally_often() -> None:
+    both = shown(seed_rows=2)
+    one = torch.nonzero(both.task == 1).flatten()
+    few = replace(both, task=torch.where(torch.isin(torch.arange(len(both)), one[1:]), 0, both.task))  # one of task 1
+    drawn = Demonstrations(few, replace(SMALL, demonstration_batch=4000), 0, torch.device("cpu")).draw()[1]
+    assert float((drawn == both.actions[one[0]]).all(1).float().mean()) == pytest.approx(0.5, abs=0.03)
+    alone = Demonstrations(shown(only=1), SMALL, 0, torch.device("cpu"))
+    assert torch.equal(alone.draw()[0][:, 1:], torch.tensor([0.0, 1.0]).expand(256, 2))
+
+
+def test_where_nothing_is_rewarded_the_policy_does_what_it_was_shown() -> None:
+    config = replace(SMALL, demonstration_weight=1.0, demonstration_half_life=1e9, learning_rate_range=(1e-3, 3e-3))
+    obs = torch.tensor([[0.3, 1.0, 0.0], [-0.2, 0.0, 1.0]])
+    shown_to, _ = trained(config, shown(0.4), 40, NOTHING)
+    assert float((shown_to.eval_action(obs) - 0.4).abs().max()) < 0.1
+    without, _ = trained(config, None, 40, NOTHING)
+    assert float((without.eval_action(obs) - 0.4).abs().max()) > 0.2
+
+
+def test_a_resumed_run_goes_on_bit_for_bit_with_its_own_data_alone() -> None:
+    straight, _ = trained(SMALL, shown(), 4)
+    half, _ = trained(SMALL, shown(), 2)
+    state = {"learner": half.state_dict(), "env": half.world.state_dict()}
+    resumed = MTPPO(world(), SMALL, seed=9)
+    resumed.learn_from_demonstrations(shown())
+    resumed.load_state_dict(state["learner"])
+    resumed.world.load_state_dict(state["env"])
+    for _ in range(2):
+        resumed.iterate()
+    assert same(straight, resumed)
+    assert "demonstrated" in resumed.per_process and "demonstrated" not in MTPPO.per_process
+    other = MTPPO(world(), SMALL, seed=9)
+    other.learn_from_demonstrations(shown(seed_rows=2))
+    with pytest.raises(BidexError, match="demonstrations are others"):
+        other.load_state_dict(state["learner"])
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"demonstration_weight": -0.1}, {"demonstration_half_life": 0.0}, {"demonstration_batch": 0}]
+)
+def test_settings_out_of_range_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(BidexError, match=next(iter(wrong))):
+        replace(SMALL, **wrong)

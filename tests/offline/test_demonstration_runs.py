@@ -1,0 +1,128 @@
+"""bidex-meta record demonstrations, and run --demonstrations: one real class, a few episodes."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from bidex_meta.cli import main
+from bidex_meta.commands import record_demonstrations
+from bidex_meta.data import open_dataset
+from bidex_meta.record import RunFolder
+from bidex_meta.sources.source import SingleClass
+from bidex_meta.witness.shifted import ShiftedStarts
+from bidex_meta.witness.simulator import Simulator
+from bidex_meta.witness.store import load_witness
+
+pytest.importorskip("h5py", reason="needs the extra data")
+
+RECORD = ["record", "demonstrations", "--task", "HandOver", "--num-envs", "3", "--threads", "1", "--noise", "0.02"]
+RUN = ["run", "--task", "HandOver", "--base", "moving", "--algo", "ppo", "--num-envs", "50", "--steps", "800"]
+RUN += ["--threads", "1", "--device", "cpu", "--logger", "none", "--learner.hidden", "8", "--no-evaluate"]
+
+
+def told(capsys: pytest.CaptureFixture[str], *words: object, code: int = 0) -> str:
+    capsys.readouterr()
+    try:
+        assert main([str(word) for word in words]) == code
+    except SystemExit as end:
+        assert end.code == code
+    out = capsys.readouterr()
+    return out.out + out.err
+
+
+@pytest.fixture
+def sets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("BIDEX_DATA", str(tmp_path / "sets"))
+    return tmp_path
+
+
+def test_the_world_begins_and_goes_as_the_witness_does() -> None:
+    name = "HandOver"
+    actions = torch.from_numpy(load_witness(name).actions)
+    simulator, world = Simulator(name, 1, threads=1), ShiftedStarts(name, 1, 0.0, threads=1)
+    trace = simulator.play(actions[:, None])
+    obs, _ = world.reset(seed=1)
+    seen = [obs]
+    rewards = []
+    for action in actions:
+        obs, *_, info = world.step(action[None])
+        seen.append(obs)
+        rewards.append(float(info["reward_unscaled"]))
+    assert rewards == pytest.approx(trace.rewards[:, 0].tolist(), abs=1e-6)
+    again, _ = world.reset(seed=2)
+    assert torch.equal(again, seen[0])
+    shifted = ShiftedStarts(name, 3, 0.002, threads=1)
+    places = [shifted.reset(seed=seed)[0] for seed in (1, 1, 2)]
+    assert torch.equal(places[0], places[1]) and not torch.equal(places[0], places[2])
+    assert not torch.equal(places[0][0], places[0][1])
+    off = (places[0] - seen[0]).abs()
+    assert 1e-5 < float(off.max()) < 0.05  # of positions; angles in observations stay
+    for each in (simulator, world, shifted):
+        each.close()
+
+
+def test_only_what_succeeds_is_kept_and_a_recording_goes_on(
+    sets: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "0.00 GB" in told(capsys, *RECORD, "--size", "300", "--estimate")
+    assert not (sets / "sets").exists()
+    told(capsys, *RECORD, "--size", "300")
+    whole = open_dataset("HandOver/demonstrations-v0")
+    assert whole.num_steps >= 300 and bool(whole.table["success"].all())
+    assert (whole.metadata["kind"], whole.metadata["base"]) == ("demonstrations", "moving")
+    torn = [*RECORD, "--size", "300", "--out", sets / "sets" / "torn-v0"]
+    play, rounds = record_demonstrations._round, []
+
+    def once(*given: Any) -> None:
+        if rounds:
+            raise KeyboardInterrupt
+        rounds.append(play(*given))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(record_demonstrations, "_round", once)
+        told(capsys, *torn, code=130)
+    told(capsys, *torn)
+    again = open_dataset("torn-v0").transitions()
+    assert all(np.array_equal(a, again[name]) for name, a in whole.transitions().items())
+    assert "rewards computed again" in told(capsys, "data", "check", whole.name)
+    # A witness that is shaken hard succeeds no more.
+    told_of = told(capsys, *RECORD, "--noise", "3", "--out", sets / "sets" / "wild-v0", code=2)
+    assert "None of 9 replays of HandOver's witness succeeds" in told_of
+
+
+def test_a_run_imitates_them_and_is_resumed(
+    sets: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told(capsys, *RECORD, "--size", "200")
+    shown = ["--demonstrations", "HandOver/demonstrations-v0"]
+    assert "Demonstrations: 2" in told(capsys, *RUN, *shown, "--run-dir", sets / "whole")
+    told(capsys, *RUN, *shown, "--steps", "400", "--run-dir", sets / "torn")
+    told(capsys, "run", "--resume", sets / "torn", "--steps", "800", "--no-evaluate")
+    told(capsys, *RUN, "--run-dir", sets / "plain")
+    weights = []
+    for name in ("whole", "torn", "plain"):
+        found = RunFolder.open(sets / name).checkpoints.load()
+        assert found is not None
+        weights.append(found[0]["learner"]["policy"]["weights"]["actor.log_std"])
+    assert torch.equal(weights[0], weights[1]) and not torch.equal(weights[0], weights[2])
+    assert RunFolder.open(sets / "whole").config()["demonstrations"] == shown[1]
+
+    # Nothing is built for what cannot be imitated.
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("a world was made")
+
+    monkeypatch.setattr(SingleClass, "world", refuse)
+    wrong = [
+        (["--demonstrations", "HandOver/demo-v0"], "Unknown data set 'HandOver/demo-v0'"),
+        ([*shown, "--base", "own"], "Add --base moving"),
+        ([*shown, "--task", "Switch"], "HandOver"),
+        ([*shown, "--algo", "td3"], "td3 imitates nothing; --demonstrations goes with mtppo, ppo"),
+    ]
+    for flags, text in wrong:
+        assert text in told(capsys, *RUN, *flags, "--run-dir", sets / "bad", code=2)
+    assert "Name the class" in told(capsys, "record", "demonstrations", code=2)
+    assert "--shift must lie in" in told(capsys, *RECORD, "--shift", "1", code=2)
+    assert not (sets / "bad").exists()

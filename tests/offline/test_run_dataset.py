@@ -1,0 +1,143 @@
+"""bidex-meta run --dataset, from recording to evaluation; data sets in the form of a world."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box
+
+from bidex_meta.cli import main
+from bidex_meta.data import Dataset, open_dataset
+from bidex_meta.data.joined import join
+from bidex_meta.data.writer import DatasetWriter, begin, finish
+from bidex_meta.errors import BidexError
+from bidex_meta.record import RunFolder
+from bidex_meta.sources.source import OwnSuite
+from tests.algos.problems import opposite_bandits
+from tests.data.worlds import rough
+from tests.offline.stored import noisy, played
+
+pytest.importorskip("h5py", reason="needs the extra data")
+
+FEW = ["--num-envs", "6", "--threads", "1", "--device", "cpu"]
+SMALL = ["--threads", "1", "--device", "cpu", "--learner.hidden", "8", "--learner.updates-per-iteration", "10"]
+SMALL += ["--learner.batch-size", "16", "--logger", "none"]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("BIDEX_DATA", str(tmp_path / "sets"))
+    make = lambda source, split="train", rows=None, mode="DISABLED": rough(rows or 6, mode, seed=source.seed)  # noqa: E731
+    monkeypatch.setattr(OwnSuite, "world", make)
+    return tmp_path
+
+
+def told(capsys: pytest.CaptureFixture[str], *words: object, code: int = 0) -> str:
+    capsys.readouterr()
+    try:
+        assert main([str(word) for word in words]) == code
+    except SystemExit as end:
+        assert end.code == code
+    out = capsys.readouterr()
+    return out.out + out.err
+
+
+def test_a_run_on_data_sets_is_evaluated_resumed_and_reported(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for kind, seed in (("a", 0), ("b", 5)):
+        more = ["--size", "150", "--seed", seed, "--out", folder / "sets" / f"{kind}-v0"]
+        told(capsys, "record", "random", "--suite", "mt4", *FEW, *more)
+    run = ["run", "--dataset", "a-v0", "--dataset", folder / "sets" / "b-v0", "--algo", "iql", "--seed", "3", *SMALL]
+    whole, halves = folder / "whole", folder / "halves"
+    said = told(capsys, *run, "--steps", "40", "--evaluate-every", "2", "--run-dir", whole, "--episodes", "1")
+    assert "Reading 3" in said and "Evaluating" in said
+    assert "--dataset is ['a-v0'," in told(
+        capsys, "run", "--algo", "iql", "--resume", whole, "--dataset", "a-v0", code=2
+    )
+    told(capsys, *run, "--steps", "20", "--run-dir", halves, "--no-evaluate")
+    told(capsys, "run", "--resume", halves, "--steps", "40", "--no-evaluate")
+    config = RunFolder.open(whole).config()
+    assert (config["suite"], config["task"], config["task_seed"], config["num_envs"]) == ("MT4", None, 0, 4)
+    assert config["dataset"] == ["a-v0", str((folder / "sets" / "b-v0").resolve())]
+    a, b = (RunFolder.open(name).checkpoints.load()[0]["learner"] for name in (whole, halves))
+    for name, weight in a["policy"]["weights"].items():
+        assert torch.equal(weight, b["policy"]["weights"][name])
+    lines = [json.loads(line) for line in (whole / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [10, 20, 30, 40]
+    assert ["Eval/mean_return" in line for line in lines] == [False, True, False, True]
+    assert "iql" in told(capsys, "compare", whole)
+    told(capsys, "plot", whole, "--out", folder / "curves.png")
+    assert (folder / "curves.png").stat().st_size > 5000
+    told(capsys, "report", whole, "--out", folder / "report.html")
+
+
+def test_what_does_not_go_together_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    told(capsys, "record", "random", "--suite", "MT4", *FEW, "--size", "60")
+    data = ["--dataset", "MT4/random-v0"]
+    assert "Add --dataset NAME" in told(capsys, "run", "--suite", "MT4", "--algo", "bc", code=2)
+    assert "goes with bc, bcq, td3bc, iql" in told(capsys, "run", *data, "--algo", "mtppo", code=2)
+    assert "nothing to record" in told(capsys, "run", *data, "--algo", "bc", "--record", "10", code=2)
+    assert "Unknown data set 'MT4/rand-v0'. Did you mean" in told(
+        capsys, "run", "--dataset", "MT4/rand-v0", "--algo", "bc", code=2
+    )
+    assert "MT4/random-v0 shows goals, ML4 hides" in told(
+        capsys, "run", *data, "--suite", "ML4", "--algo", "bc", code=2
+    )
+    assert "--dataset" in told(capsys, "run", "--algo", "bc", "--help")
+    assert not (folder / "runs").exists()
+
+
+def stored(folder: Path, name: str, episodes: list[Any], tasks: list[str], **about: Any) -> Dataset:
+    """A data set of some episodes."""
+    begin(folder / name, {"kind": "test"})
+    writer = DatasetWriter(folder / name)
+    for episode in episodes:
+        writer.add(episode)
+    writer.commit()
+    writer.close()
+    shapes = episodes[0].observations.shape[1], episodes[0].actions.shape[1]
+    spaces = [Box(-np.inf, np.inf, (size,), np.float32) for size in shapes]
+    finish(folder / name, "toy/test-v0", *spaces, {"tasks": tasks, "kind": "test", **about})
+    return open_dataset(folder / name)
+
+
+def alone(slot: int, size: int) -> list[Any]:
+    """Episodes of one of two bandits as if recorded alone: so many entries, no one-hot."""
+    world = opposite_bandits(rows=2)
+    found = [e for e in played(world, noisy(lambda obs: torch.zeros(len(obs), 2), 0.3), 9) if e.task == slot]
+    for episode in found:
+        object.__setattr__(episode, "task", 0)
+        object.__setattr__(episode, "observations", np.repeat(episode.observations[:, :1], size, 1))
+    return found
+
+
+def test_classes_recorded_alone_get_padding_one_hot_and_scale(tmp_path: Path) -> None:
+    both, world = [alone(0, 1), alone(1, 3)], opposite_bandits(rows=2)
+    world.single_observation_space = Box(-np.inf, np.inf, (5,), np.float32)  # 3 and the one-hot
+    world.slots = [SimpleNamespace(name=f"task{i}", reward_scale=2.0) for i in (0, 1)]  # type: ignore
+    sets = [
+        stored(tmp_path, f"{i}-v0", both[i], [f"task{i}"], reward_scales={f"task{i}": 4.0 * i + 1.0}) for i in (0, 1)
+    ]
+    data = join(sets, world)
+    start = 0
+    for slot, episodes in enumerate(both):
+        for episode in episodes:
+            for t in range(len(episode)):
+                padded = np.zeros(5, np.float32)
+                padded[: 1 + 2 * slot], padded[3 + slot] = episode.observations[t], 1.0
+                assert data.observations[data.at[start]].numpy() == pytest.approx(padded)
+                assert data.observations[data.at[start] + 1][0] == float(episode.observations[t + 1][0])
+                assert float(data.rewards[start]) == pytest.approx(episode.rewards[t] * 2.0 / (4.0 * slot + 1.0))
+                assert (int(data.task[start]), int(data.left[start])) == (slot, len(episode) - 1 - t)
+                start += 1
+    assert start == len(data)
+    with pytest.raises(BidexError, match="found none of task1"):
+        join(sets[:1], world)
+    world.single_action_space = Box(-1, 1, (7,), np.float32)
+    with pytest.raises(BidexError, match="has 2 actions, the world 7"):
+        join(sets, world)
+    with pytest.raises(BidexError, match="entries beside the task id"):
+        join(sets, opposite_bandits(rows=2))
