@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, cast
 import numpy as np
 
 from bidex_meta.errors import BidexError, shortened, unknown_name
-from bidex_meta.memory import ROW_BYTES, check_memory
+from bidex_meta.memory import POINT_BYTES, ROW_BYTES, check_memory
 from bidex_meta.outside import name_with_object
 from bidex_meta.suite import SPLITS, ListedTask, Split, Suite, SuiteClass, load_suite
 from bidex_meta.tasks import registry
@@ -197,6 +197,7 @@ class Benchmark:
             observation=self.suite.observation,
             pad_to=self.padded_size,
             task_sampling="fixed" if evaluation or self.suite.kind == "meta" else "uniform",
+            points=(self.suite.points, self.suite.point_kinds),
         )
 
     def _draw(self, entry: SuiteClass, split: Split) -> list[Task]:
@@ -251,6 +252,7 @@ def make_task_world(
     moving_base: bool | None = None,
     engine: str = "auto",
     stagger: bool = True,
+    points: int = 0,
     object: str | None = None,
 ) -> "World":
     """A world of one class as it is on its own: goal visible, no one-hot, no padding, 50 tasks drawn by the seed.
@@ -268,8 +270,8 @@ def make_task_world(
         moving_base: Drive the hands' bases or fix them; left out, as the class has it on its own.
         engine: As in `Benchmark.make_world`.
         stagger: As in `Benchmark.make_world`.
-        object: What the class has in the place of its own object: a name, or the path of an MJCF file
-            (docs/objects.md); its slot is then called e.g. `CatchUnderarm-block`.
+        points: Points of the cloud shown in the place of the object's state (docs/points.md); 0: the state.
+        object: In the place of its own: a name, or an MJCF file (docs/objects.md); in the slot's name behind a dash.
 
     Raises:
         BidexError: Unknown class or object, too few rows, an unknown mode, device or engine.
@@ -295,6 +297,7 @@ def make_task_world(
         observation="plain",
         pad_to=None,
         task_sampling=task_sampling,
+        points=(points, False),
     )
 
 
@@ -311,8 +314,9 @@ def _make_world(
     observation: Literal["plain", "one-hot", "masked"],
     pad_to: int | None,
     task_sampling: TaskSampling,
+    points: tuple[int, bool],
 ) -> "World":
-    from bidex_meta.world import World
+    from bidex_meta.world import PointsRule, World
     from bidex_meta.world.autoreset import checked_mode
 
     place = _checked_device(device)
@@ -322,7 +326,7 @@ def _make_world(
         names = ", ".join(slot.name for slot in slots)
         raise BidexError(f"num_envs: expected at least {len(slots)}, a row each for {names}; got {num_envs!r}.")
     if place.type == "cpu":
-        check_memory(int(num_envs) * ROW_BYTES, f"{num_envs:,} rows", "Lower num_envs.")
+        check_memory(int(num_envs) * (ROW_BYTES + points[0] * POINT_BYTES), f"{num_envs:,} rows", "Lower num_envs.")
     keep_freed_memory()
     return World(
         slots,
@@ -336,6 +340,7 @@ def _make_world(
         threads=threads,
         engine=engine,
         stagger=stagger,
+        points=PointsRule(*points) if points[0] else None,
     )
 
 

@@ -8,6 +8,9 @@ from bidex_meta.errors import BidexError
 ROW_BYTES = 500_000
 """Of a row of a world on the CPU: measured 0.39 MB on MT4 and 0.48 on MT20, with 1000 rows each."""
 
+POINT_BYTES = 100
+"""Of a point of a row's cloud: calculated, in the observation, its copies in a step's info and what makes them."""
+
 
 def available() -> int | None:
     """Bytes that can still be had, by the system and by the container's limit; None where neither is told."""

@@ -21,6 +21,8 @@ Split = Literal["train", "test"]
 SPLITS: tuple[Split, Split] = ("train", "test")
 _LARGEST = 1_000_000
 """Of any number in a suite file: metres, radians, tasks; beyond it nothing is meant."""
+MOST_POINTS = 16_384
+"""Of a cloud: more than a coarse image has pixels are no finer."""
 _LONGEST_TEXT, _MOST_TABLES = 500, 1000
 
 
@@ -82,6 +84,10 @@ class Suite:
     """In the order of rows, one-hot and task lists."""
     file: Path
     """Where it was read from."""
+    points: int = 0
+    """Points of the cloud that observations show in the place of objects' states; 0: they show the states."""
+    point_kinds: bool = False
+    """Whether each point tells what it is of."""
 
     @property
     def splits(self) -> tuple[Split, ...]:
@@ -116,6 +122,7 @@ def load_suite(name_or_path: str | Path) -> Suite:
 def _parse(file: Path) -> Suite:
     content = read_toml(file, "a suite file")
     table = _Table(file, "", content)
+    points, kinds = _parse_points(table.table("points", "{ count = 768 }")) if "points" in content else (0, False)
     suite = Suite(
         name=table.text("name"),
         version=table.count("version"),
@@ -128,10 +135,20 @@ def _parse(file: Path) -> Suite:
         tasks_per_class=table.count("tasks_per_class") if "tasks_per_class" in content else None,
         classes=tuple(entry for each in table.tables("classes") for entry in _parse_classes(each)),
         file=file,
+        points=points,
+        point_kinds=kinds,
     )
     table.finish()
     _check(suite, table)
     return suite
+
+
+def _parse_points(table: "_Table") -> tuple[int, bool]:
+    count, kinds = table.count("count") if "count" in table.content else 768, table.flag("kinds", default=False)
+    table.finish()
+    if count > MOST_POINTS:
+        raise table.error("count", f"a whole number of at most {MOST_POINTS:,}", count)
+    return count, kinds
 
 
 def _parse_classes(table: "_Table") -> list[SuiteClass]:
@@ -286,6 +303,12 @@ class _Table:
             raise self.error(key, f"a whole number of at most {_LARGEST:,}", value)
         return value
 
+    def flag(self, key: str, default: bool) -> bool:
+        value = self._get(key, "true or false", default)
+        if not isinstance(value, bool):
+            raise self.error(key, "true or false", value)
+        return value
+
     def number(self, key: str, default: float = _REQUIRED) -> float:
         value = self._get(key, "a number", default)
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
@@ -294,10 +317,10 @@ class _Table:
             raise self.error(key, f"a number within +-{_LARGEST:,}", value)
         return float(value)
 
-    def table(self, key: str) -> "_Table":
+    def table(self, key: str, example: str = "{ goal_x = 0.0 }") -> "_Table":
         value = self._get(key, "a table", _REQUIRED)
         if not isinstance(value, dict):
-            raise self.error(key, "a table such as { goal_x = 0.0 }", value)
+            raise self.error(key, f"a table such as {example}", value)
         return _Table(self.file, f"{self._prefix}{key}.", value)
 
     def tables(self, key: str, default: Any = _REQUIRED) -> list["_Table"]:

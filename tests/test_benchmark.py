@@ -150,6 +150,7 @@ def test_what_a_world_is_asked_for(
         "threads": 2,
         "engine": "auto",
         "stagger": True,
+        "points": None,
     }
 
 

@@ -18,6 +18,7 @@ ORDER = (
     ("paths", "maths", "agents", "drawing", "reading", "fields", "memory", "outside"),
     ("engine", "record", "hands", "suite"),
     ("tasks",),
+    ("points",),
     ("world",),
     ("envs",),
     ("evaluation", "benchmark", "train"),

@@ -44,3 +44,12 @@ def rising(config: Any, *names: str) -> None:
         low, high = getattr(config, name)
         if not 0.0 < low <= high:
             raise BidexError(f"{config.algo}: {name} must be two rising positive numbers, got {low} {high}.")
+
+
+def widths(config: Any, *names: str) -> None:
+    """Refuses layers that are none, or of no width."""
+    for name in names:
+        if not getattr(config, name) or min(getattr(config, name)) < 1:
+            raise BidexError(
+                f"{config.algo}: {name} must be one or more widths of at least 1, got {getattr(config, name)}."
+            )

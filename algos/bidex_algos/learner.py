@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from bidex_algos.experience.rollout import check_autoreset
 from bidex_algos.nets.encoders.inputs import Inputs
+from bidex_algos.nets.encoders.point_net import with_point_net
 from bidex_algos.nets.encoders.task_embedding import with_task_embedding
 from bidex_algos.nets.shape import Shape
 from bidex_algos.reports import check_finite
@@ -105,7 +106,7 @@ class Learner(ABC):
     @classmethod
     def _inputs(cls, config: Any, shape: Shape) -> Inputs:
         """How its networks read an observation: the place for encoders of its groups."""
-        return with_task_embedding(Inputs(shape.groups), cls._embedded(config, shape))
+        return with_task_embedding(with_point_net(Inputs(shape.groups), config), cls._embedded(config, shape))
 
     @staticmethod
     def _embedded(config: Any, shape: Shape) -> int:

@@ -3,6 +3,7 @@
 from bidex_meta.bench.adapters import clients
 from bidex_meta.bench.against import world_against
 from bidex_meta.bench.capacity import capacity
+from bidex_meta.bench.clouds import points
 from bidex_meta.bench.gpu import gpu, kernels
 from bidex_meta.bench.others import field
 from bidex_meta.bench.physics import stability
@@ -16,6 +17,7 @@ __all__ = [
     "gpu",
     "kernels",
     "mixing",
+    "points",
     "scaling",
     "soak",
     "stability",

@@ -29,6 +29,7 @@ _KINDS = (
     "adapt",
     "multiagent",
     "clients",
+    "points",
 )
 
 
@@ -43,12 +44,13 @@ class BenchFlags:
     """world, scaling, mixing, stability, capacity, gpu, kernels; soak: memory, speed and broken rows of a world that is
     stepped for long; field: beside Meta-World and gymnasium-robotics; learner: MT-PPO's update against rsl-rl-lib's;
     adapt: all tasks' adaptation at once against a loop over them; multiagent: training of learners of several agents
-    beside MT-PPO's, in turns; clients: another library's PPO through its adapter against the world's own loop."""
+    beside MT-PPO's, in turns; clients: another library's PPO through its adapter against the world's own loop; points:
+    a world that shows point clouds beside the same that shows states."""
     suite: str | None = None
     """Suite to measure: by default world and scaling take MT4, mixing, soak, gpu and kernels MT20, the others every
     class."""
     task: str | None = None
-    """For stability, capacity, clients and multiagent: this task class alone."""
+    """For stability, capacity, clients, multiagent and points: this task class alone."""
     client: str | None = None
     """For clients: sb3 or rsl-rl."""
     tasks: tuple[str, ...] | None = None
@@ -70,6 +72,8 @@ class BenchFlags:
     out: Path | None = None
     """For gpu, soak and world --against: file that takes each row of the table as it is measured; what is in it
     already, gpu does not measure again."""
+    count: int | None = None
+    """For points: points of a cloud."""
     num_envs: int | None = None
     """Rows stepped together; for this and the flags below None leaves the measurement its default."""
     steps: StepCount | None = None

@@ -123,6 +123,7 @@ _BOUNDS = {
     "port": (1, 65_535),
     "size": (0, 10**12),
     "record": (0, 10**12),
+    "points": (0, 16_384),
 }
 """Least and most of whole numbers by the name of their flag; a resumed run may have more threads than cores."""
 _OTHERS = (1, 1_000_000)

@@ -161,6 +161,7 @@ def looked_at(policy: str, suite: str | None, task: str | None, seed: int, thing
     if policy not in ("zero", "random"):
         stored = RunFolder.open(Path(policy)).config()
         config |= {"suite": suite or stored["suite"], "base": stored.get("base", "own")}
+        config |= {"points": stored.get("points", 0)}
         config |= {"task": task or stored["task"], "object": thing if task or thing else stored.get("object")}
     if config["suite"] is None and config["task"] is None:
         raise BidexError("Name what to show: a run folder, --task TASK or --suite SUITE.")

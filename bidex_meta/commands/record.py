@@ -175,8 +175,8 @@ def _config(flags: RecordFlags) -> dict[str, Any]:
 
     if flags.runs:
         stored = [RunFolder.open(run).config() for run in flags.runs]
-        names = ("suite", "task", "base", "object", "seed")
-        found = [{name: each.get(name, "own" if name == "base" else None) for name in names} for each in stored]
+        names = ("suite", "task", "base", "object", "points", "seed")
+        found = [{name: each.get(name, {"base": "own", "points": 0}.get(name)) for name in names} for each in stored]
         if differ := [name for name in names if found[0][name] != found[-1][name]]:
             raise BidexError(
                 f"The two runs differ in {differ[0]}: {found[0][differ[0]]} and {found[-1][differ[0]]}. Name runs on "

@@ -52,6 +52,9 @@ class RenderFlags:
     """Pixels, likewise; None: three quarters of the width."""
     camera: str | None = None
     """front, side, top or back; None: front."""
+    points: Switch = False
+    """Beside each picture the point cloud of the class's depth camera, seen from there and from the side; as many
+    points as the run's observations have, else 768."""
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -88,11 +91,24 @@ def main(arguments: Sequence[str]) -> None:
     # One row for each slot is enough to see one of them.
     world = source.world("train", len(slots))
     agent = acting(policy, world, flags.seed, flags.checkpoint)
+    if flags.points:
+        world = _seen(world)
     rows = list(range(len(slots))) if flags.tiled else [world.slot_rows[slots.index(str(task))].start]
     look = {"width": width, "height": height, "camera": flags.camera}
     _write(out, _frames(flags, agent, world, rows, every if suffix != ".png" else None, look), every)
     world.close()
     print(out)
+
+
+def _seen(world: Any) -> Any:
+    """The world with clouds in its pictures."""
+    from bidex_meta.evaluation.seen import SeenWorld
+    from bidex_meta.points.sight import PointsRule
+    from bidex_meta.world import World
+
+    if not isinstance(world, World):
+        raise BidexError("Point clouds are made of scenes of our own, not of Meta-World's. Leave --points out.")
+    return SeenWorld(world, (world.points or PointsRule()).count)
 
 
 def _out(flags: RenderFlags, policy: str) -> Path:

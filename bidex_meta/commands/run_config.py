@@ -18,10 +18,11 @@ from bidex_meta.commands.learners import LearnerKind, choose_preset, learner_kin
 from bidex_meta.commands.parsing import StepCount, Switch, parse, peek
 from bidex_meta.data import part_files
 from bidex_meta.errors import BidexError, one_line
-from bidex_meta.memory import ROW_BYTES, check_memory
+from bidex_meta.memory import POINT_BYTES, ROW_BYTES, check_memory
 from bidex_meta.reading import expanded
 from bidex_meta.record.folder import RunFolder, flat
 from bidex_meta.sources import Source
+from bidex_meta.suite import MOST_POINTS
 from bidex_meta.train.launch import launch, resume_command
 
 _MAY_CHANGE = ("steps", "minutes", "evaluate_every", "video_every", "logger", "stop_at_return", "stop_at_score")
@@ -43,6 +44,9 @@ class RunFlags:
     base: Literal["own", "moving", "fixed"] = "own"
     """With --task: whether the hands' bases move; own: as the class has it alone. Suites move them, HandOver alone
     does not."""
+    points: int = 0
+    """Points of the cloud that observations show in the place of objects' states, as a depth camera would (768 in the
+    original; docs/points.md); 0: the states, or what the suite's file says."""
     object: str | None = None
     """With --task: what is thrown in the place of the class's own object: a name of the shelf or the path of an MJCF
     file (docs/objects.md)."""
@@ -141,7 +145,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     folder = RunFolder.open(Path(resume)) if resume else None
     # What older runs did not know.
     older = {"engine": "auto", "base": "own", "start_from": None, "minutes": None, "object": None}
-    older |= {"evaluate_every": None, "video_every": None, "logger": "tensorboard"}
+    older |= {"points": 0, "evaluate_every": None, "video_every": None, "logger": "tensorboard"}
     older |= {"record": 0, "record_share": 0.0, "stop_at_return": None, "stop_at_score": None}
     older |= {"dataset": [], "task_seed": None, "demonstrations": None}
     stored = {**older, **folder.config("learner", "num_envs", "steps")} if folder else {}
@@ -209,6 +213,8 @@ def _resolved(
         value = getattr(flags, name)
         if value is not None and value < 1:
             raise BidexError(f"--{name.replace('_', '-')} must be at least 1, not {value}.")
+    if not 0 <= flags.points <= MOST_POINTS:
+        raise BidexError(f"--points must be a whole number from 0 to {MOST_POINTS:,}, not {flags.points}.")
     if flags.minutes is not None and not 0.0 < flags.minutes < math.inf:
         raise BidexError(f"--minutes must be a number above 0, such as 4 or 0.5, not {flags.minutes:g}.")
     if flags.stop_at_score is not None and flags.evaluate_every is None:
@@ -224,6 +230,7 @@ def _resolved(
         "suite": suite,
         "task": names["source"] if flags.task else None,
         "base": flags.base,
+        "points": flags.points,
         "object": _placed(flags.object),
         "start_from": None if flags.start_from is None else str(expanded(flags.start_from).resolve()),
         "algo": names["algo"],
@@ -262,8 +269,8 @@ _WIDTH = 1200
 def _check_memory(flags: Any) -> None:
     """Refuses a world, and what the learner says it holds (``bytes_held``), that this machine has no room for."""
     held = getattr(flags.learner, "bytes_held", None)
-    of_learner = 0 if held is None else held(flags.num_envs, _WIDTH)
-    needed = launch().local_count * (flags.num_envs * ROW_BYTES + of_learner)
+    of_learner = 0 if held is None else held(flags.num_envs, _WIDTH + 3 * flags.points)
+    needed = launch().local_count * (flags.num_envs * (ROW_BYTES + flags.points * POINT_BYTES) + of_learner)
     told = f"--num-envs {flags.num_envs} ({of_learner / 1e9:,.1f} GB of it the learner's)"
     check_memory(needed, told, "Lower it, or the learner's layers, steps or replay.")
 

@@ -67,6 +67,7 @@ class CpuEngine:
         self._quaternions = self._quaternion_columns(models[0])
         self._models, self._model_of = list(models), list(rows)
         self._probe: mujoco.MjData | None = None
+        self._poses: tuple[Tensor, Tensor] | None = None
 
     def _quaternion_columns(self, model: mujoco.MjModel) -> Tensor:
         """Columns of the batch's numbers that hold quaternions, four for each, shape (4 k,)."""
@@ -126,6 +127,12 @@ class CpuEngine:
         if not self._mocap:
             return self.qpos.clone()
         return torch.cat((self.qpos, torch.cat(self._mocap, dim=2).flatten(1)), dim=1)
+
+    def body_poses(self) -> tuple[Tensor, Tensor]:
+        """Where all bodies stand: positions (num, nbody, 3) and rotation matrices (num, nbody, 3, 3)."""
+        if self._poses is None:  # each field that is bound is copied out after every step
+            self._poses = self._bind("xpos"), self._bind("xmat").unflatten(2, (3, 3))
+        return self._poses
 
     def reset(self, mask: Tensor, start: Tensor) -> None:
         """Starts the simulations of a mask anew, at rest, at given positions (one row per true entry).

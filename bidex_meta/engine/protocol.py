@@ -49,6 +49,14 @@ class Engine(Protocol):
         """What ``reset`` takes, of every simulation as it stands, a copy. Shape (num, nq + 7 nmocap)."""
         ...
 
+    def body_poses(self) -> tuple[Tensor, Tensor]:
+        """Where all bodies stand, of the state that sensors describe: views that each step writes anew.
+
+        Returns:
+            Positions (num, nbody, 3), metres, and rotation matrices (num, nbody, 3, 3), world frame.
+        """
+        ...
+
     def unstable(self) -> Tensor:
         """Which simulations broke (numbers out of bounds or not finite, no room for contacts) since their last reset.
 

@@ -155,6 +155,10 @@ class WarpEngine:
             return self.qpos.clone()
         return torch.cat((self.qpos, torch.cat(self._mocap, dim=2).flatten(1)), dim=1)
 
+    def body_poses(self) -> tuple[Tensor, Tensor]:
+        """Where all bodies stand: positions (num, nbody, 3) and rotation matrices (num, nbody, 3, 3)."""
+        return wp.to_torch(self._d.xpos), wp.to_torch(self._d.xmat)
+
     def reset(self, mask: Tensor, start: Tensor) -> None:
         """Starts the simulations of a mask anew, at rest, at given positions.
 

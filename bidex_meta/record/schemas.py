@@ -13,6 +13,7 @@ CONFIG = {
     "suite": TEXT.or_none(),
     "task": TEXT.or_none(),
     "base": choice("own", "moving", "fixed"),
+    "points": whole(0),
     "object": TEXT.or_none(),
     "start_from": TEXT.or_none(),
     "algo": TEXT,

@@ -32,6 +32,8 @@ class MetaWorldSuite(Source):
     def __init__(self, name: str, config: Mapping[str, Any]) -> None:
         super().__init__(name, config)
         self.class_names = class_names(name)
+        if self.points:
+            raise BidexError(f"Point clouds are made of scenes of our own, got the suite {name}. Leave --points out.")
 
     def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> "PooledWorld":
         """As in ``Source``."""

@@ -5,6 +5,7 @@ Opening reads a suite file at most; torch and physics are imported when a world 
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
@@ -33,8 +34,8 @@ class Source(ABC):
     Args:
         name: How the user calls it: a suite's name or path, or a task class.
         config: A run's config, or a part of one; read are ``seed`` (0), ``task_seed`` (None: ``seed``),
-            ``device`` (cpu, of this very process), ``threads`` (None: one per core), ``engine`` (auto) and, by a single
-            class, ``base`` (own) and ``object`` (None: its own).
+            ``device`` (cpu, of this very process), ``threads`` (None: one per core), ``engine`` (auto), ``points`` (0:
+            as the suite says) and, by a single class, ``base`` (own) and ``object`` (None: its own).
     """
 
     hides_goals: bool = False
@@ -53,6 +54,7 @@ class Source(ABC):
         self.device: str = config.get("device", "cpu")
         self.threads: int | None = config.get("threads")
         self.engine: str = config.get("engine", "auto")
+        self.points: int = config.get("points", 0)
 
     @staticmethod
     def open(config: Mapping[str, Any]) -> "Source":
@@ -155,7 +157,8 @@ class OwnSuite(Source):
 
     def __init__(self, name: str, config: Mapping[str, Any]) -> None:
         super().__init__(name, config)
-        self.suite = load_suite(name)
+        suite = load_suite(name)
+        self.suite = replace(suite, points=self.points) if self.points else suite
         self.hides_goals = self.suite.kind == "meta"
 
     @cached_property
@@ -163,7 +166,7 @@ class OwnSuite(Source):
         """The suite with its classes and the tasks that the config's seed draws."""
         from bidex_meta.benchmark import Benchmark
 
-        return Benchmark(self.name, seed=self.seed)
+        return Benchmark(self.suite, seed=self.seed)
 
     def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> "PooledWorld":
         """As in ``Source``."""
@@ -220,6 +223,7 @@ class SingleClass(Source):
             self.threads,
             moving_base=self.moving_base,
             engine=self.engine,
+            points=self.points,
             object=self.object,
         )
 

@@ -75,6 +75,8 @@ class TaskClass(ABC):
             not measured has the largest of all.
         camera_target: Point that pictures look at, world, metres.
         camera_distance: Distance of the camera from it, metres.
+        depth_camera: Where the camera of point clouds stands and what it looks at, world, metres; None: it looks down
+            at ``camera_target`` from the front.
     """
 
     name: ClassVar[str]
@@ -93,6 +95,7 @@ class TaskClass(ABC):
     needs: Capacity = Capacity(71, 20, 134)
     camera_target: ClassVar[tuple[float, float, float]] = (0.0, -0.58, 0.5)
     camera_distance: ClassVar[float] = 1.15
+    depth_camera: ClassVar[tuple[tuple[float, float, float], tuple[float, float, float]] | None] = None
 
     def __init__(self, moving_base: bool | None = None) -> None:
         """Chooses the base.

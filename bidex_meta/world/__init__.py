@@ -1,6 +1,7 @@
 """The batched world: groups of equal structure, actions, observations, resets, episodes, random numbers."""
 
+from bidex_meta.points.sight import PointsRule
 from bidex_meta.world.groups import Slot
 from bidex_meta.world.world import World
 
-__all__ = ["Slot", "World"]
+__all__ = ["PointsRule", "Slot", "World"]

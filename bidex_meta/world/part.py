@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.maths import xyzw
+from bidex_meta.points.sight import Sight
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.world.actions import Controls
@@ -23,7 +24,9 @@ class Part:
         start_size: Numbers of a start: ``qpos`` and the poses of movable fixtures.
     """
 
-    def __init__(self, group: Group, slots: list[Slot], rule: Rule, width: int, num_envs: int) -> None:
+    def __init__(
+        self, group: Group, slots: list[Slot], rule: Rule, width: int, num_envs: int, sights: list[Sight] | None = None
+    ) -> None:
         """Prepares controls and observers.
 
         Args:
@@ -32,6 +35,7 @@ class Part:
             rule: What observations show.
             width: Entries of an observation with padding and task id.
             num_envs: Rows of the world.
+            sights: What rows of each of the world's slots see of objects; None: their state.
         """
         device = group.engine.device
         self.engine_rows = torch.full((num_envs,), -1, device=device)
@@ -43,6 +47,9 @@ class Part:
         self._start = torch.stack([torch.from_numpy(m.scene.start_qpos) for m in group.members]).to(group.engine.qpos)
         self.start_size = self._start.shape[1]
         self._observer = Observer(group.members[0].scene, self._start_mounts(), width)
+        self._sights = sights
+        if sights is not None:
+            group.engine.body_poses()  # from now on the engine gives them
         self._pools: list[dict[str, Tensor]] = []
         self.set_pools(slots)
 
@@ -124,6 +131,11 @@ class Part:
             for member, where, state in states:
                 for name, block in member.scene.task.observe(state).items():
                     values[where, self._observer.layout.range(name)] = block.float()
+        if self._sights is not None:
+            position, rotation = self._engine.body_poses()
+            for member, where, _ in states:
+                own = member.engine_rows if rows is None else rows[where]
+                self._sights[member.slot].show(values[where], position[own], rotation[own])
         return clip(values)
 
     def starts(self, rows: Tensor | None, draws: Tensor, task_index: Tensor) -> Tensor:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from bidex_meta.engine.choice import choose_engine
 from bidex_meta.errors import BidexError, whole_number
+from bidex_meta.points.sight import PointsRule
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.layout import CLIP
 from bidex_meta.world import actions, checked
@@ -25,7 +26,7 @@ from bidex_meta.world.autoreset import checked_mode, checked_seed, reset_mask
 from bidex_meta.world.copying import Recreated
 from bidex_meta.world.ends import Clock, ended_info
 from bidex_meta.world.episodes import Episodes
-from bidex_meta.world.groups import Slot, build_groups, split_rows, with_pool, with_pools
+from bidex_meta.world.groups import Group, Slot, build_groups, sights, split_rows, with_pool, with_pools
 from bidex_meta.world.observation_groups import observation_groups
 from bidex_meta.world.observations import Rule
 from bidex_meta.world.overlap import SideBySide
@@ -70,6 +71,7 @@ class World(Recreated, RowAttributes, VectorEnv):
         task_sampling: str = "fixed",
         threads: int | None = None,
         stagger: bool = True,
+        points: PointsRule | None = None,
     ) -> None:
         """Builds the world; no row is started before ``reset``.
 
@@ -87,6 +89,7 @@ class World(Recreated, RowAttributes, VectorEnv):
             threads: Engine threads; None takes all CPUs. Trajectories do not depend on it.
             stagger: In SAME_STEP mode the first episodes begin at random elapsed steps, so that rows do not end
                 together; these shortened ones do not count in ``episode``. False: they begin at 0.
+            points: Show a point cloud before the task id, and of objects nothing else; None: their state.
 
         Raises:
             BidexError: Fewer rows than slots, unknown device, engine, mode or sampling, or too narrow a padding.
@@ -111,8 +114,9 @@ class World(Recreated, RowAttributes, VectorEnv):
         self._scale = self._of_rows([slot.reward_scale for slot in slots]).float()
         self._uniform_tasks = task_sampling == "uniform"
         groups = build_groups(self.slots, self.slot_rows, make_engine)
-        self._make_spaces(observation, pad_to)
-        self.parts = [Part(g, self.slots, observation, self.observation_size, num_envs) for g in groups]
+        self.points = points
+        self._make_spaces(observation, pad_to, points, groups)
+        self.parts = [Part(g, self.slots, observation, self.observation_size, num_envs, self._sights) for g in groups]
         self._masked = groups[0].engine.masked
         self._side_by_side = SideBySide(len(groups), self.device)
         captured = self.device.type == "cuda" and self.autoreset_mode == AutoresetMode.SAME_STEP
@@ -131,7 +135,9 @@ class World(Recreated, RowAttributes, VectorEnv):
         """A number of each slot as one of each row, shape (num_envs,)."""
         return torch.tensor(of_slots, device=self.device)[self.task_id]
 
-    def _make_spaces(self, observation: Rule, pad_to: int | None) -> None:
+    def _make_spaces(
+        self, observation: Rule, pad_to: int | None, points: PointsRule | None, groups: list[Group]
+    ) -> None:
         widest = max(slot.task_class.observation_size for slot in self.slots)
         self._width = widest if pad_to is None else pad_to
         if whole_number("pad_to", self._width, 0, _MOST_COLUMNS) < widest:
@@ -139,9 +145,12 @@ class World(Recreated, RowAttributes, VectorEnv):
         self.action_size = max(slot.task_class.action_size for slot in self.slots)
         self.num_id_columns = self.num_tasks if observation == "one-hot" else 0
         self._one_hot = torch.eye(self.num_tasks, device=self.device)[self.task_id]
-        self.observation_size = self._width + self.num_id_columns
         layouts = [slot.task_class.layout for slot in self.slots]
-        self.observation_groups = observation_groups(layouts, self._width, self.num_id_columns)
+        self._sights = None if points is None else sights(groups, points, self._width)
+        hidden = None if self._sights is None else [sight.hidden for sight in self._sights]
+        cloud = None if points is None else (points.group, points.entries)
+        self.observation_groups = observation_groups(layouts, self._width, self.num_id_columns, hidden, cloud)
+        self.observation_size = sum(group.size for group in self.observation_groups)
         single = Box(-CLIP, CLIP, (self.observation_size,), np.float32)
         spaces = make_spaces(single, self.action_size, self.num_envs)
         self.single_observation_space, self.single_action_space = spaces.single_observation, spaces.single_action
@@ -252,7 +261,7 @@ class World(Recreated, RowAttributes, VectorEnv):
     def _with_id(self, obs: Tensor, world_rows: Tensor) -> Tensor:
         """Writes the one-hot task id into observations of the given rows."""
         if self.num_id_columns:
-            obs[:, self._width :] = self._one_hot[world_rows]
+            obs[:, -self.num_id_columns :] = self._one_hot[world_rows]
         return obs
 
     def step(self, action: Tensor | np.ndarray) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from bidex_algos.nets.encoders.columns import Columns
 from bidex_algos.nets.encoders.inputs import Inputs
+from bidex_algos.nets.encoders.point_net import with_point_net
 from bidex_algos.nets.encoders.task_embedding import with_task_embedding
 from bidex_algos.nets.networks import MLP, stacked_forward
 from bidex_meta.world.agent_views import AgentView
@@ -53,7 +54,7 @@ class Team(nn.Module):
                 continue
             if share and len(family) > 1:
                 inputs = inputs.extended("agent", len(family))
-            inputs = with_task_embedding(inputs, config.task_embedding)
+            inputs = with_task_embedding(with_point_net(inputs, config), config.task_embedding)
             self.net_of[i] = len(made)
             made.append(MLP(inputs, config.hidden, outputs[i], output_gain, generator, config.activation))
         self.nets = nn.ModuleList(made)

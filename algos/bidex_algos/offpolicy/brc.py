@@ -16,6 +16,7 @@ from torch import Tensor
 from bidex_algos.experience.advantages import discounts
 from bidex_algos.experience.replay import Transitions
 from bidex_algos.nets.encoders.inputs import Inputs
+from bidex_algos.nets.encoders.point_net import with_point_net
 from bidex_algos.nets.encoders.task_embedding import with_task_embedding
 from bidex_algos.nets.residual import ResidualMLP
 from bidex_algos.nets.shape import Shape
@@ -39,7 +40,9 @@ class BRC(Categorical, MTSAC):
 
     @classmethod
     def _inputs(cls, config: BRCConfig, shape: Shape) -> Inputs:
-        return with_task_embedding(Inputs(shape.groups), cls._embedded(config, shape), unit=True)
+        return with_task_embedding(
+            with_point_net(Inputs(shape.groups), config), cls._embedded(config, shape), unit=True
+        )
 
     @torch.no_grad()
     def _target(self, draw: Transitions, next_obs: Tensor) -> Tensor:

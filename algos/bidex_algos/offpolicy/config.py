@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from bidex_algos.checks import at_least, between, network_bytes, positive, types
+from bidex_algos.checks import at_least, between, network_bytes, positive, types, widths
 from bidex_algos.choices import Activation, Autocast
 from bidex_algos.nets.multitask.config import ArchitectureConfig
 from bidex_meta.errors import BidexError
@@ -27,6 +27,10 @@ class OffPolicyConfig(ArchitectureConfig):
     """Give the actor an output layer per task; the world must show the task's one-hot."""
     task_embedding: int = 0
     """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
+    point_widths: tuple[int, ...] = (32, 64)
+    """Widths of the layers that all points of a point cloud share (PointNet), where the world shows one."""
+    points_read: int = 0
+    """Points of a cloud that they read, evenly out of all; 0: all."""
     value_heads: bool = True
     """Give each critic one output per task instead of one for all."""
     critic_layer_norm: bool = True
@@ -82,7 +86,8 @@ class OffPolicyConfig(ArchitectureConfig):
         at_least(self, 1, "replay_steps", "steps_per_iteration", "updates_per_step", "batch_size", "n_steps")
         if self.batch_per_task is not None:
             at_least(self, 1, "batch_per_task")
-        at_least(self, 0, "warmup_steps", "task_embedding", "weight_decay")
+        at_least(self, 0, "warmup_steps", "task_embedding", "points_read", "weight_decay")
+        widths(self, "point_widths")
         if not 0.0 <= self.gamma < 1.0:
             raise BidexError(f"{self.algo}: gamma must lie in [0, 1), got {self.gamma}.")
         between(self, 0.0, 1.0, "tau", "cut_share")

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from bidex_algos.checks import at_least, between, network_bytes, positive, rising, types
+from bidex_algos.checks import at_least, between, network_bytes, positive, rising, types, widths
 from bidex_algos.choices import Activation, Autocast
 from bidex_algos.nets.multitask.config import ArchitectureConfig
 
@@ -26,6 +26,10 @@ class OnPolicyConfig(ArchitectureConfig):
     observations show the task."""
     task_embedding: int = 0
     """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
+    point_widths: tuple[int, ...] = (32, 64)
+    """Widths of the layers that all points of a point cloud share (PointNet), where the world shows one."""
+    points_read: int = 0
+    """Points of a cloud that they read, evenly out of all; 0: all."""
     init_std: float = 0.8
     """Standard deviation of the actions at the start."""
     std_range: tuple[float, float] = (0.05, 1.5)
@@ -56,7 +60,8 @@ class OnPolicyConfig(ArchitectureConfig):
         types(self)
         self._check_architecture()
         at_least(self, 1, "rollout_steps")
-        at_least(self, 0, "task_embedding")
+        at_least(self, 0, "task_embedding", "points_read")
+        widths(self, "point_widths")
         between(self, 0.0, 1.0, "gamma", "lam")
         rising(self, "std_range")
         positive(self, "init_std", "value_horizon")

@@ -1,0 +1,155 @@
+"""From the poses of bodies to what a depth camera sees of them: torch operations on all rows, no loop over rows.
+
+A candidate is seen if it faces the camera, lies in its frustum, and nothing nearer was drawn around its pixel of a
+coarse depth buffer. Shapes depend on no value, so that CUDA graphs can hold it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bidex_meta.points.camera import Camera
+from bidex_meta.points.surfaces import Surfaces
+
+_CHUNK = 32
+"""Rows that a CPU computes at once: what they need fits its cache."""
+
+
+@dataclass(frozen=True)
+class Sharpness:
+    """How finely hidden points are told from seen ones.
+
+    Attributes:
+        pixels: Width and height of the depth buffer.
+        depth: How far behind the nearest depth around its pixel a point may lie, metres.
+        slope: The same for surfaces that are seen at a slant, as a share of what depth changes across a pixel.
+        most: Most that slant may add, metres.
+    """
+
+    pixels: int = 128
+    depth: float = 0.004
+    slope: float = 1.5
+    most: float = 0.05
+
+
+class Cloud:
+    """Clouds of rows of one model.
+
+    Args:
+        surfaces: The candidates, P.
+        camera: What sees them.
+        count: Points of a cloud.
+        kinds: Whether each point has a fourth entry, what it is of (``surfaces.FIXTURE``, ...).
+        device: Where to compute.
+        sharpness: How hidden points are found.
+
+    Attributes:
+        shape: Of a row's cloud, (count, 3) or (count, 4).
+    """
+
+    def __init__(
+        self,
+        surfaces: Surfaces,
+        camera: Camera,
+        count: int,
+        kinds: bool = False,
+        device: str | torch.device = "cpu",
+        sharpness: Sharpness | None = None,
+    ) -> None:
+        def tensor(values: np.ndarray) -> Tensor:
+            return torch.as_tensor(values, dtype=torch.float32, device=device).contiguous()
+
+        self.shape = (count, 4 if kinds else 3)
+        self.camera, self.sharpness = camera, sharpness or Sharpness()
+        self._bodies = torch.as_tensor(surfaces.bodies, device=device).long()
+        points, normals = surfaces.points.T, surfaces.normals.T
+        ones = np.ones_like(points[:1])
+        starts = [0, *surfaces.ends[:-1]]
+        self._parts = [slice(int(a), int(b)) for a, b in zip(starts, surfaces.ends, strict=True)]
+        self._places = [tensor(np.concatenate((points, ones))[:, part]) for part in self._parts]
+        along = (points * normals).sum(axis=0, keepdims=True)
+        self._faces = [tensor(np.concatenate((normals, -along))[:, part]) for part in self._parts]
+        self._axes, self._eye = tensor(camera.axes), tensor(np.array(camera.eye))
+        self._kinds = tensor(surfaces.kinds) if kinds else None
+        self._slots = torch.arange(count, device=device)
+        self._size = len(surfaces.points)
+
+    def __call__(self, position: Tensor, rotation: Tensor) -> Tensor:
+        """Clouds of n rows, in the rows' frames, metres: (n, *shape), float32. A row that sees nothing gets zeros.
+
+        Where fewer candidates are seen than a cloud has points, some stand there several times; where more, every so
+        many-th of them is left out. What is not seen changes nothing, to the last bit.
+
+        Args:
+            position: Of the model's bodies, metres, (n, nbody, 3).
+            rotation: Likewise, matrices (n, nbody, 3, 3).
+        """
+        if position.device.type == "cpu" and len(position) > _CHUNK:
+            pairs = zip(position.split(_CHUNK), rotation.split(_CHUNK), strict=True)
+            return torch.cat([self._clouds(*pair) for pair in pairs])
+        return self._clouds(position, rotation)
+
+    def _clouds(self, position: Tensor, rotation: Tensor) -> Tensor:
+        x, y, depth, facing = self._in_camera(position, rotation)
+        seen = self._seen(x, y, depth, facing)
+        number = seen.cumsum(1, dtype=torch.int32)
+        total = number[:, -1:].long()
+        wanted = (self._slots * total.clamp(min=1)) // len(self._slots) + 1
+        index = torch.searchsorted(number, wanted.int()).clamp_(max=self._size - 1)
+        chosen = torch.stack([plane.gather(1, index) for plane in (x, y, depth)], dim=2)
+        cloud = chosen @ self._axes + self._eye
+        if self._kinds is not None:
+            cloud = torch.cat((cloud, self._kinds[index][..., None]), dim=2)
+        # where, not a product: candidates of a row whose physics broke are NaN.
+        return torch.where(total[..., None] > 0, cloud, 0.0)
+
+    def seen(self, position: Tensor, rotation: Tensor) -> Tensor:
+        """Which candidates are seen, (n, P), bool; arguments as those of a call."""
+        return self._seen(*self._in_camera(position, rotation))
+
+    def _in_camera(self, position: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """To the right, down and forward of the camera (m), and distance to the tangent plane, (n, P) each."""
+        turn = rotation.index_select(1, self._bodies).float()
+        offset = position.index_select(1, self._bodies).float() - self._eye
+        poses = torch.cat((self._axes @ turn, (offset @ self._axes.T)[..., None]), dim=3)
+        # The eye in the body's frame; n . (eye - p) is positive where a surface faces it.
+        eye = torch.cat((-(offset[:, :, None] @ turn)[:, :, 0], torch.ones_like(offset[..., :1])), dim=2)
+        n = len(offset)
+        places, facing = offset.new_empty(n, 3, self._size), offset.new_empty(n, self._size)
+        for i, part in enumerate(self._parts):
+            places[:, :, part] = poses[:, i] @ self._places[i]
+            facing[:, part] = eye[:, i] @ self._faces[i]
+        return places[:, 0], places[:, 1], places[:, 2], facing
+
+    def _seen(self, x: Tensor, y: Tensor, depth: Tensor, facing: Tensor) -> Tensor:
+        s, camera = self.sharpness, self.camera
+        focal = camera.focal * s.pixels
+        scale = focal / depth
+        column, row = x * scale + 0.5 * s.pixels, y * scale + 0.5 * s.pixels
+        # False where NaN: a row whose physics broke sees nothing.
+        inside = (column >= 0) & (column < s.pixels) & (row >= 0) & (row < s.pixels)
+        candidate = inside & (depth > camera.near) & (depth < camera.far) & (facing > 0)
+        pixel = torch.where(candidate, row.floor() * s.pixels + column.floor(), 0.0).long()
+        # A neighbour on the same slanted surface must hide nothing: each draws what its surface reaches a pixel further
+        # away. Depth changes by tan(angle) / focal of itself from pixel to pixel; cos(angle) = facing / distance.
+        cosine = (facing / torch.sqrt(x * x + y * y + depth * depth)).clamp_min(1e-3)
+        slant = torch.sqrt((1.0 - cosine * cosine).clamp_min(0.0)) / cosine
+        reach = (s.slope * slant * depth / focal).clamp_max(s.most)
+        drawn = torch.where(candidate, depth + reach, torch.inf)
+        buffer = torch.full((len(depth), s.pixels**2), torch.inf, device=depth.device)
+        buffer.scatter_reduce_(1, pixel, drawn, "amin")
+        nearest = _spread(buffer.view(-1, s.pixels, s.pixels)).flatten(1).gather(1, pixel)
+        return candidate & (depth <= nearest + s.depth)
+
+
+def _spread(buffer: Tensor) -> Tensor:
+    """Each pixel gets the nearest of itself and its eight neighbours: what is drawn there hides what lies behind."""
+    wide = buffer.clone()
+    torch.minimum(wide[:, :, 1:], buffer[:, :, :-1], out=wide[:, :, 1:])
+    torch.minimum(wide[:, :, :-1], buffer[:, :, 1:], out=wide[:, :, :-1])
+    tall = wide.clone()
+    torch.minimum(tall[:, 1:], wide[:, :-1], out=tall[:, 1:])
+    torch.minimum(tall[:, :-1], wide[:, 1:], out=tall[:, :-1])
+    return tall

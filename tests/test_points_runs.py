@@ -1,0 +1,108 @@
+"""Point clouds from the command line: trained on, evaluated, drawn, measured, refused."""
+
+import copy
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from bidex_meta import bench
+from bidex_meta.benchmark import make_task_world
+from bidex_meta.cli import main
+from bidex_meta.commands.policies import checkpoint
+from bidex_meta.errors import BidexError
+from bidex_meta.evaluation import seen
+from bidex_meta.record import RunFolder, read_metrics
+from bidex_meta.suite import load_suite
+from tests.pages import ROOT
+
+_SMALL = ["--num-envs", "8", "--threads", "1", "--device", "cpu", "--points", "24", "--logger", "none"]
+
+
+def suite_file(folder: Path, table: str) -> Path:
+    path = folder / "own.toml"
+    path.write_text((ROOT / "suites" / "MT4.toml").read_text().replace("[[classes]]", f"{table}\n\n[[classes]]", 1))
+    return path
+
+
+@pytest.mark.parametrize("algo", ["ppo", "sac", "happo"])
+def test_a_run_reads_clouds_and_is_evaluated_on_them(
+    algo: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ["--task", "HandOver", "--algo", algo, *_SMALL, "--learner.point-widths", "4", "8", "--learner.hidden", "8"]
+    flags += ["--learner.warmup-steps", "2"] if algo == "sac" else []
+    assert main(["run", *flags, "--steps", "64", "--episodes", "1", "--run-dir", str(tmp_path / "a")]) == 0
+    folder = RunFolder.open(tmp_path / "a")
+    assert folder.config()["points"] == 24 and read_metrics(folder.metrics_path)[-1]["step"] >= 64
+    assert folder.evaluation()["policy"]["classes"].keys() == {"HandOver"}
+    state, _ = checkpoint(folder, "last")
+    shapes = [each.shape for name, each in state["learner"]["policy"]["weights"].items() if "shared.0.weight" in name]
+    assert torch.Size([4, 3]) in shapes, "the actor has a PointNet"
+    # Whoever looks at the run sees its own points.
+    assert main(["evaluate", str(tmp_path / "a"), "--episodes", "1"]) == 0
+    capsys.readouterr()
+
+
+def test_a_suite_file_asks_for_points(tmp_path: Path) -> None:
+    suite = load_suite(suite_file(tmp_path, "[points]\ncount = 12\nkinds = true"))
+    assert (suite.points, suite.point_kinds) == (12, True)
+    suite = load_suite(suite_file(tmp_path, "[points]"))
+    assert (suite.points, suite.point_kinds) == (768, False)
+    assert load_suite("MT4").points == 0
+
+
+@pytest.mark.parametrize(
+    "table", ["points = 3", "[points]\ncount = 0", "[points]\ncount = 99999", "[points]\nkind = 1"]
+)
+def test_bad_tables_are_one_line(table: str, tmp_path: Path) -> None:
+    with pytest.raises(BidexError, match=r"points|count|kind"):
+        load_suite(suite_file(tmp_path, table))
+
+
+@pytest.mark.parametrize(
+    ("flags", "told"),
+    [
+        (["--task", "HandOver", "--points", "-1"], "--points must be"),
+        (["--suite", "MT4", "--points", "99999"], "at most 16,384"),
+        (["--suite", "metaworld/MT10", "--points", "16"], "scenes of our own"),
+        (["--suite", "ML1", "--algo", "maml", "--points", "16", "--threads", "1"], "does not read point clouds"),
+    ],
+)
+def test_what_cannot_be_is_one_line(
+    flags: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", *flags, "--run-dir", str(tmp_path / "a")]) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_render_puts_the_cloud_beside_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    import numpy as np
+
+    world = make_task_world("HandOver", 3, "cpu", autoreset_mode="DISABLED", threads=1)
+    monkeypatch.setattr(type(world), "render", lambda self, row, width, height, camera: np.zeros((height, width, 3), np.uint8))  # fmt: skip  # noqa: E501
+    looked = seen.SeenWorld(world, 200)
+    looked.reset(seed=0)
+    pictures = [looked.render(row=row, width=60, height=50) for row in (0, 2)]
+    assert pictures[0].shape == (50, 180, 3) and (pictures[0][:, :60] == 0).all()
+    red, blue = (pictures[0][..., i].astype(int) for i in (0, 2))
+    orange = np.asarray((red > blue + 40).any(axis=0))
+    assert orange[60:120].any() and orange[120:].any(), "the egg is seen from the camera and from the side"
+    for _ in range(20):
+        looked.step(torch.zeros(3, looked.action_size))
+    assert (looked.render(row=0, width=60, height=50) != pictures[0]).any(), "it moves with the physics"
+
+
+def test_a_copy_of_a_world_with_points_goes_on_alike() -> None:
+    world = make_task_world("HandOver", 2, "cpu", autoreset_mode="SAME_STEP", threads=1, points=24)
+    world.reset(seed=0)
+    other = copy.deepcopy(world)
+    action = torch.zeros(2, world.action_size)
+    assert torch.equal(world.step(action)[0], other.step(action)[0])
+
+
+def test_bench_points_compares_with_states(capsys: pytest.CaptureFixture[str]) -> None:
+    found = bench.points("HandOver", num_envs=4, count=32, steps=2, repeats=2, threads=1)
+    assert found["points"] == 32 and found["frames_per_s"].keys() == {"points", "state"} and 0 < found["ratio"] < 1.5
+    assert main(["bench", "points", "--num-envs", "4", "--count", "8", "--steps", "1", "--repeats", "1", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["task"] == "HandOver"
