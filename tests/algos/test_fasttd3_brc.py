@@ -284,7 +284,7 @@ def test_one_task_needs_no_embedding_and_several_need_their_one_hot() -> None:
 @pytest.mark.parametrize("preset", ["paper", "laptop"])
 def test_they_are_found_by_name_and_every_preset_runs(name: str, preset: str) -> None:
     kind = learner_kind(name)
-    assert kind.make is {"fasttd3": FastTD3, "brc": BRC}[name] and list(kind.presets) == ["paper", "laptop"]
+    assert kind.make is {"fasttd3": FastTD3, "brc": BRC}[name] and list(kind.presets)[:2] == ["paper", "laptop"]
     small: dict[str, Any] = {"hidden": (16, 16), "critic_hidden": (16, 16), "replay_steps": 50, "batch_size": 64}
     config = replace(kind.presets[preset], **small, warmup_steps=1, steps_per_iteration=3)
     assert "Loss/critic" in kind.make(opposite_bandits(), config, seed=0).iterate()

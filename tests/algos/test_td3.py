@@ -205,4 +205,4 @@ def test_td3_refuses_what_could_only_fail_later() -> None:
 def test_they_are_found_by_name() -> None:
     assert learner_kind("ddpg").make is DDPG
     assert learner_kind("td3").make is learner_kind("mttd3").make is TD3
-    assert list(learner_kind("td3").presets) == ["paper", "laptop"]
+    assert list(learner_kind("td3").presets) == ["paper", "laptop", "metaworld"]

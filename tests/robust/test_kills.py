@@ -13,7 +13,7 @@ if sys.platform != "linux":
 
 from bidex_meta.commands.learners import ALGOS
 from tests.robust.kills import KILLED, Victim, outcome, quick_folder, server, unequal
-from tests.robust.victims import FLAGS, arguments
+from tests.robust.victims import FLAGS, OFFLINE, arguments
 
 ITERATIONS = 12
 pytestmark = pytest.mark.xdist_group("kills")  # one server for all
@@ -35,9 +35,12 @@ def killed_often(
     algo: str, seed: int, killer: subprocess.Popen[str], place: Path, record: bool = False
 ) -> dict[str, object]:
     """The unbroken run's outcome, which the killed one's equals."""
-    draw = random.Random(f"{algo} {seed}")
+    draw, data = random.Random(f"{algo} {seed}"), None
+    if algo in OFFLINE:
+        pytest.importorskip("h5py")
+        data = stored(killer, place)
     often = draw.random() < 0.5 or record  # each checkpoint begins another part of what is recorded
-    whole = Victim(killer, arguments(algo, ITERATIONS, record=record), place / f"{algo}{seed}whole{record}")
+    whole = Victim(killer, arguments(algo, ITERATIONS, record=record, dataset=data), place / f"{algo}{seed}whole{record}")
     answer = whole.go_on()
     assert answer["code"] == 0, whole.log.read_text()
     run = Victim(killer, whole.arguments, place / f"{algo}{seed}{record}", 0.0 if often else 0.02)
@@ -48,11 +51,19 @@ def killed_often(
     return expected
 
 
+def stored(killer: subprocess.Popen[str], place: Path) -> Path:
+    """The data set of a run that recorded."""
+    run = Victim(killer, arguments("mtppo", ITERATIONS, record=True), place / "stored")
+    if not run.path.exists():
+        assert run.go_on()["code"] == 0, run.log.read_text()
+    return run.path / "replay"
+
+
 def test_every_learner_can_be_killed() -> None:
     assert FLAGS.keys() == ALGOS.keys()
 
 
-@pytest.mark.parametrize("algo", ["mtsac", "rl2"])
+@pytest.mark.parametrize("algo", ["mtsac", "rl2", "iql"])
 def test_killed_runs_end_as_unbroken_ones(algo: str, killer: subprocess.Popen[str], place: Path) -> None:
     killed_often(algo, 0, killer, place)
 

@@ -34,6 +34,7 @@ _ROLLOUTS = "--learner.hidden 8 --learner.rollout-steps 4"
 _REPLAY = "--learner.hidden 8 --learner.batch-size 8 --learner.warmup-steps 4 --learner.replay-steps 16"
 _REPLAY += " --learner.steps-per-iteration 4 --learner.updates-per-step 1"
 _ADAPTS = "--learner.hidden 8 --learner.max-adapt-steps 4"
+_STORED = "--learner.hidden 8 --learner.batch-size 8 --learner.updates-per-iteration 4"
 _PAIR = "--agents a=action/0;b=action/1"
 FLAGS = {
     **dict.fromkeys(("mtppo", "mttrpo", "ppo", "trpo"), _ROLLOUTS),
@@ -44,6 +45,8 @@ FLAGS = {
     "brc": f"{_REPLAY} --learner.critic-hidden 8 --learner.atoms 5 --learner.task-embedding 2",
     **dict.fromkeys(("promp", "maml"), f"{_ADAPTS} --learner.tasks-per-class 2"),
     "rl2": f"{_ADAPTS} --learner.memory 8 --learner.chunk 4 --learner.episodes-per-trial 2",
+    **dict.fromkeys(("bc", "td3bc", "iql"), _STORED),
+    "bcq": f"{_STORED} --learner.vae-hidden 8 --learner.candidates 2",
 }
 """Of each learner; ``tests/robust/test_kills.py`` holds that none is missing."""
 _LOADED = ("bidex_meta.benchmark", "bidex_meta.cli", "scipy.optimize", "scipy.stats", "torch._dynamo", "typeguard")
@@ -51,11 +54,18 @@ _LOADED += tuple(f"bidex_meta.commands.{name}" for name in ("metatest", "policie
 _LOADED += tuple(f"bidex_meta.evaluation.{name}" for name in ("meta_test", "play", "references", "untrained"))
 """What each process would load by itself, for longer than it runs."""
 ADAPTS = ("promp", "maml", "rl2")
+OFFLINE = ("bc", "bcq", "td3bc", "iql")
 ROWS = 8
 
 
-def arguments(algo: str, iterations: int, processes: int = 1, record: bool = False) -> list[str]:
-    """A run of so many iterations of a learner, without its folder."""
+def arguments(
+    algo: str, iterations: int, processes: int = 1, record: bool = False, dataset: Path | None = None
+) -> list[str]:
+    """A run of so many iterations of a learner, without its folder; ``dataset`` is of those that play nothing."""
+    if algo in OFFLINE:
+        words = ["run", "--suite", "MT4", "--algo", algo, "--dataset", str(dataset), "--seed", "5"]
+        words += ["--steps", str(iterations * 4), "--threads", "1", "--device", "cpu", "--logger", "none"]
+        return [*words, *FLAGS[algo].split(), "--episodes", "1", "--evaluate-every", "4"]
     # One that adapts plays two phases of four steps.
     adapts = algo in ADAPTS
     steps = iterations * ROWS * processes * (8 if adapts else 4)
