@@ -13,6 +13,7 @@ PYTHON = os.environ.get("D3RLPY_PYTHON")
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 @pytest.mark.skipif(not PYTHON, reason="D3RLPY_PYTHON names no interpreter with d3rlpy")
 def test_the_intervals_of_three_seeds_overlap() -> None:
     world = PointMass()
