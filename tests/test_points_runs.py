@@ -44,6 +44,19 @@ def test_a_run_reads_clouds_and_is_evaluated_on_them(
     capsys.readouterr()
 
 
+def test_a_data_set_of_clouds_is_learned_from(tmp_path: Path) -> None:
+    """Its points are the run's without being named."""
+    pytest.importorskip("h5py", reason="needs the extra data")
+    seen, learned = tmp_path / "seen", tmp_path / "learned"
+    small = ["--learner.hidden", "8", "--no-evaluate"]
+    record = ["--steps", "1200", "--record", "1200", "--run-dir", str(seen)]
+    assert main(["run", "--task", "HandOver", "--algo", "ppo", *_SMALL, *small, *record]) == 0
+    flags = ["--algo", "bc", "--steps", "2", "--threads", "1", "--device", "cpu", "--logger", "none", *small]
+    assert main(["run", "--dataset", str(seen / "replay"), *flags, "--run-dir", str(learned)]) == 0
+    config = RunFolder.open(learned).config()
+    assert (config["task"], config["points"], config["learner"]["point_widths"]) == ("HandOver", 24, [32, 64])
+
+
 def test_a_suite_file_asks_for_points(tmp_path: Path) -> None:
     suite = load_suite(suite_file(tmp_path, "[points]\ncount = 12\nkinds = true"))
     assert (suite.points, suite.point_kinds) == (12, True)

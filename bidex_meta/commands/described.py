@@ -18,7 +18,8 @@ def described(source: Source, world: Any, kind: str, policies: Sequence[dict[str
         more: What else belongs there.
 
     Returns:
-        ``suite`` and ``suite_version``, or ``task``, ``base`` and ``object``, the others None; ``tasks``, names of the
+        ``suite`` and ``suite_version``, or ``task``, ``base`` and ``object``, the others None; ``points`` of a
+        cloud, as the run was told; ``tasks``, names of the
         slots; ``reward_scales``, factor on the printed reward by slot; ``hides_goals``; ``observation_groups``, [name,
         index ranges]; ``kind``, ``policies``, ``seed`` of the tasks, ``references`` ({class: {random, zero, expert}},
         unscaled returns), ``versions`` and ``commit``; all ready for JSON.
@@ -33,6 +34,7 @@ def described(source: Source, world: Any, kind: str, policies: Sequence[dict[str
         "suite_version": getattr(suite, "version", None),
         "task": getattr(source, "class_name", None),
         "object": getattr(source, "object", None),
+        "points": source.points,
         "base": {None: "own", True: "moving", False: "fixed"}[getattr(source, "moving_base", None)] if alone else None,
         "tasks": list(world.task_names),
         "reward_scales": {slot.name: slot.reward_scale for slot in getattr(world, "slots", ())},

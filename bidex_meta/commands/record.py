@@ -128,7 +128,9 @@ def _record(flags: RecordFlags, kind: str) -> None:
     actors, policies = _actors(flags, kind, config["device"])
     rows = flags.num_envs or _rows(source)
     plan = {"kind": kind, "size": size, "num_envs": rows, "noise": flags.noise, "policies": policies}
-    plan |= {key: config[key] for key in ("suite", "task", "base", "object", "seed", "device", "engine", "threads")}
+    plan |= {
+        key: config[key] for key in ("suite", "task", "base", "object", "points", "seed", "device", "engine", "threads")
+    }
     plan |= {"starts": flags.seed}
     if not flags.estimate:
         check_place(folder, plan)
@@ -184,7 +186,8 @@ def _config(flags: RecordFlags) -> dict[str, Any]:
             )
         config: dict[str, Any] = found[0]
     else:
-        config = {"suite": flags.suite, "task": flags.task, "base": flags.base, "object": None, "seed": flags.seed}
+        config = {"suite": flags.suite, "task": flags.task, "base": flags.base, "seed": flags.seed}
+        config |= {"object": None, "points": 0}
         if flags.suite is not None and flags.suite.endswith(".toml"):
             config["suite"] = str(expanded(flags.suite).resolve())
     on_gpu = Source.open(config).on_gpu

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 UPDATES = 300_000
 """Of a run whose user names no number."""
-_FORM = ("suite", "task", "base", "object")
+_FORM = ("suite", "task", "base", "object", "points")
 
 
 def named(arguments: Sequence[str], stored: Mapping[str, Any]) -> list[str]:
@@ -38,12 +38,12 @@ def opened(names: Sequence[str]) -> "list[Dataset]":
 
 
 def implied(datasets: "Sequence[Dataset]") -> dict[str, Any]:
-    """Suite, or task, base and object, that all data sets were recorded of; empty where they tell none.
+    """Suite, or task, base and object, and points, that all data sets were recorded of; empty where they tell none.
 
     Raises:
         BidexError: They were recorded of different ones.
     """
-    told = [tuple(each.metadata.get(name) for name in _FORM) for each in datasets]
+    told = [tuple(each.metadata.get(name) or None for name in _FORM) for each in datasets]
     if not told or told[0][:2] == (None, None):
         return {}
     if len(set(told)) > 1:

@@ -145,10 +145,10 @@ def test_classes_recorded_alone_get_padding_one_hot_and_scale(tmp_path: Path) ->
 
 
 def test_data_sets_imply_what_they_were_recorded_of():
-    """Suite, task, base and object of a run come from the data; other objects are other data."""
-    told = {"suite": None, "task": "CatchUnderarm", "base": "moving", "object": "mug"}
-    mug, egg = (SimpleNamespace(metadata=told | {"object": name}) for name in ("mug", None))
-    assert implied([mug, mug]) == {"task": "CatchUnderarm", "base": "moving", "object": "mug"}
+    """Suite, task, base, object and points of a run come from the data; other objects are other data."""
+    told = {"suite": None, "task": "CatchUnderarm", "base": "moving"}
+    mug, egg = (SimpleNamespace(metadata=told | {"object": n, "points": p}) for n, p in (("mug", 64), (None, 0)))
+    assert implied([mug, mug]) == {"task": "CatchUnderarm", "base": "moving", "object": "mug", "points": 64}
     assert implied([egg]) == {"task": "CatchUnderarm", "base": "moving"}
     assert implied([SimpleNamespace(metadata={})]) == {}
     with pytest.raises(BidexError, match="--suite NAME"):

@@ -40,7 +40,9 @@ def killed_often(
         pytest.importorskip("h5py")
         data = stored(killer, place)
     often = draw.random() < 0.5 or record  # each checkpoint begins another part of what is recorded
-    whole = Victim(killer, arguments(algo, ITERATIONS, record=record, dataset=data), place / f"{algo}{seed}whole{record}")
+    whole = Victim(
+        killer, arguments(algo, ITERATIONS, record=record, dataset=data), place / f"{algo}{seed}whole{record}"
+    )
     answer = whole.go_on()
     assert answer["code"] == 0, whole.log.read_text()
     run = Victim(killer, whole.arguments, place / f"{algo}{seed}{record}", 0.0 if often else 0.02)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from bidex_algos.checks import at_least, between, network_bytes, positive, types
+from bidex_algos.checks import at_least, between, network_bytes, positive, types, widths
 from bidex_algos.choices import Activation, Autocast
 from bidex_algos.nets.multitask.config import ArchitectureConfig
 from bidex_meta.errors import BidexError
@@ -24,6 +24,10 @@ class OfflineConfig(ArchitectureConfig):
     """Give the actor an output layer per task; the world must show the task's one-hot."""
     task_embedding: int = 0
     """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
+    point_widths: tuple[int, ...] = (32, 64)
+    """Widths of the layers that all points of a point cloud share (PointNet), where the data show one."""
+    points_read: int = 0
+    """Points of a cloud that they read, evenly out of all; 0: all."""
     updates_per_iteration: int = 1000
     """Updates between two reports; --evaluate-every and --video-every count reports."""
     batch_size: int = 256
@@ -52,7 +56,8 @@ class OfflineConfig(ArchitectureConfig):
         at_least(self, 1, "updates_per_iteration", "batch_size")
         if self.batch_per_task is not None:
             at_least(self, 1, "batch_per_task")
-        at_least(self, 0, "task_embedding")
+        at_least(self, 0, "task_embedding", "points_read")
+        widths(self, "point_widths")
         positive(self, "learning_rate", *["max_grad_norm"] * (self.max_grad_norm is not None))
 
     def bytes_held(self, rows: int, width: int) -> int:
