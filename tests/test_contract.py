@@ -13,6 +13,7 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
+from bidex_meta.clients.humanoid_world import HumanoidWorld
 from bidex_meta.clients.metaworld_world import MetaWorldWorld
 from bidex_meta.errors import BidexError
 from bidex_meta.world import World
@@ -63,6 +64,7 @@ KINDS = {
     "ML1-test": Kind(lambda mode: suite_world("ML1", 3, mode, "test"), fixed=True),
     "HandOver": Kind(lambda mode: class_world("HandOver", 3, mode)),
     "metaworld": Kind(lambda mode: MetaWorldWorld("metaworld/MT3", 4, autoreset_mode=mode)),
+    "humanoid": Kind(lambda mode: HumanoidWorld(ROWS, autoreset_mode=mode, threads=1)),
     "ToyWorld": Kind(lambda mode: ToyWorld(ROWS, mode), TaskWorld, fixed=True),
     "PointWorld": Kind(point_world, fixed=True),
     "PointGoals": Kind(point_goals, fixed=True),

@@ -31,7 +31,8 @@ class CpuEngine:
     """Simulations of models of equal structure, in double precision. See ``Engine`` for the views.
 
     Sensors are refreshed by a velocity stage after each step, which costs about a tenth of the speed but makes
-    positions and velocities those of the new state; a persistent batch takes its next step from there.
+    positions and velocities those of the new state; a persistent batch takes its next step from there. Without
+    ``refresh`` it is left out, as by ``mj_step``: what is no part of the state is then that before the last substep.
 
     A row with a number out of bounds is told by ``unstable`` and put at rest at the model's reference pose, before a
     step by ``_quarantine``, within it by MuJoCo's autoreset: all geoms of a row with NaN would touch, and solving for
@@ -41,15 +42,19 @@ class CpuEngine:
     device = torch.device("cpu")
     masked = False
 
-    def __init__(self, models: Sequence[mujoco.MjModel], rows: Sequence[int], threads: int | None = None) -> None:
+    def __init__(
+        self, models: Sequence[mujoco.MjModel], rows: Sequence[int], threads: int | None = None, refresh: bool = True
+    ) -> None:
         """Builds the batch.
 
         Args:
             models: The distinct models, of equal structure.
             rows: For each simulation the index of its model.
             threads: Engine threads; None takes all CPUs. Results do not depend on it.
+            refresh: Whether a step ends with sensors, positions and velocities of the new state.
         """
         self.num = len(rows)
+        self._after_step = mujoco.mjtStage.mjSTAGE_VEL if refresh else mujoco.mjtStage.mjSTAGE_NONE
         # MuJoCo would print each broken row to stderr and to a log file in the working folder; unstable() tells it.
         mujoco.set_mju_user_warning(_silent)
         self.batch = mujoco.batch.Batch(
@@ -90,7 +95,7 @@ class CpuEngine:
         self._quarantine()
         ids = None if active is None else active.numpy()
         try:
-            self.batch.step(ids=ids, nstep=substeps, stage=mujoco.mjtStage.mjSTAGE_VEL)
+            self.batch.step(ids=ids, nstep=substeps, stage=self._after_step)
         except mujoco.batch.SimulationError as error:
             # A broken row can meet more contacts than its memory holds; it keeps its old state, the others are done.
             self._failed[torch.as_tensor(error.ids)] = True

@@ -63,9 +63,12 @@ class Source(ABC):
         Raises:
             BidexError: Unknown suite or task, with the nearest name; or a faulty suite file.
         """
+        from bidex_meta.sources.humanoid_task import HUMANOID, HumanoidTask
         from bidex_meta.sources.metaworld_suite import MetaWorldSuite
 
         suite = config.get("suite")
+        if suite is None and config["task"].casefold() == HUMANOID.casefold():
+            return HumanoidTask(HUMANOID, config)
         if suite is None:
             return SingleClass(registry.resolve(config["task"], "task"), config)
         if not suite.endswith(".toml"):

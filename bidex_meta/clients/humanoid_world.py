@@ -1,0 +1,174 @@
+"""Gymnasium's Humanoid-v5 as a world: its model, observation and reward, many rows on ``mujoco.batch``.
+
+The paper's appendix C compares PPO and SAC over numbers of rows on a humanoid, since no hand shows what SAC can do.
+This is the one that everybody has (Gymnasium 1.x, ``gymnasium/envs/mujoco/humanoid_v5.py``, whose constants stand
+below); starts, actions and steps give its numbers bit for bit, to single precision (``tests/test_humanoid.py``).
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode
+from torch import Tensor
+
+from bidex_meta.clients.foreign_world import ForeignWorld, Sizes, Transition
+from bidex_meta.engine.cpu import CpuEngine
+from bidex_meta.errors import BidexError, unknown_name
+
+NAME = "Humanoid-v5"
+EPISODE_STEPS = 1000
+
+_SUBSTEPS = 5
+_FORWARD_WEIGHT, _HEALTHY_REWARD = 1.25, 5.0
+_CONTROL_WEIGHT, _CONTACT_WEIGHT, _CONTACT_MOST = 0.1, 5e-7, 10.0
+_LOWEST, _HIGHEST = 1.0, 2.0  # metres, of the torso
+_START_NOISE = 1e-2
+_DRAWS_BEFORE = 2  # of a task and of an elapsed step, by ``ForeignWorld``
+
+
+class HumanoidWorld(ForeignWorld):
+    """``num_envs`` humanoids that learn to walk, on the CPU: a ``contract.PooledWorld`` of one slot.
+
+    Observations are Humanoid-v5's 348 numbers: positions without x and y, velocities, and of its 13 bodies inertias,
+    velocities, actuators' forces and contact forces. An action of [-1, 1] is its motors' range, [-0.4, 0.4]. The reward
+    is 1.25 times the speed of the centre of mass along x (m/s), and 5 while it is up, less the price of control and
+    contact; it falls (terminated) when the torso leaves 1 to 2 m, and an episode lasts 1,000 steps of 15 ms. There is
+    no success. All its tasks are alike: a variation has no numbers.
+    """
+
+    def __init__(
+        self,
+        num_envs: int,
+        *,
+        seed: int = 0,
+        autoreset_mode: str | AutoresetMode | None = None,
+        threads: int | None = None,
+        stagger: bool = True,
+    ) -> None:
+        """Builds the rows; none is started before ``reset``.
+
+        Args:
+            num_envs: Rows.
+            seed: Of starts, until ``reset(seed=...)`` says otherwise.
+            autoreset_mode: SAME_STEP (training) or DISABLED (evaluation), as a member or its name.
+            threads: Of the engine; None takes all CPUs.
+            stagger: As in ``bidex_meta.World``.
+
+        Raises:
+            BidexError: Unknown mode or no row.
+        """
+        import gymnasium.envs.mujoco as home
+
+        model = mujoco.MjModel.from_xml_path(str(Path(home.__file__).parent / "assets" / "humanoid.xml"))
+        num_state = (model.nq - 2) + model.nv + (model.nbody - 1) * 22 + (model.nv - 6)
+        super().__init__([NAME], num_envs, Sizes(num_state, model.nu, EPISODE_STEPS), seed, autoreset_mode, stagger)
+        self._model, self._data = model, mujoco.MjData(model)
+        self._dt = _SUBSTEPS * model.opt.timestep
+        self._mass = torch.from_numpy(model.body_mass.copy())
+        self._largest = torch.from_numpy(model.actuator_ctrlrange[:, 1].copy())
+        self._engine = CpuEngine([model], [0] * num_envs, threads, refresh=False)
+        bind = self._engine.batch.bind
+        self._bound = [torch.from_numpy(bind(name).view()) for name in ("cinert", "cvel", "qfrc_actuator")]
+        self._centres = torch.from_numpy(bind("xipos").view())
+        self._contact = torch.zeros(num_envs, model.nbody, 6, dtype=torch.float64)
+        self._x = torch.zeros(num_envs, dtype=torch.float64)  # of the centre of mass, metres
+        self.set_tasks({NAME: np.zeros((1, 0))})
+
+    def set_tasks(self, pools: Mapping[str, np.ndarray]) -> None:
+        """Replaces the pool; as no task differs from another, only their number counts.
+
+        Args:
+            pools: ``Humanoid-v5`` to an array (n, 0).
+
+        Raises:
+            BidexError: Unknown class, an empty pool or a wrong shape.
+        """
+        for name, pool in pools.items():
+            if name != NAME:
+                raise unknown_name("class", name, [NAME])
+            shape = np.shape(pool)
+            if len(shape) != 2 or shape[0] == 0 or shape[1] != 0:
+                raise BidexError(f"Expected tasks of {NAME} as (n, 0), for they are all alike, got {shape}.")
+            self._set_pool_sizes([shape[0]])
+
+    @property
+    def pools(self) -> list[np.ndarray]:
+        """Tasks, (n, 0)."""
+        return [np.zeros((self.num_slot_tasks[0], 0))]
+
+    def _start(self, mask: Tensor) -> None:
+        model, engine = self._model, self._engine
+        draws = self._draws(_DRAWS_BEFORE + model.nq + model.nv)[mask, _DRAWS_BEFORE:]
+        noise = (2.0 * draws - 1.0) * _START_NOISE
+        engine.reset(mask, torch.from_numpy(model.qpos0) + noise[:, : model.nq])
+        engine.qvel[mask] = noise[:, model.nq :]
+        engine.batch.forward(ids=mask.numpy())
+        self._contact[mask] = 0.0
+        self._x = torch.where(mask, self._centre(), self._x)
+        self._obs = torch.where(mask[:, None], self._state(), self._obs)
+
+    def _centre(self) -> Tensor:
+        """Of mass, along x, shape (n,)."""
+        return (self._mass * self._centres[:, :, 0]).sum(1) / self._mass.sum()
+
+    def _state(self) -> Tensor:
+        """Observations, (n, 348), float32."""
+        inertia, velocity, force = self._bound
+        parts = self._engine.qpos[:, 2:], self._engine.qvel, inertia[:, 1:], velocity[:, 1:], force[:, 6:]
+        return torch.cat([part.flatten(1) for part in (*parts, self._contact[:, 1:])], dim=1).float()
+
+    def _advance(self, action: Tensor, active: Tensor, broken: Tensor) -> Transition:
+        engine, moved = self._engine, active & ~broken
+        # In single precision, as Gymnasium's actions are.
+        engine.ctrl[:] = action * self._largest.float()
+        engine.step(_SUBSTEPS, moved)
+        self._feel(moved)
+        broken = broken | (engine.unstable() & active)
+        good = moved & ~broken
+        before, self._x = self._x, torch.where(good, self._centre(), self._x)
+        contact = (_CONTACT_WEIGHT * self._contact.square().sum((1, 2))).clamp_max(_CONTACT_MOST)
+        control = _CONTROL_WEIGHT * engine.ctrl.square().sum(1)
+        reward = _FORWARD_WEIGHT * (self._x - before) / self._dt + _HEALTHY_REWARD * self._is_up() - control - contact
+        return Transition(
+            torch.where(good[:, None], self._state(), self._obs),
+            torch.where(good, reward, 0.0).float(),
+            torch.zeros_like(active),
+            ~self._is_up() & good,
+            broken,
+        )
+
+    def _is_up(self) -> Tensor:
+        height = self._engine.qpos[:, 2]
+        return (height > _LOWEST) & (height < _HIGHEST)
+
+    def _feel(self, moved: Tensor) -> None:
+        """Forces on the bodies from outside; MuJoCo's step leaves them out, and Gymnasium asks for them after it."""
+        for row in moved.nonzero()[:, 0].tolist():
+            self._engine.batch.get_data(row, self._data)
+            mujoco.mj_rnePostConstraint(self._model, self._data)
+            self._contact[row] = torch.from_numpy(self._data.cfrc_ext)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that decides the future of the world: tensors and plain values, copied."""
+        return {
+            **super().state_dict(),
+            "tasks": self.num_slot_tasks[0],
+            "engine": self._engine.state_dict(),
+            "x": self._x.clone(),
+            "contact": self._contact.clone(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Puts back what ``state_dict`` gave, on a world of as many rows.
+
+        Raises:
+            BidexError: The state is of another number of rows.
+        """
+        self.set_tasks({NAME: np.zeros((int(state["tasks"]), 0))})
+        super().load_state_dict(state)
+        self._engine.load_state_dict(state["engine"])
+        self._x, self._contact = state["x"].clone(), state["contact"].clone()
