@@ -103,6 +103,27 @@ def test_suites_of_the_same_classes_and_classes_alone_stand_beside_each_other(tm
     assert [study.on for study in read_studies(tmp_path / "data", "x", on="C")] == ["C"]
 
 
+def test_rows_by_learners(tmp_path: Path) -> None:
+    """The paper's Figure 6: a cell a number of rows, of each learner; a panel a learner."""
+    for algo, rows, value in (("sac", 8, 0.9), ("sac", 64, 0.1), ("ppo", 64, 0.5)):
+        for seed in (0, 1):
+            path = test_collect.run(tmp_path, seed, {"C": value + seed / 10}, algo, task="place/C")
+            path = path.rename(tmp_path / f"C-{algo} {rows}-seed{seed}")
+            folder = log(path, {"step": 500, "Train/return/C": 1.0}, {"step": 1000, "Train/return/C": 2.0})
+            folder.change_config({**folder.config(), "num_envs": rows})
+            (path / "versions.json").write_text(json.dumps({"git": {"commit": test_collect.COMMIT, "dirty": False}}))
+            assert collect(path, "--into", tmp_path / "data" / "many") == 0
+    page = tmp_path / "page.md"
+    page.write_text("".join(f"<!-- results: study=many show={s} -->\n<!-- end -->\n" for s in ("rows", "row-curves")))
+    assert [path.name for path in fill(page, tmp_path / "data")] == ["many-row-curves.png", "page.md"]
+    text = page.read_text()
+    head, _, *rows = [cells(line) for line in text.splitlines() if line.startswith("|")]
+    assert head == ["rows", "ppo", "sac"] and [row[0] for row in rows] == ["8", "64"]
+    assert rows == [["8", "–", "9.5 (9 to 10)"], ["64", "5.5 (5 to 6)", "1.5 (1 to 2)"]]
+    assert "Seeds: 2. Steps: 1,000." in text and "![Return over training, by rows: many, C]" in text
+    assert fill(page, tmp_path / "data", check=True) == []
+
+
 def test_an_arm_of_two_kinds_is_refused(page: Path, tmp_path: Path) -> None:
     third = evaluated(tmp_path, 2, 0.5, "MT4-base-seed2", gamma=0.7)
     assert collect(third, "--into", data(page) / "tiny") == 0

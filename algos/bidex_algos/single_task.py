@@ -30,9 +30,9 @@ _PPO_50: dict[str, Any] = {
     "lam": 0.95, "init_std": 1.0, "desired_kl": 0.01, "max_grad_norm": 1.0, "entropy_weight": 0.0,
 }  # fmt: skip
 # Table 49; its 2 epochs of one mini-batch are made after every vector step, as in MT-SAC's ``paper``. Its replay of
-# 40,000 is that many vector steps there (no GPU would hold it at 2,048 rows), here as many transitions at 8 rows.
+# 40,000 counts vector steps, as everywhere here, and ends where ``replay_memory`` does.
 _SAC_49: dict[str, Any] = {
-    "replay_steps": 5000, "steps_per_iteration": 32, "updates_per_step": 2, "batch_per_task": 64, "gamma": 0.99,
+    "replay_steps": 40_000, "steps_per_iteration": 32, "updates_per_step": 2, "batch_per_task": 64, "gamma": 0.99,
     "tau": 0.005, "learning_rate": 3e-4, "critic_learning_rate": 3e-4, "init_alpha": 0.2, "max_grad_norm": 1.0,
 }  # fmt: skip
 

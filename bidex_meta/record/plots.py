@@ -93,6 +93,31 @@ def draw_metrics(groups: Sequence[Group], tags: Mapping[str, str]) -> Any:
     return figure
 
 
+def draw_panels(panels: Mapping[str, Sequence[Group]], tag: str, title: str) -> Any:
+    """One metric against environment steps, a panel for each title, all on one scale.
+
+    Args:
+        panels: Title to the groups of runs, a line each; groups of one label have one colour.
+        tag: The metric.
+        title: What is written beside it.
+
+    Raises:
+        BidexError: matplotlib is missing.
+    """
+    labels = list(dict.fromkeys(label for groups in panels.values() for label, _ in groups))
+    figure = _figure()(figsize=(5.2 * len(panels), 3.6), layout="constrained")
+    axes = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
+    for axis, (name, groups) in zip(axes, panels.items(), strict=True):
+        for label, curves in groups:
+            _draw_curve(axis, curves.get(tag), label, labels.index(label), "-")
+        axis.set_title(_plain(name))
+        axis.grid(alpha=0.3)
+        axis.set_xlabel("environment steps (millions)")
+    axes[0].set_ylabel(title)
+    _add_legend(figure, labels)
+    return figure
+
+
 def draw_comparison(panels: Mapping[str, Sequence[Bar]]) -> Any:
     """Numbers of groups beside each other, as points with their intervals.
 

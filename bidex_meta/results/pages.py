@@ -7,25 +7,31 @@
     <!-- end -->
 
 ``show`` is ``table`` (an arm a row), ``classes`` (success and return of each class), ``offline`` (data sets by
-learners), ``curves`` or ``points`` (pictures, written beside the page); ``on=MT4`` shows one suite or class of the
-study, ``split=test`` of a meta-test one split.
+learners), ``rows`` (numbers of rows by learners), ``curves``, ``points`` or ``row-curves`` (pictures, written beside
+the page); ``on=MT4`` shows one suite or class of the study, ``split=test`` of a meta-test one split.
 """
 
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.reading import is_file, read_text
 from bidex_meta.record import plots
 from bidex_meta.record.atomic import write_atomic
 from bidex_meta.results.offline import offline_table
+from bidex_meta.results.scaling import rows_figure, rows_table
 from bidex_meta.results.studies import Study, arms_table, classes_table, figures, read_studies
 
 _BLOCK = re.compile(r"(?P<head><!-- results: (?P<words>[^\n]*?) -->\n)(?P<old>.*?)(?P<end><!-- end -->)", re.DOTALL)
 _OPTIONS = ("study", "show", "on", "split")
-_TABLES = {"table": arms_table, "classes": classes_table, "offline": offline_table}
-_TITLES = {"curves": "Return and success over training", "points": "Success and score, 95 % intervals over seeds"}
+_TABLES = {"table": arms_table, "classes": classes_table, "offline": offline_table, "rows": rows_table}
+_TITLES = {
+    "curves": "Return and success over training",
+    "points": "Success and score, 95 % intervals over seeds",
+    "row-curves": "Return over training, by rows",
+}
 _DIGEST = "Description"
 """Of a picture's PNG metadata: what data it was drawn from."""
 
@@ -90,8 +96,12 @@ def _lines(studies: list[Study], show: str, page: Path, check: bool, changed: li
         if _digest_of(out) != study.digest:
             changed.append(out)
             if not check:
-                plots.save(figures(study)[show](), out, {_DIGEST: study.digest})
+                plots.save(_figure(study, show), out, {_DIGEST: study.digest})
         yield f"![{_TITLES[show]}: {study.name}, {study.on}]({out.name})"
+
+
+def _figure(study: Study, show: str) -> Any:
+    return rows_figure(study) if show == "row-curves" else figures(study)[show]()
 
 
 def _digest_of(picture: Path) -> str | None:

@@ -12,6 +12,7 @@ import numpy as np
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import Estimate, Group, classes_of, estimates, group_of, iqm
 from bidex_meta.evaluation.histories import curves_of
+from bidex_meta.outside import short_name
 from bidex_meta.record import plots
 from bidex_meta.record.folder import flat
 from bidex_meta.record.stored import StoredRun
@@ -169,7 +170,7 @@ def _subject(runs: Sequence[StoredRun]) -> str:
     """The suite or the class; of several suites of the same classes the shipped one."""
     suites = [run.content["suite"] for run in runs if run.content["suite"] is not None]
     if not suites:
-        return runs[0].config()["task"]
+        return short_name(runs[0].config()["task"]).rpartition("/")[2]
     return str(min(suites, key=lambda suite: "file" in suite).get("name"))
 
 

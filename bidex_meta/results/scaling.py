@@ -1,0 +1,82 @@
+"""What more rows are worth at equal steps: numbers of rows by learners (the paper's Figure 6)."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.comparison import classes_of
+from bidex_meta.evaluation.histories import curves_of
+from bidex_meta.record import plots
+from bidex_meta.record.stored import StoredRun
+from bidex_meta.results.studies import Study, head_of, refuse_differing, row_of
+
+
+def rows_table(study: Study) -> Iterator[str]:
+    """Lines of Markdown: rows by learners, the evaluation's return as mean over seeds (least to most).
+
+    Args:
+        study: Runs on one class.
+
+    Raises:
+        BidexError: Seeds of one cell differ in more than the seed, or there are several classes.
+    """
+    cells = _cells(study)
+    algos = list(dict.fromkeys(algo for algo, _ in cells))
+    yield from head_of(["rows", *algos])
+    for rows in sorted({rows for _, rows in cells}):
+        yield row_of([f"{rows:,}", *(_cell(cells.get((algo, rows), [])) for algo in algos)])
+    steps = sorted({run.content["steps"] for runs in cells.values() for run in runs})
+    seeds = sorted({len(runs) for runs in cells.values()})
+    yield ""
+    yield f"Seeds: {_range(seeds)}. Steps: {_range(steps)}. {_random(study)}"
+
+
+def rows_figure(study: Study) -> Any:
+    """Return over training: a panel a learner, a line for each number of rows.
+
+    Raises:
+        BidexError: As for ``rows_table``, or matplotlib is missing.
+    """
+    panels: dict[str, list[plots.Group]] = {}
+    for (algo, rows), runs in sorted(_cells(study).items()):
+        panels.setdefault(algo, []).append((f"{rows} rows", curves_of(runs)))
+    return plots.draw_panels(panels, f"Train/return/{_class(study)}", "return in training")
+
+
+def _cells(study: Study) -> dict[tuple[str, int], list[StoredRun]]:
+    """Runs by learner and rows."""
+    cells: dict[tuple[str, int], list[StoredRun]] = {}
+    for run in study.runs:
+        config = run.config()
+        cells.setdefault((config["algo"], config["num_envs"]), []).append(run)
+    for (algo, rows), runs in cells.items():
+        refuse_differing(f"{algo} with {rows} rows", runs)
+    _class(study)
+    return cells
+
+
+def _class(study: Study) -> str:
+    names = {name for run in study.runs for name in classes_of(run.evaluation())}
+    if len(names) != 1:
+        raise BidexError(f"Study {study.name}: rows are compared on one class, got {', '.join(sorted(names))}.")
+    return names.pop()
+
+
+def _cell(runs: Sequence[StoredRun]) -> str:
+    if not runs:
+        return "–"
+    found = np.array([row["return"] for run in runs for row in classes_of(run.evaluation()).values()])
+    told = f"{found.mean():.4g}"
+    return told if len(found) == 1 else f"{told} ({found.min():.4g} to {found.max():.4g})"
+
+
+def _random(study: Study) -> str:
+    found = [run.evaluation().get("random", {"classes": {}})["classes"].values() for run in study.runs]
+    returns = [row["return"] for rows in found for row in rows]
+    return f"Uniform actions: {np.mean(returns):.4g}." if returns else ""
+
+
+def _range(numbers: Sequence[int]) -> str:
+    return f"{numbers[0]:,}" if len(numbers) == 1 else f"{numbers[0]:,} to {numbers[-1]:,}"
