@@ -18,6 +18,7 @@ from bidex_meta.data.writer import DatasetWriter, begin, finish
 from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder
 from bidex_meta.sources.source import OwnSuite
+from bidex_meta.world.contract import ObservationGroup
 from tests.algos.problems import opposite_bandits
 from tests.data.worlds import rough
 from tests.offline.stored import noisy, played
@@ -142,6 +143,42 @@ def test_classes_recorded_alone_get_padding_one_hot_and_scale(tmp_path: Path) ->
         join(sets, world)
     with pytest.raises(BidexError, match="entries beside the task id"):
         join(sets, opposite_bandits(rows=2))
+
+
+def clouds(points: int, kind: str, state: int, ids: int) -> list[Any]:
+    """Groups of an observation [state | cloud | one-hot], as metadata have them."""
+    first, last = state, state + points * {"points": 3, "kind_points": 4}[kind]
+    found = [["state", [[0, first]]], [kind, [[first, last]]], ["task_id", [[last, last + ids]]]]
+    return found if ids else found[:2]
+
+
+def test_a_class_recorded_alone_keeps_its_cloud_in_its_place(tmp_path: Path) -> None:
+    """A state of two entries is padded to three; the clouds of two points stand behind it."""
+    world = opposite_bandits(rows=2)
+    world.single_observation_space = Box(-np.inf, np.inf, (3 + 6 + 2,), np.float32)
+
+    def show(points: int, kind: str = "points") -> None:
+        world.observation_groups = tuple(
+            ObservationGroup(name, tuple(slice(*part) for part in parts)) for name, parts in clouds(points, kind, 3, 2)
+        )
+
+    show(2)
+    episodes = alone(1, 2 + 6)
+    for episode in episodes:
+        episode.observations[:] += np.arange(8, dtype=np.float32)
+    seen = stored(tmp_path, "seen-v0", episodes, ["task1"], observation_groups=clouds(2, "points", 2, 0))
+    data, first = join([seen], world, every=False), episodes[0].observations[0]
+    assert data.observations[0].tolist() == [*first[:2], 0.0, *first[2:], 0.0, 1.0]
+    # Of the same sizes altogether, but of other clouds, or of none.
+    blind = stored(tmp_path, "blind-v0", alone(1, 2 + 6), ["task1"])
+    few = stored(tmp_path, "few-v0", alone(1, 2 + 3), ["task1"], observation_groups=clouds(1, "points", 2, 0))
+    for dataset, told in ((blind, "none, the world: points of 2"), (few, "points of 1, the world: points of 2")):
+        with pytest.raises(BidexError, match=f"has point clouds: {told}. Learn with the points"):
+            join([dataset], world, every=False)
+    world.single_observation_space = Box(-np.inf, np.inf, (3 + 8 + 2,), np.float32)
+    show(2, "kind_points")
+    with pytest.raises(BidexError, match="points of 2, the world: kind_points of 2"):
+        join([seen], world, every=False)
 
 
 def test_data_sets_imply_what_they_were_recorded_of():
