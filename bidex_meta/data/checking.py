@@ -6,6 +6,7 @@ an error of the recorder (a shifted row, a wrong task, a wrong start) would part
 than the observation shows (the hand's point of most table classes) cannot be computed again, and the check says so.
 """
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -89,13 +90,13 @@ def verify(dataset: Dataset, most: int | None = None) -> Findings:
 
     Args:
         dataset: What to check.
-        most: Episodes to look at, evenly spread; None: all.
+        most: Episodes to look at at most, from 1 on, evenly spread; None: all.
 
     Raises:
         BidexError: Files are missing or damaged.
     """
     found, task_classes = Findings(), _Formulas(dataset)
-    table, every = dataset.table, 1 if most is None else max(1, dataset.num_episodes // most)
+    table, every = dataset.table, 1 if most is None else max(1, math.ceil(dataset.num_episodes / most))
     for number, episode in enumerate(dataset.episodes()):
         if number % every:
             continue

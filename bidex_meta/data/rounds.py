@@ -48,9 +48,10 @@ class Actor:
         if self.policy is None:
             return RandomAgent(world.action_space, seed).eval_action
         policy: Agent = self.policy
-        # A generator for each kind of draw: the policy's lives where its network does.
+        # A generator for each kind of draw: the policy's lives where its network does. With one seed the noise would be
+        # the policy's own normals once more.
         inner = torch.Generator(world.device).manual_seed(seed)
-        outer = torch.Generator().manual_seed(seed)
+        outer = torch.Generator().manual_seed(int(np.random.SeedSequence(seed).generate_state(1)[0]))
 
         def act(obs: Tensor) -> Tensor:
             action = policy.sample_action(obs, inner) if self.sampled else policy.eval_action(obs)  # type: ignore

@@ -1,6 +1,7 @@
 """record, run --record and data, on small worlds and one real one."""
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +66,8 @@ def test_a_real_class_its_rewards_and_a_damaged_copy(real: Dataset, capsys: pyte
     assert info["coverage"]["constant"]["right_hand"] < 0.1
     assert real.name in told(capsys, "data", "list")
     assert "rewards computed again" in told(capsys, "data", "check", real.name)
+    most = real.num_episodes // 2 + 1  # every second one, not all
+    assert verify(real, most).episodes == math.ceil(real.num_episodes / 2) <= most
     # Observations shifted by a step, a reward of another task, a torn end: each is seen.
     path = part_files.parts_of(real.folder)[0]
     with h5py.File(path, "r+") as file:

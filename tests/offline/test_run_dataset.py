@@ -17,6 +17,7 @@ from bidex_meta.data.joined import join
 from bidex_meta.data.writer import DatasetWriter, begin, finish
 from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder
+from bidex_meta.sources.humanoid_task import HUMANOID
 from bidex_meta.sources.source import OwnSuite
 from bidex_meta.world.contract import ObservationGroup
 from tests.algos.problems import opposite_bandits
@@ -74,6 +75,44 @@ def test_a_run_on_data_sets_is_evaluated_resumed_and_reported(folder: Path, caps
     told(capsys, "plot", whole, "--out", folder / "curves.png")
     assert (folder / "curves.png").stat().st_size > 5000
     told(capsys, "report", whole, "--out", folder / "report.html")
+
+
+def test_a_policy_from_data_is_recorded_on_the_tasks_of_its_data(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whatever the seeds of the runs are, so that two of them make one data set."""
+    told(capsys, "record", "random", "--suite", "MT4", *FEW, "--size", "60", "--seed", "4")
+    runs = [folder / name for name in ("a", "b")]
+    for seed, run in enumerate(runs, 1):
+        flags = ["--dataset", "MT4/random-v0", "--algo", "bc", "--seed", seed, "--steps", "10", "--run-dir", run]
+        told(capsys, "run", *flags, *SMALL, "--no-evaluate")
+    told(capsys, "record", "medium-expert", *runs, *FEW, "--size", "60", "--seed", "9")
+    about = open_dataset("MT4/medium-expert-v0").metadata
+    assert (about["seed"], about["starts"]) == (4, 9)
+
+
+def test_gymnasiums_humanoid_is_learned_without_being_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its data set tells the task, and no suite."""
+    few = ["--size", "60", "--num-envs", "4", "--threads", "1", "--device", "cpu"]
+    told(capsys, "record", "random", "--task", HUMANOID, *few)
+    name = f"{HUMANOID}/random-v0"
+    about = open_dataset(name).metadata
+    assert (about["suite"], about["task"], about["base"]) == (None, HUMANOID, "own")
+    told(
+        capsys,
+        "run",
+        "--dataset",
+        name,
+        "--algo",
+        "bc",
+        *SMALL,
+        "--steps",
+        10,
+        "--no-evaluate",
+        "--run-dir",
+        folder / "a",
+    )
+    assert RunFolder.open(folder / "a").config()["task"] == HUMANOID
 
 
 def test_what_does_not_go_together_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -188,5 +227,15 @@ def test_data_sets_imply_what_they_were_recorded_of():
     assert implied([mug, mug]) == {"task": "CatchUnderarm", "base": "moving", "object": "mug", "points": 64}
     assert implied([egg]) == {"task": "CatchUnderarm", "base": "moving"}
     assert implied([SimpleNamespace(metadata={})]) == {}
-    with pytest.raises(BidexError, match="--suite NAME"):
-        implied([mug, egg])
+
+    def other(**more: Any) -> SimpleNamespace:
+        return SimpleNamespace(metadata=egg.metadata | more)
+
+    for differs, named in (
+        (other(object="mug"), "of CatchUnderarm differ in object: its own and mug. Name the suite .* --suite NAME"),
+        (other(points=64), "of CatchUnderarm differ in points: 0 and 64. Name some that were recorded alike"),
+        (other(base="own"), "of CatchUnderarm differ in base: moving and own. .* --task NAME --base BASE"),
+        (other(task="Switch"), "are of CatchUnderarm and Switch. Name the suite .* --suite NAME"),
+    ):
+        with pytest.raises(BidexError, match=named):
+            implied([egg, differs])
