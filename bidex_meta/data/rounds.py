@@ -189,7 +189,8 @@ def _round(recorder: EpisodeRecorder, actor: Actor, rows: Tensor, repeats: int, 
                 actor.policy.reset(again)
 
 
-def bytes_held(world: PooledWorld) -> int:
-    """Bytes that the episodes that run take at most, while they are recorded."""
+def bytes_held(world: PooledWorld, rows: Sequence[int] | None = None) -> int:
+    """Bytes that the episodes that run in some rows (None: all) take at most, while they are recorded."""
     step = 4 * (world.single_observation_space.shape[0] + world.single_action_space.shape[0] + 2)
-    return int(world.max_episode_steps.sum()) * step
+    limits = world.max_episode_steps if rows is None else world.max_episode_steps[list(rows)]
+    return int(limits.sum()) * step

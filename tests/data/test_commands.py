@@ -3,12 +3,15 @@
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from bidex_meta import memory
 from bidex_meta.cli import main
+from bidex_meta.commands import run_recording
 from bidex_meta.data import Dataset, open_dataset, part_files, place
 from bidex_meta.data.checking import verify
 from bidex_meta.errors import BidexError
@@ -121,6 +124,29 @@ def test_a_resumed_run_records_as_one_that_was_not_ended(toy: None, folder: Path
     a, b = (open_dataset(folder / name / "replay") for name in ("whole", "torn"))
     assert a.num_steps == b.num_steps > 100
     assert all(np.array_equal(x, y) for x, y in zip(a.transitions().values(), b.transitions().values(), strict=True))
+
+
+def test_a_recorded_run_asks_for_memory_and_for_the_rest_of_the_room(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a share of the rows, with a checkpoint's copy; of a resumed run less the parts that are there."""
+    plan: Any = SimpleNamespace(config={"record": 100, "record_share": 0.5}, folder=None)
+    plan.flags = SimpleNamespace(run_dir=folder / "run")
+    asked: list[int] = []
+    monkeypatch.setattr(place, "check_room", lambda where, needed, told: asked.append(needed))
+    # Two rows of five steps, two of eight, of three observations, two actions and two rewards; and once more.
+    needed = 2 * 4 * (3 + 2 + 2) * (2 * 5 + 2 * 8)
+    monkeypatch.setattr(memory, "available", lambda: needed)
+    assert len(run_recording.recorded(plan, rough(6)).rows) == 4
+    monkeypatch.setattr(memory, "available", lambda: needed - 1)
+    with pytest.raises(BidexError, match=r"running episodes of 4 recorded rows .* Lower --record or --num-envs"):
+        run_recording.recorded(plan, rough(6))
+    part = part_files.part_path(folder / "run" / "replay" / "data", 0, 0)
+    part.parent.mkdir(parents=True)
+    part.write_bytes(bytes(1000))
+    with pytest.raises(BidexError, match="running episodes"):
+        run_recording.recorded(plan, rough(6))
+    assert asked[0] == asked[1] == asked[2] + 1000
 
 
 def test_stopping_at_a_return(toy: None, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
