@@ -12,11 +12,15 @@ import pytest
 from bidex_meta import memory
 from bidex_meta.cli import main
 from bidex_meta.commands import run_recording
-from bidex_meta.data import Dataset, open_dataset, part_files, place
+from bidex_meta.commands.described import described
+from bidex_meta.data import Dataset, open_dataset, part_files, place, rounds
 from bidex_meta.data.checking import verify
+from bidex_meta.data.writer import DatasetWriter, finish
 from bidex_meta.errors import BidexError
+from bidex_meta.sources import Source
 from bidex_meta.sources.source import OwnSuite
 from tests.data.worlds import rough
+from tests.pages import ROOT
 
 h5py = pytest.importorskip("h5py", reason="needs the extra data")
 
@@ -88,6 +92,40 @@ def test_a_real_class_its_rewards_and_a_damaged_copy(real: Dataset, capsys: pyte
     assert "is damaged or no part" in told(capsys, "data", "check", real.name, code=2)
     path.unlink()
     assert "Parts are missing" in told(capsys, "data", "info", real.name, code=2)
+
+
+def recorded(folder: Path, **config: Any) -> Dataset:
+    """Uniform actions in two rows of what a config names."""
+    source = Source.open({"seed": 0, "threads": 1, **config})
+    world, out = source.world("train", 2), DatasetWriter(folder)
+    try:
+        rounds.collect(world, [rounds.Actor(None)], out, 60, 0, lambda now, seconds: None)
+        about = described(source, world, "random", [])
+        finish(folder, "own/random-v0", world.single_observation_space, world.single_action_space, about)
+    finally:
+        world.close()
+    return open_dataset(folder)
+
+
+def test_rewards_of_clouds_are_not_computed_again_and_no_episode_is_wrong(tmp_path: Path) -> None:
+    """The egg's entries are zero there: the formula has no place to read."""
+    found = verify(recorded(tmp_path, task="HandOver", points=16))
+    assert (found.count, found.recomputed) == (0, {})
+    assert found.skipped == {"HandOver": "its formula asks for object/position, which no observation shows"}
+
+
+def test_rewards_of_a_suite_with_bases_alone_are_computed_again(tmp_path: Path) -> None:
+    """Its HandOver has fixed ones, which nothing but the number of actions tells once the file is gone."""
+    text = (ROOT / "suites" / "MT4.toml").read_text().replace('base = "moving"', 'base = "alone"')
+    (tmp_path / "own.toml").write_text(text.split("[[classes]]")[0] + '[[classes]]\nname = "HandOver"\n')
+    dataset = recorded(tmp_path / "a", suite=str(tmp_path / "own.toml"))
+    (tmp_path / "own.toml").unlink()
+    found = verify(dataset)
+    assert (dataset.action_size, found.count, found.recomputed) == (40, 0, {"HandOver": found.steps})
+    # A class that has no such number of actions.
+    dataset.metadata["base"] = "moving"
+    found = verify(dataset)
+    assert (found.count, found.skipped) == (0, {"HandOver": "HandOver has 52 actions here, the data 40"})
 
 
 def test_the_four_kinds_of_a_suite(toy: None, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
