@@ -29,7 +29,7 @@ class DataFlags:
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")] = ""
     """info, check: a data set's name or folder."""
     episodes: int | None = None
-    """check: look at so many episodes, evenly spread; None: all."""
+    """check: look at so many episodes at most, evenly spread; None: all."""
     json: Switch = False
     """Print JSON."""
 

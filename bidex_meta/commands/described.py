@@ -25,7 +25,7 @@ def described(source: Source, world: Any, kind: str, policies: Sequence[dict[str
         unscaled returns), ``versions`` and ``commit``; all ready for JSON.
     """
     suite = getattr(source, "suite", None)
-    alone = hasattr(source, "moving_base")
+    alone = getattr(source, "class_name", None) is not None
     versions = collect_versions()
     names = {name.partition("/")[0] for name in world.task_names}
     known = source.references()

@@ -179,6 +179,9 @@ def _config(flags: RecordFlags) -> dict[str, Any]:
         stored = [RunFolder.open(run).config() for run in flags.runs]
         names = ("suite", "task", "base", "object", "points", "seed")
         found = [{name: each.get(name, {"base": "own", "points": 0}.get(name)) for name in names} for each in stored]
+        for one, given in zip(found, stored, strict=True):
+            if given.get("task_seed") is not None:  # what learned from data plays the tasks of its data
+                one["seed"] = given["task_seed"]
         if differ := [name for name in names if found[0][name] != found[-1][name]]:
             raise BidexError(
                 f"The two runs differ in {differ[0]}: {found[0][differ[0]]} and {found[-1][differ[0]]}. Name runs on "

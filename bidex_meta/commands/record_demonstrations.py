@@ -65,7 +65,8 @@ def record_demonstrations(flags: Any, say: Callable[[str], None]) -> tuple[Path,
         say(f"{name}: {size:,} transitions, at most about {needed / 1e9:.2f} GB on the disk.")
         if flags.estimate:
             return None
-        check_room(folder, needed, f"{size:,} transitions")
+        there = sum(path.stat().st_size for path in part_files.parts_of(folder / "data"))
+        check_room(folder, max(0, needed - there), f"{size:,} transitions")
         begin(folder, plan)
         keep = whole_parts([path.name for path in part_files.parts_of(folder / "data", 0)])
         writer = DatasetWriter(folder, keep=keep)

@@ -46,12 +46,25 @@ def implied(datasets: "Sequence[Dataset]") -> dict[str, Any]:
     told = [tuple(each.metadata.get(name) or None for name in _FORM) for each in datasets]
     if not told or told[0][:2] == (None, None):
         return {}
-    if len(set(told)) > 1:
-        raise BidexError(
-            f"The data sets are of {' and '.join(sorted({str(suite or task) for suite, task, *_ in told}))}. Name the "
-            "suite that one policy shall learn: --suite NAME, of exactly these classes."
-        )
+    _check_alike(told)
     return {name: value for name, value in zip(_FORM, told[0], strict=True) if value is not None}
+
+
+def _check_alike(told: Sequence[tuple[Any, ...]]) -> None:
+    """Refuses data sets of different suites or classes, or of one that differ in anything else of ``_FORM``."""
+    which = sorted({str(suite or task or "elsewhere") for suite, task, *_ in told})
+    suite = "Name the suite that one policy shall learn: --suite NAME, of exactly these classes."
+    if len(which) > 1:
+        raise BidexError(f"The data sets are of {' and '.join(which)}. {suite}")
+    same = "Name some that were recorded alike"
+    mends = {"base": f"{same}, or what fits all: --task NAME --base BASE.", "points": f"{same}.", "object": suite}
+    usual = {"points": 0, "object": "its own"}
+    for name, mend in mends.items():
+        values = {each[_FORM.index(name)] or usual.get(name) for each in told}
+        if len(values) > 1:
+            raise BidexError(
+                f"The data sets of {which[0]} differ in {name}: {' and '.join(sorted(map(str, values)))}. {mend}"
+            )
 
 
 def task_seed(datasets: "Sequence[Dataset]") -> int | None:

@@ -3,9 +3,11 @@
 The reward is computed again by the class's own formula (``TaskClass.reward_terms``), from sensors that the observation
 shows and the variation that the episode stores; so it holds observations, variations and rewards to each other, where
 an error of the recorder (a shifted row, a wrong task, a wrong start) would part them. A formula that asks for more
-than the observation shows (the hand's point of most table classes) cannot be computed again, and the check says so.
+than the observation shows (the hand's point of most table classes; with point clouds the objects' states) cannot be
+computed again, and the check says so.
 """
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -18,9 +20,12 @@ from bidex_meta.data.dataset import Dataset
 from bidex_meta.data.episode import Episode
 from bidex_meta.errors import BidexError
 from bidex_meta.outside import name_without_object
+from bidex_meta.points.sight import POINT_ENTRIES
+from bidex_meta.points.told import entries_of_objects
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.layout import CLIP, Block
+from bidex_meta.tasks.scene import compile_scene
 from bidex_meta.tasks.state import TaskState
 
 _TOLERANCE = 1e-5
@@ -89,13 +94,13 @@ def verify(dataset: Dataset, most: int | None = None) -> Findings:
 
     Args:
         dataset: What to check.
-        most: Episodes to look at, evenly spread; None: all.
+        most: Episodes to look at at most, from 1 on, evenly spread; None: all.
 
     Raises:
         BidexError: Files are missing or damaged.
     """
     found, task_classes = Findings(), _Formulas(dataset)
-    table, every = dataset.table, 1 if most is None else max(1, dataset.num_episodes // most)
+    table, every = dataset.table, 1 if most is None else max(1, math.ceil(dataset.num_episodes / most))
     for number, episode in enumerate(dataset.episodes()):
         if number % every:
             continue
@@ -148,9 +153,12 @@ class _Formulas:
     """
 
     def __init__(self, dataset: Dataset) -> None:
-        self._scales = dataset.metadata.get("reward_scales", {})
-        base = {"moving": True, "fixed": False}.get(dataset.metadata.get("base") or "")
-        self._moving = base if dataset.metadata.get("task") else True
+        self._dataset, about = dataset, dataset.metadata
+        self._scales = about.get("reward_scales", {})
+        told = {"own": (None,), "moving": (True,), "fixed": (False,)}
+        # What a suite says of bases stands in its file, which may have gone; its actions tell.
+        self._bases = told.get(about.get("base") or "", (True, None))
+        self._clouds = any(name in POINT_ENTRIES for name, _ in about.get("observation_groups", ()))
         self._known: dict[str, tuple[TaskClass, dict[str, tuple[slice, float]]] | None] = {}
 
     def check(self, episode: Episode, found: Findings) -> Iterator[str]:
@@ -184,22 +192,45 @@ class _Formulas:
         if name not in self._known:
             self._known[name] = None
             try:
-                task = registry.get(name_without_object(name), self._moving)
-                self._known[name] = task, shown_sensors(task)
+                task = self._class(name_without_object(name))
+                self._known[name] = task, shown_sensors(task, hidden=self._hidden(task))
             except BidexError as error:
                 found.skipped[name] = str(error)
         return self._known[name]
 
+    def _class(self, name: str) -> TaskClass:
+        """A class with the bases of the recording.
 
-def shown_sensors(task: TaskClass) -> dict[str, tuple[slice, float]]:
-    """Where a class's observation shows each sensor whole and unmapped, and the factor on it."""
+        Raises:
+            BidexError: It is unknown, or has other actions than the data with any of them.
+        """
+        classes, actions = [registry.get(name, base) for base in self._bases], self._dataset.action_size
+        for task in classes:
+            if task.action_size == actions:
+                return task
+        sizes = " or ".join(str(size) for size in sorted({task.action_size for task in classes}))
+        raise BidexError(f"{name} has {sizes} actions here, the data {actions}")
+
+    def _hidden(self, task: TaskClass) -> frozenset[int]:
+        """Entries of a class's observation that are zero since clouds stand in their place."""
+        return frozenset(entries_of_objects(compile_scene(task)) if self._clouds else ())
+
+
+def shown_sensors(task: TaskClass, hidden: frozenset[int] = frozenset()) -> dict[str, tuple[slice, float]]:
+    """Where a class's observation shows each sensor whole and unmapped, and the factor on it.
+
+    Args:
+        task: The class.
+        hidden: Entries that show nothing.
+    """
     found: dict[str, tuple[slice, float]] = {}
     for block, where in task.layout:
         if block.sensors and not block.name.endswith("joint_position"):  # those are mapped from the joint's range
             start = where.start
             for sensor in block.sensors:
                 size = _size(block, sensor)
-                found[sensor] = slice(start, start + size), block.scale
+                if hidden.isdisjoint(range(start, start + size)):
+                    found[sensor] = slice(start, start + size), block.scale
                 start += size
     return found
 

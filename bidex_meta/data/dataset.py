@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bidex_meta.data import part_files
+from bidex_meta.data import foreign, part_files
 from bidex_meta.data.episode import Episode
 from bidex_meta.errors import BidexError, unknown_name
 from bidex_meta.memory import check_memory
@@ -137,6 +137,15 @@ class Dataset:
         """Actions, a."""
         return self._sizes[1]
 
+    @property
+    def action_bounds(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Least and largest actions, (a,) each, of a data set from elsewhere; None: -1 and 1, as all recorded here.
+
+        Raises:
+            BidexError: Its metadata do not tell finite ones.
+        """
+        return None if "bidex" in self.content else foreign.action_bounds(self.content, self.name, self.action_size)
+
     @cached_property
     def _sizes(self) -> tuple[int, int]:
         first = next(self.episodes(), None)
@@ -148,14 +157,19 @@ class Dataset:
         """All episodes, read one by one.
 
         Raises:
-            BidexError: A file is damaged.
+            BidexError: A file is damaged, or observations or actions of a data set from elsewhere are not flat.
         """
         h5, names, number = part_files.hdf5(), self.metadata["tasks"], 0
+        foreign.check_spaces(self.content, self.name)
         for place in self._places():
             try:
                 with h5.File(place.path, "r") as file:
                     for inner in range(place.count):
-                        arrays = {ours: file[f"episode_{inner}"][name][()] for name, ours in part_files.ARRAYS.items()}
+                        group = file[f"episode_{inner}"]
+                        arrays = {
+                            ours: foreign.numbers(group[name], name, self.name)
+                            for name, ours in part_files.ARRAYS.items()
+                        }
                         yield Episode(**arrays, **self._told(number, names))
                         number += 1
             except (OSError, KeyError) as error:

@@ -5,8 +5,8 @@ That is half of what two tensors of observations would take.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from bidex_meta.data.dataset import Dataset
 from bidex_meta.data.episode import Episode
 from bidex_meta.errors import BidexError, unknown_name
 from bidex_meta.memory import check_memory
+from bidex_meta.points.sight import POINT_ENTRIES
 from bidex_meta.world.contract import VectorWorld
 
 
@@ -52,7 +53,7 @@ def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) ->
     """Reads data sets for a world.
 
     Classes are found by the names of their slots. Of a class recorded on its own, observations get the padding and the
-    one-hot that the world shows, and rewards its scale.
+    one-hot that the world shows, and rewards its scale. Actions of a data set from elsewhere are brought to [-1, 1].
 
     Args:
         datasets: At least one.
@@ -60,8 +61,8 @@ def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) ->
         every: Whether each of the world's classes needs data.
 
     Raises:
-        BidexError: Actions or observations of another form, a class that the world does not have, one of the world's
-            that no data set holds, or no room in memory.
+        BidexError: Actions, states or clouds of another form, actions from elsewhere without bounds, a class that the
+            world does not have, one of the world's that no data set holds, or no room in memory.
     """
     ids = world.num_id_columns
     plain, actions = world.single_observation_space.shape[0] - ids, world.single_action_space.shape[0]
@@ -108,6 +109,28 @@ def gathered(
     return Joined(states, at, acts, rewards, ends, task, left)
 
 
+class _Columns(NamedTuple):
+    """Where an observation has what, task id aside: a padded state stands before its cloud, not behind it."""
+
+    state: np.ndarray
+    """Columns beside the cloud, ascending."""
+    cloud: np.ndarray
+    """Columns of the point cloud, point after point; none without one."""
+    told: str
+    """What cloud it is, for messages."""
+
+    @staticmethod
+    def of(groups: Iterable[tuple[str, Sequence[tuple[int, int]]]], size: int) -> "_Columns":
+        """Those of an observation of so many entries before the task id, by its groups' names and index ranges."""
+        every = np.arange(size)
+        for name, parts in groups:
+            if name in POINT_ENTRIES:
+                cloud = np.concatenate([np.arange(start, stop) for start, stop in parts])
+                told = f"{name} of {len(cloud) // POINT_ENTRIES[name]:,}"
+                return _Columns(np.setdiff1d(every, cloud), cloud, told)
+        return _Columns(every, every[:0], "none")
+
+
 class _Form:
     """How a data set's episodes become a world's.
 
@@ -130,32 +153,48 @@ class _Form:
                 f"{dataset.name} has {dataset.action_size} actions, the world {actions}. Record it with the same bases "
                 "(--base), or learn for what it was recorded of."
             )
-        shown = {
-            name: sum(stop - start for start, stop in parts) for name, parts in about.get("observation_groups", ())
-        }
-        self._plain, self._width = dataset.observation_size - shown.get("task_id", 0), plain
-        padded = self._plain < plain and world.num_tasks > 1 and len(names) == 1
-        if self._plain != plain and not padded:
-            raise BidexError(
-                f"{dataset.name} has observations of {self._plain} entries beside the task id, the world {plain}. "
-                "Learn for what it was recorded of."
-            )
+        shown = about.get("observation_groups", ())
+        ids = sum(stop - start for name, parts in shown if name == "task_id" for start, stop in parts)
+        self._width, self._own = plain, _Columns.of(shown, dataset.observation_size - ids)
+        seen = ((group.name, [(part.start, part.stop) for part in group.where]) for group in world.observation_groups)
+        self._theirs = _Columns.of(seen, plain)
+        self._bounds = dataset.action_bounds
+        self._check_observations(world.num_tasks > 1 and len(names) == 1)
         own, theirs = about.get("reward_scales", {}), {s.name: s.reward_scale for s in getattr(world, "slots", ())}
         self._factors = [
             theirs.get(world.task_names[slot], 1.0) / own.get(name, 1.0) if own and theirs else 1.0
             for name, slot in zip(names, self.slots, strict=True)
         ]
 
+    def _check_observations(self, may_pad: bool) -> None:
+        """Refuses states and clouds of other sizes; ``may_pad``: whether the world's states may be wider."""
+        name, own, theirs = self.dataset.name, self._own, self._theirs
+        if own.told != theirs.told:
+            raise BidexError(
+                f"{name} has point clouds: {own.told}, the world: {theirs.told}. Learn with the points that it was "
+                "recorded with (--points, or [points] in the suite's file)."
+            )
+        here, there = len(own.state), len(theirs.state)
+        if here > there or (here < there and not may_pad):
+            raise BidexError(
+                f"{name} has observations of {here} entries beside the task id and cloud, the world {there}. Learn for "
+                "what it was recorded of."
+            )
+
     def fitted(self, episode: Episode, ids: int) -> tuple[Episode, int, np.ndarray]:
         """An episode, its slot, and its observations in the world's form."""
         slot, factor = self.slots[episode.task], self._factors[episode.task]
-        seen = episode.observations[:, : self._plain]
-        if self._width + ids != seen.shape[1]:
-            wide = np.zeros((len(seen), self._width + ids), np.float32)
-            wide[:, : self._plain] = seen
-            if ids:
-                wide[:, self._width + slot] = 1.0
-            seen = wide
+        own, theirs = self._own, self._theirs
+        seen = np.zeros((len(episode) + 1, self._width + ids), np.float32)
+        seen[:, theirs.state[: len(own.state)]] = episode.observations[:, own.state]
+        seen[:, theirs.cloud] = episode.observations[:, own.cloud]
+        if ids:
+            seen[:, self._width + slot] = 1.0
+        if self._bounds is not None:
+            low, high = self._bounds
+            # What lies outside is clipped, as the data set's own environment does and the world would.
+            mapped = (episode.actions - (high / 2.0 + low / 2.0)) / (high / 2.0 - low / 2.0)
+            episode = replace(episode, actions=mapped.clip(-1.0, 1.0))
         if factor != 1.0:
             episode.rewards[:] *= np.float32(factor)
         return episode, slot, seen

@@ -48,9 +48,10 @@ class Actor:
         if self.policy is None:
             return RandomAgent(world.action_space, seed).eval_action
         policy: Agent = self.policy
-        # A generator for each kind of draw: the policy's lives where its network does.
+        # A generator for each kind of draw: the policy's lives where its network does. With one seed the noise would be
+        # the policy's own normals once more.
         inner = torch.Generator(world.device).manual_seed(seed)
-        outer = torch.Generator().manual_seed(seed)
+        outer = torch.Generator().manual_seed(int(np.random.SeedSequence(seed).generate_state(1)[0]))
 
         def act(obs: Tensor) -> Tensor:
             action = policy.sample_action(obs, inner) if self.sampled else policy.eval_action(obs)  # type: ignore
@@ -188,7 +189,8 @@ def _round(recorder: EpisodeRecorder, actor: Actor, rows: Tensor, repeats: int, 
                 actor.policy.reset(again)
 
 
-def bytes_held(world: PooledWorld) -> int:
-    """Bytes that the episodes that run take at most, while they are recorded."""
+def bytes_held(world: PooledWorld, rows: Sequence[int] | None = None) -> int:
+    """Bytes that the episodes that run in some rows (None: all) take at most, while they are recorded."""
     step = 4 * (world.single_observation_space.shape[0] + world.single_action_space.shape[0] + 2)
-    return int(world.max_episode_steps.sum()) * step
+    limits = world.max_episode_steps if rows is None else world.max_episode_steps[list(rows)]
+    return int(limits.sum()) * step

@@ -1,5 +1,6 @@
 """What a data set holds, in numbers: episodes, returns, successes, and how much of the tasks and states it covers."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -69,14 +70,14 @@ def coverage(dataset: Dataset, most: int = 2000) -> dict[str, Any]:
 
     Args:
         dataset: The data set.
-        most: Episodes to look at.
+        most: Episodes to look at at most, from 1 on.
 
     Returns:
         ``observation_std`` by group of the observation: mean over its entries of the standard deviation over all
         states; ``constant``: share of its entries that never change; ``action_std``: mean over actions;
         ``action_at_bounds``: share of actions at -1 or 1.
     """
-    every = max(1, dataset.num_episodes // most)
+    every = max(1, math.ceil(dataset.num_episodes / most))
     d, a = dataset.observation_size, dataset.action_size
     count, taken = 0, 0
     sums, squares = np.zeros(d + a), np.zeros(d + a)

@@ -15,6 +15,8 @@ from bidex_meta.tasks.scene import Scene
 
 CANDIDATES = 3072
 """Points fixed on a scene at least: fewer leave gaps through which what is hidden shines."""
+POINT_ENTRIES = {"points": 3, "kind_points": 4}
+"""Entries of a point, by the name of the clouds' observation group."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class PointsRule:
     @property
     def entries(self) -> int:
         """Entries of an observation that a cloud takes, point after point."""
-        return self.count * (4 if self.kinds else 3)
+        return self.count * POINT_ENTRIES[self.group]
 
     @property
     def group(self) -> str:

@@ -1,18 +1,26 @@
 """record, run --record and data, on small worlds and one real one."""
 
 import json
+import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from bidex_meta import memory
 from bidex_meta.cli import main
-from bidex_meta.data import Dataset, open_dataset, part_files, place
+from bidex_meta.commands import run_recording
+from bidex_meta.commands.described import described
+from bidex_meta.data import Dataset, open_dataset, part_files, place, rounds
 from bidex_meta.data.checking import verify
+from bidex_meta.data.writer import DatasetWriter, finish
 from bidex_meta.errors import BidexError
+from bidex_meta.sources import Source
 from bidex_meta.sources.source import OwnSuite
 from tests.data.worlds import rough
+from tests.pages import ROOT
 
 h5py = pytest.importorskip("h5py", reason="needs the extra data")
 
@@ -65,6 +73,8 @@ def test_a_real_class_its_rewards_and_a_damaged_copy(real: Dataset, capsys: pyte
     assert info["coverage"]["constant"]["right_hand"] < 0.1
     assert real.name in told(capsys, "data", "list")
     assert "rewards computed again" in told(capsys, "data", "check", real.name)
+    most = real.num_episodes // 2 + 1  # every second one, not all
+    assert verify(real, most).episodes == math.ceil(real.num_episodes / 2) <= most
     # Observations shifted by a step, a reward of another task, a torn end: each is seen.
     path = part_files.parts_of(real.folder)[0]
     with h5py.File(path, "r+") as file:
@@ -82,6 +92,40 @@ def test_a_real_class_its_rewards_and_a_damaged_copy(real: Dataset, capsys: pyte
     assert "is damaged or no part" in told(capsys, "data", "check", real.name, code=2)
     path.unlink()
     assert "Parts are missing" in told(capsys, "data", "info", real.name, code=2)
+
+
+def recorded(folder: Path, **config: Any) -> Dataset:
+    """Uniform actions in two rows of what a config names."""
+    source = Source.open({"seed": 0, "threads": 1, **config})
+    world, out = source.world("train", 2), DatasetWriter(folder)
+    try:
+        rounds.collect(world, [rounds.Actor(None)], out, 60, 0, lambda now, seconds: None)
+        about = described(source, world, "random", [])
+        finish(folder, "own/random-v0", world.single_observation_space, world.single_action_space, about)
+    finally:
+        world.close()
+    return open_dataset(folder)
+
+
+def test_rewards_of_clouds_are_not_computed_again_and_no_episode_is_wrong(tmp_path: Path) -> None:
+    """The egg's entries are zero there: the formula has no place to read."""
+    found = verify(recorded(tmp_path, task="HandOver", points=16))
+    assert (found.count, found.recomputed) == (0, {})
+    assert found.skipped == {"HandOver": "its formula asks for object/position, which no observation shows"}
+
+
+def test_rewards_of_a_suite_with_bases_alone_are_computed_again(tmp_path: Path) -> None:
+    """Its HandOver has fixed ones, which nothing but the number of actions tells once the file is gone."""
+    text = (ROOT / "suites" / "MT4.toml").read_text().replace('base = "moving"', 'base = "alone"')
+    (tmp_path / "own.toml").write_text(text.split("[[classes]]")[0] + '[[classes]]\nname = "HandOver"\n')
+    dataset = recorded(tmp_path / "a", suite=str(tmp_path / "own.toml"))
+    (tmp_path / "own.toml").unlink()
+    found = verify(dataset)
+    assert (dataset.action_size, found.count, found.recomputed) == (40, 0, {"HandOver": found.steps})
+    # A class that has no such number of actions.
+    dataset.metadata["base"] = "moving"
+    found = verify(dataset)
+    assert (found.count, found.skipped) == (0, {"HandOver": "HandOver has 52 actions here, the data 40"})
 
 
 def test_the_four_kinds_of_a_suite(toy: None, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -118,6 +162,29 @@ def test_a_resumed_run_records_as_one_that_was_not_ended(toy: None, folder: Path
     a, b = (open_dataset(folder / name / "replay") for name in ("whole", "torn"))
     assert a.num_steps == b.num_steps > 100
     assert all(np.array_equal(x, y) for x, y in zip(a.transitions().values(), b.transitions().values(), strict=True))
+
+
+def test_a_recorded_run_asks_for_memory_and_for_the_rest_of_the_room(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a share of the rows, with a checkpoint's copy; of a resumed run less the parts that are there."""
+    plan: Any = SimpleNamespace(config={"record": 100, "record_share": 0.5}, folder=None)
+    plan.flags = SimpleNamespace(run_dir=folder / "run")
+    asked: list[int] = []
+    monkeypatch.setattr(place, "check_room", lambda where, needed, told: asked.append(needed))
+    # Two rows of five steps, two of eight, of three observations, two actions and two rewards; and once more.
+    needed = 2 * 4 * (3 + 2 + 2) * (2 * 5 + 2 * 8)
+    monkeypatch.setattr(memory, "available", lambda: needed)
+    assert len(run_recording.recorded(plan, rough(6)).rows) == 4
+    monkeypatch.setattr(memory, "available", lambda: needed - 1)
+    with pytest.raises(BidexError, match=r"running episodes of 4 recorded rows .* Lower --record or --num-envs"):
+        run_recording.recorded(plan, rough(6))
+    part = part_files.part_path(folder / "run" / "replay" / "data", 0, 0)
+    part.parent.mkdir(parents=True)
+    part.write_bytes(bytes(1000))
+    with pytest.raises(BidexError, match="running episodes"):
+        run_recording.recorded(plan, rough(6))
+    assert asked[0] == asked[1] == asked[2] + 1000
 
 
 def test_stopping_at_a_return(toy: None, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -75,6 +75,17 @@ def test_sizes_and_shares(tmp_path: Path) -> None:
     assert abs(drawn.mean()) < 0.15 and drawn.min() < -0.9 and drawn.max() > 0.9
 
 
+def test_noise_is_added_apart_from_the_policys_own() -> None:
+    """Drawn from one seed, both were the same normals."""
+    world = rough(200, mode="DISABLED")
+    obs, _ = world.reset(seed=0)
+    drawn = Actor(Drifter(0.0), sampled=True).acting(world, 5)(obs).flatten()  # type: ignore[arg-type]
+    both = Actor(Drifter(0.0), sampled=True, noise=0.1).acting(world, 5)(obs).flatten()  # type: ignore[arg-type]
+    added = both - drawn
+    assert 0.08 < added.std() < 0.12
+    assert abs(np.corrcoef(drawn, added)[0, 1]) < 0.2
+
+
 def test_every_row_plays_as_many_episodes(tmp_path: Path) -> None:
     """An episode that ends early is not played more often within a round."""
     found = record(tmp_path / "a", [Actor(None)], 100, brittle=False)

@@ -9,7 +9,7 @@ import torch
 
 from bidex_meta.cli import main
 from bidex_meta.commands import record_demonstrations
-from bidex_meta.data import open_dataset
+from bidex_meta.data import open_dataset, place
 from bidex_meta.record import RunFolder
 from bidex_meta.sources.source import SingleClass
 from bidex_meta.witness.shifted import ShiftedStarts
@@ -84,7 +84,12 @@ def test_only_what_succeeds_is_kept_and_a_recording_goes_on(
     with monkeypatch.context() as patch:
         patch.setattr(record_demonstrations, "_round", once)
         told(capsys, *torn, code=130)
-    told(capsys, *torn)
+    asked, room = [], place.check_room
+    with monkeypatch.context() as patch:
+        patch.setattr(place, "check_room", lambda *given: (asked.append(given[1]), room(*given)))
+        told(capsys, *torn)
+        told(capsys, *RECORD, "--size", "300", "--out", sets / "sets" / "fresh-v0")
+    assert 0 <= asked[0] < asked[1]  # less what the killed one left
     again = open_dataset("torn-v0").transitions()
     assert all(np.array_equal(a, again[name]) for name, a in whole.transitions().items())
     assert "rewards computed again" in told(capsys, "data", "check", whole.name)

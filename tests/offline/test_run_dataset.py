@@ -17,7 +17,9 @@ from bidex_meta.data.joined import join
 from bidex_meta.data.writer import DatasetWriter, begin, finish
 from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder
+from bidex_meta.sources.humanoid_task import HUMANOID
 from bidex_meta.sources.source import OwnSuite
+from bidex_meta.world.contract import ObservationGroup
 from tests.algos.problems import opposite_bandits
 from tests.data.worlds import rough
 from tests.offline.stored import noisy, played
@@ -73,6 +75,44 @@ def test_a_run_on_data_sets_is_evaluated_resumed_and_reported(folder: Path, caps
     told(capsys, "plot", whole, "--out", folder / "curves.png")
     assert (folder / "curves.png").stat().st_size > 5000
     told(capsys, "report", whole, "--out", folder / "report.html")
+
+
+def test_a_policy_from_data_is_recorded_on_the_tasks_of_its_data(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whatever the seeds of the runs are, so that two of them make one data set."""
+    told(capsys, "record", "random", "--suite", "MT4", *FEW, "--size", "60", "--seed", "4")
+    runs = [folder / name for name in ("a", "b")]
+    for seed, run in enumerate(runs, 1):
+        flags = ["--dataset", "MT4/random-v0", "--algo", "bc", "--seed", seed, "--steps", "10", "--run-dir", run]
+        told(capsys, "run", *flags, *SMALL, "--no-evaluate")
+    told(capsys, "record", "medium-expert", *runs, *FEW, "--size", "60", "--seed", "9")
+    about = open_dataset("MT4/medium-expert-v0").metadata
+    assert (about["seed"], about["starts"]) == (4, 9)
+
+
+def test_gymnasiums_humanoid_is_learned_without_being_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its data set tells the task, and no suite."""
+    few = ["--size", "60", "--num-envs", "4", "--threads", "1", "--device", "cpu"]
+    told(capsys, "record", "random", "--task", HUMANOID, *few)
+    name = f"{HUMANOID}/random-v0"
+    about = open_dataset(name).metadata
+    assert (about["suite"], about["task"], about["base"]) == (None, HUMANOID, "own")
+    told(
+        capsys,
+        "run",
+        "--dataset",
+        name,
+        "--algo",
+        "bc",
+        *SMALL,
+        "--steps",
+        10,
+        "--no-evaluate",
+        "--run-dir",
+        folder / "a",
+    )
+    assert RunFolder.open(folder / "a").config()["task"] == HUMANOID
 
 
 def test_what_does_not_go_together_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -144,6 +184,42 @@ def test_classes_recorded_alone_get_padding_one_hot_and_scale(tmp_path: Path) ->
         join(sets, opposite_bandits(rows=2))
 
 
+def clouds(points: int, kind: str, state: int, ids: int) -> list[Any]:
+    """Groups of an observation [state | cloud | one-hot], as metadata have them."""
+    first, last = state, state + points * {"points": 3, "kind_points": 4}[kind]
+    found = [["state", [[0, first]]], [kind, [[first, last]]], ["task_id", [[last, last + ids]]]]
+    return found if ids else found[:2]
+
+
+def test_a_class_recorded_alone_keeps_its_cloud_in_its_place(tmp_path: Path) -> None:
+    """A state of two entries is padded to three; the clouds of two points stand behind it."""
+    world = opposite_bandits(rows=2)
+    world.single_observation_space = Box(-np.inf, np.inf, (3 + 6 + 2,), np.float32)
+
+    def show(points: int, kind: str = "points") -> None:
+        world.observation_groups = tuple(
+            ObservationGroup(name, tuple(slice(*part) for part in parts)) for name, parts in clouds(points, kind, 3, 2)
+        )
+
+    show(2)
+    episodes = alone(1, 2 + 6)
+    for episode in episodes:
+        episode.observations[:] += np.arange(8, dtype=np.float32)
+    seen = stored(tmp_path, "seen-v0", episodes, ["task1"], observation_groups=clouds(2, "points", 2, 0))
+    data, first = join([seen], world, every=False), episodes[0].observations[0]
+    assert data.observations[0].tolist() == [*first[:2], 0.0, *first[2:], 0.0, 1.0]
+    # Of the same sizes altogether, but of other clouds, or of none.
+    blind = stored(tmp_path, "blind-v0", alone(1, 2 + 6), ["task1"])
+    few = stored(tmp_path, "few-v0", alone(1, 2 + 3), ["task1"], observation_groups=clouds(1, "points", 2, 0))
+    for dataset, told in ((blind, "none, the world: points of 2"), (few, "points of 1, the world: points of 2")):
+        with pytest.raises(BidexError, match=f"has point clouds: {told}. Learn with the points"):
+            join([dataset], world, every=False)
+    world.single_observation_space = Box(-np.inf, np.inf, (3 + 8 + 2,), np.float32)
+    show(2, "kind_points")
+    with pytest.raises(BidexError, match="points of 2, the world: kind_points of 2"):
+        join([seen], world, every=False)
+
+
 def test_data_sets_imply_what_they_were_recorded_of():
     """Suite, task, base, object and points of a run come from the data; other objects are other data."""
     told = {"suite": None, "task": "CatchUnderarm", "base": "moving"}
@@ -151,5 +227,15 @@ def test_data_sets_imply_what_they_were_recorded_of():
     assert implied([mug, mug]) == {"task": "CatchUnderarm", "base": "moving", "object": "mug", "points": 64}
     assert implied([egg]) == {"task": "CatchUnderarm", "base": "moving"}
     assert implied([SimpleNamespace(metadata={})]) == {}
-    with pytest.raises(BidexError, match="--suite NAME"):
-        implied([mug, egg])
+
+    def other(**more: Any) -> SimpleNamespace:
+        return SimpleNamespace(metadata=egg.metadata | more)
+
+    for differs, named in (
+        (other(object="mug"), "of CatchUnderarm differ in object: its own and mug. Name the suite .* --suite NAME"),
+        (other(points=64), "of CatchUnderarm differ in points: 0 and 64. Name some that were recorded alike"),
+        (other(base="own"), "of CatchUnderarm differ in base: moving and own. .* --task NAME --base BASE"),
+        (other(task="Switch"), "are of CatchUnderarm and Switch. Name the suite .* --suite NAME"),
+    ):
+        with pytest.raises(BidexError, match=named):
+            implied([egg, differs])

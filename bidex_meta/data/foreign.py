@@ -1,0 +1,89 @@
+"""Data sets that were not recorded here, such as Minari's: what of them can be read, and the range of their actions."""
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from bidex_meta.errors import BidexError, shortened
+
+_SPACES = {"observations": "observation_space", "actions": "action_space"}
+"""Of an episode's arrays, those of several numbers a step, and where their spaces stand."""
+
+
+def check_spaces(content: Mapping[str, Any], name: str) -> None:
+    """Refuses observations or actions that are no flat numbers, where the metadata tell their spaces.
+
+    Args:
+        content: All of ``metadata.json``.
+        name: The data set's.
+
+    Raises:
+        BidexError: One is a dictionary, discrete, an image, or anything else than a Box of one dimension.
+    """
+    for what, entry in _SPACES.items():
+        space = _space(content, entry)
+        kind, shape = space.get("type", "Box"), space.get("shape", [0])
+        if kind != "Box" or not isinstance(shape, list) or len(shape) != 1:
+            raise _not_flat(name, what, f"a Box of shape {shortened(shape)}" if kind == "Box" else f"{kind} ones")
+
+
+def numbers(stored: Any, what: str, name: str) -> np.ndarray:
+    """An episode's array as it is stored.
+
+    Args:
+        stored: HDF5's group or dataset.
+        what: Minari's name of the array: ``observations``, ``rewards``, ...
+        name: The data set's.
+
+    Raises:
+        BidexError: It is a group of several, of another number of dimensions, or holds no numbers.
+    """
+    if not hasattr(stored, "shape"):
+        raise _not_flat(name, what, f"a group of {shortened(', '.join(stored))}")
+    values = np.asarray(stored[()])
+    if values.ndim != 1 + (what in _SPACES) or values.dtype.kind not in "biuf":
+        raise _not_flat(name, what, f"an array of shape {values.shape} and type {values.dtype}")
+    return values
+
+
+def action_bounds(content: Mapping[str, Any], name: str, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Least and largest actions, (a,) each, float64: what becomes -1 and 1 here.
+
+    Args:
+        content: All of ``metadata.json``.
+        name: The data set's.
+        size: Actions, a.
+
+    Raises:
+        BidexError: They are not told, not finite, or not one below the other.
+    """
+    space = _space(content, "action_space")
+    try:
+        low, high = (np.array(space[end], np.float64) for end in ("low", "high"))
+    except (KeyError, TypeError, ValueError):
+        low = high = np.zeros(0)
+    fits = low.shape == high.shape == (size,)
+    if not fits or not np.isfinite([low, high]).all() or (low >= high).any():
+        told = " to ".join(shortened(space.get(end)) for end in ("low", "high"))
+        raise BidexError(
+            f"Expected finite bounds of the {size} actions of {name}, which become -1 and 1, got {told}. Store it "
+            "with an action_space that has them."
+        )
+    return low, high
+
+
+def _space(content: Mapping[str, Any], entry: str) -> dict[str, Any]:
+    """A space in Minari's words, JSON within JSON; empty where none is told."""
+    told = content.get(entry)
+    try:
+        found = json.loads(told) if isinstance(told, str) else told
+    except (ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _not_flat(name: str, what: str, found: str) -> BidexError:
+    expected = "a row of numbers" if what in _SPACES else "a number"
+    return BidexError(f"{name}: expected {expected} a step as {what}, got {found}. Flatten them and store it again.")

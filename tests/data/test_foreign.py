@@ -1,0 +1,86 @@
+"""Data sets that Minari's users made: actions of other bounds, and observations that are no row of numbers."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.spaces import Box, Dict, Discrete, Space
+
+from bidex_meta.cli import main
+from bidex_meta.data import Dataset, open_dataset
+from bidex_meta.data.joined import join
+from bidex_meta.errors import BidexError
+from tests.algos.problems import one_step_bandit
+
+h5py = pytest.importorskip("h5py", reason="needs the extra data")
+
+STATE = Box(-np.inf, np.inf, (3,), np.float32)
+LOW, HIGH = [-0.4, 0.0], [0.4, 3.0]
+
+
+def written(folder: Path, state: Space | None, action: Space | None, **arrays: Any) -> Dataset:
+    """One episode of two steps as Minari stores it; of a dictionary each entry by its name."""
+    minari = pytest.importorskip("minari.serialization", reason="needs the extra data")
+    inner = folder / "mine-v0" / "data"
+    inner.mkdir(parents=True)
+    episode = {"observations": np.zeros((3, 3)), "actions": np.zeros((2, 2)), "rewards": np.ones(2), **arrays}
+    episode |= {"terminations": np.array([False, True]), "truncations": np.zeros(2, bool)}
+    with h5py.File(inner / "main_data.hdf5", "w") as file:
+        for name, values in episode.items():
+            for key, each in values.items() if isinstance(values, dict) else [("", values)]:
+                file[f"episode_0/{name}/{key}".rstrip("/")] = each
+    content: dict[str, Any] = {"total_episodes": 1, "total_steps": 2, "dataset_id": "other/mine-v0"}
+    spaces = {"observation_space": state, "action_space": action}
+    content |= {name: minari.serialize_space(space) for name, space in spaces.items() if space is not None}
+    (inner / "metadata.json").write_text(json.dumps(content))
+    return open_dataset(inner.parent)
+
+
+def world() -> Any:
+    """A world of one class, three observations and two actions."""
+    made = one_step_bandit(rows=2)
+    made.single_observation_space = Box(-np.inf, np.inf, (3 + made.num_id_columns,), np.float32)
+    return made
+
+
+def test_actions_are_brought_to_the_worlds_range(tmp_path: Path) -> None:
+    """What lies a rounding outside is clipped; bounds of -1 and 1 change no bit."""
+    box = Box(np.array(LOW, np.float32), np.array(HIGH, np.float32))
+    actions = np.array([[-0.4, 3.0], [0.2, -1e-6]], np.float32)
+    data = join([written(tmp_path / "a", STATE, box, actions=actions)], world())
+    assert data.actions.numpy() == pytest.approx(np.array([[-1.0, 1.0], [0.5, -1.0]]), abs=1e-6)
+    assert float(data.actions.abs().max()) == 1.0
+    small = np.array([[1e-12, -1.0], [0.1, 1.0]], np.float32)
+    same = join([written(tmp_path / "b", STATE, Box(-1.0, 1.0, (2,), np.float32), actions=small)], world())
+    assert np.array_equal(same.actions.numpy(), small)
+
+
+@pytest.mark.parametrize("space", [None, Box(-np.inf, np.inf, (2,), np.float32), Box(0.0, 0.0, (2,), np.float32)])
+def test_actions_without_a_range_are_refused(space: Space | None, tmp_path: Path) -> None:
+    with pytest.raises(BidexError, match="Expected finite bounds of the 2 actions of other/mine-v0"):
+        join([written(tmp_path, STATE, space)], world())
+
+
+@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize(
+    ("what", "space", "values", "found"),
+    [
+        ("observations", Dict({"goal": STATE}), {"goal": np.zeros((3, 3))}, "Dict ones|a group of 'goal'"),
+        ("observations", Discrete(4), np.zeros(3, int), "Discrete ones|an array of shape"),
+        ("actions", Discrete(4), np.zeros(2, int), "Discrete ones|an array of shape"),
+        ("observations", Box(0, 255, (4, 4, 3), np.uint8), np.zeros((3, 4, 4, 3)), "a Box of shape|an array of shape"),
+    ],
+)
+def test_what_is_no_row_of_numbers_is_one_line(
+    what: str, space: Space, values: Any, found: str, told: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whether the metadata tell it or the arrays alone."""
+    spaces = {"observations": STATE, "actions": Box(-1.0, 1.0, (2,), np.float32)} | {what: space if told else None}
+    written(tmp_path, spaces["observations"], spaces["actions"], **{what: values})
+    for command in ("info", "check"):
+        assert main(["data", command, str(tmp_path / "mine-v0")]) == 2
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert f"expected a row of numbers a step as {what}, got " in line
+        assert line.split("got ")[1].startswith(tuple(found.split("|")))
