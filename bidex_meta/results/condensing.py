@@ -132,7 +132,7 @@ def _engine(config: dict[str, Any]) -> str:
 def _without_places(config: dict[str, Any]) -> dict[str, Any]:
     """The config without folders of this machine."""
     kept = dict(config)
-    for name in ("suite", "start_from"):
+    for name in ("suite", "object", "start_from"):
         if config.get(name) is not None:
             kept[name] = Path(config[name]).name if Path(config[name]).is_absolute() else config[name]
     for name in ("dataset", "demonstrations"):
