@@ -48,6 +48,42 @@ def test_runs_that_start_from_runs_of_their_own_seed_are_one_group(tmp_path: Pat
     assert (fresh.label, fresh.seeds) == ("mtppo, started afresh", [2])
 
 
+def change(path: Path, **entries: Any) -> Path:
+    folder = RunFolder.open(path)
+    folder.change_config({**folder.config(), **entries})
+    return path
+
+
+@pytest.mark.parametrize(
+    ("entry", "usual", "other", "label"),
+    [
+        ("dataset", [], ["HandOver/medium-v0"], "medium-v0"),
+        ("dataset", ["HandOver/medium-v0"], ["HandOver/medium-v0", "/data/mine"], "medium-v0 + /data/mine"),
+        ("demonstrations", None, "HandOver/demonstrations-v0", "demonstrations-v0"),
+        ("points", 0, 256, "256"),
+        ("object", None, "mug", "mug"),
+        ("base", "own", "moving", "moving"),
+    ],
+)
+def test_runs_of_other_data_or_worlds_are_other_groups(
+    tmp_path: Path, entry: str, usual: object, other: object, label: str
+):
+    runs = [change(run(tmp_path, s, {"A": 0.5}, "bc", task="HandOver"), **{entry: usual}) for s in (0, 1)]
+    runs += [run(tmp_path, 2, {"A": 0.5}, "bc", task="HandOver")] if not usual or usual == "own" else []
+    (tmp_path / "x").mkdir()
+    first, second = groups(*runs, change(run(tmp_path / "x", 0, {"A": 0.5}, "bc", task="HandOver"), **{entry: other}))
+    assert (len(first.seeds), second.seeds) == (len(runs), [0]), "configs that do not know the entry have the usual"
+    assert second.label == f"bc, {entry} {label}"
+
+
+def test_data_sets_called_as_their_class_leave_classes_one_group(tmp_path: Path):
+    paths = [
+        change(run(tmp_path, 0, {c: 0.5}, "bc", task=c), dataset=[f"{c}/medium-v0"], demonstrations=f"{c}/d")
+        for c in ("A", "B")
+    ]
+    assert [(group.label, group.classes) for group in groups(*paths)] == [("bc", ["A", "B"])]
+
+
 def test_runs_of_single_classes_make_one_seed_together(tmp_path: Path):
     paths = [run(tmp_path, seed, {c: 0.5}, "ppo", task=c) for seed in (0, 1) for c in "AB"]
     [group] = groups(*paths)
