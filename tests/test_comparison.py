@@ -156,6 +156,30 @@ def test_a_run_that_time_ended_is_of_the_steps_it_made(tmp_path: Path):
         groups(path)
 
 
+def test_a_run_that_a_return_or_score_ended_is_of_the_steps_it_made(tmp_path: Path):
+    path = run(tmp_path, 0, {"A": 0.5})
+    found = json.loads((path / "evaluation.json").read_text())
+    (path / "evaluation.json").write_text(json.dumps({"steps": 1000, **found}))
+    rows = [{"step": 500, "Train/mean_return": 2.0, "Eval/score": None}, {"step": 1000, "Train/mean_return": 8.5}]
+
+    def log(**last: float):
+        rows[-1] |= last
+        RunFolder.open(path).metrics_path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+
+    log()
+    change(path, steps=10**9, stop_at_return=8.0)
+    assert groups(path)[0].steps == 1000
+    for ends in ({"stop_at_return": 9.0}, {"stop_at_score": 33.0}, {"evaluate_every": 10}):
+        change(path, **{"stop_at_return": 8.0, "stop_at_score": None, "evaluate_every": None, **ends})
+        if "stop_at_score" in ends:
+            change(path, stop_at_return=None)
+        with pytest.raises(BidexError, match="is of 1,000 steps, but the run goes on to 1,000,000,000"):
+            groups(path)
+    change(path, stop_at_return=None, stop_at_score=33.0)
+    log(**{"Eval/score": 34.0})
+    assert groups(path)[0].steps == 1000
+
+
 def test_a_class_without_a_reference_leaves_the_group_without_a_score(tmp_path: Path):
     path = run(tmp_path, 0, {"A": 0.5})
     (path / "evaluation.json").write_text(

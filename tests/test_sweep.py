@@ -176,6 +176,23 @@ def test_all_runs_end_in_order_and_on_their_core(file: Path, tmp_path: Path, cap
     assert main(["sweep", str(file), "--dry-run"]) == 0
 
 
+def test_a_run_that_its_return_ended_is_done_at_the_steps_it_made(
+    file: Path, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    file.write_text(FILE.replace("steps = 6", "steps = 6, stop_at_return = 4"))
+    config = {**CONFIG, "stop_at_return": 4.0}
+    monkeypatch.setattr("bidex_meta.commands.sweep._configs", lambda sweep, _: {r.words: config for r in sweep.runs})
+    assert main(["sweep", str(file)]) == 0
+    assert "2 done, 0 runs, 0 failed, 0 left" in capsys.readouterr().out
+    begun = starts(tmp_path)
+    assert main(["sweep", str(file)]) == 0 and starts(tmp_path) == begun, "and not trained further"
+    run = read_sweep(file).runs[0]
+    found = state_of(run, config)
+    assert (found.state, found.step, found.goal) == ("done", 4, 4)
+    (run.path / "evaluation.json").unlink()
+    assert state_of(run, config).state == "left" and seconds_left([state_of(run, config)]) == [0.0]
+
+
 def test_a_failure_is_told_stops_no_other_and_is_tried_again(file: Path, tmp_path: Path, capsys) -> None:
     file.write_text(FILE.replace("[0, 1]", "[13, 1]"))
     with pytest.raises(SystemExit, match="1"):

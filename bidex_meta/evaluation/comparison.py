@@ -71,6 +71,7 @@ def run_kind(config: dict[str, Any], split: str = "train") -> dict[str, Any]:
     """What runs that are compared as one have in common: all of the config that matters but the seed."""
     kind = {"algo": config["algo"], "on": config["suite"] or "one class at a time", "steps": config["steps"]}
     kind |= {"num_envs": config["num_envs"], "minutes": config.get("minutes"), "split": split}
+    kind |= {name: config.get(name) for name in ("stop_at_return", "stop_at_score")}
     kind["started"] = "afresh" if config.get("start_from") is None else "from another run"  # which: one for each seed
     # Older configs have fewer of these, at these values.
     kind |= {"base": config.get("base", "own"), "points": config.get("points", 0), "object": config.get("object")}
@@ -141,9 +142,7 @@ def _along(i: np.ndarray, j: np.ndarray, statistic: Any) -> Any:
 
 
 def _read(run: Run) -> dict[str, Any]:
-    config, found, rows = run.config("learner", "num_envs", "steps"), run.evaluation(), run.metrics()
-    # Where time ends a run, its last line tells how far it came.
-    goal = config["steps"] if config.get("minutes") is None else max((row["step"] for row in rows), default=0)
+    config, found, goal = run.config("learner", "num_envs", "steps"), run.evaluation(), run.goal
     steps = found.get("steps", goal)
     if steps < goal:
         raise BidexError(
@@ -155,7 +154,7 @@ def _read(run: Run) -> dict[str, Any]:
         "kind": run_kind(config, found.get("split", "train")),
         "seed": config["seed"],
         "classes": classes_of(found),
-        "seconds": training_seconds(rows),
+        "seconds": training_seconds(run.metrics()),
         "steps": goal,
     }
 
