@@ -210,11 +210,9 @@ class Benchmark:
 
     def _env_classes(self, split: Split) -> "dict[str, type[SuiteEnv]]":
         from bidex_meta.envs.suite_env import EnvRecipe
-        from bidex_meta.world import PointsRule
 
-        points = PointsRule(self.suite.points, self.suite.point_kinds) if self.suite.points else None
         moving, hides = True if self.suite.base == "moving" else None, self.suite.observation == "masked"
-        found = {}
+        points, found = (self.suite.points, self.suite.point_kinds), {}
         for entry in self.suite.split_classes(split):
             look = (moving, tuple(entry.options.items()), self.padded_size, hides)
             found[entry.name] = EnvRecipe(entry.name, *look, entry.reward_scale, entry.class_name, points).make_class()

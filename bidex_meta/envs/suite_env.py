@@ -53,8 +53,8 @@ class EnvRecipe:
     """Factor on the reward."""
     class_name: str | None = None
     """The task class, where it is called otherwise: with an object."""
-    points: PointsRule | None = None
-    """The point cloud in the place of objects' states; None: the states."""
+    points: tuple[int, bool] = (0, False)
+    """Points of the cloud in the place of objects' states, and whether each tells of what it is; 0: the states."""
 
     def make_class(self) -> type["SuiteEnv"]:
         """The environment's class: the same object for equal recipes."""
@@ -114,7 +114,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             autoreset_mode="DISABLED",
             observation="masked" if recipe.hides_goal else "plain",
             pad_to=recipe.padded_size,
-            points=recipe.points,
+            points=PointsRule(*recipe.points) if recipe.points[0] else None,
         )
         self.observation_space = self._world.single_observation_space
         self.action_space = self._world.single_action_space
