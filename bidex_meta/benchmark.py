@@ -212,10 +212,10 @@ class Benchmark:
         from bidex_meta.envs.suite_env import EnvRecipe
 
         moving, hides = True if self.suite.base == "moving" else None, self.suite.observation == "masked"
-        found = {}
+        points, found = (self.suite.points, self.suite.point_kinds), {}
         for entry in self.suite.split_classes(split):
             look = (moving, tuple(entry.options.items()), self.padded_size, hides)
-            found[entry.name] = EnvRecipe(entry.name, *look, entry.reward_scale, entry.class_name).make_class()
+            found[entry.name] = EnvRecipe(entry.name, *look, entry.reward_scale, entry.class_name, points).make_class()
         return found
 
     def _checked_split(self, split: str) -> Split:

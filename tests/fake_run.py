@@ -1,6 +1,6 @@
 """Stands for ``bidex-meta run`` in tests of sweeps: the same folder, lock and files, a checkpoint a step, no physics.
 
-Its seed says what becomes of it: 13 always fails.
+Its seed says what becomes of it: 13 always fails. ``--stop-at-return`` ends it at that step, which is its return.
 """
 
 import json
@@ -22,6 +22,7 @@ def main(words: list[str]) -> int:
     else:
         config = {"suite": None, "task": "HandOver", "algo": "ppo", "seed": int(given["seed"]), "steps": STEPS}
         config |= {"num_envs": 8, "minutes": None, "learner": {}}
+        config |= {"stop_at_return": float(given["stop-at-return"])} if "stop-at-return" in given else {}
         folder = RunFolder.create(config, Path(given["run-dir"]))
     with folder.locked():
         with (folder.path / "starts").open("a") as starts:
@@ -32,13 +33,15 @@ def main(words: list[str]) -> int:
             return 2
         saved = folder.checkpoints_path / "step"
         done = int(saved.read_text()) if saved.is_file() else 0
-        for step in range(done + 1, STEPS + 1):
+        last = int(folder.config().get("stop_at_return", STEPS))
+        for step in range(done + 1, last + 1):
             time.sleep(float(os.environ.get("FAKE_SECONDS", "0.01")))
             with folder.metrics_path.open("a") as metrics:
-                metrics.write(json.dumps({"step": step, "time": 1.0, "Perf/training_time": 0.5 * step}) + "\n")
+                row = {"step": step, "time": 1.0, "Train/mean_return": step, "Perf/training_time": 0.5 * step}
+                metrics.write(json.dumps(row) + "\n")
             saved.write_text(str(step))
         row = {"success": 0.5, "return": 1.0, "score": None}
-        (folder.path / "evaluation.json").write_text(json.dumps({"steps": STEPS, "classes": {"HandOver": row}}))
+        (folder.path / "evaluation.json").write_text(json.dumps({"steps": last, "classes": {"HandOver": row}}))
     return 0
 
 

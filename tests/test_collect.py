@@ -96,6 +96,32 @@ def test_no_folder_of_this_machine_stays(tmp_path: Path) -> None:
     assert str(tmp_path) not in json.dumps(content)
     assert content["suite"]["name"] == "own" and "CatchUnderarm" in content["suite"]["file"]
     assert content["config"]["suite"] == "own.toml"
+    folder.change_config({**folder.config(), "suite": None, "task": "HandOver", "object": str(tmp_path / "mug.xml")})
+    content = condensing.condensed(folder, "x", None)
+    assert str(tmp_path) not in json.dumps(content) and content["config"]["object"] == "mug.xml"
+
+
+def test_a_run_that_a_return_ended_is_kept_as_it_ended(tmp_path: Path) -> None:
+    path = evaluated(tmp_path, 0, 0.5)
+    folder = log(path, *({"step": 2 * i, "Train/mean_return": i / 50, "Train/return/A": 1.0} for i in range(1, 501)))
+    found = json.loads((path / "evaluation.json").read_text())
+    (path / "evaluation.json").write_text(json.dumps({"steps": 1000, **found}))
+    folder.change_config({**folder.config(), "steps": 10**9, "stop_at_return": 10.0})
+    assert collect(path, "--into", tmp_path / "data") == 0
+    stored = StoredRun.open(tmp_path / "data" / f"{path.name}.json")
+    [group] = read_groups([stored])
+    assert (stored.content["steps"], stored.goal, group.steps) == (1000, 1000, 1000)
+    folder.change_config({**folder.config(), "stop_at_return": 10.5})
+    assert collect(path, "--into", tmp_path / "data") == 2
+
+
+def test_a_run_of_changed_code_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    clean, changed = (evaluated(tmp_path, seed, 0.5, f"run{seed}") for seed in (0, 1))
+    (changed / "versions.json").write_text(json.dumps({"git": {"commit": COMMIT, "dirty": True}}))
+    assert collect(clean, changed, "--into", tmp_path / "data") == 0
+    told = capsys.readouterr()
+    assert told.err == f"{changed} was made by changed code: its commit alone does not make it again.\n"
+    assert len(told.out.split()) == 2
 
 
 @pytest.mark.parametrize(

@@ -48,6 +48,42 @@ def test_runs_that_start_from_runs_of_their_own_seed_are_one_group(tmp_path: Pat
     assert (fresh.label, fresh.seeds) == ("mtppo, started afresh", [2])
 
 
+def change(path: Path, **entries: Any) -> Path:
+    folder = RunFolder.open(path)
+    folder.change_config({**folder.config(), **entries})
+    return path
+
+
+@pytest.mark.parametrize(
+    ("entry", "usual", "other", "label"),
+    [
+        ("dataset", [], ["HandOver/medium-v0"], "medium-v0"),
+        ("dataset", ["HandOver/medium-v0"], ["HandOver/medium-v0", "/data/mine"], "medium-v0 + /data/mine"),
+        ("demonstrations", None, "HandOver/demonstrations-v0", "demonstrations-v0"),
+        ("points", 0, 256, "256"),
+        ("object", None, "mug", "mug"),
+        ("base", "own", "moving", "moving"),
+    ],
+)
+def test_runs_of_other_data_or_worlds_are_other_groups(
+    tmp_path: Path, entry: str, usual: object, other: object, label: str
+):
+    runs = [change(run(tmp_path, s, {"A": 0.5}, "bc", task="HandOver"), **{entry: usual}) for s in (0, 1)]
+    runs += [run(tmp_path, 2, {"A": 0.5}, "bc", task="HandOver")] if not usual or usual == "own" else []
+    (tmp_path / "x").mkdir()
+    first, second = groups(*runs, change(run(tmp_path / "x", 0, {"A": 0.5}, "bc", task="HandOver"), **{entry: other}))
+    assert (len(first.seeds), second.seeds) == (len(runs), [0]), "configs that do not know the entry have the usual"
+    assert second.label == f"bc, {entry} {label}"
+
+
+def test_data_sets_called_as_their_class_leave_classes_one_group(tmp_path: Path):
+    paths = [
+        change(run(tmp_path, 0, {c: 0.5}, "bc", task=c), dataset=[f"{c}/medium-v0"], demonstrations=f"{c}/d")
+        for c in ("A", "B")
+    ]
+    assert [(group.label, group.classes) for group in groups(*paths)] == [("bc", ["A", "B"])]
+
+
 def test_runs_of_single_classes_make_one_seed_together(tmp_path: Path):
     paths = [run(tmp_path, seed, {c: 0.5}, "ppo", task=c) for seed in (0, 1) for c in "AB"]
     [group] = groups(*paths)
@@ -118,6 +154,30 @@ def test_a_run_that_time_ended_is_of_the_steps_it_made(tmp_path: Path):
     (path / "evaluation.json").write_text(json.dumps({"steps": 500, **found}))
     with pytest.raises(BidexError, match="is of 500 steps, but the run goes on to 1,000"):
         groups(path)
+
+
+def test_a_run_that_a_return_or_score_ended_is_of_the_steps_it_made(tmp_path: Path):
+    path = run(tmp_path, 0, {"A": 0.5})
+    found = json.loads((path / "evaluation.json").read_text())
+    (path / "evaluation.json").write_text(json.dumps({"steps": 1000, **found}))
+    rows = [{"step": 500, "Train/mean_return": 2.0, "Eval/score": None}, {"step": 1000, "Train/mean_return": 8.5}]
+
+    def log(**last: float):
+        rows[-1] |= last
+        RunFolder.open(path).metrics_path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+
+    log()
+    change(path, steps=10**9, stop_at_return=8.0)
+    assert groups(path)[0].steps == 1000
+    for ends in ({"stop_at_return": 9.0}, {"stop_at_score": 33.0}, {"evaluate_every": 10}):
+        change(path, **{"stop_at_return": 8.0, "stop_at_score": None, "evaluate_every": None, **ends})
+        if "stop_at_score" in ends:
+            change(path, stop_at_return=None)
+        with pytest.raises(BidexError, match="is of 1,000 steps, but the run goes on to 1,000,000,000"):
+            groups(path)
+    change(path, stop_at_return=None, stop_at_score=33.0)
+    log(**{"Eval/score": 34.0})
+    assert groups(path)[0].steps == 1000
 
 
 def test_a_class_without_a_reference_leaves_the_group_without_a_score(tmp_path: Path):

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from bidex_meta.cli import main
-from bidex_meta.clients.humanoid_world import HumanoidWorld
+from bidex_meta.clients.humanoid_world import NAME, HumanoidWorld
+from bidex_meta.commands import watching
 from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder
 from bidex_meta.sources import Source
@@ -51,6 +52,20 @@ def test_a_run_on_it(algo: str, tmp_path: Path, capsys: pytest.CaptureFixture[st
     capsys.readouterr()
 
 
+def test_an_evaluation_while_training_is_of_ten_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[np.ndarray] = []
+    monkeypatch.setattr(watching, "_metrics", lambda found: {"Eval/mean_return": note(found.classes[NAME].returns)})
+
+    def note(returns: np.ndarray) -> float:
+        seen.append(returns)
+        return 0.0
+
+    flags = ["--task", HUMANOID, "--algo", "ppo", "--num-envs", "4", "--steps", "8", "--learner.rollout-steps", "2"]
+    flags += ["--threads", "1", "--device", "cpu", "--logger", "none", "--learner.hidden", "8", "--no-evaluate"]
+    assert main(["run", *flags, "--evaluate-every", "1", "--run-dir", str(tmp_path / "run")]) == 0
+    assert len(seen) == 1 and len(set(seen[0].tolist())) == 10, "ten starts, not one ten times"
+
+
 @pytest.mark.parametrize(
     ("flags", "told"),
     [
@@ -68,6 +83,16 @@ def test_what_is_of_hands_is_refused(
     error = capsys.readouterr().err
     last = error.splitlines()[-1]
     assert told in last and HUMANOID in last and "Traceback" not in error
+
+
+@pytest.mark.parametrize("more", [["--tiled"], []])
+@pytest.mark.parametrize("named", [["--task", HUMANOID], ["--suite", "metaworld/MT10"]])
+def test_there_are_no_pictures_of_it(
+    named: list[str], more: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["render", *named, *more, "--out", str(tmp_path / "a.png")]) == 2
+    error = capsys.readouterr().err
+    assert f"got {'the suite ' * (named[0] == '--suite')}{named[1]}. Name another." in error and error.count("\n") == 1
 
 
 def test_no_other_split() -> None:

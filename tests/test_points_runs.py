@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from bidex_meta import bench
-from bidex_meta.benchmark import make_task_world
+from bidex_meta.benchmark import Benchmark, make_task_world
 from bidex_meta.cli import main
 from bidex_meta.commands.policies import checkpoint
 from bidex_meta.errors import BidexError
@@ -63,6 +63,20 @@ def test_a_suite_file_asks_for_points(tmp_path: Path) -> None:
     suite = load_suite(suite_file(tmp_path, "[points]"))
     assert (suite.points, suite.point_kinds) == (768, False)
     assert load_suite("MT4").points == 0
+
+
+def test_environments_of_a_suites_classes_show_its_points(tmp_path: Path) -> None:
+    """As the rows of its worlds, before the one-hot."""
+    benchmark = Benchmark(suite_file(tmp_path, "[points]\ncount = 12\nkinds = true"))
+    world = benchmark.make_world(num_envs=4, device="cpu", threads=1)
+    env = benchmark.train_classes["HandOver"]()
+    env.set_task(benchmark.train_tasks[50])
+    assert env.task_name == "HandOver" == benchmark.train_tasks[50].env_name
+    obs, _ = env.reset(seed=0)
+    assert world.single_observation_space.shape == (len(obs) + 4,)
+    kinds = obs[-48:].reshape(12, 4)[:, 3]
+    assert set(kinds.tolist()) <= {1.0, 0.0, -1.0}
+    assert Benchmark("MT4").train_classes["HandOver"]().observation_space.shape == (len(obs) - 48,)
 
 
 @pytest.mark.parametrize(

@@ -76,6 +76,45 @@ def test_seeds_are_outermost_and_words_are_those_of_run(tmp_path: Path) -> None:
     assert sweep.runs[4].go_on == ["run", f"--resume={sweep.runs[4].path}", "--steps=1000"]
 
 
+def test_values_with_slashes_make_no_folders(tmp_path: Path) -> None:
+    path = tmp_path / "s.toml"
+    path.write_text(
+        FILE.replace('"ppo"', '"bc"') + '[grid]\ndataset = ["HandOver/medium-v0", "/data/mine", ["a/x", "b/x"]]\n'
+        "learner.gamma = [-0.5]\n"
+    )
+    runs = read_sweep(path).runs[:3]
+    told = ["HandOver-medium-v0", "data-mine", "a-xxb-x"]
+    assert [run.name for run in runs] == [f"HandOver-bc-dataset={each}-gamma=-0.5-seed0" for each in told]
+    assert [run.arm for run in runs] == [f"bc dataset={each} gamma=-0.5" for each in told]
+    assert all(run.path.parent == Path("runs/tiny") for run in runs)
+    path.write_text(path.read_text().replace('"/data/mine"', '"HandOver-medium-v0"'))
+    with pytest.raises(BidexError, match="two runs are called HandOver-bc-dataset=HandOver-medium-v0"):
+        read_sweep(path)
+
+
+def test_several_data_sets_are_named_one_by_one_as_run_takes_them(tmp_path: Path) -> None:
+    from bidex_meta.commands.parsing import parse, peek_all
+    from bidex_meta.commands.run_config import RunFlags
+
+    path = tmp_path / "s.toml"
+    path.write_text(FILE.replace("steps = 6", 'steps = 6, dataset = ["a/x", "b/x"]'))
+    words = read_sweep(path).runs[0].words
+    assert peek_all(words, "--dataset") == ["a/x", "b/x"]
+    assert parse(RunFlags, words, "run").dataset == ("a/x", "b/x")
+
+
+def test_an_arm_that_sets_a_key_of_the_grid_is_not_run_once_a_value(tmp_path: Path) -> None:
+    path = tmp_path / "s.toml"
+    path.write_text(
+        FILE.replace("[0, 1]", "[0]") + "[grid]\nnum_envs = [8, 16]\nlearner.gamma = [0.8, 0.9]\n"
+        '[[arms]]\nname = "x"\nalgo = "ppo"\noverrides = { num-envs = 4 }\n'
+    )
+    runs = [run for run in read_sweep(path).runs if run.arm.startswith("x")]
+    assert [run.arm for run in runs] == ["x gamma=0.8", "x gamma=0.9"]
+    assert [word for word in runs[0].words if word.startswith("--num-envs")][-1] == "--num-envs=4"
+    assert len(read_sweep(path).runs) == 4 + 2
+
+
 @pytest.mark.parametrize(
     "change, told",
     [
@@ -135,6 +174,23 @@ def test_all_runs_end_in_order_and_on_their_core(file: Path, tmp_path: Path, cap
         assert len(os.sched_getaffinity(0)) > 1 or os.cpu_count() == 1, "the sweep itself stays free"
     assert main(["sweep", str(file)]) == 0 and starts(tmp_path) == begun, "nothing is run twice"
     assert main(["sweep", str(file), "--dry-run"]) == 0
+
+
+def test_a_run_that_its_return_ended_is_done_at_the_steps_it_made(
+    file: Path, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    file.write_text(FILE.replace("steps = 6", "steps = 6, stop_at_return = 4"))
+    config = {**CONFIG, "stop_at_return": 4.0}
+    monkeypatch.setattr("bidex_meta.commands.sweep._configs", lambda sweep, _: {r.words: config for r in sweep.runs})
+    assert main(["sweep", str(file)]) == 0
+    assert "2 done, 0 runs, 0 failed, 0 left" in capsys.readouterr().out
+    begun = starts(tmp_path)
+    assert main(["sweep", str(file)]) == 0 and starts(tmp_path) == begun, "and not trained further"
+    run = read_sweep(file).runs[0]
+    found = state_of(run, config)
+    assert (found.state, found.step, found.goal) == ("done", 4, 4)
+    (run.path / "evaluation.json").unlink()
+    assert state_of(run, config).state == "left" and seconds_left([state_of(run, config)]) == [0.0]
 
 
 def test_a_failure_is_told_stops_no_other_and_is_tried_again(file: Path, tmp_path: Path, capsys) -> None:

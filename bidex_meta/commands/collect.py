@@ -48,6 +48,7 @@ def main(arguments: Sequence[str]) -> None:
     from bidex_meta.results.condensing import arm_of, condensed, told
 
     made: dict[Path, bytes] = {}
+    changed: list[Path] = []
     for path, arm in _named(flags):
         folder = RunFolder.open(path)
         name = folder.path.resolve().name
@@ -59,10 +60,14 @@ def main(arguments: Sequence[str]) -> None:
         content = condensed(folder, arm or arm_of(folder.path, config), _parameters(folder))
         check_writable(out)
         made[out] = told(content)
+        if (content["versions"].get("git") or {}).get("dirty") is True:
+            changed.append(folder.path)
     flags.into.mkdir(parents=True, exist_ok=True)
     for out, text in made.items():
         write_atomic(out, lambda file, text=text: file.write(text))
         print(out)
+    for path in changed:
+        print(f"{path} was made by changed code: its commit alone does not make it again.", file=sys.stderr)
 
 
 def _named(flags: CollectFlags) -> list[tuple[Path, str | None]]:

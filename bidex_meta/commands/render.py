@@ -86,8 +86,9 @@ def main(arguments: Sequence[str]) -> None:
 
     source = looked_at(policy, flags.suite, flags.task, flags.seed, flags.object)
     slots, task = slots_of(source), flags.task and name_with_object(flags.task, flags.object)
+    classes = source.task_classes()  # refuses what is not of ours
     if not flags.tiled:
-        task = known_name(f"task of {source.name}", task or slots[0], source.task_classes())
+        task = known_name(f"task of {source.name}", task or slots[0], classes)
     # One row for each slot is enough to see one of them.
     world = source.world("train", len(slots))
     agent = acting(policy, world, flags.seed, flags.checkpoint)

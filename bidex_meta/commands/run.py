@@ -219,6 +219,7 @@ def _train(plan: RunPlan, folder: Any, world: "VectorWorld", learner: Any, loade
     done = mend(folder.metrics_path, resume_step or 0)
     logger, total = plan.config["logger"], dict(budget)
     budget["spent_seconds"] = training_seconds(done)
+    last = done[-1] if done and done[-1]["step"] == resume_step else None
     with Recorder(folder, **total, resume_step=resume_step, logger=logger) as record, contextlib.ExitStack() as stack:
         watch = None
         if plan.config["evaluate_every"] or plan.config["video_every"]:
@@ -227,7 +228,7 @@ def _train(plan: RunPlan, folder: Any, world: "VectorWorld", learner: Any, loade
             watch = Watch(plan, folder, learner, record, iterations=len(done))
             stack.callback(watch.close)
         return runner.train(
-            learner, world, **budget, record=record, watch=watch, enough=run_recording.enough(plan.config)
+            learner, world, **budget, record=record, watch=watch, enough=run_recording.enough(plan.config), last=last
         )
 
 

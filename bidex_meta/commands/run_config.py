@@ -87,8 +87,9 @@ class RunFlags:
     """Continue this run from its last checkpoint, with its own config; only --steps and --minutes may change, which
     count what it has done already, and --logger, --evaluate-every and --video-every."""
     evaluate_every: int | None = None
-    """Evaluate every so many iterations, one episode of ten tasks of each class (what adapts: one shot on train tasks),
-    and keep the policy that did best as checkpoints/best.pt. Changes nothing of the training. None: never."""
+    """Evaluate every so many iterations, one episode of ten tasks of each class (ten at least in all; what adapts: one
+    shot on train tasks), and keep the policy that did best as checkpoints/best.pt. Changes nothing of the training.
+    None: never."""
     video_every: int | None = None
     """Film every so many iterations, a row of each class, into videos/ and the logger. None: never."""
     logger: Literal["tensorboard", "wandb", "none"] = "tensorboard"

@@ -1,12 +1,12 @@
 """What ``bidex-meta run`` adds for data sets: a recorder around its world, and an early end at a named return."""
 
-import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from bidex_meta.commands.run_config import RunPlan
 from bidex_meta.memory import check_memory
+from bidex_meta.record import stopping
 from bidex_meta.record.folder import new_folder_name
 from bidex_meta.train.launch import launch
 
@@ -49,19 +49,16 @@ def complete(plan: RunPlan, recorder: Any) -> None:
     _say(f"Recorded: {recorder.folder}")
 
 
-def enough(config: dict[str, Any]) -> Callable[[dict[str, float]], bool] | None:
+def enough(config: dict[str, Any]) -> Callable[[Mapping[str, Any]], bool] | None:
     """What ends the training early, by its metrics; None where nothing does."""
-    tag = f"{'Eval' if config['evaluate_every'] else 'Train'}/mean_return"
-    wanted = {tag: config["stop_at_return"], "Eval/score": config["stop_at_score"]}
-    known = {name: value for name, value in wanted.items() if value is not None}
-    if not known:
+    if config["stop_at_return"] is None and config["stop_at_score"] is None:
         return None
 
-    def reached(metrics: dict[str, float]) -> bool:
-        found = [name for name, value in known.items() if metrics.get(name, -math.inf) >= value]
-        if found:
-            _say(f"Enough: {found[0]} is {metrics[found[0]]:.4g}.")
-        return bool(found)
+    def reached(metrics: Mapping[str, Any]) -> bool:
+        tag = stopping.enough(config, metrics)
+        if tag is not None:
+            _say(f"Enough: {tag} is {metrics[tag]:.4g}.")
+        return tag is not None
 
     return reached
 

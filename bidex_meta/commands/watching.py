@@ -1,8 +1,9 @@
 """Looking at a learner while it learns: evaluations, the best policy, films. Nothing of the training depends on it."""
 
+import math
 import random
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -20,6 +21,8 @@ from bidex_meta.train.launch import launch
 
 TASKS = 10
 """Tasks of each class in such an evaluation, the first of its pool; one episode each."""
+_LEAST = 10
+"""Episodes over all classes: where there are fewer tasks each is played several times, so that not one fall decides."""
 _FILM = {"width": 240, "height": 180}
 _FILM_EVERY, _MOST_FILM_STEPS = 2, 300
 
@@ -97,16 +100,17 @@ class Watch:
         from bidex_meta.evaluation.play import EVALUATION_SEED, evaluate
         from bidex_meta.world.contract import PooledWorld
 
-        source = self._plan.source
+        source, pools = self._plan.source, self._plan.source.tasks("train")
+        tasks, episodes = played(pools)
         if "evaluation" not in self._worlds:
-            pools = source.tasks("train")
-            tasks = min(TASKS, max(map(len, pools.values())))
-            world = self._worlds["evaluation"] = source.world("train", tasks * len(pools))
+            world = self._worlds["evaluation"] = source.world("train", tasks * len(pools) * episodes)
             if isinstance(world, PooledWorld):
                 first = zip(world.task_names, world.pools, strict=True)
                 world.set_tasks({name: pool[:tasks] for name, pool in first})
         world = self._worlds["evaluation"]
-        return evaluate(self._policy(self._device), world, 1, seed=EVALUATION_SEED, references=source.references())
+        return evaluate(
+            self._policy(self._device), world, episodes, seed=EVALUATION_SEED, references=source.references()
+        )
 
     def _meta_test(self) -> dict[str, float]:
         """One shot on train tasks: test tasks must not choose the policy that is judged on them."""
@@ -141,6 +145,12 @@ class Watch:
             self._record.film("training", frames, CONTROL_RATE / _FILM_EVERY, self._learner.env_steps)
         except (BidexError, OSError) as error:
             print(f"No film at {self._learner.env_steps:,} steps: {error}", file=sys.stderr, flush=True)
+
+
+def played(pools: Mapping[str, Sequence[str]]) -> tuple[int, int]:
+    """Of an evaluation while training the tasks of each class, and the episodes of each task, by the pools' names."""
+    tasks = min(TASKS, max(map(len, pools.values())))
+    return tasks, math.ceil(_LEAST / (tasks * len(pools)))
 
 
 @contextmanager

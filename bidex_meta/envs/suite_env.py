@@ -15,7 +15,7 @@ from gymnasium.spaces import Box
 from bidex_meta.errors import BidexError
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import CONTROL_RATE, TaskClass
-from bidex_meta.world import Slot, World
+from bidex_meta.world import PointsRule, Slot, World
 from bidex_meta.world.rendering import CAMERAS
 
 _FAR = 2**31
@@ -46,13 +46,15 @@ class EnvRecipe:
     options: tuple[tuple[str, float | str], ...]
     """What else the suite chose of the class."""
     padded_size: int
-    """Entries of an observation."""
+    """Entries of an observation, without a point cloud."""
     hides_goal: bool
     """Whether the goal entries are zero."""
     reward_scale: float
     """Factor on the reward."""
     class_name: str | None = None
     """The task class, where it is called otherwise: with an object."""
+    points: tuple[int, bool] = (0, False)
+    """Points of the cloud in the place of objects' states, and whether each tells of what it is; 0: the states."""
 
     def make_class(self) -> type["SuiteEnv"]:
         """The environment's class: the same object for equal recipes."""
@@ -63,8 +65,9 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """A task class as an environment that plays the task it is given; its subclasses stand in `train_classes`.
 
     Observations are those of the suite's worlds before a one-hot: padded to the suite's widest class, goal entries zero
-    where the suite hides goals. `info` has `success` (1.0 or 0.0 in this state), `unscaled_reward` and `unstable`
-    (physics broke: the episode is truncated).
+    where the suite hides goals; where it shows point clouds, one behind them in the place of objects' states. `info`
+    has `success` (1.0 or 0.0 in this state), `unscaled_reward` and `unstable` (physics broke: the episode is
+    truncated).
 
     Args:
         render_mode: None or `"rgb_array"`.
@@ -103,9 +106,15 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._picture = (width, height, _camera(camera_name, camera_id))
         recipe, space = self.recipe, self.task_class.variation_space
         slot = Slot(recipe.name, self.task_class, np.array([space.low]), recipe.reward_scale)
-        rule = "masked" if recipe.hides_goal else "plain"
         self._world = World(
-            [slot], 1, engine="c", threads=1, autoreset_mode="DISABLED", observation=rule, pad_to=recipe.padded_size
+            [slot],
+            1,
+            engine="c",
+            threads=1,
+            autoreset_mode="DISABLED",
+            observation="masked" if recipe.hides_goal else "plain",
+            pad_to=recipe.padded_size,
+            points=PointsRule(*recipe.points) if recipe.points[0] else None,
         )
         self.observation_space = self._world.single_observation_space
         self.action_space = self._world.single_action_space

@@ -10,6 +10,7 @@ import numpy as np
 
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.statistics import Interval, bootstrap_interval
+from bidex_meta.outside import name_with_object, short_name
 from bidex_meta.record.metrics import training_seconds
 from bidex_meta.record.stored import Run
 
@@ -70,8 +71,19 @@ def run_kind(config: dict[str, Any], split: str = "train") -> dict[str, Any]:
     """What runs that are compared as one have in common: all of the config that matters but the seed."""
     kind = {"algo": config["algo"], "on": config["suite"] or "one class at a time", "steps": config["steps"]}
     kind |= {"num_envs": config["num_envs"], "minutes": config.get("minutes"), "split": split}
+    kind |= {name: config.get(name) for name in ("stop_at_return", "stop_at_score")}
     kind["started"] = "afresh" if config.get("start_from") is None else "from another run"  # which: one for each seed
+    # Older configs have fewer of these, at these values.
+    kind |= {"base": config.get("base", "own"), "points": config.get("points", 0), "object": config.get("object")}
+    kind |= {"dataset": _data(config, "dataset"), "demonstrations": _data(config, "demonstrations")}
     return kind | {f"learner.{name}": value for name, value in config["learner"].items()}
+
+
+def _data(config: dict[str, Any], name: str) -> str | None:
+    """Data sets by their names; of those called as the run's class the kind alone, or classes were no one group."""
+    given = config.get(name) or []
+    own = "" if config["task"] is None else f"{name_with_object(short_name(config['task']), config.get('object'))}/"
+    return " + ".join(each.removeprefix(own) for each in ([given] if isinstance(given, str) else given)) or None
 
 
 def by_kind(runs: Sequence[dict[str, Any]]) -> list[tuple[str, list[dict[str, Any]]]]:
@@ -130,9 +142,7 @@ def _along(i: np.ndarray, j: np.ndarray, statistic: Any) -> Any:
 
 
 def _read(run: Run) -> dict[str, Any]:
-    config, found, rows = run.config("learner", "num_envs", "steps"), run.evaluation(), run.metrics()
-    # Where time ends a run, its last line tells how far it came.
-    goal = config["steps"] if config.get("minutes") is None else max((row["step"] for row in rows), default=0)
+    config, found, goal = run.config("learner", "num_envs", "steps"), run.evaluation(), run.goal
     steps = found.get("steps", goal)
     if steps < goal:
         raise BidexError(
@@ -144,7 +154,7 @@ def _read(run: Run) -> dict[str, Any]:
         "kind": run_kind(config, found.get("split", "train")),
         "seed": config["seed"],
         "classes": classes_of(found),
-        "seconds": training_seconds(rows),
+        "seconds": training_seconds(run.metrics()),
         "steps": goal,
     }
 

@@ -26,8 +26,9 @@ from bidex_meta.outside import name_with_object, short_name
 from bidex_meta.reading import exists, is_file
 from bidex_meta.record.atomic import TEMPORARY_SUFFIX, check_writable, refuse_links, remove_leftovers, write_json
 from bidex_meta.record.checkpoints import Checkpoints
-from bidex_meta.record.metrics import read_metrics
+from bidex_meta.record.metrics import last_rows, read_metrics
 from bidex_meta.record.schemas import read_config, read_evaluation, read_versions
+from bidex_meta.record.stopping import goal
 from bidex_meta.record.versions import collect_versions
 
 _ENTRIES = ("checkpoints", "videos", "metrics.jsonl", "versions.json")
@@ -140,6 +141,11 @@ class RunFolder:
     def metrics(self) -> list[dict[str, Any]]:
         """The rows of ``metrics.jsonl`` that can be read."""
         return read_metrics(self.metrics_path)
+
+    @property
+    def goal(self) -> int:
+        """Steps that it trains for; of a run that time, a return or a score has ended those it made."""
+        return goal(self.config("steps"), last_rows(self.metrics_path))
 
     def versions(self) -> dict[str, Any]:
         """``versions.json``; empty where there is none."""

@@ -75,6 +75,11 @@ class Run(Protocol):
         """Logged rows, each with ``step``, rising; of a file thinned."""
         ...
 
+    @property
+    def goal(self) -> int:
+        """Steps that it trains for; see :attr:`RunFolder.goal`."""
+        ...
+
     def versions(self) -> dict[str, Any]:
         """What it was made with."""
         ...
@@ -156,6 +161,12 @@ class StoredRun:
         """As in :class:`Run`: means over stretches of about equal length, told at their ends."""
         curves = self.content["curves"]
         return [dict(zip(curves, row, strict=True)) for row in zip(*curves.values(), strict=True)]
+
+    @property
+    def goal(self) -> int:
+        """As in :class:`Run`: what has not come to its end is never collected, so that fewer steps were its end."""
+        config, steps = self.content["config"], self.content["steps"]
+        return steps if config.get("minutes") is not None else min(steps, config["steps"])
 
     def versions(self) -> dict[str, Any]:
         """As in :class:`Run`."""

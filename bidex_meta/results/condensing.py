@@ -44,8 +44,7 @@ def condensed(folder: RunFolder, arm: str, parameters: int | None) -> dict[str, 
     config, found = folder.config("learner", "num_envs", "steps"), folder.evaluation()
     rows, versions = folder.metrics(), folder.versions()
     _refuse_foreign(folder, found, rows, versions)
-    steps = rows[-1]["step"]
-    goal = config["steps"] if config.get("minutes") is None else steps
+    steps, goal = rows[-1]["step"], folder.goal
     if found.get("steps", steps) < goal or steps < goal:
         raise BidexError(
             f"{folder.path} is evaluated at {min(found.get('steps', steps), steps):,} steps, but goes on to {goal:,}. "
@@ -132,7 +131,7 @@ def _engine(config: dict[str, Any]) -> str:
 def _without_places(config: dict[str, Any]) -> dict[str, Any]:
     """The config without folders of this machine."""
     kept = dict(config)
-    for name in ("suite", "start_from"):
+    for name in ("suite", "object", "start_from"):
         if config.get(name) is not None:
             kept[name] = Path(config[name]).name if Path(config[name]).is_absolute() else config[name]
     for name in ("dataset", "demonstrations"):

@@ -24,9 +24,10 @@ def _list_of(rule: Rule) -> Rule:
     )
 
 
+_IN_NAMES = r"\w.+ -"
 _NAMED = Rule(
     "letters, digits, blanks and . + - _ (60 at most)",
-    lambda value: isinstance(value, str) and bool(re.fullmatch(r"[\w.+ -]{1,60}", value)),
+    lambda value: isinstance(value, str) and bool(re.fullmatch(rf"[{_IN_NAMES}]{{1,60}}", value)),
 )
 _SUBJECTS = {"suites": _list_of(TEXT), "tasks": _list_of(TEXT)}
 _FILE = {
@@ -124,7 +125,7 @@ def read_sweep(path: Path, root: Path = Path("runs")) -> Sweep:
     names = [run.name for run in runs]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise BidexError(f"{path}: two runs are called {twice}. Name arms apart, and each seed once.")
+        raise BidexError(f"{path}: two runs are called {twice}. Name arms apart, and each seed and value once.")
     return Sweep(content["name"], out, runs, content.get("slurm", {}))
 
 
@@ -141,14 +142,14 @@ def _runs(
     _check(arm, _ARM, path, ("name", "algo"), f"arms[{place}].")
     own = flat(arm.get("overrides", {}))
     _refuse_own(own, path, f"arms[{place}].overrides")
-    overrides, grid = shared
+    overrides, grid = shared[0], _varied(shared[1], own)
     subjects = arm if arm.keys() & _SUBJECTS.keys() else content
     named = [(kind[:-1], each) for kind in _SUBJECTS for each in subjects.get(kind, [])]
     if not named:
         raise BidexError(f"{path}: expected suites or tasks, for all or for the arm {arm['name']!r}, found neither.")
     for values in itertools.product(*grid.values()):
         chosen = dict(zip(grid, values, strict=True))
-        label = " ".join([arm["name"], *(f"{_last(flag)}={_told(value)}" for flag, value in chosen.items())])
+        label = " ".join([arm["name"], *(f"{_last(flag)}={_named(value)}" for flag, value in chosen.items())])
         flags = [word for flag, value in {**overrides, **chosen, **own}.items() for word in _words(flag, value, path)]
         for kind, subject in named:
             given = str((path.parent / expanded(subject)).resolve()) if subject.endswith(".toml") else subject
@@ -175,6 +176,12 @@ def _refuse_own(overrides: Mapping[str, Any], path: Path, place: str) -> None:
             )
 
 
+def _varied(grid: Mapping[str, Sequence[Any]], own: Mapping[str, Any]) -> dict[str, Sequence[Any]]:
+    """The grid of an arm: without what it sets itself, or it would be run once a value and be the same each time."""
+    fixed = {flag.replace("-", "_") for flag in own}
+    return {flag: values for flag, values in grid.items() if flag.replace("-", "_") not in fixed}
+
+
 def _words(flag: str, value: Any, path: Path) -> list[str]:
     """A value as words of the command line."""
     if not re.fullmatch(r"[A-Za-z][\w.-]*", flag):
@@ -184,12 +191,18 @@ def _words(flag: str, value: Any, path: Path) -> list[str]:
         before, dot, last = flag.rpartition(".")
         return [f"--{flag}" if value else f"--{before}{dot}no-{last}"]
     if isinstance(value, list):
-        return [f"--{flag}", *map(_told, value)]
+        # Of this flag alone each value is given with its name: see RunFlags.
+        return [f"--{flag}={_told(each)}" for each in value] if flag == "dataset" else [f"--{flag}", *map(_told, value)]
     return [f"--{flag}={_told(value)}"]
 
 
 def _told(value: Any) -> str:
     return "x".join(map(_told, value)) if isinstance(value, list) else str(value)
+
+
+def _named(value: Any) -> str:
+    """A value as a part of a folder's name: data sets and paths have slashes."""
+    return re.sub(rf"[^{_IN_NAMES}]+", "-", _told(value).strip("/"))
 
 
 def _last(flag: str) -> str:

@@ -12,6 +12,7 @@ from bidex_meta.errors import BidexError, one_line
 from bidex_meta.reading import exists, is_file
 from bidex_meta.record.folder import flat
 from bidex_meta.record.metrics import last_rows, training_seconds
+from bidex_meta.record.stopping import enough
 from bidex_meta.sweep.plan import PlannedRun
 
 _FREE = ("steps", "minutes", "evaluate_every", "video_every", "logger", "threads", "seed", "device")
@@ -30,7 +31,7 @@ class State:
     step: int
     """Environment steps that were logged."""
     goal: int
-    """Steps to train for."""
+    """Steps to train for; where a return or a score has ended it, those it made."""
     minutes: float | None
     """Minutes to train for, where time ends it."""
     seconds: float
@@ -64,6 +65,8 @@ def state_of(run: PlannedRun, config: Mapping[str, Any]) -> State:
         if rows and rows[-1].get("Perf/training_time") is None:
             rows = run.folder.metrics()  # of an older version
         step, seconds = (rows[-1]["step"] if rows else 0), training_seconds(rows)
+        if rows and enough(config, rows[-1]):
+            goal = step
     why = ""
     if locked(run):
         state = "runs"

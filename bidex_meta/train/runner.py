@@ -8,7 +8,7 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any, Protocol
@@ -69,7 +69,8 @@ def train(
     spent_seconds: float = 0.0,
     checkpoint_seconds: float = 60.0,
     watch: Callable[[], dict[str, float]] | None = None,
-    enough: Callable[[dict[str, float]], bool] | None = None,
+    enough: Callable[[Mapping[str, Any]], bool] | None = None,
+    last: Mapping[str, Any] | None = None,
 ) -> int:
     """Trains until ``total_steps`` environment steps are done or ``total_seconds`` are up, whichever comes first.
 
@@ -92,6 +93,8 @@ def train(
             and its time is no time of training. None in processes other than 0.
         enough: Whether metrics of an iteration, the watch's too, end the training; process 0's decide. None in no
             process or in all.
+        last: Metrics of the iteration that a resumed run goes on from: where they were enough, nothing is trained. None
+            in processes other than 0.
 
     Returns:
         Number of the signal that ended the training early, 0 if none did; where another process got it, SIGTERM's.
@@ -99,6 +102,8 @@ def train(
     Raises:
         LostProcess: Another process is gone. What was saved stays as it is.
     """
+    if enough is not None and any_process(is_main() and last is not None and enough(last)):
+        return 0  # it was stopped between its last iteration and the end of its evaluation
     # Of several processes one may be lost at any time, and then nothing more can be saved: so the first iteration is.
     saved_at = time.monotonic() if world_size() == 1 else -math.inf
     saved_step, pause = learner.env_steps, checkpoint_seconds

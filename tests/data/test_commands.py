@@ -18,6 +18,7 @@ from bidex_meta.data.checking import verify
 from bidex_meta.data.writer import DatasetWriter, finish
 from bidex_meta.errors import BidexError
 from bidex_meta.sources import Source
+from bidex_meta.record import RunFolder
 from bidex_meta.sources.source import OwnSuite
 from tests.data.worlds import rough
 from tests.pages import ROOT
@@ -192,6 +193,11 @@ def test_stopping_at_a_return(toy: None, folder: Path, capsys: pytest.CaptureFix
     assert "Enough: Train/mean_return is" in said
     steps = [json.loads(line)["step"] for line in (folder / "r" / "metrics.jsonl").read_text().splitlines()]
     assert 24 <= steps[-1] < 100
+    assert RunFolder.open(folder / "r").goal == steps[-1]
+    # Killed before its evaluation was written, it is evaluated and not trained further.
+    said = told(capsys, "run", "--resume", folder / "r", "--episodes", "1")
+    assert "Enough: Train/mean_return is" in said and RunFolder.open(folder / "r").evaluation()["steps"] == steps[-1]
+    assert [row["step"] for row in RunFolder.open(folder / "r").metrics()] == steps
     assert "Add --evaluate-every" in told(capsys, "run", *SMALL, "--stop-at-score", "33", code=2)
 
 
