@@ -17,8 +17,8 @@ from bidex_meta.data import Dataset, open_dataset, part_files, place, rounds
 from bidex_meta.data.checking import verify
 from bidex_meta.data.writer import DatasetWriter, finish
 from bidex_meta.errors import BidexError
-from bidex_meta.sources import Source
 from bidex_meta.record import RunFolder
+from bidex_meta.sources import Source
 from bidex_meta.sources.source import OwnSuite
 from tests.data.worlds import rough
 from tests.pages import ROOT
