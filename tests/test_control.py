@@ -135,7 +135,7 @@ def test_runs_that_are_no_seeds_of_one_experiment_are_refused(runs, capsys):
     folder.change_config({**config, "steps": 48})
     assert "differ in steps" in refusal(*runs)
     folder.change_config({**config, "start_from": "/runs/1"})
-    assert "differ in start_from" in refusal(*runs)
+    assert "differ in started" in refusal(*runs)
     folder.change_config({**config, "suite": "MT4"})
     assert "but MT4 shows them" in refusal(runs[1])
     folder.change_config({**config, "algo": "mtppo"})

@@ -90,6 +90,7 @@ def _check(folders: "Sequence[RunFolder]") -> None:
     """All runs adapt, on a suite with the same classes in both splits, and differ in the seed alone."""
     from bidex_meta.commands import metatest
     from bidex_meta.commands.learners import learner_kind
+    from bidex_meta.evaluation.comparison import run_kind
 
     kinds: list[dict[str, Any]] = []
     seeds: dict[int, Path] = {}
@@ -100,15 +101,12 @@ def _check(folders: "Sequence[RunFolder]") -> None:
                 f"{folder.path}: {config['algo']} does not adapt to tasks. Name runs of maml, promp or rl2."
             )
         metatest.check_source(Source.open(config), config["algo"])
-        kind = {name: config[name] for name in ("algo", "suite", "steps", "num_envs", "learner")}
-        kind["minutes"] = config.get("minutes")
-        # Where from is another run for each seed; whether is not.
-        kinds.append(kind | {"start_from": config.get("start_from") is not None})
+        kinds.append(run_kind(config))
         if (seed := config["seed"]) in seeds:
             raise BidexError(f"{folder.path} and {seeds[seed]} both have seed {seed}. Name one run for each seed.")
         seeds[seed] = folder.path
     for folder, kind in zip(folders, kinds, strict=True):
-        differing = [name for name in kind if kind[name] != kinds[0][name]]
+        differing = [name for name in kind if kind[name] != kinds[0].get(name)]
         if differing:
             raise BidexError(
                 f"Expected runs that differ in the seed alone, but {folders[0].path} and {folder.path} differ in "

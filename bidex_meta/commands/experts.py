@@ -61,5 +61,6 @@ def _of_run(run: Path) -> list[tuple[str, dict[str, Any]]]:
             "mtppo, mttrpo or mtsac."
         )
     classes = found["policy"]["classes"]
-    told = f"{config['algo']} on {source.name}, {config['steps']:,} steps, seed {config['seed']}"
+    steps = found.get("steps", config["steps"])  # of what time, a return or a score has ended fewer than were asked for
+    told = f"{config['algo']} on {source.name}, {steps:,} steps, seed {config['seed']}"
     return [(name, {"return": row["return"], "source": told}) for name, row in classes.items()]
