@@ -34,11 +34,7 @@ class HumanoidTask(Source):
 
     def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> "PooledWorld":
         """As in ``Source``."""
-        if split != "train":
-            raise BidexError(f"{self.name} has the split train alone, got {split!r}. Leave --split out.")
-        if not self.device.startswith("cpu") or self.engine == "warp":
-            wrong = "--engine warp" if self.engine == "warp" else f"--device {self.device}"
-            raise BidexError(f"{self.name} runs on the CPU in C MuJoCo, got {wrong}. Add --device cpu.")
+        self._check_foreign(split, f"{self.name} runs")
         from bidex_meta.clients.humanoid_world import HumanoidWorld
 
         rows = rows or _EVALUATION_ROWS

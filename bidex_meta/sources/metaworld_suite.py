@@ -37,11 +37,7 @@ class MetaWorldSuite(Source):
 
     def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> "PooledWorld":
         """As in ``Source``."""
-        if split != "train":
-            raise BidexError(f"{self.name} has the split train alone, got {split!r}. Leave --split out.")
-        if not self.device.startswith("cpu") or self.engine == "warp":
-            wrong = "--engine warp" if self.engine == "warp" else f"--device {self.device}"
-            raise BidexError(f"Meta-World's environments run on the CPU in C MuJoCo, got {wrong}. Add --device cpu.")
+        self._check_foreign(split, "Meta-World's environments run")
         from bidex_meta.clients.metaworld_world import MetaWorldWorld
 
         rows = rows or _EVALUATION_ROWS * len(self.class_names)

@@ -100,6 +100,14 @@ class Source(ABC):
             BidexError: They are Meta-World's, of which nothing is drawn or measured here.
         """
 
+    def _check_foreign(self, split: str, told: str) -> None:
+        """Refuses another split than train, and other engines than C MuJoCo on the CPU; ``told``: whose they are."""
+        if split != "train":
+            raise BidexError(f"{self.name} has the split train alone, got {split!r}. Leave --split out.")
+        if not self.device.startswith("cpu") or self.engine == "warp":
+            wrong = "--engine warp" if self.engine == "warp" else f"--device {self.device}"
+            raise BidexError(f"{told} on the CPU in C MuJoCo, got {wrong}. Add --device cpu.")
+
     @property
     def splits(self) -> list[str]:
         """The splits there are: ``train``, and ``test`` for a meta suite."""
