@@ -175,7 +175,13 @@ def test_a_run_that_a_return_or_score_ended_is_of_the_steps_it_made(tmp_path: Pa
             change(path, stop_at_return=None)
         with pytest.raises(BidexError, match="is of 1,000 steps, but the run goes on to 1,000,000,000"):
             groups(path)
-    change(path, stop_at_return=None, stop_at_score=33.0)
+    change(path, stop_at_return=None, stop_at_success=0.8, evaluate_every=None)
+    log(**{"Train/success_rate": 0.79})
+    with pytest.raises(BidexError, match="goes on"):
+        groups(path)
+    log(**{"Train/success_rate": 0.8})
+    assert groups(path)[0].steps == 1000
+    change(path, stop_at_success=None, stop_at_score=33.0)
     log(**{"Eval/score": 34.0})
     assert groups(path)[0].steps == 1000
 

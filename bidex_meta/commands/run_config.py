@@ -21,11 +21,12 @@ from bidex_meta.errors import BidexError, one_line
 from bidex_meta.memory import POINT_BYTES, ROW_BYTES, check_memory
 from bidex_meta.reading import expanded
 from bidex_meta.record.folder import RunFolder, flat
+from bidex_meta.record.stopping import ENDS
 from bidex_meta.sources import Source
 from bidex_meta.suite import MOST_POINTS
 from bidex_meta.train.launch import launch, resume_command
 
-_MAY_CHANGE = ("steps", "minutes", "evaluate_every", "video_every", "logger", "stop_at_return", "stop_at_score")
+_MAY_CHANGE = ("steps", "minutes", "evaluate_every", "video_every", "logger", *ENDS)
 """What a resumed run may be given anew: nothing of it changes what is learned."""
 _EXAMPLE = "MT4"  # a suite whose defaults `run --help` shows
 
@@ -99,6 +100,9 @@ class RunFlags:
     episodes in some of the rows (docs/data.md). 0: none."""
     stop_at_return: float | None = None
     """End as soon as the mean return reaches this: of the evaluations with --evaluate-every, else of training."""
+    stop_at_success: float | None = None
+    """End as soon as this share of the episodes succeeds, such as 0.8: of the evaluations with --evaluate-every, else
+    of training, whose actions explore."""
     stop_at_score: float | None = None
     """End as soon as the normalised score of the evaluations reaches this; 33 is a third of the expert's. Needs
     --evaluate-every."""
@@ -147,7 +151,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     # What older runs did not know.
     older = {"engine": "auto", "base": "own", "start_from": None, "minutes": None, "object": None}
     older |= {"points": 0, "evaluate_every": None, "video_every": None, "logger": "tensorboard"}
-    older |= {"record": 0, "record_share": 0.0, "stop_at_return": None, "stop_at_score": None}
+    older |= {"record": 0, "record_share": 0.0, **dict.fromkeys(ENDS)}
     older |= {"dataset": [], "task_seed": None, "demonstrations": None}
     stored = {**older, **folder.config("learner", "num_envs", "steps")} if folder else {}
     suite, task = (peek(arguments, f"--{name}") or stored.get(name) for name in ("suite", "task"))
@@ -218,6 +222,8 @@ def _resolved(
         raise BidexError(f"--points must be a whole number from 0 to {MOST_POINTS:,}, not {flags.points}.")
     if flags.minutes is not None and not 0.0 < flags.minutes < math.inf:
         raise BidexError(f"--minutes must be a number above 0, such as 4 or 0.5, not {flags.minutes:g}.")
+    if flags.stop_at_success is not None and not 0.0 < flags.stop_at_success <= 1.0:
+        raise BidexError(f"--stop-at-success is a share above 0 up to 1, such as 0.8, not {flags.stop_at_success:g}.")
     if flags.stop_at_score is not None and flags.evaluate_every is None:
         raise BidexError("--stop-at-score is judged by evaluations while training. Add --evaluate-every 50, say.")
     if flags.record:
@@ -247,8 +253,7 @@ def _resolved(
         "record": flags.record,
         # A resumed run that takes more steps goes on with the rows that it began with.
         "record_share": stored.get("record_share", flags.record / max(flags.steps, 1)),
-        "stop_at_return": flags.stop_at_return,
-        "stop_at_score": flags.stop_at_score,
+        **{name: getattr(flags, name) for name in ENDS},
         "processes": launch().count,
         "seed": flags.seed,
         "device": device,

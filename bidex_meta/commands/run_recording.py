@@ -1,4 +1,4 @@
-"""What ``bidex-meta run`` adds for data sets: a recorder around its world, and an early end at a named return."""
+"""What ``bidex-meta run`` adds for data sets: a recorder around its world, and an early end at a named goal."""
 
 import sys
 from collections.abc import Callable, Mapping
@@ -51,7 +51,7 @@ def complete(plan: RunPlan, recorder: Any) -> None:
 
 def enough(config: dict[str, Any]) -> Callable[[Mapping[str, Any]], bool] | None:
     """What ends the training early, by its metrics; None where nothing does."""
-    if config["stop_at_return"] is None and config["stop_at_score"] is None:
+    if all(config[name] is None for name in stopping.ENDS):
         return None
 
     def reached(metrics: Mapping[str, Any]) -> bool:

@@ -12,6 +12,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.statistics import Interval, bootstrap_interval
 from bidex_meta.outside import name_with_object, short_name
 from bidex_meta.record.metrics import training_seconds
+from bidex_meta.record.stopping import ENDS
 from bidex_meta.record.stored import Run
 
 
@@ -71,7 +72,7 @@ def run_kind(config: dict[str, Any], split: str = "train") -> dict[str, Any]:
     """What runs that are compared as one have in common: all of the config that matters but the seed."""
     kind = {"algo": config["algo"], "on": config["suite"] or "one class at a time", "steps": config["steps"]}
     kind |= {"num_envs": config["num_envs"], "minutes": config.get("minutes"), "split": split}
-    kind |= {name: config.get(name) for name in ("stop_at_return", "stop_at_score")}
+    kind |= {name: config.get(name) for name in ENDS}
     kind["started"] = "afresh" if config.get("start_from") is None else "from another run"  # which: one for each seed
     # Older configs have fewer of these, at these values.
     kind |= {"base": config.get("base", "own"), "points": config.get("points", 0), "object": config.get("object")}

@@ -31,6 +31,7 @@ CONFIG = {
     "record": whole(0),
     "record_share": number(0.0, 1e15),
     "stop_at_return": number(-1e12, 1e12).or_none(),
+    "stop_at_success": number(0.0, 1.0).or_none(),
     "stop_at_score": number(-1e12, 1e12).or_none(),
     "processes": whole(1, 1_000_000),
     "seed": whole(0),

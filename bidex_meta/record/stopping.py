@@ -1,4 +1,4 @@
-"""What ends a run before its steps are done: time, or a return or score that its metrics reach.
+"""What ends a run before its steps are done: time, or a return, success or score that its metrics reach.
 
 Its config and the last line of its metrics say so, whoever asks later: nothing else need be kept of it.
 """
@@ -6,9 +6,12 @@ Its config and the last line of its metrics say so, whoever asks later: nothing 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+ENDS = ("stop_at_return", "stop_at_success", "stop_at_score")
+"""Entries of a run's config that end it early; None where they do not, and missing in older ones."""
+
 
 def enough(config: Mapping[str, Any], row: Mapping[str, Any]) -> str | None:
-    """By what a line of metrics ends its run (``--stop-at-return``, ``--stop-at-score``).
+    """By what a line of metrics ends its run (one of ``ENDS``).
 
     Args:
         config: The run's; an older one knows no such ends.
@@ -17,10 +20,9 @@ def enough(config: Mapping[str, Any], row: Mapping[str, Any]) -> str | None:
     Returns:
         The tag that has reached its number; None where the run goes on.
     """
-    evaluated = config.get("evaluate_every") is not None
-    wanted = {f"{'Eval' if evaluated else 'Train'}/mean_return": config.get("stop_at_return")}
-    wanted["Eval/score"] = config.get("stop_at_score")
-    for tag, value in wanted.items():
+    place = "Train" if config.get("evaluate_every") is None else "Eval"
+    tags = (f"{place}/mean_return", f"{place}/success_rate", "Eval/score")
+    for tag, value in zip(tags, map(config.get, ENDS), strict=True):
         found = row.get(tag)
         if value is not None and found is not None and found >= value:
             return tag
