@@ -43,7 +43,7 @@ SHARED: dict[str, Any] = {
     "atoms": 51,
 }
 FAST = FastTD3Config(**SHARED | {"updates_per_step": 4}, critic_layer_norm=False, n_steps=1, squash_price=0.0)
-SMALL = BRCConfig(**SHARED, task_embedding=4, init_alpha=0.01, target_entropy_per_action=-2.0)
+SMALL = BRCConfig(**SHARED, n_steps=1, task_embedding=4, init_alpha=0.01, target_entropy_per_action=-2.0)
 both = pytest.mark.parametrize(("kind", "config"), [(FastTD3, FAST), (BRC, SMALL)], ids=["fasttd3", "brc"])
 
 
@@ -59,8 +59,9 @@ def test_two_tasks_at_odds_are_learned_though_one_pays_a_thousandfold(kind: Any,
 
 
 @pytest.mark.parametrize(
-    ("kind", "config"), [(FastTD3, FAST), (FastTD3, replace(FAST, n_steps=3)), (BRC, SMALL)],
-    ids=["fasttd3", "fasttd3-3", "brc"],
+    ("kind", "config"),
+    [(FastTD3, FAST), (FastTD3, replace(FAST, n_steps=3)), (BRC, SMALL), (BRC, replace(SMALL, n_steps=3))],
+    ids=["fasttd3", "fasttd3-3", "brc", "brc-3"],
 )  # fmt: skip
 def test_lqr_comes_close_to_the_riccati_optimum(kind: Any, config: Any) -> None:
     learner, test = trained(kind, LQR(), config, 20), LQR(rows=256)

@@ -22,8 +22,12 @@ class BRCConfig(CategoricalConfig, MTSACConfig):
     """Give each critic one distribution per task instead of one for all."""
     task_embedding: int = 32
     """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
-    updates_per_step: int = 2
+    updates_per_step: int = 4
     """Updates of all networks after each vector step."""
+    n_steps: int = 3
+    """Steps whose rewards a target takes as they came, before it asks for the value of what follows."""
+    tau: float = 0.05
+    """Share of the critics that enters the target critics in each update (1 - Polyak's factor)."""
     clipped_double_q: bool = False
     """Targets and actor take the critic that says less; off: the mean of both."""
     weight_decay: float = 1e-4
@@ -57,7 +61,7 @@ PRESETS: dict[str, BRCConfig] = {
     # Decay: AdamW's default there, 1e-4. No limit of the gradient (here a huge one), observations as they are.
     "paper": BRCConfig(
         hidden=(256, 256), critic_hidden=(4096, 4096, 4096), replay_steps=4000, warmup_steps=20, updates_per_step=2,
-        batch_size=1024, gamma=0.99, tau=0.005, learning_rate=3e-4, critic_learning_rate=3e-4,
+        batch_size=1024, gamma=0.99, n_steps=1, tau=0.005, learning_rate=3e-4, critic_learning_rate=3e-4,
         alpha_learning_rate=3e-4, init_alpha=0.1, one_temperature=True, std_range=(4.54e-5, 7.39), init_std=0.0183,
         weight_decay=1e-4, max_grad_norm=1e9, normalise_observations=False, atoms=101, value_bound=10.0,
     ),
