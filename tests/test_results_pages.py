@@ -124,6 +124,35 @@ def test_rows_by_learners(tmp_path: Path) -> None:
     assert fill(page, tmp_path / "data", check=True) == []
 
 
+def test_gains_of_meta_tests(tmp_path: Path) -> None:
+    """A run's own interval, bold where it excludes zero; over the control of the same seed, errors added as squares."""
+
+    def made(arm: str, seed: int, gain: float, half: float) -> Path:
+        path = evaluated(tmp_path, seed, 0.0, f"MT4-{arm}-seed{seed}")
+        rows = {when: {"success": s, "return": 8 * s, "score": None} for when, s in (("before", 0.25), ("after", 0.5))}
+        one = {"return": {"value": gain, "interval": [gain - half, gain + half]}}
+        part = {when: {"classes": {"A": row, "B": row}} for when, row in rows.items()}
+        part |= {"shots": 2, "rollouts": 40, "gain": {"classes": {"A": one}, "aggregate": one}}
+        (path / "evaluation.json").write_text(json.dumps({"steps": 1000, "splits": {"test": part}}))
+        return path
+
+    runs = [made("promp", 0, 3.0, 0.3), made("promp", 1, 0.1, 0.5), made("control", 0, 1.0, 0.4)]
+    assert collect(*runs, "--into", tmp_path / "data" / "meta") == 0
+    page = tmp_path / "page.md"
+    page.write_text("<!-- results: study=meta show=gains -->\n<!-- end -->\n")
+    fill(page, tmp_path / "data")
+    _, _, *rows = [cells(line) for line in page.read_text().splitlines() if line.startswith("|")]
+    shown = ["1,000", "2 × 40", "25 → 50 %", "2 → 4"]
+    assert rows == [
+        ["A", "promp", "0", *shown, "**+3** [+2.7, +3.3]", "**+2** [+1.5, +2.5]"],
+        ["A", "promp", "1", *shown, "+0.1 [-0.4, +0.6]", ""],
+        ["A", "control", "0", *shown, "**+1** [+0.6, +1.4]", ""],
+    ]
+    page.write_text("<!-- results: study=meta show=gains split=train -->\n<!-- end -->\n")
+    with pytest.raises(BidexError, match="has no meta-test of train tasks"):
+        fill(page, tmp_path / "data")
+
+
 def test_an_arm_of_two_kinds_is_refused(page: Path, tmp_path: Path) -> None:
     third = evaluated(tmp_path, 2, 0.5, "MT4-base-seed2", gamma=0.7)
     assert collect(third, "--into", data(page) / "tiny") == 0

@@ -6,9 +6,10 @@
     (whatever stands here is replaced)
     <!-- end -->
 
-``show`` is ``table`` (an arm a row), ``classes`` (success and return of each class), ``offline`` (data sets by
-learners), ``rows`` (numbers of rows by learners), ``curves``, ``points`` or ``row-curves`` (pictures, written beside
-the page); ``on=MT4`` shows one suite or class of the study, ``split=test`` of a meta-test one split.
+``show`` is ``table`` (an arm a row), ``classes`` (success and return of each class), ``gains`` (what adaptation
+gained, by class and run), ``offline`` (data sets by learners), ``rows`` (numbers of rows by learners), ``curves``,
+``points`` or ``row-curves`` (pictures, written beside the page); ``on=MT4`` shows one suite or class of the study,
+``split=test`` of a meta-test one split.
 """
 
 import re
@@ -20,13 +21,20 @@ from bidex_meta.errors import BidexError, known_name
 from bidex_meta.reading import is_file, read_text
 from bidex_meta.record import plots
 from bidex_meta.record.atomic import write_atomic
+from bidex_meta.results.gains import gains_table
 from bidex_meta.results.offline import offline_table
 from bidex_meta.results.scaling import rows_figure, rows_table
 from bidex_meta.results.studies import Study, arms_table, classes_table, figures, read_studies
 
 _BLOCK = re.compile(r"(?P<head><!-- results: (?P<words>[^\n]*?) -->\n)(?P<old>.*?)(?P<end><!-- end -->)", re.DOTALL)
 _OPTIONS = ("study", "show", "on", "split")
-_TABLES = {"table": arms_table, "classes": classes_table, "offline": offline_table, "rows": rows_table}
+_TABLES = {
+    "table": arms_table,
+    "classes": classes_table,
+    "gains": gains_table,
+    "offline": offline_table,
+    "rows": rows_table,
+}
 _TITLES = {
     "curves": "Return and success over training",
     "points": "Success and score, 95 % intervals over seeds",

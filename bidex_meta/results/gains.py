@@ -1,0 +1,79 @@
+"""What adaptation gained in each run's meta-test, and how much more than in a control without meta-training."""
+
+from collections.abc import Iterator
+from math import hypot
+from typing import Any
+
+from bidex_meta.errors import BidexError
+from bidex_meta.record.stored import StoredRun
+from bidex_meta.results.studies import Study, head_of, row_of
+
+CONTROL = "control"
+"""The arm that every other is held against: the same policy to start from and the same adaptation, no meta-training."""
+_HEAD = ("class", "arm", "seed", "steps", "shots × rollouts", "success", "return", "gain [95 %]", "over control [95 %]")
+
+
+def gains_table(study: Study) -> Iterator[str]:
+    """Lines of Markdown: a run a row, class by class; what excludes zero is bold.
+
+    A gain is the meta-test's own, of returns, with its interval over adaptations and their episodes. Over the control
+    stands the difference to the gain of the control's run of the same seed, both sides' half widths added as errors of
+    independent measurements are (the root of the sum of squares).
+
+    Args:
+        study: Runs with a meta-test; of the test split where the study names none.
+
+    Raises:
+        BidexError: A run has no meta-test of the split, or an arm several runs of one seed.
+    """
+    split = study.split or "test"
+    parts: dict[tuple[str, int], tuple[StoredRun, dict[str, Any]]] = {}
+    for run in study.runs:
+        part, key = run.evaluation().get("splits", {}).get(split), (run.arm, run.config()["seed"])
+        if part is None or "gain" not in part:
+            raise BidexError(f"Study {study.name}: {run.path} has no meta-test of {split} tasks. Leave it out.")
+        if key in parts:
+            raise BidexError(f"{run.path} and {parts[key][0].path.name} are both seed {key[1]} of the arm {key[0]!r}.")
+        parts[key] = run, part
+    yield from head_of(_HEAD)
+    order = sorted(parts, key=lambda key: (key[0] == CONTROL, *key))
+    for name in dict.fromkeys(name for _, part in parts.values() for name in part["gain"]["classes"]):
+        for arm, seed in order:
+            run, part = parts[arm, seed]
+            if name not in part["gain"]["classes"]:
+                continue
+            _, control = parts.get((CONTROL, seed), (None, None))
+            more = "" if control is None or arm == CONTROL else _told(_over(_gain(part, name), _gain(control, name)))
+            yield row_of([
+                name, arm, str(seed), f"{run.content['steps']:,}", f"{part['shots']} × {part['rollouts']}",
+                _both(part, name, "success", 100.0, " %"), _both(part, name, "return"),
+                _told(_gain(part, name)), more,
+            ])  # fmt: skip
+
+
+def _gain(part: dict[str, Any], name: str) -> dict[str, Any]:
+    """The return's, with its interval."""
+    return part["gain"]["classes"][name]["return"]
+
+
+def _over(gain: dict[str, Any], control: dict[str, Any]) -> dict[str, Any]:
+    """The difference of two gains that were measured apart."""
+    value = gain["value"] - control["value"]
+    if gain["interval"] is None or control["interval"] is None:
+        return {"value": value, "interval": None}
+    low = hypot(gain["value"] - gain["interval"][0], control["interval"][1] - control["value"])
+    high = hypot(gain["interval"][1] - gain["value"], control["value"] - control["interval"][0])
+    return {"value": value, "interval": [value - low, value + high]}
+
+
+def _both(part: dict[str, Any], name: str, measure: str, factor: float = 1.0, unit: str = "") -> str:
+    before, after = (factor * part[when]["classes"][name][measure] for when in ("before", "after"))
+    return f"{before:.4g} → {after:.4g}{unit}"
+
+
+def _told(found: dict[str, Any]) -> str:
+    value, interval = found["value"], found["interval"]
+    if interval is None:
+        return f"{value:+.3g}"
+    sure = interval[0] > 0 or interval[1] < 0
+    return f"{'**' if sure else ''}{value:+.3g}{'**' if sure else ''} [{interval[0]:+.3g}, {interval[1]:+.3g}]"
