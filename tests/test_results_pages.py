@@ -124,6 +124,25 @@ def test_rows_by_learners(tmp_path: Path) -> None:
     assert fill(page, tmp_path / "data", check=True) == []
 
 
+def test_the_best_run_of_each_class(tmp_path: Path) -> None:
+    for name, arm, success, value in (("C", "ppo", 0.5, 9.0), ("C", "sac", 0.75, 2.0), ("D", "ppo", 0.0, 3.0)):
+        path = test_collect.run(tmp_path, 0, {name: success}, arm, task=f"place/{name}")
+        path = path.rename(tmp_path / f"{name}-{arm}-seed0")
+        log(path, {"step": 1000, f"Train/return/{name}": 1.0, "Perf/training_time": 1800.0})
+        row = {"success": success, "success_interval": [0.0, 1.0], "return": value, "score": None}
+        (path / "evaluation.json").write_text(json.dumps({"steps": 1000, "policy": {"classes": {name: row}}}))
+        (path / "versions.json").write_text(json.dumps({"git": {"commit": test_collect.COMMIT, "dirty": False}}))
+        assert collect(path, "--into", tmp_path / "data" / "alone") == 0
+    page = tmp_path / "page.md"
+    page.write_text("<!-- results: study=alone show=best -->\n<!-- end -->\n")
+    fill(page, tmp_path / "data")
+    _, _, *rows = [cells(line) for line in page.read_text().splitlines() if line.startswith("|")]
+    assert rows == [
+        ["C", "sac", "0", "1,000", "0.50", "75 % [0, 100]", "2", "–", "2"],
+        ["D", "ppo", "0", "1,000", "0.50", "0 % [0, 100]", "3", "–", "1"],
+    ]
+
+
 def test_gains_of_meta_tests(tmp_path: Path) -> None:
     """A run's own interval, bold where it excludes zero; over the control of the same seed, errors added as squares."""
 

@@ -7,9 +7,9 @@
     <!-- end -->
 
 ``show`` is ``table`` (an arm a row), ``classes`` (success and return of each class), ``gains`` (what adaptation
-gained, by class and run), ``offline`` (data sets by learners), ``rows`` (numbers of rows by learners), ``curves``,
-``points`` or ``row-curves`` (pictures, written beside the page); ``on=MT4`` shows one suite or class of the study,
-``split=test`` of a meta-test one split.
+gained, by class and run), ``best`` (the best run of each class, in one table), ``offline`` (data sets by learners),
+``rows`` (numbers of rows by learners), ``curves``, ``points`` or ``row-curves`` (pictures, written beside the page);
+``on=MT4`` shows one suite or class of the study, ``split=test`` of a meta-test one split.
 """
 
 import re
@@ -21,6 +21,7 @@ from bidex_meta.errors import BidexError, known_name
 from bidex_meta.reading import is_file, read_text
 from bidex_meta.record import plots
 from bidex_meta.record.atomic import write_atomic
+from bidex_meta.results.best import best_table
 from bidex_meta.results.gains import gains_table
 from bidex_meta.results.offline import offline_table
 from bidex_meta.results.scaling import rows_figure, rows_table
@@ -35,6 +36,8 @@ _TABLES = {
     "offline": offline_table,
     "rows": rows_table,
 }
+_OVER_ALL = {"best": best_table}
+"""Tables of all suites and classes of a study at once."""
 _TITLES = {
     "curves": "Return and success over training",
     "points": "Success and score, 95 % intervals over seeds",
@@ -88,11 +91,14 @@ def _options(words: str, page: Path) -> dict[str, str]:
         options[known_name("option of a block", name, _OPTIONS)] = value
     if not re.fullmatch(r"[\w.-]+", options.get("study", "")):
         raise BidexError(f"{page}: expected a block to name its study, such as study=multitask, got {words!r}.")
-    options["show"] = known_name("block", options["show"], [*_TABLES, *_TITLES])
+    options["show"] = known_name("block", options["show"], [*_TABLES, *_OVER_ALL, *_TITLES])
     return options
 
 
 def _lines(studies: list[Study], show: str, page: Path, check: bool, changed: list[Path]) -> Iterator[str]:
+    if show in _OVER_ALL:
+        yield from _OVER_ALL[show](studies) if studies else ()
+        return
     for place, study in enumerate(studies):
         if len(studies) > 1:
             yield from ["", f"**{study.on}**", ""] if place else [f"**{study.on}**", ""]

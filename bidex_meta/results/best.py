@@ -1,0 +1,37 @@
+"""The best run of each class: what a study of single classes found as experts."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from bidex_meta.evaluation.comparison import classes_of
+from bidex_meta.record.stored import StoredRun
+from bidex_meta.results.studies import Study, head_of, row_of
+
+_HEAD = ("class", "arm", "seed", "steps", "hours", "success [95 %]", "return [95 %]", "uniform actions", "runs")
+
+
+def best_table(studies: Sequence[Study]) -> Iterator[str]:
+    """Lines of Markdown: a class a row, of its runs the one that succeeds most often; of equals the largest return.
+
+    Args:
+        studies: One for each class or set of classes.
+    """
+    rows: dict[str, list[tuple[StoredRun, dict[str, Any]]]] = {}
+    for study in studies:
+        for run in study.runs:
+            for name, row in classes_of(run.evaluation()).items():
+                rows.setdefault(name, []).append((run, row))
+    yield from head_of(_HEAD)
+    for name, found in rows.items():
+        run, best = max(found, key=lambda each: (each[1]["success"], each[1]["return"]))
+        random = run.evaluation().get("random", {"classes": {}})["classes"].get(name)
+        yield row_of([
+            name, run.arm, str(run.config()["seed"]), f"{run.content['steps']:,}",
+            f"{run.content['seconds'] / 3600:.2f}", _ranged(best, "success", 100.0, " %"), _ranged(best, "return"),
+            "–" if random is None else f"{random['return']:.4g}", str(len(found)),
+        ])  # fmt: skip
+
+
+def _ranged(row: dict[str, Any], measure: str, factor: float = 1.0, unit: str = "") -> str:
+    told, interval = f"{factor * row[measure]:.4g}{unit}", row.get(f"{measure}_interval")
+    return told if interval is None else f"{told} [{', '.join(f'{factor * end:.4g}' for end in interval)}]"
