@@ -16,3 +16,6 @@ Balancing = Literal["none", "pcgrad", "cagrad", "famo"]
 
 Adapted = Literal["all", "head"]
 """Which parameters an adaptation step moves: all, or those of the mean's output layer."""
+
+StepSizeKind = Literal["fixed", "layer", "weight"]
+"""Whether sizes of the adaptation step are learned, and of what; see :mod:`bidex_algos.meta.step_sizes`."""

@@ -42,7 +42,8 @@ def start_from(learner: PolicyLearner, state: dict[str, Any]) -> None:
     """
     own, given = asdict(learner.config) | _seen(learner.shape), state["config"] | _seen(Shape.load(state["shape"]))
     _agree(own, given, _FORM)
-    if _shapes(learner.policy.state_dict()) != _shapes(state["weights"]):
+    network, weights = _network(learner.policy.state_dict()), _network(state["weights"])
+    if _shapes(network) != _shapes(weights):
         raise BidexError(
             "Expected a policy to start from of the same kind (mtppo, mttrpo, promp and maml share one; mtsac and rl2 "
             "have their own, other architectures, policy heads and a task embedding others), got one with other "
@@ -51,7 +52,12 @@ def start_from(learner: PolicyLearner, state: dict[str, Any]) -> None:
     if isinstance(getattr(learner.policy, "actor", None), SquashedActor):
         # Its network speaks of a place between these bounds; a Gaussian one has its deviation as a weight.
         _agree(own, given, ("std_range",))
-    learner.policy.load_state_dict(state["weights"])
+    learner.policy.load_state_dict(learner.policy.state_dict() | weights)
+
+
+def _network(weights: dict[str, Any]) -> dict[str, Any]:
+    """Without learned sizes of inner steps, which are no part of what plays."""
+    return {name: weight for name, weight in weights.items() if not name.startswith("step_sizes.")}
 
 
 def _seen(shape: Shape) -> dict[str, Any]:

@@ -38,7 +38,7 @@ def tiny(kind: Any, config: Any, tasks: int = 3) -> tuple[Any, Any]:
     """A learner whose actor and data are those of ``problem``, in float64."""
     learner = kind(PointGoals(rows=tasks, classes=(PointClass(count=tasks),)), replace(config, hidden=(5,)), seed=0)
     actor, batches = problem(tasks=tasks, dtype=torch.float64)
-    learner.policy.actor.double().load_state_dict(actor.state_dict())
+    learner.policy.double().actor.load_state_dict(actor.state_dict())
     learner.rows = type(learner.rows)(torch.arange(tasks))
     return learner, batches
 
@@ -48,13 +48,20 @@ def surrogate(learner: Any, batches: Any) -> Tensor:
     return learner._objective(batches)[0]
 
 
-@pytest.mark.parametrize(("inner_steps", "adapted"), [(1, "all"), (2, "all"), (2, "head")])
+@pytest.mark.parametrize(
+    ("inner_steps", "adapted", "sizes"),
+    [(1, "all", "fixed"), (2, "all", "fixed"), (2, "head", "fixed"), (2, "all", "layer"), (2, "head", "weight")],
+)
 @both
-def test_second_order_gradients_agree_with_finite_differences(kind: Any, config: Any, inner_steps: int, adapted: Any):
-    config = replace(config, inner_learning_rate=0.3, inner_steps=inner_steps, adapted=adapted)
+def test_second_order_gradients_agree_with_finite_differences(
+    kind: Any, config: Any, inner_steps: int, adapted: Any, sizes: Any
+):
+    config = replace(config, inner_learning_rate=0.3, inner_steps=inner_steps, adapted=adapted, step_sizes=sizes)
     learner, batches = tiny(kind, config)
     batches = [batches[0]] * inner_steps + [batches[1]]
-    parameters = list(learner.policy.actor.parameters())
+    parameters = list(learner.policy.parameters())
+    learned = {"fixed": 0, "layer": 5, "weight": len(flatten(learner.policy.actor.mean.head.parameters()))}[sizes]
+    assert sum(p.numel() for p in parameters) == learned + sum(p.numel() for p in learner.policy.actor.parameters())
     gradient = flatten(torch.autograd.grad(surrogate(learner, batches), parameters))
     start = flatten(parameters).detach().clone()
     step = 1e-6
@@ -194,12 +201,37 @@ def test_one_inner_step_closes_the_gap_to_a_policy_that_sees_the_goal(kind: Any,
     assert (after - before) / (best - before) > 0.4
 
 
-@pytest.mark.parametrize("slice_steps", [None, 7])
+@pytest.mark.parametrize("sizes", ["layer", "weight"])
+def test_step_sizes_that_are_far_too_small_are_learned(sizes: Any):
+    """Begun with 1 / 50 of the inner step that PointGoals wants, adaptation gains next to nothing unless they grow."""
+    gained = []
+    for each in ("fixed", sizes):
+        chosen = replace(PROMP, inner_learning_rate=0.002, step_sizes=each, step_size_rate=0.5)
+        learner = ProMP(PointGoals(rows=80), chosen, seed=0)
+        for _ in range(12):
+            told = learner.iterate()
+        before, after = returns(learner)
+        gained.append(after - before)
+        assert ("Policy/inner_learning_rate" in told) == (each != "fixed")
+    assert told["Policy/inner_learning_rate"] > 0.004 and gained[1] > 10 * gained[0]
+
+
+def test_a_step_size_below_zero_comes_back_to_it():
+    learner = ProMP(PointGoals(rows=16), replace(PROMP, step_sizes="weight"), seed=0)
+    factors = learner.policy.step_sizes["mean.head.weight"]
+    with torch.no_grad():
+        factors[0, :2] = torch.tensor([-0.5, 0.5])
+    learner.policy.adapter.project()
+    assert factors[0, :2].tolist() == [0.0, 0.5] and float(learner.policy.step_sizes.mean()) < 1.0
+
+
+@pytest.mark.parametrize(("slice_steps", "sizes"), [(None, "fixed"), (7, "fixed"), (None, "layer")])
 @both
-def test_save_load_resume_is_bit_equal(kind: Any, config: Any, slice_steps: int | None):
+def test_save_load_resume_is_bit_equal(kind: Any, config: Any, slice_steps: int | None, sizes: Any):
     config = replace(
-        config, slice_steps=slice_steps, tasks_per_class=3, max_adapt_steps=30, normalise_observations=True
-    )
+        config, slice_steps=slice_steps, tasks_per_class=3, max_adapt_steps=30, normalise_observations=True,
+        step_sizes=sizes,
+    )  # fmt: skip
     mode = kind.autoreset({"slice_steps": slice_steps})
     assert mode == ("DISABLED" if slice_steps is None else "SAME_STEP")
     resumed(lambda seed: kind(PointGoals(rows=12, autoreset_mode=mode), config, seed))

@@ -39,6 +39,18 @@ def test_a_meta_learner_acts_as_the_policy_it_starts_from_and_learns_on():
     assert not torch.equal(learner.eval_action(obs), before)
 
 
+def test_learned_step_sizes_are_no_part_of_what_another_run_begins_with():
+    sizing = ProMP(PointGoals(rows=16), replace(PROMP, step_sizes="layer"), seed=0)
+    start_from(sizing, trained().policy_state_dict())
+    sizing.iterate()
+    assert float(sizing.policy.step_sizes.mean()) != 1.0
+    for again in (PROMP, replace(PROMP, step_sizes="weight")):
+        learner = ProMP(PointGoals(rows=16), again, seed=0)
+        start_from(learner, sizing.policy_state_dict())
+        assert torch.equal(learner.policy.actor.log_std, sizing.policy.actor.log_std)
+        assert learner.policy.step_sizes is None or float(learner.policy.step_sizes.mean()) == 1.0
+
+
 @pytest.mark.parametrize(
     ("change", "expected"),
     [

@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 from torch.func import grad
 
-from bidex_algos.choices import Adapted
+from bidex_algos.choices import Adapted, StepSizeKind
+from bidex_algos.meta.step_sizes import StepSizes
 from bidex_algos.nets.networks import GaussianActor, gaussian_kl, gaussian_log_prob, stacked_forward
 
 Params = dict[str, Tensor]
@@ -60,6 +61,7 @@ class Adapter:
         std_range: Bounds of the standard deviations, wherever they are used.
         first_order: Whether the outer loop takes the inner gradient for a constant.
         adapted: Which parameters the inner step moves: all of them, or those of the output layer.
+        step_sizes: Whether sizes of the inner step are learned, and of what.
     """
 
     def __init__(
@@ -70,15 +72,20 @@ class Adapter:
         std_range: tuple[float, float],
         first_order: bool = False,
         adapted: Adapted = "all",
+        step_sizes: StepSizeKind = "fixed",
     ):
         self.actor, self.learning_rate, self.objective, self.first_order = actor, learning_rate, objective, first_order
         self._prefix = "mean.head." if adapted == "head" else ""
         self.log_std_range = math.log(std_range[0]), math.log(std_range[1])
+        moved = self._moved([name for name, _ in actor.named_parameters()])
+        self.step_sizes = None if step_sizes == "fixed" else StepSizes(actor, moved, step_sizes)
 
     @torch.no_grad()
     def project(self) -> None:
-        """Moves the meta-parameters' standard deviations back between their bounds: beyond one no gradient would."""
+        """Moves standard deviations and step sizes back between their bounds: beyond one no gradient would."""
         self.actor.log_std.clamp_(*self.log_std_range)
+        if self.step_sizes is not None:
+            self.step_sizes.project()
 
     def meta(self, count: int) -> Params:
         """The meta-parameters once per task, a view with their graph."""
@@ -91,12 +98,20 @@ class Adapter:
 
     def adapt(self, params: Params, batch: TaskBatch) -> Params:
         """Parameters after one inner step of each task on its own batch."""
-        own = [name for name in params if name.startswith(self._prefix)]
+        own = self._moved(list(params))
         parts = [self._slopes(*part, own) for part in _parts(params, batch)]
         slopes = {name: torch.cat([part[name] for part in parts]) for name in own}
         if self.first_order:
             slopes = {name: slope.detach() for name, slope in slopes.items()}
-        return params | {name: params[name] - self.learning_rate * slopes[name] for name in own}
+        return params | {name: params[name] - self._size(name) * slopes[name] for name in own}
+
+    def _moved(self, names: list[str]) -> list[str]:
+        """Of these parameters those that an inner step moves."""
+        return [name for name in names if name.startswith(self._prefix)]
+
+    def _size(self, name: str) -> float | Tensor:
+        """Size of an inner step of a parameter."""
+        return self.learning_rate if self.step_sizes is None else self.learning_rate * self.step_sizes[name]
 
     def _slopes(self, params: Params, batch: TaskBatch, own: list[str]) -> Params:
         """Gradients of the tasks' inner losses by the parameters named; no task's loss knows another's parameters."""

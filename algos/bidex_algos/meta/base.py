@@ -67,6 +67,9 @@ class MetaLearner(Learner):
         self.tasks_generator = torch.Generator().manual_seed(seed)
         self.rows = TaskRows(world.task_id)
         self.adam = torch.optim.Adam(self.policy.actor.parameters(), lr=config.outer_learning_rate)
+        if self.policy.step_sizes is not None:
+            sizes = list(self.policy.step_sizes.parameters())
+            self.adam.add_param_group({"params": sizes, "lr": config.step_size_rate})
 
     @staticmethod
     def autoreset(config: dict[str, Any]) -> str:
@@ -124,6 +127,8 @@ class MetaLearner(Learner):
         told |= as_numbers(self._outer(batches))
         self.policy.observations.merge(seen.mean, seen.var, seen.count)
         self.env_steps += steps
+        if self.policy.step_sizes is not None:
+            told["Policy/inner_learning_rate"] = self.config.inner_learning_rate * float(self.policy.step_sizes.mean())
         told["Policy/std"] = float(self.policy.actor.log_std.detach().clamp(*adapter.log_std_range).exp().mean())
         return told
 

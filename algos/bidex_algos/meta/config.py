@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 from bidex_algos.checks import at_least, between, network_bytes, positive, rising, types
-from bidex_algos.choices import Activation, Adapted
+from bidex_algos.choices import Activation, Adapted, StepSizeKind
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,11 @@ class MetaConfig:
     """Size of an adaptation step."""
     adapted: Adapted = "all"
     """What an adaptation step moves: all parameters, or the mean's output layer alone (ANIL, Raghu et al. 2020)."""
+    step_sizes: StepSizeKind = "fixed"
+    """Whether the outer step learns sizes of the inner one, from inner_learning_rate on: of each tensor (layer,
+    MAML++), of each weight (Meta-SGD), or of none (fixed)."""
+    step_size_rate: float = 0.01
+    """Adam's step size for these, as shares of inner_learning_rate. A trust region moves them with all else."""
     advantage_scale: Literal["std", "variance"] = "std"
     """What advantages are divided by in each task. With the variance, as in garage and Meta-World's baselines, the
     inner step depends on the scale of the rewards."""
@@ -58,7 +63,7 @@ class MetaConfig:
         if self.slice_steps is not None:
             at_least(self, 1, "slice_steps")
         between(self, 0.0, 1.0, "gamma", "lam")
-        positive(self, "inner_learning_rate", "init_std")
+        positive(self, "inner_learning_rate", "step_size_rate", "init_std")
         rising(self, "std_range")
 
     def bytes_held(self, rows: int, width: int) -> int:

@@ -60,5 +60,5 @@ class MAML(MetaLearner):
             return objective, moved
 
         surrogate, kl = self._objective(batches)
-        stepped = trust_region_step(list(self.policy.actor.parameters()), surrogate, kl, measure, self.config)
+        stepped = trust_region_step(list(self.policy.parameters()), surrogate, kl, measure, self.config)
         return stepped.told("Policy/outer_kl", self.device)

@@ -43,7 +43,9 @@ class MetaPolicy(nn.Module):
             config.std_range,
             config.first_order,
             config.adapted,
+            config.step_sizes,
         )
+        self.step_sizes = self.adapter.step_sizes  # among the weights of a checkpoint, where there are such
         self.seed = seed
         self.generator: torch.Generator | None = None
         self.rows: TaskRows | None = None

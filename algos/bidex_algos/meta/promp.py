@@ -51,7 +51,7 @@ class ProMP(MetaLearner):
         if self.config.desired_kl is None:
             return
         low, high = self.config.outer_learning_rate_range
-        for group in self.adam.param_groups:
+        for group in self.adam.param_groups[:1]:  # not that of learned step sizes
             group["lr"] = min(max(group["lr"] * float(factor_of(kl.detach(), self.config.desired_kl)), low), high)
 
     def _objective(self, batches: list[TaskBatch]) -> tuple[Tensor, Tensor, Tensor]:
