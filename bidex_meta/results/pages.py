@@ -22,7 +22,7 @@ from bidex_meta.reading import is_file, read_text
 from bidex_meta.record import plots
 from bidex_meta.record.atomic import write_atomic
 from bidex_meta.results.best import best_table
-from bidex_meta.results.gains import gains_table
+from bidex_meta.results.gained import gains_table
 from bidex_meta.results.offline import offline_table
 from bidex_meta.results.scaling import rows_figure, rows_table
 from bidex_meta.results.studies import Study, arms_table, classes_table, figures, read_studies
