@@ -39,9 +39,7 @@ def gains_table(study: Study) -> Iterator[str]:
     order = sorted(parts, key=lambda key: (key[0] == CONTROL, *key))
     for name in dict.fromkeys(name for _, part in parts.values() for name in part["gain"]["classes"]):
         for arm, seed in order:
-            run, part = parts[arm, seed]
-            if name not in part["gain"]["classes"]:
-                continue
+            run, part = parts[arm, seed]  # of the same classes as all: a study's runs are
             _, control = parts.get((CONTROL, seed), (None, None))
             more = "" if control is None or arm == CONTROL else _told(_over(_gain(part, name), _gain(control, name)))
             yield row_of([
