@@ -25,6 +25,21 @@ def test_without_a_file_nothing_is_known(folder: Path) -> None:
     assert references.load("random") == {} == references.references()
 
 
+@pytest.mark.parametrize("base", ["own", "moving"])
+def test_scores_of_another_day_are_told_by_todays_references(folder: Path, base: str) -> None:
+    for kind, value in (("random", 1.0), ("expert", 5.0)):
+        references.store(folder / f"{kind}.json", {name: {"return": value} for name in ("A", "B")}, {})
+    rows = {name: {"return": 2.0, "success": 0.5, "score": score} for name, score in (("A", 90.0), ("B", None))}
+    foreign = {"Lamp": {"return": 2.0, "score": 7.0}}
+    assert references.rescored(rows | foreign, {"base": base}) == {
+        "A": {"return": 2.0, "success": 0.5, "score": 25.0},
+        "B": {"return": 2.0, "success": 0.5, "score": 25.0},
+        **foreign,
+    }
+    unscored = {"B": rows["B"]}  # nobody could say of what base, but where the run says so itself
+    assert references.rescored(unscored, {"base": base})["B"]["score"] == (25.0 if base == "moving" else None)
+
+
 def test_storing_keeps_the_other_classes_and_how_each_was_made(folder: Path) -> None:
     references.store(folder / "random.json", {"HandOver": {"return": 0.4}, "Switch": {"return": 9.0}}, {"seed": 0})
     references.store(folder / "random.json", {"Switch": {"return": 8.0}}, {"seed": 1})
@@ -98,7 +113,7 @@ def test_an_unknown_baseline_names_the_known_ones(capsys: pytest.CaptureFixture[
 
 def evaluated_run(path: Path, task: str | None, suite: str | None, returns: dict[str, float]) -> Path:
     path.mkdir()
-    config = {"task": task, "suite": suite, "algo": "mtppo", "steps": 1000, "seed": 3}
+    config = {"task": task, "suite": suite, "algo": "mtppo", "steps": 1000, "seed": 3, "num_envs": 8, "learner": {}}
     (path / "config.json").write_text(json.dumps(config))
     classes = {name: {"success": 0.5, "return": value, "score": None} for name, value in returns.items()}
     (path / "evaluation.json").write_text(json.dumps({"policy": {"classes": classes}}))
@@ -117,8 +132,14 @@ def test_the_expert_is_the_best_of_witness_and_runs(
     )
     suite = evaluated_run(tmp_path / "a", None, "MT4", {"HandOver": 30.0, "CatchAbreast": 20.0})
     alone = evaluated_run(tmp_path / "b", "CatchAbreast", None, {"CatchAbreast": 12.0})
+    for name, row in (("metrics.jsonl", {"step": 1000}), ("versions.json", {"git": {"commit": "c" * 40}})):
+        (suite / name).write_text(json.dumps(row) + "\n")
+    monkeypatch.setattr("bidex_meta.commands.collect._parameters", lambda folder: None)
+    assert main(["collect", str(suite), "--into", str(tmp_path / "data")]) == 0
+    (stored,) = (tmp_path / "data").iterdir()
+    capsys.readouterr()
     out = tmp_path / "expert.json"
-    words = ["baseline", "expert", "--suite", "MT4", "--runs", str(suite), str(alone), "--out", str(out), "--json"]
+    words = ["baseline", "expert", "--suite", "MT4", "--runs", str(stored), str(alone), "--out", str(out), "--json"]
     assert main(words) == 0
     assert json.loads(capsys.readouterr().out) == {
         "HandOver": {"return": 40.0, "source": "witness, task 0"},

@@ -138,8 +138,8 @@ def test_the_best_run_of_each_class(tmp_path: Path) -> None:
     fill(page, tmp_path / "data")
     _, _, *rows = [cells(line) for line in page.read_text().splitlines() if line.startswith("|")]
     assert rows == [
-        ["C", "sac", "0", "1,000", "0.50", "75 % [0, 100]", "2", "–", "2"],
-        ["D", "ppo", "0", "1,000", "0.50", "0 % [0, 100]", "3", "–", "1"],
+        ["C", "sac", "0", "1,000", "0.50", "75 % [0, 100]", "2", "–", "–", "2"],
+        ["D", "ppo", "0", "1,000", "0.50", "0 % [0, 100]", "3", "–", "–", "1"],
     ]
 
 

@@ -37,7 +37,7 @@ class BaselineFlags:
     threads: int | None = None
     """Threads of the physics; None: one per core."""
     runs: tuple[Path, ...] = ()
-    """expert: run folders of trained policies."""
+    """expert: trained policies: run folders, or files of results/data/."""
     out: Path | None = None
     """JSON file that takes the figures, beside those it has of other classes; None: print them alone. `evaluate` reads
     assets/references/ of the installation, which is not written unless this names it."""

@@ -5,9 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from bidex_meta.errors import BidexError
-from bidex_meta.reading import exists
-from bidex_meta.record import RunFolder
-from bidex_meta.record.schemas import read_evaluation
+from bidex_meta.record.stored import open_run
 from bidex_meta.sources import Source
 from bidex_meta.witness.replay import replay
 from bidex_meta.witness.store import load_witness, witness_path
@@ -18,7 +16,7 @@ def best_known(names: Collection[str], runs: Sequence[Path], threads: int | None
 
     Args:
         names: The classes.
-        runs: Run folders with an ``evaluation.json``, as ``run`` leaves them.
+        runs: Evaluated runs: their folders, or what ``collect`` has kept of them.
         threads: Engine threads.
 
     Raises:
@@ -41,24 +39,20 @@ def _of_witness(name: str, threads: int | None) -> list[tuple[str, dict[str, Any
     return [(name, {"return": played.total, "source": "witness, task 0"})] if played.found else []
 
 
-def _of_run(run: Path) -> list[tuple[str, dict[str, Any]]]:
+def _of_run(path: Path) -> list[tuple[str, dict[str, Any]]]:
     """What a run's evaluation says of its classes: the mean over all tasks."""
-    folder = RunFolder.open(run)
-    config, path = folder.config("steps"), folder.path / "evaluation.json"
+    run = open_run(path)
+    config = run.config("steps")
     source = Source.open(config)
     if not source.moving_bases:
         raise BidexError(
-            f"Expected a run with moving bases, as suites have them, but {run} plays {source.name} with fixed ones."
+            f"Expected a run with moving bases, as suites have them, but {path} plays {source.name} with fixed ones."
         )
-    if not exists(path):
-        raise BidexError(
-            f"{run} has no evaluation.json. Let the run end, or write one: bidex-meta evaluate {run} --json > {path}"
-        )
-    found = read_evaluation(path, f"bidex-meta evaluate {run} --json > {path}")
+    found = run.evaluation()
     if "policy" not in found:
         raise BidexError(
-            f"Expected the evaluation of a policy, but {path} is a meta-test, whose policies are many. Name a run of "
-            "mtppo, mttrpo or mtsac."
+            f"Expected the evaluation of a policy, but that of {path} is a meta-test, whose policies are many. Name a "
+            "run of mtppo, mttrpo or mtsac."
         )
     classes = found["policy"]["classes"]
     steps = found.get("steps", config["steps"])  # of what time, a return or a score has ended fewer than were asked for

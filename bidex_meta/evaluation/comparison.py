@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.references import rescored
 from bidex_meta.evaluation.statistics import Interval, bootstrap_interval
 from bidex_meta.outside import name_with_object, short_name
 from bidex_meta.record.metrics import training_seconds
@@ -154,7 +155,7 @@ def _read(run: Run) -> dict[str, Any]:
         "path": run.path,
         "kind": run_kind(config, found.get("split", "train")),
         "seed": config["seed"],
-        "classes": classes_of(found),
+        "classes": scored_classes(run),
         "seconds": training_seconds(run.metrics()),
         "steps": goal,
     }
@@ -166,6 +167,18 @@ def classes_of(found: dict[str, Any]) -> dict[str, Any]:
         parts = found["splits"].items()
         return {f"{name} ({split})": row for split, part in parts for name, row in part["after"]["classes"].items()}
     return found.get("policy", found)["classes"]
+
+
+def scored_classes(run: Run) -> dict[str, Any]:
+    """As :func:`classes_of` of its evaluation, with scores by today's references."""
+    found, config = run.evaluation(), run.config()
+    if "splits" not in found:
+        return rescored(classes_of(found), config)
+    rows = {}
+    for split, part in found["splits"].items():
+        scored = rescored(part["after"]["classes"], config)
+        rows |= {f"{name} ({split})": row for name, row in scored.items()}
+    return rows
 
 
 def _differing(kinds: list[dict[str, Any]]) -> dict[str, set[str]]:

@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from bidex_meta import paths
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.scores import Reference
@@ -80,3 +82,31 @@ def references() -> dict[str, Reference]:
         known = Reference(random[name], expert.get(name), zero.get(name))
         found[name] = known if known.expert is not None and known.expert > known.floor else replace(known, expert=None)
     return found
+
+
+def rescored(classes: dict[str, Any], config: dict[str, Any]) -> dict[str, Any]:
+    """Rows of an evaluation with the scores that today's references give their returns.
+
+    A stored score is of the references of its day: beside another day's it would compare nothing.
+
+    Args:
+        classes: By class the row, with ``return`` and ``score``.
+        config: The run's. References hold where a class has one of the names here and, as in suites, moving bases:
+            the run says so itself, or it was scored when it was evaluated.
+
+    Returns:
+        The same rows; those of other bases and of foreign classes as they are.
+    """
+    if config.get("base") != "moving" and all(row["score"] is None for row in classes.values()):
+        return classes
+    known = references()
+    return {
+        name: {**row, "score": _score(known[name], row["return"])} if name in known else row
+        for name, row in classes.items()
+    }
+
+
+def _score(reference: Reference, value: float) -> float | None:
+    """The mean score of episodes of a mean return."""
+    found = reference.scores(np.array([value]))
+    return None if found is None else float(found[0])

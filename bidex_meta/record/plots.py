@@ -132,7 +132,7 @@ def draw_comparison(panels: Mapping[str, Sequence[Bar]]) -> Any:
     for axis, (title, bars) in zip(figure.subplots(1, len(panels), squeeze=False).flat, panels.items(), strict=True):
         for place, (_, value, interval) in enumerate(bars):
             low, high = interval or (value, value)
-            colour = f"C{place % 10}"
+            colour = _colour(place)
             axis.plot([low, high], [place, place], linewidth=2.5, alpha=0.5, color=colour)
             axis.plot([value], [place], marker="o", color=colour)
         axis.set_yticks(range(len(bars)), ["\n".join(textwrap.wrap(_plain(label), 40)) for label, _, _ in bars])
@@ -257,17 +257,25 @@ def svg(figure: Any) -> bytes:
 def _draw_curve(axis: Any, curve: Curve | None, label: str, number: int, style: str) -> None:
     if curve is None:
         return
-    steps, colour = curve.steps / 1e6, f"C{number % 10}"
+    steps, colour = curve.steps / 1e6, _colour(number)
     marker = "." if len(steps) == 1 or (style != "-" and len(steps) <= _FEW) else None
     axis.plot(steps, curve.mean, linewidth=1.2, color=colour, linestyle=style, marker=marker, label=_plain(label))
     if curve.low is not None and curve.high is not None:
         axis.fill_between(steps, curve.low, curve.high, alpha=0.2, color=colour, linewidth=0.0)
 
 
+def _colour(number: int) -> Any:
+    """The colour of a group: ten strong ones, then their light twins, then again from the first."""
+    from matplotlib import colormaps
+
+    colours = colormaps["tab20"].colors  # type: ignore[attr-defined]
+    return (colours[0::2] + colours[1::2])[number % len(colours)]
+
+
 def _add_legend(figure: Any, labels: Sequence[str]) -> None:
     from matplotlib.lines import Line2D
 
-    lines = [Line2D([], [], color=f"C{number % 10}") for number in range(len(labels))]
+    lines = [Line2D([], [], color=_colour(number)) for number in range(len(labels))]
     inches = figure.get_size_inches()[0]
     words = ["\n".join(textwrap.wrap(_plain(label), max(20, int(12 * inches)))) for label in labels]
     longest = max(map(len, labels))

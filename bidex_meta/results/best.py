@@ -3,11 +3,13 @@
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from bidex_meta.evaluation.comparison import classes_of
+from bidex_meta.evaluation.comparison import scored_classes
 from bidex_meta.record.stored import StoredRun
 from bidex_meta.results.studies import Study, head_of, row_of
 
-_HEAD = ("class", "arm", "seed", "steps", "hours", "success [95 %]", "return [95 %]", "uniform actions", "runs")
+_HEAD = (
+    "class", "arm", "seed", "steps", "hours", "success [95 %]", "return [95 %]", "score", "uniform actions", "runs",
+)  # fmt: skip
 
 
 def best_table(studies: Sequence[Study]) -> Iterator[str]:
@@ -19,7 +21,7 @@ def best_table(studies: Sequence[Study]) -> Iterator[str]:
     rows: dict[str, list[tuple[StoredRun, dict[str, Any]]]] = {}
     for study in studies:
         for run in study.runs:
-            for name, row in classes_of(run.evaluation()).items():
+            for name, row in scored_classes(run).items():
                 rows.setdefault(name, []).append((run, row))
     yield from head_of(_HEAD)
     for name, found in rows.items():
@@ -28,6 +30,7 @@ def best_table(studies: Sequence[Study]) -> Iterator[str]:
         yield row_of([
             name, run.arm, str(run.config()["seed"]), f"{run.content['steps']:,}",
             f"{run.content['seconds'] / 3600:.2f}", _ranged(best, "success", 100.0, " %"), _ranged(best, "return"),
+            "–" if best["score"] is None else f"{best['score']:.0f}",
             "–" if random is None else f"{random['return']:.4g}", str(len(found)),
         ])  # fmt: skip
 

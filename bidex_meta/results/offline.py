@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from bidex_meta.evaluation.comparison import classes_of
+from bidex_meta.evaluation.comparison import classes_of, scored_classes
 from bidex_meta.record.stored import StoredRun
 from bidex_meta.results.studies import Study, head_of, refuse_differing, row_of
 
@@ -72,7 +72,7 @@ def _cell(runs: Sequence[StoredRun], ends: tuple[float, float] | None) -> str:
         return "–"
     refuse_differing(f"{_kind(runs[0].config()['dataset'])} {runs[0].config()['algo']}", runs)
     if ends is None:
-        scores = np.array([_of(run.evaluation(), "score") for run in runs])
+        scores = np.array([_of({"classes": scored_classes(run)}, "score") for run in runs])
     else:
         scores = 100 * (np.array([_of(run.evaluation(), "return") for run in runs]) - ends[0]) / (ends[1] - ends[0])
     told = f"{scores.mean():.1f}"

@@ -160,6 +160,12 @@ def test_curves_are_drawn_and_an_empty_run_says_so(tmp_path):
     assert b"gamma $0.9$" in svg(figure)
 
 
+def test_twenty_groups_have_twenty_colours():
+    figure = draw_learning([(f"arm {i}", {"Train/success/T": curve(0.1, 0.2)}) for i in range(20)])
+    assert len({line.get_color() for line in figure.axes[1].lines}) == 20
+    assert len({line.get_color() for line in figure.legends[0].get_lines()}) == 20
+
+
 def test_an_ending_that_is_no_pictures_is_one_line(tmp_path):
     figure = draw_learning([("mtppo", {"Train/return/Near": curve(2.0)})])
     with pytest.raises(BidexError, match=r"png.*got 'c\.txt'"):
