@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from bidex_algos.choices import Activation
 from bidex_algos.nets.encoders.inputs import GroupEncoder, Inputs
+from bidex_algos.nets.products import Linear, affine, stacked_affine
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
 
@@ -82,8 +83,8 @@ def stacked_forward(network: MLP, params: Mapping[str, Tensor], prefix: str, x: 
     def stacked(name: str, x: Tensor) -> Tensor:
         weight, bias = params[f"{prefix}{name}.weight"], params[f"{prefix}{name}.bias"]
         if not f"{prefix}{name}.".startswith(own):
-            return nn.functional.linear(x, weight[0], bias[0])
-        return torch.baddbmm(bias[:, None], x, weight.transpose(1, 2))
+            return affine(x, weight[0], bias[0])
+        return stacked_affine(x, weight, bias)
 
     x = network.encoder(x)
     for name, layer in network.body.named_children():
@@ -97,7 +98,7 @@ def stacked_forward(network: MLP, params: Mapping[str, Tensor], prefix: str, x: 
 def linear(inputs: int, outputs: int, gain: float, generator: torch.Generator) -> nn.Linear:
     """A layer with orthogonal weights of this gain, drawn from a CPU generator, and zero biases."""
     # Made without memory first: the default initialisation would draw from (and so disturb) the global generator.
-    layer = nn.Linear(inputs, outputs, device="meta").to_empty(device="cpu")
+    layer = Linear(inputs, outputs, device="meta").to_empty(device="cpu")
     nn.init.orthogonal_(layer.weight, gain, generator=generator)
     nn.init.zeros_(layer.bias)
     return layer

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.nets.encoders.inputs import Inputs
+from bidex_algos.nets.products import Linear
 from bidex_meta.errors import BidexError
 
 POINT_GROUPS = {"points": 3, "kind_points": 4}
@@ -45,7 +46,7 @@ class PointNet(nn.Module):
         self.step = 1 if read == 0 else max(1, points // read)
         layers: list[nn.Module] = []
         for before, after in zip((channels, *widths[:-1]), widths, strict=True):
-            layer = nn.Linear(before, after)
+            layer = Linear(before, after)
             nn.init.orthogonal_(layer.weight, math.sqrt(2.0), generator=generator)
             nn.init.zeros_(layer.bias)
             layers += [layer, nn.ReLU()]

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.nets.encoders.inputs import Inputs
+from bidex_algos.nets.products import affine, stacked_affine
 
 
 class StackedLinear(nn.Module):
@@ -31,10 +32,9 @@ class StackedLinear(nn.Module):
         """Maps (batch, inputs), the same for all, or (K, batch, inputs), one for each, to (K, batch, outputs)."""
         if x.dim() == 2:
             bias = None if self.bias is None else self.bias.flatten()
-            out = nn.functional.linear(x, self.weight.flatten(0, 1), bias)
+            out = affine(x, self.weight.flatten(0, 1), bias)
             return out.unflatten(-1, self.weight.shape[:2]).transpose(0, 1)
-        out = torch.bmm(x, self.weight.transpose(1, 2))
-        return out if self.bias is None else out + self.bias[:, None]
+        return stacked_affine(x, self.weight, self.bias)
 
 
 class TaskWeights(nn.Module):

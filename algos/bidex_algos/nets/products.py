@@ -1,0 +1,121 @@
+"""The products of layers with weights, by the faster of the two libraries that PyTorch computes them with on a CPU.
+
+PyTorch takes MKL, which runs AMD's processors without their AVX-512: its oneDNN, of the same precision, is 2.2 times as
+fast there (docs/results/speed.md). Elsewhere, and where a product is small, it is PyTorch's own choice.
+``torch.backends.mkldnn.flags(enabled=False)`` turns it off.
+"""
+
+import platform
+from functools import cache
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from torch import Tensor, nn
+
+_LEAST = 1 << 21
+"""Multiplications from which oneDNN pays: below, what a call costs is more than what it saves."""
+
+
+def affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    """What ``torch.nn.functional.linear`` gives, to rounding: ``x @ weight.T + bias``; differentiable as often as that.
+
+    Args:
+        x: (..., inputs).
+        weight: (outputs, inputs).
+        bias: (outputs,).
+
+    Returns:
+        (..., outputs).
+    """
+    if not _pays(x, weight):
+        return nn.functional.linear(x, weight, bias)
+    rows = x.reshape(-1, x.shape[-1])
+    out = cast(Tensor, _Affine.apply(rows, weight, bias)) if torch.is_grad_enabled() else _onednn(rows, weight, bias)
+    return out.view(*x.shape[:-1], -1)
+
+
+def stacked_affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    """Products of several layers of one form with a batch each.
+
+    Args:
+        x: (K, batch, inputs).
+        weight: (K, outputs, inputs).
+        bias: (K, outputs).
+
+    Returns:
+        (K, batch, outputs).
+    """
+    if _pays(x[0], weight[0]):
+        biases = [None] * len(x) if bias is None else bias.unbind()
+        return torch.stack([affine(*each) for each in zip(x.unbind(), weight.unbind(), biases, strict=True)])
+    if bias is None:
+        return torch.bmm(x, weight.transpose(1, 2))
+    return torch.baddbmm(bias[:, None], x, weight.transpose(1, 2))
+
+
+class Linear(nn.Linear):
+    """PyTorch's layer, computed by :func:`affine`."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Maps (..., inputs) to (..., outputs)."""
+        return affine(input, self.weight, self.bias)
+
+
+class _Affine(torch.autograd.Function):
+    """oneDNN's product, which knows no gradient; those are products too, so that there are gradients of them."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+        return _onednn(x, weight, bias)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, Tensor | None], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs[:2])
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Any) -> tuple[Tensor | None, ...]:
+        (grad,), (x, weight) = grads, ctx.saved_tensors
+        of_x, of_weight, of_bias = ctx.needs_input_grad
+        return (
+            affine(grad, weight.t()) if of_x else None,
+            affine(grad.t(), x.t()) if of_weight else None,
+            grad.sum(0) if of_bias else None,
+        )
+
+
+def _onednn(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+    return torch.ops.mkldnn._linear_pointwise(x, weight, bias, "none", [], "")
+
+
+def _pays(x: Tensor, weight: Tensor) -> bool:
+    """Whether oneDNN is to make ``x @ weight.T``."""
+    return (
+        x.device.type == "cpu"
+        and x.numel() * len(weight) >= _LEAST
+        and x.dtype == weight.dtype == torch.float32
+        and torch.backends.mkldnn.enabled
+        and not torch.is_autocast_enabled("cpu")
+        and is_faster_here()
+    )
+
+
+@cache
+def is_faster_here() -> bool:
+    """Whether this machine's processor is AMD's with AVX-512, and PyTorch has both libraries."""
+    both = torch.backends.mkl.is_available() and torch.backends.mkldnn.is_available()
+    if not both or torch.backends.cpu.get_cpu_capability() != "AVX512" or "AuthenticAMD" not in _processor():
+        return False
+    try:  # an operation that PyTorch keeps for its compiler: another version may call it otherwise
+        return _onednn(torch.ones(2, 3), torch.ones(2, 3), None).shape == (2, 2)
+    except (AttributeError, RuntimeError, TypeError):
+        return False
+
+
+def _processor() -> str:
+    try:
+        return Path("/proc/cpuinfo").read_text(errors="ignore")
+    except OSError:
+        return platform.processor()  # where it is no Linux
