@@ -23,6 +23,7 @@ def main(words: list[str]) -> int:
         config = {"suite": None, "task": "HandOver", "algo": "ppo", "seed": int(given["seed"]), "steps": STEPS}
         config |= {"num_envs": 8, "minutes": None, "learner": {}}
         config |= {"stop_at_return": float(given["stop-at-return"])} if "stop-at-return" in given else {}
+        config |= {"start_from": str(Path(given["start-from"]).resolve())} if "start-from" in given else {}
         folder = RunFolder.create(config, Path(given["run-dir"]))
     with folder.locked():
         with (folder.path / "starts").open("a") as starts:

@@ -208,6 +208,49 @@ def test_a_failure_is_told_stops_no_other_and_is_tried_again(file: Path, tmp_pat
     assert [len(each) for each in starts(tmp_path).values()] == [1, 2], "seed 1 once, seed 13 again"
 
 
+STARTING = '[[arms]]\nname = "on"\nalgo = "ppo"\nstart_from = "ppo"\n'
+
+
+def test_an_arm_starts_from_another_on_the_same_subject_seed_and_value(tmp_path: Path) -> None:
+    path = tmp_path / "s.toml"
+    path.write_text(
+        FILE.replace('["HandOver"]', '["HandOver", "Switch"]') + "[grid]\nlearner.gamma = [0.8, 0.9]\n" + STARTING
+    )
+    runs = [run for run in read_sweep(path).runs if run.after is not None]
+    assert len(runs) == 2 * 2 * 2
+    for run in runs:
+        assert run.after is not None and run.after.name == run.name.replace("-on-", "-ppo-")
+        assert f"--start-from={run.after}" in run.begin and not any("start" in word for word in run.go_on)
+    path.write_text(
+        FILE + STARTING.replace('"on"', '"on"\noverrides = { num_envs = 4 }') + "[grid]\nnum_envs = [8, 16]\n"
+    )
+    with pytest.raises(BidexError, match=r"'ppo', of which there are 2 runs on HandOver"):
+        read_sweep(path)
+    path.write_text(FILE + STARTING.replace('"ppo"\n', '"ppo"\ntasks = ["Switch"]\n', 1))
+    with pytest.raises(BidexError, match=r"'ppo', of which there are 0 runs on Switch"):
+        read_sweep(path)
+    path.write_text(FILE + STARTING.replace('start_from = "ppo"', 'start_from = "on"'))
+    with pytest.raises(BidexError, match=r"arms\[1\].start_from: expected the name of an arm above it \(ppo\)"):
+        read_sweep(path)
+
+
+def test_what_starts_from_another_waits_for_it_and_fails_with_it(file: Path, tmp_path: Path, capsys) -> None:
+    file.write_text(FILE.replace("[0, 1]", "[13, 1]") + STARTING)
+    with pytest.raises(SystemExit, match="1"):
+        main(["sweep", str(file), "--workers", str(min(2, os.cpu_count() or 1))])
+    told = capsys.readouterr()
+    assert "HandOver-on-seed13 cannot start from HandOver-ppo-seed13, which has failed" in told.err
+    assert "2 done, 0 runs, 1 failed, 1 left" in told.out
+    first, second = (tmp_path / "runs/tiny" / f"HandOver-{arm}-seed1" for arm in ("ppo", "on"))
+    begun = json.loads((second / "starts").read_text())["at"]
+    assert begun >= (first / "evaluation.json").stat().st_mtime - 0.05
+    assert json.loads((second / "config.json").read_text())["start_from"] == str(first)
+    assert read_sweep(file).runs[-1].after == first.relative_to(tmp_path)
+    (second / "config.json").write_text((second / "config.json").read_text().replace("ppo-seed1", "ppo-seed2"))
+    assert main(["sweep", str(file), "--status"]) == 2
+    assert "start_from is" in capsys.readouterr().err
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="processes are found by /proc")
 @pytest.mark.parametrize("with_workers", [True, False])
 def test_a_sweep_that_was_killed_loses_no_run(file: Path, tmp_path: Path, with_workers: bool) -> None:

@@ -70,9 +70,14 @@ def main(arguments: Sequence[str]) -> None:
         if flags.submit is not None:
             from bidex_meta.sweep.cluster import submit
 
+            unfinished = {run.path for run in left}
             left = [state.run for state in states if state.state in ("left", "failed")]
+            later = [run for run in left if run.after in unfinished]
+            left = [run for run in left if run not in later]
             for name, job in submit(left, sweep.out, flags.submit, sweep.slurm).items():
                 print(f"{name} is job {job.job_id}")
+            if later:
+                _say(f"{len(later)} start from runs that are not through yet: submit again when those are.")
             return
 
         def through(run: "PlannedRun") -> bool:

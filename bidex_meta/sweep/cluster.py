@@ -69,7 +69,8 @@ def submit(runs: Sequence[PlannedRun], out: Path, where: Where, parameters: Mapp
         jobs = {}
         for run in waiting:
             executor.update_parameters(name=run.name)
-            job = executor.submit(Job(replace(run, path=run.path.resolve())))
+            after = None if run.after is None else run.after.resolve()
+            job = executor.submit(Job(replace(run, path=run.path.resolve(), after=after)))
             _job_path(run).write_text(f"{job.job_id}\n")
             jobs[run.name] = job
     except (

@@ -3,7 +3,7 @@
 import itertools
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,7 @@ _FILE = {
     "arms": Rule("a list of tables", lambda value: isinstance(value, list) and all(map(TABLE.fits, value))),
     "slurm": TABLE,
 }
-_ARM = {**_SUBJECTS, "name": _NAMED, "algo": TEXT, "overrides": TABLE}
+_ARM = {**_SUBJECTS, "name": _NAMED, "algo": TEXT, "overrides": TABLE, "start_from": TEXT}
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,8 @@ class PlannedRun:
     """Its seed."""
     words: tuple[str, ...]
     """Flags of ``bidex-meta run``, without seed and folder."""
+    after: Path | None = None
+    """The folder of the run whose policy it starts from."""
 
     @property
     def name(self) -> str:
@@ -71,7 +73,8 @@ class PlannedRun:
     @property
     def begin(self) -> list[str]:
         """The words that begin it."""
-        return ["run", *self.words, f"--seed={self.seed}", "--threads=1", f"--run-dir={self.path}"]
+        started = [] if self.after is None else [f"--start-from={self.after}"]
+        return ["run", *self.words, *started, f"--seed={self.seed}", "--threads=1", f"--run-dir={self.path}"]
 
     @property
     def go_on(self) -> list[str]:
@@ -118,10 +121,12 @@ def read_sweep(path: Path, root: Path = Path("runs")) -> Sweep:
         raise BidexError(f'{path}: expected algos = ["mtppo"] or [[arms]], found neither.')
     out, runs = expanded(root) / content["name"].replace(" ", "-"), []
     for seed in content["seeds"]:
+        of_seed: dict[int, list[PlannedRun]] = {}
         for place, arm in enumerate(arms):
-            runs += _runs(path, content, arm, place, seed, (overrides, grid), out)
-            if len(runs) > _MOST_RUNS:
+            of_seed[place] = list(_runs(path, content, arm, place, seed, (overrides, grid), out))
+            if len(runs) + sum(map(len, of_seed.values())) > _MOST_RUNS:
                 raise BidexError(f"{path}: expected at most {_MOST_RUNS:,} runs, got more. Make several sweeps of it.")
+        runs += [run for place, arm in enumerate(arms) for run in _following(path, arms, place, of_seed)]
     names = [run.name for run in runs]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
@@ -156,6 +161,32 @@ def _runs(
             name = f"{Path(short_name(subject)).stem}-{label}-seed{seed}".replace(" ", "-")
             words = (f"--{kind}={given}", f"--algo={arm['algo']}", *flags)
             yield PlannedRun(out / name, label, subject, seed, words)
+
+
+def _following(
+    path: Path, arms: Sequence[Mapping[str, Any]], place: int, of_seed: Mapping[int, Sequence[PlannedRun]]
+) -> Iterator[PlannedRun]:
+    """The runs of an arm on one seed, each with the run on the same subject that it starts from, where it says so."""
+    name = arms[place].get("start_from")
+    if name is None:
+        yield from of_seed[place]
+        return
+    earlier = [other["name"] for other in arms[:place]]
+    if name not in earlier:
+        above = ", ".join(earlier) or "none there"
+        raise BidexError(
+            f"{path}: arms[{place}].start_from: expected the name of an arm above it ({above}), got {name!r}."
+        )
+    for run in of_seed[place]:
+        found = [other for other in of_seed[earlier.index(name)] if other.subject == run.subject]
+        values = run.arm.removeprefix(arms[place]["name"])
+        alike = [other for other in found if other.arm == name + values] or found
+        if len(alike) != 1:
+            raise BidexError(
+                f"{path}: {run.name} is to start from the arm {name!r}, of which there are {len(alike)} runs on "
+                f"{run.subject}. Give both the same suites and tasks, and the same values of the grid."
+            )
+        yield replace(run, after=alike[0].path)
 
 
 def _check(

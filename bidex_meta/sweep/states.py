@@ -143,6 +143,8 @@ def _why(run: PlannedRun) -> str:
 
 def _refuse_another(run: PlannedRun, config: Mapping[str, Any]) -> None:
     known, wanted = flat(run.folder.config()), flat(dict(config))
+    if run.after is not None:  # another for each seed
+        wanted["start_from"] = str(run.after.resolve())
     for name in known.keys() & wanted.keys():
         if name not in _FREE and known[name] != wanted[name]:
             raise BidexError(

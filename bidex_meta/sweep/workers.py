@@ -63,7 +63,7 @@ def work(
     """Runs everything in order; one that fails stops no other.
 
     Runs in whose folders others train already (processes that a killed sweep left) count as workers, and are waited
-    for.
+    for. A run that starts from another waits for its end, and fails with it.
     After Ctrl-C or SIGTERM each own run saves and stops.
 
     Args:
@@ -75,7 +75,7 @@ def work(
     Returns:
         How many have failed.
     """
-    waiting, free, failed = list(runs), list(cores), 0
+    waiting, free, failed = list(runs), list(cores), list[Path]()
     own: dict[PlannedRun, tuple[subprocess.Popen[bytes], int | None]] = {}
     elsewhere = {run.name for run in waiting if locked(run)}
     looked = time.monotonic()
@@ -87,11 +87,16 @@ def work(
                     del own[run]
                     free.append(core)
                     why = ended(run, code, through(run))
-                    failed += why is not None
+                    failed += [run.path] * (why is not None)
                     say(f"{run.name} {'done' if why is None else f'failed: {why}'}")
             if elsewhere and time.monotonic() - looked > _SLOW_TICK:
                 looked, elsewhere = time.monotonic(), {run.name for run in waiting if locked(run)}
-            ready = [run for run in waiting if run.name not in elsewhere]
+            for run in [run for run in waiting if run.after in failed]:
+                waiting.remove(run)
+                failed.append(run.path)
+                say(f"{run.name} cannot start from {run.after.name if run.after else ''}, which has failed")
+            unfinished = {run.path for run in (*waiting, *own)}
+            ready = [run for run in waiting if run.name not in elsewhere and run.after not in unfinished]
             for run in ready[: max(0, min(len(free), len(cores) - len(own) - len(elsewhere)))]:
                 waiting.remove(run)
                 if through(run):
@@ -108,7 +113,7 @@ def work(
         for process, _ in own.values():
             process.wait()
         raise
-    return failed
+    return len(failed)
 
 
 @contextmanager
