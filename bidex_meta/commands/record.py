@@ -33,8 +33,8 @@ class RecordFlags:
 
     kind: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="|".join(RUNS))]
     """random: uniform actions; medium, expert: the policy of one run; medium-expert: of two runs, half each; replay:
-    what `bidex-meta run --record N` kept of a run's training; demonstrations: replays of the class's witness from
-    shifted starts, those that succeed."""
+    what `bidex-meta run --record N` kept of a run's training; demonstrations: replays of the class's witness (see
+    --starts), those that succeed."""
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = ()
     """Run folders, as many as the kind takes."""
     suite: str | None = None
@@ -53,8 +53,11 @@ class RecordFlags:
     noise: float = 0.0
     """Standard deviation of Gaussian noise on a policy's actions, for those that have no distribution, or on a
     witness's."""
+    starts: Literal["witness", "tasks"] = "witness"
+    """demonstrations: replay the witness from its own start in its own task, objects shifted; or on all tasks of the
+    class, from their starts, where it succeeds less often but shows more."""
     shift: float = 1e-4
-    """demonstrations: how far the objects' start is shifted, metres."""
+    """demonstrations, --starts witness: how far the objects' start is shifted, metres."""
     num_envs: int | None = None
     """Rows stepped together; None: one per task, 200 at least."""
     seed: int = 0

@@ -11,11 +11,10 @@ from bidex_meta.errors import BidexError
 from bidex_meta.sources import Source
 
 if TYPE_CHECKING:
-    from bidex_meta.witness.shifted import ShiftedStarts
     from bidex_meta.witness.store import Witness
 
-SIZE, ROWS = 20_000, 32
-"""Transitions, and replays that are played together, where nobody says otherwise."""
+SIZE, ROWS, ROWS_OF_TASKS = 20_000, 32, 200
+"""Transitions, and replays played together from shifted starts or on all tasks, where nobody says otherwise."""
 FAILED = "unsuccessful_episodes"
 _PATIENCE = 3
 """Rounds in which nothing has to succeed."""
@@ -28,8 +27,8 @@ def record_demonstrations(flags: Any, say: Callable[[str], None]) -> tuple[Path,
     seed and its number.
 
     Args:
-        flags: ``RecordFlags`` with ``task``; read are also ``size``, ``noise``, ``shift``, ``num_envs``, ``seed``,
-            ``out``, ``threads``, ``estimate``.
+        flags: ``RecordFlags`` with ``task``; read are also ``size``, ``noise``, ``shift``, ``starts``, ``num_envs``,
+            ``seed``, ``out``, ``threads``, ``estimate``.
         say: Takes lines of progress.
 
     Raises:
@@ -51,14 +50,20 @@ def record_demonstrations(flags: Any, say: Callable[[str], None]) -> tuple[Path,
     source = Source.open({"task": flags.task, "base": "moving", "seed": 0, "threads": flags.threads})
     if source.name not in source.task_classes() or ":" in source.name:
         raise BidexError(f"{source.name} is none of the classes that have witnesses (bidex-meta witness --all).")
-    witness, size, rows = load_witness(source.name), flags.size or SIZE, flags.num_envs or ROWS
-    folder, name = place_of(flags.out, source.name, "demonstrations")
+    of_tasks = flags.starts == "tasks"
+    witness, size = load_witness(source.name), flags.size or SIZE
+    rows = flags.num_envs or (ROWS_OF_TASKS if of_tasks else ROWS)
+    folder, name = place_of(flags.out, source.name, "demonstrations-tasks" if of_tasks else "demonstrations")
     plan = {"kind": "demonstrations", "task": source.name, "size": size, "num_envs": rows, "seed": flags.seed}
-    plan |= {"noise": flags.noise, "shift": flags.shift}
+    plan |= {"noise": flags.noise} | ({"starts": "tasks"} if of_tasks else {"shift": flags.shift})
     if not flags.estimate:
         check_place(folder, plan)
-    made = source.name, rows, flags.shift, flags.threads
-    world = ShiftedStarts(*made)  # pyright: ignore[reportAbstractUsage]  # the wrapped world has all
+    world: Any
+    if of_tasks:
+        world = source.world("train", rows)
+    else:
+        made = source.name, rows, flags.shift, flags.threads
+        world = ShiftedStarts(*made)  # pyright: ignore[reportAbstractUsage]  # the wrapped world has all
     try:
         sizes = world.single_observation_space.shape[0], world.single_action_space.shape[0]
         needed = estimated_bytes(size, *sizes, float(world.max_episode_steps[0]))
@@ -75,7 +80,7 @@ def record_demonstrations(flags: Any, say: Callable[[str], None]) -> tuple[Path,
                 if not now.steps[0] and writer.parts >= _PATIENCE:
                     raise BidexError(
                         f"None of {_PATIENCE * rows} replays of {source.name}'s witness succeeds. Lower --noise or "
-                        "--shift."
+                        f"{'play --starts witness' if of_tasks else '--shift'}."
                     )
                 _round(world, witness, writer, flags)
                 after = standing(writer, 1)
@@ -83,7 +88,8 @@ def record_demonstrations(flags: Any, say: Callable[[str], None]) -> tuple[Path,
                 say(f"{after.steps[0]:,} of {size:,} transitions | {kept} of {rows} replays succeed")
         finally:
             writer.close()
-        told = {"algo": None, "actions": "witness", "noise": flags.noise, "shift": flags.shift}
+        drawn = {key: plan[key] for key in ("noise", "shift", "starts") if key in plan}
+        told = {"algo": None, "actions": "witness", **drawn}
         about = described(source, world, "demonstrations", [told], starts=flags.seed)
         finish(folder, name, world.single_observation_space, world.single_action_space, about)
     finally:
@@ -91,7 +97,7 @@ def record_demonstrations(flags: Any, say: Callable[[str], None]) -> tuple[Path,
     return folder, name
 
 
-def _round(world: "ShiftedStarts", witness: "Witness", writer: Any, flags: Any) -> None:
+def _round(world: Any, witness: "Witness", writer: Any, flags: Any) -> None:
     """Plays the witness in every row, each with noise of its own; after its end its last action is held."""
     from bidex_meta.data.episode import Episode
     from bidex_meta.data.episode_recorder import EpisodeRecorder

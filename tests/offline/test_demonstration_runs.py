@@ -98,6 +98,23 @@ def test_only_what_succeeds_is_kept_and_a_recording_goes_on(
     assert "None of 9 replays of HandOver's witness succeeds" in told_of
 
 
+def test_on_all_tasks_they_show_more(
+    sets: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The witness knows one task; what it does by chance in others is kept where it succeeds."""
+    played = load_witness("CatchAbreast")
+    monkeypatch.setattr("bidex_meta.witness.store.load_witness", lambda name: played)
+    words = ["record", "demonstrations", "--task", "Switch", "--threads", "1", "--starts", "tasks"]
+    assert "None of 12 replays" in told(capsys, *words, "--num-envs", "4", "--size", "10", code=2)
+    monkeypatch.undo()
+    monkeypatch.setenv("BIDEX_DATA", str(sets / "sets"))
+    told(capsys, *words, "--num-envs", "8", "--size", "1", "--out", sets / "sets" / "own-v0")
+    kept = open_dataset("own-v0")
+    (policy,) = kept.metadata["policies"]
+    assert policy == {"algo": None, "actions": "witness", "noise": 0.0, "starts": "tasks"}
+    assert bool(kept.table["success"].all()) and len(set(kept.table["task_index"])) > 1
+
+
 def test_a_run_imitates_them_and_is_resumed(
     sets: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
