@@ -99,11 +99,25 @@ def test_where_nothing_is_rewarded_the_policy_does_what_it_was_shown() -> None:
     assert float((without.eval_action(obs) - 0.4).abs().max()) > 0.2
 
 
-def test_a_resumed_run_goes_on_bit_for_bit_with_its_own_data_alone() -> None:
-    straight, _ = trained(SMALL, shown(), 4)
-    half, _ = trained(SMALL, shown(), 2)
+def test_a_cloned_policy_does_what_it_was_shown_before_it_learns_anything() -> None:
+    config = replace(SMALL, demonstration_cloning=300, demonstration_weight=0.0, learning_rate_range=(1e-9, 2e-9))
+    obs = torch.tensor([[0.3, 1.0, 0.0], [-0.2, 0.0, 1.0]])
+    config = replace(config, learning_rate=1e-9)
+    cloned, _ = trained(config, shown(0.4), 1)
+    assert float((cloned.eval_action(obs) - 0.4).abs().max()) < 0.05
+    deviation = MTPPO(world(), config, seed=3).policy.actor.log_std
+    assert float((cloned.policy.actor.log_std - deviation).abs().max()) < 1e-6
+    plain, _ = trained(replace(config, demonstration_cloning=0), shown(0.4), 1)
+    assert float((plain.eval_action(obs) - 0.4).abs().max()) > 0.2
+
+
+@pytest.mark.parametrize("cloning", [0, 5])
+def test_a_resumed_run_goes_on_bit_for_bit_with_its_own_data_alone(cloning: int) -> None:
+    config = replace(SMALL, demonstration_cloning=cloning)
+    straight, _ = trained(config, shown(), 4)
+    half, _ = trained(config, shown(), 2)
     state = {"learner": half.state_dict(), "env": half.world.state_dict()}
-    resumed = MTPPO(world(), SMALL, seed=9)
+    resumed = MTPPO(world(), config, seed=9)
     resumed.learn_from_demonstrations(shown())
     resumed.load_state_dict(state["learner"])
     resumed.world.load_state_dict(state["env"])
@@ -118,7 +132,13 @@ def test_a_resumed_run_goes_on_bit_for_bit_with_its_own_data_alone() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"demonstration_weight": -0.1}, {"demonstration_half_life": 0.0}, {"demonstration_batch": 0}]
+    "wrong",
+    [
+        {"demonstration_weight": -0.1},
+        {"demonstration_half_life": 0.0},
+        {"demonstration_batch": 0},
+        {"demonstration_cloning": -1},
+    ],
 )
 def test_settings_out_of_range_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(BidexError, match=next(iter(wrong))):

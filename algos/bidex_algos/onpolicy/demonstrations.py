@@ -1,7 +1,8 @@
 """Demonstrations beside reinforcement: a term of behaviour cloning in the policy's loss, which fades.
 
-As in DAPG (Rajeswaran et al. 2018, arXiv 1709.10087, equation 6), with normalised advantages in the place of their
-weight by the largest one, and with standard deviations that demonstrations do not touch.
+As in DAPG (Rajeswaran et al. 2018, arXiv 1709.10087, equation 6, and its cloning before that), with normalised
+advantages in the place of their weight by the largest one, and with standard deviations that demonstrations do not
+touch.
 """
 
 from typing import Any
@@ -13,10 +14,12 @@ from bidex_algos.nets.policy import GaussianPolicy
 from bidex_algos.nets.precision import autocast
 from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
-from bidex_meta.train.distributed import own_seed
+from bidex_meta.train.distributed import own_seed, sum_gradients, world_size
 
 _OWN = 0xDE30
 """Told apart from the learner's other draws, which are the same with and without demonstrations."""
+_CLONING_RATE = 1e-3
+"""Adam's step size while the policy is cloned."""
 
 
 class Demonstrations:
@@ -24,7 +27,8 @@ class Demonstrations:
 
     Args:
         data: In the form of the learner's world; some of its tasks may have none.
-        config: Its ``demonstration_weight``, ``demonstration_half_life`` and ``demonstration_batch``.
+        config: Its ``demonstration_weight``, ``demonstration_half_life``, ``demonstration_batch`` and
+            ``demonstration_cloning``.
         seed: Of the draws.
         device: Where they lie.
 
@@ -67,6 +71,18 @@ class Demonstrations:
         with autocast(raw.device, policy.low_precision):
             means = policy.actor(obs)
         return imitation(actions, means.float(), policy.actor.log_std_of(obs).detach())
+
+    def clone(self, policy: GaussianPolicy) -> None:
+        """Behaviour cloning before anything is played: statistics of observations, then steps of the mean alone."""
+        policy.observations.update(self._obs)
+        weights = list(policy.actor.parameters())
+        adam = torch.optim.Adam(weights, lr=_CLONING_RATE)
+        for _ in range(self._config.demonstration_cloning):
+            adam.zero_grad()
+            loss = self.loss(policy) / world_size()
+            loss.backward()
+            sum_gradients(weights, loss.detach()[None])
+            adam.step()
 
     def check(self, name: str, stored: dict[str, Any] | None) -> None:
         """Refuses a checkpoint of other demonstrations.

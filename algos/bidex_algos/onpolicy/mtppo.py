@@ -61,6 +61,11 @@ class MTPPO(OnPolicy):
         self.demonstrations = Demonstrations(data, self.config, self.seed, self.device)
         self.per_process = (*OnPolicy.per_process, "demonstrated")
 
+    def _iterate(self) -> dict[str, float]:
+        if self.demonstrations is not None and self.config.demonstration_cloning and not self.env_steps:
+            self.demonstrations.clone(self.policy)
+        return super()._iterate()
+
     def _imitated(self) -> float:
         """Weight of the demonstrations in this update, 0 without any."""
         return 0.0 if self.demonstrations is None else self.demonstrations.weight(self.env_steps)

@@ -40,6 +40,8 @@ class MTPPOConfig(PPOConfig, OnPolicyConfig):
     """Environment steps in which that weight falls to half."""
     demonstration_batch: int = 256
     """Transitions of them in each mini-batch, of each process."""
+    demonstration_cloning: int = 0
+    """Steps of so many of them in which the policy is cloned before it plays."""
 
     def __post_init__(self) -> None:
         """Rejects values that could only fail later.
@@ -50,7 +52,7 @@ class MTPPOConfig(PPOConfig, OnPolicyConfig):
         super().__post_init__()
         self._check_ppo()
         positive(self, "max_grad_norm", "famo_rate")
-        at_least(self, 0, "famo_decay", "demonstration_weight")
+        at_least(self, 0, "famo_decay", "demonstration_weight", "demonstration_cloning")
         at_least(self, 1, "demonstration_batch")
         positive(self, "demonstration_half_life")
         if not 0.0 <= self.cagrad_radius < 1.0:
