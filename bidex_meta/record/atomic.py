@@ -29,8 +29,11 @@ def write_atomic(path: Path, write: Callable[[IO[bytes]], object]) -> None:
             os.fsync(file.fileno())
         os.chmod(name, 0o644)  # mkstemp's 0600 would lock colleagues out of a shared run folder
         os.replace(name, path)
-    except BaseException:
+    except BaseException as error:
         Path(name).unlink(missing_ok=True)
+        # torch.save tells of what the system refuses, such as a full disk, as of an error of its own.
+        if isinstance(error, RuntimeError) and isinstance(why := error.__context__, OSError):
+            raise OSError(why.errno, why.strerror, str(path)) from None
         raise
     _sync_folder(path.parent)
 

@@ -1,3 +1,4 @@
+import errno
 import os
 import signal
 import subprocess
@@ -88,6 +89,28 @@ checkpoints = Checkpoints(Path(sys.argv[1]))
 for step in range(1, 10**9):
     checkpoints.save({"w": torch.full((300_000,), float(step))}, step)
 """
+
+
+def test_a_full_disk_while_torch_writes_is_told_as_what_it_is(tmp_path, monkeypatch):
+    """torch.save hides it behind an error of its own, which would be a traceback in the place of one line."""
+    save = torch.save
+
+    class Full:
+        def __init__(self, file):
+            self.file = file
+
+        def write(self, data):
+            if self.file.tell() > 500:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return self.file.write(data)
+
+        def __getattr__(self, name):
+            return getattr(self.file, name)
+
+    monkeypatch.setattr(torch, "save", lambda content, file: save(content, Full(file)))
+    with pytest.raises(OSError, match="No space left") as told:
+        Checkpoints(tmp_path).save(state(1), 1)
+    assert told.value.filename == str(tmp_path / "step_1.pt") and list(tmp_path.iterdir()) == []
 
 
 def test_sigkill_while_writing_leaves_a_readable_checkpoint(tmp_path):
