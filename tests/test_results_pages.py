@@ -124,7 +124,10 @@ def test_rows_by_learners(tmp_path: Path) -> None:
     assert fill(page, tmp_path / "data", check=True) == []
 
 
-def test_the_best_run_of_each_class(tmp_path: Path) -> None:
+def test_the_best_run_of_each_class(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "bidex_meta.results.best.load", lambda kind: {"C": {"success": 0.125}} if kind == "witness" else {}
+    )
     for name, arm, success, value in (("C", "ppo", 0.5, 9.0), ("C", "sac", 0.75, 2.0), ("D", "ppo", 0.0, 3.0)):
         path = test_collect.run(tmp_path, 0, {name: success}, arm, task=f"place/{name}")
         path = path.rename(tmp_path / f"{name}-{arm}-seed0")
@@ -138,9 +141,22 @@ def test_the_best_run_of_each_class(tmp_path: Path) -> None:
     fill(page, tmp_path / "data")
     _, _, *rows = [cells(line) for line in page.read_text().splitlines() if line.startswith("|")]
     assert rows == [
-        ["C", "sac", "0", "1,000", "0.50", "75 % [0, 100]", "2", "–", "–", "2"],
-        ["D", "ppo", "0", "1,000", "0.50", "0 % [0, 100]", "3", "–", "–", "1"],
+        ["C", "sac", "0", "1,000", "0.50", "75 % [0, 100]", "2", "–", "–", "12.5 %", "2"],
+        ["D", "ppo", "0", "1,000", "0.50", "0 % [0, 100]", "3", "–", "–", "–", "1"],
     ]
+
+
+def test_references_are_a_table_without_a_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    known = {
+        "random": {"Switch": {"return": 8696.25, "success": 0.005}},
+        "expert": {"Switch": {"return": 9.0, "source": "x"}},
+    }
+    monkeypatch.setattr("bidex_meta.results.reference_ends.load", lambda kind: known.get(kind, {}))
+    page = tmp_path / "page.md"
+    page.write_text("<!-- results: show=references -->\n<!-- end -->\n")
+    assert fill(page, tmp_path) == [page]
+    rows = [cells(line) for line in page.read_text().splitlines() if line.startswith("| ")]
+    assert len(rows) == 21 and ["Switch", "8696", "0.5 %", "–", "–", "–", "–", "9", "x"] in rows
 
 
 def test_gains_of_meta_tests(tmp_path: Path) -> None:

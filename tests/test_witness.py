@@ -12,10 +12,12 @@ from bidex_meta import paths
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
 from bidex_meta.record.versions import collect_versions
+from bidex_meta.sources.source import OwnSuite
 from bidex_meta.tasks import registry
 from bidex_meta.witness import steady
 from bidex_meta.witness.config import PlannerConfig
 from bidex_meta.witness.mutants import mutants, parts_of_the_hands
+from bidex_meta.witness.open_loop import OpenLoop
 from bidex_meta.witness.planner import LEVELS, Planner, interpolation, quantised, rest_action, shifted
 from bidex_meta.witness.replay import Replay, replay
 from bidex_meta.witness.simulator import SHIFT, Simulator, task_slot
@@ -239,3 +241,34 @@ def test_what_a_search_finds_goes_into_the_working_folder(
 def test_steady_needs_an_episode(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["witness", "--task", "Switch", "--find", "--steady", "3"]) == 2
     assert "--improve" in capsys.readouterr().err
+
+
+def test_a_witness_is_played_in_its_order_by_every_row_of_its_class() -> None:
+    known = {"A": Witness(np.arange(6, dtype=np.float32).reshape(3, 2) / 8, {})}
+    agent = OpenLoop(known, ["A", "B"], torch.tensor([0, 1, 0]), 3)
+    obs = torch.zeros(3, 5)
+    played = [agent.eval_action(obs) for _ in range(2)]
+    assert played[1].tolist() == [[0.25, 0.375, 0.0], [0.0, 0.0, 0.0], [0.25, 0.375, 0.0]]
+    agent.reset(torch.tensor([True, True, False]))
+    assert agent.eval_action(obs)[:, 0].tolist() == [0.0, 0.0, 0.5]
+    for _ in range(4):
+        last = agent.eval_action(obs)
+    assert last[:, 0].tolist() == [0.5, 0.0, 0.5], "held after its end"
+
+
+def test_the_baseline_of_witnesses_is_of_the_classes_that_have_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from tests.fakes import ToyWorld
+
+    monkeypatch.setattr(OwnSuite, "world", lambda source: ToyWorld(6, "DISABLED", source.seed))
+    first, *_ = ToyWorld(6, "DISABLED", 0).task_names
+    size = ToyWorld(6, "DISABLED", 0).single_action_space.shape[0]
+    paths_of = {
+        first: save_witness(
+            tmp_path / "one.npz", np.zeros((2, size), np.float32), {"return": 1.0, "first_success": 0, "rival": None}
+        )
+    }
+    monkeypatch.setattr("bidex_meta.witness.store.witness_path", lambda name: paths_of.get(name, tmp_path / "none"))
+    assert main(["baseline", "witness", "--suite", "MT4", "--episodes", "1", "--json"]) == 0
+    assert list(json.loads(capsys.readouterr().out)) == [first]

@@ -2,9 +2,9 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -12,7 +12,10 @@ from bidex_meta.commands.parsing import Switch, parse
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.sources import Source
 
-_POLICIES = {"random": "uniform actions", "zero": "zero actions"}
+if TYPE_CHECKING:
+    from bidex_meta.agents import Agent
+
+_POLICIES = {"random": "uniform actions", "zero": "zero actions", "witness": "the witness of task 0, open loop"}
 
 
 @dataclass(frozen=True)
@@ -25,9 +28,10 @@ class BaselineFlags:
     with the worst finished one of its class, elsewhere with what is stored of random actions.
     """
 
-    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="random|zero|expert")]
+    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="random|zero|witness|expert")]
     """random: uniform actions; zero: the action 0, joints held in the middle of their range and bases at rest;
-    expert: per class the best of its witness and of the runs given."""
+    witness: the actions that solve task 0 of a class, in all its tasks; expert: per class the best of its witness and
+    of the runs given."""
     suite: str = "MT20"
     """Suite whose train tasks are played."""
     episodes: int = 4
@@ -75,15 +79,15 @@ def _expert(flags: BaselineFlags) -> None:
 
 def _measure(what: str, flags: BaselineFlags) -> None:
     from bidex_meta.evaluation.play import EVALUATION_SEED, evaluate
-    from bidex_meta.evaluation.untrained import RandomAgent, ZeroAgent
 
     source = Source.open({"suite": flags.suite, "seed": flags.seed, "threads": flags.threads})
     if not source.moving_bases:
         raise BidexError(f'References are of moving bases, but {flags.suite} has fixed ones. Write base = "moving".')
     world = source.world()
-    agent = RandomAgent(world.action_space, flags.seed) if what == "random" else ZeroAgent(world.action_space)
+    agent, names = _agent(what, world, flags.seed)
     found = evaluate(agent, world, flags.episodes, seed=EVALUATION_SEED)
     world.close()
+    found = replace(found, classes={name: found.classes[name] for name in names})
     numbers = {name: result.to_json() for name, result in found.classes.items()}
     kept = ("return", "return_interval", "success", "episodes", "unstable")
     made = {"policy": _POLICIES[what], "suite": flags.suite, "seed": flags.seed}
@@ -95,6 +99,22 @@ def _measure(what: str, flags: BaselineFlags) -> None:
 
     stored = "" if flags.out is None else f", stored in {flags.out}"
     print_table(evaluation_table(f"{_POLICIES[what]} on {flags.suite}{stored}", found, None))
+
+
+def _agent(what: str, world: Any, seed: int) -> tuple["Agent", list[str]]:
+    """The policy, and the classes that it can play."""
+    from bidex_meta.evaluation.untrained import RandomAgent, ZeroAgent
+    from bidex_meta.witness.open_loop import OpenLoop
+    from bidex_meta.witness.store import load_witness, witness_path
+
+    names = list(world.task_names)
+    if what == "random":
+        return RandomAgent(world.action_space, seed), names
+    if what == "zero":
+        return ZeroAgent(world.action_space), names
+    witnesses = {name: load_witness(name) for name in names if witness_path(name).is_file()}
+    agent = OpenLoop(witnesses, names, world.task_id, world.single_action_space.shape[0])
+    return agent, list(witnesses)
 
 
 def _store(out: Path | None, classes: dict[str, dict[str, Any]], made: dict[str, Any]) -> None:

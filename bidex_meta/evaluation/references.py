@@ -2,7 +2,8 @@
 
 They hold for classes with moving bases, as every suite has them. Files under ``assets/references/``: ``random.json``
 and ``zero.json``, the returns of random actions and of doing nothing, the better of which is the score's zero, and
-``expert.json``; ``bidex-meta baseline`` measures all three.
+``expert.json``; ``witness.json`` holds what each witness gets open loop, which no score is made of. ``bidex-meta
+baseline`` measures them.
 """
 
 from dataclasses import replace
@@ -17,7 +18,7 @@ from bidex_meta.evaluation.scores import Reference
 from bidex_meta.reading import TABLE, check, exists, number, read_json
 from bidex_meta.record.atomic import write_json
 
-Kind = Literal["random", "zero", "expert"]
+Kind = Literal["random", "zero", "expert", "witness"]
 
 
 def reference_path(kind: Kind) -> Path:

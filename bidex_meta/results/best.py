@@ -1,14 +1,16 @@
-"""The best run of each class: what a study of single classes found as experts."""
+"""The best run of each class, beside its witness played blindly: what a study of single classes found as experts."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 from bidex_meta.evaluation.comparison import scored_classes
+from bidex_meta.evaluation.references import load
 from bidex_meta.record.stored import StoredRun
 from bidex_meta.results.studies import Study, head_of, row_of
 
 _HEAD = (
-    "class", "arm", "seed", "steps", "hours", "success [95 %]", "return [95 %]", "score", "uniform actions", "runs",
+    "class", "arm", "seed", "steps", "hours", "success [95 %]", "return [95 %]", "score", "uniform actions",
+    "witness, open loop", "runs",
 )  # fmt: skip
 
 
@@ -23,6 +25,7 @@ def best_table(studies: Sequence[Study]) -> Iterator[str]:
         for run in study.runs:
             for name, row in scored_classes(run).items():
                 rows.setdefault(name, []).append((run, row))
+    witnesses = load("witness")
     yield from head_of(_HEAD)
     for name, found in rows.items():
         run, best = max(found, key=lambda each: (each[1]["success"], each[1]["return"]))
@@ -31,7 +34,8 @@ def best_table(studies: Sequence[Study]) -> Iterator[str]:
             name, run.arm, str(run.config()["seed"]), f"{run.content['steps']:,}",
             f"{run.content['seconds'] / 3600:.2f}", _ranged(best, "success", 100.0, " %"), _ranged(best, "return"),
             "–" if best["score"] is None else f"{best['score']:.0f}",
-            "–" if random is None else f"{random['return']:.4g}", str(len(found)),
+            "–" if random is None else f"{random['return']:.4g}",
+            f"{100 * witnesses[name]['success']:.4g} %" if name in witnesses else "–", str(len(found)),
         ])  # fmt: skip
 
 

@@ -9,7 +9,8 @@
 ``show`` is ``table`` (an arm a row), ``classes`` (success and return of each class), ``gains`` (what adaptation
 gained, by class and run), ``best`` (the best run of each class, in one table), ``offline`` (data sets by learners),
 ``rows`` (numbers of rows by learners), ``curves``, ``points`` or ``row-curves`` (pictures, written beside the page);
-``on=MT4`` shows one suite or class of the study, ``split=test`` of a meta-test one split.
+``on=MT4`` shows one suite or class of the study, ``split=test`` of a meta-test one split. ``show=references`` is of no
+study: both ends of the score, and witnesses.
 """
 
 import re
@@ -24,6 +25,7 @@ from bidex_meta.record.atomic import write_atomic
 from bidex_meta.results.best import best_table
 from bidex_meta.results.gained import gains_table
 from bidex_meta.results.offline import offline_table
+from bidex_meta.results.reference_ends import references_table
 from bidex_meta.results.scaling import rows_figure, rows_table
 from bidex_meta.results.studies import Study, arms_table, classes_table, figures, read_studies
 
@@ -38,6 +40,7 @@ _TABLES = {
 }
 _OVER_ALL = {"best": best_table}
 """Tables of all suites and classes of a study at once."""
+_REFERENCES = "references"
 _TITLES = {
     "curves": "Return and success over training",
     "points": "Success and score, 95 % intervals over seeds",
@@ -70,8 +73,11 @@ def fill(page: Path, data: Path, check: bool = False) -> list[Path]:
 
     def block(found: re.Match[str]) -> str:
         options = _options(found["words"], page)
-        studies = read_studies(data, options["study"], options.get("on"), options.get("split"))
-        lines = list(_lines(studies, options["show"], page, check, changed))
+        if options["show"] == _REFERENCES:
+            lines = list(references_table())
+        else:
+            studies = read_studies(data, options["study"], options.get("on"), options.get("split"))
+            lines = list(_lines(studies, options["show"], page, check, changed))
         return f"{found['head']}\n" + "\n".join(lines or ["No runs yet."]) + f"\n\n{found['end']}"
 
     new = _BLOCK.sub(block, text)
@@ -89,9 +95,9 @@ def _options(words: str, page: Path) -> dict[str, str]:
         if not given or not value:
             raise BidexError(f"{page}: a block's options are written name=value, got {word!r}.")
         options[known_name("option of a block", name, _OPTIONS)] = value
-    if not re.fullmatch(r"[\w.-]+", options.get("study", "")):
+    if options["show"] != _REFERENCES and not re.fullmatch(r"[\w.-]+", options.get("study", "")):
         raise BidexError(f"{page}: expected a block to name its study, such as study=multitask, got {words!r}.")
-    options["show"] = known_name("block", options["show"], [*_TABLES, *_OVER_ALL, *_TITLES])
+    options["show"] = known_name("block", options["show"], [*_TABLES, *_OVER_ALL, *_TITLES, _REFERENCES])
     return options
 
 
