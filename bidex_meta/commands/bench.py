@@ -26,6 +26,7 @@ _KINDS = (
     "gpu",
     "kernels",
     "learner",
+    "libraries",
     "adapt",
     "multiagent",
     "clients",
@@ -41,11 +42,12 @@ class BenchFlags:
     """
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="|".join(_KINDS))]
-    """world, scaling, mixing, stability, capacity, gpu, kernels; soak: memory, speed and broken rows of a world that is
-    stepped for long; field: beside Meta-World and gymnasium-robotics; learner: MT-PPO's update against rsl-rl-lib's;
-    adapt: all tasks' adaptation at once against a loop over them; multiagent: training of learners of several agents
-    beside MT-PPO's, in turns; clients: another library's PPO through its adapter against the world's own loop; points:
-    a world that shows point clouds beside the same that shows states."""
+    """world, scaling, mixing, stability, capacity, gpu, kernels; soak: memory, speed and broken rows of a world that
+    is stepped for long; field: beside Meta-World and gymnasium-robotics; learner: MT-PPO's update against
+    rsl-rl-lib's; libraries: the same with and without oneDNN's products; adapt: all tasks' adaptation at once against
+    a loop over them; multiagent: training of learners of several agents beside MT-PPO's, in turns; clients: another
+    library's PPO through its adapter against the world's own loop; points: a world that shows point clouds beside the
+    same that shows states."""
     suite: str | None = None
     """Suite to measure: by default world and scaling take MT4, mixing, soak, gpu and kernels MT20, the others every
     class."""
@@ -64,7 +66,7 @@ class BenchFlags:
     minutes: float | None = None
     """For soak: ends after so long; None: 60, or where --steps are given, never."""
     preset: str | None = None
-    """For learner and multiagent: the preset, by default laptop."""
+    """For learner, libraries and multiagent: the preset, by default laptop."""
     against: str | None = None
     """For world: measure beside other code in turns: a commit, a folder with a checkout, or what --out took of it."""
     classes: Switch = False
@@ -81,7 +83,7 @@ class BenchFlags:
     repeats: int | None = None
     """Interleaved repeats; medians are reported."""
     threads: int | None = None
-    """Threads of the physics, for learner those of torch, for multiagent of both."""
+    """Threads of the physics, for learner and libraries those of torch, for multiagent of both."""
     device: str | None = None
     """auto, cpu or cuda:N."""
     engine: str | None = None
@@ -132,7 +134,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _measurement(what: str) -> Any:
-    if what in ("learner", "adapt", "multiagent"):
+    if what in ("learner", "libraries", "adapt", "multiagent"):
         from bidex_meta.commands.learners import shared
 
         return getattr(shared(f"bench.{what}"), what)

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from bidex_algos.bench import learner as bench
+from bidex_algos.bench import libraries as compared
 from bidex_algos.bench.adapt import adapt
 from bidex_algos.bench.multiagent import multiagent
 from bidex_algos.onpolicy.mtppo import PRESETS
@@ -31,6 +32,24 @@ def test_bench_learner_prints_both_speeds_and_their_ratio(
             # Seconds are rounded to a tenth of a millisecond.
             assert 64 / rate == pytest.approx(row["seconds"][side], abs=1e-4)
     assert torch.equal(torch.get_rng_state(), before)
+
+
+@pytest.mark.filterwarnings("ignore:TF32")  # what flags() says of Intel's GPUs
+def test_bench_libraries_measures_every_architecture_in_turns(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    enabled = []
+    monkeypatch.setattr(compared, "PRESETS", {"laptop": TINY})
+    iterate = bench.Ours.seconds
+    monkeypatch.setattr(
+        bench.Ours, "seconds", lambda side: (enabled.append(torch.backends.mkldnn.enabled), iterate(side))[1]
+    )
+    assert main(["bench", "libraries", "--num-envs", "16", "--repeats", "2", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [row["architecture"] for row in found["table"]] == list(compared.ARCHITECTURES)
+    assert all(0.01 < row["ratio"] < 100.0 and row["oneDNN"] > 0.0 for row in found["table"])
+    assert enabled == [False, True, True, False, False, True] * 4
+    assert main(["bench", "libraries", "--preset", "laptob"]) == 2
 
 
 @pytest.mark.parametrize("value_heads", [True, False])
