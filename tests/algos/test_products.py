@@ -70,6 +70,16 @@ def test_gradients_have_gradients(chosen) -> None:
         assert_close(one.double(), other, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.parametrize("view", ["rows", "columns", "expanded", "middle"])
+def test_operands_are_without_gaps(view) -> None:
+    """What soft modules and MOORE hand on: slices of stacks, which oneDNN would multiply by its slowest code."""
+    x = torch.arange(60.0).view(4, 3, 5)
+    given = {"rows": x[0], "columns": x[0].t(), "expanded": x[0, :1].expand(3, 5), "middle": x[:, 1]}[view]
+    dense = products._dense(given)
+    assert torch.equal(dense, given) and (dense.is_contiguous() or dense.t().is_contiguous())
+    assert (dense.data_ptr() == given.data_ptr()) == (view in ("rows", "columns"))
+
+
 def test_layers_side_by_side(chosen) -> None:
     x, weight, bias = drawn(3, ROWS, INPUTS), drawn(3, OUTPUTS, INPUTS, seed=1), drawn(3, OUTPUTS, seed=2)
     out = stacked_affine(x, weight, bias)
