@@ -101,6 +101,7 @@ def _round(world: Any, witness: "Witness", writer: Any, flags: Any) -> None:
     """Plays the witness in every row, each with noise of its own; after its end its last action is held."""
     from bidex_meta.data.episode import Episode
     from bidex_meta.data.episode_recorder import EpisodeRecorder
+    from bidex_meta.witness.open_loop import OpenLoop
 
     def sink(episode: Episode) -> None:
         if episode.success and not episode.broken:
@@ -110,14 +111,13 @@ def _round(world: Any, witness: "Witness", writer: Any, flags: Any) -> None:
 
     seeds = np.random.SeedSequence((flags.seed, writer.parts)).generate_state(2, np.uint32).tolist()
     recorder = EpisodeRecorder(world, sink)  # pyright: ignore[reportAbstractUsage]  # the wrapped world has all
-    recorder.reset(seed=seeds[0])
+    obs, _ = recorder.reset(seed=seeds[0])
     generator = torch.Generator().manual_seed(seeds[1])
-    played, over = torch.from_numpy(witness.actions), torch.zeros(world.num_envs, dtype=torch.bool)
-    step = 0
+    (name,), size = world.task_names, world.single_action_space.shape[0]
+    agent, over = OpenLoop({name: witness}, [name], world.task_id, size), torch.zeros(world.num_envs, dtype=torch.bool)
     while not bool(over.all()):
-        action = played[min(step, len(played) - 1)].expand(world.num_envs, -1)
+        action = agent.eval_action(obs)
         noise = flags.noise * torch.randn(action.shape, generator=generator)
-        *_, info = recorder.step((action + noise).clamp(-1.0, 1.0))
+        obs, *_, info = recorder.step((action + noise).clamp(-1.0, 1.0))
         over |= info["_final_obs"]
-        step += 1
     writer.commit()

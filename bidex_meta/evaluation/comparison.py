@@ -1,7 +1,7 @@
 """Several runs beside each other: groups that differ in nothing but the seed, with intervals over seeds."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -161,24 +161,25 @@ def _read(run: Run) -> dict[str, Any]:
     }
 
 
-def classes_of(found: dict[str, Any]) -> dict[str, Any]:
-    """Of a meta-test the classes after adaptation, train and test apart: ML1's splits hold the same class."""
+def classes_of(
+    found: dict[str, Any], told: Callable[[dict[str, Any]], dict[str, Any]] = lambda rows: rows
+) -> dict[str, Any]:
+    """Of a meta-test the classes after adaptation, train and test apart: ML1's splits hold the same class.
+
+    Args:
+        found: An evaluation.
+        told: What becomes of the rows of a split, by class.
+    """
     if "splits" in found:
-        parts = found["splits"].items()
-        return {f"{name} ({split})": row for split, part in parts for name, row in part["after"]["classes"].items()}
-    return found.get("policy", found)["classes"]
+        after = {split: told(part["after"]["classes"]) for split, part in found["splits"].items()}
+        return {f"{name} ({split})": row for split, rows in after.items() for name, row in rows.items()}
+    return told(found.get("policy", found)["classes"])
 
 
 def scored_classes(run: Run) -> dict[str, Any]:
     """As :func:`classes_of` of its evaluation, with scores by today's references."""
-    found, config = run.evaluation(), run.config()
-    if "splits" not in found:
-        return rescored(classes_of(found), config)
-    rows = {}
-    for split, part in found["splits"].items():
-        scored = rescored(part["after"]["classes"], config)
-        rows |= {f"{name} ({split})": row for name, row in scored.items()}
-    return rows
+    config = run.config()
+    return classes_of(run.evaluation(), lambda rows: rescored(rows, config))
 
 
 def _differing(kinds: list[dict[str, Any]]) -> dict[str, set[str]]:

@@ -1,7 +1,7 @@
 """The products of layers with weights, by the faster of the two libraries that PyTorch computes them with on a CPU.
 
-PyTorch takes MKL, which runs AMD's processors without their AVX-512: its oneDNN, of the same precision, is 2.2 times as
-fast there (docs/results/speed.md). Elsewhere, and where a product is small, it is PyTorch's own choice.
+PyTorch takes MKL, which runs AMD's processors without their AVX-512: its oneDNN, of the same precision, is more than
+twice as fast there (docs/results/speed.md). Elsewhere, and where a product is small, it is PyTorch's own choice.
 ``torch.backends.mkldnn.flags(enabled=False)`` turns it off.
 """
 
@@ -91,7 +91,7 @@ def _onednn(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
 
 
 def _dense(x: Tensor) -> Tensor:
-    """The same numbers without gaps, by rows or by columns: of others oneDNN makes products a hundred times slower."""
+    """The same numbers without gaps, by rows or by columns: others oneDNN multiplies by its slowest code."""
     return x if x.is_contiguous() or x.t().is_contiguous() else x.contiguous()
 
 
