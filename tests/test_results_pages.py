@@ -144,6 +144,11 @@ def test_the_best_run_of_each_class(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         ["C", "sac", "0", "1,000", "0.50", "75 % [0, 100]", "2", "–", "–", "12.5 %", "2"],
         ["D", "ppo", "0", "1,000", "0.50", "0 % [0, 100]", "3", "–", "–", "–", "1"],
     ]
+    (tmp_path / "data" / "alone" / "C-ppo-seed0.json").unlink()
+    (tmp_path / "data" / "alone" / "C-sac-seed0.json").unlink()
+    fill(page, tmp_path / "data")
+    _, _, *rows = [cells(line) for line in page.read_text().splitlines() if line.startswith("|")]
+    assert rows == [["D", "0 % [0, 100]", "3", "–", "–", "–"]]
 
 
 def test_references_are_a_table_without_a_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,14 +8,15 @@ from bidex_meta.evaluation.references import load
 from bidex_meta.record.stored import StoredRun
 from bidex_meta.results.studies import Study, head_of, row_of
 
-_HEAD = (
-    "class", "arm", "seed", "steps", "hours", "success [95 %]", "return [95 %]", "score", "uniform actions",
-    "witness, open loop", "runs",
-)  # fmt: skip
+_OF_RUN = ("arm", "seed", "steps", "hours")
+"""Columns that tell which of several runs a row is of."""
+_FOUND = ("success [95 %]", "return [95 %]", "score", "uniform actions", "witness, open loop")
 
 
 def best_table(studies: Sequence[Study]) -> Iterator[str]:
     """Lines of Markdown: a class a row, of its runs the one that succeeds most often; of equals the largest return.
+
+    Where there is one run of all classes, no row says which.
 
     Args:
         studies: One for each class or set of classes.
@@ -25,18 +26,24 @@ def best_table(studies: Sequence[Study]) -> Iterator[str]:
         for run in study.runs:
             for name, row in scored_classes(run).items():
                 rows.setdefault(name, []).append((run, row))
-    witnesses = load("witness")
-    yield from head_of(_HEAD)
+    witnesses, many = load("witness"), sum(len(study.runs) for study in studies) > 1
+    yield from head_of(["class", *_OF_RUN, *_FOUND, "runs"] if many else ["class", *_FOUND])
     for name, found in rows.items():
         run, best = max(found, key=lambda each: (each[1]["success"], each[1]["return"]))
         random = run.evaluation().get("random", {"classes": {}})["classes"].get(name)
-        yield row_of([
-            name, run.arm, str(run.config()["seed"]), f"{run.content['steps']:,}",
-            f"{run.content['seconds'] / 3600:.2f}", _ranged(best, "success", 100.0, " %"), _ranged(best, "return"),
+        cells = [
+            _ranged(best, "success", 100.0, " %"),
+            _ranged(best, "return"),
             "–" if best["score"] is None else f"{best['score']:.0f}",
             "–" if random is None else f"{random['return']:.4g}",
-            f"{100 * witnesses[name]['success']:.4g} %" if name in witnesses else "–", str(len(found)),
-        ])  # fmt: skip
+            f"{100 * witnesses[name]['success']:.4g} %" if name in witnesses else "–",
+        ]
+        yield row_of([name, *_which(run), *cells, str(len(found))] if many else [name, *cells])
+
+
+def _which(run: StoredRun) -> list[str]:
+    content = run.content
+    return [run.arm, str(run.config()["seed"]), f"{content['steps']:,}", f"{content['seconds'] / 3600:.2f}"]
 
 
 def _ranged(row: dict[str, Any], measure: str, factor: float = 1.0, unit: str = "") -> str:
