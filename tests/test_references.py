@@ -120,7 +120,7 @@ def evaluated_run(path: Path, task: str | None, suite: str | None, returns: dict
     return path
 
 
-def test_the_expert_is_the_best_of_witness_and_runs(
+def test_the_expert_is_the_best_of_witness_script_and_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     totals = {"HandOver": 40.0, "CatchAbreast": 5.0, "CatchUnderarm": 90.0}
@@ -130,6 +130,8 @@ def test_the_expert_is_the_best_of_witness_and_runs(
     monkeypatch.setattr(
         experts, "replay", lambda name, *_: Replay(totals[name], 1, 3 if name == "CatchUnderarm" else 9, 0.0)
     )
+    scripts = {name: {"return": value} for name, value in (("HandOver", 39.0), ("TwoCatchUnderarm", 7.0))}
+    monkeypatch.setattr(experts, "load", lambda kind: scripts if kind == "script" else {})
     suite = evaluated_run(tmp_path / "a", None, "MT4", {"HandOver": 30.0, "CatchAbreast": 20.0})
     alone = evaluated_run(tmp_path / "b", "CatchAbreast", None, {"CatchAbreast": 12.0})
     for name, row in (("metrics.jsonl", {"step": 1000}), ("versions.json", {"git": {"commit": "c" * 40}})):
@@ -144,6 +146,7 @@ def test_the_expert_is_the_best_of_witness_and_runs(
     assert json.loads(capsys.readouterr().out) == {
         "HandOver": {"return": 40.0, "source": "witness, task 0"},
         "CatchAbreast": {"return": 20.0, "source": "mtppo on MT4, 1,000 steps, seed 3"},
+        "TwoCatchUnderarm": {"return": 7.0, "source": "script"},
     }
     assert json.loads(out.read_text())["classes"]["HandOver"]["return"] == 40.0
 

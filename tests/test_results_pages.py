@@ -141,14 +141,14 @@ def test_the_best_run_of_each_class(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     fill(page, tmp_path / "data")
     _, _, *rows = [cells(line) for line in page.read_text().splitlines() if line.startswith("|")]
     assert rows == [
-        ["C", "sac", "0", "1,000", "0.50", "75 % [0, 100]", "2", "–", "–", "12.5 %", "2"],
-        ["D", "ppo", "0", "1,000", "0.50", "0 % [0, 100]", "3", "–", "–", "–", "1"],
+        ["C", "sac", "0", "1,000", "0.50", "75 % [0, 100]", "2", "–", "–", "12.5 %", "–", "2"],
+        ["D", "ppo", "0", "1,000", "0.50", "0 % [0, 100]", "3", "–", "–", "–", "–", "1"],
     ]
     (tmp_path / "data" / "alone" / "C-ppo-seed0.json").unlink()
     (tmp_path / "data" / "alone" / "C-sac-seed0.json").unlink()
     fill(page, tmp_path / "data")
     _, _, *rows = [cells(line) for line in page.read_text().splitlines() if line.startswith("|")]
-    assert rows == [["D", "0 % [0, 100]", "3", "–", "–", "–"]]
+    assert rows == [["D", "0 % [0, 100]", "3", "–", "–", "–", "–"]]
 
 
 def test_references_are_a_table_without_a_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -161,7 +161,7 @@ def test_references_are_a_table_without_a_study(tmp_path: Path, monkeypatch: pyt
     page.write_text("<!-- results: show=references -->\n<!-- end -->\n")
     assert fill(page, tmp_path) == [page]
     rows = [cells(line) for line in page.read_text().splitlines() if line.startswith("| ")]
-    assert len(rows) == 21 and ["Switch", "8696", "0.5 %", "–", "–", "–", "–", "9", "x"] in rows
+    assert len(rows) == 21 and ["Switch", "8696", "0.5 %", "–", "–", "–", "–", "–", "–", "9", "x"] in rows
 
 
 def test_gains_of_meta_tests(tmp_path: Path) -> None:

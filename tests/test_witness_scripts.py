@@ -4,16 +4,18 @@ import numpy as np
 import pytest
 import torch
 
+from bidex_meta.benchmark import make_task_world
 from bidex_meta.errors import BidexError
 from bidex_meta.hands.hand import hand
-from bidex_meta.witness.puppets import Puppets
-from bidex_meta.witness.scripts import script_of
+from bidex_meta.witness.puppets import Puppets, shifted_puppets
+from bidex_meta.witness.scripted import Scripted
+from bidex_meta.witness.scripts import SCRIPTS, script_of
 from bidex_meta.witness.store import load_witness
 
 
 @pytest.fixture(scope="module")
 def hands() -> Puppets:
-    return Puppets("StackBlock", threads=1)
+    return shifted_puppets("StackBlock", threads=1)
 
 
 def test_a_hand_goes_where_it_is_led_and_the_other_stays(hands: Puppets) -> None:
@@ -40,10 +42,37 @@ def test_a_class_without_a_script_is_refused() -> None:
         script_of("HandOver")
 
 
+def test_a_script_is_led_anew_from_each_rows_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the copy earned is what the world's row earns, whatever its task and start; then the last action holds."""
+    led: list[Puppets] = []
+
+    def to_the_block(hands: Puppets) -> None:
+        hands.lead(tuple((hands.where("block1/position") + 0.1).tolist()), tuple(hands.at("left").tolist()), steps=6)
+        led.append(hands)
+
+    monkeypatch.setitem(SCRIPTS, "StackBlock", to_the_block)
+    world = make_task_world("StackBlock", 50, "cpu", autoreset_mode="DISABLED", threads=1)
+    world.reset(seed=3)
+    agent, rows = Scripted(world), torch.zeros(50, dtype=torch.bool)
+    rows[[4, 31]] = True
+    for _ in range(2):
+        agent.reset(rows)
+        obs, rewards = torch.zeros(50, 1), []
+        for _ in range(6):
+            action = agent.eval_action(obs)
+            rewards.append(world.step(action)[-1]["reward_unscaled"][rows])
+        first, second = torch.stack(rewards).T
+        known = torch.tensor([hands.rewards for hands in led[-2:]]).float()
+        assert torch.equal(torch.stack([first, second]).float(), known) and not torch.equal(first, second)
+        assert torch.equal(agent.eval_action(obs), action) and not action[~rows].any()
+        world.reset(options={"reset_mask": rows})
+    assert led[0].rewards != led[2].rewards, "another start"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["StackBlock", "GraspAndPlace", "LiftUnderarm", "PourWater"])
 def test_a_script_gives_the_stored_witness_again(name: str) -> None:
-    hands = Puppets(name)
+    hands = shifted_puppets(name)
     script_of(name)(hands)
     played = np.stack([action.numpy() for action in hands.actions])
     # Feedback on chaos: in StackBlock five of 13,000 actions are two steps of the file off.

@@ -14,8 +14,14 @@ from bidex_meta.sources import Source
 
 if TYPE_CHECKING:
     from bidex_meta.agents import Agent
+    from bidex_meta.evaluation.results import Evaluation
 
-_POLICIES = {"random": "uniform actions", "zero": "zero actions", "witness": "the witness of task 0, open loop"}
+_POLICIES = {
+    "random": "uniform actions",
+    "zero": "zero actions",
+    "witness": "the witness of task 0, open loop",
+    "script": "the script of the class, led anew from each start",
+}
 
 
 @dataclass(frozen=True)
@@ -28,10 +34,10 @@ class BaselineFlags:
     with the worst finished one of its class, elsewhere with what is stored of random actions.
     """
 
-    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="random|zero|witness|expert")]
+    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="random|zero|witness|script|expert")]
     """random: uniform actions; zero: the action 0, joints held in the middle of their range and bases at rest;
-    witness: the actions that solve task 0 of a class, in all its tasks; expert: per class the best of its witness and
-    of the runs given."""
+    witness: the actions that solve task 0 of a class, in all its tasks; script: hands that a script leads, which knows
+    the whole state (four classes have one); expert: per class the best of its witness and of the runs given."""
     suite: str = "MT20"
     """Suite whose train tasks are played."""
     episodes: int = 4
@@ -78,16 +84,10 @@ def _expert(flags: BaselineFlags) -> None:
 
 
 def _measure(what: str, flags: BaselineFlags) -> None:
-    from bidex_meta.evaluation.play import EVALUATION_SEED, evaluate
-
     source = Source.open({"suite": flags.suite, "seed": flags.seed, "threads": flags.threads})
     if not source.moving_bases:
         raise BidexError(f'References are of moving bases, but {flags.suite} has fixed ones. Write base = "moving".')
-    world = source.world()
-    agent, names = _agent(what, world, flags.seed)
-    found = evaluate(agent, world, flags.episodes, seed=EVALUATION_SEED)
-    world.close()
-    found = replace(found, classes={name: found.classes[name] for name in names})
+    found = _scripted(source, flags) if what == "script" else _played(what, source, flags)
     numbers = {name: result.to_json() for name, result in found.classes.items()}
     kept = ("return", "return_interval", "success", "episodes", "unstable")
     made = {"policy": _POLICIES[what], "suite": flags.suite, "seed": flags.seed}
@@ -99,6 +99,35 @@ def _measure(what: str, flags: BaselineFlags) -> None:
 
     stored = "" if flags.out is None else f", stored in {flags.out}"
     print_table(evaluation_table(f"{_POLICIES[what]} on {flags.suite}{stored}", found, None))
+
+
+def _played(what: str, source: Source, flags: BaselineFlags) -> "Evaluation":
+    from bidex_meta.evaluation.play import EVALUATION_SEED, evaluate
+
+    world = source.world()
+    agent, names = _agent(what, world, flags.seed)
+    found = evaluate(agent, world, flags.episodes, seed=EVALUATION_SEED)
+    world.close()
+    return replace(found, classes={name: found.classes[name] for name in names})
+
+
+def _scripted(source: Source, flags: BaselineFlags) -> "Evaluation":
+    """Each class that has a script on its own: alone it has the tasks that it has in suites."""
+    from bidex_meta.evaluation.play import EVALUATION_SEED, evaluate
+    from bidex_meta.evaluation.results import Evaluation
+    from bidex_meta.witness.scripted import Scripted
+    from bidex_meta.witness.scripts import SCRIPTS
+
+    names = [name for name in source.task_classes() if name in SCRIPTS]
+    if not names:
+        raise BidexError(f"Expected a suite with a class that has a script ({', '.join(SCRIPTS)}), got {flags.suite}.")
+    classes = {}
+    for name in names:
+        config = {"task": name, "base": "moving", "seed": flags.seed, "device": "cpu", "engine": "c"}
+        world: Any = Source.open(config | {"threads": flags.threads}).world()
+        classes |= evaluate(Scripted(world), world, flags.episodes, seed=EVALUATION_SEED).classes
+        world.close()
+    return Evaluation(classes, flags.episodes)
 
 
 def _agent(what: str, world: Any, seed: int) -> tuple["Agent", list[str]]:

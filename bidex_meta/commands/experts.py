@@ -1,10 +1,11 @@
-"""The upper end of the normalised score: per class the best of its witness and of trained policies."""
+"""The upper end of the normalised score: per class the best of its witness, its script and trained policies."""
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.references import load
 from bidex_meta.record.stored import open_run
 from bidex_meta.sources import Source
 from bidex_meta.witness.replay import replay
@@ -23,6 +24,7 @@ def best_known(names: Collection[str], runs: Sequence[Path], threads: int | None
         BidexError: A run has no evaluation, or plays a class with fixed bases.
     """
     candidates = [row for run in runs for row in _of_run(run)]
+    candidates += [(name, {"return": row["return"], "source": "script"}) for name, row in load("script").items()]
     candidates += [row for name in names for row in _of_witness(name, threads)]
     best: dict[str, dict[str, Any]] = {}
     for name, row in candidates:

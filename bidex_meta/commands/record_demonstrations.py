@@ -1,4 +1,4 @@
-"""``bidex-meta record demonstrations``: replays of a class's witness, of which those that succeed are kept."""
+"""``bidex-meta record demonstrations``: a class's witness or script played, of which what succeeds is kept."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +11,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.sources import Source
 
 if TYPE_CHECKING:
-    from bidex_meta.witness.store import Witness
+    from bidex_meta.witness.open_loop import OpenLoop
 
 SIZE, ROWS, ROWS_OF_TASKS = 20_000, 32, 200
 """Transitions, and replays played together from shifted starts or on all tasks, where nobody says otherwise."""
@@ -27,12 +27,12 @@ def record_demonstrations(flags: Any, say: Callable[[str], None]) -> tuple[Path,
     seed and its number.
 
     Args:
-        flags: ``RecordFlags`` with ``task``; read are also ``size``, ``noise``, ``shift``, ``starts``, ``num_envs``,
-            ``seed``, ``out``, ``threads``, ``estimate``.
+        flags: ``RecordFlags`` with ``task``; read are also ``size``, ``noise``, ``shift``, ``starts``, ``script``,
+            ``num_envs``, ``seed``, ``out``, ``threads``, ``estimate``.
         say: Takes lines of progress.
 
     Raises:
-        BidexError: Flags that do not go together, no witness, no room, or no replay that succeeds.
+        BidexError: Flags that do not go together, no witness or script, no room, or nothing that succeeds.
     """
     from bidex_meta.commands.described import described
     from bidex_meta.data import part_files
@@ -40,7 +40,6 @@ def record_demonstrations(flags: Any, say: Callable[[str], None]) -> tuple[Path,
     from bidex_meta.data.rounds import standing, whole_parts
     from bidex_meta.data.writer import DatasetWriter, begin, check_place, estimated_bytes, finish
     from bidex_meta.witness.shifted import ShiftedStarts
-    from bidex_meta.witness.store import load_witness
 
     part_files.hdf5()
     if flags.base == "fixed" or flags.engine == "warp" or flags.device not in ("auto", "cpu"):
@@ -50,12 +49,13 @@ def record_demonstrations(flags: Any, say: Callable[[str], None]) -> tuple[Path,
     source = Source.open({"task": flags.task, "base": "moving", "seed": 0, "threads": flags.threads})
     if source.name not in source.task_classes() or ":" in source.name:
         raise BidexError(f"{source.name} is none of the classes that have witnesses (bidex-meta witness --all).")
-    of_tasks = flags.starts == "tasks"
-    witness, size = load_witness(source.name), flags.size or SIZE
+    of_tasks, player = flags.starts == "tasks", _script if flags.script else _witness
+    agent_of, size = player(source.name), flags.size or SIZE
     rows = flags.num_envs or (ROWS_OF_TASKS if of_tasks else ROWS)
     folder, name = place_of(flags.out, source.name, "demonstrations-tasks" if of_tasks else "demonstrations")
     plan = {"kind": "demonstrations", "task": source.name, "size": size, "num_envs": rows, "seed": flags.seed}
     plan |= {"noise": flags.noise} | ({"starts": "tasks"} if of_tasks else {"shift": flags.shift})
+    plan |= {"script": True} if flags.script else {}
     if not flags.estimate:
         check_place(folder, plan)
     world: Any
@@ -78,18 +78,15 @@ def record_demonstrations(flags: Any, say: Callable[[str], None]) -> tuple[Path,
         try:
             while (now := standing(writer, 1)).steps[0] < size:
                 if not now.steps[0] and writer.parts >= _PATIENCE:
-                    raise BidexError(
-                        f"None of {_PATIENCE * rows} replays of {source.name}'s witness succeeds. Lower --noise or "
-                        f"{'play --starts witness' if of_tasks else '--shift'}."
-                    )
-                _round(world, witness, writer, flags)
+                    raise _nothing_succeeds(_PATIENCE * rows, source.name, flags)
+                _round(world, agent_of(world), writer, flags)
                 after = standing(writer, 1)
                 kept = after.episodes[0] - now.episodes[0]
                 say(f"{after.steps[0]:,} of {size:,} transitions | {kept} of {rows} replays succeed")
         finally:
             writer.close()
         drawn = {key: plan[key] for key in ("noise", "shift", "starts") if key in plan}
-        told = {"algo": None, "actions": "witness", **drawn}
+        told = {"algo": None, "actions": "script" if flags.script else "witness", **drawn}
         about = described(source, world, "demonstrations", [told], starts=flags.seed)
         finish(folder, name, world.single_observation_space, world.single_action_space, about)
     finally:
@@ -97,11 +94,35 @@ def record_demonstrations(flags: Any, say: Callable[[str], None]) -> tuple[Path,
     return folder, name
 
 
-def _round(world: Any, witness: "Witness", writer: Any, flags: Any) -> None:
-    """Plays the witness in every row, each with noise of its own; after its end its last action is held."""
+def _witness(name: str) -> Callable[[Any], "OpenLoop"]:
+    """What makes a player of the class's witness for a world."""
+    from bidex_meta.witness.open_loop import OpenLoop
+    from bidex_meta.witness.store import load_witness
+
+    known = {name: load_witness(name)}
+    return lambda world: OpenLoop(known, [name], world.task_id, world.single_action_space.shape[0])
+
+
+def _script(name: str) -> Callable[[Any], "OpenLoop"]:
+    """What makes a player of the class's script for a world."""
+    from bidex_meta.witness.scripted import Scripted
+    from bidex_meta.witness.scripts import script_of
+
+    script_of(name)
+    return Scripted
+
+
+def _nothing_succeeds(played: int, name: str, flags: Any) -> BidexError:
+    if flags.script:
+        return BidexError(f"None of {played} episodes that {name}'s script leads succeeds. Lower --noise.")
+    other = "play --starts witness" if flags.starts == "tasks" else "--shift"
+    return BidexError(f"None of {played} replays of {name}'s witness succeeds. Lower --noise or {other}.")
+
+
+def _round(world: Any, agent: "OpenLoop", writer: Any, flags: Any) -> None:
+    """Plays in every row what it is known to do, each with noise of its own."""
     from bidex_meta.data.episode import Episode
     from bidex_meta.data.episode_recorder import EpisodeRecorder
-    from bidex_meta.witness.open_loop import OpenLoop
 
     def sink(episode: Episode) -> None:
         if episode.success and not episode.broken:
@@ -113,8 +134,8 @@ def _round(world: Any, witness: "Witness", writer: Any, flags: Any) -> None:
     recorder = EpisodeRecorder(world, sink)  # pyright: ignore[reportAbstractUsage]  # the wrapped world has all
     obs, _ = recorder.reset(seed=seeds[0])
     generator = torch.Generator().manual_seed(seeds[1])
-    (name,), size = world.task_names, world.single_action_space.shape[0]
-    agent, over = OpenLoop({name: witness}, [name], world.task_id, size), torch.zeros(world.num_envs, dtype=torch.bool)
+    over = torch.zeros(world.num_envs, dtype=torch.bool)
+    agent.reset(~over)
     while not bool(over.all()):
         action = agent.eval_action(obs)
         noise = flags.noise * torch.randn(action.shape, generator=generator)

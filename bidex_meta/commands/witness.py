@@ -159,13 +159,13 @@ def _play_script(name: str, flags: WitnessFlags) -> Path | None:
     import numpy as np
 
     from bidex_meta.record.versions import collect_versions
-    from bidex_meta.witness.puppets import Puppets
+    from bidex_meta.witness.puppets import shifted_puppets
     from bidex_meta.witness.replay import replay
     from bidex_meta.witness.scripts import script_of
     from bidex_meta.witness.store import Witness
 
     play = script_of(name)
-    hands = Puppets(name, flags.threads)
+    hands = shifted_puppets(name, flags.threads)
     play(hands)
     first = hands.success.index(True) if any(hands.success) else None
     made = {"return": sum(hands.rewards), "first_success": first, "script": play.__name__, "rival": None}

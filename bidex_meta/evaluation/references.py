@@ -2,8 +2,8 @@
 
 They hold for classes with moving bases, as every suite has them. Files under ``assets/references/``: ``random.json``
 and ``zero.json``, the returns of random actions and of doing nothing, the better of which is the score's zero, and
-``expert.json``; ``witness.json`` holds what each witness gets open loop, which no score is made of. ``bidex-meta
-baseline`` measures them.
+``expert.json``; ``witness.json`` and ``script.json`` hold what witnesses get open loop and scripts in closed loop.
+``bidex-meta baseline`` measures them.
 """
 
 from dataclasses import replace
@@ -18,7 +18,7 @@ from bidex_meta.evaluation.scores import Reference
 from bidex_meta.reading import TABLE, check, exists, number, read_json
 from bidex_meta.record.atomic import write_json
 
-Kind = Literal["random", "zero", "expert", "witness"]
+Kind = Literal["random", "zero", "expert", "witness", "script"]
 
 
 def reference_path(kind: Kind) -> Path:

@@ -1,4 +1,4 @@
-"""The best run of each class, beside its witness played blindly: what a study of single classes found as experts."""
+"""The best run of each class, beside its witness and its script: what a study of single classes found as experts."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -10,7 +10,7 @@ from bidex_meta.results.studies import Study, head_of, row_of
 
 _OF_RUN = ("arm", "seed", "steps", "hours")
 """Columns that tell which of several runs a row is of."""
-_FOUND = ("success [95 %]", "return [95 %]", "score", "uniform actions", "witness, open loop")
+_FOUND = ("success [95 %]", "return [95 %]", "score", "uniform actions", "witness, open loop", "script")
 
 
 def best_table(studies: Sequence[Study]) -> Iterator[str]:
@@ -26,7 +26,7 @@ def best_table(studies: Sequence[Study]) -> Iterator[str]:
         for run in study.runs:
             for name, row in scored_classes(run).items():
                 rows.setdefault(name, []).append((run, row))
-    witnesses, many = load("witness"), sum(len(study.runs) for study in studies) > 1
+    untaught, many = [load("witness"), load("script")], sum(len(study.runs) for study in studies) > 1
     yield from head_of(["class", *_OF_RUN, *_FOUND, "runs"] if many else ["class", *_FOUND])
     for name, found in rows.items():
         run, best = max(found, key=lambda each: (each[1]["success"], each[1]["return"]))
@@ -36,7 +36,7 @@ def best_table(studies: Sequence[Study]) -> Iterator[str]:
             _ranged(best, "return"),
             "–" if best["score"] is None else f"{best['score']:.0f}",
             "–" if random is None else f"{random['return']:.4g}",
-            f"{100 * witnesses[name]['success']:.4g} %" if name in witnesses else "–",
+            *(f"{100 * known[name]['success']:.4g} %" if name in known else "–" for known in untaught),
         ]
         yield row_of([name, *_which(run), *cells, str(len(found))] if many else [name, *cells])
 

@@ -2,19 +2,21 @@
 
 from collections.abc import Iterator
 
-from bidex_meta.evaluation.references import load
+from bidex_meta.evaluation.references import Kind, load
 from bidex_meta.results.studies import head_of, row_of
 from bidex_meta.tasks import registry
+
+_PLAYED: dict[Kind, str] = {"random": "random", "zero": "zero", "witness": "witness, open loop", "script": "script"}
 
 
 def references_table() -> Iterator[str]:
     """Lines of Markdown: a class a row; return and success of each, of the expert its return and what it is."""
-    random, zero, witness, expert = (load(kind) for kind in ("random", "zero", "witness", "expert"))
-    untaught = [f"{who}: {what}" for who in ("random", "zero", "witness, open loop") for what in ("return", "success")]
+    played, expert = [load(kind) for kind in _PLAYED], load("expert")
+    untaught = [f"{who}: {what}" for who in _PLAYED.values() for what in ("return", "success")]
     yield from head_of(["class", *untaught, "expert: return", "which"])
     for name in registry.names():
         cells = [name]
-        for known in (random, zero, witness):
+        for known in played:
             row = known.get(name)
             cells += ["–", "–"] if row is None else [f"{row['return']:.4g}", f"{100 * row['success']:.1f} %"]
         best = expert.get(name)

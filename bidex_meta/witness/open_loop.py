@@ -25,16 +25,20 @@ class OpenLoop:
         self._played = torch.zeros(len(task_names), longest, actions, device=task_id.device)
         for slot, name in enumerate(task_names):
             if name in witnesses:
-                found = torch.from_numpy(witnesses[name].actions)
-                self._played[slot, :, : found.shape[1]] = found[torch.arange(longest).clamp_max(len(found) - 1)]
-        self._slot, self._step = task_id, torch.zeros_like(task_id)
+                held(self._played[slot], torch.from_numpy(witnesses[name].actions))
+        self._which, self._step = task_id, torch.zeros_like(task_id)
 
     def eval_action(self, obs: Tensor) -> Tensor:
         """The next actions ``(num_envs, action)``."""
-        action = self._played[self._slot, self._step.clamp_max(self._played.shape[1] - 1)]
+        action = self._played[self._which, self._step.clamp_max(self._played.shape[1] - 1)]
         self._step += 1
         return action
 
     def reset(self, env_mask: Tensor) -> None:
         """These rows begin again."""
         self._step[env_mask] = 0
+
+
+def held(into: Tensor, actions: Tensor) -> None:
+    """Puts actions (T, a) into the first columns of a longer sequence, and the last one into the steps after it."""
+    into[:, : actions.shape[1]] = actions[torch.arange(len(into)).clamp_max(len(actions) - 1)]

@@ -1,7 +1,7 @@
 """Hands led to points in closed loop, for witnesses that a script finds where the planner stays in a local optimum.
 
-A script watches the mean of some shifted copies of the start, in which all hands do the same, so that what it does does
-not depend on one of them. The actions are recorded; played again they need no script.
+A script watches the mean of all copies of the start, in which all hands do the same; for a witness they are shifted, so
+that what it does does not depend on one of them. The actions are recorded; played again they need no script.
 """
 
 import torch
@@ -21,23 +21,33 @@ _KNUCKLES, _MIDDLES = ("FFJ2", "MFJ2", "RFJ2", "LFJ2"), ("FFJ1", "MFJ1", "RFJ1",
 Point = tuple[float, float, float]
 
 
-class Puppets:
-    """Both hands of a class's task 0.
+def shifted_puppets(name: str, threads: int | None = None) -> "Puppets":
+    """The hands of a class's task 0, in some shifted copies of its start.
 
     Args:
         name: The class.
         threads: Engine threads; None takes all CPUs.
+    """
+    simulator = Simulator(name, _COPIES, threads)
+    simulator.load(simulator.starts(_COPIES - 1, seed=_SEED))
+    return Puppets(simulator)
+
+
+class Puppets:
+    """Both hands of a class, from where they stand.
+
+    Args:
+        simulator: Its rows are the copies that a script watches, and does the same in.
 
     Attributes:
         actions: What was done so far, each (action_size,).
-        rewards: What it gave from the unshifted start.
+        rewards: What it gave in the first copy, whose start is the unshifted one.
         success: Which of its steps were a success there.
         episode_steps: Time limit, control steps.
     """
 
-    def __init__(self, name: str, threads: int | None = None):
-        self._simulator = Simulator(name, _COPIES, threads)
-        self._simulator.load(self._simulator.starts(_COPIES - 1, seed=_SEED))
+    def __init__(self, simulator: Simulator):
+        self._simulator = simulator
         self.actions: list[Tensor] = []
         self.rewards: list[float] = []
         self.success: list[bool] = []
@@ -103,7 +113,7 @@ class Puppets:
                 action[i * half + self._joints :][:3] = (way / self._full_speed).float().clamp(-1.0, 1.0)
                 action[i * half + self._joints :][3:6] = self._torque(side).float()
             action = quantised(action)
-            trace = self._simulator.play(action.expand(1, _COPIES, -1))
+            trace = self._simulator.play(action.expand(1, self._simulator.num, -1))
             self.actions.append(action)
             self.rewards.append(float(trace.rewards[0, 0]))
             self.success.append(bool(trace.success[0, 0]))

@@ -33,15 +33,9 @@ def script_of(name: str) -> Callable[[Puppets], None]:
     Raises:
         BidexError: It has none.
     """
-    scripts = {
-        "GraspAndPlace": grasp_and_place,
-        "LiftUnderarm": lift_underarm,
-        "PourWater": pour_water,
-        "StackBlock": stack_block,
-    }
-    if name not in scripts:
-        raise BidexError(f"Expected a class with a script ({', '.join(scripts)}), got {name}; leave --script out.")
-    return scripts[name]
+    if name not in SCRIPTS:
+        raise BidexError(f"Expected a class with a script ({', '.join(SCRIPTS)}), got {name}; leave --script out.")
+    return SCRIPTS[name]
 
 
 def grasp_and_place(hands: Puppets) -> None:
@@ -196,3 +190,12 @@ def _carry_block1(hands: Puppets, x: float) -> None:
 def _from(point: Tensor, x: float, y: float, height: float) -> Point:
     """A place beside a point, at a height above the floor, metres."""
     return float(point[0]) + x, float(point[1]) + y, height
+
+
+SCRIPTS: dict[str, Callable[[Puppets], None]] = {
+    "GraspAndPlace": grasp_and_place,
+    "LiftUnderarm": lift_underarm,
+    "PourWater": pour_water,
+    "StackBlock": stack_block,
+}
+"""By class."""

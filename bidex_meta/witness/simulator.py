@@ -61,7 +61,7 @@ class Simulator:
 
     def __init__(self, name: str, num: int, threads: int | None = None):
         slot = task_slot(name)
-        self.num, self.task = num, slot.task_class
+        self._name, self.num, self.task = name, num, slot.task_class
         self.action_size, self.episode_steps = slot.task_class.action_size, slot.task_class.episode_steps
         self._world = World([slot], num, autoreset_mode="DISABLED", seed=SEED, threads=threads)
         self._world.reset(seed=SEED)
@@ -97,6 +97,17 @@ class Simulator:
         self._engine.load_state_dict(
             {name: torch.stack([s[name] for s in states]).repeat_interleave(share, dim=0) for name in names}
         )
+
+    def take(self, task: np.ndarray, start: State) -> None:
+        """Puts all rows into another task of the class, and into a start of it.
+
+        Args:
+            task: Its variation, shape (variation_space.size,).
+            start: A row of the state of an engine that plays the class, as :meth:`save` gives one.
+        """
+        self._world.set_tasks({self._name: task[None]})
+        self._world.reset(seed=SEED)
+        self.load([start])
 
     def play(self, actions: Tensor, each_step: Callable[[], None] | None = None) -> Trace:
         """Plays actions (T, N, action_size) in [-1, 1] from where the rows stand, and calls back after each step."""

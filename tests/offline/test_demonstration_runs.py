@@ -12,6 +12,7 @@ from bidex_meta.commands import record_demonstrations
 from bidex_meta.data import open_dataset, place
 from bidex_meta.record import RunFolder
 from bidex_meta.sources.source import SingleClass
+from bidex_meta.witness.scripts import SCRIPTS
 from bidex_meta.witness.shifted import ShiftedStarts
 from bidex_meta.witness.simulator import Simulator
 from bidex_meta.witness.store import load_witness
@@ -113,6 +114,24 @@ def test_on_all_tasks_they_show_more(
     (policy,) = kept.metadata["policies"]
     assert policy == {"algo": None, "actions": "witness", "noise": 0.0, "starts": "tasks"}
     assert bool(kept.table["success"].all()) and len(set(kept.table["task_index"])) > 1
+
+
+def test_a_script_shows_tasks_in_closed_loop(
+    sets: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("BIDEX_DATA", str(sets / "sets"))
+    words = ["record", "demonstrations", "--threads", "1", "--script"]
+    assert "--starts tasks" in told(capsys, *words, "--task", "PourWater", code=2)
+    words += ["--starts", "tasks", "--num-envs", "2", "--size", "1"]
+    assert "Expected a class with a script" in told(capsys, *words, "--task", "Switch", code=2)
+    told(capsys, *words, "--task", "PourWater", "--out", sets / "sets" / "led-v0")
+    kept = open_dataset("led-v0")
+    (policy,) = kept.metadata["policies"]
+    assert policy == {"algo": None, "actions": "script", "noise": 0.0, "starts": "tasks"}
+    assert bool(kept.table["success"].all())
+    monkeypatch.setitem(SCRIPTS, "PourWater", lambda hands: hands.lead((0.0, 0.0, 1.0), (0.0, 0.0, 1.0)))
+    told_of = told(capsys, *words, "--task", "PourWater", "--out", sets / "sets" / "idle-v0", code=2)
+    assert "None of 6 episodes that PourWater's script leads succeeds" in told_of
 
 
 def test_a_run_imitates_them_and_is_resumed(
