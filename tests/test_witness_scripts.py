@@ -42,7 +42,8 @@ def test_a_class_without_a_script_is_refused() -> None:
         script_of("HandOver")
 
 
-def test_a_script_is_led_anew_from_each_rows_start(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_a_script_is_led_anew_from_each_rows_start(noise: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the copy earned is what the world's row earns, whatever its task and start; then the last action holds."""
     led: list[Puppets] = []
 
@@ -53,7 +54,7 @@ def test_a_script_is_led_anew_from_each_rows_start(monkeypatch: pytest.MonkeyPat
     monkeypatch.setitem(SCRIPTS, "StackBlock", to_the_block)
     world = make_task_world("StackBlock", 50, "cpu", autoreset_mode="DISABLED", threads=1)
     world.reset(seed=3)
-    agent, rows = Scripted(world), torch.zeros(50, dtype=torch.bool)
+    agent, rows = Scripted(world, noise, seed=1), torch.zeros(50, dtype=torch.bool)
     rows[[4, 31]] = True
     for _ in range(2):
         agent.reset(rows)
@@ -67,6 +68,8 @@ def test_a_script_is_led_anew_from_each_rows_start(monkeypatch: pytest.MonkeyPat
         assert torch.equal(agent.eval_action(obs), action) and not action[~rows].any()
         world.reset(options={"reset_mask": rows})
     assert led[0].rewards != led[2].rewards, "another start"
+    thumbs = torch.stack([hands.actions[0] for hands in led])[:, 2]
+    assert (len(thumbs.unique()) > 1) == (noise > 0), "what is not led moves by noise alone"
 
 
 @pytest.mark.slow

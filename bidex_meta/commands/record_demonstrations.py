@@ -11,13 +11,15 @@ from bidex_meta.errors import BidexError
 from bidex_meta.sources import Source
 
 if TYPE_CHECKING:
-    from bidex_meta.witness.open_loop import OpenLoop
+    from bidex_meta.witness.open_loop import Played
 
 SIZE, ROWS, ROWS_OF_TASKS = 20_000, 32, 200
 """Transitions, and replays played together from shifted starts or on all tasks, where nobody says otherwise."""
 FAILED = "unsuccessful_episodes"
 _PATIENCE = 3
 """Rounds in which nothing has to succeed."""
+_Player = Callable[[Any, float, int], "Played"]
+"""Makes an agent for a world, with so much noise from a seed."""
 
 
 def record_demonstrations(flags: Any, say: Callable[[str], None]) -> tuple[Path, str] | None:
@@ -79,7 +81,7 @@ def record_demonstrations(flags: Any, say: Callable[[str], None]) -> tuple[Path,
             while (now := standing(writer, 1)).steps[0] < size:
                 if not now.steps[0] and writer.parts >= _PATIENCE:
                     raise _nothing_succeeds(_PATIENCE * rows, source.name, flags)
-                _round(world, agent_of(world), writer, flags)
+                _round(world, agent_of, writer, flags)
                 after = standing(writer, 1)
                 kept = after.episodes[0] - now.episodes[0]
                 say(f"{after.steps[0]:,} of {size:,} transitions | {kept} of {rows} replays succeed")
@@ -94,17 +96,21 @@ def record_demonstrations(flags: Any, say: Callable[[str], None]) -> tuple[Path,
     return folder, name
 
 
-def _witness(name: str) -> Callable[[Any], "OpenLoop"]:
-    """What makes a player of the class's witness for a world."""
+def _witness(name: str) -> _Player:
+    """Plays the class's witness, noise on its actions."""
     from bidex_meta.witness.open_loop import OpenLoop
     from bidex_meta.witness.store import load_witness
 
     known = {name: load_witness(name)}
-    return lambda world: OpenLoop(known, [name], world.task_id, world.single_action_space.shape[0])
+
+    def agent(world: Any, noise: float, seed: int) -> "Played":
+        return OpenLoop(known, [name], world.task_id, world.single_action_space.shape[0], noise, seed)
+
+    return agent
 
 
-def _script(name: str) -> Callable[[Any], "OpenLoop"]:
-    """What makes a player of the class's script for a world."""
+def _script(name: str) -> _Player:
+    """Plays the class's script, which makes up for the noise on its actions."""
     from bidex_meta.witness.scripted import Scripted
     from bidex_meta.witness.scripts import script_of
 
@@ -119,8 +125,8 @@ def _nothing_succeeds(played: int, name: str, flags: Any) -> BidexError:
     return BidexError(f"None of {played} replays of {name}'s witness succeeds. Lower --noise or {other}.")
 
 
-def _round(world: Any, agent: "OpenLoop", writer: Any, flags: Any) -> None:
-    """Plays in every row what it is known to do, each with noise of its own."""
+def _round(world: Any, player: _Player, writer: Any, flags: Any) -> None:
+    """Plays an episode in every row, each with noise of its own."""
     from bidex_meta.data.episode import Episode
     from bidex_meta.data.episode_recorder import EpisodeRecorder
 
@@ -133,12 +139,9 @@ def _round(world: Any, agent: "OpenLoop", writer: Any, flags: Any) -> None:
     seeds = np.random.SeedSequence((flags.seed, writer.parts)).generate_state(2, np.uint32).tolist()
     recorder = EpisodeRecorder(world, sink)  # pyright: ignore[reportAbstractUsage]  # the wrapped world has all
     obs, _ = recorder.reset(seed=seeds[0])
-    generator = torch.Generator().manual_seed(seeds[1])
-    over = torch.zeros(world.num_envs, dtype=torch.bool)
+    agent, over = player(world, flags.noise, seeds[1]), torch.zeros(world.num_envs, dtype=torch.bool)
     agent.reset(~over)
     while not bool(over.all()):
-        action = agent.eval_action(obs)
-        noise = flags.noise * torch.randn(action.shape, generator=generator)
-        obs, *_, info = recorder.step((action + noise).clamp(-1.0, 1.0))
+        obs, *_, info = recorder.step(agent.eval_action(obs))
         over |= info["_final_obs"]
     writer.commit()

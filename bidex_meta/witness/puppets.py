@@ -38,6 +38,8 @@ class Puppets:
 
     Args:
         simulator: Its rows are the copies that a script watches, and does the same in.
+        noise: Standard deviation of Gaussian noise on each action, which the script then makes up for.
+        generator: Of the noise.
 
     Attributes:
         actions: What was done so far, each (action_size,).
@@ -46,8 +48,8 @@ class Puppets:
         episode_steps: Time limit, control steps.
     """
 
-    def __init__(self, simulator: Simulator):
-        self._simulator = simulator
+    def __init__(self, simulator: Simulator, noise: float = 0.0, generator: torch.Generator | None = None):
+        self._simulator, self._noise, self._generator = simulator, noise, generator
         self.actions: list[Tensor] = []
         self.rewards: list[float] = []
         self.success: list[bool] = []
@@ -112,7 +114,9 @@ class Puppets:
                 action[i * half :][: self._joints] = self._fingers[side]
                 action[i * half + self._joints :][:3] = (way / self._full_speed).float().clamp(-1.0, 1.0)
                 action[i * half + self._joints :][3:6] = self._torque(side).float()
-            action = quantised(action)
+            if self._noise:
+                action += self._noise * torch.randn(action.shape, generator=self._generator)
+            action = quantised(action.clamp(-1.0, 1.0))
             trace = self._simulator.play(action.expand(1, self._simulator.num, -1))
             self.actions.append(action)
             self.rewards.append(float(trace.rewards[0, 0]))
