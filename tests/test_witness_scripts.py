@@ -10,6 +10,7 @@ from bidex_meta.hands.hand import hand
 from bidex_meta.witness.puppets import Puppets, shifted_puppets
 from bidex_meta.witness.scripted import Scripted
 from bidex_meta.witness.scripts import SCRIPTS, script_of
+from bidex_meta.witness.simulator import Simulator
 from bidex_meta.witness.store import load_witness
 
 
@@ -38,7 +39,7 @@ def test_bent_fingers_are_those_of_the_joint_table(hands: Puppets) -> None:
 
 
 def test_a_class_without_a_script_is_refused() -> None:
-    with pytest.raises(BidexError, match="GraspAndPlace, LiftUnderarm, PourWater, StackBlock"):
+    with pytest.raises(BidexError, match="DoorOpenInward, GraspAndPlace, LiftUnderarm, PourWater, StackBlock"):
         script_of("HandOver")
 
 
@@ -70,6 +71,15 @@ def test_a_script_is_led_anew_from_each_rows_start(noise: float, monkeypatch: py
     assert led[0].rewards != led[2].rewards, "another start"
     thumbs = torch.stack([hands.actions[0] for hands in led])[:, 2]
     assert (len(thumbs.unique()) > 1) == (noise > 0), "what is not led moves by noise alone"
+
+
+@pytest.mark.parametrize("name", ["DoorCloseOutward", "DoorOpenInward"])
+def test_both_leaves_are_pulled(name: str) -> None:
+    simulator = Simulator(name, 1, threads=1)
+    simulator.load(simulator.starts(0))
+    hands = Puppets(simulator)
+    script_of(name)(hands)
+    assert any(hands.success) and len(hands.actions) == hands.episode_steps
 
 
 @pytest.mark.slow

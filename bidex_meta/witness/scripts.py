@@ -11,6 +11,7 @@ from collections.abc import Callable
 from torch import Tensor
 
 from bidex_meta.errors import BidexError
+from bidex_meta.witness.door_scripts import close_outward, open_inward
 from bidex_meta.witness.puppets import Point, Puppets
 
 _FINGERS = 0.085
@@ -193,6 +194,8 @@ def _from(point: Tensor, x: float, y: float, height: float) -> Point:
 
 
 SCRIPTS: dict[str, Callable[[Puppets], None]] = {
+    "DoorCloseOutward": close_outward,
+    "DoorOpenInward": open_inward,
     "GraspAndPlace": grasp_and_place,
     "LiftUnderarm": lift_underarm,
     "PourWater": pour_water,
