@@ -92,6 +92,13 @@ def test_values_with_slashes_make_no_folders(tmp_path: Path) -> None:
         read_sweep(path)
 
 
+def test_a_flag_may_name_the_subject(tmp_path: Path) -> None:
+    path = tmp_path / "s.toml"
+    path.write_text(FILE.replace("steps = 6", 'steps = 6, demonstrations = "{subject}/script-v0"'))
+    run = read_sweep(path).runs[0]
+    assert run.subject == "HandOver" and "--demonstrations=HandOver/script-v0" in run.words
+
+
 def test_several_data_sets_are_named_one_by_one_as_run_takes_them(tmp_path: Path) -> None:
     from bidex_meta.commands.parsing import parse, peek_all
     from bidex_meta.commands.run_config import RunFlags
@@ -153,6 +160,9 @@ def test_what_run_would_refuse_is_told_before_anything_begins(tmp_path: Path, mo
 
 def test_the_sweeps_of_the_repository_are_what_run_takes(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
+    # Data sets are recorded before; which, the files say.
+    monkeypatch.setattr("bidex_meta.commands.run_demonstrations.named", lambda name: name)
+    monkeypatch.setattr("bidex_meta.commands.run_demonstrations.check", lambda *_: None)
     for path in sorted((ROOT / "results" / "sweeps").glob("*.toml")):
         if "seeds" in path.read_text():
             assert main(["sweep", str(path), "--dry-run"]) == 0

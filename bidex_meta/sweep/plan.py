@@ -24,6 +24,8 @@ def _list_of(rule: Rule) -> Rule:
     )
 
 
+_SUBJECT = "{subject}"
+"""In a flag's value: the run's suite or class."""
 _IN_NAMES = r"\w.+ -"
 _NAMED = Rule(
     "letters, digits, blanks and . + - _ (60 at most)",
@@ -158,8 +160,9 @@ def _runs(
         flags = [word for flag, value in {**overrides, **chosen, **own}.items() for word in _words(flag, value, path)]
         for kind, subject in named:
             given = str((path.parent / expanded(subject)).resolve()) if subject.endswith(".toml") else subject
-            name = f"{Path(short_name(subject)).stem}-{label}-seed{seed}".replace(" ", "-")
-            words = (f"--{kind}={given}", f"--algo={arm['algo']}", *flags)
+            called = Path(short_name(subject)).stem
+            name = f"{called}-{label}-seed{seed}".replace(" ", "-")
+            words = (f"--{kind}={given}", f"--algo={arm['algo']}", *(word.replace(_SUBJECT, called) for word in flags))
             yield PlannedRun(out / name, label, subject, seed, words)
 
 
