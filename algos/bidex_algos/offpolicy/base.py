@@ -45,8 +45,8 @@ class OffPolicy(Learner):
         critic: ``num_critics`` networks (:class:`Critics`); ``target_critic`` follows them.
         returns: How large those of each task are.
         adams: Optimisers by name; an algorithm may add some.
-        batch_per_task: Transitions of each task in an update; B is ``num_tasks`` times as many, task after task.
-        task_of_draw: Their tasks, int64 (B,).
+        batch_per_task: Transitions of each task in an update; B is ``num_tasks`` times as many, task after task:
+            ``task_of_draw``, int64 (B,).
         gamma_of_rows: Discount of all rows, or of each (N,); ``gamma_of_draw``: of the transitions of an update (B,).
 
     Raises:
@@ -63,8 +63,7 @@ class OffPolicy(Learner):
         super().__init__(world, config, seed)
         self.low_precision = use_bfloat16(config.autocast, self.device)
         judged = self.inputs.extended("action", self.shape.actions)
-        heads = world.num_tasks if config.value_heads else 1
-        self.critic = self._make_critics(judged, heads).to(self.device)
+        self.critic = self._make_critics(judged, world.num_tasks if config.value_heads else 1).to(self.device)
         self.target_critic = copy.deepcopy(self.critic)
         self.adams = {
             "actor": self._adam(self.policy.actor.parameters(), config.learning_rate),
@@ -143,11 +142,10 @@ class OffPolicy(Learner):
         actions = self._act(self.replay.obs)
         obs, reward, terminated, truncated, info = self.world.step(actions)
         self.replay.add(actions, reward, terminated, truncated, obs, info)
-        broken = info["unstable"]
-        self.returns.note(reward, terminated, truncated, broken)
+        self.returns.note(reward, terminated, truncated, info["unstable"])
         self.policy.observations.update(obs)
         self.episodes.update(info)
-        return broken.sum()
+        return info["unstable"].sum()
 
     def _act(self, obs: Tensor) -> Tensor:
         if self.replay.added < self.config.warmup_steps:
@@ -210,12 +208,9 @@ class OffPolicy(Learner):
 
         Args:
             loss: A scalar.
-            numbers: What shall be summed over the processes besides (n,).
+            numbers: What shall be summed over the processes besides (n,); the sums are returned.
             clipped: The optimiser whose gradient is shortened to ``max_grad_norm``.
             parameters: What each optimiser moves.
-
-        Returns:
-            The sums of the numbers (n,).
         """
         weights = [weight for each in parameters.values() for weight in each]
         for name in parameters:
