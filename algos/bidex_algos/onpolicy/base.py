@@ -83,8 +83,7 @@ class OnPolicy(Learner):
         self.low_precision = self.policy.low_precision
         self.obs: Tensor | None = None
         self.critic = self._make_critic(world.num_tasks if config.value_heads else 1).to(self.device)
-        samples = config.rollout_steps * world.num_envs
-        horizon = config.value_horizon * samples * world_size() / world.num_tasks
+        horizon = config.value_horizon * config.rollout_steps * world.num_envs * world_size() / world.num_tasks
         self.return_stats = RunningStats((self.num_critics * world.num_tasks,), max_count=horizon).to(self.device)
         self.gamma = discounts(world, config.gamma, world.task_id)
         sizes = self.shape.observations, self.shape.actions
