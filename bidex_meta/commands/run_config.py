@@ -64,9 +64,9 @@ class RunFlags:
     dataset: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """Learn from this data set (a name of `bidex-meta data list`, or a folder) instead of playing, with --algo bc, bcq,
     td3bc or iql, for the suite or task that it was recorded of. Given several times: from all of them."""
-    demonstrations: str | None = None
+    demonstrations: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """Imitate this data set too (as --dataset; see `bidex-meta record demonstrations`), ever less: with --algo mtppo
-    and ppo, see --learner.demonstration-weight."""
+    and ppo, see --learner.demonstration-weight. Given several times: all of them."""
     minutes: float | None = None
     """Minutes to train for, counted from the first step of the world and without the evaluation; training ends with
     whichever is up first, these or --steps. None: as long as --steps take."""
@@ -174,7 +174,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     sizes = run_offline.rows_and_steps(source) if kind.offline else source.rows_and_steps(device, kind.adapts)
     flags = parse(*_options(arguments, learner_default, {**stored, **implied}, sizes))
     run_offline.check(kind, flags.record, datasets, source)
-    data["demonstrations"] = run_demonstrations.named(flags.demonstrations)
+    data["demonstrations"] = run_demonstrations.named(arguments, stored)
     names = {"source": alone or source.name, "algo": kind.name, "preset": preset}
     data["task_seed"] = stored.get("task_seed", run_offline.task_seed(datasets))
     config = _resolved(flags, names, device, stored, data)
@@ -200,6 +200,7 @@ def _options(
         known["start_from"] = Path(known["start_from"])
     if "dataset" in known:
         known["dataset"] = tuple(known["dataset"])
+        known["demonstrations"] = run_demonstrations.listed(known["demonstrations"])
     default = options(**{"num_envs": rows, "steps": steps, **known, "learner": learner})
     return options, arguments, "run", default
 

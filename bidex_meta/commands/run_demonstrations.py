@@ -1,34 +1,52 @@
-"""What ``bidex-meta run --demonstrations`` adds: a data set that is imitated beside what is learned by playing."""
+"""What ``bidex-meta run --demonstrations`` adds: data sets that are imitated beside what is learned by playing."""
 
 import sys
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bidex_meta.commands.learners import ALGOS, LearnerKind, learner_kind
+from bidex_meta.commands.parsing import peek_all
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.reading import expanded
 from bidex_meta.sources import Source
 
 
-def named(name: str | None) -> str | None:
-    """The data set as a config keeps it: a folder stands with its whole path."""
-    return str(expanded(name).resolve()) if name is not None and expanded(name).is_dir() else name
+def listed(kept: str | Sequence[str] | None) -> tuple[str, ...]:
+    """The data sets of a config, which keeps none as None and a single one as its name."""
+    return () if kept is None else (kept,) if isinstance(kept, str) else tuple(kept)
 
 
-def check(kind: LearnerKind, name: str | None, source: Source) -> None:
-    """Refuses, before a world is made, what could not be imitated in it; reads the data set's metadata alone.
+def named(arguments: Sequence[str], stored: Mapping[str, Any]) -> str | list[str] | None:
+    """The data sets that the flags name, or those of the run to be resumed, as a config keeps them.
+
+    A folder stands with its whole path.
+    """
+    given = peek_all(arguments, "--demonstrations") or listed(stored.get("demonstrations"))
+    names = [str(expanded(name).resolve()) if expanded(name).is_dir() else name for name in given]
+    return names if len(names) > 1 else names[0] if names else None
+
+
+def check(kind: LearnerKind, kept: str | Sequence[str] | None, source: Source) -> None:
+    """Refuses, before a world is made, what could not be imitated in it; reads the data sets' metadata alone.
 
     Raises:
         BidexError: The learner takes none, there is no such data set, or it is of another class, of other bases or with
             other goals shown.
     """
-    if name is None:
+    names = listed(kept)
+    if not names:
         return
     if not kind.imitates:
         takers = ", ".join(each for each in ALGOS if learner_kind(each).imitates)
         raise BidexError(f"{kind.name} imitates nothing; --demonstrations goes with {takers}. Leave one of them out.")
     from bidex_meta.data import open_dataset
 
-    dataset, classes = open_dataset(name), source.task_classes()
+    for name in names:
+        _check_dataset(open_dataset(name), source)
+
+
+def _check_dataset(dataset: Any, source: Source) -> None:
+    classes = source.task_classes()
     for slot in dataset.metadata["tasks"]:
         known_name(f"class in {source.name} of", slot.partition("/")[0], classes)
     if dataset.metadata.get("hides_goals", source.hides_goals) != source.hides_goals:
@@ -41,12 +59,12 @@ def check(kind: LearnerKind, name: str | None, source: Source) -> None:
         )
 
 
-def give(name: str, learner: Any) -> None:
-    """Reads the data set and hands it to a fresh learner; errors as of ``join``."""
+def give(kept: str | Sequence[str], learner: Any) -> None:
+    """Reads the data sets and hands them to a fresh learner; errors as of ``join``."""
     from bidex_meta.data import open_dataset
     from bidex_meta.data.joined import join
 
-    dataset = open_dataset(name)
-    told = f"Demonstrations: {dataset.num_steps:,} transitions of {dataset.num_episodes:,} episodes."
-    print(told, file=sys.stderr, flush=True)
-    learner.learn_from_demonstrations(join([dataset], learner.world, every=False))
+    datasets = [open_dataset(name) for name in listed(kept)]
+    steps, episodes = sum(each.num_steps for each in datasets), sum(each.num_episodes for each in datasets)
+    print(f"Demonstrations: {steps:,} transitions of {episodes:,} episodes.", file=sys.stderr, flush=True)
+    learner.learn_from_demonstrations(join(datasets, learner.world, every=False))

@@ -9,6 +9,7 @@ from bidex_meta.reading import TABLE, TEXT, Rule, check, choice, exists, number,
 NAMES = ("suite", "task", "algo", "seed")
 """What every run's config holds."""
 
+_TEXTS = Rule("a list of texts", lambda value: isinstance(value, list) and all(map(TEXT.fits, value)))
 CONFIG = {
     "suite": TEXT.or_none(),
     "task": TEXT.or_none(),
@@ -25,9 +26,9 @@ CONFIG = {
     "evaluate_every": whole(1).or_none(),
     "video_every": whole(1).or_none(),
     "logger": TEXT,
-    "dataset": Rule("a list of texts", lambda value: isinstance(value, list) and all(map(TEXT.fits, value))),
+    "dataset": _TEXTS,
     "task_seed": whole(0).or_none(),
-    "demonstrations": TEXT.or_none(),
+    "demonstrations": Rule("a text, a list of texts or null", lambda x: x is None or TEXT.fits(x) or _TEXTS.fits(x)),
     "record": whole(0),
     "record_share": number(0.0, 1e15),
     "stop_at_return": number(-1e12, 1e12).or_none(),

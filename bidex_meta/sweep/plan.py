@@ -225,8 +225,9 @@ def _words(flag: str, value: Any, path: Path) -> list[str]:
         before, dot, last = flag.rpartition(".")
         return [f"--{flag}" if value else f"--{before}{dot}no-{last}"]
     if isinstance(value, list):
-        # Of this flag alone each value is given with its name: see RunFlags.
-        return [f"--{flag}={_told(each)}" for each in value] if flag == "dataset" else [f"--{flag}", *map(_told, value)]
+        # Of these flags alone each value is given with its name: see RunFlags.
+        many = flag in ("dataset", "demonstrations")
+        return [f"--{flag}={_told(each)}" for each in value] if many else [f"--{flag}", *map(_told, value)]
     return [f"--{flag}={_told(value)}"]
 
 

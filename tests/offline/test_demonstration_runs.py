@@ -167,3 +167,17 @@ def test_a_run_imitates_them_and_is_resumed(
     assert "Name the class" in told(capsys, "record", "demonstrations", code=2)
     assert "--shift must lie in" in told(capsys, *RECORD, "--shift", "1", code=2)
     assert not (sets / "bad").exists()
+
+
+def test_a_run_imitates_several_sets_and_is_resumed(sets: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    told(capsys, *RECORD, "--size", "200")
+    told(capsys, *RECORD, "--size", "200", "--seed", "1", "--out", sets / "other")
+    counts = [open_dataset(name).num_steps for name in ("HandOver/demonstrations-v0", sets / "other")]
+    shown = ["--demonstrations", "HandOver/demonstrations-v0", "--demonstrations", sets / "other"]
+    suite = ["--suite", "MT4", *RUN[7:], "--num-envs", "200", *shown]
+    assert f"Demonstrations: {sum(counts)} transitions" in told(capsys, "run", *suite, "--run-dir", sets / "many")
+    kept = ["HandOver/demonstrations-v0", str((sets / "other").resolve())]
+    assert RunFolder.open(sets / "many").config()["demonstrations"] == kept
+    told(capsys, "run", "--resume", sets / "many", "--steps", "1600", "--no-evaluate")
+    assert RunFolder.open(sets / "many").config()["demonstrations"] == kept
+    assert "Switch" in told(capsys, "run", "--task", "Switch", *RUN[5:], *shown, "--run-dir", sets / "bad", code=2)

@@ -104,15 +104,15 @@ def test_progress_without_a_terminal_is_one_plain_line(rare_lines):
 
 def test_time_left_is_that_of_what_ends_first(rare_lines):
     stream = io.StringIO()
-    progress = Progress(10**9, total_seconds=300.0, stream=stream)
+    progress = Progress(10**15, total_seconds=300.0, stream=stream)  # more steps than any machine's microseconds make
     progress.start()
     progress.update({"Perf/training_time": 60.0}, 10)
     progress.update({"Perf/training_time": 120.0}, 20)
     progress.update({"Perf/training_time": 301.0}, 30)
     progress.close()
     first, last = stream.getvalue().splitlines()
-    assert "10 / 1,000,000,000 steps" in first and "4:00 left" in first
-    assert "30 / 1,000,000,000 steps" in last and "0:00 left" in last
+    assert "10 / 1,000,000,000,000,000 steps" in first and "4:00 left" in first
+    assert "30 / 1,000,000,000,000,000 steps" in last and "0:00 left" in last
 
 
 def test_training_time_is_counted_over_resumes_and_known_of_older_runs():
