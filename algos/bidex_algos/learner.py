@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.experience.rollout import check_autoreset
+from bidex_algos.fitting import check_discounts, check_options
 from bidex_algos.nets.encoders.inputs import Inputs
 from bidex_algos.nets.encoders.point_net import with_point_net
 from bidex_algos.nets.encoders.task_embedding import with_task_embedding
@@ -71,23 +72,8 @@ class Learner(ABC):
         self.device = torch.device(world.device)
         self.env_steps = 0
         self.shape = Shape.of(world)
-        wanted = [option for option in ("policy_heads", "task_embedding") if getattr(config, option, False)]
-        if world.num_tasks == 1 and "task_embedding" in wanted:
-            wanted.remove("task_embedding")  # one task needs none; heads it cannot have
-        if not getattr(config, "shares_a_trunk", True):
-            wanted.append(f"architecture {config.architecture}")
-        for option in wanted:
-            if self.shape.num_id_columns != world.num_tasks:
-                raise BidexError(
-                    f"{self.name}: {option} needs the one-hot of {world.num_tasks} tasks in the observation (an MT "
-                    f"suite), this world shows {self.shape.num_id_columns} such entries. Leave {option} off."
-                )
-        own = [name for name, gamma in zip(world.task_names, world.gammas, strict=True) if gamma is not None]
-        if own and not self.discounts_by_class:
-            raise BidexError(
-                f"{self.name}: has one discount for all classes, but the suite gives {', '.join(own)} one of its own. "
-                "Leave gamma out of the suite's file."
-            )
+        check_options(self.name, config, world, self.shape)
+        check_discounts(self.name, world, self.discounts_by_class)
         self.inputs = self._inputs(config, self.shape)
         # Weights come from a CPU generator, so that a seed means the same network on every device.
         self.initial = torch.Generator().manual_seed(seed)
