@@ -16,10 +16,10 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.experience.rollout import check_autoreset
-from bidex_algos.fitting import check_discounts, check_options
 from bidex_algos.nets.encoders.inputs import Inputs
 from bidex_algos.nets.encoders.point_net import with_point_net
 from bidex_algos.nets.encoders.task_embedding import with_task_embedding
+from bidex_algos.nets.fitting import check_discounts, check_options
 from bidex_algos.nets.shape import Shape
 from bidex_algos.reports import check_finite
 from bidex_meta.agents import Agent
