@@ -69,8 +69,8 @@ def test_a_script_is_led_anew_from_each_rows_start(noise: float, monkeypatch: py
         assert torch.equal(agent.eval_action(obs), action) and not action[~rows].any()
         world.reset(options={"reset_mask": rows})
     assert led[0].rewards != led[2].rewards, "another start"
-    thumbs = torch.stack([hands.actions[0] for hands in led])[:, 2]
-    assert (len(thumbs.unique()) > 1) == (noise > 0), "what is not led moves by noise alone"
+    spread = torch.stack([hands.actions[0] for hands in led])[:, 2]  # of the forefinger
+    assert (len(spread.unique()) > 1) == (noise > 0), "what is not led moves by noise alone"
 
 
 @pytest.mark.parametrize("name", ["DoorCloseOutward", "DoorOpenInward"])

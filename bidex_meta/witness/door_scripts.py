@@ -47,7 +47,10 @@ def open_inward(hands: Puppets) -> None:
 
     def go(angles: Sequence[float], aside: float = 0.0, back: float = 0.0, steps: int = 1, speed: float = 0.6) -> None:
         """Hooks behind the bars of leaves that stand open by these angles, or ``aside`` and ``back`` of that."""
-        at = [leaf.place(leaf.along - 0.009 - aside, leaf.over + 0.01 + back, a) for leaf, a in _each(_INWARD, angles)]
+        at = [
+            leaf.place(leaf.along - 0.009 - aside, leaf.over + 0.01 + back, angle)
+            for leaf, angle in zip(_INWARD, angles, strict=True)
+        ]
         _lead(hands, at, angles, steps, speed)
 
     for side in SIDES:
@@ -69,7 +72,7 @@ def close_outward(hands: Puppets) -> None:
         """Fingers behind the bars of leaves that stand open by these angles, or ``back`` of that."""
         yaws = [0.8 * (first - angle) for first, angle in zip(start, angles, strict=True)]
         at = []
-        for (leaf, angle), yaw in zip(_each(_OUTWARD, angles), yaws, strict=True):
+        for leaf, angle, yaw in zip(_OUTWARD, angles, yaws, strict=True):
             x, y = leaf.place(leaf.along, leaf.over - 0.04, -angle)
             ahead, sine, cosine = _TO_FINGERS + back, math.sin(yaw), math.cos(yaw)
             at.append((x + ahead * cosine + _TO_PALM * sine, y + ahead * sine - _TO_PALM * cosine))
@@ -88,10 +91,6 @@ def close_outward(hands: Puppets) -> None:
 def _angles(hands: Puppets) -> list[float]:
     """How far the right and the left leaf stand open, rad."""
     return [float(hands.where(f"object/hinge{leaf}_angle")) for leaf in (1, 2)]
-
-
-def _each(leaves: Sequence[_Leaf], angles: Sequence[float]) -> list[tuple[_Leaf, float]]:
-    return list(zip(leaves, angles, strict=True))
 
 
 def _lead(hands: Puppets, at: Sequence[tuple[float, float]], yaws: Sequence[float], steps: int, speed: float) -> None:

@@ -1,0 +1,138 @@
+"""What a sweep's file asks for: names, words, order, the grid; and files that are wrong."""
+
+from pathlib import Path
+
+import pytest
+
+from bidex_meta.cli import main
+from bidex_meta.errors import BidexError
+from bidex_meta.sweep.plan import read_sweep
+from tests.pages import ROOT
+
+FILE = """
+name = "tiny"
+tasks = ["HandOver"]
+algos = ["ppo"]
+seeds = [0, 1]
+overrides = { steps = 6, num_envs = 8 }
+"""
+
+
+def test_seeds_are_outermost_and_words_are_those_of_run(tmp_path: Path) -> None:
+    path = tmp_path / "s.toml"
+    path.write_text(
+        'name = "two words"\nsuites = ["MT4", "own.toml"]\nalgos = ["mtppo"]\nseeds = [3, 1]\n'
+        "[overrides]\nsteps = 1_000\nlearner.hidden = [64, 32]\n[grid]\nlearner.gamma = [0.9, 0.99]\n"
+        '[[arms]]\nname = "my arm"\nalgo = "mtsac"\ntasks = ["HandOver"]\n'
+        "overrides = { learner = { policy_heads = false } }\n"
+    )
+    sweep = read_sweep(path)
+    names = [run.name for run in sweep.runs]
+    half = len(names) // 2
+    assert all("seed3" in name for name in names[:half]) and all("seed1" in name for name in names[half:])
+    assert names[:5] == [
+        "MT4-mtppo-gamma=0.9-seed3", "own-mtppo-gamma=0.9-seed3", "MT4-mtppo-gamma=0.99-seed3",
+        "own-mtppo-gamma=0.99-seed3", "HandOver-my-arm-gamma=0.9-seed3",
+    ]  # fmt: skip
+    assert sweep.runs[1].words[0] == f"--suite={tmp_path / 'own.toml'}" and sweep.out == Path("runs/two-words")
+    assert sweep.runs[4].begin == [
+        "run", "--task=HandOver", "--algo=mtsac", "--steps=1000", "--learner.hidden", "64", "32", "--learner.gamma=0.9",
+        "--learner.no-policy-heads", "--seed=3", "--threads=1",
+        "--run-dir=runs/two-words/HandOver-my-arm-gamma=0.9-seed3",
+    ]  # fmt: skip
+    assert sweep.runs[4].go_on == ["run", f"--resume={sweep.runs[4].path}", "--steps=1000"]
+
+
+def test_values_with_slashes_make_no_folders(tmp_path: Path) -> None:
+    path = tmp_path / "s.toml"
+    path.write_text(
+        FILE.replace('"ppo"', '"bc"') + '[grid]\ndataset = ["HandOver/medium-v0", "/data/mine", ["a/x", "b/x"]]\n'
+        "learner.gamma = [-0.5]\n"
+    )
+    runs = read_sweep(path).runs[:3]
+    told = ["HandOver-medium-v0", "data-mine", "a-xxb-x"]
+    assert [run.name for run in runs] == [f"HandOver-bc-dataset={each}-gamma=-0.5-seed0" for each in told]
+    assert [run.arm for run in runs] == [f"bc dataset={each} gamma=-0.5" for each in told]
+    assert all(run.path.parent == Path("runs/tiny") for run in runs)
+    path.write_text(path.read_text().replace('"/data/mine"', '"HandOver-medium-v0"'))
+    with pytest.raises(BidexError, match="two runs are called HandOver-bc-dataset=HandOver-medium-v0"):
+        read_sweep(path)
+
+
+def test_a_flag_may_name_the_subject(tmp_path: Path) -> None:
+    path = tmp_path / "s.toml"
+    path.write_text(FILE.replace("steps = 6", 'steps = 6, demonstrations = "{subject}/script-v0"'))
+    run = read_sweep(path).runs[0]
+    assert run.subject == "HandOver" and "--demonstrations=HandOver/script-v0" in run.words
+
+
+def test_several_data_sets_are_named_one_by_one_as_run_takes_them(tmp_path: Path) -> None:
+    from bidex_meta.commands.parsing import parse, peek_all
+    from bidex_meta.commands.run_config import RunFlags
+
+    path = tmp_path / "s.toml"
+    path.write_text(FILE.replace("steps = 6", 'steps = 6, dataset = ["a/x", "b/x"]'))
+    words = read_sweep(path).runs[0].words
+    assert peek_all(words, "--dataset") == ["a/x", "b/x"]
+    assert parse(RunFlags, words, "run").dataset == ("a/x", "b/x")
+
+
+def test_an_arm_that_sets_a_key_of_the_grid_is_not_run_once_a_value(tmp_path: Path) -> None:
+    path = tmp_path / "s.toml"
+    path.write_text(
+        FILE.replace("[0, 1]", "[0]") + "[grid]\nnum_envs = [8, 16]\nlearner.gamma = [0.8, 0.9]\n"
+        '[[arms]]\nname = "x"\nalgo = "ppo"\noverrides = { num-envs = 4 }\n'
+    )
+    runs = [run for run in read_sweep(path).runs if run.arm.startswith("x")]
+    assert [run.arm for run in runs] == ["x gamma=0.8", "x gamma=0.9"]
+    assert [word for word in runs[0].words if word.startswith("--num-envs")][-1] == "--num-envs=4"
+    assert len(read_sweep(path).runs) == 4 + 2
+
+
+@pytest.mark.parametrize(
+    "change, told",
+    [
+        (("seeds = [0, 1]", "seeds = []"), "seeds: expected a list, each entry a whole number"),
+        (("seeds = [0, 1]", "seeds = [0, 0]"), "two runs are called HandOver-ppo-seed0"),
+        (("algos", "algoss"), "algoss: Unknown entry 'algoss'"),
+        (('algos = ["ppo"]', ""), "expected algos"),
+        (('tasks = ["HandOver"]', ""), "expected suites or tasks"),
+        (('"tiny"', '"../up"'), "name: expected letters, digits"),
+        (("steps = 6", "seed = 6"), "overrides.seed: the file's"),
+        (("steps = 6", "threads = 6"), "overrides.threads: the file's"),
+        (("[0, 1]", "[0, 1]\ngrid = { num_envs = 3 }"), "grid.num_envs: expected a list of values"),
+        (("[0, 1]", '[0, 1]\narms = [{ name = "x" }]'), r"arms\[1\].algo: expected it to be there"),
+        (("[0, 1]", "[0, 1"), "expected a sweep in TOML"),
+    ],
+)
+def test_a_bad_file_is_one_line(tmp_path: Path, change: tuple[str, str], told: str) -> None:
+    file = tmp_path / "s.toml"
+    file.write_text(FILE.replace(*change))
+    with pytest.raises(BidexError, match=told):
+        read_sweep(file)
+
+
+def test_what_run_would_refuse_is_told_before_anything_begins(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    for change, told in (
+        (('["ppo"]', '["ppoo"]'), "ppoo on HandOver: Unknown algo 'ppoo'"),
+        (('"HandOver"', '"HandOvr"'), "Unknown task 'HandOvr'"),
+        (("steps = 6", 'learner = { gama = "x" }'), "Unknown flag --learner.gama of bidex-meta run"),
+        (("steps = 6", "learner = { gamma = 3.0 }"), "gamma"),
+    ):
+        Path("s.toml").write_text(FILE.replace(*change))
+        assert main(["sweep", "s.toml"]) == 2
+        error = capsys.readouterr().err
+        assert told in error and error.count("\n") == 1 and not Path("runs").exists()
+
+
+def test_the_sweeps_of_the_repository_are_what_run_takes(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    # Data sets are recorded before; which, the files say.
+    monkeypatch.setattr("bidex_meta.commands.run_offline.opened", lambda names: [])
+    monkeypatch.setattr("bidex_meta.commands.run_offline.check", lambda *_: None)
+    for path in sorted((ROOT / "results" / "sweeps").glob("*.toml")):
+        if "seeds" in path.read_text():
+            assert main(["sweep", str(path), "--dry-run"]) == 0
+            assert f"--run-dir=runs/{path.stem}/" in capsys.readouterr().out
+    assert not (tmp_path / "runs").exists()
