@@ -89,6 +89,20 @@ def test_an_arm_that_sets_a_key_of_the_grid_is_not_run_once_a_value(tmp_path: Pa
     assert len(read_sweep(path).runs) == 4 + 2
 
 
+def test_an_arm_may_leave_seeds_out(tmp_path: Path) -> None:
+    path = tmp_path / "s.toml"
+    path.write_text(
+        FILE + '[[arms]]\nname = "x"\nalgo = "ppo"\nseeds = [1]\n'
+        '[[arms]]\nname = "y"\nalgo = "ppo"\nstart_from = "ppo"\nseeds = [0]\n'
+    )
+    runs = read_sweep(path).runs
+    assert [(run.arm, run.seed) for run in runs] == [("ppo", 0), ("y", 0), ("ppo", 1), ("x", 1)]
+    assert runs[1].after == runs[0].path
+    path.write_text(path.read_text().replace('start_from = "ppo"', 'start_from = "x"'))
+    with pytest.raises(BidexError, match="the arm 'x', of which there are 0 runs on HandOver"):
+        read_sweep(path)
+
+
 @pytest.mark.parametrize(
     "change, told",
     [
@@ -102,6 +116,10 @@ def test_an_arm_that_sets_a_key_of_the_grid_is_not_run_once_a_value(tmp_path: Pa
         (("steps = 6", "threads = 6"), "overrides.threads: the file's"),
         (("[0, 1]", "[0, 1]\ngrid = { num_envs = 3 }"), "grid.num_envs: expected a list of values"),
         (("[0, 1]", '[0, 1]\narms = [{ name = "x" }]'), r"arms\[1\].algo: expected it to be there"),
+        (
+            ("[0, 1]", '[0, 1]\narms = [{ name = "x", algo = "ppo", seeds = [2] }]'),
+            "expected seeds of the file's .0, 1., got",
+        ),
         (("[0, 1]", "[0, 1"), "expected a sweep in TOML"),
     ],
 )

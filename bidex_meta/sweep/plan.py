@@ -42,7 +42,7 @@ _FILE = {
     "arms": Rule("a list of tables", lambda value: isinstance(value, list) and all(map(TABLE.fits, value))),
     "slurm": TABLE,
 }
-_ARM = {**_SUBJECTS, "name": _NAMED, "algo": TEXT, "overrides": TABLE, "start_from": TEXT}
+_ARM = {**_SUBJECTS, "name": _NAMED, "algo": TEXT, "seeds": _FILE["seeds"], "overrides": TABLE, "start_from": TEXT}
 
 
 @dataclass(frozen=True)
@@ -145,8 +145,13 @@ def _runs(
     shared: tuple[Mapping[str, Any], Mapping[str, Sequence[Any]]],
     out: Path,
 ) -> Iterator[PlannedRun]:
-    """The runs of an arm on one seed: all its subjects with every combination of the grid."""
+    """The runs of an arm on one seed: all its subjects with every combination of the grid; none on a seed it leaves."""
     _check(arm, _ARM, path, ("name", "algo"), f"arms[{place}].")
+    seeds = arm.get("seeds", content["seeds"])
+    if not set(seeds) <= set(content["seeds"]):
+        raise BidexError(f"{path}: arms[{place}].seeds: expected seeds of the file's {content['seeds']}, got {seeds}.")
+    if seed not in seeds:
+        return
     own = flat(arm.get("overrides", {}))
     _refuse_own(own, path, f"arms[{place}].overrides")
     overrides, grid = shared[0], _varied(shared[1], own)
