@@ -73,7 +73,7 @@ class OffPolicyConfig(ArchitectureConfig):
     per_task_rewards: bool = True
     """Divide rewards, when they are drawn, by the running standard deviation of their task's discounted return."""
     autocast: Autocast = "auto"
-    """Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX."""
+    """Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX or AVX-512's BF16."""
 
     def __post_init__(self) -> None:
         """Rejects values that could only fail later.

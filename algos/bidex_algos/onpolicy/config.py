@@ -49,7 +49,7 @@ class OnPolicyConfig(ArchitectureConfig):
     per_task_advantages: bool = True
     """Normalise advantages within each task instead of over the whole batch."""
     autocast: Autocast = "auto"
-    """Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX."""
+    """Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX or AVX-512's BF16."""
 
     def __post_init__(self) -> None:
         """Rejects values that could only fail later.
