@@ -1,6 +1,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -31,19 +32,23 @@ def random_actions(steps: int) -> torch.Tensor:
     return quantised(2.0 * torch.rand(steps, 52, generator=torch.Generator().manual_seed(3)) - 1.0)
 
 
-def test_the_simulator_plays_what_the_world_plays() -> None:
+@pytest.mark.parametrize("name", ["HandOver", "TwoCatchUnderarm"])
+def test_the_simulator_plays_what_the_world_plays(name: str) -> None:
     actions = random_actions(40)
-    simulator = Simulator("HandOver", 2, threads=1)
+    simulator = Simulator(name, 2, threads=1)
     trace = simulator.play(actions[:, None].expand(-1, 2, -1))
-    world = World([task_slot("HandOver")], 1, autoreset_mode="DISABLED", seed=0, threads=1)
+    world = World([task_slot(name)], 1, autoreset_mode="DISABLED", seed=0, threads=1)
     world.reset(seed=0)
-    rewards, success, ended = [], [], False
+    rewards, least, success, ended = [], [], [], False
     for action in actions:
         _, reward, terminated, truncated, info = world.step(action[None])
+        terms = [float(term[0]) for term in info["reward_terms"].values()]
         rewards.append(0.0 if ended else float(reward[0]))
+        least.append(0.0 if ended else len(terms) * min(terms))
         success.append(bool(info["success"][0]) and not ended)
         ended |= bool(terminated[0] | truncated[0])
     np.testing.assert_allclose(trace.rewards[:, 0].float().numpy(), np.array(rewards, np.float32), rtol=1e-6)
+    np.testing.assert_allclose(trace.least[:, 0].numpy(), np.array(least), rtol=1e-5)
     assert trace.success[:, 0].tolist() == success
     assert bool(trace.alive[0]) == (not ended)
     torch.testing.assert_close(trace.rewards[:, 0], trace.rewards[:, 1], rtol=0, atol=0)
@@ -126,6 +131,19 @@ def test_a_plan_that_is_shifted_says_the_same_of_the_same_moment(horizon: int, k
     moved = shifted(line, steps, horizon)
     expected = (torch.linspace(0.0, horizon - 1.0, knots) + steps).clamp(max=horizon - 1.0) / (horizon - 1.0)
     torch.testing.assert_close(moved[:, 0], expected, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("objective", ["reward", "least"])
+def test_a_plan_is_chosen_by_what_the_objective_says(objective: Literal["reward", "least"]) -> None:
+    planner = Planner("TwoCatchUnderarm", replace(SMALL, objective=objective, gamma=1.0, effort=0.0), threads=1)
+    knots = 2.0 * torch.rand(6, 3, 52, generator=torch.Generator().manual_seed(1)) - 1.0
+    states = planner.simulator.starts(0)
+    scores, _ = planner._try(states, knots)
+    planner.simulator.load(states)
+    trace = planner.simulator.play(quantised(torch.einsum("hk,nka->hna", interpolation(6, 3), knots)))
+    earned = trace.rewards if objective == "reward" else trace.least
+    torch.testing.assert_close(scores, earned.sum(0))
+    assert not torch.allclose(trace.rewards, trace.least)
 
 
 def test_mutants_change_a_few_actions_or_one_part_of_the_hands() -> None:

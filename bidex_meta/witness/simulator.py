@@ -26,6 +26,8 @@ class Trace:
 
     rewards: Tensor
     """Unscaled reward (T, N), float64; 0 from the step after an end on."""
+    least: Tensor
+    """The least of the reward's terms, times their number; else as ``rewards``."""
     success: Tensor
     """Bool (T, N), counted until the end of the episode."""
     alive: Tensor
@@ -112,18 +114,20 @@ class Simulator:
     def play(self, actions: Tensor, each_step: Callable[[], None] | None = None) -> Trace:
         """Plays actions (T, N, action_size) in [-1, 1] from where the rows stand, and calls back after each step."""
         alive = torch.ones(self.num, dtype=torch.bool)
-        rewards, success = [], []
+        rewards, least, success = [], [], []
         for action in actions:
             self._part.step(action, None)
             (_, _, state), *_ = self._part.states(self._world.task_index)
             transition = judge(self._part.group.members[0].scene.task, state)
             alive &= ~self._part.unstable()
+            terms = torch.stack(list(transition.terms.values()))
             rewards.append(torch.where(alive, transition.reward, 0.0))
+            least.append(torch.where(alive, len(terms) * terms.amin(0), 0.0))
             success.append(alive & transition.success)
             alive &= ~transition.failed
             if each_step is not None:
                 each_step()
-        return Trace(torch.stack(rewards), torch.stack(success), alive)
+        return Trace(torch.stack(rewards), torch.stack(least), torch.stack(success), alive)
 
     def sensor(self, name: str) -> Tensor:
         """A sensor's values in all rows, (N, k), a copy."""

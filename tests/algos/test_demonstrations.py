@@ -111,9 +111,21 @@ def test_a_cloned_policy_does_what_it_was_shown_before_it_learns_anything() -> N
     assert float((plain.eval_action(obs) - 0.4).abs().max()) > 0.2
 
 
+def test_the_critic_learns_alone_at_first_and_the_policy_stays_as_cloned() -> None:
+    config = replace(SMALL, demonstration_cloning=50, learning_rate=1e-2)
+    (cloned, _), (longer, told), (later, _) = (
+        trained(replace(config, critic_first=steps), shown(), iterations)
+        for steps, iterations in ((1, 1), (129, 3), (129, 4))
+    )
+    assert same(cloned, longer) and not same(longer, later)
+    assert told["Policy/kl"] == pytest.approx(0.0, abs=1e-6) and float(told["Policy/lr"]) == pytest.approx(1e-2)
+    critics = [list(learner.critic.parameters()) for learner in (cloned, longer)]
+    assert all(not torch.equal(a, b) for a, b in zip(*critics, strict=True))
+
+
 @pytest.mark.parametrize("cloning", [0, 5])
 def test_a_resumed_run_goes_on_bit_for_bit_with_its_own_data_alone(cloning: int) -> None:
-    config = replace(SMALL, demonstration_cloning=cloning)
+    config = replace(SMALL, demonstration_cloning=cloning, critic_first=12 * cloning)
     straight, _ = trained(config, shown(), 4)
     half, _ = trained(config, shown(), 2)
     state = {"learner": half.state_dict(), "env": half.world.state_dict()}
@@ -138,6 +150,7 @@ def test_a_resumed_run_goes_on_bit_for_bit_with_its_own_data_alone(cloning: int)
         {"demonstration_half_life": 0.0},
         {"demonstration_batch": 0},
         {"demonstration_cloning": -1},
+        {"critic_first": -1},
     ],
 )
 def test_settings_out_of_range_are_refused(wrong: dict[str, Any]) -> None:

@@ -93,9 +93,10 @@ class AdaptiveAdams(AdaptiveAdam):
         super().zero_grad()
         self.critic.zero_grad()
 
-    def step(self) -> None:
-        """One step of both."""
-        super().step()
+    def step(self, critic_alone: bool = False) -> None:
+        """One step of both, or of the critic alone."""
+        if not critic_alone:
+            super().step()
         self.critic.step()
 
     def parts(self) -> dict[str, Any]:

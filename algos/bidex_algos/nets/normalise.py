@@ -69,11 +69,13 @@ class ObservationNormaliser(nn.Module):
 
     Attributes:
         measured: The columns that are normalised: of all groups but ``inputs.unscaled``.
+        settled: While true, :meth:`update` leaves the statistics as they are.
     """
 
     def __init__(self, inputs: int | Inputs, enabled: bool = True, clip: float = 10.0):
         super().__init__()
         self.enabled = enabled
+        self.settled = False
         self.clip = clip
         inputs = Inputs.of(inputs)
         self.measured = inputs.columns(*(group.name for group in inputs.groups if group.name not in inputs.unscaled))
@@ -93,7 +95,7 @@ class ObservationNormaliser(nn.Module):
     @torch.no_grad()
     def update(self, obs: Tensor) -> None:
         """Takes (..., columns) raw observations, of all processes, into the statistics."""
-        if not self.enabled or self.measured.size == 0:
+        if not self.enabled or self.settled or self.measured.size == 0:
             return
         flat = self.measured(obs.reshape(-1, obs.shape[-1]))
         var, mean = torch.var_mean(flat, dim=0, correction=0)

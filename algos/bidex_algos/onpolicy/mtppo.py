@@ -64,11 +64,16 @@ class MTPPO(OnPolicy):
     def _iterate(self) -> dict[str, float]:
         if self.demonstrations is not None and self.config.demonstration_cloning and not self.env_steps:
             self.demonstrations.clone(self.policy)
+        self.policy.observations.settled = self._critic_alone()
         return super()._iterate()
 
     def _imitated(self) -> float:
         """Weight of the demonstrations in this update, 0 without any."""
         return 0.0 if self.demonstrations is None else self.demonstrations.weight(self.env_steps)
+
+    def _critic_alone(self) -> bool:
+        """Whether the policy stays as it is in this iteration, and with it what it sees."""
+        return self.env_steps < self.config.critic_first
 
     def _optimisers(self) -> dict[str, Any]:
         return self.adams.parts() | (self.balance.parts() if self.balance is not None else {})
@@ -83,12 +88,12 @@ class MTPPO(OnPolicy):
             part = batch.select(index)
             measured.append(self._gradients(part, count, old_log_std))
             # The first mini-batch compares the sampling policy with itself and says nothing about the step.
-            if not first:
+            if not first and not self._critic_alone():
                 self.adams.follow(measured[-1][2])
             actor_weights, critic_weights = list(actor.parameters()), list(self.critic.parameters())
             for weights in [actor_weights, critic_weights] if cfg.clip_apart else [actor_weights + critic_weights]:
                 nn.utils.clip_grad_norm_(weights, cfg.max_grad_norm)
-            self.adams.step()
+            self.adams.step(self._critic_alone())
             with torch.no_grad():
                 actor.log_std.clamp_(low, high)
                 if self.balance is not None:

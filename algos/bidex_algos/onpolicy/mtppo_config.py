@@ -42,6 +42,9 @@ class MTPPOConfig(PPOConfig, OnPolicyConfig):
     """Transitions of them in each mini-batch, of each process."""
     demonstration_cloning: int = 0
     """Steps of so many of them in which the policy is cloned before it plays."""
+    critic_first: int = 0
+    """Environment steps at the start in which the critic alone learns: for a policy that begins with a skill (cloned, or
+    of --start-from), which a critic that knows nothing would spoil."""
 
     def __post_init__(self) -> None:
         """Rejects values that could only fail later.
@@ -52,7 +55,7 @@ class MTPPOConfig(PPOConfig, OnPolicyConfig):
         super().__post_init__()
         self._check_ppo()
         positive(self, "max_grad_norm", "famo_rate")
-        at_least(self, 0, "famo_decay", "demonstration_weight", "demonstration_cloning")
+        at_least(self, 0, "famo_decay", "demonstration_weight", "demonstration_cloning", "critic_first")
         at_least(self, 1, "demonstration_batch")
         positive(self, "demonstration_half_life")
         if not 0.0 <= self.cagrad_radius < 1.0:
