@@ -1,7 +1,6 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -15,13 +14,13 @@ from bidex_meta.errors import BidexError
 from bidex_meta.record.versions import collect_versions
 from bidex_meta.sources.source import OwnSuite
 from bidex_meta.tasks import registry
-from bidex_meta.witness import steady
+from bidex_meta.witness import steady, whole
 from bidex_meta.witness.config import PlannerConfig
 from bidex_meta.witness.mutants import mutants, parts_of_the_hands
 from bidex_meta.witness.open_loop import OpenLoop
 from bidex_meta.witness.planner import LEVELS, Planner, interpolation, quantised, rest_action, shifted
 from bidex_meta.witness.replay import Replay, replay
-from bidex_meta.witness.simulator import SHIFT, Simulator, task_slot
+from bidex_meta.witness.simulator import SHIFT, Simulator, Trace, task_slot
 from bidex_meta.witness.store import Witness, load_witness, save_witness, witness_path
 from bidex_meta.world import World
 
@@ -133,19 +132,6 @@ def test_a_plan_that_is_shifted_says_the_same_of_the_same_moment(horizon: int, k
     torch.testing.assert_close(moved[:, 0], expected, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("objective", ["reward", "least"])
-def test_a_plan_is_chosen_by_what_the_objective_says(objective: Literal["reward", "least"]) -> None:
-    planner = Planner("TwoCatchUnderarm", replace(SMALL, objective=objective, gamma=1.0, effort=0.0), threads=1)
-    knots = 2.0 * torch.rand(6, 3, 52, generator=torch.Generator().manual_seed(1)) - 1.0
-    states = planner.simulator.starts(0)
-    scores, _ = planner._try(states, knots)
-    planner.simulator.load(states)
-    trace = planner.simulator.play(quantised(torch.einsum("hk,nka->hna", interpolation(6, 3), knots)))
-    earned = trace.rewards if objective == "reward" else trace.least
-    torch.testing.assert_close(scores, earned.sum(0))
-    assert not torch.allclose(trace.rewards, trace.least)
-
-
 def test_mutants_change_a_few_actions_or_one_part_of_the_hands() -> None:
     elites, generator = torch.zeros(1, 9, 52), torch.Generator().manual_seed(0)
     changed = (mutants(elites, 400, PlannerConfig(), generator) != 0).any(1)
@@ -171,7 +157,17 @@ def test_the_rest_action_holds_the_start() -> None:
     assert torch.equal(action[:26], action[26:])
 
 
-@pytest.mark.parametrize("words", [[], ["--task", "HandOver", "--all"], ["--task", "HandOve"]])
+@pytest.mark.parametrize(
+    "words",
+    [
+        [],
+        ["--task", "HandOver", "--all"],
+        ["--task", "HandOve"],
+        ["--task", "HandOver", "--whole", "3"],
+        ["--task", "HandOver", "--find", "--whole", "3"],
+        ["--task", "HandOver", "--find", "--exchange", "3"],
+    ],
+)
 def test_bad_calls_are_answered_in_one_line(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["witness", *words]) == 2
     assert capsys.readouterr().err.count("\n") == 1
@@ -215,6 +211,29 @@ def test_every_stored_witness_holds(name: str) -> None:
         f"{name}: success {result.first_success}, {result.succeeded} of 10 shifted starts, "
         f"on {here['platform']} with {here['packages']}; made on {witness.made['versions']}"
     )
+
+
+def test_a_search_of_whole_episodes_never_falls_behind_the_episode_it_began_with(tmp_path: Path) -> None:
+    actions = load_witness("HandOver").actions
+    seen: list[tuple[float, bool]] = []
+
+    def report(number: int, trace: Trace, best: int) -> None:
+        seen.append((float(trace.rewards[:, best].sum()), bool(trace.success[:, best].any())))
+
+    found = whole.searched("HandOver", actions, 2, report=report)
+    began, ended = (replay("HandOver", Witness(each, {}), threads=1) for each in (actions, found))
+    assert ended.total > began.total - 1.0 and ended.first_success is not None
+    assert all(success for _, success in seen) and seen[0][0] >= began.total - 1.0
+    assert np.abs(found * LEVELS - np.rint(found * LEVELS)).max() < 1e-4
+
+
+def test_exchanged_hands_are_each_others_turn_about_the_vertical() -> None:
+    actions = random_actions(6).numpy()
+    both = whole.exchanged(actions, 2)
+    assert np.array_equal(both[:2, :26], actions[:2, :26]) and np.array_equal(both[2:, 26:], actions[2:, 26:])
+    turned = both.reshape(6, 2, 26)[:, ::-1].copy()
+    turned[:, :, [20, 21, 23, 24]] *= -1.0
+    assert np.array_equal(turned.reshape(6, 52), both)
 
 
 def test_steadying_keeps_an_episode_that_nothing_betters(monkeypatch: pytest.MonkeyPatch) -> None:

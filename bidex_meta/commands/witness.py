@@ -12,6 +12,9 @@ from bidex_meta.memory import ROW_BYTES, check_memory
 from bidex_meta.witness.config import PlannerConfig
 
 if TYPE_CHECKING:
+    import numpy as np
+
+    from bidex_meta.witness.simulator import Trace
     from bidex_meta.witness.store import Witness
 
 
@@ -41,6 +44,10 @@ class WitnessFlags:
     """With --find: start from the episode in this file."""
     steady: int = 0
     """With --find and --improve: no search, but so many rounds of small changes that shall stand shifted starts."""
+    whole: int = 0
+    """With --find and --improve: so many rounds of whole episodes instead of plans that look some steps ahead."""
+    exchange: int = 0
+    """With --whole: the episode is of a throw from right to left. Both hands throw for so many steps, then catch."""
     script: Switch = False
     """With --find: play the class's script (bidex_meta/witness/scripts.py) instead of searching."""
     out: Path | None = None
@@ -60,7 +67,7 @@ def main(arguments: Sequence[str]) -> None:
     flags = parse(WitnessFlags, arguments, "witness")
     names = _names(flags)
     _check_files(flags)
-    find = _play_script if flags.script else _steady if flags.steady else _find
+    find = _play_script if flags.script else _steady if flags.steady else _whole if flags.whole else _find
     files = {name: find(name, flags) if flags.find else flags.file for name in names}
     rows = [_replay(name, file, flags.threads) for name, file in files.items()]
     if flags.out is not None:
@@ -78,8 +85,11 @@ def _names(flags: WitnessFlags) -> list[str]:
 
     if flags.all == (flags.task is not None):
         raise BidexError("witness: expected --task T or --all, got " + ("both." if flags.all else "neither."))
-    if (flags.improve is not None or flags.script) and not flags.find:
-        raise BidexError("witness: --improve and --script say how to find an episode; give them with --find.")
+    how = ("improve", "script", "steady", "whole", "exchange")
+    if not flags.find and (given := next((name for name in how if getattr(flags, name)), None)):
+        raise BidexError(f"witness: --{given} says how to find an episode; give it with --find.")
+    if flags.exchange and not flags.whole:
+        raise BidexError("witness: --exchange says what --whole begins with; give it with --whole ROUNDS.")
     if flags.all and (flags.out is not None or flags.file is not None or flags.improve is not None):
         raise BidexError("witness: films and files are of one class; give --task T with --out or --file.")
     return registry.names() if flags.task is None else [known_name("task", flags.task, registry.names())]
@@ -176,13 +186,8 @@ def _play_script(name: str, flags: WitnessFlags) -> Path | None:
 
 def _steady(name: str, flags: WitnessFlags) -> Path | None:
     """Makes an episode safer against shifted starts; where it is kept if it holds."""
-    import torch
-
-    from bidex_meta.record.versions import collect_versions
-    from bidex_meta.witness.replay import replay
-    from bidex_meta.witness.simulator import Simulator
     from bidex_meta.witness.steady import steadied
-    from bidex_meta.witness.store import Witness, load_witness
+    from bidex_meta.witness.store import load_witness
 
     if flags.improve is None:
         raise BidexError("witness: --steady makes an episode safer; give it with --improve FILE.")
@@ -192,11 +197,43 @@ def _steady(name: str, flags: WitnessFlags) -> Path | None:
         print(f"{name}: {solved} of 10 shifted starts, mean return {total:.3f}, deep states {deep:.1f}", flush=True)
 
     actions = steadied(name, earlier.actions, flags.steady, seed, flags.threads, report)
+    made = earlier.made | {"steadied": {"rounds": flags.steady, "seed": seed}}
+    return _keep_if_it_holds(name, actions, made, flags)
+
+
+def _whole(name: str, flags: WitnessFlags) -> Path | None:
+    """Searches whole episodes, from an earlier one; where the last round's best is kept if it holds."""
+    from bidex_meta.witness.store import load_witness
+    from bidex_meta.witness.whole import exchanged, searched
+
+    if flags.improve is None:
+        raise BidexError("witness: --whole goes on from an episode; give it with --improve FILE.")
+    earlier, seed = load_witness(name, flags.improve), flags.planner.seed
+    began = exchanged(earlier.actions, flags.exchange) if flags.exchange else earlier.actions
+
+    def report(number: int, trace: "Trace", best: int) -> None:
+        total, least = (float(x[:, best].sum()) for x in (trace.rewards, trace.least))
+        solved = int(trace.success.any(0).sum())
+        print(f"{name}: round {number}, return {total:.3f}, least term {least:.3f}, {solved} succeed", flush=True)
+
+    actions = searched(name, began, flags.whole, seed, flags.threads, report)
+    how = {"rounds": flags.whole, "exchange": flags.exchange, "seed": seed, "began_with": earlier.made}
+    return _keep_if_it_holds(name, actions, {"rival": None, "whole": how}, flags)
+
+
+def _keep_if_it_holds(name: str, actions: "np.ndarray", made: dict[str, Any], flags: WitnessFlags) -> Path | None:
+    """Where an episode is kept: if it stands shifted starts, or a file was named for it."""
+    import torch
+
+    from bidex_meta.record.versions import collect_versions
+    from bidex_meta.witness.replay import replay
+    from bidex_meta.witness.simulator import Simulator
+    from bidex_meta.witness.store import Witness
+
     trace = Simulator(name, 1, flags.threads).play(torch.from_numpy(actions)[:, None])
     won = trace.success[:, 0].nonzero().flatten().tolist()
-    made = earlier.made | {"return": float(trace.rewards.sum()), "first_success": won[0] if won else None}
-    made |= {"steadied": {"rounds": flags.steady, "seed": seed}, "versions": collect_versions()}
-    witness = Witness(actions, made)
+    made = made | {"return": float(trace.rewards.sum()), "first_success": won[0] if won else None}
+    witness = Witness(actions, made | {"versions": collect_versions()})
     holds = flags.file is not None or replay(name, witness, flags.threads).found
     return _keep(name, witness, flags) if holds else None
 

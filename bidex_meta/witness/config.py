@@ -1,7 +1,6 @@
 """What can be set about the planner; imports no torch, so that a command line can show it at once."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 from bidex_meta.errors import BidexError
 from bidex_meta.fields import check_fields
@@ -11,9 +10,6 @@ from bidex_meta.fields import check_fields
 class PlannerConfig:
     """Everything that can be set about the planner."""
 
-    objective: Literal["reward", "least"] = "reward"
-    """What a plan is chosen by: the printed reward, or the least of its terms times their number, where one term alone
-    pays so much that a plan never gives it up for both (TwoCatchUnderarm)."""
     samples: int = 128
     """Action sequences per round."""
     copies: int = 1

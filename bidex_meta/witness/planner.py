@@ -133,15 +133,14 @@ class Planner:
     def _try(self, states: list[State], knots: Tensor) -> tuple[Tensor, Tensor]:
         """Score (samples,) of sequences, equal shares of them played from each state, and who succeeds.
 
-        The score is the discounted sum of what the config's ``objective`` says, less effort.
+        The score is the discounted sum of reward less effort.
         """
         self.simulator.load(states)
         actions = quantised(torch.einsum("hk,nka->hna", self._weights, knots))
         trace = self.simulator.play(actions)
         effort = self.config.effort * actions[:, :, self._of_bases].square().sum(2)
         discount = self.config.gamma ** torch.arange(self.config.horizon, dtype=torch.float64)
-        earned = trace.least if self.config.objective == "least" else trace.rewards
-        return (discount[:, None] * (earned - effort)).sum(0), trace.success.any(0)
+        return (discount[:, None] * (trace.rewards - effort)).sum(0), trace.success.any(0)
 
     def _to_the_end(self, state: State, knots: Tensor, played: int) -> list[float]:
         """What is still to come of the episode's reward if these sequences (n, K, a) are played, the last action held.

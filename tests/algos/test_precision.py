@@ -1,5 +1,6 @@
 import pytest
 import torch
+
 from bidex_algos.nets.precision import use_bfloat16
 
 CPU = torch.device("cpu")

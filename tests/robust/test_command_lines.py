@@ -30,7 +30,8 @@ FLAGS = {
     "plot": "evaluation out",
     "report": "out",
     "render": "task out policy checkpoint suite seed steps every width height camera",
-    "witness": "task tries file improve steady out camera threads planner.samples planner.horizon planner.std",
+    "witness": "task tries file improve steady whole exchange out camera threads planner.samples "
+    "planner.horizon planner.std",
     "baseline": "suite episodes seed threads runs out",
     "list": "",
     "completion": "",

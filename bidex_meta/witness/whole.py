@@ -1,0 +1,118 @@
+"""The cross-entropy method over whole episodes, from an earlier one: for what a receding horizon gives up too early.
+
+In TwoCatchUnderarm one egg that is caught pays more than both in the air, so a plan of forty steps keeps the other.
+Here an episode is judged to its end, by its return and by the least of the reward's terms, which one egg alone does
+not raise.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bidex_meta.hands.pair import SIDES
+from bidex_meta.witness.planner import interpolation, quantised
+from bidex_meta.witness.simulator import SEED, Simulator, Trace
+
+_SAMPLES, _ELITES, _KEPT = 256, 14, 10
+_SPACING = 3
+"""Control steps between knots."""
+_STD, _LEAST_STD = 0.4, 0.12
+_SUCCESS, _LASTING = 5.0, 0.2
+"""What an episode's success is worth in units of return, and each step that it lasts."""
+_TURNED = (20, 21, 23, 24)
+"""Forces and torques of a base along x and y: a turn by 180 degrees about the vertical reverses them."""
+
+
+def searched(
+    name: str,
+    actions: np.ndarray,
+    rounds: int,
+    seed: int = 0,
+    threads: int | None = None,
+    report: Callable[[int, Trace, int], None] | None = None,
+) -> np.ndarray:
+    """The best episode of the last round, (T, action_size), multiples of 1/127.
+
+    Args:
+        name: The class.
+        actions: The episode to begin with, (T, action_size); its last action is held.
+        rounds: Rounds of 256 episodes, in turns from the start and from one that is shifted.
+        seed: Of changes and of the shifted start.
+        threads: Engine threads; None takes all CPUs.
+        report: Called after every round with its number, what happened, and the best row.
+    """
+    simulator, generator = Simulator(name, _SAMPLES, threads), torch.Generator().manual_seed(seed)
+    steps = simulator.episode_steps
+    states = simulator.starts(1, seed=1 + SEED + seed)
+    base = torch.from_numpy(actions)[torch.arange(steps).clamp(max=len(actions) - 1)]
+    knots = steps // _SPACING + 1
+    weights = interpolation(steps, knots)
+    mean = torch.linalg.lstsq(weights, base).solution
+    rest = base - weights @ mean  # what the knots cannot say stays as it is
+    std, elites, best = torch.full_like(mean, _STD), mean[None], base
+    for number in range(rounds):
+        tried = _tries(mean, std, elites, generator)
+        played = quantised(torch.einsum("tk,nka->tna", weights, tried) + rest[:, None])
+        simulator.load([states[number % len(states)]])
+        trace = simulator.play(played)
+        order = _worth(trace).argsort(descending=True)
+        chosen, elites = tried[order[:_ELITES]], tried[order[:_KEPT]]
+        mean = 0.5 * (mean + chosen.mean(0))
+        std = (0.6 * std + 0.4 * chosen.std(0)).clamp(min=_LEAST_STD)
+        best = played[:, order[0]]
+        if report is not None:
+            report(number, trace, int(order[0]))
+    simulator.close()
+    return best.numpy()
+
+
+def _worth(trace: Trace) -> Tensor:
+    lasting = trace.success.double().sum(0)
+    return (trace.rewards + trace.least).sum(0) + _SUCCESS * trace.success.any(0) + _LASTING * lasting
+
+
+def _tries(mean: Tensor, std: Tensor, elites: Tensor, generator: torch.Generator) -> Tensor:
+    """Knots to try (samples, K, a): the elites, mutants of them, draws around the mean."""
+    knots, size = mean.shape
+    count = _SAMPLES - len(elites)
+    scale = torch.logspace(0.0, -1.3, count)[:, None, None]
+    drawn = mean + scale * std * torch.randn(count, knots, size, generator=generator)
+    parents = elites[torch.randint(len(elites), (count * 2 // 3,), generator=generator)]
+    drawn[: len(parents)] = _mutants(parents, generator)
+    return torch.cat((elites, drawn.clamp(-1.0, 1.0)))
+
+
+def _mutants(parents: Tensor, generator: torch.Generator) -> Tensor:
+    """Parents (n, K, a), each changed in some of its actions for a while."""
+    count, knots, size = parents.shape
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator)
+
+    middle, width = knots * uniform(count, 1), 1.0 + 6.0 * uniform(count, 1)
+    within = (torch.arange(knots) - middle).abs() < width
+    changed = within[:, :, None] & (uniform(count, 1, size) < 0.03 + 0.3 * uniform(count, 1, 1))
+    far = (3.0 * uniform(count, 1, 1) - 3.5).exp()
+    return torch.where(changed, parents + far * torch.randn(parents.shape, generator=generator), parents)
+
+
+def exchanged(actions: np.ndarray, give: int) -> np.ndarray:
+    """What both hands do if each throws like the right one and catches like the left one of an episode.
+
+    Both are right hands, one turned by 180 degrees about the vertical.
+
+    Args:
+        actions: Of moving bases, (T, 52): the right hand throws what the left one catches.
+        give: Steps after which the hands do not throw any more.
+
+    Returns:
+        Actions (T, 52).
+    """
+    hand = actions.shape[1] // len(SIDES)
+    right, left = actions[:, :hand], actions[:, hand:]
+    turn = np.ones(hand, np.float32)
+    turn[list(_TURNED)] = -1.0
+    first = np.concatenate((right[:give], turn * left[give:]))
+    return np.concatenate((first, np.concatenate((turn * right[:give], left[give:]))), axis=1)
