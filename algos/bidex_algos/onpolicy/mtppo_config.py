@@ -43,8 +43,8 @@ class MTPPOConfig(PPOConfig, OnPolicyConfig):
     demonstration_cloning: int = 0
     """Steps of so many of them in which the policy is cloned before it plays."""
     critic_first: int = 0
-    """Environment steps at the start in which the critic alone learns: for a policy that begins with a skill (cloned, or
-    of --start-from), which a critic that knows nothing would spoil."""
+    """Environment steps at the start in which the critic alone learns: for a policy that begins with a skill (cloned,
+    or of --start-from), which a critic that knows nothing would spoil."""
 
     def __post_init__(self) -> None:
         """Rejects values that could only fail later.
