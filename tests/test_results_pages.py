@@ -128,6 +128,7 @@ def test_the_best_run_of_each_class(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(
         "bidex_meta.results.best.load", lambda kind: {"C": {"success": 0.125}} if kind == "witness" else {}
     )
+    monkeypatch.setattr("bidex_meta.results.best.registry.names", lambda: ["D"])  # first, though its file is read last
     for name, arm, success, value in (("C", "ppo", 0.5, 9.0), ("C", "sac", 0.75, 2.0), ("D", "ppo", 0.0, 3.0)):
         path = test_collect.run(tmp_path, 0, {name: success}, arm, task=f"place/{name}")
         path = path.rename(tmp_path / f"{name}-{arm}-seed0")
@@ -141,8 +142,8 @@ def test_the_best_run_of_each_class(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     fill(page, tmp_path / "data")
     _, _, *rows = [cells(line) for line in page.read_text().splitlines() if line.startswith("|")]
     assert rows == [
-        ["C", "sac", "0", "1,000", "0.50", "75 % [0, 100]", "2", "–", "–", "12.5 %", "–", "2"],
         ["D", "ppo", "0", "1,000", "0.50", "0 % [0, 100]", "3", "–", "–", "–", "–", "1"],
+        ["C", "sac", "0", "1,000", "0.50", "75 % [0, 100]", "2", "–", "–", "12.5 %", "–", "2"],
     ]
     (tmp_path / "data" / "alone" / "C-ppo-seed0.json").unlink()
     (tmp_path / "data" / "alone" / "C-sac-seed0.json").unlink()

@@ -7,6 +7,7 @@ from bidex_meta.evaluation.comparison import scored_classes
 from bidex_meta.evaluation.references import load
 from bidex_meta.record.stored import StoredRun
 from bidex_meta.results.studies import Study, head_of, row_of
+from bidex_meta.tasks import registry
 
 _OF_RUN = ("arm", "seed", "steps", "hours")
 """Columns that tell which of several runs a row is of."""
@@ -16,7 +17,7 @@ _FOUND = ("success [95 %]", "return [95 %]", "score", "uniform actions", "witnes
 def best_table(studies: Sequence[Study]) -> Iterator[str]:
     """Lines of Markdown: a class a row, of its runs the one that succeeds most often; of equals the largest return.
 
-    Where there is one run of all classes, no row says which.
+    Classes stand in MT20's order. Where there is one run of all classes, no row says which.
 
     Args:
         studies: One for each class or set of classes.
@@ -28,7 +29,8 @@ def best_table(studies: Sequence[Study]) -> Iterator[str]:
                 rows.setdefault(name, []).append((run, row))
     untaught, many = [load("witness"), load("script")], sum(len(study.runs) for study in studies) > 1
     yield from head_of(["class", *_OF_RUN, *_FOUND, "runs"] if many else ["class", *_FOUND])
-    for name, found in rows.items():
+    place = {name: number for number, name in enumerate(registry.names())}
+    for name, found in sorted(rows.items(), key=lambda row: place.get(row[0], len(place))):
         run, best = max(found, key=lambda each: (each[1]["success"], each[1]["return"]))
         random = run.evaluation().get("random", {"classes": {}})["classes"].get(name)
         cells = [
