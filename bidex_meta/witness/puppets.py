@@ -14,7 +14,7 @@ from bidex_meta.witness.planner import quantised, rest_action
 from bidex_meta.witness.simulator import Simulator
 
 _COPIES, _SEED = 16, 7
-_GAIN = 8.0
+GAIN = 8.0
 """Speed of a hand over its distance to where it is led, and of its turn over its angle to how it is held, 1/s."""
 _KNUCKLES, _MIDDLES = ("FFJ2", "MFJ2", "RFJ2", "LFJ2"), ("FFJ1", "MFJ1", "RFJ1", "LFJ1")
 
@@ -97,6 +97,17 @@ class Puppets:
         turn = torch.tensor(quaternion_from_rpy((roll, pitch, yaw)), dtype=torch.float64)
         self._held[side] = multiply(xyzw(turn), xyzw(self._first[side]))
 
+    def turn(self, side: str, way: Tensor) -> None:
+        """Turns a hand from how it stands now.
+
+        Args:
+            side: The hand.
+            way: Axis times angle (3,), world, rad; small: a hand turns at ``GAIN`` times it a second.
+        """
+        angle = way.norm()
+        turn = torch.cat((torch.sin(0.5 * angle) * way / (angle + 1e-9), torch.cos(0.5 * angle)[None]))
+        self._held[side] = multiply(turn, self._now(side))
+
     def lead(self, right: Point, left: Point, steps: int = 1, speed: float = 0.6) -> None:
         """Leads the hands' points towards two points for some control steps.
 
@@ -109,7 +120,7 @@ class Puppets:
         for _ in range(min(steps, self.episode_steps - len(self.actions))):
             action, half = self._rest.clone(), len(self._rest) // 2
             for i, (side, goal) in enumerate(zip(SIDES, (right, left), strict=True)):
-                way = _GAIN * (torch.tensor(goal, dtype=torch.float64) - self.at(side))
+                way = GAIN * (torch.tensor(goal, dtype=torch.float64) - self.at(side))
                 way *= min(1.0, speed / (float(way.norm()) + 1e-9))
                 action[i * half :][: self._joints] = self._fingers[side]
                 action[i * half + self._joints :][:3] = (way / self._full_speed).float().clamp(-1.0, 1.0)
@@ -126,9 +137,13 @@ class Puppets:
         """The actions (3,) that turn a hand towards how it is held, or leave it alone if it is not."""
         if side not in self._held:
             return torch.zeros(3)
-        mean = self.where(f"{side}/mount_quaternion")
-        now = xyzw(mean / mean.norm())
+        now = self._now(side)
         error = multiply(self._held[side], conjugate(now))
         way = 2.0 * error[:3] * error[3].sign()  # rad, for small angles
         torque = rotate(now, rotate(conjugate(now), way) * torch.tensor(ANGULAR_DAMPING, dtype=torch.float64))
-        return (_GAIN * torque / self._full_torque).clamp(-1.0, 1.0)
+        return (GAIN * torque / self._full_torque).clamp(-1.0, 1.0)
+
+    def _now(self, side: str) -> Tensor:
+        """How a hand stands, (x, y, z, w), (4,)."""
+        mean = self.where(f"{side}/mount_quaternion")
+        return xyzw(mean / mean.norm())

@@ -2,7 +2,8 @@
 
 GraspAndPlace: the reward for the block's nearness is flat where the block starts, and a push pays only after the hand
 has followed. StackBlock: both blocks beside each other at the target pay almost as much as the stack. LiftUnderarm: a
-pot that is thrown to its goal pays before one that is lifted there. PourWater: water itself is not paid.
+pot that is thrown to its goal pays before one that is lifted there. PourWater: water itself is not paid. The doors' and
+the cubes' own files say why they have one.
 """
 
 import math
@@ -11,6 +12,7 @@ from collections.abc import Callable
 from torch import Tensor
 
 from bidex_meta.errors import BidexError
+from bidex_meta.witness.cube_script import turn_cubes
 from bidex_meta.witness.door_scripts import close_outward, open_inward
 from bidex_meta.witness.puppets import Point, Puppets
 
@@ -199,6 +201,7 @@ SCRIPTS: dict[str, Callable[[Puppets], None]] = {
     "GraspAndPlace": grasp_and_place,
     "LiftUnderarm": lift_underarm,
     "PourWater": pour_water,
+    "ReOrientation": turn_cubes,
     "StackBlock": stack_block,
 }
 """By class."""
