@@ -37,7 +37,7 @@ class BaselineFlags:
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="random|zero|witness|script|expert")]
     """random: uniform actions; zero: the action 0, joints held in the middle of their range and bases at rest;
     witness: the actions that solve task 0 of a class, in all its tasks; script: hands that a script leads, which knows
-    the whole state (six classes have one); expert: per class the best of its witness, its script and the runs given."""
+    the whole state (seven classes have one); expert: per class the best of witness, script and the runs given."""
     suite: str = "MT20"
     """Suite whose train tasks are played."""
     episodes: int = 4

@@ -58,7 +58,7 @@ class RecordFlags:
     class, from their starts, where it succeeds less often but shows more."""
     script: Switch = False
     """demonstrations, --starts tasks: play in the place of the witness the class's script, led anew from each start
-    (about a second for 500 steps): six classes have one, and it succeeds more often."""
+    (about a second for 500 steps): seven classes have one, and it succeeds more often."""
     shift: float = 1e-4
     """demonstrations, --starts witness: how far the objects' start is shifted, metres."""
     num_envs: int | None = None
