@@ -2,48 +2,69 @@
 
 Noise on the bases throws cubes off open hands, and a turn of a hand moves its cube, which costs as much as the turn
 earns: to a learner that explores, doing nothing looks better than what it tries.
+
+What a hand does follows from how it and its cube are, not from the time: a policy that is cloned from what the script
+does would not know the time, and would wait for ever where it once waited.
 """
 
 from torch import Tensor
 
 from bidex_meta.hands.pair import SIDES
-from bidex_meta.maths import conjugate, multiply, rotation_angle, xyzw
-from bidex_meta.witness.puppets import GAIN, Puppets
+from bidex_meta.maths import conjugate, multiply, rotate, rotation_angle, xyzw
+from bidex_meta.witness.puppets import GAIN, Point, Puppets
 
 _CUBES = {"right": ("object2", "goal2"), "left": ("object1", "goal1")}
-_FALL, _CLOSE = 25, 22
-"""Control steps until the cubes lie still in the cups, and until the fists are closed."""
+_CUP = {"knuckles": 0.6, "middles": 0.55, "THJ4": 0.4, "THJ3": 0.6, "THJ1": 0.0, "THJ0": 0.0}
+_FIST = {"knuckles": 1.3, "middles": 1.35, "THJ4": 0.85, "THJ3": 1.1, "THJ1": -0.3, "THJ0": -0.6}
+"""Joints of a hand that waits for its cube, and that holds it, rad."""
+_KNUCKLES = ("FFJ2", "MFJ2", "RFJ2")
 _RATE, _FASTEST = 4.0, 1.8
 """Speed of the turn over the angle that is left, 1/s, and at most, rad/s: faster ones shake cubes out."""
 
 
 def turn_cubes(hands: Puppets) -> None:
-    """Both hands catch their cubes, close, and turn them in closed loop, each about its goal's place."""
-    at = {side: hands.at(side) for side in SIDES}
-    for side in SIDES:
-        hands.hold(side)
-        hands.bend(side, 0.6, 0.55, THJ4=0.4, THJ3=0.6)
-    hands.lead(_point(at["right"]), _point(at["left"]), _FALL)
-    for side in SIDES:
-        hands.bend(side, 1.3, 1.35, THJ4=0.85, THJ3=1.1, THJ1=-0.3, THJ0=-0.6)
-    hands.lead(_point(at["right"]), _point(at["left"]), _CLOSE)
+    """Each hand catches its cube in a cup, closes to a fist, and turns it about its goal's place."""
     while len(hands.actions) < hands.episode_steps:
-        points = {}
-        for side, (cube, goal) in _CUBES.items():
-            hands.turn(side, _turn(hands, cube, goal))
-            points[side] = _point(hands.at(side) + hands.frozen(goal)[:3] - hands.where(f"{cube}/position"))
+        points = {side: _next(hands, side) for side in SIDES}
         hands.lead(points["right"], points["left"])
 
 
+def _next(hands: Puppets, side: str) -> Point:
+    """Bends the fingers and turns a hand, as it now should; where it should go."""
+    cube, goal = _CUBES[side]
+    place, knuckles = hands.where(f"{cube}/position"), _knuckles(hands, side, "position")
+    mount = _unit(hands.where(f"{side}/mount_quaternion"))
+    height = -float(rotate(conjugate(mount), place - hands.at(side))[1])  # above the palm; 3 cm where it lies
+    speed = float(hands.where(f"{cube}/linear_velocity").norm())
+    # Half closed fingers go on closing, whatever the cube does.
+    lies = _falls(speed, 0.06, 0.12) * _falls(height, 0.05, 0.06)
+    closed = max(lies, 1.0 - _falls(knuckles, 0.62, 0.67))
+    hands.bend(side, **{name: (1.0 - closed) * cup + closed * _FIST[name] for name, cup in _CUP.items()})
+    moving = abs(_knuckles(hands, side, "velocity"))
+    held = (1.0 - _falls(knuckles, 0.7, 0.8)) * _falls(moving, 0.3, 1.1)
+    hands.turn(side, held * _turn(hands, cube, goal))
+    x, y, z = (hands.at(side) + held * (hands.frozen(goal)[:3] - place)).tolist()
+    return x, y, z
+
+
 def _turn(hands: Puppets, cube: str, goal: str) -> Tensor:
-    """The turn (3,) that is asked of a hand now, rad about the world's axes."""
-    mean = hands.where(f"{cube}/quaternion")
-    left = multiply(hands.frozen(goal)[3:].double(), conjugate(xyzw(mean / mean.norm())))
+    """The turn (3,) that takes a cube to its goal's orientation, for one step, rad about the world's axes."""
+    left = multiply(hands.frozen(goal)[3:].double(), conjugate(_unit(hands.where(f"{cube}/quaternion"))))
     axis = left[:3] * left[3].sign()
     speed = min(_RATE * float(rotation_angle(left)), _FASTEST)
     return speed / GAIN * axis / (axis.norm() + 1e-9)
 
 
-def _point(place: Tensor) -> tuple[float, float, float]:
-    x, y, z = place.tolist()
-    return x, y, z
+def _knuckles(hands: Puppets, side: str, what: str) -> float:
+    """Mean angle, rad, or its speed, of three knuckles."""
+    return sum(float(hands.where(f"{side}/{joint}_{what}")) for joint in _KNUCKLES) / len(_KNUCKLES)
+
+
+def _falls(value: float, low: float, high: float) -> float:
+    """1 up to ``low``, 0 from ``high`` on, linear between."""
+    return min(1.0, max(0.0, (high - value) / (high - low)))
+
+
+def _unit(quaternion: Tensor) -> Tensor:
+    """A mean (w, x, y, z) as the unit quaternion (x, y, z, w)."""
+    return xyzw(quaternion / quaternion.norm())
