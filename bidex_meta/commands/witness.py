@@ -37,7 +37,7 @@ class WitnessFlags:
     """Search with a sampling planner on the printed reward, and keep the episode found if it holds: as --file says, or
     in witnesses/TASK.npz of the working folder."""
     tries: int = 1
-    """Searches with other seeds, or plays of the script with a little noise, before giving up."""
+    """Searches with other seeds before giving up."""
     file: Path | None = None
     """Replay this file, not the stored witness; with --find keep the best episode here, whether it holds or not."""
     improve: Path | None = None
@@ -165,31 +165,23 @@ def _find(name: str, flags: WitnessFlags) -> Path | None:
 
 
 def _play_script(name: str, flags: WitnessFlags) -> Path | None:
-    """Plays a class's script, again with a little noise until an episode holds; where it is kept."""
+    """Plays a class's script; where the episode is kept if it holds."""
     import numpy as np
 
     from bidex_meta.record.versions import collect_versions
-    from bidex_meta.witness.puppets import lone_puppets, shifted_puppets
+    from bidex_meta.witness.puppets import shifted_puppets
     from bidex_meta.witness.replay import replay
     from bidex_meta.witness.scripts import script_of
     from bidex_meta.witness.store import Witness
 
-    play, best, kept = script_of(name), -float("inf"), flags.file
-    for seed in range(flags.planner.seed, flags.planner.seed + flags.tries):
-        hands = lone_puppets(name, seed, flags.threads) if seed else shifted_puppets(name, flags.threads)
-        play(hands)
-        total, first = sum(hands.rewards), hands.success.index(True) if any(hands.success) else None
-        made = {"return": total, "first_success": first, "script": play.__name__, "rival": None}
-        made |= {"noise_seed": seed} if seed else {}
-        witness = Witness(np.stack([a.numpy() for a in hands.actions]), made | {"versions": collect_versions()})
-        holds = first is not None and replay(name, witness, flags.threads).found
-        if holds or (flags.file is not None and total > best):
-            best = total
-            kept = _keep(name, witness, flags)
-        if holds:
-            break
-        print(f"{name}: seed {seed} gave a return of {total:.3f}, first success {first}.")
-    return kept
+    play = script_of(name)
+    hands = shifted_puppets(name, flags.threads)
+    play(hands)
+    first = hands.success.index(True) if any(hands.success) else None
+    made = {"return": sum(hands.rewards), "first_success": first, "script": play.__name__, "rival": None}
+    witness = Witness(np.stack([a.numpy() for a in hands.actions]), made | {"versions": collect_versions()})
+    holds = flags.file is not None or replay(name, witness, flags.threads).found
+    return _keep(name, witness, flags) if holds else None
 
 
 def _steady(name: str, flags: WitnessFlags) -> Path | None:

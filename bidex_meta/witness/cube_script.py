@@ -20,10 +20,12 @@ _FIST = {"knuckles": 1.3, "middles": 1.35, "THJ4": 0.85, "THJ3": 1.1, "THJ1": -0
 _KNUCKLES = ("FFJ2", "MFJ2", "RFJ2")
 _RATE, _FASTEST = 4.0, 1.8
 """Speed of the turn over the angle that is left, 1/s, and at most, rad/s: faster ones shake cubes out."""
+_FOLLOW = 0.5
+"""Share of the full gain with which a cup stays below its cube: 98 instead of 82 % of fifty tasks; twice it, 68 %."""
 
 
 def turn_cubes(hands: Puppets) -> None:
-    """Each hand catches its cube in a cup, closes to a fist, and turns it about its goal's place."""
+    """Each hand stays below its cube until that lies in the cup, closes to a fist, and turns it at its goal's place."""
     while len(hands.actions) < hands.episode_steps:
         points = {side: _next(hands, side) for side in SIDES}
         hands.lead(points["right"], points["left"])
@@ -43,7 +45,9 @@ def _next(hands: Puppets, side: str) -> Point:
     moving = abs(_knuckles(hands, side, "velocity"))
     held = (1.0 - _falls(knuckles, 0.7, 0.8)) * _falls(moving, 0.3, 1.1)
     hands.turn(side, held * _turn(hands, cube, goal))
-    x, y, z = (hands.at(side) + held * (hands.frozen(goal)[:3] - place)).tolist()
+    below = place - hands.at(side)
+    below[2] = 0.0
+    x, y, z = (hands.at(side) + (1.0 - closed) * _FOLLOW * below + held * (hands.frozen(goal)[:3] - place)).tolist()
     return x, y, z
 
 

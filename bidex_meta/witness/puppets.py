@@ -14,8 +14,6 @@ from bidex_meta.witness.planner import quantised, rest_action
 from bidex_meta.witness.simulator import Simulator
 
 _COPIES, _SEED = 16, 7
-_NOISE = 0.01
-"""Standard deviation of the noise by which the episodes of lone puppets differ."""
 GAIN = 8.0
 """Speed of a hand over its distance to where it is led, and of its turn over its angle to how it is held, 1/s."""
 _KNUCKLES, _MIDDLES = ("FFJ2", "MFJ2", "RFJ2", "LFJ2"), ("FFJ1", "MFJ1", "RFJ1", "LFJ1")
@@ -33,17 +31,6 @@ def shifted_puppets(name: str, threads: int | None = None) -> "Puppets":
     simulator = Simulator(name, _COPIES, threads)
     simulator.load(simulator.starts(_COPIES - 1, seed=_SEED))
     return Puppets(simulator)
-
-
-def lone_puppets(name: str, seed: int, threads: int | None = None) -> "Puppets":
-    """The hands of a class's task 0 at its start alone, with a little noise on what they do: an episode for each seed.
-
-    Args:
-        name: The class.
-        seed: Of the noise.
-        threads: Engine threads; None takes all CPUs.
-    """
-    return Puppets(Simulator(name, 1, threads), _NOISE, torch.Generator().manual_seed(seed))
 
 
 class Puppets:
