@@ -49,14 +49,28 @@ def _check_dataset(dataset: Any, source: Source) -> None:
     classes = source.task_classes()
     for slot in dataset.metadata["tasks"]:
         known_name(f"class in {source.name} of", slot.partition("/")[0], classes)
-    if dataset.metadata.get("hides_goals", source.hides_goals) != source.hides_goals:
-        raise BidexError(f"{dataset.name} and {source.name} do not both show goals. Record what shall be learned.")
+    check_goals(dataset, source)
     actions = max(each.action_size for each in classes.values())
     if dataset.action_size != actions:
         raise BidexError(
             f"{dataset.name} has {dataset.action_size} actions, {source.name} here {actions}: its bases do not move "
             f"alike. {'Add --base moving' if dataset.action_size > actions else 'Record it with the same bases'}."
         )
+
+
+def check_goals(dataset: Any, source: Source) -> None:
+    """Refuses data that do not show the goals which the source shows; what it hides, they may show.
+
+    Raises:
+        BidexError: They do not.
+    """
+    about = dataset.metadata
+    if about.get("hides_goals", source.hides_goals) == source.hides_goals:
+        return
+    if about["hides_goals"]:
+        raise BidexError(f"{dataset.name} hides goals, {source.name} shows them. Record what shall be learned.")
+    if about.get("points"):
+        raise BidexError(f"{dataset.name} has point clouds, where {source.name} hides goals. Record without --points.")
 
 
 def give(kept: str | Sequence[str], learner: Any) -> None:

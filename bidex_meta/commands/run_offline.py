@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from bidex_meta.commands.learners import ALGOS, LearnerKind, learner_kind
 from bidex_meta.commands.parsing import peek_all
+from bidex_meta.commands.run_demonstrations import check_goals
 from bidex_meta.errors import BidexError
 from bidex_meta.reading import expanded
 from bidex_meta.sources import Source
@@ -96,9 +97,7 @@ def check(kind: LearnerKind, record: int, datasets: "Sequence[Dataset]", source:
     if launch().count > 1:
         raise BidexError(f"{kind.name} learns in one process, here are {launch().count}. Start it without torchrun.")
     for each in datasets:
-        if each.metadata.get("hides_goals", source.hides_goals) != source.hides_goals:
-            shown, here = ("hides", "shows") if each.metadata["hides_goals"] else ("shows", "hides")
-            raise BidexError(f"{each.name} {shown} goals, {source.name} {here} them. Learn for what was recorded.")
+        check_goals(each, source)
 
 
 def give(names: Sequence[str], learner: Any) -> None:

@@ -53,7 +53,8 @@ def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) ->
     """Reads data sets for a world.
 
     Classes are found by the names of their slots. Of a class recorded on its own, observations get the padding and the
-    one-hot that the world shows, and rewards its scale. Actions of a data set from elsewhere are brought to [-1, 1].
+    one-hot that the world shows, and rewards its scale; goals that the world hides are zero, as it shows them. Actions
+    of a data set from elsewhere are brought to [-1, 1].
 
     Args:
         datasets: At least one.
@@ -159,6 +160,9 @@ class _Form:
         seen = ((group.name, [(part.start, part.stop) for part in group.where]) for group in world.observation_groups)
         self._theirs = _Columns.of(seen, plain)
         self._bounds = dataset.action_bounds
+        hide = getattr(world, "hides_goals", False) and not about.get("hides_goals", True)
+        slots: Sequence[Any] = getattr(world, "slots", ())
+        self._hidden = [slots[slot].task_class.layout.goal_indices() if hide else [] for slot in self.slots]
         self._check_observations(world.num_tasks > 1 and len(names) == 1)
         own, theirs = about.get("reward_scales", {}), {s.name: s.reward_scale for s in getattr(world, "slots", ())}
         self._factors = [
@@ -188,6 +192,7 @@ class _Form:
         seen = np.zeros((len(episode) + 1, self._width + ids), np.float32)
         seen[:, theirs.state[: len(own.state)]] = episode.observations[:, own.state]
         seen[:, theirs.cloud] = episode.observations[:, own.cloud]
+        seen[:, theirs.state[self._hidden[episode.task]]] = 0.0
         if ids:
             seen[:, self._width + slot] = 1.0
         if self._bounds is not None:

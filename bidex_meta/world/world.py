@@ -114,7 +114,7 @@ class World(Recreated, RowAttributes, VectorEnv):
         self._scale = self._of_rows([slot.reward_scale for slot in slots]).float()
         self._uniform_tasks = task_sampling == "uniform"
         groups = build_groups(self.slots, self.slot_rows, make_engine)
-        self.points = points
+        self.points, self.hides_goals = points, observation == "masked"
         self._make_spaces(observation, pad_to, points, groups)
         self.parts = [Part(g, self.slots, observation, self.observation_size, num_envs, self._sights) for g in groups]
         self._masked = groups[0].engine.masked

@@ -13,12 +13,15 @@ from gymnasium.spaces import Box
 from bidex_meta.cli import main
 from bidex_meta.commands.run_offline import implied
 from bidex_meta.data import Dataset, open_dataset
+from bidex_meta.data.episode_recorder import EpisodeRecorder
 from bidex_meta.data.joined import join
 from bidex_meta.data.writer import DatasetWriter, begin, finish
 from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder
 from bidex_meta.sources.humanoid_task import HUMANOID
 from bidex_meta.sources.source import OwnSuite
+from bidex_meta.witness.simulator import task_slot
+from bidex_meta.world import World
 from bidex_meta.world.contract import ObservationGroup
 from tests.algos.problems import opposite_bandits
 from tests.data.worlds import rough
@@ -124,8 +127,10 @@ def test_what_does_not_go_together_is_refused(folder: Path, capsys: pytest.Captu
     assert "Unknown data set 'MT4/rand-v0'. Did you mean" in told(
         capsys, "run", "--dataset", "MT4/rand-v0", "--algo", "bc", code=2
     )
-    assert "MT4/random-v0 shows goals, ML4 hides" in told(
-        capsys, "run", *data, "--suite", "ML4", "--algo", "bc", code=2
+    told(capsys, "record", "random", "--suite", "ML4", *FEW, "--size", "60")
+    hidden = ["--dataset", "ML4/random-v0"]
+    assert "ML4/random-v0 hides goals, MT4 shows" in told(
+        capsys, "run", *hidden, "--suite", "MT4", "--algo", "bc", code=2
     )
     assert "--dataset" in told(capsys, "run", "--algo", "bc", "--help")
     assert not (folder / "runs").exists()
@@ -182,6 +187,27 @@ def test_classes_recorded_alone_get_padding_one_hot_and_scale(tmp_path: Path) ->
         join(sets, world)
     with pytest.raises(BidexError, match="entries beside the task id"):
         join(sets, opposite_bandits(rows=2))
+
+
+def test_goals_that_the_world_hides_are_zero_as_it_shows_them(tmp_path: Path) -> None:
+    slot = task_slot("Switch")
+    plain, masked = (
+        World([slot], 1, observation=rule, pad_to=pad, autoreset_mode="DISABLED", seed=3, threads=1)
+        for rule, pad in (("plain", None), ("masked", 450))
+    )
+    episodes: list[Any] = []
+    recorder = EpisodeRecorder(plain, episodes.append)
+    seen, action = [masked.reset(seed=3)[0]], torch.full((1, 52), 0.1)
+    recorder.reset(seed=3)
+    for _ in range(slot.task_class.episode_steps):
+        recorder.step(action)
+        seen.append(masked.step(action)[0])
+    goals = slot.task_class.layout.goal_indices()
+    assert episodes[0].observations[:, goals].any()
+    shown = stored(tmp_path, "a-v0", episodes, ["Switch"], hides_goals=False)
+    masked.num_tasks = 2  # of several classes, whose observations are padded
+    assert torch.equal(join([shown], masked).observations, torch.cat(seen))
+    plain.close()
 
 
 def clouds(points: int, kind: str, state: int, ids: int) -> list[Any]:
