@@ -7,6 +7,7 @@ from torch.testing import assert_close
 from bidex_algos.nets.encoders.inputs import Inputs
 from bidex_algos.nets.networks import MLP, GaussianActor, gaussian_entropy, gaussian_kl, gaussian_log_prob
 from bidex_algos.nets.normalise import ObservationNormaliser, RunningStats
+from bidex_algos.nets.normalise_tasks import TaskNormaliser
 from bidex_meta.world.contract import plain_groups
 
 TASKS_LAST = Inputs(plain_groups(5, 2))
@@ -98,3 +99,25 @@ def test_observations_are_normalised_and_task_ids_are_not():
     off = ObservationNormaliser(4, enabled=False)
     off.update(obs)
     assert torch.equal(off(obs), obs)
+
+
+def test_each_task_is_normalised_by_its_own_statistics():
+    inputs = Inputs(plain_groups(5, 3))
+    one_hot = torch.eye(3)[[0] * 200 + [2] * 100]  # of the second nothing is seen
+    obs = torch.cat([torch.randn(300, 2) * torch.tensor([0.1, 50.0]), one_hot], dim=1)
+    obs[200:, :2] = obs[200:, :2] * 30 - 4
+    normaliser, halves = TaskNormaliser(inputs, 3), TaskNormaliser(inputs, 3)
+    normaliser.update(obs)
+    for half in (obs[:250], obs[250:]):
+        halves.update(half.view(-1, 10, 5))
+    out = normaliser(obs.view(-1, 10, 5)).view(300, 5)
+    for of_task in (out[:200], out[200:]):
+        assert_close(of_task[:, :2].mean(0), torch.zeros(2), atol=1e-4, rtol=0)
+        assert_close(of_task[:, :2].std(0, correction=0), torch.ones(2), atol=2e-3, rtol=0)
+    assert torch.equal(out[:, 2:], one_hot)
+    assert_close(halves(obs), normaliser(obs))
+    unseen = torch.tensor([[3.0, -2.0, 0.0, 1.0, 0.0]])
+    assert_close(normaliser(unseen), unseen)
+    again = TaskNormaliser(inputs, 3)
+    again.load_state_dict(normaliser.state_dict())
+    assert torch.equal(again(obs), normaliser(obs))

@@ -6,6 +6,8 @@ from bidex_algos.nets.shape import Shape
 from bidex_meta.errors import BidexError
 from bidex_meta.world.contract import VectorWorld
 
+_OF_SEVERAL = ("task_embedding", "normalise_per_task")
+
 
 def check_options(name: str, config: Any, world: VectorWorld, shape: Shape) -> None:
     """Options that tell tasks apart need the one-hot of the tasks.
@@ -13,9 +15,9 @@ def check_options(name: str, config: Any, world: VectorWorld, shape: Shape) -> N
     Raises:
         BidexError: The world does not show one.
     """
-    wanted = [option for option in ("policy_heads", "task_embedding") if getattr(config, option, False)]
-    if world.num_tasks == 1 and "task_embedding" in wanted:
-        wanted.remove("task_embedding")  # one task needs none; heads it cannot have
+    wanted = [option for option in (*_OF_SEVERAL, "policy_heads") if getattr(config, option, False)]
+    if world.num_tasks == 1:
+        wanted = [option for option in wanted if option not in _OF_SEVERAL]  # one task needs none; heads it cannot have
     if not getattr(config, "shares_a_trunk", True):
         wanted.append(f"architecture {config.architecture}")
     for option in wanted:

@@ -6,7 +6,7 @@ from torch import Tensor
 from bidex_algos.experience.replay import Transitions
 from bidex_algos.nets.deterministic import DeterministicActor, DeterministicPolicy
 from bidex_algos.nets.multitask.architecture import network_of
-from bidex_algos.nets.normalise import ObservationNormaliser
+from bidex_algos.nets.normalise_tasks import observation_normaliser
 from bidex_algos.nets.precision import autocast, use_bfloat16
 from bidex_algos.nets.shape import Shape
 from bidex_algos.offline.base import Offline
@@ -50,5 +50,5 @@ class BC(Offline):
         inputs, heads = cls._inputs(config, shape), shape.num_id_columns if config.policy_heads else 1
         network = network_of(config)
         actor = DeterministicActor(inputs, config.hidden, shape.actions, heads, init, config.activation, network)
-        observations = ObservationNormaliser(inputs, config.normalise_observations)
+        observations = observation_normaliser(config, inputs, shape.num_id_columns)
         return DeterministicPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)

@@ -7,7 +7,7 @@ from bidex_algos.nets.deterministic import DeterministicActor
 from bidex_algos.nets.encoders.inputs import Inputs
 from bidex_algos.nets.multitask.architecture import network_of
 from bidex_algos.nets.networks import MLP
-from bidex_algos.nets.normalise import ObservationNormaliser
+from bidex_algos.nets.normalise_tasks import observation_normaliser
 from bidex_algos.nets.precision import autocast
 from bidex_algos.nets.shape import Shape
 from bidex_algos.offline.bcq_config import BCQConfig
@@ -77,7 +77,7 @@ class BCQPolicy(nn.Module):
     ):
         super().__init__()
         self.perturbation, self.low_precision = config.perturbation, low_precision
-        self.observations = ObservationNormaliser(inputs, config.normalise_observations)
+        self.observations = observation_normaliser(config, inputs, shape.num_id_columns)
         judged, heads = inputs.extended("action", shape.actions), shape.num_id_columns
         self.actor = DeterministicActor(
             judged,

@@ -42,6 +42,8 @@ class OfflineConfig(ArchitectureConfig):
     """Gradients longer than this are shortened to it, those of each network apart; None: none is."""
     normalise_observations: bool = True
     """Give observations zero mean and unit variance by the data's statistics; the task's one-hot stays as it is."""
+    normalise_per_task: bool = False
+    """By the statistics of each task's data apart; the world must show the task's one-hot."""
     autocast: Autocast = "auto"
     """Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX."""
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from bidex_algos.experience.replay import Transitions
 from bidex_algos.nets.multitask.architecture import network_of
 from bidex_algos.nets.networks import GaussianActor, gaussian_log_prob
-from bidex_algos.nets.normalise import ObservationNormaliser
+from bidex_algos.nets.normalise_tasks import observation_normaliser
 from bidex_algos.nets.policy import GaussianPolicy
 from bidex_algos.nets.precision import autocast, use_bfloat16
 from bidex_algos.nets.shape import Shape
@@ -93,7 +93,7 @@ class IQL(Offline):
         actor = BoundedMean(
             inputs, config.hidden, shape.actions, config.init_std, init, config.activation, heads, network
         )
-        observations = ObservationNormaliser(inputs, config.normalise_observations)
+        observations = observation_normaliser(config, inputs, shape.num_id_columns)
         return GaussianPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
 
     def _own_parts(self) -> dict[str, Any]:
