@@ -11,6 +11,7 @@ from bidex_meta.evaluation import references
 from bidex_meta.evaluation.scores import Reference
 from bidex_meta.sources import Source
 from bidex_meta.sources.source import OwnSuite
+from bidex_meta.tasks import registry
 from bidex_meta.witness.replay import Replay
 from tests.fakes import ToyWorld
 
@@ -67,6 +68,11 @@ def test_an_expert_that_doing_nothing_beats_gives_no_score(folder: Path) -> None
             folder / f"{kind}.json", {"A": {"return": value}, "B": {"return": value + (kind == "expert") * 2}}, {}
         )
     assert references.references() == {"A": Reference(1.0, None, 3.0), "B": Reference(1.0, 4.0, 3.0)}
+
+
+def test_every_class_has_an_expert_that_beats_doing_nothing_and_doing_anything() -> None:
+    known = references.references()  # None where it does not
+    assert sorted(name for name in registry.names() if known[name].expert is not None) == sorted(registry.names())
 
 
 @pytest.mark.parametrize("what", ["random", "zero"])

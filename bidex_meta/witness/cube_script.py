@@ -21,7 +21,7 @@ _KNUCKLES = ("FFJ2", "MFJ2", "RFJ2")
 _RATE, _FASTEST = 4.0, 1.8
 """Speed of the turn over the angle that is left, 1/s, and at most, rad/s: faster ones shake cubes out."""
 _FOLLOW = 0.5
-"""Share of the full gain with which a cup stays below its cube: 98 instead of 82 % of fifty tasks; twice it, 68 %."""
+"""Share of the full gain with which a cup follows its cube: 98 instead of 82 % of fifty episodes; twice it, 68 %."""
 
 
 def turn_cubes(hands: Puppets) -> None:
