@@ -10,7 +10,7 @@ does would not know the time, and would wait for ever where it once waited.
 from torch import Tensor
 
 from bidex_meta.hands.pair import SIDES
-from bidex_meta.maths import conjugate, multiply, rotate, rotation_angle, xyzw
+from bidex_meta.maths import conjugate, multiply, rotate, rotation_angle
 from bidex_meta.witness.puppets import GAIN, Point, Puppets
 
 _CUBES = {"right": ("object2", "goal2"), "left": ("object1", "goal1")}
@@ -35,7 +35,7 @@ def _next(hands: Puppets, side: str) -> Point:
     """Bends the fingers and turns a hand, as it now should; where it should go."""
     cube, goal = _CUBES[side]
     place, knuckles = hands.where(f"{cube}/position"), _knuckles(hands, side, "position")
-    mount = _unit(hands.where(f"{side}/mount_quaternion"))
+    mount = hands.orientation(f"{side}/mount_quaternion")
     height = -float(rotate(conjugate(mount), place - hands.at(side))[1])  # above the palm; 3 cm where it lies
     speed = float(hands.where(f"{cube}/linear_velocity").norm())
     # Half closed fingers go on closing, whatever the cube does.
@@ -53,7 +53,7 @@ def _next(hands: Puppets, side: str) -> Point:
 
 def _turn(hands: Puppets, cube: str, goal: str) -> Tensor:
     """The turn (3,) that takes a cube to its goal's orientation, for one step, rad about the world's axes."""
-    left = multiply(hands.frozen(goal)[3:].double(), conjugate(_unit(hands.where(f"{cube}/quaternion"))))
+    left = multiply(hands.frozen(goal)[3:].double(), conjugate(hands.orientation(f"{cube}/quaternion")))
     axis = left[:3] * left[3].sign()
     speed = min(_RATE * float(rotation_angle(left)), _FASTEST)
     return speed / GAIN * axis / (axis.norm() + 1e-9)
@@ -67,8 +67,3 @@ def _knuckles(hands: Puppets, side: str, what: str) -> float:
 def _falls(value: float, low: float, high: float) -> float:
     """1 up to ``low``, 0 from ``high`` on, linear between."""
     return min(1.0, max(0.0, (high - value) / (high - low)))
-
-
-def _unit(quaternion: Tensor) -> Tensor:
-    """A mean (w, x, y, z) as the unit quaternion (x, y, z, w)."""
-    return xyzw(quaternion / quaternion.norm())

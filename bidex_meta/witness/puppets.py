@@ -71,6 +71,11 @@ class Puppets:
         """A sensor's mean over the copies, (k,)."""
         return self.everywhere(sensor).mean(0)
 
+    def orientation(self, sensor: str) -> Tensor:
+        """The mean over the copies of a sensor's quaternion, (x, y, z, w), (4,)."""
+        mean = self.where(sensor)
+        return xyzw(mean / mean.norm())
+
     def frozen(self, name: str) -> Tensor:
         """A number that the task has frozen, (k,)."""
         return self._simulator.frozen(name)[0]
@@ -106,7 +111,7 @@ class Puppets:
         """
         angle = way.norm()
         turn = torch.cat((torch.sin(0.5 * angle) * way / (angle + 1e-9), torch.cos(0.5 * angle)[None]))
-        self._held[side] = multiply(turn, self._now(side))
+        self._held[side] = multiply(turn, self.orientation(f"{side}/mount_quaternion"))
 
     def lead(self, right: Point, left: Point, steps: int = 1, speed: float = 0.6) -> None:
         """Leads the hands' points towards two points for some control steps.
@@ -137,13 +142,8 @@ class Puppets:
         """The actions (3,) that turn a hand towards how it is held, or leave it alone if it is not."""
         if side not in self._held:
             return torch.zeros(3)
-        now = self._now(side)
+        now = self.orientation(f"{side}/mount_quaternion")
         error = multiply(self._held[side], conjugate(now))
         way = 2.0 * error[:3] * error[3].sign()  # rad, for small angles
         torque = rotate(now, rotate(conjugate(now), way) * torch.tensor(ANGULAR_DAMPING, dtype=torch.float64))
         return (GAIN * torque / self._full_torque).clamp(-1.0, 1.0)
-
-    def _now(self, side: str) -> Tensor:
-        """How a hand stands, (x, y, z, w), (4,)."""
-        mean = self.where(f"{side}/mount_quaternion")
-        return xyzw(mean / mean.norm())

@@ -208,6 +208,7 @@ def test_goals_that_the_world_hides_are_zero_as_it_shows_them(tmp_path: Path) ->
     masked.num_tasks = 2  # of several classes, whose observations are padded
     assert torch.equal(join([shown], masked).observations, torch.cat(seen))
     plain.close()
+    masked.close()
 
 
 def clouds(points: int, kind: str, state: int, ids: int) -> list[Any]:

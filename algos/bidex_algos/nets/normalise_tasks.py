@@ -14,14 +14,14 @@ from bidex_algos.nets.normalise import ObservationNormaliser, RunningStats
 
 
 def observation_normaliser(config: Any, inputs: Inputs, tasks: int) -> ObservationNormaliser:
-    """What a config asks for: ``normalise_observations``, and ``normalise_per_task`` where it knows that.
+    """What a config asks for by ``normalise_observations`` and ``normalise_per_task``.
 
     Args:
-        config: A learner's.
+        config: An offline learner's.
         inputs: The groups of the observation.
         tasks: Entries of the one-hot of the tasks, 0 without one.
     """
-    if getattr(config, "normalise_per_task", False) and config.normalise_observations and tasks > 1:
+    if config.normalise_per_task and config.normalise_observations and tasks > 1:
         return TaskNormaliser(inputs, tasks)
     return ObservationNormaliser(inputs, config.normalise_observations)
 
