@@ -67,6 +67,23 @@ def test_a_run_ends_with_both_tables_of_both_splits_and_trains_on_the_learners_k
     assert list(stored["splits"]) == ["train", "test"] and stored["steps"] == 24
 
 
+def test_a_run_is_told_what_its_meta_test_plays(tmp_path, capsys):
+    path = tmp_path / "r"
+    flags = ["run", "--suite", "ML4", "--algo", "finder", "--num-envs", "24", "--steps", "24", "--device", "cpu"]
+    flags += ["--threads", "1", "--run-dir", str(path)]
+    assert main([*flags, "--split", "test", "--shots", "2", "--rollouts", "7"]) == 0
+    splits = json.loads((path / "evaluation.json").read_text())["splits"]
+    assert list(splits) == ["test"] and (splits["test"]["shots"], splits["test"]["rollouts"]) == (2, 7)
+    assert not {"split", "shots", "rollouts"} & RunFolder.open(path).config().keys()  # a resumed run may differ
+    capsys.readouterr()
+    assert main([*flags[:-1], str(tmp_path / "other"), "--rollouts", "0"]) == 2
+    assert "--rollouts must be at least 1, not 0." in capsys.readouterr().err
+    flags[flags.index("finder")] = "mtppo"
+    assert main([*flags[:-1], str(tmp_path / "other"), "--shots", "2"]) == 2
+    assert "--shots is of what adapts (maml, promp, rl2, ...), not of mtppo." in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()
+
+
 def test_evaluate_agrees_with_the_run_and_takes_shots_rollouts_tasks_and_trials(run, capsys):
     again = json.loads(evaluate(capsys, run, "--json").out)
     assert again["splits"] == json.loads((run / "evaluation.json").read_text())["splits"]

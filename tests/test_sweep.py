@@ -112,6 +112,12 @@ def test_an_arm_starts_from_another_on_the_same_subject_seed_and_value(tmp_path:
     for run in runs:
         assert run.after is not None and run.after.name == run.name.replace("-on-", "-ppo-")
         assert f"--start-from={run.after}" in run.begin and not any("start" in word for word in run.go_on)
+    path.write_text(FILE + "[grid]\nrollouts = [3]\nnum_envs = [9]\n")
+    go_on = read_sweep(path).runs[0].go_on
+    assert "--rollouts=3" in go_on and "--num-envs=9" not in go_on
+    path.write_text(
+        FILE.replace('["HandOver"]', '["HandOver", "Switch"]') + "[grid]\nlearner.gamma = [0.8, 0.9]\n" + STARTING
+    )
     path.write_text(
         FILE + STARTING.replace('"on"', '"on"\noverrides = { num_envs = 4 }') + "[grid]\nnum_envs = [8, 16]\n"
     )

@@ -117,10 +117,7 @@ def _meta_test(flags: EvaluateFlags, folder: Any, config: dict[str, Any], source
     if flags.random:
         raise BidexError(f"{config['algo']} is compared with itself before adaptation. Leave --random out.")
     metatest.check_source(source, config["algo"])
-    known = source.splits
-    if flags.split in ("train", "test") and flags.split not in known:
-        raise BidexError(f"{source.name} has no {flags.split} tasks. Leave --split out.")
-    splits = [name for name in known if flags.split in ("auto", "both", name)]
+    splits = metatest.splits_of(source, flags.split)
     seed = EVALUATION_SEED if flags.seed is None else flags.seed
     numbers = (flags.shots, flags.rollouts, flags.episodes, flags.tasks, flags.trials, flags.num_envs)
     load, step = policy_loader(folder, config["device"], flags.checkpoint)

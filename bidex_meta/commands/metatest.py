@@ -153,6 +153,21 @@ def check_source(source: Source, algo: str) -> None:
         )
 
 
+def splits_of(source: Source, asked: str) -> list[str]:
+    """The splits that a meta-test plays.
+
+    Args:
+        source: Of the run's worlds.
+        asked: A split's name; ``both`` or ``auto``: all there are.
+
+    Raises:
+        BidexError: The source has no such split.
+    """
+    if asked in ("train", "test") and asked not in source.splits:
+        raise BidexError(f"{source.name} has no {asked} tasks. Leave --split out.")
+    return [name for name in source.splits if asked in ("auto", "both", name)]
+
+
 def rows_for(classes: int, adaptations: int, rollouts: int, limit: int) -> int:
     """Rows of a world that plays as many adaptations of each class at once as the limit allows.
 

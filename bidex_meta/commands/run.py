@@ -125,9 +125,10 @@ def _read(plan: RunPlan) -> Checkpoint | None:
     from bidex_meta.record import RunFolder
 
     if plan.kind.adapts:
-        from bidex_meta.commands.metatest import check_source
+        from bidex_meta.commands.metatest import check_source, splits_of
 
         check_source(plan.source, plan.config["algo"])
+        splits_of(plan.source, plan.flags.split)
     if launch().rank == 0:
         from bidex_meta.commands import watching
 
@@ -287,9 +288,11 @@ def _meta_test(plan: RunPlan, folder: Any, learner: Any) -> None:
     from bidex_meta.record.atomic import write_json
 
     state, device = learner.policy_state_dict(), launch().own_device(plan.config["device"])
-    options, source = metatest.Options(episodes=plan.flags.episodes), plan.source
+    flags, source = plan.flags, plan.source
+    options = metatest.Options(shots=flags.shots, rollouts=flags.rollouts, episodes=flags.episodes)
     load = partial(plan.kind.make.load_policy, state, device)
-    found = metatest.meta_test(source, plan.config, load, options, source.splits, _say)
+    splits = metatest.splits_of(source, flags.split)
+    found = metatest.meta_test(source, plan.config, load, options, splits, _say)
     report = {"steps": learner.env_steps, "seed": options.seed, "splits": metatest.report(found)}
     report["conditions"] = conditions(source)
     write_json(folder.path / "evaluation.json", report)

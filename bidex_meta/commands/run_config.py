@@ -110,7 +110,14 @@ class RunFlags:
     """Evaluate at the end."""
     episodes: int | None = None
     """Episodes of each task in that evaluation; None: 4, or 1 where a task fixes its start (metaworld/...); for what
-    adapts, as many as it adapts to."""
+    adapts, as many as --rollouts."""
+    split: Literal["auto", "train", "test", "both"] = "auto"
+    """Tasks of that evaluation where the learner adapts (maml, promp, rl2, ...). auto: both, on ML20 fifteen classes
+    beside the five unseen ones."""
+    shots: int | None = None
+    """There: adapt so often, one after the other. None: 1."""
+    rollouts: int | None = None
+    """There: episodes of each task in a shot. None: as in training, but 40 at most."""
     print_config: Switch = False
     """Print the resolved config as JSON and stop."""
 
@@ -178,6 +185,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     names = {"source": alone or source.name, "algo": kind.name, "preset": preset}
     data["task_seed"] = stored.get("task_seed", run_offline.task_seed(datasets))
     config = _resolved(flags, names, device, stored, data)
+    _check_meta_test(flags, kind)
     run_demonstrations.check(kind, config["demonstrations"], Source.open(config))
     if folder:
         _refuse_changes(stored, config, folder)
@@ -215,7 +223,7 @@ def _resolved(
         raise BidexError(f"--base {flags.base} goes with --task; a suite's file says whether bases move.")
     if flags.object is not None and flags.task is None:
         raise BidexError("--object goes with --task; a suite's file names objects itself (docs/objects.md).")
-    for name in ("num_envs", "threads", "episodes", "evaluate_every", "video_every"):
+    for name in ("num_envs", "threads", "episodes", "shots", "rollouts", "evaluate_every", "video_every"):
         value = getattr(flags, name)
         if value is not None and value < 1:
             raise BidexError(f"--{name.replace('_', '-')} must be at least 1, not {value}.")
@@ -262,6 +270,12 @@ def _resolved(
         "threads": flags.threads or stored.get("threads") or max(1, _cores() // launch().local_count),
     }
     return json.loads(json.dumps(config))  # tuples to lists, so that it equals what is read back
+
+
+def _check_meta_test(flags: Any, kind: LearnerKind) -> None:
+    asked = [name for name in ("split", "shots", "rollouts") if getattr(flags, name) not in (None, "auto")]
+    if asked and not kind.adapts:
+        raise BidexError(f"--{asked[0]} is of what adapts (maml, promp, rl2, ...), not of {kind.name}. Leave it out.")
 
 
 def _placed(thing: str | None) -> str | None:

@@ -14,6 +14,11 @@ from bidex_meta.record.folder import RunFolder, flat
 
 _OWN = ("suite", "task", "algo", "seed", "run_dir", "resume", "print_config", "evaluate", "threads", "learner")
 """Flags of a run that the file says otherwise, or that a sweep decides."""
+_CHANGING = frozenset((
+    *("--steps", "--minutes", "--evaluate-every", "--video-every", "--logger"),
+    *("--episodes", "--split", "--shots", "--rollouts"),
+))  # fmt: skip
+"""Flags that a resumed run may be given anew."""
 _MOST_RUNS = 10_000
 
 
@@ -81,8 +86,7 @@ class PlannedRun:
     @property
     def go_on(self) -> list[str]:
         """The words that continue it: those alone that a resumed run may be given anew."""
-        changing = ("--steps=", "--minutes=", "--evaluate-every=", "--video-every=", "--logger=", "--episodes=")
-        return ["run", f"--resume={self.path}", *(word for word in self.words if word.startswith(changing))]
+        return ["run", f"--resume={self.path}", *(word for word in self.words if word.split("=")[0] in _CHANGING)]
 
 
 @dataclass(frozen=True)
