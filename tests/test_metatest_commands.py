@@ -71,10 +71,12 @@ def test_a_run_is_told_what_its_meta_test_plays(tmp_path, capsys):
     path = tmp_path / "r"
     flags = ["run", "--suite", "ML4", "--algo", "finder", "--num-envs", "24", "--steps", "24", "--device", "cpu"]
     flags += ["--threads", "1", "--run-dir", str(path)]
-    assert main([*flags, "--split", "test", "--shots", "2", "--rollouts", "7"]) == 0
+    assert main([*flags, "--split", "test", "--shots", "2", "--rollouts", "7", "--tasks", "1"]) == 0
     splits = json.loads((path / "evaluation.json").read_text())["splits"]
-    assert list(splits) == ["test"] and (splits["test"]["shots"], splits["test"]["rollouts"]) == (2, 7)
-    assert not {"split", "shots", "rollouts"} & RunFolder.open(path).config().keys()  # a resumed run may differ
+    assert list(splits) == ["test"] and [splits["test"][name] for name in ("shots", "rollouts", "trials")] == [2, 7, 5]
+    assert (
+        not {"split", "shots", "rollouts", "tasks"} & RunFolder.open(path).config().keys()
+    )  # a resumed run may differ
     capsys.readouterr()
     assert main([*flags[:-1], str(tmp_path / "other"), "--rollouts", "0"]) == 2
     assert "--rollouts must be at least 1, not 0." in capsys.readouterr().err

@@ -289,7 +289,7 @@ def _meta_test(plan: RunPlan, folder: Any, learner: Any) -> None:
 
     state, device = learner.policy_state_dict(), launch().own_device(plan.config["device"])
     flags, source = plan.flags, plan.source
-    options = metatest.Options(shots=flags.shots, rollouts=flags.rollouts, episodes=flags.episodes)
+    options = metatest.Options(flags.shots, flags.rollouts, flags.episodes, flags.tasks)
     load = partial(plan.kind.make.load_policy, state, device)
     splits = metatest.splits_of(source, flags.split)
     found = metatest.meta_test(source, plan.config, load, options, splits, _say)

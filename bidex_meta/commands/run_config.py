@@ -118,6 +118,8 @@ class RunFlags:
     """There: adapt so often, one after the other. None: 1."""
     rollouts: int | None = None
     """There: episodes of each task in a shot. None: as in training, but 40 at most."""
+    tasks: int | None = None
+    """There: the first so many tasks of each class. None: 5."""
     print_config: Switch = False
     """Print the resolved config as JSON and stop."""
 
@@ -223,7 +225,7 @@ def _resolved(
         raise BidexError(f"--base {flags.base} goes with --task; a suite's file says whether bases move.")
     if flags.object is not None and flags.task is None:
         raise BidexError("--object goes with --task; a suite's file names objects itself (docs/objects.md).")
-    for name in ("num_envs", "threads", "episodes", "shots", "rollouts", "evaluate_every", "video_every"):
+    for name in ("num_envs", "threads", "episodes", "shots", "rollouts", "tasks", "evaluate_every", "video_every"):
         value = getattr(flags, name)
         if value is not None and value < 1:
             raise BidexError(f"--{name.replace('_', '-')} must be at least 1, not {value}.")
@@ -273,7 +275,7 @@ def _resolved(
 
 
 def _check_meta_test(flags: Any, kind: LearnerKind) -> None:
-    asked = [name for name in ("split", "shots", "rollouts") if getattr(flags, name) not in (None, "auto")]
+    asked = [name for name in ("split", "shots", "rollouts", "tasks") if getattr(flags, name) not in (None, "auto")]
     if asked and not kind.adapts:
         raise BidexError(f"--{asked[0]} is of what adapts (maml, promp, rl2, ...), not of {kind.name}. Leave it out.")
 

@@ -16,7 +16,7 @@ _OWN = ("suite", "task", "algo", "seed", "run_dir", "resume", "print_config", "e
 """Flags of a run that the file says otherwise, or that a sweep decides."""
 _CHANGING = frozenset((
     *("--steps", "--minutes", "--evaluate-every", "--video-every", "--logger"),
-    *("--episodes", "--split", "--shots", "--rollouts"),
+    *("--episodes", "--split", "--shots", "--rollouts", "--tasks"),
 ))  # fmt: skip
 """Flags that a resumed run may be given anew."""
 _MOST_RUNS = 10_000
