@@ -165,6 +165,17 @@ def test_what_is_refused_is_one_line_and_nothing_is_written(tmp_path: Path, caps
     assert collect(good, "--into", into) == 2 and "is of another run: seed differs" in capsys.readouterr().err
 
 
+def test_a_meta_test_of_test_tasks_alone_need_not_show_what_was_trained(tmp_path: Path) -> None:
+    run = evaluated(tmp_path, 0, 0.5)
+    rows = {"classes": {"C": {"success": 1.0, "return": 1.0, "score": None}}}
+    of_test = {"before": rows, "after": rows}
+    (run / "evaluation.json").write_text(json.dumps({"splits": {"test": of_test}}))
+    assert condensing.condensed(RunFolder.open(run), "x", 7)["evaluation"]["splits"].keys() == {"test"}
+    (run / "evaluation.json").write_text(json.dumps({"splits": {"train": of_test, "test": of_test}}))
+    with pytest.raises(BidexError, match="of another run"):
+        condensing.condensed(RunFolder.open(run), "x", 7)
+
+
 def test_a_damaged_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "x.json"
     content = condensing.condensed(RunFolder.open(evaluated(tmp_path, 0, 0.5)), "x", 7)
