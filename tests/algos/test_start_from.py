@@ -65,9 +65,10 @@ def test_another_form_is_refused(change, expected):
         start_from(learner, trained().policy_state_dict())
 
 
+@pytest.mark.parametrize("preset", ["tuned", "unseen"])
 @pytest.mark.parametrize("presets", [PROMP_PRESETS, MAML_PRESETS])
-def test_the_tuned_presets_fit_what_mtppo_learns_on_a_laptop(presets):
-    tuned, given = presets["tuned"], PPO_PRESETS["laptop"]
+def test_presets_that_go_on_fit_what_mtppo_learns_on_a_laptop(presets, preset):
+    tuned, given = presets[preset], PPO_PRESETS["laptop"]
     for name in ("hidden", "activation", "normalise_observations", "gamma"):
         assert getattr(tuned, name) == getattr(given, name)
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from bidex_algos.checks import at_least, between, positive
-from bidex_algos.meta.config import TABLE_48, TUNED, OuterConfig
+from bidex_algos.meta.config import TABLE_48, TUNED, UNSEEN, OuterConfig
 
 
 @dataclass(frozen=True)
@@ -47,5 +47,6 @@ PRESETS: dict[str, MAMLConfig] = {
     # The Bi-DexHands appendix has no table for MAML: all but the trust region, MAML's own, is as in ProMP's.
     "paper": MAMLConfig(**TABLE_48, max_kl=0.01, damping=1e-5),
     "tuned": MAMLConfig(**TUNED),
+    "unseen": MAMLConfig(**UNSEEN),
     "laptop": MAMLConfig(),
 }

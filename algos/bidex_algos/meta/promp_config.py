@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from bidex_algos.checks import at_least, positive, rising
-from bidex_algos.meta.config import TABLE_48, TUNED, OuterConfig
+from bidex_algos.meta.config import TABLE_48, TUNED, UNSEEN, OuterConfig
 
 
 @dataclass(frozen=True)
@@ -60,5 +60,6 @@ PRESETS: dict[str, ProMPConfig] = {
     # Outer steps that learn from nothing are too large for what is learned already: of 1e-3 five made a KL of 1.1 and
     # lost a third of the return, with a KL of 0.05 a seed lost 0.5 of 7.4 in 1.6 M steps.
     "tuned": ProMPConfig(**TUNED, outer_learning_rate=1e-4, desired_kl=0.0125),
+    "unseen": ProMPConfig(**UNSEEN, outer_learning_rate=1e-4, desired_kl=0.0125),
     "laptop": ProMPConfig(),
 }
