@@ -115,5 +115,5 @@ TUNED: dict[str, Any] = {
 }
 
 # The same where the test tasks are of classes that nobody has trained on (ML4, ML20): smaller steps and whole episodes.
-# docs/results/ml20.md: adapted to the first 150 of its 500 steps LiftUnderarm lost 317 of its return, to all it gained 352.
+# docs/results/ml20.md: adapted to the first 150 of its 500 steps LiftUnderarm lost 317 of return, to all it gained 352.
 UNSEEN: dict[str, Any] = TUNED | {"inner_learning_rate": 0.01, "max_adapt_steps": 500, "tasks_per_class": 1}
