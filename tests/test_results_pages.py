@@ -122,6 +122,8 @@ def test_rows_by_learners(tmp_path: Path) -> None:
     assert rows == [["8", "–", "9.5 (9 to 10)"], ["64", "5.5 (5 to 6)", "1.5 (1 to 2)"]]
     assert "Seeds: 2. Steps: 1,000." in text and "![Return over training, by rows: many, C]" in text
     assert fill(page, tmp_path / "data", check=True) == []
+    page.write_text("<!-- results: study=many on=C show=row-curves -->\n<!-- end -->\n")
+    assert [path.name for path in fill(page, tmp_path / "data")] == ["many-C-row-curves.png", "page.md"]
 
 
 def test_the_best_run_of_each_class(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -77,7 +77,7 @@ def fill(page: Path, data: Path, check: bool = False) -> list[Path]:
             lines = list(references_table())
         else:
             studies = read_studies(data, options["study"], options.get("on"), options.get("split"))
-            lines = list(_lines(studies, options["show"], page, check, changed))
+            lines = list(_lines(studies, options, page, check, changed))
         return f"{found['head']}\n" + "\n".join(lines or ["No runs yet."]) + f"\n\n{found['end']}"
 
     new = _BLOCK.sub(block, text)
@@ -101,7 +101,10 @@ def _options(words: str, page: Path) -> dict[str, str]:
     return options
 
 
-def _lines(studies: list[Study], show: str, page: Path, check: bool, changed: list[Path]) -> Iterator[str]:
+def _lines(
+    studies: list[Study], options: dict[str, str], page: Path, check: bool, changed: list[Path]
+) -> Iterator[str]:
+    show = options["show"]
     if show in _OVER_ALL:
         yield from _OVER_ALL[show](studies) if studies else ()
         return
@@ -111,7 +114,9 @@ def _lines(studies: list[Study], show: str, page: Path, check: bool, changed: li
         if show in _TABLES:
             yield from _TABLES[show](study)
             continue
-        told = [study.name, *([study.on] if len(studies) > 1 else []), *([study.split] if study.split else []), show]
+        # A page may have a block for each class of a study: their pictures are two.
+        on = [study.on] if len(studies) > 1 or "on" in options else []
+        told = [study.name, *on, *([study.split] if study.split else []), show]
         out = page.parent / f"{'-'.join(told)}.png"
         if _digest_of(out) != study.digest:
             changed.append(out)
