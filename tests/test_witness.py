@@ -211,6 +211,10 @@ def test_every_stored_witness_holds(name: str) -> None:
         f"{name}: success {result.first_success}, {result.succeeded} of 10 shifted starts, "
         f"on {here['platform']} with {here['packages']}; made on {witness.made['versions']}"
     )
+    page = (Path(__file__).parent.parent / "docs/results/mt20.md").read_text().partition("| class | return | best")[2]
+    row = next(line for line in page.splitlines() if line.startswith(f"| {name} |")).split(" | ")
+    assert row[1] == f"{result.total:.4g}" and row[3].startswith(f"{result.first_success} of ")
+    assert row[4:6] == [f"{result.succeeded} of 10", f"{1000.0 * result.deepest:.1f} mm"]
 
 
 def test_a_search_of_whole_episodes_never_falls_behind_the_episode_it_began_with(tmp_path: Path) -> None:
