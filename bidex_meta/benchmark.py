@@ -5,17 +5,16 @@ physics is made here: this module decides which numbers belong to which task and
 """
 
 import hashlib
-import operator
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple, cast
 
 import numpy as np
 
-from bidex_meta.errors import BidexError, shortened, unknown_name
+from bidex_meta.errors import BidexError, shortened, unknown_name, whole_number
 from bidex_meta.memory import POINT_BYTES, ROW_BYTES, check_memory
 from bidex_meta.outside import name_with_object
-from bidex_meta.suite import SPLITS, ListedTask, Split, Suite, SuiteClass, load_suite
+from bidex_meta.suite import MOST_POINTS, SPLITS, ListedTask, Split, Suite, SuiteClass, load_suite
 from bidex_meta.tasks import registry
 
 if TYPE_CHECKING:
@@ -87,7 +86,7 @@ class Benchmark:
 
     def __init__(self, name_or_path: str | Path | Suite, seed: int = 0) -> None:
         self.suite = name_or_path if isinstance(name_or_path, Suite) else load_suite(name_or_path)
-        self.seed = _checked_seed(seed)
+        self.seed = whole_number("seed", seed, 0)
         self._classes = {entry.name: _task_class(self.suite, entry) for entry in self.suite.classes}
         self._tasks = {
             split: [task for entry in self.suite.split_classes(split) for task in self._draw(entry, split)]
@@ -281,7 +280,7 @@ def make_task_world(
 
     task_name = registry.resolve(task_name)
     task_class = registry.get(task_name, moving_base, **registry.with_object(object))
-    tasks = _drawn(task_class.variation_space, _checked_seed(seed), task_name, "train", _TASKS_ALONE)
+    tasks = _drawn(task_class.variation_space, whole_number("seed", seed, 0), task_name, "train", _TASKS_ALONE)
     slot = Slot(name_with_object(task_name, object), task_class, np.stack([task.variation for task in tasks]))
     if task_sampling is None:
         task_sampling = "fixed" if checked_mode(autoreset_mode).name == "DISABLED" else "uniform"
@@ -297,7 +296,7 @@ def make_task_world(
         observation="plain",
         pad_to=None,
         task_sampling=task_sampling,
-        points=(points, False),
+        points=(whole_number("points", points, 0, MOST_POINTS), False),
     )
 
 
@@ -324,7 +323,9 @@ def _make_world(
         num_envs = _DEFAULT_ROWS["cpu" if place.type == "cpu" else "accelerator"]
     if not isinstance(num_envs, int | np.integer) or isinstance(num_envs, bool) or num_envs < len(slots):
         names = ", ".join(slot.name for slot in slots)
-        raise BidexError(f"num_envs: expected at least {len(slots)}, a row each for {names}; got {num_envs!r}.")
+        raise BidexError(
+            f"num_envs: expected at least {len(slots)}, a row each for {names}; got {shortened(num_envs)}."
+        )
     if place.type == "cpu":
         check_memory(int(num_envs) * (ROW_BYTES + points[0] * POINT_BYTES), f"{num_envs:,} rows", "Lower num_envs.")
     keep_freed_memory()
@@ -332,7 +333,7 @@ def _make_world(
         slots,
         int(num_envs),
         device=place,
-        seed=_checked_seed(seed),
+        seed=whole_number("seed", seed, 0),
         autoreset_mode=checked_mode(autoreset_mode),
         observation=observation,
         pad_to=pad_to,
@@ -376,16 +377,6 @@ def _listed(space: "VariationSpace", seed: int, name: str, task: ListedTask) -> 
     return variation
 
 
-def _checked_seed(seed: object) -> int:
-    try:
-        number = operator.index(seed)  # type: ignore[arg-type]
-    except TypeError:
-        number = -1
-    if number < 0 or isinstance(seed, bool):
-        raise BidexError(f"seed: expected a whole number from 0 on, got {seed!r}.")
-    return number
-
-
 def _checked_device(device: "str | torch.device") -> "torch.device":
     import torch
 
@@ -396,5 +387,7 @@ def _checked_device(device: "str | torch.device") -> "torch.device":
     except (RuntimeError, TypeError, ValueError) as error:
         raise BidexError(f"device: expected auto, cpu, cuda or cuda:N, got {shortened(device)}.") from error
     if place.type == "cuda" and not torch.cuda.is_available():
-        raise BidexError(f"device: expected one that is here, got {device!r} without a CUDA device. Use cpu or auto.")
+        raise BidexError(
+            f"device: expected one that is here, got {shortened(device)} without a CUDA device. Use cpu or auto."
+        )
     return place

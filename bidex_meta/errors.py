@@ -4,6 +4,8 @@ import difflib
 import operator
 from collections.abc import Iterable
 
+import numpy as np
+
 EXIT_BAD_INPUT = 2
 EXIT_FAILED = 1
 EXIT_INTERRUPTED = 130
@@ -84,6 +86,17 @@ def whole_number(name: str, value: object, least: int, most: int | None = None) 
         bounds = f"from {least} on" if most is None else f"from {least} to {most}"
         raise BidexError(f"{name}: expected a whole number {bounds}, got {shortened(value)}.")
     return number
+
+
+def true_or_false(name: str, value: object) -> bool:
+    """A truth value, Python's or NumPy's.
+
+    Raises:
+        BidexError: Neither true nor false; no other value stands for one.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise BidexError(f"{name}: expected True or False, got {shortened(value)}.")
+    return bool(value)
 
 
 def shortened(value: object) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
-from bidex_meta.errors import BidexError
+from bidex_meta.errors import BidexError, shortened
 from bidex_meta.suite import Suite, load_suite, suite_names
 from bidex_meta.tasks import registry
 
@@ -114,5 +114,5 @@ def check_render_mode(render_mode: str | None) -> None:
     Raises:
         BidexError: Neither None nor `"rgb_array"`.
     """
-    if render_mode not in (None, "rgb_array"):
-        raise BidexError(f"render_mode: expected None or 'rgb_array', got {render_mode!r}.")
+    if not isinstance(render_mode, str | None) or render_mode not in (None, "rgb_array"):
+        raise BidexError(f"render_mode: expected None or 'rgb_array', got {shortened(render_mode)}.")

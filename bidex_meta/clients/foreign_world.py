@@ -17,6 +17,7 @@ from torch import Tensor
 from bidex_meta.errors import BidexError
 from bidex_meta.world.actions import clean
 from bidex_meta.world.autoreset import checked_mode, checked_seed, reset_mask
+from bidex_meta.world.checked import fits
 from bidex_meta.world.contract import plain_groups
 from bidex_meta.world.copying import Recreated
 from bidex_meta.world.ends import Clock, ended_info
@@ -245,11 +246,9 @@ class ForeignWorld(Recreated, VectorEnv):
         """Puts back what ``state_dict`` gave, on a world made alike.
 
         Raises:
-            BidexError: The state is of another number of rows or other sizes.
+            BidexError: The state is of another number of rows or other sizes, or damaged.
         """
-        here, there = tuple(self._obs.shape), tuple(state["observation"].shape)
-        if here != there:
-            raise BidexError(f"Expected the state of a world whose observations are {here}, got {there}.")
+        fits(state, self.state_dict())
         self._seed_rows(int(state["seed"]))
         self.episodes.load_state_dict(state["episodes"])
         self.task_index = state["task_index"].clone()

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from bidex_meta.clients.foreign_world import ForeignWorld, Sizes, Transition
 from bidex_meta.engine.cpu import CpuEngine
-from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.errors import BidexError, unknown_name, whole_number
+from bidex_meta.world.checked import fits
 
 NAME = "Humanoid-v5"
 EPISODE_STEPS = 1000
@@ -168,7 +169,8 @@ class HumanoidWorld(ForeignWorld):
         Raises:
             BidexError: The state is of another number of rows.
         """
-        self.set_tasks({NAME: np.zeros((int(state["tasks"]), 0))})
+        fits(state, self.state_dict())
+        self.set_tasks({NAME: np.zeros((whole_number("tasks", state["tasks"], 1), 0))})
         super().load_state_dict(state)
         self._engine.load_state_dict(state["engine"])
         self._x, self._contact = state["x"].clone(), state["contact"].clone()

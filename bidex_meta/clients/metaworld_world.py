@@ -26,6 +26,7 @@ from bidex_meta.clients.metaworld import (
 from bidex_meta.errors import BidexError, unknown_name
 from bidex_meta.evaluation.play import check_world, play_tasks
 from bidex_meta.evaluation.results import Evaluation, results_by_class
+from bidex_meta.world.checked import fits
 from bidex_meta.world.contract import PooledWorld
 
 
@@ -135,12 +136,11 @@ class MetaWorldWorld(ForeignWorld):
         Raises:
             BidexError: The state is of another suite, seed or number of rows.
         """
-        here = self.suite, self._task_seed, self.num_envs
-        there = state["suite"], state["task_seed"], len(state["observation"])
+        fits(state, self.state_dict())
+        here, there = (self.suite, self._task_seed), (state["suite"], state["task_seed"])
         if here != there:
             raise BidexError(
-                f"Expected the state of a world with (suite, seed, num_envs) = {here}, got {there}; build the world "
-                "with the same."
+                f"Expected the state of a world of (suite, seed) = {here}, got {there}; build the world with the same."
             )
         self.set_tasks(state["pools"])
         super().load_state_dict(state)

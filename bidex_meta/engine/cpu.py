@@ -1,7 +1,9 @@
 """C MuJoCo on all cores of the machine: ``mujoco.batch``."""
 
+import ctypes
 import os
 import warnings
+import weakref
 from collections.abc import Sequence
 
 import mujoco
@@ -11,6 +13,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.engine.health import LARGEST, LONGEST, SHORTEST, checked_state, outside, quaternion_columns
+from bidex_meta.errors import BidexError
 
 # What a simulation carries from one step to the next; the fields that a model has none of are skipped.
 _STATE_FIELDS = (
@@ -57,22 +60,38 @@ class CpuEngine:
         self._after_step = mujoco.mjtStage.mjSTAGE_VEL if refresh else mujoco.mjtStage.mjSTAGE_NONE
         # MuJoCo would print each broken row to stderr and to a log file in the working folder; unstable() tells it.
         mujoco.set_mju_user_warning(_silent)
-        self.batch = mujoco.batch.Batch(
-            models[0], self.num, nthread=default_threads() if threads is None else threads, persistent=True
-        )
+        threads = default_threads() if threads is None else threads
+        self._batch = mujoco.batch.Batch(models[0], self.num, nthread=threads, persistent=True)
+        self._forked = False
+        if threads > 1:
+            _WITH_THREADS.add(self)
         if len(models) > 1:
-            self.batch.set_models([models[i] for i in rows])
-        self._state = {name: self._bind(name) for name in _STATE if 0 not in self.batch.bind(name).shape}
+            self._batch.set_models([models[i] for i in rows])
+        self._state = {name: self._bind(name) for name in _STATE if 0 not in self._batch.bind(name).shape}
         self.qpos, self.qvel, self.ctrl = (self._state[n] for n in ("qpos", "qvel", "ctrl"))
         self.xfrc_applied = self._state["xfrc_applied"]
         self.sensordata = self._bind("sensordata")
         self._mocap = [self._state[name] for name in ("mocap_pos", "mocap_quat") if name in self._state]
         self._failed = torch.zeros(self.num, dtype=torch.bool)
-        self._numbers = torch.from_numpy(self.batch.state)
+        self._numbers = torch.from_numpy(self._batch.state)
         self._quaternions = self._quaternion_columns(models[0])
         self._models, self._model_of = list(models), list(rows)
         self._probe: mujoco.MjData | None = None
         self._poses: tuple[Tensor, Tensor] | None = None
+
+    @property
+    def batch(self) -> mujoco.batch.Batch:
+        """The simulations.
+
+        Raises:
+            BidexError: Its threads stayed in the process that made it.
+        """
+        if self._forked:
+            raise BidexError(
+                "Expected a world in the process that made it, got one with engine threads in a forked child, where "
+                "they are not. Make it with threads=1, or in the child."
+            )
+        return self._batch
 
     def _quaternion_columns(self, model: mujoco.MjModel) -> Tensor:
         """Columns of the batch's numbers that hold quaternions, four for each, shape (4 k,)."""
@@ -88,7 +107,7 @@ class CpuEngine:
     def _bind(self, name: str) -> Tensor:
         with warnings.catch_warnings():  # torch warns that outputs of the batch are read-only; nothing here writes them
             warnings.simplefilter("ignore")
-            return torch.from_numpy(self.batch.bind(name))
+            return torch.from_numpy(self._batch.bind(name))
 
     def step(self, substeps: int, active: Tensor | None = None) -> None:
         """Advances all simulations, or those of the mask ``active``."""
@@ -118,14 +137,14 @@ class CpuEngine:
 
     def unstable(self) -> Tensor:
         """Which simulations broke since their last reset. Shape (num,), bool."""
-        told = self.batch.warning[:, :, 1]
+        told = self._batch.warning[:, :, 1]
         bad = told.take(_BAD, axis=1).any(axis=1) if told.any() else np.zeros(self.num, dtype=bool)
         # One non-finite addend makes the sum non-finite.
         return torch.from_numpy(bad) | self._failed | ~self.sensordata.sum(dim=1).isfinite()
 
     def warnings(self) -> Tensor:
         """How many of MuJoCo's warnings each simulation has told since its last reset. Shape (num,), int64."""
-        return torch.from_numpy((self.batch.warning[:, :, 1] > 0).sum(axis=1)) + self._failed
+        return torch.from_numpy((self._batch.warning[:, :, 1] > 0).sum(axis=1)) + self._failed
 
     def placement(self) -> Tensor:
         """What ``reset`` takes, of every simulation as it stands, a copy. Shape (num, nq + 7 nmocap)."""
@@ -172,11 +191,11 @@ class CpuEngine:
 
     def model(self, row: int) -> mujoco.MjModel:
         """The model of a simulation, for pictures and checks."""
-        return self.batch.get_model(row)
+        return self._batch.get_model(row)
 
     def data(self, row: int) -> mujoco.MjData:
         """A copy of a simulation's data, forwarded, for pictures and checks."""
-        model, data = self.batch.get_model(row), self.batch.get_data(row)
+        model, data = self._batch.get_model(row), self._batch.get_data(row)
         mujoco.mj_forward(model, data)
         return data
 
@@ -192,6 +211,20 @@ class CpuEngine:
         mujoco.mj_comPos(model, data)
         mujoco.mj_collision(model, data)
         return float(max(0.0, -data.contact.dist.min())) if data.ncon else 0.0
+
+
+_WITH_THREADS: "weakref.WeakSet[CpuEngine]" = weakref.WeakSet()
+
+
+def _after_fork() -> None:
+    """In a child: to step a batch, and even to free it, would wait without end for threads that stayed behind."""
+    for engine in _WITH_THREADS:
+        engine._forked = True
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(engine._batch))
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
 
 
 def _silent(message: str) -> None:

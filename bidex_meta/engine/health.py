@@ -47,6 +47,23 @@ def checked_state(state: object, views: Mapping[str, Tensor]) -> dict[str, Tenso
     return {name: _checked_field(name, state[name], view) for name, view in views.items()}
 
 
+def dense(given: object, device: torch.device, dtype: torch.dtype | None = None) -> Tensor | None:
+    """What was given as a dense tensor on a device, without a gradient; None if it is no array of real numbers.
+
+    Args:
+        given: A tensor, an array or nested lists, of numbers or truth values.
+        device: Where it shall be.
+        dtype: What type it shall have; None keeps its own.
+    """
+    try:
+        # In C's order: torch takes no array that is read backwards.
+        made = given.detach() if isinstance(given, Tensor) else torch.as_tensor(np.asarray(given, order="C"))
+        usable = made.layout == torch.strided and not made.is_complex()
+        return made.to(device=device, dtype=dtype) if usable else None
+    except (TypeError, ValueError, RuntimeError, OverflowError, NotImplementedError):
+        return None
+
+
 def _checked_field(name: str, value: Any, view: Tensor) -> Tensor:
     if not isinstance(value, Tensor) or value.shape[:1] != view.shape[:1] or value.numel() != view.numel():
         got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
@@ -54,7 +71,12 @@ def _checked_field(name: str, value: Any, view: Tensor) -> Tensor:
             f"Expected {name} of an engine's state of shape {tuple(view.shape)}, got {got}; build the world with the "
             "same suite and num_envs."
         )
-    value = value.detach().to(view).reshape(view.shape)
+    made = dense(value, view.device, view.dtype)
+    if made is None or value.is_floating_point() != view.is_floating_point():
+        raise BidexError(
+            f"Expected {name} of an engine's state as {view.dtype}, got {value.dtype}; take another state."
+        )
+    value = made.reshape(view.shape)
     if view.is_floating_point() and not bool(value.isfinite().all()):
         row = int((~value.reshape(len(value), -1).isfinite().all(dim=1)).nonzero()[0])
         raise BidexError(

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bidex_meta.errors import BidexError, whole_number
+from bidex_meta.errors import BidexError, shortened, whole_number
 from bidex_meta.points.camera import camera_of
 from bidex_meta.points.cloud import Cloud
 from bidex_meta.points.surfaces import sample
@@ -33,9 +33,9 @@ class PointsRule:
 
     def __post_init__(self) -> None:
         """Refuses what is no number of points."""
-        whole_number("points", self.count, 1, MOST_POINTS)
+        object.__setattr__(self, "count", whole_number("points", self.count, 1, MOST_POINTS))
         if not isinstance(self.kinds, bool):
-            raise BidexError(f"Expected kinds of points as true or false, got {self.kinds!r}.")
+            raise BidexError(f"Expected kinds of points as true or false, got {shortened(self.kinds)}.")
 
     @property
     def entries(self) -> int:

@@ -10,7 +10,7 @@ from bidex_meta.hands.pair import SIDES
 from bidex_meta.points.solids import DRAWN, area, inside, surface
 
 FIXTURE, HAND, OBJECT = -1.0, 0.0, 1.0
-"""What a point is of, where a cloud tells it: table and other parts of the world; either hand; anything that moves."""
+"""What a point is of, where a cloud has kinds: what stands still in an episode; either hand; what physics moves."""
 _SHARES = {HAND: 0.5, OBJECT: 0.35, FIXTURE: 0.15}
 """Of the candidates: by area alone a table would leave an egg a handful."""
 _SHOWN_GROUPS = 3
@@ -54,9 +54,10 @@ def visible_geoms(model: mujoco.MjModel) -> list[int]:
 
 
 def body_kinds(model: mujoco.MjModel) -> list[float]:
-    """FIXTURE, HAND or OBJECT of each body."""
+    """FIXTURE, HAND or OBJECT of each body; a body without a joint up to the world is in no kinematic tree."""
     hands = tuple(f"{side}/" for side in SIDES)
-    return [FIXTURE, *(HAND if model.body(i).name.startswith(hands) else OBJECT for i in range(1, model.nbody))]
+    moving = [OBJECT if tree >= 0 else FIXTURE for tree in model.body_treeid]
+    return [HAND if model.body(i).name.startswith(hands) else kind for i, kind in enumerate(moving)]
 
 
 def sample(model: mujoco.MjModel, count: int, seed: int = 0) -> Surfaces:
@@ -78,7 +79,9 @@ def sample(model: mujoco.MjModel, count: int, seed: int = 0) -> Surfaces:
     of_body = body_kinds(model)
     seen = {geom: _in_body(model, geom, _PROBES, offsets[geom], geoms) for geom in geoms}
     open_area = np.array([area(model, g) * len(seen[g][0]) / _PROBES for g in geoms])
-    kinds = np.array([of_body[model.geom_bodyid[g]] for g in geoms])
+    # Only geoms of the world itself have the fixtures' share: a door's frame has its points from the objects'.
+    owners = model.geom_bodyid[geoms]
+    kinds = np.array([FIXTURE if body == 0 else HAND if of_body[body] == HAND else OBJECT for body in owners])
     found = []
     for geom, number in zip(geoms, _portions(open_area, kinds, count), strict=True):
         tries = int(np.ceil(1.3 * number * _PROBES / max(len(seen[geom][0]), 1))) + 8

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
+from bidex_meta.errors import true_or_false
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.tasks.layout import Layout
 from bidex_meta.tasks.state import TaskState
@@ -102,8 +103,12 @@ class TaskClass(ABC):
 
         Args:
             moving_base: Drive the bases or fix them; None takes the class's own (fixed for HandOver alone).
+
+        Raises:
+            BidexError: Neither True, False nor None.
         """
-        self.moving_base = self.moves_by_default if moving_base is None else moving_base
+        chosen = self.moves_by_default if moving_base is None else moving_base
+        self.moving_base = true_or_false("moving_base", chosen)
 
     @property
     def scene_key(self) -> tuple[Hashable, ...]:

@@ -7,6 +7,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
+from bidex_meta.engine.health import dense
 from bidex_meta.errors import BidexError, shortened, unknown_name, whole_number
 
 _MODES = {"SAME_STEP": AutoresetMode.SAME_STEP, "DISABLED": AutoresetMode.DISABLED}
@@ -44,12 +45,15 @@ def reset_mask(options: dict[str, Any] | None, num_envs: int, device: torch.devi
     mask = (options or {}).get("reset_mask")
     if mask is None:
         return torch.ones(num_envs, dtype=torch.bool, device=device)
-    mask = torch.as_tensor(mask, device=device)
-    if mask.shape != (num_envs,) or mask.dtype != torch.bool:
-        raise BidexError(f"Expected a bool reset_mask of shape ({num_envs},), got {mask.dtype} {tuple(mask.shape)}.")
-    if not ready and not mask.all():
+    made = dense(mask, device)
+    if made is None or made.shape != (num_envs,) or made.dtype != torch.bool:
+        got = shortened(mask) if made is None else f"{made.dtype} {tuple(made.shape)}"
+        raise BidexError(
+            f"Expected a bool reset_mask of shape ({num_envs},), got {got}. True starts a row; without it all start."
+        )
+    if not ready and not made.all():
         raise BidexError("Expected a full reset first, got a reset_mask with false entries; call reset() once without.")
-    return mask
+    return made
 
 
 def checked_seed(seed: Any, mask: Tensor) -> int:

@@ -7,14 +7,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bidex_meta.engine.health import checked_state
+from bidex_meta.engine.health import checked_state, dense
 from bidex_meta.errors import BidexError, shortened, unknown_name, whole_number
+from bidex_meta.points.sight import PointsRule
 from bidex_meta.world.groups import Slot, with_pool
 from bidex_meta.world.observations import Rule
 
 _MOST_ROWS = 10_000_000
 """Beyond any memory; less than what an engine's library could not count."""
 _LARGEST_SEED = 2**128
+_LEAST = {"episodes/number": -1}
+"""Of whole numbers in a state; the number of a row's episode before its first is -1."""
 _AGAIN = "build the world with the same suite, split and num_envs."
 
 
@@ -39,16 +42,18 @@ def seed(given: object) -> int:
     return whole_number("seed", given, 0, _LARGEST_SEED)
 
 
-def choices(task_sampling: object, observation: object) -> None:
-    """Refuses what is none of the names.
+def choices(task_sampling: object, observation: object, points: object) -> None:
+    """Refuses what is none of the names, and points that are no rule of them.
 
     Raises:
-        BidexError: An unknown name.
+        BidexError: An unknown name, or something else than a ``PointsRule`` or None.
     """
-    if task_sampling not in ("uniform", "fixed"):
-        raise BidexError(f"Expected task_sampling 'uniform' or 'fixed', got {task_sampling!r}.")
-    if observation not in get_args(Rule):
+    if not isinstance(task_sampling, str) or task_sampling not in ("uniform", "fixed"):
+        raise BidexError(f"Expected task_sampling 'uniform' or 'fixed', got {shortened(task_sampling)}.")
+    if not isinstance(observation, str) or observation not in get_args(Rule):
         raise unknown_name("observation", str(observation), get_args(Rule))
+    if points is not None and not isinstance(points, PointsRule):
+        raise BidexError(f"points: expected a PointsRule or None, got {shortened(points)}. Write PointsRule(768).")
 
 
 def action(given: Tensor | np.ndarray, shape: tuple[int, int], device: torch.device) -> Tensor:
@@ -58,12 +63,7 @@ def action(given: Tensor | np.ndarray, shape: tuple[int, int], device: torch.dev
         BidexError: No real numbers, or another shape.
     """
     wanted = f"Expected actions of shape {shape}"
-    try:
-        made = given.detach() if isinstance(given, Tensor) else torch.as_tensor(given)
-        usable = made.layout == torch.strided and not made.is_complex()
-        made = made.to(device, torch.float32) if usable else None
-    except (TypeError, ValueError, RuntimeError, OverflowError, NotImplementedError):
-        made = None
+    made = dense(given, device, torch.float32)
     if made is None:
         raise BidexError(f"{wanted}, got {type(given).__name__} that is no dense array of real numbers.")
     if made.shape != shape:
@@ -83,17 +83,11 @@ def state(given: Any, own: Mapping[str, Any], slots: Sequence[Slot], task_id: Te
     Raises:
         BidexError: Another world's state, or a damaged one.
     """
-    if not isinstance(given, Mapping) or not own.keys() <= given.keys():
-        got = sorted(map(str, given)) if isinstance(given, Mapping) else type(given).__name__
-        raise BidexError(f"Expected the state of a world with {sorted(own)}, got {got}.")
+    _names("it", given, own)
     _alike(own, given)
-    seed(given["seed"])
-    for name in ("task_index", "action", "observation"):
-        _tensor(name, given[name], own[name])
-    for name, value in own["episodes"].items():
-        _tensor(f"episodes/{name}", dict(given["episodes"]).get(name), value)
+    fits(given, own)
     for name in ("tasks", "engines"):
-        if not isinstance(given[name], Sequence) or len(given[name]) != len(own[name]):
+        if len(given[name]) != len(own[name]):
             raise BidexError(f"Expected {len(own[name])} {name} in a world's state, got others; {_AGAIN}")
     for mine, engine in zip(own["engines"], given["engines"], strict=True):
         checked_state(engine, mine)
@@ -105,6 +99,38 @@ def state(given: Any, own: Mapping[str, Any], slots: Sequence[Slot], task_id: Te
     return filled
 
 
+def fits(given: Any, own: Mapping[str, Any], inside: str = "") -> None:
+    """Refuses a saved state with other names, types or shapes than a world's own, or numbers that are not finite.
+
+    Args:
+        given: The saved state.
+        own: That of the world that takes it: tensors, plain values, and mappings of such.
+        inside: Where in a larger state both stand.
+
+    Raises:
+        BidexError: The first difference.
+    """
+    _names(inside or "it", given, own)
+    for name, value in own.items():
+        if isinstance(value, Mapping):
+            fits(given[name], value, f"{inside}{name}/")
+        elif isinstance(value, Tensor):
+            _tensor(f"{inside}{name}", given[name], value)
+        elif not isinstance(given[name], type(value)):
+            got = f"{type(value).__name__}, got {shortened(given[name])}"
+            raise BidexError(f"Expected {inside}{name} of a world's state as {got}; {_AGAIN}")
+    if "seed" in own:
+        seed(given["seed"])
+
+
+def _names(inside: str, given: object, own: Mapping[str, Any]) -> None:
+    if not isinstance(given, Mapping) or not own.keys() <= given.keys():
+        got = sorted(map(str, given)) if isinstance(given, Mapping) else type(given).__name__
+        raise BidexError(
+            f"Expected the state of a world with {sorted(own)} in {inside}, got {shortened(got)}; {_AGAIN}"
+        )
+
+
 def _alike(own: Mapping[str, Any], given: Mapping[str, Any]) -> None:
     if not isinstance(given["slots"], list) or not all(isinstance(name, str) for name in given["slots"]):
         raise BidexError(
@@ -112,7 +138,7 @@ def _alike(own: Mapping[str, Any], given: Mapping[str, Any]) -> None:
         )
     there = given["slots"], tuple(getattr(given["observation"], "shape", ()))
     here = own["slots"], tuple(own["observation"].shape)
-    if here != there or not isinstance(given["episodes"], Mapping):
+    if here != there:
         raise BidexError(
             f"Expected the state of a world of {here[0]} with observations {here[1]}, got one of {there[0]} with "
             f"{there[1]}; {_AGAIN}"
@@ -120,10 +146,13 @@ def _alike(own: Mapping[str, Any], given: Mapping[str, Any]) -> None:
 
 
 def _tensor(name: str, given: object, own: Tensor) -> None:
-    if not isinstance(given, Tensor) or given.shape != own.shape or given.dtype != own.dtype:
+    usable = isinstance(given, Tensor) and given.layout == torch.strided and not given.is_meta
+    if not isinstance(given, Tensor) or not usable or given.shape != own.shape or given.dtype != own.dtype:
         got = f"{given.dtype} {tuple(given.shape)}" if isinstance(given, Tensor) else type(given).__name__
         raise BidexError(f"Expected {name} of a world's state as {own.dtype} {tuple(own.shape)}, got {got}; {_AGAIN}")
     if given.requires_grad:
         raise BidexError(f"Expected {name} of a world's state without gradients; detach it.")
     if not bool(given.isfinite().all()):
         raise BidexError(f"Expected finite numbers in {name} of a world's state, got others; take an older state.")
+    if given.dtype == torch.int64 and bool((given < _LEAST.get(name, 0)).any()):
+        raise BidexError(f"Expected counts in {name} of a world's state, got some below zero; take an older state.")

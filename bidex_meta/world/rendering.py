@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from bidex_meta import drawing
-from bidex_meta.errors import BidexError
+from bidex_meta.errors import BidexError, shortened
 from bidex_meta.maths import wxyz
 
 if TYPE_CHECKING:
@@ -46,9 +46,9 @@ class Painter:
             BidexError: Unknown camera, a row that does not exist, too large a picture, or no way to draw on this
                 machine.
         """
-        name = camera or "front"
-        if name not in CAMERAS:
-            raise BidexError(f"Expected a camera among {', '.join(CAMERAS)}, got {name!r}.")
+        name = "front" if camera is None else camera
+        if not isinstance(name, str) or name not in CAMERAS:
+            raise BidexError(f"Expected a camera among {', '.join(CAMERAS)}, got {shortened(name)}.")
         if not 0 <= row < world.num_envs:
             raise BidexError(f"Expected a row from 0 to {world.num_envs - 1}, got {row}.")
         engine, engine_row = simulation(world, row)

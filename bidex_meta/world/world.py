@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from torch import Tensor
 
 from bidex_meta.engine.choice import choose_engine
-from bidex_meta.errors import BidexError, whole_number
+from bidex_meta.errors import BidexError, true_or_false, whole_number
 from bidex_meta.points.sight import PointsRule
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.layout import CLIP
@@ -96,10 +96,10 @@ class World(Recreated, RowAttributes, VectorEnv):
         """
         self.device, make_engine = choose_engine(device, engine, threads)
         num_envs = checked.num_rows(num_envs, slots)
-        checked.choices(task_sampling, observation)
+        checked.choices(task_sampling, observation, points)
         self.num_envs, self.slots, self.seed = num_envs, [with_pool(slot, slot.tasks) for slot in slots], seed
         self.autoreset_mode = checked_mode(autoreset_mode)
-        self._stagger = stagger and self.autoreset_mode == AutoresetMode.SAME_STEP
+        self._stagger = true_or_false("stagger", stagger) and self.autoreset_mode == AutoresetMode.SAME_STEP
         self.metadata = {
             "autoreset_mode": self.autoreset_mode, "render_modes": ["rgb_array"], "render_fps": CONTROL_RATE
         }  # fmt: skip

@@ -1,5 +1,9 @@
 """The CPU engine's resets, health report and state."""
 
+import os
+import subprocess
+import sys
+
 import mujoco
 import pytest
 import torch
@@ -126,6 +130,47 @@ def test_inactive_rows_stand_still(scene: Scene) -> None:
 def test_threads_change_nothing(scene: Scene) -> None:
     assert same(run(fresh(scene, 8, threads=1), 10, seed=10), run(fresh(scene, 8, threads=2), 10, seed=10))
     assert default_threads() >= 1
+
+
+AFTER_FORK = """
+import os, signal, sys
+import torch
+from bidex_meta import BidexError, make_task_world
+
+def make():
+    world = make_task_world("HandOver", 4, "cpu", threads=int(sys.argv[1]))
+    world.reset(seed=0)
+    return world
+
+world, action = make(), torch.zeros(4, 40)
+saved = world.state_dict()
+pid = os.fork()
+if pid == 0:
+    signal.alarm(20)  # ends a child that waits for threads
+    for call in (lambda: world.step(action), world.reset, lambda: world.load_state_dict(saved)):
+        try:
+            call()
+            print("went on")
+        except BidexError as error:
+            print(error)
+    print("anew", *make().step(action)[1].shape)
+    sys.exit(0)  # the interpreter frees the old world
+status = os.waitpid(pid, 0)[1]
+world.step(action)
+sys.exit(status != 0)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_forked_child_is_refused_its_parents_threads_and_ends(threads: int) -> None:
+    command = [sys.executable, "-W", "ignore", "-c", AFTER_FORK, str(threads)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    *calls, anew = done.stdout.splitlines()
+    assert anew == "anew 4" and len(calls) == 3
+    for line in calls:
+        assert "forked" in line and "threads=1" in line if threads == 2 else line == "went on"
 
 
 def test_a_saved_state_goes_on_bit_for_bit(scene: Scene) -> None:

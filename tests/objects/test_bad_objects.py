@@ -1,8 +1,10 @@
 """What is no object for a hand: one line that says so, before a world is built or a folder written."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
+import mujoco
 import pytest
 
 from bidex_meta import Benchmark, BidexError, make_task_world
@@ -37,8 +39,15 @@ BAD = {
     "in millimetres": (mjcf(GEOM.replace("0.03 0.03 0.03", "30 30 30")), "MJCF is in metres"),
     "a crumb": (mjcf(GEOM.replace("0.03 0.03 0.03", "0.001 0.001 0.001")), "1 to 25 cm"),
     "a size below zero": (mjcf(GEOM.replace("0.03 0.03 0.03", "0.03 -0.03 0.03")), "MuJoCo says"),
-    "a size that is none": (mjcf(GEOM.replace("0.03 0.03 0.03", "0.03 nan 0.03")), "expected"),
-    "an infinite mass": (mjcf(GEOM.replace("0.1", "inf")), "expected"),
+    "a size that is none": (mjcf(GEOM.replace("0.03 0.03 0.03", "0.03 nan 0.03")), "finite numbers, got size="),
+    "an infinite mass": (mjcf(GEOM.replace("0.1", "inf")), "finite numbers, got mass='inf'"),
+    "no place": (mjcf(GEOM.replace("<geom", "<geom pos='-NaN 0 0'")), "finite numbers, got pos="),
+    "an infinite place": (mjcf(GEOM.replace("<geom", "<geom pos='0 -Infinity 0'")), "finite numbers, got pos="),
+    "no colour": (mjcf(GEOM.replace("<geom", "<geom rgba='nan(1) 0 0 1'")), "finite numbers, got rgba="),
+    "no numbers of a mesh": (
+        mjcf('<geom type="mesh" mesh="m"/>', '<asset><mesh name="m" file="m.obj" scale="nan 1 1"/></asset>'),
+        "finite numbers, got scale=",
+    ),
     "a mass below zero": (mjcf(GEOM.replace("0.1", "-1")), "MuJoCo says"),
     "a shape elsewhere": (mjcf(GEOM.replace("<geom", "<geom pos='0.06 0 0'")), "origin inside its shape"),
     "only to be seen": (mjcf(GEOM.replace("<geom", "<geom contype='0' conaffinity='0'")), "geoms that collide"),
@@ -69,8 +78,17 @@ BAD = {
 }
 
 
+@pytest.fixture
+def loud(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """MuJoCo as before the first engine: it writes warnings to stderr and a log file in the working folder."""
+    monkeypatch.chdir(tmp_path)
+    mujoco.set_mju_user_warning(None)
+    yield
+    mujoco.set_mju_user_warning(lambda _: None)
+
+
 @pytest.mark.parametrize("case", BAD)
-def test_a_bad_file_is_one_line(case: str, tmp_path: Path) -> None:
+def test_a_bad_file_is_one_line(case: str, tmp_path: Path, loud: None, capfd: pytest.CaptureFixture[str]) -> None:
     text, told = BAD[case]
     (tmp_path / "outside.obj").write_text("v 0 0 0\n")
     folder = tmp_path / "mine"
@@ -81,6 +99,16 @@ def test_a_bad_file_is_one_line(case: str, tmp_path: Path) -> None:
         registry.get("CatchUnderarm", True, object=str(file))
     assert told in str(raised.value) and "\n" not in str(raised.value), raised.value
     assert str(file) in str(raised.value)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine", "outside.obj"], "MuJoCo wrote a log"
+    assert not capfd.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["infinite", "nano", "inf.obj", "Inf-1"])
+def test_a_name_may_begin_like_a_number_that_is_none(name: str, tmp_path: Path) -> None:
+    file = tmp_path / "thing.xml"
+    named = GEOM.replace("<geom", f"<geom name='{name}' material='{name}'")
+    file.write_text(mjcf(named, f"<asset><material name='{name}'/></asset>"))
+    registry.get("CatchUnderarm", True, object=str(file))
 
 
 @pytest.mark.parametrize("name", ["crate", "", 3, None, "/no/such/file.xml", "a\0.xml", "a\nb.xml"])

@@ -2,8 +2,10 @@
 
 import copy
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -74,6 +76,31 @@ def test_making_worlds() -> None:
 
     draws(80, safe, st.sampled_from(names), odd)
     draws(40, lambda name: make_task_world(name, 1, "cpu", threads=1).close(), odd)
+
+
+NOT_TRUE_OR_FALSE = [value for value in ODD if value is not None and not isinstance(value, bool)]
+
+
+@pytest.mark.parametrize("name, values", [
+    ("moving_base", NOT_TRUE_OR_FALSE),
+    ("stagger", NOT_TRUE_OR_FALSE),
+    ("points", [value for value in ODD if type(value) not in (int, np.int64)] + [-1, 10**6]),
+    ("task_sampling", [value for value in ODD if value is not None]),
+    ("object", [value for value in ODD if value is not None]),
+])  # fmt: skip
+def test_no_odd_argument_of_a_task_world_is_taken(name: str, values: list[Any]) -> None:
+    given = {"num_envs": 1, "device": "cpu", "threads": 1}
+    for make in (partial(make_task_world, "HandOver"), partial(gymnasium.make_vec, "bidex-meta/HandOver-v1")):
+        for value in values:
+            with pytest.raises(BidexError) as raised:
+                make(**given, **{name: value})
+            assert "\n" not in str(raised.value)
+
+
+def test_render_modes() -> None:
+    for value in NOT_TRUE_OR_FALSE:
+        with pytest.raises(BidexError, match="render_mode"):
+            gymnasium.make_vec("bidex-meta/MT1-v1", num_envs=5, render_mode=value)
 
 
 def test_steps_resets_and_pools(world: Any) -> None:

@@ -34,7 +34,7 @@ def refused(call: Any, *arguments: Any, **named: Any) -> str:
     return message
 
 
-def unchanged(world: World, before: dict[str, Any]) -> bool:
+def unchanged(world: Any, before: dict[str, Any]) -> bool:
     def same(a: Any, b: Any) -> bool:
         if isinstance(a, dict):
             return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
@@ -183,6 +183,13 @@ BAD_STATES: dict[str, tuple[str, Any]] = {
     "NaN action": ("action", _spoilt),
     "a task beyond the pool": ("task_index", lambda value: value + 50),
     "a negative task": ("task_index", lambda value: value - 50),
+    "an episode of negative length": ("episodes/length", lambda value: value - 50),
+    "an action without numbers": ("action", lambda value: value.to("meta")),
+    "a sparse observation": ("observation", lambda value: value.to_sparse()),
+    "an engine's field without numbers": ("engines/0/qpos", lambda value: value.to("meta")),
+    "a sparse field of an engine": ("engines/0/qpos", lambda value: value.to_sparse()),
+    "an engine's field of complex numbers": ("engines/0/qpos", lambda value: value.to(torch.complex128)),
+    "an engine's field of whole numbers": ("engines/0/qvel", lambda value: value.long()),
 }
 
 
@@ -205,6 +212,65 @@ def test_foreign_states(world: World) -> None:
         refused(world.load_state_dict, state)
 
 
+BAD_MASKS = {
+    "none": lambda: torch.ones(ROWS),
+    "whole numbers": lambda: np.ones(ROWS, int),
+    "NaN": lambda: torch.full((ROWS,), NAN),
+    "a row short": lambda: [True] * (ROWS - 1),
+    "a column": lambda: torch.ones(ROWS, 1, dtype=torch.bool),
+    "text": lambda: "all",
+    "texts": lambda: np.full(ROWS, "True"),
+    "objects": lambda: np.array([True, None, True, True], object),
+    "ragged": lambda: [[True], [True, False]],
+    "a dict": lambda: {"rows": [0]},
+    "a slice": lambda: slice(2),
+    "a number beyond any": lambda: 10**30,
+    "without numbers": lambda: torch.ones(ROWS, dtype=torch.bool, device="meta"),
+    "sparse": lambda: torch.ones(ROWS, dtype=torch.bool).to_sparse(),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_MASKS)
+def test_masks(world: World, kind: str) -> None:
+    before = world.state_dict()
+    assert "reset_mask of shape (4,)" in refused(world.reset, options={"reset_mask": BAD_MASKS[kind]()})
+    assert unchanged(world, before)
+
+
+def test_masks_of_other_types_start_the_same_rows() -> None:
+    mask = [True, False, False, True]
+    backwards = np.array(mask[::-1])[::-1]
+    made = []
+    for given in (torch.tensor(mask), np.array(mask), mask, tuple(mask), backwards):
+        world = suite_world("MT4", ROWS, "DISABLED")
+        world.reset(seed=0)
+        world.step(0.5 * torch.ones(ROWS, 52))
+        made.append(world.reset(options={"reset_mask": given})[0])
+        assert world.episodes.elapsed.tolist() == [0, 1, 1, 0]
+    assert all(torch.equal(obs, made[0]) for obs in made)
+
+
+def test_states_of_worlds_of_others() -> None:
+    from bidex_meta.clients.humanoid_world import HumanoidWorld
+
+    world = HumanoidWorld(2, threads=1)
+    world.reset(seed=0)
+    good = world.state_dict()
+    for path, change in {
+        "seed": None,
+        "x": lambda x: x[:1],
+        "contact": lambda _: 3,
+        "tasks": lambda _: -1,
+        "engine/qpos": None,
+        "episodes/elapsed": lambda value: value.double(),
+        "observation": _spoilt,
+    }.items():
+        refused(world.load_state_dict, _with(world.state_dict(), path, change))
+        assert unchanged(world, good)
+    refused(world.load_state_dict, None)
+    world.load_state_dict(good)
+
+
 @pytest.mark.parametrize("threads", [0, -1, [], 1.5, "2", True, 10**9])
 def test_threads(world: World, threads: Any) -> None:
     assert refused(World, world.slots, ROWS, threads=threads).startswith("threads: ")
@@ -220,6 +286,11 @@ def test_threads(world: World, threads: Any) -> None:
         {"pad_to": 1.5},
         {"pad_to": 10**9},
         {"task_sampling": []},
+        {"task_sampling": np.zeros(3)},
+        {"stagger": 2},
+        {"stagger": np.zeros(3)},
+        {"points": 64},
+        {"points": (64, True)},
         {"engine": []},
         {"device": 3.5},
         {"seed": -2},
@@ -231,7 +302,18 @@ def test_worlds(world: World, options: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [{"width": -1}, {"width": 0}, {"height": 1.5}, {"row": -1}, {"row": 4}, {"row": None}], ids=str
+    "options",
+    [
+        {"width": -1},
+        {"width": 0},
+        {"height": 1.5},
+        {"row": -1},
+        {"row": 4},
+        {"row": None},
+        {"camera": ["top"]},
+        {"camera": 0},
+    ],
+    ids=str,
 )
 def test_pictures(world: World, options: dict[str, Any]) -> None:
     assert next(iter(options)) in refused(world.render, **options)

@@ -8,8 +8,9 @@ from torch import Tensor
 from bidex_meta.benchmark import Benchmark, make_task_world
 from bidex_meta.errors import BidexError
 from bidex_meta.points.sight import PointsRule
-from bidex_meta.points.surfaces import OBJECT, body_kinds
+from bidex_meta.points.surfaces import FIXTURE, OBJECT, body_kinds, sample
 from bidex_meta.tasks import registry
+from bidex_meta.tasks.scene import compile_scene
 from bidex_meta.world import World
 from bidex_meta.world.contract import ObservationGroup
 
@@ -117,6 +118,27 @@ def test_kinds_are_a_fourth_number_and_a_broken_row_is_no_harm() -> None:
     kinds = obs[:, where].view(8, COUNT, 4)[..., 3]
     assert info["unstable"].tolist() == [True, *[False] * 7] and obs.isfinite().all()
     assert set(kinds.unique().tolist()) <= {0.0, 1.0} and (kinds == 1).any(1).all() and (kinds == 0).any(1).all()
+
+
+DOORS = ("DoorOpenOutward", "DoorOpenInward", "DoorCloseOutward", "DoorCloseInward")
+HELD_FAST = {name: {"object/object"} for name in DOORS} | {"Switch": {"switch1/object", "switch2/object"}}
+"""Door frames and switch housings: a task says where they stand, and nothing moves them in an episode."""
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_what_no_joint_moves_is_the_scene(name: str) -> None:
+    model = compile_scene(registry.get(name)).model
+    of_body = body_kinds(model)
+    fast = {model.body(i).name for i, kind in enumerate(of_body) if kind == FIXTURE}
+    assert fast == {"world"} | HELD_FAST.get(name, set())
+    # Objects are what physics moves: a joint of their own or of what carries them.
+    for body in (i for i, kind in enumerate(of_body) if kind == OBJECT):
+        carriers = [body]
+        while carriers[-1]:
+            carriers.append(int(model.body_parentid[carriers[-1]]))
+        assert any(model.body_dofnum[each] for each in carriers)
+    seen = sample(model, 400)
+    assert [of_body[body] for body in model.geom_bodyid[seen.geoms]] == seen.kinds.tolist()
 
 
 @pytest.mark.parametrize("count", [-1, 1.5, 100_000, True])

@@ -4,13 +4,14 @@ MuJoCo opens whatever a model names, so that what a file may hold is listed here
 """
 
 import math
+import re
 from pathlib import Path
 from typing import NoReturn
 from xml.parsers import expat
 
 import mujoco
 
-from bidex_meta.errors import BidexError, one_line
+from bidex_meta.errors import BidexError, one_line, shortened
 from bidex_meta.reading import is_file, read_bytes
 
 _MOST_BYTES, _MOST_MESH_BYTES = 1_000_000, 20_000_000
@@ -22,6 +23,8 @@ _TAGS = _OUTER_TAGS | {"body", "inertial", "geom", "joint", "freejoint", "site"}
 _SENSOR_TAGS = frozenset(["sensor", "framepos", "framequat", "framelinvel", "frameangvel", "jointpos"])
 _SOLREF, _SOLIMP, _MARGIN = (0.0084, 1.0), (0.95, 0.99, 0.001), 0.002
 """As those of the files under assets/objects: as stiff as the time step allows (bidex_meta/hands/README.md)."""
+_NOT_FINITE = re.compile(r"(?:^|\s)[+-]?(?:inf(?:inity)?|nan(?:\([^)]*\))?)(?:\s|$)", re.IGNORECASE)
+"""MuJoCo takes such numbers, and writes a log file into the working folder."""
 _FOLDERS = ("meshdir", "texturedir", "assetdir")
 
 
@@ -111,6 +114,9 @@ def _check_tags(path: Path, content: bytes, allowed: frozenset[str]) -> None:
             refuse("the tags of an object", f"<{one_line(name)[:60]}>", f"Known: {', '.join(sorted(allowed))}.")
         if name == "texture" and any(key.startswith("file") and key != "file" for key in attributes):
             refuse("a texture in one file", "one with a file for each side", "Leave it out.")
+        for key, value in attributes.items():
+            if _NOT_FINITE.search(value):
+                refuse("finite numbers", f"{key}={shortened(one_line(value))}", "Mend the file.")
         for key in _FOLDERS:
             if Path(attributes.get(key, "")).is_absolute():
                 refuse("a folder beside the file", f"{key} with an absolute path", "Write a relative one.")
