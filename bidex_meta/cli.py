@@ -22,6 +22,7 @@ from bidex_meta.errors import (
     BidexError,
     known_name,
     one_line,
+    shortened,
 )
 from bidex_meta.streams import open_missing, silence, unread
 from bidex_meta.train.launch import hangup, launch
@@ -52,6 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with _signals_raise():
             try:
+                _check_text(given)
                 return _dispatch(given)
             finally:
                 sys.stdout.flush()  # at Python's own end nobody would catch that it cannot be written
@@ -137,6 +139,17 @@ def _dispatch(arguments: list[str]) -> int:
             raise BidexError(f"{flag} after bidex-meta {name} has no value. Give it one, or leave it out.")
     importlib.import_module(COMMANDS[name].module).main(rest)
     return 0
+
+
+def _check_text(arguments: Sequence[str]) -> None:
+    """Refuses what cannot be written into a config, a log or an event file; Python gives such bytes as surrogates."""
+    for word in arguments:
+        try:
+            word.encode()
+        except UnicodeEncodeError:
+            raise BidexError(
+                f"Expected arguments in UTF-8, got {shortened(word)}. Rename the file or folder, or name another."
+            ) from None
 
 
 def _help() -> str:
