@@ -24,6 +24,7 @@ from bidex_meta.errors import (
     one_line,
     shortened,
 )
+from bidex_meta.outside import own_fault
 from bidex_meta.streams import open_missing, silence, unread
 from bidex_meta.train.launch import hangup, launch
 
@@ -77,6 +78,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         silence(sys.stdout)  # what it could not write it would try again at its end
         place = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
         return _failed(f"{place}{error.strerror or error}. Mend the path, or make room.", EXIT_BAD_INPUT, debug)
+    except (Exception, SystemExit) as error:
+        told = own_fault(error)
+        if told is None:
+            raise
+        return _failed(f"{told} Mend it there; --debug shows the traceback.", EXIT_BAD_INPUT, debug)
 
 
 class _Terminated(KeyboardInterrupt):
