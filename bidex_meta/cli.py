@@ -18,12 +18,15 @@ from bidex_meta.errors import (
     EXIT_BAD_INPUT,
     EXIT_FAILED,
     EXIT_INTERRUPTED,
-    EXIT_TERMINATED,
+    EXIT_UNREAD,
     BidexError,
     known_name,
     one_line,
+    shortened,
 )
-from bidex_meta.train.launch import launch
+from bidex_meta.outside import own_fault
+from bidex_meta.streams import open_missing, silence, unread
+from bidex_meta.train.launch import hangup, launch
 
 _LONGEST = 2000
 """Letters of an error: what was given may be any text."""
@@ -38,7 +41,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns:
         The exit code: 0, 1 where training diverged or a run differs from what it recorded, 2 for bad input or what the
-        system refuses (a full disk, a folder that cannot be written, no memory), 130 after Ctrl-C, 143 after SIGTERM.
+        system refuses (a full disk, a folder that cannot be written, no memory), 129 after SIGHUP, 130 after Ctrl-C,
+        141 where nobody reads stderr any more, 143 after SIGTERM (0 where training saved and ended at SIGTERM).
 
     Raises:
         SystemExit: With another exit code, from a subcommand.
@@ -46,52 +50,70 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in given
     given = [argument for argument in given if argument != "--debug"]
+    open_missing()
     try:
-        with _told_of_sigterm():
-            return _dispatch(given)
+        with _signals_raise():
+            try:
+                _check_text(given)
+                return _dispatch(given)
+            finally:
+                sys.stdout.flush()  # at Python's own end nobody would catch that it cannot be written
     except BidexError as error:
         return _failed(str(error), EXIT_BAD_INPUT, debug)
     except FloatingPointError as error:
         return _failed(f"{error} What was saved before stays as it is.", EXIT_FAILED, debug)
-    except _Terminated:
-        return _failed("stopped by SIGTERM.", EXIT_TERMINATED, debug=False)
+    except _Terminated as stop:
+        return _failed(f"stopped by {stop}.", 128 + stop.number, debug=False)
     except KeyboardInterrupt:
         return _failed("interrupted.", EXIT_INTERRUPTED, debug=False)
     except MemoryError as error:
         return _failed(f"out of memory: {error or 'ask for fewer rows'}.", EXIT_BAD_INPUT, debug)
     except BrokenPipeError:
-        # The reader has seen enough (`| head`); without this Python complains again when it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        # A reader of results alone has seen enough (`| head`); without one of stderr work may have been broken off.
+        code = EXIT_UNREAD if unread(sys.stderr) else 0
+        silence(sys.stdout)  # Python complains otherwise when it flushes at its end
+        silence(sys.stderr)
+        return code
     except OSError as error:
+        silence(sys.stdout)  # what it could not write it would try again at its end
         place = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
         return _failed(f"{place}{error.strerror or error}. Mend the path, or make room.", EXIT_BAD_INPUT, debug)
+    except (Exception, SystemExit) as error:
+        told = own_fault(error)
+        if told is None:
+            raise
+        return _failed(f"{told} Mend it there; --debug shows the traceback.", EXIT_BAD_INPUT, debug)
 
 
 class _Terminated(KeyboardInterrupt):
-    """SIGTERM came: everything is cleaned up as after Ctrl-C."""
+    """SIGTERM or SIGHUP came: everything is cleaned up as after Ctrl-C."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.number = number
 
 
 @contextlib.contextmanager
-def _told_of_sigterm() -> Iterator[None]:
-    """Turns SIGTERM into an exception, so that it leaves no half-written file and says why the command ended.
+def _signals_raise() -> Iterator[None]:
+    """Turns SIGTERM and SIGHUP into an exception, so that they leave no half-written file and it is said why it ended.
 
     Not in one of several processes: a collective operation, which waits outside Python, would hold it up.
     """
-    number = signal.SIGTERM
     if threading.current_thread() is not threading.main_thread() or launch().count > 1:
         yield
         return
 
-    def stop(signum: int, frame: FrameType | None) -> None:
-        raise _Terminated
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise _Terminated(number)
 
-    before = signal.getsignal(number)
-    signal.signal(number, stop)
+    before = {number: signal.getsignal(number) or signal.SIG_DFL for number in (signal.SIGTERM, *hangup())}
+    for number in before:
+        signal.signal(number, stop)
     try:
         yield
     finally:
-        signal.signal(number, before if before is not None else signal.SIG_DFL)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _failed(reason: str, code: int, debug: bool) -> int:
@@ -101,7 +123,8 @@ def _failed(reason: str, code: int, debug: bool) -> int:
     told = one_line(reason)
     if len(told) > _LONGEST:
         told = f"{told[: _LONGEST - 300]} ... {told[-200:]}"  # the end says how to mend it
-    print(f"bidex-meta: {told}", file=sys.stderr)
+    with contextlib.suppress(OSError):  # nobody may read it
+        print(f"bidex-meta: {told}", file=sys.stderr)
     return code
 
 
@@ -122,6 +145,17 @@ def _dispatch(arguments: list[str]) -> int:
             raise BidexError(f"{flag} after bidex-meta {name} has no value. Give it one, or leave it out.")
     importlib.import_module(COMMANDS[name].module).main(rest)
     return 0
+
+
+def _check_text(arguments: Sequence[str]) -> None:
+    """Refuses what cannot be written into a config, a log or an event file; Python gives such bytes as surrogates."""
+    for word in arguments:
+        try:
+            word.encode()
+        except UnicodeEncodeError:
+            raise BidexError(
+                f"Expected arguments in UTF-8, got {shortened(word)}. Rename the file or folder, or name another."
+            ) from None
 
 
 def _help() -> str:

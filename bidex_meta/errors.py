@@ -9,8 +9,9 @@ import numpy as np
 EXIT_BAD_INPUT = 2
 EXIT_FAILED = 1
 EXIT_INTERRUPTED = 130
-EXIT_TERMINATED = 143
-"""Exit codes of the command line: 128 and the signal's number after Ctrl-C and SIGTERM, as shells expect."""
+EXIT_UNREAD = 141
+"""Exit codes of the command line: as shells expect, 128 and the number of the signal after Ctrl-C (and SIGTERM and
+SIGHUP), and of SIGPIPE where nobody reads any more what is printed."""
 
 
 class BidexError(ValueError):

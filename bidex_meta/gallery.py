@@ -7,6 +7,7 @@ import numpy as np
 from bidex_meta.benchmark import make_task_world
 from bidex_meta.evaluation import references
 from bidex_meta.record import video
+from bidex_meta.record.atomic import write_atomic
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.hidden import hidden
@@ -44,7 +45,7 @@ def write(page: Path, width: int = 360, height: int = 270) -> None:
         if witness_path(name).is_file():
             strip = _strip(name, load_witness(name), width * 2 // 3, height * 2 // 3)
             video.write_image(page.parent / _image(name, "witness"), strip)
-    page.write_text(text())
+    write_atomic(page, lambda file: file.write(text().encode()))
 
 
 def text() -> str:

@@ -1,12 +1,17 @@
 """Classes of the user's own by name: ``package.module:Class``, installed or in the working folder."""
 
 import importlib
+import importlib.util
 import os
 import sys
+import traceback
 from pathlib import Path
 from typing import Any
 
 from bidex_meta.errors import BidexError
+
+_files: dict[str, str] = {}
+"""Files of the classes that were asked for, and the names they were asked for by."""
 
 
 def is_outside(name: object) -> bool:
@@ -38,20 +43,46 @@ def outside_class(name: str, role: str) -> tuple[type[Any], Any]:
         role: What was named, for messages, e.g. ``--algo``.
 
     Raises:
-        BidexError: There is no such module or class.
+        BidexError: There is no such module or class, or the module raises where it is imported.
     """
     module_name, _, class_name = name.partition(":")
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # a console script does not look there by itself
     try:
+        spec = importlib.util.find_spec(module_name)
+        if spec is not None and spec.origin is not None:
+            _files[spec.origin] = f"{role} {name}"
         module = importlib.import_module(module_name)
-    except (ModuleNotFoundError, ValueError, TypeError) as error:  # the latter two: an empty or a relative name
-        missing = getattr(error, "name", None) or module_name
-        raise BidexError(
-            f"{role} {name}: expected a module that can be imported, but there is no {missing}. Install its "
-            "package, or start in the folder that holds it."
-        ) from error
+    except (Exception, SystemExit) as error:
+        told = own_fault(error)
+        # ValueError and TypeError: an empty or a relative name.
+        if isinstance(error, ModuleNotFoundError) or (told is None and isinstance(error, ValueError | TypeError)):
+            missing = getattr(error, "name", None) or module_name
+            told = (
+                f"{role} {name}: expected a module that can be imported, but there is no {missing}. Install its "
+                "package, or start in the folder that holds it."
+            )
+        raise BidexError(told or f"{role} {name}: {_said(error)}.") from error
     found = getattr(module, class_name, None)
     if not isinstance(found, type):
         raise BidexError(f"{role} {name}: expected a class {class_name} in {module.__file__}, found none.")
     return found, module
+
+
+def own_fault(error: BaseException) -> str | None:
+    """What an error says that was raised in a class of the user's own or below it, and where; None for any other."""
+    at = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
+    if isinstance(error, SyntaxError):
+        at.append((error.filename or "", error.lineno))
+    for file, line in reversed(at):
+        if file in _files:
+            return f"{_files[file]}: {_said(error)} ({file}, line {line})."
+    # Wrong arguments are refused by Python before the function has a line of its own.
+    asked = [(short_name(name), file, name) for file, name in _files.items()]
+    found = [(file, name) for each, file, name in asked if isinstance(error, TypeError) and f"{each}." in str(error)]
+    return f"{found[-1][1]}: {_said(error)} ({found[-1][0]})." if found else None
+
+
+def _said(error: BaseException) -> str:
+    words = getattr(error, "msg", None) or str(error)
+    return f"{type(error).__name__}: {words}".rstrip(": .")

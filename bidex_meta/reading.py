@@ -35,6 +35,18 @@ def expanded(path: str | Path) -> Path:
         raise BidexError(f"{shortened(str(path))}: {error}. Write the whole path.") from None
 
 
+def absolute(path: str | Path) -> Path:
+    """A path from the root on, ``~`` replaced and links followed.
+
+    Raises:
+        BidexError: As :func:`expanded`, or its links lead in a circle.
+    """
+    try:
+        return expanded(path).resolve()
+    except (RuntimeError, OSError) as error:
+        raise BidexError(f"{shortened(str(path))}: {one_line(error)}. Mend the link, or name another path.") from None
+
+
 def is_file(path: Path) -> bool:
     """Whether there is a regular file; false, not an error, for a path that cannot be one."""
     try:

@@ -15,7 +15,7 @@ from typing import Any, Literal, cast
 from bidex_meta.errors import BidexError, known_name, shortened, unknown_name
 from bidex_meta.outside import name_with_object
 from bidex_meta.paths import suites_dir
-from bidex_meta.reading import expanded, read_toml
+from bidex_meta.reading import absolute, expanded, read_toml
 
 Split = Literal["train", "test"]
 SPLITS: tuple[Split, Split] = ("train", "test")
@@ -286,7 +286,7 @@ class _Table:
         return [self._placed(value) for value in values]
 
     def _placed(self, value: str) -> str:
-        return str((self.file.parent / expanded(value)).resolve()) if value.endswith(".xml") else value
+        return str(absolute(self.file.parent / expanded(value))) if value.endswith(".xml") else value
 
     def choice(self, key: str, *choices: str, default: str = _REQUIRED) -> Any:
         expected = " or ".join(f'"{choice}"' for choice in choices)

@@ -319,6 +319,7 @@ def test_a_run_can_start_from_the_policy_of_another(toy_worlds, tmp_path, capsys
 
 _TRAIN = """
 import functools, sys, time
+import bidex_meta.record.progress as progress
 import bidex_meta.train.runner as runner
 from bidex_meta.cli import main
 from bidex_meta.sources.source import OwnSuite
@@ -329,11 +330,12 @@ class Slow(ToyWorld):
         return super().step(action)
 OwnSuite.world = lambda source, split="train", rows=None, mode="DISABLED": Slow(rows or 6, mode, source.seed)
 runner.train = functools.partial(runner.train, checkpoint_seconds=0.0)
+progress._PLAIN_SECONDS = 0.01
 sys.exit(main(sys.argv[1:]))
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGPIPE])
 def test_a_killed_run_resumes_to_the_same_end(number, toy_worlds, tmp_path):
     path, steps = tmp_path / "killed", 10_000_000
     command = [sys.executable, "-c", _TRAIN, "run", *SMALL, "--steps", str(steps), "--run-dir", str(path)]
@@ -342,11 +344,19 @@ def test_a_killed_run_resumes_to_the_same_end(number, toy_worlds, tmp_path):
     deadline = time.monotonic() + 300
     while not list(path.glob("checkpoints/step_*.pt")) and time.monotonic() < deadline and process.poll() is None:
         time.sleep(0.01)
-    process.send_signal(number)
-    _, errors = process.communicate()
-    if number != signal.SIGKILL:
-        assert process.returncode == {signal.SIGTERM: 0, signal.SIGINT: 130}[number]
+    errors = ""
+    if number == signal.SIGPIPE:  # the reader ends: `2>&1 | head`
+        assert process.stderr is not None
+        process.stderr.close()
+        process.wait()
+    else:
+        process.send_signal(number)
+        _, errors = process.communicate()
+    assert process.returncode == (0 if number == signal.SIGTERM else -9 if number == signal.SIGKILL else 128 + number)
+    if number not in (signal.SIGKILL, signal.SIGPIPE):
         assert f"bidex-meta run --resume {path}" in errors
+    if number != signal.SIGKILL:
+        assert final(path)[1] == RunFolder.open(path).metrics()[-1]["step"]
     stopped = final(path)[1]
     assert 0 < stopped < steps, errors
     goal = stopped + 480

@@ -15,7 +15,7 @@ PACKAGES = {package.__name__: Path(next(iter(package.__path__))) for package in 
 
 ORDER = (
     ("errors",),
-    ("paths", "maths", "agents", "drawing", "reading", "fields", "memory", "outside"),
+    ("paths", "maths", "agents", "drawing", "reading", "fields", "memory", "outside", "streams"),
     ("engine", "record", "hands", "suite"),
     ("tasks",),
     ("points",),

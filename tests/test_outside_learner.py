@@ -86,6 +86,9 @@ def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (package / "search.py").write_text(MODULE)
     (package / "empty.py").write_text("class NoLearner: ...\nPRESETS = {}\n")
     (package / "half.py").write_text(MODULE.replace("def iterate", "def other"))
+    init = "def __init__(self, world, config, seed):"
+    (package / "raises.py").write_text(MODULE.replace(init, f"{init}\n        raise RuntimeError('no luck')"))
+    (package / "arguments.py").write_text(MODULE.replace(init, "def __init__(self, world):"))
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)  # and taken away again, unlike what the command adds
     return tmp_path
@@ -113,6 +116,8 @@ def test_a_learner_of_the_working_folder_trains_resumes_and_is_evaluated(
         ("scratch_package.search:Another", "a class Another"),
         ("scratch_package.empty:NoLearner", "expected PRESETS"),
         ("scratch_package.half:RandomSearch", "iterate is missing"),
+        ("scratch_package.raises:RandomSearch", "RuntimeError: no luck ("),
+        ("scratch_package.arguments:RandomSearch", "takes 2 positional arguments but 4 were given"),
     ],
 )
 def test_what_is_no_learner_is_told_in_one_line(
@@ -120,5 +125,7 @@ def test_what_is_no_learner_is_told_in_one_line(
 ) -> None:
     assert main([*RUN[:-1], algo, "--steps", "64"]) == 2
     error = capsys.readouterr().err
-    assert told in error and error.count("\n") == 1
+    assert told in error.splitlines()[-1] and error.count("\n") == error.count("bidex-meta: ") + 2 * (
+        "rows on" in error
+    )
     assert not (scratch / "runs").exists()

@@ -80,6 +80,74 @@ def test_an_object_of_its_own_lies_beside_the_file() -> None:
     assert float(compile_scene(task).model.body("block/object").mass[0]) == 0.2
 
 
+_MISTAKES = {
+    '"block/position"]': ('"cube/pos"]', "Unknown sensor 'cube/pos'"),
+    '*goal_blocks("goal")': ('Block("goal", 3, ("block/posture",))', "Unknown sensor 'block/posture'. Did you mean"),
+    '"target": -5.0 * distance': (
+        '"target": distance[:, None]',
+        "reward_terms: 'target': expected a tensor of shape (n,)",
+    ),
+    "return self._distance(state) < _NEAR": (
+        "return self._distance(state)",
+        "success: expected a tensor of shape (n,) of bool",
+    ),
+    "return observe_goal(state": (
+        'return {"gaol": state.frozen["goal"]} or (state',
+        "observe: expected blocks of the layout",
+    ),
+    '{"constant": torch.ones_like(distance)': ('{"constant": 1.0', "reward_terms: 'constant': expected a tensor"),
+    '"block": variation[:, :3]': ('"block": variation[0, :3]', "freeze: 'block': expected a tensor of shape (n, k)"),
+}
+
+
+@pytest.mark.parametrize("right", _MISTAKES)
+def test_a_mistake_in_a_method_names_class_method_expected_and_received(right: str, working_folder: Path) -> None:
+    wrong, told = _MISTAKES[right]
+    source = (working_folder / "my_tasks.py").read_text()
+    assert right in source
+    name = f"mistaken_{list(_MISTAKES).index(right)}"
+    source = source.replace("import Layout,", "import Block, Layout,").replace(right, wrong)
+    (working_folder / f"{name}.py").write_text(source)
+    with pytest.raises(BidexError) as raised:
+        make_task_world(f"{name}:SlideBlock", 2, device="cpu", threads=1)
+    assert told in str(raised.value) and ("sensor" in told or str(raised.value).startswith("SlideBlock."))
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("import nowhere_at_all", "there is no nowhere_at_all"),
+        ("from math import nothing", "ImportError: cannot import name 'nothing'"),
+        ("x = = 1", "SyntaxError: invalid syntax"),
+        ("1 / 0", "ZeroDivisionError: division by zero"),
+        ("raise ValueError('odd')", "ValueError: odd"),
+        ("raise SystemExit(3)", "SystemExit: 3"),
+        ("class Odd(dict, object, dict): ...", "TypeError: duplicate base class"),
+        ("SlideBlock.__init__ = lambda self, base: {}['x']", "KeyError: 'x'"),
+        ("class SlideBlock(SlideBlock):\n    def __init__(self): ...", "takes 1 positional argument"),
+        ("SlideBlock.success = lambda self, state: state.nothing", "AttributeError"),
+        ("SlideBlock.add_objects = lambda self, scene: exit(0)", "SystemExit"),
+    ],
+)
+def test_what_a_class_raises_is_told_in_one_line_with_its_place(
+    line: str, told: str, working_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = (working_folder / "my_tasks.py").read_text()
+    # Of a name that no other test has imported.
+    name = f"raising_{abs(hash(line))}"
+    (working_folder / f"{name}.py").write_text(f"{source}\n{line}\n")
+    words = ["render", "--task", f"{name}:SlideBlock", "--out", "x.png", "--steps", "1", "--policy", "random"]
+    assert main(words) == 2
+    shown = capsys.readouterr().err
+    assert told in shown and shown.count("\n") == 1 and f"task {name}:SlideBlock" in shown
+    if "nowhere" not in line:
+        assert f"{name}.py" in shown
+    if "positional" not in told and "nowhere" not in line:
+        assert f"line {source.count(chr(10)) + 2})" in shown
+    with pytest.raises((Exception, SystemExit)):
+        main([*words, "--debug"])
+
+
 @pytest.mark.parametrize(
     "name, told",
     [

@@ -197,7 +197,13 @@ def test_a_search_keeps_its_best_episode_in_a_file_and_the_file_can_be_replayed(
     capsys.readouterr()
     assert main(words) == 0
     row = json.loads(capsys.readouterr().out)[0]
-    assert row["found"] is False and row["return"] == pytest.approx(load_witness("", file).made["return"], abs=1e-3)
+    assert row["found"] is False and row["return"] == pytest.approx(
+        load_witness("CatchUnderarm", file).made["return"], abs=1e-3
+    )
+    for columns in (1, 40, 53):
+        save_witness(file, np.zeros((20, columns), np.float32), {"return": 0.0})
+        assert main(words) == 2
+        assert f"(steps, 52), as CatchUnderarm has, got (20, {columns})" in capsys.readouterr().err
     assert main([*words[:-2], str(tmp_path / "none.npz")]) == 2
     assert "--find --file" in capsys.readouterr().err
 

@@ -17,6 +17,7 @@ from bidex_meta.bench.checkout import HERE, checkout, commit_name, recorded
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.engine.cpu import default_threads
 from bidex_meta.errors import BidexError
+from bidex_meta.reading import absolute
 from bidex_meta.record.atomic import write_json
 from bidex_meta.record.versions import git_state
 
@@ -58,8 +59,8 @@ def world_against(
         BidexError: No such commit or folder, an unknown suite, too few rows, or no folder for ``out``.
     """
     Benchmark(suite, seed=seed)  # a misspelt suite is told before anything is unpacked
-    if out is not None and not out.resolve().parent.is_dir():
-        raise BidexError(f"--out {out}: expected a file in a folder that exists, {out.resolve().parent} does not.")
+    if out is not None and not absolute(out).parent.is_dir():
+        raise BidexError(f"--out {out}: expected a file in a folder that exists, {absolute(out).parent} does not.")
     against, then = recorded(against)
     setting = {"suite": suite, "num_envs": num_envs, "threads": threads or default_threads(), "steps": steps}
     with checkout(against) as folder, _Worker(folder) as old, _Worker(HERE) as new:

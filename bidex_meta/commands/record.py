@@ -12,7 +12,7 @@ import tyro
 
 from bidex_meta.commands.parsing import RunPath, StepCount, Switch, parse
 from bidex_meta.errors import BidexError, known_name
-from bidex_meta.reading import expanded
+from bidex_meta.reading import absolute
 from bidex_meta.sources import Source
 
 RUNS = {"random": 0, "medium": 1, "expert": 1, "medium-expert": 2, "replay": 1, "demonstrations": 0}
@@ -202,7 +202,7 @@ def _config(flags: RecordFlags) -> dict[str, Any]:
         config = {"suite": flags.suite, "task": flags.task, "base": flags.base, "seed": flags.seed}
         config |= {"object": None, "points": 0}
         if flags.suite is not None and flags.suite.endswith(".toml"):
-            config["suite"] = str(expanded(flags.suite).resolve())
+            config["suite"] = str(absolute(flags.suite))
     on_gpu = Source.open(config).on_gpu
     return config | {"device": resolve_device(flags.device, on_gpu), "engine": flags.engine}
 

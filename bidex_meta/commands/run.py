@@ -18,7 +18,7 @@ from bidex_meta.commands import run_demonstrations, run_offline, run_recording
 from bidex_meta.commands.conditions import conditions
 from bidex_meta.commands.learners import shared
 from bidex_meta.commands.run_config import RunPlan, plan_run
-from bidex_meta.errors import EXIT_INTERRUPTED, BidexError
+from bidex_meta.errors import BidexError
 from bidex_meta.record.folder import check_new, new_folder_name
 from bidex_meta.train.launch import launch, resume_command
 
@@ -34,7 +34,8 @@ def main(arguments: Sequence[str]) -> None:
 
     Raises:
         BidexError: Bad input. Nothing has been written then.
-        SystemExit: Another process was lost (exit code 1), or has said what is wrong with the input (2); Ctrl-C (130).
+        SystemExit: Another process was lost (exit code 1), or has said what is wrong with the input (2); Ctrl-C (130),
+            SIGHUP (129) or the end of what reads stderr (141) came while it trained, which has saved then.
     """
     from bidex_meta.train import distributed
 
@@ -59,11 +60,11 @@ def _main(arguments: Sequence[str], distributed: Any, held: contextlib.ExitStack
     if not stopped and learner.env_steps < plan.config["steps"] and plan.config["minutes"] is not None:
         _say(f"The {plan.config['minutes']:g} minutes are up after {learner.env_steps:,} steps.")
     if stopped:
-        # A batch system's SIGTERM asks for a checkpoint and gets it; Ctrl-C breaks off whatever calls this too.
+        # A batch system's SIGTERM asks for a checkpoint and gets it; the others break off whatever calls this too.
         command = resume_command(folder.path, launch().count)
         _say(f"Stopped after {learner.env_steps:,} steps and saved. Continue: {command}")
-        if stopped == signal.SIGINT:
-            raise SystemExit(EXIT_INTERRUPTED)
+        if stopped != signal.SIGTERM:
+            raise SystemExit(128 + stopped)
     elif plan.flags.evaluate and launch().rank == 0:
         _evaluate(plan, folder, learner)
 

@@ -19,7 +19,7 @@ from bidex_meta.commands.parsing import StepCount, Switch, parse, peek
 from bidex_meta.data import part_files
 from bidex_meta.errors import BidexError, one_line
 from bidex_meta.memory import POINT_BYTES, ROW_BYTES, check_memory
-from bidex_meta.reading import expanded
+from bidex_meta.reading import absolute
 from bidex_meta.record.folder import RunFolder, flat
 from bidex_meta.record.stopping import ENDS
 from bidex_meta.sources import Source
@@ -243,14 +243,14 @@ def _resolved(
         _check_memory(flags)
     suite = names["source"] if flags.suite else None
     if suite is not None and suite.endswith(".toml"):
-        suite = str(expanded(suite).resolve())  # a run may be resumed from another folder
+        suite = str(absolute(suite))  # a run may be resumed from another folder
     config = {
         "suite": suite,
         "task": names["source"] if flags.task else None,
         "base": flags.base,
         "points": flags.points,
         "object": _placed(flags.object),
-        "start_from": None if flags.start_from is None else str(expanded(flags.start_from).resolve()),
+        "start_from": None if flags.start_from is None else str(absolute(flags.start_from)),
         "algo": names["algo"],
         "preset": names["preset"],
         "learner": dataclasses.asdict(flags.learner),
@@ -282,7 +282,7 @@ def _check_meta_test(flags: Any, kind: LearnerKind) -> None:
 
 def _placed(thing: str | None) -> str | None:
     """An object's name, of a file its whole path: a run may be resumed from another folder."""
-    return str(expanded(thing).resolve()) if thing is not None and thing.endswith(".xml") else thing
+    return str(absolute(thing)) if thing is not None and thing.endswith(".xml") else thing
 
 
 _WIDTH = 1200

@@ -7,7 +7,7 @@ from typing import Any
 from bidex_meta.commands.learners import ALGOS, LearnerKind, learner_kind
 from bidex_meta.commands.parsing import peek_all
 from bidex_meta.errors import BidexError, known_name
-from bidex_meta.reading import expanded
+from bidex_meta.reading import absolute, expanded
 from bidex_meta.sources import Source
 
 
@@ -22,7 +22,7 @@ def named(arguments: Sequence[str], stored: Mapping[str, Any]) -> str | list[str
     A folder stands with its whole path.
     """
     given = peek_all(arguments, "--demonstrations") or listed(stored.get("demonstrations"))
-    names = [str(expanded(name).resolve()) if expanded(name).is_dir() else name for name in given]
+    names = [str(absolute(name)) if expanded(name).is_dir() else name for name in given]
     return names if len(names) > 1 else names[0] if names else None
 
 

@@ -8,7 +8,7 @@ from bidex_meta.commands.learners import ALGOS, LearnerKind, learner_kind
 from bidex_meta.commands.parsing import peek_all
 from bidex_meta.commands.run_demonstrations import check_goals
 from bidex_meta.errors import BidexError
-from bidex_meta.reading import expanded
+from bidex_meta.reading import absolute, expanded
 from bidex_meta.sources import Source
 from bidex_meta.train.launch import launch
 
@@ -26,7 +26,7 @@ def named(arguments: Sequence[str], stored: Mapping[str, Any]) -> list[str]:
     A folder stands with its whole path, since a run may be resumed from another one.
     """
     given = peek_all(arguments, "--dataset") or stored.get("dataset", [])
-    return [str(expanded(name).resolve()) if expanded(name).is_dir() else name for name in given]
+    return [str(absolute(name)) if expanded(name).is_dir() else name for name in given]
 
 
 def opened(names: Sequence[str]) -> "list[Dataset]":

@@ -4,7 +4,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -13,6 +12,7 @@ from bidex_meta.evaluation.agreement import DIFFERS, Agreement
 from bidex_meta.evaluation.gains import Gains
 from bidex_meta.evaluation.results import Difference, Evaluation, compare
 from bidex_meta.evaluation.statistics import Interval
+from bidex_meta.record.progress import PlainConsole
 
 _NONE = "–"
 _BROKEN = (
@@ -135,7 +135,7 @@ def plain_table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> Tab
 
 def print_table(table: Table) -> None:
     """To stdout; wide enough for every column where stdout is a file or a pipe."""
-    Console(width=None if sys.stdout.isatty() else 180).print(table)
+    PlainConsole(width=None if sys.stdout.isatty() else 180).print(table)
 
 
 def _percent(value: float) -> str:

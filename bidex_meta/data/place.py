@@ -7,7 +7,7 @@ from pathlib import Path
 from bidex_meta.data.dataset import data_folder, valid_name
 from bidex_meta.errors import BidexError
 from bidex_meta.outside import short_name
-from bidex_meta.reading import exists, expanded
+from bidex_meta.reading import absolute, exists, expanded
 
 _MARGIN = 1.05
 """What file systems take beside the files."""
@@ -41,7 +41,7 @@ def place_of(out: Path | None, subject: str, kind: str) -> tuple[Path, str]:
         return root / usual, usual
     folder = expanded(out)
     try:
-        name = folder.resolve().relative_to(root.resolve()).as_posix()
+        name = absolute(folder).relative_to(absolute(root)).as_posix()
     except ValueError:
         name = "/".join(folder.parts[-2:])
     return folder, next((n for n in (name, folder.name, usual) if valid_name(n)), usual)

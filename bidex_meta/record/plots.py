@@ -8,6 +8,7 @@ from typing import Any
 
 from bidex_meta.errors import BidexError
 from bidex_meta.reading import exists, read_json
+from bidex_meta.record.atomic import write_atomic
 from bidex_meta.record.curves import Curve
 from bidex_meta.record.schemas import check_evaluation
 
@@ -241,7 +242,8 @@ def save(figure: Any, out: Path, metadata: Mapping[str, str] | None = None) -> N
     if out.suffix[1:].lower() not in known:
         raise BidexError(f"Expected a picture's ending ({', '.join(sorted(known))}), got {out.name!r}. Name it .png.")
     out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out, dpi=120, metadata=metadata)
+    ending = out.suffix[1:].lower()
+    write_atomic(out, lambda file: figure.savefig(file, format=ending, dpi=120, metadata=metadata))
 
 
 def svg(figure: Any) -> bytes:

@@ -1,5 +1,6 @@
 """How training, or filming, goes, on stderr: a live table in a terminal, a plain line every few seconds elsewhere."""
 
+import contextlib
 import math
 import sys
 import time
@@ -12,11 +13,21 @@ from rich.markup import escape
 from rich.progress import track
 from rich.table import Table
 
+from bidex_meta.streams import silence
+
 Item = TypeVar("Item")
 
 _PLAIN_SECONDS = 5.0
 _SUCCESS = "Train/success/"
 _RETURN = "Train/return/"
+
+
+class PlainConsole(Console):
+    """Leaves it to whoever prints what to do where nobody reads it; rich would end the process."""
+
+    def on_broken_pipe(self) -> None:
+        """Goes on with the error that is being handled."""
+        raise
 
 
 class Progress:
@@ -32,7 +43,7 @@ class Progress:
     def __init__(
         self, total_steps: int, total_seconds: float = math.inf, start_step: int = 0, stream: TextIO | None = None
     ):
-        self._console = Console(file=stream or sys.stderr)
+        self._console = PlainConsole(file=stream or sys.stderr)
         self._total, self._total_seconds = total_steps, total_seconds
         self._start_step = start_step
         self._start_time = time.monotonic()
@@ -52,18 +63,27 @@ class Progress:
         Args:
             metrics: Tags of this iteration; those of earlier ones stay shown (an iteration may end no episode).
             step: Environment steps so far.
+
+        Raises:
+            BrokenPipeError: It cannot be shown: the reader has ended, the terminal is gone. What is shown later goes
+                nowhere.
         """
         self._shown.update({tag: value for tag, value in metrics.items() if value == value})
-        if self._live is not None:
-            self._live.update(self._table(step), refresh=True)
-        elif time.monotonic() - self._last_line >= _PLAIN_SECONDS or self._seconds_left(step) <= 0.0:
-            self._last_line = time.monotonic()
-            self._console.print(self._line(step), soft_wrap=True, highlight=False, markup=False)
+        try:
+            if self._live is not None:
+                self._live.update(self._table(step), refresh=True)
+            elif time.monotonic() - self._last_line >= _PLAIN_SECONDS or self._seconds_left(step) <= 0.0:
+                self._last_line = time.monotonic()
+                self._console.print(self._line(step), soft_wrap=True, highlight=False, markup=False)
+        except OSError as error:  # of a terminal that is gone: EIO
+            silence(self._console.file)
+            raise BrokenPipeError(f"progress cannot be shown: {error.strerror or error}") from error
 
     def close(self) -> None:
-        """Leave the terminal as it was found, the last table standing."""
+        """Leave the terminal as it was found, the last table standing; where it is gone, quietly."""
         if self._live is not None:
-            self._live.stop()
+            with contextlib.suppress(OSError):
+                self._live.stop()
 
     def _tasks(self) -> list[str]:
         prefixes = (_SUCCESS, _RETURN)
@@ -115,7 +135,7 @@ def counted(items: Iterable[Item], total: int, what: str, stream: TextIO | None 
         what: Their name in the plural.
         stream: Where to write instead.
     """
-    console = Console(file=stream or sys.stderr)
+    console = PlainConsole(file=stream or sys.stderr)
     if console.is_terminal:
         yield from track(items, description=what, total=total, console=console, transient=True)
         return

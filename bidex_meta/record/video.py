@@ -1,5 +1,6 @@
 """Pictures and films from rendered frames. PNG and WebP need nothing extra, MP4 the extra ``video``."""
 
+import errno
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from bidex_meta.errors import BidexError
+from bidex_meta.record.atomic import write_atomic
 
 SUFFIXES = (".png", ".mp4", ".webp")
 
@@ -33,7 +35,8 @@ def write_image(path: Path, frame: np.ndarray) -> None:
     import imageio.v3 as imageio
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    imageio.imwrite(path, frame, extension=".png")
+    picture = imageio.imwrite("<bytes>", frame, extension=".png")
+    write_atomic(path, lambda file: file.write(picture))
 
 
 def check_films() -> None:
@@ -62,7 +65,8 @@ def write_animation(path: Path, frames: Iterable[np.ndarray], fps: float, qualit
     path.parent.mkdir(parents=True, exist_ok=True)
     pictures = (Image.fromarray(frame) for frame in frames)
     options: dict[str, Any] = {"duration": round(1000 / fps), "loop": 0, "quality": quality, "method": 6}
-    next(pictures).save(path, save_all=True, append_images=pictures, **options)
+    first = next(pictures)
+    write_atomic(path, lambda file: first.save(file, "WEBP", save_all=True, append_images=pictures, **options))
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
@@ -78,15 +82,36 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
 
     Raises:
         BidexError: imageio-ffmpeg is missing.
+        OSError: It cannot be written; what was there before stays.
     """
     check_films()
     import imageio
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    count = 0
+    partial, count = path.with_name(f".{path.name}.part.mp4"), 0
     # macro_block_size 2: the default of 16 would resize 1000x750 in silence.
-    with imageio.get_writer(path, format="FFMPEG", fps=fps, codec="libx264", macro_block_size=2) as writer:  # type: ignore[arg-type]
-        for frame in frames:
-            writer.append_data(frame)  # type: ignore[attr-defined]
-            count += 1
+    try:
+        with imageio.get_writer(partial, format="FFMPEG", fps=fps, codec="libx264", macro_block_size=2) as writer:  # type: ignore[arg-type]
+            for frame in frames:
+                writer.append_data(frame)  # type: ignore[attr-defined]
+                count += 1
+        if not _whole(partial):
+            raise OSError(errno.EIO, "ffmpeg could not write all of the film; is the disk full?", str(path))
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
     return count
+
+
+def _whole(path: Path) -> bool:
+    """Whether an MP4 ends in the table of its frames, which is written last: imageio does not say how ffmpeg ended."""
+    with path.open("rb") as file:
+        end, place, kind = file.seek(0, 2), 0, b""
+        while place < end:
+            file.seek(place)
+            size, kind = int.from_bytes(file.read(4)), file.read(4)
+            size = int.from_bytes(file.read(8)) if size == 1 else size  # 1: a length of eight bytes follows
+            if size < 8:
+                return False
+            place += size
+        return place == end and kind == b"moov"

@@ -9,7 +9,7 @@ from typing import Any
 
 from bidex_meta.errors import BidexError, shortened, unknown_name
 from bidex_meta.outside import short_name
-from bidex_meta.reading import TABLE, TEXT, Rule, check, expanded, read_toml, whole
+from bidex_meta.reading import TABLE, TEXT, Rule, absolute, check, expanded, read_toml, whole
 from bidex_meta.record.folder import RunFolder, flat
 
 _OWN = ("suite", "task", "algo", "seed", "run_dir", "resume", "print_config", "evaluate", "threads", "learner")
@@ -168,7 +168,7 @@ def _runs(
         label = " ".join([arm["name"], *(f"{_last(flag)}={_named(value)}" for flag, value in chosen.items())])
         flags = [word for flag, value in {**overrides, **chosen, **own}.items() for word in _words(flag, value, path)]
         for kind, subject in named:
-            given = str((path.parent / expanded(subject)).resolve()) if subject.endswith(".toml") else subject
+            given = str(absolute(path.parent / expanded(subject))) if subject.endswith(".toml") else subject
             called = Path(short_name(subject)).stem
             name = f"{called}-{label}-seed{seed}".replace(" ", "-")
             words = (f"--{kind}={given}", f"--algo={arm['algo']}", *(word.replace(_SUBJECT, called) for word in flags))

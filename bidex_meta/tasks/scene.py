@@ -11,6 +11,7 @@ from bidex_meta import paths
 from bidex_meta.hands.hand import hand
 from bidex_meta.hands.pair import FIXTURE, OBJECT, SIDES, add_hands, damp_bases, set_contact_bits
 from bidex_meta.maths import quaternion_from_rpy
+from bidex_meta.tasks.state import unknown_sensor
 
 if TYPE_CHECKING:
     from bidex_meta.tasks.base import TaskClass
@@ -135,6 +136,16 @@ class Scene:
         return {
             m.sensor(i).name: slice(a, a + n) for i, (a, n) in enumerate(zip(m.sensor_adr, m.sensor_dim, strict=True))
         }
+
+    def sensor(self, name: str) -> slice:
+        """Its slice of ``sensordata``.
+
+        Raises:
+            BidexError: The scene has no such sensor.
+        """
+        if name not in self.sensors:
+            raise unknown_sensor(name, self.sensors)
+        return self.sensors[name]
 
     @cached_property
     def qpos(self) -> dict[str, slice]:

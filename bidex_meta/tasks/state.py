@@ -1,10 +1,18 @@
 """What a task class may look at: one transition of its rows."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from torch import Tensor
 
+from bidex_meta.errors import BidexError, unknown_name
 from bidex_meta.maths import xyzw
+
+
+def unknown_sensor(name: str, known: Iterable[str]) -> BidexError:
+    """An error for a sensor that does not exist, with those of the same object where there is one."""
+    names = list(known)
+    same = [each for each in names if each.partition("/")[0] == name.partition("/")[0]]
+    return unknown_name("sensor", name, same or names)
 
 
 class TaskState:
@@ -22,8 +30,15 @@ class TaskState:
         self.frozen = frozen
 
     def __getitem__(self, name: str) -> Tensor:
-        """Values of the named sensor, shape (n, k)."""
-        return self._sensors[:, self._addresses[name]]
+        """Values of the named sensor, shape (n, k).
+
+        Raises:
+            BidexError: The scene has no such sensor.
+        """
+        try:
+            return self._sensors[:, self._addresses[name]]
+        except KeyError:
+            raise unknown_sensor(name, self._addresses) from None
 
     def quaternion(self, name: str) -> Tensor:
         """Orientation (x, y, z, w) read from the named framequat sensor, shape (n, 4)."""

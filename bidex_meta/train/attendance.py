@@ -8,6 +8,8 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
+from bidex_meta.train.launch import hangup
+
 _BEAT_SECONDS = 0.5
 _LISTEN_SECONDS = 3.0
 # torchrun kills 30 s after it asked.
@@ -96,7 +98,7 @@ class Attendance(threading.Thread):
 
     def _was_asked_to_end(self) -> bool:
         try:
-            return bool(set(os.read(self._signals, 64)) & {signal.SIGINT, signal.SIGTERM})
+            return bool(set(os.read(self._signals, 64)) & {signal.SIGINT, signal.SIGTERM, *hangup()})
         except BlockingIOError:
             return False
 

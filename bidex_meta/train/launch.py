@@ -1,6 +1,7 @@
 """How this process was started: on its own, or by torchrun as one of several that share a run."""
 
 import os
+import signal
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,6 +32,12 @@ def launch() -> Launch:
     names = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
     defaults = (0, 1, 0, 1)
     return Launch(*(int(os.environ.get(name, default)) for name, default in zip(names, defaults, strict=True)))
+
+
+def hangup() -> tuple[signal.Signals, ...]:
+    """SIGHUP, which comes when the terminal closes; nothing where it is ignored (``nohup``), and on Windows."""
+    number = getattr(signal, "SIGHUP", None)
+    return () if number is None or signal.getsignal(number) == signal.SIG_IGN else (number,)
 
 
 def resume_command(path: Path, processes: int) -> str:

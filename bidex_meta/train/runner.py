@@ -15,6 +15,7 @@ from typing import Any, Protocol
 
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import any_process, gather, is_main, rank, world_size
+from bidex_meta.train.launch import hangup
 from bidex_meta.world.contract import VectorWorld
 
 # The most of a run's time that may go into checkpoints.
@@ -78,7 +79,9 @@ def train(
     iteration, checkpoints included: the iteration in which it is up is the last one, and there is at least one.
     Metrics get it as ``Perf/training_time``.
 
-    SIGINT or SIGTERM, in any process, finishes the current iteration, saves and returns; a second one acts at once.
+    SIGINT, SIGTERM or SIGHUP, in any process, finishes the current iteration, saves and returns; so does the end of
+    whatever reads what is printed (BrokenPipeError of ``record``, ``watch`` or ``enough``). A second SIGINT or SIGTERM
+    acts at once. SIGHUP stays ignored where it was.
 
     Args:
         learner: The learner, already made on ``world``.
@@ -97,7 +100,8 @@ def train(
             in processes other than 0.
 
     Returns:
-        Number of the signal that ended the training early, 0 if none did; where another process got it, SIGTERM's.
+        Number of the signal that ended the training early, SIGPIPE's where nobody reads what is printed, 0 if none did;
+        where another process got it, SIGTERM's.
 
     Raises:
         LostProcess: Another process is gone. What was saved stays as it is.
@@ -120,13 +124,18 @@ def train(
         while not over() and not (stopped := any_process(stop.is_set())):
             metrics = learner.iterate()
             metrics["Perf/training_time"] = time.monotonic() - began_at
-            if watch is not None:
-                paused_at = time.monotonic()
-                metrics |= watch()
-                began_at += time.monotonic() - paused_at
-            if record is not None:
-                record.log(metrics, learner.env_steps)
-            if enough is not None and any_process(is_main() and enough(metrics)):
+            reached = False
+            try:
+                if watch is not None:
+                    paused_at = time.monotonic()
+                    metrics |= watch()
+                    began_at += time.monotonic() - paused_at
+                if record is not None:
+                    record.log(metrics, learner.env_steps)
+                reached = enough is not None and is_main() and enough(metrics)
+            except BrokenPipeError:
+                stop.ask(getattr(signal, "SIGPIPE", signal.SIGTERM))
+            if enough is not None and any_process(reached):
                 break
             if any_process(is_main() and time.monotonic() - saved_at >= pause):
                 began = time.monotonic()
@@ -178,30 +187,40 @@ class _Stop(threading.Event):
 
     number: int = signal.SIGTERM
 
+    def ask(self, number: int) -> None:
+        """Only the first says why."""
+        if not self.is_set():
+            self.number = number
+            self.set()
+
 
 @contextmanager
 def _stop_requests() -> Iterator["_Stop"]:
-    """Turns the first SIGINT or SIGTERM into a set event; puts the old handlers back then and on leaving."""
+    """Turns the first SIGINT, SIGTERM or SIGHUP into a set event, then puts the first two's old handlers back.
+
+    A terminal that closes may send SIGHUP twice, its shell's and its own: what comes later of it is ignored. On leaving
+    all old handlers are back.
+    """
     stop = _Stop()
     if threading.current_thread() is not threading.main_thread():
         # Python lets only the main thread set handlers; elsewhere signals stay the caller's business.
         yield stop
         return
+    numbers = (signal.SIGINT, signal.SIGTERM, *hangup())
     # None stands for a handler that was not set from Python and cannot be put back.
-    old = {number: signal.getsignal(number) or signal.SIG_DFL for number in (signal.SIGINT, signal.SIGTERM)}
+    old = {number: signal.getsignal(number) or signal.SIG_DFL for number in numbers}
 
-    def restore() -> None:
-        for number, handler in old.items():
-            signal.signal(number, handler)
+    def restore(numbers: tuple[int, ...]) -> None:
+        for number in numbers:
+            signal.signal(number, old[signal.Signals(number)])
 
     def on_signal(number: int, frame: FrameType | None) -> None:
-        stop.number = number
-        stop.set()
-        restore()
+        stop.ask(number)
+        restore(numbers[:2])
 
-    for number in old:
+    for number in numbers:
         signal.signal(number, on_signal)
     try:
         yield stop
     finally:
-        restore()
+        restore(numbers)

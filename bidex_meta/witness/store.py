@@ -13,6 +13,7 @@ from bidex_meta import paths
 from bidex_meta.errors import BidexError, one_line
 from bidex_meta.reading import bounded, check, number, read_bytes, whole
 from bidex_meta.record.atomic import write_atomic
+from bidex_meta.tasks import registry
 from bidex_meta.witness.planner import LEVELS
 
 _MOST_BYTES, _MOST_STEPS = 50_000_000, 100_000
@@ -39,14 +40,18 @@ def load_witness(name: str, path: Path | None = None) -> Witness:
     """The witness of a class, or the one in a file.
 
     Raises:
-        BidexError: There is none, or it is damaged.
+        BidexError: There is none, it is damaged, or of another number of actions than the class has.
     """
     if path is not None and not path.is_file():
         raise BidexError(f"Expected a file that `bidex-meta witness --find --file` wrote, got {path}, which is none.")
     path = path or witness_path(name)
     if not path.is_file():
         raise BidexError(f"{name} has no witness yet. Search one: bidex-meta witness --task {name} --find")
-    return _read(path)
+    witness, size = _read(path), registry.get(name, moving_base=True).action_size
+    if witness.actions.shape[1] != size:
+        told = f"expected actions of shape (steps, {size}), as {name} has, got {witness.actions.shape}"
+        raise BidexError(f"{path}: {told}. Search one: bidex-meta witness --task {name} --find")
+    return witness
 
 
 def save_witness(path: Path, actions: np.ndarray, made: dict[str, Any]) -> Path:

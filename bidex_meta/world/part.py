@@ -10,6 +10,7 @@ from bidex_meta.points.sight import Sight
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.world.actions import Controls
+from bidex_meta.world.formulas import check_formulas
 from bidex_meta.world.groups import Group, Member, Slot
 from bidex_meta.world.observations import Observer, Rule, clip
 
@@ -46,6 +47,9 @@ class Part:
         self._controls = Controls(group)
         self._start = torch.stack([torch.from_numpy(m.scene.start_qpos) for m in group.members]).to(group.engine.qpos)
         self.start_size = self._start.shape[1]
+        for member in group.members:
+            tasks = slots[member.slot].tasks
+            check_formulas(member.scene, tasks, self._engine.sensordata, observed=rule != "masked")
         self._observer = Observer(group.members[0].scene, self._start_mounts(), width)
         self._sights = sights
         if sights is not None:

@@ -112,7 +112,7 @@ def test_saving_takes_no_more_than_a_fiftieth_of_the_time(monkeypatch: pytest.Mo
     assert saved == [60.0, 264.0, 468.0, 672.0, 716.0]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_after_the_iteration_and_saves(number: signal.Signals):
     before = signal.getsignal(number)
     learner, world = make()
@@ -120,6 +120,43 @@ def test_a_signal_ends_after_the_iteration_and_saves(number: signal.Signals):
     assert train(learner, world, total_steps=100 * ITERATION, record=notes) == number
     assert [step for step, _ in notes.saved] == [2 * ITERATION]
     assert signal.getsignal(number) is before
+
+
+@pytest.mark.parametrize("where", ["record", "watch", "enough"])
+def test_the_end_of_what_reads_the_output_ends_after_the_iteration_and_saves(where: str):
+    learner, world = make()
+    notes, calls = Notes(), []
+
+    def print_something(*_: object) -> Any:
+        calls.append(where)
+        if len(calls) == 2:
+            raise BrokenPipeError
+        return False if where == "enough" else {}
+
+    if where == "record":
+        notes.after = print_something
+    others: dict[str, Any] = {} if where == "record" else {where: print_something}
+    assert train(learner, world, total_steps=100 * ITERATION, record=notes, **others) == signal.SIGPIPE
+    assert [step for step, _ in notes.saved] == [2 * ITERATION]
+
+
+def test_of_sighup_a_second_one_changes_nothing_and_nohup_ignores_the_first():
+    def twice(iteration: int) -> None:
+        if iteration == 2:
+            os.kill(os.getpid(), signal.SIGHUP)
+            os.kill(os.getpid(), signal.SIGHUP)
+
+    before = signal.getsignal(signal.SIGHUP)
+    learner, world = make()
+    assert train(learner, world, total_steps=100 * ITERATION, record=Notes(after=twice)) == signal.SIGHUP
+    assert learner.env_steps == 2 * ITERATION
+    try:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        learner, world = make()
+        assert train(learner, world, total_steps=3 * ITERATION, record=Notes(after=twice)) == 0
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN and learner.env_steps == 3 * ITERATION
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_a_second_signal_acts_at_once():

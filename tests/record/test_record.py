@@ -1,6 +1,7 @@
 import io
 import json
 import math
+import os
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from bidex_meta.record import progress as progress_module
 from bidex_meta.record.curves import Curve
 from bidex_meta.record.metrics import last_rows
 from bidex_meta.record.plots import draw_adaptation, draw_learning, read_evaluation, save, svg
-from bidex_meta.record.video import check_suffix, write_image, write_video
+from bidex_meta.record.video import check_suffix, write_animation, write_image, write_video
 
 CONFIG = {"suite": "MT4", "task": None, "algo": "mtppo", "seed": 3, "learner": {"hidden": [8]}}
 
@@ -206,6 +207,36 @@ def test_picture_and_film_read_back(tmp_path):
     film = imageio.imread(tmp_path / "a.mp4")
     assert film.shape == (5, 50, 70, 3)
     assert abs(film[2].astype(int) - frame).mean() < 10
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a limit of a file's size")
+@pytest.mark.parametrize("name", ["a.png", "a.webp", "a.mp4", "figure.png"])
+def test_a_disk_that_fills_leaves_what_was_there(name, tmp_path):
+    import resource
+
+    path, frames = tmp_path / name, list(np.random.default_rng(0).integers(0, 256, (5, 200, 200, 3), np.uint8))
+    path.write_text("earlier")
+    figure = draw_learning([("mtppo", {"Train/return/Near": curve(2.0)})])
+
+    def write():
+        if name == "figure.png":
+            save(figure, path)
+        elif name == "a.png":
+            write_image(path, frames[0])
+        else:
+            (write_animation if name == "a.webp" else write_video)(path, frames, fps=60)
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (8192, before[1]))  # in place of a full disk
+    try:
+        with pytest.raises(OSError) as raised:
+            write()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not isinstance(raised.value, BrokenPipeError)  # which would be the end of a reader
+    assert [entry.name for entry in tmp_path.iterdir()] == [name] and path.read_text() == "earlier"
+    write()
+    assert path.stat().st_size > 8192
 
 
 def test_endings_and_the_missing_extra(tmp_path, monkeypatch):

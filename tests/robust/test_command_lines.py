@@ -102,6 +102,29 @@ def judge(arguments: list[str], place: Path) -> None:
         assert listing(place) == before, arguments
 
 
+@pytest.mark.skipif(os.name != "posix", reason="needs links")
+@pytest.mark.parametrize(
+    "line",
+    [
+        "run --suite MT4 --device cpu --start-from loop.toml",
+        "run --suite loop.toml",
+        "run --task CatchUnderarm --object loop.xml",
+        "run --suite MT4 --device cpu --run-dir r\udcff",
+        "record random --suite MT4 --out loop.toml",
+        "record random --suite MT4 --out r\udcff",
+        "render --task HandOver --out loop.toml/x.png",
+        "evaluate r\udcff",
+    ],
+)
+def test_paths_that_lead_nowhere_or_are_no_text(line: str, place: Path) -> None:
+    (place / "loop.xml").symlink_to("loop.xml")
+    try:
+        judge(line.split(), place)
+        assert called(line.split()).code == 2
+    finally:
+        (place / "loop.xml").unlink()
+
+
 # So many of each, 2,000 in all; those that cost most least.
 COUNTS = {
     "run": 400, "evaluate": 250, "control": 150, "compare": 150, "plot": 150, "report": 100, "render": 250,

@@ -1,5 +1,6 @@
 """What happens to a run when its folder, its machine or its training goes wrong."""
 
+import errno
 import json
 import os
 import signal
@@ -152,7 +153,7 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGHUP, 129)])
 def test_a_signal_before_training_is_one_line_and_leaves_nothing(number: int, code: int, tmp_path: Path) -> None:
     command = [sys.executable, "-c", _WAIT, "run", *SMALL, "--run-dir", str(tmp_path / "r")]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
@@ -162,8 +163,51 @@ def test_a_signal_before_training_is_one_line_and_leaves_nothing(number: int, co
     process.send_signal(number)
     _, errors = process.communicate()
     assert process.returncode == code and "Traceback" not in errors
-    assert errors.splitlines()[-1] in ("bidex-meta: stopped by SIGTERM.", "bidex-meta: interrupted.")
+    why = "interrupted" if number == signal.SIGINT else f"stopped by {signal.Signals(number).name}"
+    assert errors.splitlines()[-1] == f"bidex-meta: {why}."
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("line", "code"),
+    [
+        ("list suites >&-", 0),
+        ("list >&-", 2),  # tyro, which parses, asks for the encoding of stdout
+        ("run --print-config --suite MT4 2>&-", 0),
+        ("nothing 2>&-", 2),
+        ("list suites >/dev/full", 2),
+        ("run --print-config --suite MT4 >/dev/full", 2),
+        ("nothing 2>/dev/full", 2),
+        ("list suites | true", 0),
+        ("run --print-config --suite MT4 | true", 0),
+        ("list suites 2>&1 | true", 141),
+    ],
+)
+def test_output_that_nobody_takes_is_no_traceback(line: str, code: int, tmp_path: Path) -> None:
+    # Shells differ in how they tell the first command's end of a pipe: it goes into a file.
+    command, mark, rest = line.partition(" |")
+    script = f"{{ {sys.executable} -m bidex_meta.cli {command}; echo $? > {tmp_path / 'code'}; }} {mark[1:]}{rest}"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    done = subprocess.run(["sh", "-c", script], env=environment, capture_output=True, text=True)
+    assert int((tmp_path / "code").read_text()) == code, done.stderr
+    assert "Traceback" not in done.stderr and "Exception ignored" not in done.stderr
+    assert done.stderr.count("\n") <= 1
+
+
+def test_a_terminal_that_is_gone_is_a_reader_that_has_ended() -> None:
+    from io import StringIO
+
+    from bidex_meta.record import Progress
+
+    class Gone(StringIO):
+        def write(self, text: str) -> int:
+            raise OSError(errno.EIO, "Input/output error")
+
+    progress = Progress(100, stream=Gone())
+    progress.start()
+    with pytest.raises(BrokenPipeError, match="Input/output"):
+        progress.update({}, 50)
+    progress.close()
 
 
 def test_names_are_text(tmp_path: Path, capsys: pytest.CaptureFixture[str], toy: None) -> None:

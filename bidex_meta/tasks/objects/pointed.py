@@ -14,7 +14,7 @@ import torch
 from bidex_meta import paths
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.errors import BidexError, shortened
-from bidex_meta.reading import expanded
+from bidex_meta.reading import absolute
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.objects.outline import outline
 from bidex_meta.tasks.objects.own_file import compiled, read_own, set_contacts
@@ -73,7 +73,7 @@ class OwnObjectClass(TaskClass):
         if not isinstance(object, str) or not object.endswith(".xml") or not object.isprintable():
             told = f"the path of an MJCF file that takes the place of the {self.usual.asset}"
             raise BidexError(f"object: expected {told}, which ends in .xml; got {shortened(object)}.")
-        file = expanded(object).resolve()
+        file = absolute(object)
         model, like = _checked(self.usual, file, self.usual_stands), _usual_model(self.usual)
         self.own = PointedObject(
             self.usual.name, str(file), self.usual.position, self.usual.rpy, self.usual.colour, _digest(model)
