@@ -21,7 +21,6 @@ from metaworld import evaluation as original_evaluation
 
 import bidex_meta.metaworld as ours
 from bidex_meta import Benchmark, Task
-from bidex_meta.clients import metaworld as mended
 from bidex_meta.envs.suite_env import SuiteEnv
 from bidex_meta.errors import BidexError
 from bidex_meta.metaworld import evaluation as our_evaluation
@@ -33,9 +32,21 @@ SHORT: dict[str, Any] = {"max_episode_steps": 8}
 """Of episodes where a test is about their ends."""
 
 
-@pytest.fixture(scope="module", autouse=True)
-def meta_world_runs() -> None:
-    mended._library()  # Meta-World 3.0.0 makes no environment on MuJoCo 4 by itself
+ITS_OWN_CODE = """
+import metaworld
+env = metaworld.make_mt_envs("reach-v3", seed=0)
+env.reset()
+assert env.step(env.action_space.sample())[0].shape == (39,)
+"""
+
+
+@pytest.mark.parametrize("ours", ["", "import bidex_meta.metaworld", "import metaworld, bidex_meta.metaworld"])
+def test_meta_worlds_own_code_runs_beside_ours(ours: str) -> None:
+    """Meta-World 3.0.0 makes no environment on MuJoCo 4 by itself."""
+    command = [sys.executable, "-W", "ignore", "-c", ours + ITS_OWN_CODE]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    assert (done.returncode == 0) == bool(ours), done.stderr
+    assert ours or "could not broadcast input array from shape (11,) into shape (12,)" in done.stderr
 
 
 # Meta-World's examples, word for word but for the benchmark, which is an argument.
