@@ -3,10 +3,11 @@
     from bidex_meta import Benchmark
     world = Benchmark("MT4", seed=0).make_world("train", num_envs=1024)
 
-Importing registers the Gymnasium ids (`bidex-meta/MT4-v1`, ...); torch and MuJoCo are loaded
-when a name first needs them.
+Importing registers the Gymnasium ids (`bidex-meta/MT4-v1`, ...) and shortens how long waiting OpenMP
+threads spin (docs/training.md#beside-other-work); torch and MuJoCo are loaded when a name first needs them.
 """
 
+import os
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
@@ -43,6 +44,12 @@ try:
     __version__ = version("bidex-meta")
 except PackageNotFoundError:  # run from a checkout that was never installed
     __version__ = "0.0.0"
+
+if "OMP_WAIT_POLICY" not in os.environ:
+    # A thread that spins takes a core from whatever else wants it. Read once, when torch loads its OpenMP library:
+    # spins of GNU's, milliseconds of LLVM's and Intel's.
+    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+    os.environ.setdefault("KMP_BLOCKTIME", "1")
 
 set_aside_what_is_missing()
 register_ids()

@@ -1,5 +1,6 @@
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -53,6 +54,34 @@ def same(a, b):
 
 
 # Help and errors.
+
+
+SPINS = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
+
+
+@pytest.mark.parametrize(
+    "given, after",
+    [
+        ({}, {"GOMP_SPINCOUNT": "1000", "KMP_BLOCKTIME": "1"}),
+        ({"GOMP_SPINCOUNT": "7"}, {"GOMP_SPINCOUNT": "7", "KMP_BLOCKTIME": "1"}),
+        ({"OMP_WAIT_POLICY": "active"}, {"OMP_WAIT_POLICY": "active"}),
+    ],
+)
+def test_waiting_threads_spin_shortly_unless_the_user_says_otherwise(given: dict, after: dict) -> None:
+    code = (
+        "import os, subprocess, sys, bidex_meta\n"
+        f"print({{name: os.environ[name] for name in {SPINS} if name in os.environ}}, flush=True)\n"
+        "subprocess.run([sys.executable, '-c', 'import torch'])"  # a worker inherits them
+    )
+    free = {name: value for name, value in os.environ.items() if name not in SPINS}
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=free | given | {"OMP_DISPLAY_ENV": "verbose"}, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 0 and done.stdout.strip().splitlines()[0] == str(after)
+    shown = re.findall(r"GOMP_SPINCOUNT = '(\d+)'", done.stderr)
+    if shown:  # a torch with GNU's OpenMP: what it took
+        assert set(shown) == {after["GOMP_SPINCOUNT"]} if "GOMP_SPINCOUNT" in after else int(shown[-1]) > 10**9
 
 
 def test_help_is_quick_and_needs_no_torch():
