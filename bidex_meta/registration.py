@@ -66,6 +66,7 @@ def make_suite_world(
     seed: int | None = None,
     benchmark_seed: int | None = None,
     render_mode: str | None = None,
+    stagger: bool = False,
     **options: Any,
 ) -> "World | VectorEnv":
     """What `gymnasium.make_vec("bidex-meta/MT4-v1", num_envs=...)` calls.
@@ -77,6 +78,7 @@ def make_suite_world(
         seed: Chooses the tasks, the starts and the task draws; None: 0.
         benchmark_seed: Chooses the tasks instead, and the rest where there is no seed.
         render_mode: None or `"rgb_array"`, which are the same: a world draws when it is asked to.
+        stagger: As in `Benchmark.make_world`, but left out: not, since who counts for himself would count those.
         **options: The other keywords of `Benchmark.make_world`. With `vector_strategy`, `meta_batch_size`,
             `total_tasks_per_cls` or `env_name` those of Meta-World's ids, and what comes is what `metaworld` gives:
             single environments of NumPy arrays side by side, however many `num_envs` says.
@@ -90,22 +92,25 @@ def make_suite_world(
     from bidex_meta.benchmark import Benchmark
 
     benchmark = Benchmark(suite, seed=of_tasks)
-    return benchmark.make_world(split, num_envs=num_envs, seed=seed, **options)
+    return benchmark.make_world(split, num_envs=num_envs, seed=seed, stagger=stagger, **options)
 
 
-def make_class_world(task_name: str, num_envs: int = 1, render_mode: str | None = None, **options: Any) -> "World":
+def make_class_world(
+    task_name: str, num_envs: int = 1, render_mode: str | None = None, stagger: bool = False, **options: Any
+) -> "World":
     """What `gymnasium.make_vec("bidex-meta/CatchUnderarm-v1", num_envs=...)` calls.
 
     Args:
         task_name: Name of the task class.
         num_envs: Rows.
         render_mode: As in `make_suite_world`.
+        stagger: As in `make_suite_world`.
         **options: The other keywords of `make_task_world`.
     """
     from bidex_meta.benchmark import make_task_world
 
     check_render_mode(render_mode)
-    return make_task_world(task_name, num_envs=num_envs, **options)
+    return make_task_world(task_name, num_envs=num_envs, stagger=stagger, **options)
 
 
 def check_render_mode(render_mode: str | None) -> None:

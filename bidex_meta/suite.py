@@ -6,11 +6,10 @@ Names of task classes and of the components of their variations are checked wher
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, Literal, cast
+from typing import Any, Literal, TypeVar, cast
 
 from bidex_meta.errors import BidexError, known_name, shortened, unknown_name
 from bidex_meta.outside import name_with_object
@@ -24,6 +23,33 @@ _LARGEST = 1_000_000
 MOST_POINTS = 16_384
 """Of a cloud: more than a coarse image has pixels are no finer."""
 _LONGEST_TEXT, _MOST_TABLES = 500, 1000
+
+
+_V = TypeVar("_V")
+
+
+class ReadOnly(Mapping[str, _V]):
+    """A mapping that nobody changes and, unlike Python's own ``MappingProxyType``, everybody may pickle.
+
+    Args:
+        content: Is copied.
+    """
+
+    def __init__(self, content: Mapping[str, _V]) -> None:
+        self._content = dict(content)
+
+    def __getitem__(self, key: str) -> _V:
+        return self._content[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._content)
+
+    def __len__(self) -> int:
+        return len(self._content)
+
+    def __repr__(self) -> str:
+        """As the dict of its content."""
+        return repr(self._content)
 
 
 @dataclass(frozen=True)
@@ -165,7 +191,7 @@ def _parse_classes(table: "_Table") -> list[SuiteClass]:
         replace(
             entry,
             name=name_with_object(entry.class_name, thing),
-            options=MappingProxyType({**entry.options, "object": thing}),
+            options=ReadOnly({**entry.options, "object": thing}),
         )
         for thing in objects
     ]
@@ -181,7 +207,7 @@ def _parse_class(table: "_Table") -> SuiteClass:
         reward_scale=table.number("reward_scale", default=1.0),
         gamma=table.number("gamma") if "gamma" in table.content else None,
         tasks=tuple(_parse_task(task) for task in table.tables("tasks", default=())),
-        options=MappingProxyType(_parse_options(table) if "options" in table.content else {}),
+        options=ReadOnly(_parse_options(table) if "options" in table.content else {}),
     )
     if entry.reward_scale <= 0.0:
         raise table.error("reward_scale", "a number above 0", entry.reward_scale)
@@ -207,7 +233,7 @@ def _parse_task(table: "_Table") -> ListedTask:
     task = ListedTask(
         name=table.text("name"),
         split=table.choice("split", *SPLITS, default="train"),
-        fixed=MappingProxyType({key: fixed.number(key) for key in fixed.content}),
+        fixed=ReadOnly({key: fixed.number(key) for key in fixed.content}),
     )
     table.finish()
     return task

@@ -110,7 +110,8 @@ def advantages(rewards: Tensor, values: Tensor, next_values: Tensor, ended: Tens
 def main(args: Args) -> list[float]:
     """Trains; returns the episodes' returns in the order in which they ended."""
     torch.manual_seed(args.seed)
-    envs = gymnasium.make_vec(args.env_id, num_envs=args.num_envs, seed=args.seed)
+    # Rows do not end together; shortened first episodes do not count in info["_episode"].
+    envs = gymnasium.make_vec(args.env_id, num_envs=args.num_envs, seed=args.seed, stagger=True)
     device = envs.unwrapped.device
     agent = Agent(envs.single_observation_space.shape[0], envs.single_action_space.shape[0]).to(device)
     optimiser = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5)

@@ -1,3 +1,6 @@
+import copy
+import multiprocessing
+import pickle
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -15,6 +18,7 @@ from hypothesis import strategies as st
 import bidex_meta.world
 from bidex_meta.benchmark import Benchmark, Task, make_task_world
 from bidex_meta.errors import BidexError
+from bidex_meta.metaworld import CustomML
 from bidex_meta.suite import suite_names
 from bidex_meta.tasks import registry
 
@@ -46,6 +50,43 @@ def own_suite(folder: Path, **replaced: str) -> Path:
     file = folder / "own.toml"
     file.write_text(text, encoding="utf-8")
     return file
+
+
+def begun(benchmark: Benchmark) -> list[np.ndarray]:
+    """The first observations of a world, and of one environment on its first task."""
+    world = benchmark.make_world(num_envs=2, device="cpu", threads=1)
+    env, task = next(iter(benchmark.train_classes.values()))(), benchmark.train_tasks[0]
+    env.set_task(task)
+    return [world.reset()[0].numpy(), env.reset(seed=5)[0]]
+
+
+FLASK = Path(__file__).parents[1] / "examples/objects/flask.xml"
+OWN = {
+    "listed": {"tasks_per_class = 3": "", '"HandOver"': '"HandOver"\n[[classes.tasks]]\nname = "near"\nfixed = {}'},
+    "objects": {'"HandOver"': f'"BottleCap"\nobjects = ["{FLASK}"]\n[points]\ncount = 64'},
+}
+
+
+@pytest.mark.parametrize("own", OWN)
+def test_suites_and_benchmarks_pickle(own: str, tmp_path: Path) -> None:
+    benchmark = Benchmark(own_suite(tmp_path, **OWN[own]), seed=3)
+    (tmp_path / "own.toml").unlink()
+    for copied in (pickle.loads(pickle.dumps(benchmark)), copy.deepcopy(benchmark)):
+        assert copied.suite == benchmark.suite and repr(copied) == repr(benchmark)
+        assert copied.train_tasks == benchmark.train_tasks and copied.train_classes == benchmark.train_classes
+        for a, b in zip(begun(copied), begun(benchmark), strict=True):
+            np.testing.assert_array_equal(a, b)
+    entry = benchmark.suite.classes[0]
+    with pytest.raises(TypeError):
+        entry.options["object"] = "egg"  # type: ignore[index]
+
+
+def test_benchmarks_go_to_other_processes() -> None:
+    benchmark = CustomML(["HandOver"], ["CatchUnderarm"], seed=1)
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        there = pool.apply(begun, (benchmark,))
+    for a, b in zip(there, begun(benchmark), strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 @given(st.lists(st.floats(width=64), max_size=12))

@@ -1,6 +1,7 @@
 """Code written for Meta-World runs here by changing the import: the same functions on its module and on ours."""
 # ruff: noqa: RUF059  (the examples are as they were written)
 
+import copy
 import pickle
 import random
 import subprocess
@@ -20,7 +21,7 @@ from metaworld import evaluation as original_evaluation
 
 import bidex_meta.metaworld as ours
 from bidex_meta import Benchmark, Task
-from bidex_meta.clients import metaworld as mended
+from bidex_meta.envs.suite_env import SuiteEnv
 from bidex_meta.errors import BidexError
 from bidex_meta.metaworld import evaluation as our_evaluation
 
@@ -31,9 +32,21 @@ SHORT: dict[str, Any] = {"max_episode_steps": 8}
 """Of episodes where a test is about their ends."""
 
 
-@pytest.fixture(scope="module", autouse=True)
-def meta_world_runs() -> None:
-    mended._library()  # Meta-World 3.0.0 makes no environment on MuJoCo 4 by itself
+ITS_OWN_CODE = """
+import metaworld
+env = metaworld.make_mt_envs("reach-v3", seed=0)
+env.reset()
+assert env.step(env.action_space.sample())[0].shape == (39,)
+"""
+
+
+@pytest.mark.parametrize("ours", ["", "import bidex_meta.metaworld", "import metaworld, bidex_meta.metaworld"])
+def test_meta_worlds_own_code_runs_beside_ours(ours: str) -> None:
+    """Meta-World 3.0.0 makes no environment on MuJoCo 4 by itself."""
+    command = [sys.executable, "-W", "ignore", "-c", ours + ITS_OWN_CODE]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    assert (done.returncode == 0) == bool(ours), done.stderr
+    assert ours or "could not broadcast input array from shape (11,) into shape (12,)" in done.stderr
 
 
 # Meta-World's examples, word for word but for the benchmark, which is an argument.
@@ -325,8 +338,31 @@ def test_classes_are_the_same_objects_and_travel() -> None:
     assert env_cls is not Benchmark("ML4").train_classes["HandOver"]
     assert (env_cls.__name__, env_cls.task_class.name) == ("HandOver", "HandOver")
     assert pickle.loads(pickle.dumps(env_cls.recipe)).make_class() is env_cls
+    assert pickle.loads(pickle.dumps(env_cls)) is copy.deepcopy(env_cls) is env_cls
+    assert pickle.loads(pickle.dumps(SuiteEnv)) is SuiteEnv
     assert cloudpickle.loads(cloudpickle.dumps(env_cls))().task_name == "HandOver"
     assert set(ours.ALL_V3_ENVIRONMENTS) == set(ours.MT1.ENV_NAMES)
+
+
+@pytest.mark.parametrize("begun", [False, True])
+def test_environments_pickle_and_go_on_alike(begun: bool) -> None:
+    benchmark = ours.ML1("CatchUnderarm", seed=2)
+    env = benchmark.train_classes["CatchUnderarm"]()
+    env.seed(3)
+    env.set_task(benchmark.train_tasks[4])
+    if begun:
+        env.reset()
+        env.step(np.ones(52, np.float32))
+    vector = ours.make_ml_envs("CatchUnderarm", seed=0)
+    assert pickle.loads(pickle.dumps(vector)).num_envs == 1
+    action = np.linspace(-1, 1, 52, dtype=np.float32)
+    seen = []
+    for each in (pickle.loads(pickle.dumps(env)), copy.deepcopy(env), env):
+        obs = [] if begun else [each.reset()[0]]
+        seen.append([*obs, *(each.step(action)[0] for _ in range(3)), each.reset()[0], each.step(action)[0]])
+        assert type(each) is type(env) and each._task == benchmark.train_tasks[4]
+    np.testing.assert_array_equal(seen[0], seen[2])
+    np.testing.assert_array_equal(seen[1], seen[2])
 
 
 def test_a_benchmark_is_one_of_meta_worlds_whoever_was_imported_first() -> None:

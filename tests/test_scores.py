@@ -18,17 +18,18 @@ from bidex_meta.evaluation.untrained import RandomAgent, ZeroAgent
 from bidex_meta.tasks import registry
 from tests.points import Finder, PointWorld, Still, ring
 from tests.tasks.worlds import mixed_world
+from tests.world.play import class_world
 
 
 class Breaker:
     """Does nothing for some steps of every episode, then emits NaN."""
 
-    def __init__(self, after: int) -> None:
-        self.after, self.steps = after, 0
+    def __init__(self, after: int, actions: int = 52) -> None:
+        self.after, self.actions, self.steps = after, actions, 0
 
     def eval_action(self, obs: Tensor) -> Tensor:
         self.steps += 1
-        return torch.full((len(obs), 52), math.nan if self.steps > self.after else 0.0)
+        return torch.full((len(obs), self.actions), math.nan if self.steps > self.after else 0.0)
 
     def reset(self, env_mask: Tensor) -> None:
         self.steps = 0
@@ -38,7 +39,7 @@ class Breaker:
 def broken(request: pytest.FixtureRequest) -> Evaluation:
     """All classes, in every episode of which an agent breaks a row, at once or after some steps."""
     world = mixed_world(4)
-    return evaluate(Breaker(request.param), world, 1, seed=0, references=references.references())
+    return evaluate(Breaker(request.param), world, 1, seed=0)
 
 
 @pytest.mark.parametrize("name", registry.names())
@@ -47,6 +48,18 @@ def test_an_agent_that_breaks_physics_gets_nothing_for_it(name: str, broken: Eva
     assert found.unstable == found.episodes == 4 and found.lengths.max() <= 4
     assert found.success == 0.0 and found.mean_return <= known.random
     assert found.score is None or found.score <= 1.0
+
+
+@pytest.mark.parametrize(("name", "known"), [("ReOrientation", True), ("HandOver", False)])
+def test_stored_references_are_those_of_moving_bases(name: str, known: bool) -> None:
+    world = class_world(name, 2, "DISABLED")
+    world.set_tasks({name: world.pools[0][:2]})
+    expected = references.references()[name] if known else None
+    (shot,) = meta_evaluate(Breaker(0, world.action_size), world, 0, episodes_per_task=1).by_shot
+    for found in (shot, evaluate(Breaker(0, world.action_size), world, 1)):
+        assert found.classes[name].reference == expected
+        assert found.classes[name].mean_return == (expected.random if expected else 0.0)
+    assert evaluate(Breaker(0, world.action_size), world, 1, references={}).classes[name].reference is None
 
 
 @pytest.mark.parametrize("name", registry.names())

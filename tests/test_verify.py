@@ -75,6 +75,9 @@ def test_a_run_is_equal_within_or_different(run, capsys):
     changed(run, lambda found: found["policy"]["classes"]["Near"].update({"return": row["return"] + 3 * width}))
     code, shown = verify(capsys, run)
     assert code == 1 and "1 differ: this run is not what its evaluation says" in shown.out
+    wide = {"return": row["return"] + 9 * width, "return_interval": [-1e9, 1e9]}
+    changed(run, lambda found: found["policy"]["classes"]["Near"].update(wide))
+    assert verify(capsys, run)[0] == 1
 
 
 def test_another_policy_is_found(run, capsys):
@@ -192,6 +195,20 @@ def test_honest_repetitions_are_within_and_a_worse_policy_is_not():
     assert beyond <= 8
     found = agreements(_rows(generator, 20, 60), _rows(generator, 20, 60, shift=2.0))
     assert all(each.outcome == "differs" for each in found)
+
+
+@pytest.mark.parametrize("name", ["success", "return"])
+@pytest.mark.parametrize("tasks", [1, 20])
+def test_a_recorded_interval_counts_no_wider_than_episodes_can_make_it(name, tasks):
+    again = _rows(np.random.default_rng(2), 1, 60)["C0"] | {"tasks": tasks}
+    low, high = again[f"{name}_interval"]
+    for gap, outcome in ((0.3, "within"), (9.0, "differs")):
+        value = again[name] + gap * (high - low) / 2
+        for wide in (1.0, 1e9):
+            ends = [value - wide * (high - low) / 2, value + wide * (high - low) / 2]
+            row = again | {name: value, f"{name}_interval": ends}
+            (found,) = agreements({"C0": row}, {"C0": again})
+            assert found.outcome == outcome, (gap, wide)
 
 
 def test_rows_that_cannot_agree():

@@ -99,7 +99,7 @@ def _own_loop(world: World, steps: int, act: Callable[[Any], tuple[torch.Tensor,
 def _sb3(world: World, twin: World, steps: int, seed: int) -> _Pair:
     from bidex_meta.clients.sb3_env import SB3VecEnv
 
-    env = SB3VecEnv(world)
+    env = SB3VecEnv(world, stagger=True)
     from stable_baselines3 import PPO
     from stable_baselines3.common.callbacks import CallbackList
 
@@ -119,7 +119,7 @@ def _sb3(world: World, twin: World, steps: int, seed: int) -> _Pair:
 def _rsl_rl(world: World, twin: World, steps: int, seed: int) -> _Pair:
     from bidex_meta.clients.rsl_rl_env import RslRlVecEnv
 
-    env = RslRlVecEnv(world)
+    env = RslRlVecEnv(world, stagger=True)
     from rsl_rl.algorithms import PPO
     from rsl_rl.models import MLPModel
     from rsl_rl.storage import RolloutStorage

@@ -92,7 +92,7 @@ class ForeignWorld(Recreated, VectorEnv):
         if num_envs < self.num_tasks:
             raise BidexError(f"Expected at least {self.num_tasks} rows, one for each class, got {num_envs}.")
         self.autoreset_mode = checked_mode(autoreset_mode)
-        self._stagger = stagger and self.autoreset_mode == AutoresetMode.SAME_STEP
+        self.stagger = stagger
         self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
         self._sizes = sizes
         self.slot_rows = split_rows(num_envs, self.num_tasks)
@@ -165,8 +165,9 @@ class ForeignWorld(Recreated, VectorEnv):
         if seed is not None:
             self._seed_rows(checked_seed(seed, mask))
         first = not self._ready or seed is not None
+        stagger = self.stagger and first and self.autoreset_mode == AutoresetMode.SAME_STEP
         self._ready = True
-        self._begin(mask, stagger=first and self._stagger)
+        self._begin(mask, stagger)
         return self._obs.clone(), {}
 
     def _begin(self, mask: Tensor, stagger: bool) -> None:

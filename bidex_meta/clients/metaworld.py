@@ -1,4 +1,4 @@
-"""Meta-World at arm's length: which of its suites there are, the mend it needs, its tasks, and one of its environments.
+"""Meta-World at arm's length: which of its suites there are, its tasks, and one of its environments.
 
 The batched world made of these is ``clients/metaworld_world.py``. Nothing here needs torch, and Meta-World itself (a
 foreign library with physics and rewards that no one here wrote) is imported only when something is made of it.
@@ -35,8 +35,6 @@ OBSERVATION_SIZE = 39
 ACTION_SIZE = 4
 EPISODE_STEPS = 500
 
-_WELD_NUMBERS = 11
-_WELD = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 5.0)
 _BROKEN = ("BADQPOS", "BADQVEL", "BADQACC", "CONTACTFULL", "CNSTRFULL")
 
 
@@ -117,15 +115,11 @@ class Single:
 
 @functools.cache
 def _library() -> Any:
-    """Meta-World, mended.
+    """Meta-World, mended."""
+    from bidex_meta.metaworld.mending import mended  # torch comes with it: not where suites are listed
 
-    Meta-World 3.0.0 (its newest release without an upper bound on MuJoCo) sets the hand's weld by eleven numbers for
-    the whole row of ``eq_data``; since MuJoCo 3.17 that row is twelve wide, so no environment could be made. Here the
-    eleven go to the first eleven places, as they were meant; the twelfth keeps what the model was compiled with.
-    """
     try:
-        import metaworld
-        from metaworld.sawyer_xyz_env import SawyerMocapBase
+        library = mended()
     except ModuleNotFoundError as error:
         raise BidexError(
             f"Expected Meta-World for a suite {PREFIX}..., but {error.name} is not installed. "
@@ -133,14 +127,9 @@ def _library() -> Any:
         ) from None
     import mujoco
 
-    def reset_mocap_welds(self: Any) -> None:
-        welds = np.flatnonzero(self.model.eq_type == mujoco.mjtEq.mjEQ_WELD)
-        self.model.eq_data[welds, :_WELD_NUMBERS] = _WELD
-
-    SawyerMocapBase.reset_mocap_welds = reset_mocap_welds
     # MuJoCo would print each broken row to stderr and a log file in the working folder; Single.step tells it.
     mujoco.set_mju_user_warning(_silent)
-    return metaworld
+    return library
 
 
 def _silent(message: str) -> None:

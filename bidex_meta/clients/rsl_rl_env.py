@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.clients.episode_log import EpisodeLog
-from bidex_meta.clients.needs import check_training, extra
+from bidex_meta.clients.needs import check_training, extra, whole_steps
 from bidex_meta.errors import unknown_name
 from bidex_meta.world.contract import TaskWorld
 
@@ -20,19 +20,19 @@ class RslRlVecEnv(VecEnv):
     """All rows of one world on its device; observations in the groups `policy` and `critic`.
 
     `extras`: `time_outs` (cut by the time limit or broken physics) and `log` (`EpisodeLog`; empty where no row ended).
-    Rows begin staggered already: leave `init_at_random_ep_len` False.
 
     Args:
         world: In autoreset mode SAME_STEP.
         policy: The world's `observation_groups` that the policy sees; none: all. The critic sees everything.
-        cfg: What rsl-rl's loggers shall keep as the environment's config.
+        cfg: A dict: what rsl-rl's loggers shall keep as the environment's config.
+        stagger: Shortened first episodes (docs/clients.md), which "Mean reward" counts and `log` does not.
 
     Raises:
-        BidexError: Another autoreset mode, or an unknown group.
+        BidexError: Another autoreset mode, or an unknown group; `episode_length_buf` set to no whole numbers from 0 on.
     """
 
-    def __init__(self, world: TaskWorld, policy: Sequence[str] = (), cfg: dict[str, Any] | None = None) -> None:
-        check_training(world)
+    def __init__(self, world: TaskWorld, policy: Sequence[str] = (), cfg: Any = None, stagger: bool = False) -> None:
+        check_training(world, stagger)
         self.world: Any = world
         self.num_envs, self.num_actions = world.num_envs, world.action_space.shape[1]
         self.device, self.cfg = world.device, cfg or {}
@@ -53,10 +53,11 @@ class RslRlVecEnv(VecEnv):
 
     @episode_length_buf.setter
     def episode_length_buf(self, value: Tensor) -> None:
+        steps = whole_steps("episode_length_buf", value, self.world)
         self.get_observations()
         episodes = self.world.episodes
-        episodes.counts = episodes.counts & (value == episodes.elapsed)
-        episodes.elapsed = value.to(episodes.elapsed).minimum(self.world.max_episode_steps - 1)
+        episodes.counts = episodes.counts & (steps == episodes.elapsed)
+        episodes.elapsed = steps.minimum(self.world.max_episode_steps - 1)
 
     def reset(self, seed: int | None = None) -> tuple[TensorDict, dict[str, Any]]:
         """Starts episodes of all rows."""

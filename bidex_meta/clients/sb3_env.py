@@ -9,25 +9,26 @@ from bidex_meta.clients.needs import check_training, extra
 from bidex_meta.world.contract import VectorWorld
 
 with extra("sb3"):
+    from stable_baselines3.common.monitor import Monitor
     from stable_baselines3.common.vec_env import VecEnv
 
 
 class SB3VecEnv(VecEnv):
     """All rows of one world, NumPy arrays in and out.
 
-    `infos` of a row that ended: `terminal_observation`, `TimeLimit.truncated` (the episode was cut: SB3 goes on with
-    the value of that observation) and, unless it was a shortened first episode, `episode` (r, l, t) and `is_success`
-    (at any step). Those of running rows are empty.
+    `infos` of a row that ended: `terminal_observation`, `TimeLimit.truncated` (cut: SB3 goes on with the value of that
+    observation) and, unless it was a shortened first episode, `episode` (r, l, t) and `is_success` (at any step).
 
     Args:
         world: In autoreset mode SAME_STEP. One seed of SB3's starts all its rows.
+        stagger: Shortened first episodes (docs/clients.md), which SB3 does not count but `VecMonitor` does.
 
     Raises:
         BidexError: Another autoreset mode.
     """
 
-    def __init__(self, world: VectorWorld) -> None:
-        check_training(world)
+    def __init__(self, world: VectorWorld, stagger: bool = False) -> None:
+        check_training(world, stagger)
         self.world: Any = world
         super().__init__(world.num_envs, world.single_observation_space, world.single_action_space)
 
@@ -71,8 +72,8 @@ class SB3VecEnv(VecEnv):
         return [getattr(self.world, method_name)(*method_args, **method_kwargs)] * len(list(self._get_indices(indices)))
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Rows have no wrappers."""
-        return [False for _ in self._get_indices(indices)]
+        """True of `Monitor` alone: `infos` tells of whole episodes as it does, which SB3's evaluation then counts."""
+        return [wrapper_class is Monitor for _ in self._get_indices(indices)]
 
     def close(self) -> None:
         """Frees the world."""

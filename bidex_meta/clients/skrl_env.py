@@ -21,13 +21,14 @@ class SkrlEnv(Wrapper):
     Args:
         world: In autoreset mode SAME_STEP.
         seed: Of the first reset; None: the world's.
+        stagger: Shortened first episodes (docs/clients.md), which skrl's "Total reward" counts.
 
     Raises:
         BidexError: Another autoreset mode.
     """
 
-    def __init__(self, world: VectorWorld, seed: int | None = None) -> None:
-        check_training(world)
+    def __init__(self, world: VectorWorld, seed: int | None = None, stagger: bool = False) -> None:
+        check_training(world, stagger)
         super().__init__(world)
         self.world, self._seed = world, seed
         self._obs: Tensor | None = None

@@ -25,13 +25,14 @@ class TorchRLEnv(EnvBase):
 
     Args:
         world: In autoreset mode SAME_STEP.
+        stagger: Shortened first episodes (docs/clients.md), which TorchRL's transforms count.
 
     Raises:
         BidexError: Another autoreset mode.
     """
 
-    def __init__(self, world: VectorWorld) -> None:
-        check_training(world)
+    def __init__(self, world: VectorWorld, stagger: bool = False) -> None:
+        check_training(world, stagger)
         rows, device = world.num_envs, world.device
         super().__init__(device=device, batch_size=torch.Size([rows]))
         self.world, self._world_seed = world, None

@@ -106,7 +106,7 @@ def _played(what: str, source: Source, flags: BaselineFlags) -> "Evaluation":
 
     world = source.world()
     agent, names = _agent(what, world, flags.seed)
-    found = evaluate(agent, world, flags.episodes, seed=EVALUATION_SEED)
+    found = evaluate(agent, world, flags.episodes, seed=EVALUATION_SEED, references={})
     world.close()
     return replace(found, classes={name: found.classes[name] for name in names})
 
@@ -125,7 +125,8 @@ def _scripted(source: Source, flags: BaselineFlags) -> "Evaluation":
     for name in names:
         config = {"task": name, "base": "moving", "seed": flags.seed, "device": "cpu", "engine": "c"}
         world: Any = Source.open(config | {"threads": flags.threads}).world()
-        classes |= evaluate(Scripted(world), world, flags.episodes, seed=EVALUATION_SEED).classes
+        played = evaluate(Scripted(world), world, flags.episodes, seed=EVALUATION_SEED, references={})
+        classes |= played.classes
         world.close()
     return Evaluation(classes, flags.episodes)
 

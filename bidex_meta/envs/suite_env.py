@@ -3,6 +3,7 @@
 One row of a world at a time: for code that is written so. All rows of a suite at once are `Benchmark.make_world`.
 """
 
+import copyreg
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, ClassVar, Protocol
@@ -61,8 +62,21 @@ class EnvRecipe:
         return _make_class(self)
 
 
-class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+class _Remade(type):
+    """Of classes that no module holds: they are pickled as their recipes."""
+
+
+def _reduced(made: Any) -> str | tuple[Any, ...]:
+    return (_make_class, (made.recipe,)) if "recipe" in vars(made) else made.__qualname__  # one of a module's own
+
+
+copyreg.pickle(_Remade, _reduced)
+
+
+class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
     """A task class as an environment that plays the task it is given; its subclasses stand in `train_classes`.
+
+    Classes and environments pickle and copy: a copy has the same task and goes on bit for bit.
 
     Observations are those of the suite's worlds before a one-hot: padded to the suite's widest class, goal entries zero
     where the suite hides goals; where it shows point clouds, one behind them in the place of objects' states. `info`
@@ -219,7 +233,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 def _make_class(recipe: EnvRecipe) -> type[SuiteEnv]:
     task_class = registry.get(recipe.class_name or recipe.name, recipe.moving_base, **dict(recipe.options))
     text = f"{task_class.summary}."
-    return type(recipe.name, (SuiteEnv,), {"recipe": recipe, "task_class": task_class, "__doc__": text})
+    return _Remade(recipe.name, (SuiteEnv,), {"recipe": recipe, "task_class": task_class, "__doc__": text})
 
 
 def _camera(name: str | None, number: int | None) -> str:

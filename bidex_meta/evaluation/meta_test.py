@@ -24,6 +24,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.gains import Gains, paired_gains
 from bidex_meta.evaluation.play import EVALUATION_SEED, check_world, play_tasks, quota
 from bidex_meta.evaluation.portions import Portions, task_of_row
+from bidex_meta.evaluation.references import references_of
 from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.evaluation.scores import Reference
 from bidex_meta.world.contract import TaskWorld
@@ -125,7 +126,7 @@ def meta_evaluate(
         trials: How often each task is adapted to, from the start and with other episodes.
         max_adapt_steps: Episodes of adaptation are cut (``truncated``) after so many steps.
         seed: Of all starts; without adaptation, and with all tasks in the world at once, those of ``evaluate``.
-        references: Per class name, what the normalised score and broken episodes are measured against.
+        references: As in ``evaluate``.
         adapt_world: Where episodes of adaptation are played, if not on ``world``.
         evaluated: After how many shots to evaluate (0: before all); None: always.
         split: Kept in the result.
@@ -153,6 +154,7 @@ def meta_evaluate(
                     played = play_tasks(agent, world, episodes_per_task, starts)
                     found[shot].append(portions.labelled(played, number))
     joined = [{key: np.concatenate([part[key] for part in parts]) for key in parts[0]} for parts in found.values()]
+    references = references_of(world) if references is None else references
     by_class = [results_by_class(world.task_names, episodes, references, joined) for episodes in joined]
     first = joined[0]
     return MetaEvaluation(

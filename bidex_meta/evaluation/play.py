@@ -15,6 +15,7 @@ from gymnasium.vector import AutoresetMode
 
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError, shortened, whole_number
+from bidex_meta.evaluation.references import references_of
 from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.evaluation.scores import Reference
 from bidex_meta.world.contract import TaskWorld
@@ -39,13 +40,15 @@ def evaluate(
             its episodes.
         episodes_per_task: Episodes of each task.
         seed: Passed to the world's reset; None keeps the world's own.
-        references: Per class name, what the normalised score and broken episodes are measured against.
+        references: Per class name, what the normalised score and broken episodes are measured against; left out, those
+            that the installation stores of the world's classes. ``{}``: none.
 
     Raises:
         BidexError: The world resets by itself, lacks rows, or ``episodes_per_task`` is not positive.
     """
     check_world(world, episodes_per_task)
     episodes = play_tasks(agent, world, episodes_per_task, seed)
+    references = references_of(world) if references is None else references
     return Evaluation(results_by_class(world.task_names, episodes, references), episodes_per_task)
 
 

@@ -85,6 +85,12 @@ def references() -> dict[str, Reference]:
     return found
 
 
+def references_of(world: Any) -> dict[str, Reference]:
+    """Those of a world's classes by name; none of foreign classes, nor where bases are fixed."""
+    slots = getattr(world, "slots", ())
+    return references() if slots and all(slot.task_class.moving_base for slot in slots) else {}
+
+
 def rescored(classes: dict[str, Any], config: dict[str, Any]) -> dict[str, Any]:
     """Rows of an evaluation with the scores that today's references give their returns.
 

@@ -6,12 +6,11 @@ are `bidex_meta.Benchmark("MT1")` and `Benchmark("ML1")`. Hands move, as in ever
 
 from collections.abc import Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import ClassVar, Literal
 
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import BidexError, known_name
-from bidex_meta.suite import Split, Suite, SuiteClass
+from bidex_meta.suite import ReadOnly, Split, Suite, SuiteClass
 from bidex_meta.tasks import registry
 
 _TASKS = 50
@@ -122,9 +121,7 @@ def _suite(name: str, observation: Literal["plain", "one-hot", "masked"], classe
         reward="paper",
         base="moving",
         tasks_per_class=_TASKS,
-        classes=tuple(
-            SuiteClass(entry, entry, where, 1.0, None, (), MappingProxyType({})) for entry, where in splits.items()
-        ),
+        classes=tuple(SuiteClass(entry, entry, where, 1.0, None, (), ReadOnly({})) for entry, where in splits.items()),
         file=Path(f"metaworld.{name}"),
     )
 

@@ -25,10 +25,10 @@ class RowAttributes:
         """Slot name of each row."""
         return [self.task_names[i] for i in self.task_id.tolist()]
 
-    def to_numpy(self) -> NumpyWorld:
-        """This world in NumPy arrays, as Gymnasium's vector wrappers expect one."""
+    def to_numpy(self, stagger: bool = False) -> NumpyWorld:
+        """This world in NumPy arrays, as Gymnasium's vector wrappers expect one; ``stagger`` as there."""
         world: Any = self
-        return NumpyWorld(world)
+        return NumpyWorld(world, stagger)
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """An attribute for each row: its own entry of a per-row attribute, else the world's value."""

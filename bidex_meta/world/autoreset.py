@@ -9,6 +9,7 @@ from torch import Tensor
 
 from bidex_meta.engine.health import dense
 from bidex_meta.errors import BidexError, shortened, unknown_name, whole_number
+from bidex_meta.world.contract import VectorWorld
 
 _MODES = {"SAME_STEP": AutoresetMode.SAME_STEP, "DISABLED": AutoresetMode.DISABLED}
 
@@ -26,6 +27,20 @@ def checked_mode(mode: AutoresetMode | str | None) -> AutoresetMode:
         if name.upper().replace("-", "").replace("_", "") == known.replace("_", ""):
             return value
     raise unknown_name("autoreset_mode", name, _MODES)
+
+
+def set_stagger(world: VectorWorld, stagger: bool) -> None:
+    """Whether first episodes begin at random elapsed steps, from the world's next first reset on.
+
+    Other libraries sum rewards from the first step to the first end, so what is made for them begins at 0 by default.
+
+    Args:
+        world: With wrappers of ours or Gymnasium's around it or none; one without ``stagger`` is left as it is.
+        stagger: What its ``stagger`` shall be.
+    """
+    inner: Any = getattr(world, "unwrapped", world)
+    if hasattr(inner, "stagger"):
+        inner.stagger = stagger
 
 
 def reset_mask(options: dict[str, Any] | None, num_envs: int, device: torch.device, ready: bool) -> Tensor:

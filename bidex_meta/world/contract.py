@@ -33,7 +33,8 @@ where a row ended, and on the warp engine, which would have to wait for the answ
 masks. A world may add keys like these and ``reward_terms``; learners may not rely on them.
 
 Shortened first episodes: in SAME_STEP mode the first episode of each row, after the first reset and after each with a
-seed, may begin at a random elapsed step, so that rows do not end together; the time limit counts from there.
+seed, may begin at a random elapsed step, so that rows do not end together; the time limit counts from there. A world
+that does so has an attribute ``stagger``, which may be set: whether the next such reset does.
 """
 
 from dataclasses import dataclass

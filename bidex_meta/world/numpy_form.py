@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from gymnasium.vector import VectorEnv
 
+from bidex_meta.world.autoreset import set_stagger
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.world.ends import ended_info
 
@@ -21,9 +22,12 @@ class NumpyWorld(VectorEnv):
 
     Args:
         world: Is stepped; nothing of it is copied.
+        stagger: Whether a training world's first episodes begin at random elapsed steps, so that wrappers which count
+            for themselves count them too short; left out, at 0.
     """
 
-    def __init__(self, world: VectorWorld) -> None:
+    def __init__(self, world: VectorWorld, stagger: bool = False) -> None:
+        set_stagger(world, stagger)
         self.world, self.num_envs = world, world.num_envs
         self.single_observation_space, self.observation_space = world.single_observation_space, world.observation_space
         self.single_action_space, self.action_space = world.single_action_space, world.action_space

@@ -99,7 +99,7 @@ class World(Recreated, RowAttributes, VectorEnv):
         checked.choices(task_sampling, observation, points)
         self.num_envs, self.slots, self.seed = num_envs, [with_pool(slot, slot.tasks) for slot in slots], seed
         self.autoreset_mode = checked_mode(autoreset_mode)
-        self._stagger = true_or_false("stagger", stagger) and self.autoreset_mode == AutoresetMode.SAME_STEP
+        self.stagger = true_or_false("stagger", stagger)
         self.metadata = {
             "autoreset_mode": self.autoreset_mode, "render_modes": ["rgb_array"], "render_fps": CONTROL_RATE
         }  # fmt: skip
@@ -197,7 +197,8 @@ class World(Recreated, RowAttributes, VectorEnv):
         mask = reset_mask(options, self.num_envs, self.device, self._ready)
         if seed is not None:
             self._seed_rows(checked_seed(seed, mask))
-        stagger = self._stagger and (not self._ready or seed is not None)
+        first = not self._ready or seed is not None
+        stagger = self.stagger and first and self.autoreset_mode == AutoresetMode.SAME_STEP
         self._ready = True
         with one_torch_thread():
             self._begin(mask, stagger)

@@ -34,6 +34,11 @@ class WorldWrapper(VectorWorld):
             raise AttributeError(name)
         return getattr(self.world, name)
 
+    @property
+    def unwrapped(self) -> Any:
+        """The world within all wrappers."""
+        return getattr(self.world, "unwrapped", self.world)
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
         """Starts episodes; see ``VectorWorld``."""
         return self.world.reset(seed=seed, options=options)

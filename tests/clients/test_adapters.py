@@ -3,15 +3,18 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from torch import Tensor
 
 from bidex_meta.clients.needs import extra
 from bidex_meta.errors import BidexError
+from bidex_meta.world.numpy_form import NumpyWorld
 from tests.points import PointWorld, ring
-from tests.world.play import suite_world
+from tests.world.play import class_world, suite_world
 
 ROWS = 40
 
@@ -19,8 +22,10 @@ ROWS = 40
 class Staggered(PointWorld):
     """Points whose first episodes are shortened, with true ends, cuts and broken rows."""
 
+    stagger = True
+
     def _first_elapsed(self) -> Tensor:
-        return torch.arange(self.num_envs) % 5
+        return torch.arange(self.num_envs) % 5 * self.stagger
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         return (getattr(self, name, None),) * self.num_envs
@@ -64,7 +69,7 @@ def of_sb3(world: Any, actions: Tensor) -> Seen:
     pytest.importorskip("stable_baselines3")
     from bidex_meta.clients.sb3_env import SB3VecEnv
 
-    env, seen = SB3VecEnv(world), Seen([], [], [])
+    env, seen = SB3VecEnv(world, stagger=True), Seen([], [], [])
     obs = env.reset()
     total = np.zeros(env.num_envs)
     for action in actions.numpy():
@@ -88,7 +93,7 @@ def of_rsl_rl(world: Any, actions: Tensor) -> Seen:
     pytest.importorskip("rsl_rl")
     from bidex_meta.clients.rsl_rl_env import RslRlVecEnv
 
-    env, seen = RslRlVecEnv(world), Seen([], [], [])
+    env, seen = RslRlVecEnv(world, stagger=True), Seen([], [], [])
     assert torch.equal(env.get_observations()["policy"], env.get_observations()["critic"])
     for action in actions:
         with torch.inference_mode():  # as its runner has it
@@ -106,7 +111,7 @@ def of_skrl(world: Any, actions: Tensor) -> Seen:
     pytest.importorskip("skrl")
     from bidex_meta.clients.skrl_env import SkrlEnv
 
-    env, seen = SkrlEnv(world), Seen([], [], [])
+    env, seen = SkrlEnv(world, stagger=True), Seen([], [], [])
     obs, _ = env.reset()
     for action in actions:
         obs, reward, terminated, truncated, infos = env.step(action)
@@ -126,7 +131,7 @@ def of_torchrl(world: Any, actions: Tensor) -> Seen:
     pytest.importorskip("torchrl")
     from bidex_meta.clients.torchrl_env import TorchRLEnv
 
-    env, seen = TorchRLEnv(world), Seen([], [], [])
+    env, seen = TorchRLEnv(world, stagger=True), Seen([], [], [])
     state = env.reset()
     whole = world.episodes.counts.clone()
     for action in actions:
@@ -180,7 +185,7 @@ def test_sb3_seeds_options_and_attributes() -> None:
     pytest.importorskip("stable_baselines3")
     from bidex_meta.clients.sb3_env import SB3VecEnv
 
-    env, twin = SB3VecEnv(real()), real()
+    env, twin = SB3VecEnv(real(), stagger=True), real()
     env.seed(3)
     np.testing.assert_array_equal(env.reset(), twin.reset(seed=3)[0])
     assert env.get_attr("task_name", [0, 7]) == ["CatchUnderarm", "TwoCatchUnderarm"]
@@ -207,6 +212,15 @@ def test_rsl_rl_groups_limits_and_lengths() -> None:
     env.episode_length_buf = torch.full((8,), 74)
     dones = env.step(torch.zeros(8, 52))[2]
     assert torch.equal(dones, world.max_episode_steps == 75)
+    before = env.episode_length_buf
+    for wrong in (-1.0, torch.nan, torch.inf, 0.5, 2.0**70):
+        with pytest.raises(
+            BidexError, match=r"episode_length_buf: expected whole numbers from 0 on, shape \(8,\), got"
+        ):
+            env.episode_length_buf = torch.full((8,), wrong)
+    with pytest.raises(BidexError, match=r"shape \(8,\), got \[1, 1\]"):
+        env.episode_length_buf = torch.ones(2, dtype=torch.int64)
+    assert torch.equal(env.episode_length_buf, before)
     with pytest.raises(BidexError, match=r"Unknown observation group 'gaol'. Did you mean 'goal'"):
         RslRlVecEnv(world, policy=("gaol",))
 
@@ -242,3 +256,170 @@ def test_torchrl_specs_seeds_and_part_resets() -> None:
     part = env.reset(state.select("observation", "episode", "success", "done").set("_reset", mask))
     assert torch.equal(part["observation"][3:], state["observation"][3:])
     assert world.episodes.length.tolist() == [0, 0, 0, 1, 1, 1, 1, 1]
+
+
+STEPS = 75
+"""An episode of CatchUnderarm in which nothing is done."""
+
+
+def catch() -> Any:
+    return class_world("CatchUnderarm", 4)
+
+
+def evaluated_by_sb3(wrap: Callable[[Any], Any]) -> list[int]:
+    pytest.importorskip("stable_baselines3")
+    from stable_baselines3.common.evaluation import evaluate_policy
+
+    from bidex_meta.clients.sb3_env import SB3VecEnv
+
+    model: Any = Still()
+    return evaluate_policy(model, wrap(SB3VecEnv(catch())), n_eval_episodes=6, return_episode_rewards=True)[1]  # type: ignore[return-value]
+
+
+class Still:
+    """A model that does nothing."""
+
+    def predict(self, obs: np.ndarray, state: Any = None, **kwargs: Any) -> tuple[np.ndarray, Any]:
+        return np.zeros((len(obs), 52), np.float32), state
+
+
+def by_sb3() -> list[int]:
+    return evaluated_by_sb3(lambda env: env)
+
+
+def by_sb3s_monitor() -> list[int]:
+    pytest.importorskip("stable_baselines3")
+    from stable_baselines3.common.vec_env import VecMonitor
+
+    with pytest.warns(UserWarning, match="already wrapped"):  # whose numbers are the same
+        return evaluated_by_sb3(VecMonitor)
+
+
+def by_rsl_rl() -> list[int]:
+    pytest.importorskip("rsl_rl")
+    from rsl_rl.utils.logger import Logger
+
+    from bidex_meta.clients.rsl_rl_env import RslRlVecEnv
+
+    env = RslRlVecEnv(catch())
+    logger: Any = Logger(None, {"algorithm": {}}, {}, 4, False, 1, 0, "cpu")
+    logger.writer = object()  # it counts where it writes
+    env.get_observations()
+    for _ in range(2 * STEPS):
+        _, reward, dones, extras = env.step(torch.zeros(4, 52))
+        logger.process_env_step(reward, dones, extras)
+    return list(logger.lenbuffer)
+
+
+def by_skrl() -> list[int]:
+    pytest.importorskip("skrl")
+    from skrl.agents.torch.base import Agent, AgentCfg
+
+    from bidex_meta.clients.skrl_env import SkrlEnv
+
+    class Counts(Agent):
+        act = pre_interaction = post_interaction = update = None  # type: ignore[assignment]
+
+    env, agent = SkrlEnv(catch()), Counts(cfg=AgentCfg(), models={})
+    agent.write_interval = 1
+    names = ("observations", "states", "actions", "next_observations", "next_states", "timestep", "timesteps")
+    other: Any = dict.fromkeys(names)
+    env.reset()
+    for _ in range(2 * STEPS):
+        _, reward, terminated, truncated, infos = env.step(torch.zeros(4, 52))
+        agent.record_transition(rewards=reward, terminated=terminated, truncated=truncated, infos=infos, **other)
+    return [steps for (steps,) in agent._track_timesteps]
+
+
+def by_torchrl() -> list[int]:
+    pytest.importorskip("torchrl")
+    from torchrl.envs import StepCounter, TransformedEnv
+
+    from bidex_meta.clients.torchrl_env import TorchRLEnv
+
+    env, found = TransformedEnv(TorchRLEnv(catch()), StepCounter()), []
+    state = env.reset()
+    for _ in range(2 * STEPS):
+        told, state = env.step_and_maybe_reset(state.set("action", torch.zeros(4, 52)))
+        found += told["next", "step_count"][told["next", "done"]].tolist()
+    return found
+
+
+def counted_by_gymnasium(env: Any, shape: tuple[int, ...], steps: int) -> list[int]:
+    env.reset(seed=0)
+    for _ in range(steps):
+        env.step(np.zeros(shape, np.float32))
+    return [int(length) for length in env.length_queue]
+
+
+def by_gymnasium() -> list[int]:
+    return counted_by_gymnasium(RecordEpisodeStatistics(catch().to_numpy()), (4, 52), 2 * STEPS)
+
+
+def by_gymnasiums_ids() -> list[int]:
+    suite, world = (
+        gymnasium.make_vec(f"bidex-meta/{name}-v1", num_envs=4, device="cpu", threads=1).unwrapped
+        for name in ("MT4", "CatchUnderarm")
+    )
+    for each in (suite, world):
+        each.reset(seed=0)
+        assert each.episodes.counts.all()  # type: ignore[attr-defined]
+    return counted_by_gymnasium(RecordEpisodeStatistics(NumpyWorld(world, stagger=world.stagger)), (4, 52), STEPS)  # type: ignore[attr-defined, arg-type]
+
+
+def by_gymnasiums_single_environment() -> list[int]:
+    env = gymnasium.wrappers.RecordEpisodeStatistics(gymnasium.make("bidex-meta/CatchUnderarm-v1"))
+    return counted_by_gymnasium(env, (52,), STEPS)
+
+
+def by_metaworlds_wrappers() -> list[int]:
+    import bidex_meta.metaworld
+
+    env: Any = bidex_meta.metaworld.make_mt_envs("CatchUnderarm", seed=0)
+    env.reset(seed=0)
+    return [int(e["episode"]["l"]) for _ in range(STEPS) if "episode" in (e := env.step(np.zeros(52, np.float32))[-1])]
+
+
+def by_pettingzoo() -> list[int]:
+    pytest.importorskip("pettingzoo")
+    from bidex_meta.clients.pettingzoo import parallel_env
+
+    env = parallel_env("CatchUnderarm")
+    env.reset(seed=0)
+    still, steps = {name: np.zeros(26, np.float32) for name in env.agents}, 0
+    while env.agents:
+        env.step(still)
+        steps += 1
+    return [steps]
+
+
+STATISTICS = (
+    by_sb3,
+    by_sb3s_monitor,
+    by_rsl_rl,
+    by_skrl,
+    by_torchrl,
+    by_gymnasium,
+    by_gymnasiums_ids,
+    by_gymnasiums_single_environment,
+    by_metaworlds_wrappers,
+    by_pettingzoo,
+)
+
+
+@pytest.mark.parametrize("count", STATISTICS)
+def test_no_librarys_statistics_count_a_shortened_episode(count: Callable[[], list[int]]) -> None:
+    lengths = count()
+    assert lengths and set(lengths) == {STEPS}
+
+
+def test_sb3_evaluates_whole_episodes_of_a_staggered_world_too() -> None:
+    pytest.importorskip("stable_baselines3")
+    from stable_baselines3.common.evaluation import evaluate_policy
+
+    from bidex_meta.clients.sb3_env import SB3VecEnv
+
+    model: Any = Still()
+    env = SB3VecEnv(catch(), stagger=True)
+    lengths: Any = evaluate_policy(model, env, n_eval_episodes=6, return_episode_rewards=True)[1]
+    assert lengths == [STEPS] * 6 and env.world.stagger

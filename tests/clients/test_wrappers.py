@@ -132,7 +132,7 @@ def test_video_of_a_world_of_tensors_is_refused(films: dict[str, list[np.ndarray
 
 def test_statistics_of_the_numpy_form_are_the_worlds_own() -> None:
     """1,000 episodes of points; the first, shortened ones the world does not count."""
-    env = wrap.RecordEpisodeStatistics(NumpyWorld(points()), buffer_length=10_000)
+    env = wrap.RecordEpisodeStatistics(NumpyWorld(points(), stagger=True), buffer_length=10_000)
     env.reset(seed=0)
     generator, first, seen = np.random.default_rng(0), np.ones(ROWS, bool), 0
     while seen < 1000:
@@ -153,7 +153,7 @@ def test_statistics_of_the_numpy_form_are_the_worlds_own() -> None:
 
 def test_the_numpy_form_is_the_world() -> None:
     """The same numbers, and what an episode ended with."""
-    world, env = suite_world("MT4", 8), suite_world("MT4", 8).to_numpy()
+    world, env = suite_world("MT4", 8), suite_world("MT4", 8).to_numpy(stagger=True)
     np.testing.assert_array_equal(world.reset(seed=0)[0], env.reset(seed=0)[0])
     env.action_space.seed(0)
     for _ in range(80):

@@ -1,5 +1,6 @@
 """Gymnasium's keys of a step: there where something ended, as its own vector environments have them."""
 
+import copy
 from collections.abc import Callable
 from typing import Any
 
@@ -94,7 +95,10 @@ def test_they_repeat_the_contracts_keys(kind: str) -> None:
 def test_without_stagger_first_episodes_are_whole() -> None:
     world = suite_world("MT4", 8)
     whole = World(world.slots, 8, stagger=False, threads=1)
-    whole.reset(seed=0)
+    world.stagger = False
+    for other in (whole, world, copy.deepcopy(world)):
+        other.reset(seed=0)
+        assert torch.equal(other.episodes.elapsed, whole.episodes.elapsed)
     assert (whole.episodes.elapsed == 0).all() and whole.episodes.counts.all()
     ended = torch.zeros(8, dtype=torch.bool)
     for action in random_actions(whole, 75):
