@@ -2,6 +2,8 @@
 
 import json
 import mmap
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -58,6 +60,26 @@ def test_a_soak_of_a_learner_counts_its_worlds_steps_and_broken_rows(monkeypatch
     last = found["table"][-1]
     assert last["unstable"] == last["env_steps"] // 8
     assert found["unstable_per_million"] == pytest.approx(1e6 / 8)
+
+
+IMPORTED = """
+import sys
+from importlib import import_module
+
+soak, loaded = import_module("bidex_meta.bench.soak"), []
+take = soak._sample
+soak._sample = lambda *given: (loaded.append(set(sys.modules)), take(*given))[1]
+soak.soak("MT1", steps=400, num_envs=8, threads=1)
+assert len(loaded) > 10, len(loaded)
+print(*sorted(set(sys.modules) - loaded[0]))
+"""
+
+
+def test_a_soak_imports_nothing_after_its_first_sample():
+    """What is imported then would pass for a leak: scipy alone is 59 MB."""
+    done = subprocess.run([sys.executable, "-c", IMPORTED], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "\n"
 
 
 def test_time_ends_a_soak():
