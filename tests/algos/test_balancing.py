@@ -8,8 +8,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 import torch
-from hypothesis import assume, given, settings
-from scipy.optimize import minimize
+from hypothesis import assume, example, given, settings
 from torch.testing import assert_close
 
 from bidex_algos.experience.rollout import collect
@@ -64,21 +63,25 @@ def test_cagrad_of_two_gradients_is_the_closed_form(seed: int, c: float, size: f
     assert apart == float(gradients[0] @ gradients[1] < 0)
 
 
-@settings(max_examples=15, deadline=None)
-@given(seeds, st.integers(3, 8))
-def test_cagrad_of_more_solves_the_dual(seed: int, tasks: int):
-    gradients = draw(seed, tasks, 12) * torch.logspace(0, 1, tasks, dtype=torch.float64)[:, None]
+@settings(max_examples=60, deadline=None)
+@given(seeds, st.integers(2, 20), st.integers(1, 30), st.integers(1, 30), st.floats(-4, 0), st.floats(0.05, 0.95))
+@example(296, 16, 17, 6, -1.16, 0.87)  # a descent along pairs of weights ended 0.4 below, in squares of the mean
+def test_no_direction_serves_the_worst_served_task_better_than_cagrads(
+    seed: int, tasks: int, entries: int, rank: int, apart: float, c: float
+):
+    # Of low rank, or nearly parallel; sizes differ tenfold.
+    gradients = draw(seed, 1, entries) * (apart < -2) + 10**apart * draw(seed, tasks, rank) @ draw(seed, rank, entries)
+    gradients *= torch.logspace(0, 1, tasks, dtype=torch.float64)[:, None]
     gram, even = gradients @ gradients.T, torch.full((tasks,), 1 / tasks, dtype=torch.float64)
-    reach = 0.5 * (even @ gram @ even).sqrt()
-
-    def dual(w: np.ndarray) -> float:
-        return float(w @ gram.numpy() @ even.numpy() + float(reach) * np.sqrt(w @ gram.numpy() @ w))
-
-    found = worst_served(gram, even, reach)
-    assert found.min() >= 0 and found.sum() == pytest.approx(1)
-    sums_to_one: Any = {"type": "eq", "fun": lambda w: w.sum() - 1}
-    best = minimize(dual, even.numpy(), bounds=[(0, 1)] * tasks, constraints=sums_to_one, options={"ftol": 1e-12})
-    assert dual(found.numpy()) <= best.fun + 1e-4 * abs(best.fun)
+    length = gradients.mean(0).norm()
+    direction = conflict_averse(gradients, c)[0] / tasks
+    assert (direction - gradients.mean(0)).norm() <= (c + 1e-6) * length
+    # Whatever the weights, their dual value is no less than what any direction gives.
+    weights = worst_served(gram, even, c * length)
+    assert weights.min() >= 0 and weights.sum() == pytest.approx(1, abs=1e-5)
+    weights /= weights.sum()
+    best = weights @ gram @ even + c * length * (weights @ gram @ weights).clamp_min(0.0).sqrt()
+    assert (gradients @ direction).min() >= best - 1e-4 * length.square()
 
 
 def test_cagrad_without_a_radius_or_a_conflict_is_the_sum():

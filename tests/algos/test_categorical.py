@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 from torch.testing import assert_close
@@ -165,6 +165,22 @@ def test_a_time_limit_counts_as_if_the_episode_went_on() -> None:
     assert_close(bound.bound, torch.tensor([5.0, 2.44]))
     both = bound_after(0.8, [[1.0, 1.0]], truncated=[[True, True]], terminated=[[True, False]])
     assert_close(both.bound, torch.tensor([1.0, 5.0]))
+
+
+@given(
+    late=st.integers(30, 60), idle=st.integers(0, 60), reward=st.floats(-50.0, 50.0).filter(lambda x: abs(x) > 1e-3),
+    gamma=st.floats(0.5, 0.99),
+)  # fmt: skip
+@example(late=45, idle=30, reward=1.0, gamma=0.99)  # 0.69 of the value, were all rewards of the episode averaged
+def test_reward_that_comes_late_is_bounded_as_if_it_never_ended(
+    late: int, idle: int, reward: float, gamma: float
+) -> None:
+    rewards, never = [0.0] * idle + [reward] * late, [False, False]
+    ends = [never] * (len(rewards) - 1) + [[True, True]]
+    bound = bound_after(gamma, [[each, reward] for each in rewards], truncated=ends).bound
+    value = abs(reward) / (1.0 - gamma)
+    assert 0.95 * value < float(bound[0]) < 1.001 * value
+    assert float(bound[1]) == pytest.approx(value, rel=1e-3)
 
 
 @pytest.mark.parametrize("garbage", [1e9, float("nan")])

@@ -22,7 +22,7 @@ from bidex_meta.train import distributed
 from bidex_meta.world.contract import plain_groups
 from tests.algos.off_policy import errors, trained
 from tests.algos.problems import LQR, discounted_return, one_step_bandit, opposite_bandits
-from tests.algos.ranks import in_two_processes
+from tests.algos.ranks import in_two_processes, same
 from tests.algos.resume import resumed
 from tests.algos.test_categorical import slow_projection
 from tests.algos.toy import ToyWorld, nearness
@@ -127,13 +127,15 @@ TWO: dict[str, Any] = {"gamma": 0.7, "batch_per_task": 3, "cut_share": 1.0}
 def test_fasttd3s_target_is_that_of_the_definition(lower: bool) -> None:
     world = ToyWorld([nearness(0.5), nearness(-0.5)], rows=3)
     learner, draw = FastTD3(world, replace(FAST, **TWO, clipped_double_q=lower), seed=0), a_draw()
+    with torch.no_grad():  # away from whatever was copied of it
+        next(learner.policy.actor.parameters()).mul_(3.0)
     shaken(learner)
     learner.returns.stats.var.copy_(torch.tensor([4.0, 0.25]))
     learner.returns.bound.copy_(torch.tensor([1.0, 50.0]))  # deviation 2 counts, and 50 / 10
     again = learner.generator.clone_state()
     target = learner._target(draw, draw.next_obs)
     noise = (0.2 * torch.randn(6, 2, generator=again)).clamp(-0.5, 0.5)
-    actions = (learner.target_actor(draw.next_obs) + noise).clamp(-1, 1)
+    actions = (learner.policy.actor(draw.next_obs) + noise).clamp(-1, 1)
     probs = distributions(learner, draw.next_obs, actions.detach())
     means = (probs * torch.linspace(-10, 10, 51).double()).sum(2)
     choice = (means[1] < means[0]).long()
@@ -142,6 +144,25 @@ def test_fasttd3s_target_is_that_of_the_definition(lower: bool) -> None:
     rewards = draw.rewards / torch.tensor([2.0] * 3 + [5.0] * 3)
     expected = projected(learner, draw, rewards, following, torch.zeros(6))
     assert_close(target.double(), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_fasttd3s_target_critics_move_at_every_update_and_its_actor_at_every_second() -> None:
+    learner = FastTD3(opposite_bandits(rows=6), replace(FAST, **TWO), seed=0)
+    parts, moves = [learner.critic, learner.target_critic, learner.policy.actor], torch.zeros(3)
+    for _ in range(62):
+        before = [next(part.parameters()).clone() for part in parts]
+        learner._update(a_draw(), torch.ones(6), torch.full((2,), 3.0))
+        moves += torch.tensor([not torch.equal(a, next(b.parameters())) for a, b in zip(before, parts, strict=True)])
+    assert moves.tolist() == [62, 62, 31]
+
+
+def test_an_older_fasttd3_checkpoint_still_loads() -> None:
+    learner, again = (FastTD3(opposite_bandits(rows=6), FAST, seed=seed) for seed in (0, 1))
+    state = learner.state_dict()
+    assert "target_actor" not in state
+    del state["recent"]
+    again.load_state_dict(state | {"target_actor": again.policy.actor.state_dict()})
+    assert same(again.policy.state_dict(), learner.policy.state_dict())
 
 
 def test_brcs_target_is_that_of_the_definition() -> None:

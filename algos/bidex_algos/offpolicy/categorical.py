@@ -82,10 +82,14 @@ class Categorical(OffPolicy):
     """The part of a learner with such critics that knows no actor; stands before the learner whose actor it takes."""
 
     config: Any
-    per_process = (*OffPolicy.per_process, "discounted_ones")
+    per_process = (*OffPolicy.per_process, "discounted_ones", "recent")
     critic_network: ClassVar[type[MLP] | None] = None
     returns_type = ReturnBound
     returns: ReturnBound
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """As in the base; older checkpoints have no recent rewards, of which the episodes that go on then lack some."""
+        super().load_state_dict({"recent": torch.zeros_like(self.returns.recent)} | state)
 
     def _make_critics(self, inputs: Inputs, heads: int) -> CategoricalCritics:
         network = self.critic_network or network_of(self.config)

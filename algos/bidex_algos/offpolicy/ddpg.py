@@ -17,7 +17,7 @@ policy does and others what lies far from it (the spread of Horgan et al. 2018);
 """
 
 import copy
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -42,7 +42,7 @@ class DDPG(OffPolicy):
     Arguments and errors are those of :class:`~bidex_algos.offpolicy.base.OffPolicy`, so are the attributes.
 
     Attributes:
-        target_actor: Follows the actor.
+        target_actor: Follows the actor; only with ``delayed_targets``.
         noise_std: Of each row (N, 1).
     """
 
@@ -51,10 +51,14 @@ class DDPG(OffPolicy):
     config: DDPGConfig
     policy: DeterministicPolicy
     num_critics = 1
+    delayed_targets: ClassVar[bool] = True
+    """Whether targets take the actions of an actor that follows the actor, and all that follow move only when the actor
+    learns. Off: they take the present actor's, and the target critics move in each update."""
 
     def __init__(self, world: VectorWorld, config: DDPGConfig, seed: int):
         super().__init__(world, config, seed)
-        self.target_actor = copy.deepcopy(self.policy.actor)
+        if self.delayed_targets:
+            self.target_actor = copy.deepcopy(self.policy.actor)
         self.noise_std = spread(*config.exploration_std, world.task_id, world.num_tasks)[:, None]
         self.actor_loss = torch.zeros((), device=self.device)
 
@@ -66,12 +70,15 @@ class DDPG(OffPolicy):
         return torch.randn(like.shape, generator=self.generator, device=self.device)
 
     def _update(self, draw: Transitions, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
-        """One update of the critic and, when it is due, of the actor and the targets."""
+        """One update of the critic, of the actor when it is due, and of what follows them."""
         obs, next_obs = self.policy.observations(draw.obs), self.policy.observations(draw.next_obs)
         told = self._fit_critics(obs, draw, self._target(draw, next_obs), weights, counts)
-        if self._actor_is_due():
+        due = self._actor_is_due()
+        if due:
             self._policy_step(obs, draw, weights, counts)
+        if due and self.delayed_targets:
             follow(self.target_actor, self.policy.actor, self.config.tau)
+        if due or not self.delayed_targets:
             follow(self.target_critic, self.critic, self.config.tau)
         return told
 
@@ -86,9 +93,10 @@ class DDPG(OffPolicy):
         return self._bootstrapped(draw, self._pooled(following))
 
     def _target_action(self, next_obs: Tensor) -> Tensor:
-        """What the target actor does (B, a) with normalised observations (B, d)."""
+        """What a target assumes to be done (B, a) at normalised observations (B, d)."""
+        actor = self.target_actor if self.delayed_targets else self.policy.actor
         with autocast(self.device, self.low_precision):
-            return self.target_actor(next_obs)
+            return actor(next_obs)
 
     def _policy_step(self, obs: Tensor, draw: Transitions, weights: Tensor, counts: Tensor) -> None:
         """One step of the actor up the critics, on normalised observations (B, d) of ``draw``."""
@@ -117,7 +125,8 @@ class DDPG(OffPolicy):
         return DeterministicPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
 
     def _own_parts(self) -> dict[str, Any]:
-        return {"target_actor": self.target_actor, "actor_loss": self.actor_loss}
+        follows = {"target_actor": self.target_actor} if self.delayed_targets else {}
+        return {**follows, "actor_loss": self.actor_loss}
 
 
 def spread(low: float, high: float, task_id: Tensor, num_tasks: int) -> Tensor:

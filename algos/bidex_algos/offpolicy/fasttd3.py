@@ -1,9 +1,9 @@
 """FastTD3: TD3 with categorical critics and large batches (Seo et al. 2025, arXiv 2505.22642), on all tasks of a world.
 
     a  = mu(s) + noise                           of another size in each row ("mixed noise")
-    a' = mu'(s') + clip(noise, -c, c)
+    a' = mu(s') + clip(noise, -c, c)             the present actor's: none follows it
     y  = r + gamma (1 - terminated) Z'(s', a')   of the critic with the lower mean, projected on the atoms
-    Z_i  towards y by cross-entropy; mu up on min_i E Z_i(s, mu(s)), at every second update
+    Z_i  towards y by cross-entropy; mu up on min_i E Z_i(s, mu(s)), at every second update; Z' at each
     rewards over max(deviation, largest / bound) of their task's returns, so that values fit the atoms
 
 Few updates of many transitions follow each vector step, targets follow fast, returns may take several steps (n-step),
@@ -30,6 +30,7 @@ class FastTD3(Categorical, TD3):
     name = "fasttd3"
     config_type = FastTD3Config
     config: FastTD3Config
+    delayed_targets = False
 
     @torch.no_grad()
     def _target(self, draw: Transitions, next_obs: Tensor) -> Tensor:

@@ -10,6 +10,9 @@ from bidex_algos.nets.normalise import RunningStats
 from bidex_meta.train.distributed import all_max
 from bidex_meta.world.contract import VectorWorld
 
+RECENT = 0.9
+"""Weight of a reward in the recent ones' mean over that of the next: about the last ten steps count."""
+
 
 class ReturnScale:
     """Running statistics of the discounted sum of rewards since an episode began.
@@ -53,30 +56,37 @@ class ReturnBound(ReturnScale):
 
     The sum is discounted towards the episode's beginning and not, as a return is, towards its end: that one is known
     only when the episode is over. Both weigh any stretch of rewards alike. At a time limit the episode is taken to go
-    on as it went, since that is what a critic is taught there.
+    on as it went, or as it went most recently if that is more, since that is what a critic is taught there: states that
+    pay are worth their reward for ever, though the episode reached them late.
 
     Attributes:
         bound: Of each task (num_tasks,); it never falls.
         mass: The sum in each row, had all rewards been 1 (N,).
+        recent: Sum and mass with a discount of :data:`RECENT` at most (2, N).
     """
 
     def __init__(self, world: VectorWorld, gamma: float | Tensor, horizon: float):
         super().__init__(world, gamma, horizon)
         self.bound = torch.zeros(world.num_tasks, device=world.device)
         self.mass = torch.zeros(world.num_envs, device=world.device)
+        self.recent = torch.zeros(2, world.num_envs, device=world.device)
+        self.short = torch.as_tensor(gamma, device=world.device).clamp_max(RECENT)
 
     def note(self, reward: Tensor, terminated: Tensor, truncated: Tensor, broken: Tensor) -> None:
         """As in the base."""
         self.mass = self.gamma * self.mass + 1.0
+        self.recent = self.short * self.recent + torch.stack([reward, torch.ones_like(reward)])
         super().note(reward, terminated, truncated, broken)
-        self.mass = self.mass.masked_fill(terminated | truncated | broken, 0.0)
+        over = terminated | truncated | broken
+        self.mass, self.recent = self.mass.masked_fill(over, 0.0), self.recent.masked_fill(over, 0.0)
 
     def _take(self, cut: Tensor, valid: Tensor) -> None:
         super()._take(cut, valid)
-        size = self.discounted.abs().masked_fill(~valid, 0.0)
-        size = torch.where(cut, size / ((1.0 - self.gamma) * self.mass), size)
+        size, (rewards, mass), rest = self.discounted.abs(), self.recent, 1.0 - self.gamma
+        size = torch.where(cut, torch.maximum(size / (rest * self.mass), rewards.abs() / (rest * mass)), size)
+        size = size.masked_fill(~valid, 0.0)
         self.bound = all_max(self.bound.scatter_reduce(0, self.task_id, size, "amax"))
 
     def parts(self) -> dict[str, Any]:
         """As in the base."""
-        return super().parts() | {"return_bound": self.bound, "discounted_ones": self.mass}
+        return super().parts() | {"return_bound": self.bound, "discounted_ones": self.mass, "recent": self.recent}

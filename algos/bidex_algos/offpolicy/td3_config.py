@@ -14,11 +14,11 @@ class TD3Config(DDPGConfig):
     algo: ClassVar[str] = "td3"
 
     target_std: float = 0.2
-    """Standard deviation of the noise on the target actor's actions."""
+    """Standard deviation of the noise on the actions that targets assume."""
     target_bound: float = 0.5
     """That noise is cut to plus and minus this."""
     policy_delay: int = 2
-    """Updates of the critics for each of the actor and the targets."""
+    """Updates of the critics for each of the actor and of what follows them (FastTD3's target critics: at each)."""
 
     def __post_init__(self) -> None:
         """Rejects values that could only fail later.
