@@ -17,6 +17,7 @@ from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError, shortened, whole_number
 from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.evaluation.scores import Reference
+from bidex_meta.maths import check_precision
 from bidex_meta.world.contract import TaskWorld
 
 EVALUATION_SEED = 1_000_000
@@ -42,8 +43,10 @@ def evaluate(
         references: Per class name, what the normalised score and broken episodes are measured against.
 
     Raises:
-        BidexError: The world resets by itself, lacks rows, or ``episodes_per_task`` is not positive.
+        BidexError: The world resets by itself, lacks rows, or ``episodes_per_task`` is not positive;
+            or torch's default precision is not single.
     """
+    check_precision()
     check_world(world, episodes_per_task)
     episodes = play_tasks(agent, world, episodes_per_task, seed)
     return Evaluation(results_by_class(world.task_names, episodes, references), episodes_per_task)

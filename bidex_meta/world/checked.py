@@ -9,6 +9,7 @@ from torch import Tensor
 
 from bidex_meta.engine.health import checked_state
 from bidex_meta.errors import BidexError, shortened, unknown_name, whole_number
+from bidex_meta.maths import check_precision
 from bidex_meta.world.groups import Slot, with_pool
 from bidex_meta.world.observations import Rule
 
@@ -55,8 +56,9 @@ def action(given: Tensor | np.ndarray, shape: tuple[int, int], device: torch.dev
     """Actions as a tensor on the device, float32, without a gradient; not finite ones are the world's to tell.
 
     Raises:
-        BidexError: No real numbers, or another shape.
+        BidexError: No real numbers, or another shape; or torch's default precision is not single.
     """
+    check_precision()
     wanted = f"Expected actions of shape {shape}"
     try:
         made = given.detach() if isinstance(given, Tensor) else torch.as_tensor(given)
