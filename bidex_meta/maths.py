@@ -13,6 +13,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bidex_meta.errors import BidexError
+
+
+def check_precision() -> None:
+    """Refuses another default precision than single: observations, networks and replays are made in it.
+
+    Raises:
+        BidexError: ``torch.set_default_dtype`` has set another.
+    """
+    kind = torch.get_default_dtype()
+    if kind != torch.float32:
+        raise BidexError(
+            f"Expected torch's default dtype to be torch.float32, got {kind}. Call "
+            "torch.set_default_dtype(torch.float32), and give your own tensors their dtype."
+        )
+
 
 def constant(values: Sequence[Any], like: Tensor) -> Tensor:
     """Fixed numbers, nested tuples of them, as a tensor of another one's dtype and device. Not to be written to.

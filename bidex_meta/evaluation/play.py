@@ -18,6 +18,7 @@ from bidex_meta.errors import BidexError, shortened, whole_number
 from bidex_meta.evaluation.references import references_of
 from bidex_meta.evaluation.results import Evaluation, results_by_class
 from bidex_meta.evaluation.scores import Reference
+from bidex_meta.maths import check_precision
 from bidex_meta.world.contract import TaskWorld
 
 EVALUATION_SEED = 1_000_000
@@ -44,8 +45,10 @@ def evaluate(
             that the installation stores of the world's classes. ``{}``: none.
 
     Raises:
-        BidexError: The world resets by itself, lacks rows, or ``episodes_per_task`` is not positive.
+        BidexError: The world resets by itself, lacks rows, or ``episodes_per_task`` is not positive;
+            or torch's default precision is not single.
     """
+    check_precision()
     check_world(world, episodes_per_task)
     episodes = play_tasks(agent, world, episodes_per_task, seed)
     references = references_of(world) if references is None else references

@@ -31,8 +31,9 @@ from bidex_meta.record.schemas import read_config, read_evaluation, read_version
 from bidex_meta.record.stopping import goal
 from bidex_meta.record.versions import collect_versions
 
-_ENTRIES = ("checkpoints", "videos", "metrics.jsonl", "versions.json")
-"""What stands in a run folder before its ``config.json`` does."""
+_ENTRIES = ("checkpoints", "videos", "metrics.jsonl", "versions.json", "config.json", "replay", "wandb", "wandb-id")
+"""What stands in a run folder before its first iteration has ended, beside TensorBoard's file."""
+_EVENTS = "events.out.tfevents."
 _MOST_LOOKED_AT = 2000
 """Entries that are looked at to find runs below a folder that is none."""
 
@@ -230,12 +231,14 @@ def _runs_below(path: Path) -> Iterator[Path]:
 
 
 def _torn_start(path: Path) -> bool:
-    """Whether a folder holds nothing but what ``create`` makes before the config, and no result."""
+    """Whether a folder holds nothing but what a run makes before its first iteration has ended, and no result."""
     try:
         entries = list(path.iterdir())
         found = [entry for entry in entries if not entry.name.endswith(TEMPORARY_SUFFIX)]
         folders = [entry for entry in found if entry.name in _ENTRIES[:2]]
-        known = all(entry.name in _ENTRIES and not entry.is_symlink() for entry in found)
+        known = all(
+            (entry.name in _ENTRIES or entry.name.startswith(_EVENTS)) and not entry.is_symlink() for entry in found
+        )
         # A file that was to be written alone: the first look at whether the folder can be written was killed.
         known = known and (bool(found) or all(_is_own_leftover(entry) for entry in entries))
         empty = not any(any(folder.iterdir()) for folder in folders)
@@ -289,10 +292,14 @@ def check_new(path: Path) -> None:
     """Makes sure that a run can begin in a folder.
 
     Raises:
-        BidexError: There is something in it, or it cannot be made or written.
+        BidexError: There is something in it other than a run that failed or was killed before it had learned anything;
+            another process trains there; or it cannot be made or written.
     """
     if exists(path) and not (path.is_dir() and (_torn_start(path) or not any(path.iterdir()))):
         raise BidexError(
             f"--run-dir {path} exists and is not empty. Name a new folder, or continue it by --resume {path}."
         )
+    if is_file(path / "config.json"):
+        with RunFolder(path).locked():
+            pass
     check_writable(path / "config.json")

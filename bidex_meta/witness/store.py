@@ -42,11 +42,13 @@ def load_witness(name: str, path: Path | None = None) -> Witness:
     Raises:
         BidexError: There is none, it is damaged, or of another number of actions than the class has.
     """
-    if path is not None and not path.is_file():
-        raise BidexError(f"Expected a file that `bidex-meta witness --find --file` wrote, got {path}, which is none.")
-    path = path or witness_path(name)
+    if path is None:
+        path = witness_path(name)
+        if not path.is_file():
+            raise BidexError(f"{name} has no witness yet. Search one: bidex-meta witness --task {name} --find")
+        return _read(path)
     if not path.is_file():
-        raise BidexError(f"{name} has no witness yet. Search one: bidex-meta witness --task {name} --find")
+        raise BidexError(f"Expected a file that `bidex-meta witness --find --file` wrote, got {path}, which is none.")
     witness, size = _read(path), registry.get(name, moving_base=True).action_size
     if witness.actions.shape[1] != size:
         told = f"expected actions of shape (steps, {size}), as {name} has, got {witness.actions.shape}"

@@ -9,17 +9,19 @@ from torch import Tensor
 
 from bidex_meta.engine.health import dense
 from bidex_meta.errors import BidexError, shortened, unknown_name, whole_number
+from bidex_meta.maths import check_precision
 from bidex_meta.world.contract import VectorWorld
 
 _MODES = {"SAME_STEP": AutoresetMode.SAME_STEP, "DISABLED": AutoresetMode.DISABLED}
 
 
 def checked_mode(mode: AutoresetMode | str | None) -> AutoresetMode:
-    """The mode as a member; None: SAME_STEP.
+    """The mode as a member; None: SAME_STEP. Every world asks for it as it is made.
 
     Raises:
-        BidexError: Neither SAME_STEP nor DISABLED, in whatever spelling.
+        BidexError: Neither SAME_STEP nor DISABLED, in whatever spelling; or torch's default precision is not single.
     """
+    check_precision()
     if mode is None:
         return AutoresetMode.SAME_STEP
     name = mode.name if isinstance(mode, AutoresetMode) else str(mode)
@@ -48,8 +50,9 @@ def reset_mask(options: dict[str, Any] | None, num_envs: int, device: torch.devi
 
     Raises:
         BidexError: Another option, a mask of another shape or dtype, or one with false entries before the first full
-            reset.
+            reset; or torch's default precision is not single.
     """
+    check_precision()
     if options is not None and not isinstance(options, Mapping):
         raise BidexError(f"Expected reset options as a dict, got {shortened(options)}. Leave options out.")
     if unknown := sorted(map(str, (options or {}).keys() - {"reset_mask"})):

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from bidex_meta.engine.health import checked_state, dense
 from bidex_meta.errors import BidexError, shortened, unknown_name, whole_number
+from bidex_meta.maths import check_precision
 from bidex_meta.points.sight import PointsRule
 from bidex_meta.world.groups import Slot, with_pool
 from bidex_meta.world.observations import Rule
@@ -60,8 +61,9 @@ def action(given: Tensor | np.ndarray, shape: tuple[int, int], device: torch.dev
     """Actions as a tensor on the device, float32, without a gradient; not finite ones are the world's to tell.
 
     Raises:
-        BidexError: No real numbers, or another shape.
+        BidexError: No real numbers, or another shape; or torch's default precision is not single.
     """
+    check_precision()
     wanted = f"Expected actions of shape {shape}"
     made = dense(given, device, torch.float32)
     if made is None:

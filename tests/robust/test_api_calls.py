@@ -114,6 +114,28 @@ def test_steps_resets_and_pools(world: Any) -> None:
     assert torch.isfinite(obs).all() and torch.isfinite(reward).all()
 
 
+@pytest.mark.parametrize("call", ["make", "reset", "step", "evaluate", "learn"])
+def test_another_default_precision_is_refused(call: str, world: Any) -> None:
+    from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
+    from tests.fakes import ToyWorld
+
+    toy = ToyWorld(6, "SAME_STEP")
+    world.reset(seed=0)
+    calls: dict[str, Callable[[], object]] = {
+        "make": lambda: make_task_world("HandOver", ROWS, device="cpu", threads=1),
+        "reset": lambda: world.reset(seed=0),
+        "step": lambda: world.step(torch.zeros(ROWS, 40)),
+        "evaluate": lambda: evaluate(ZeroAgent(world.action_space), world, 1),
+        "learn": lambda: MTPPO(toy, MTPPOConfig(hidden=(8,), rollout_steps=4), 0),
+    }
+    torch.set_default_dtype(torch.float64)
+    try:
+        with pytest.raises(BidexError, match=r"torch\.float32, got torch\.float64"):
+            calls[call]()
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
 def test_saved_states(world: Any) -> None:
     world.reset(seed=0)
     good = world.state_dict()

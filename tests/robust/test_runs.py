@@ -65,6 +65,31 @@ def test_a_start_that_was_torn_begins_again(toy: None, tmp_path: Path, capsys: p
     assert main(["run", *SMALL, "--steps", "24", "--run-dir", str(tmp_path / "r")]) == 0
 
 
+@pytest.mark.parametrize("more", [[], ["--record", "24"]])
+def test_a_run_that_failed_before_it_learned_anything_does_not_block_its_command(
+    more: list[str], toy: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from bidex_algos.onpolicy.mtppo import MTPPO
+
+    words = ["run", *SMALL, "--steps", "24", "--run-dir", str(tmp_path / "r"), *more]
+
+    def fail(learner: object) -> None:
+        raise MemoryError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(MTPPO, "_iterate", fail)
+        assert main(words) == 2
+    assert (tmp_path / "r" / "config.json").is_file()
+    with RunFolder(tmp_path / "r").locked():
+        assert "Another process trains in" in refused(capsys, *words)
+    (tmp_path / "r" / "mine").touch()
+    assert "is not empty" in refused(capsys, *words)
+    (tmp_path / "r" / "mine").unlink()
+    assert main(words) == 0
+    assert [row["step"] for row in RunFolder(tmp_path / "r").metrics()] == [24]
+    assert "is not empty" in refused(capsys, *words)
+
+
 def test_a_start_that_was_killed_at_its_first_file_begins_again(toy: None, tmp_path: Path) -> None:
     (tmp_path / "r").mkdir()
     (tmp_path / "r" / ".config.json.x1.tmp").touch()

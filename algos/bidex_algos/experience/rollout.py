@@ -7,6 +7,7 @@ from torch import Tensor
 
 from bidex_algos.experience.episodes import EpisodeStatistics
 from bidex_meta.errors import BidexError
+from bidex_meta.maths import check_precision
 from bidex_meta.world.contract import VectorWorld
 
 Sampler = Callable[[Tensor], tuple[Tensor, Tensor]]
@@ -80,8 +81,9 @@ def check_autoreset(world: VectorWorld, learner: str, expected: str) -> None:
     """Refuses a world that resets in another way than the learner needs.
 
     Raises:
-        BidexError: It is in another autoreset mode.
+        BidexError: It is in another autoreset mode, or torch's default precision is not single.
     """
+    check_precision()
     name = world.metadata["autoreset_mode"].name
     if name != expected:
         raise BidexError(
