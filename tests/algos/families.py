@@ -1,4 +1,4 @@
-"""A family of tasks to adapt to: 2-D point goals, with the contract of ``bidex_meta.world.World`` in mode DISABLED."""
+"""Families of tasks to adapt to, with the contract of ``bidex_meta.world.World`` in mode DISABLED."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -105,3 +105,32 @@ class PointGoals(FakePools):
     def best(self, obs: Tensor) -> Tensor:
         """The best action (N, 2) for observations (N, 4) that show the goal."""
         return ((obs[:, 2:] - obs[:, :2]) / self.speed).clamp(-1.0, 1.0)
+
+
+class Recall(FakePools):
+    """Two tasks, 1 and -1. The first reward of an episode is the task, the last one is paid for an action of its sign.
+
+    Between them nothing is earned. Observations show the last step, (N, 1). Success: the last action had that sign.
+    Without memory of the first reward half of the episodes succeed, with it all of them.
+
+    Args:
+        rows: Rows.
+        steps: Steps per episode.
+    """
+
+    def __init__(self, rows: int = 32, steps: int = 60):
+        super().__init__({"Recall": np.array([[1.0, 0.0], [-1.0, 0.0]])}, rows, (1, 1), (steps,), "DISABLED")
+
+    def _start(self, mask: Tensor) -> None:
+        """There is no state but the clock."""
+
+    def _at_end(self) -> Tensor:
+        return self.episodes.elapsed == self.max_episode_steps - 1
+
+    def _observe(self) -> Tensor:
+        return self._at_end()[:, None].float()
+
+    def _advance(self, action: Tensor, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        sign, last = self.goal[:, 0], self._at_end()
+        earned = sign * torch.where(last, action[:, 0], (self.episodes.elapsed == 0).float())
+        return earned, last & (earned > 0.0), torch.zeros_like(last)

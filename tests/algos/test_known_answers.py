@@ -1,4 +1,4 @@
-"""The on-policy learners on problems whose optimum is known: LQR, a point mass, tasks told apart by the one-hot."""
+"""On-policy learners on problems whose optimum is known: LQR, a point mass, tasks of a one-hot, one to remember."""
 
 from dataclasses import replace
 from typing import Any
@@ -6,8 +6,10 @@ from typing import Any
 import pytest
 import torch
 
+from bidex_algos.meta.rl2 import RL2, RL2Config
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig
+from tests.algos.families import Recall
 from tests.algos.problems import LQR, PointMass, discounted_return, one_step_bandit, opposite_bandits
 from tests.algos.toy import ToyWorld, nearness
 
@@ -74,3 +76,17 @@ def test_without_the_one_hot_there_is_nothing_between_the_two(learner_type: Any,
     blind = replace(config, value_heads=False)
     means = mean_actions(trained(learner_type, Blind([nearness(0.5), nearness(-0.5)]), blind, 30))
     assert means == pytest.approx([0.0, 0.0], abs=0.25)
+
+
+# RL² plays the default chunk (whole trials) and, so that the test is known to be able to fail, one of 25 steps.
+REMEMBERING = RL2Config(
+    hidden=(16,), activation="tanh", memory=16, init_std=0.6, episodes_per_trial=1, max_adapt_steps=60, gamma=0.9,
+    blind_share=0.0, num_minibatches=2, learning_rate=2e-3, learning_rate_range=(3e-4, 1e-2), critic_learning_rate=3e-3,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("chunk", [REMEMBERING.chunk, 25], ids=["default", "25"])
+def test_what_the_first_of_60_steps_shows_is_used_in_the_last(chunk: int | None):
+    learner = RL2(Recall(steps=60), replace(REMEMBERING, chunk=chunk), seed=0)
+    success = [learner.iterate()["Train/success_last_episode"] for _ in range(25)][-1]
+    assert success < 0.75 if chunk == 25 else success > 0.9

@@ -98,6 +98,37 @@ def test_one_shot_closes_most_of_the_gap_to_a_policy_that_knows_the_goal():
 # Memory.
 
 
+def test_a_chunk_no_shorter_than_a_trial_is_the_whole_of_it():
+    learners = [RL2(PointGoals(6, classes=UNEVEN), replace(TINY, chunk=chunk), seed=0) for chunk in (None, 21, 1000)]
+    for learner in learners:
+        [learner.iterate() for _ in range(2)]
+        batch, _ = learner._prepare()
+        # Three episodes of 7 steps, and the observation after the last one.
+        assert len(learner.trials.obs) == len(batch.weights) == batch.size == 22
+        assert not batch.actor_states.any() and batch.row.tolist() == list(range(6))
+        assert equal(learner.policy.state_dict(), learners[0].policy.state_dict())
+
+
+@pytest.mark.parametrize("chunk", [4, None])
+def test_a_longer_chunk_makes_no_fewer_steps_of_the_optimiser(chunk: int | None, monkeypatch: pytest.MonkeyPatch):
+    learner = RL2(PointGoals(6, classes=UNEVEN), replace(TINY, chunk=chunk), seed=0)
+    learner.iterate()
+    steps, step = [], learner.adams.step
+    monkeypatch.setattr(learner.adams, "step", lambda: (steps.append(None), step()))
+    learner.iterate()
+    assert len(steps) == TINY.epochs * TINY.num_minibatches
+
+
+def test_a_new_memory_fades_slowly_and_its_gradient_with_it():
+    short, long = (RecurrentNet(2, (8,), 32, 1, 1.0, torch.Generator().manual_seed(0), lasting=n) for n in (1, 60))
+    gradients = []
+    for net in (short, long):
+        state = torch.zeros(1, 32, requires_grad=True)
+        _, last = net(torch.zeros(60, 1, 2), state)
+        gradients.append(torch.autograd.grad(last.sum(), state)[0].abs().max())
+    assert gradients[0] < 1e-3 and gradients[1] > 0.1
+
+
 def test_the_chunked_forward_equals_a_loop_by_hand():
     generator = torch.Generator().manual_seed(0)
     net = RecurrentNet(5, (6,), 7, 3, 1.0, generator, "tanh")

@@ -69,7 +69,14 @@ class RL2(Learner):
         self.agent = RL2Agent(self.policy, own_seed(seed))
         heads = world.num_tasks if config.value_heads else 1
         self.critic = RecurrentNet(
-            self.policy.inputs, config.hidden, config.memory, heads, 0.01, self.initial, config.activation
+            self.policy.inputs,
+            config.hidden,
+            config.memory,
+            heads,
+            0.01,
+            self.initial,
+            config.activation,
+            config.trial_steps,
         ).to(self.device)
         self.adams = AdaptiveAdams(self.policy.parameters(), self.critic.parameters(), config, self.device)
 
@@ -209,6 +216,7 @@ class RL2(Learner):
             config.normalise_observations,
             init,
             config.activation,
+            config.trial_steps,
         ).to(device)
 
     @classmethod

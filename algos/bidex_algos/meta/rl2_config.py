@@ -37,8 +37,8 @@ class TrialConfig:
     """Discount per step, over all episodes of a trial."""
     lam: float = 0.95
     """Trace decay of the advantage estimate."""
-    chunk: int = 25
-    """Steps that gradients flow back through the memory."""
+    chunk: int | None = None
+    """Steps that gradients flow back through the memory; None, or no fewer than a trial has: the whole trial."""
 
 
 @dataclass(frozen=True)
@@ -66,12 +66,19 @@ class RL2Config(PPOConfig, TrialConfig):
         """
         types(self)
         self._check_ppo()
-        at_least(self, 1, "memory", "episodes_per_trial", "max_adapt_steps", "chunk")
+        at_least(self, 1, "memory", "episodes_per_trial", "max_adapt_steps")
+        if self.chunk is not None:
+            at_least(self, 1, "chunk")
         between(self, 0.0, 1.0, "gamma", "lam", "blind_share")
         positive(self, "init_std", "reward_unit", "max_grad_norm", "value_horizon")
         rising(self, "std_range")
         if not self.hidden:
             raise BidexError("rl2: hidden must name at least one layer, got none.")
+
+    @property
+    def trial_steps(self) -> int:
+        """Most steps of a trial."""
+        return self.episodes_per_trial * self.max_adapt_steps
 
     def bytes_held(self, rows: int, width: int) -> int:
         """About how much memory a learner takes on so many rows.
@@ -80,9 +87,8 @@ class RL2Config(PPOConfig, TrialConfig):
             rows: Rows of its world.
             width: Numbers that are kept of a step of a row.
         """
-        steps = self.episodes_per_trial * self.max_adapt_steps
         memory = 4 * 4 * 2 * 3 * self.memory * (self.memory + (self.hidden[-1]))
-        return 4 * rows * width * steps + network_bytes(self.hidden, width, 2) + memory
+        return 4 * rows * width * self.trial_steps + network_bytes(self.hidden, width, 2) + memory
 
 
 PRESETS: dict[str, RL2Config] = {

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from bidex_algos.experience.advantages import explained_variance, gae, normalise_per_task, task_moments
 from bidex_algos.meta.rl2_config import RL2Config
-from bidex_algos.meta.trials import Trials
+from bidex_algos.meta.trials import Trials, in_chunks
 from bidex_algos.nets.networks import gaussian_log_prob
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.recurrent import RecurrentNet, RecurrentPolicy
@@ -86,9 +86,9 @@ def make_batch(
     Returns:
         The batch and the explained variance per task (num_tasks,).
     """
-    num_tasks, size = len(return_stats.mean), config.chunk
-    # The only wait for the device: how many chunks the longest trial fills, its last observation included.
-    slots = (int(t.lengths.max()) // size + 1) * size
+    num_tasks = len(return_stats.mean)
+    # The only wait for the device: how many steps the longest trial has.
+    slots, size = in_chunks(int(t.lengths.max()), config.chunk)
     previous = t.previous(slots)
     means, values = [], []
     actor_states, critic_states = [], []

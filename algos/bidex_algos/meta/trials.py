@@ -14,6 +14,20 @@ from bidex_algos.nets.recurrent import Memory, RecurrentPolicy
 from bidex_meta.world.contract import VectorWorld
 
 
+def in_chunks(steps: int, chunk: int | None) -> tuple[int, int]:
+    """How a trial is cut.
+
+    Args:
+        steps: Steps of the longest trial.
+        chunk: Steps of a chunk; None, or no fewer than ``steps``: one chunk, without padding.
+
+    Returns:
+        Number of slots, among them one for the last observation, and slots of a chunk, which they are a multiple of.
+    """
+    size = steps + 1 if chunk is None or chunk >= steps else chunk
+    return (steps // size + 1) * size, size
+
+
 class Trials:
     """One trial of N rows, preallocated on the device and overwritten by each :func:`play`.
 
@@ -34,13 +48,13 @@ class Trials:
         limits: See above.
         observations: Width of the observation.
         actions: Number of actions.
-        multiple: The number of slots S is a multiple of this, and more than a trial has steps.
+        chunk: Steps of a chunk. There are slots for as many whole chunks as the longest trial needs.
     """
 
-    def __init__(self, episodes: int, limits: Tensor, observations: int, actions: int, multiple: int):
+    def __init__(self, episodes: int, limits: Tensor, observations: int, actions: int, chunk: int | None):
         self.episodes, self.limits = episodes, limits
         rows, longest = len(limits), int(limits.max())
-        slots = -(-(episodes * longest + 1) // multiple) * multiple
+        slots, _ = in_chunks(episodes * longest, chunk)
 
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros(slots, rows, *shape, dtype=dtype, device=limits.device)

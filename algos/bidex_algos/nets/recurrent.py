@@ -26,6 +26,8 @@ class RecurrentNet(nn.Module):
         output_gain: Gain of the orthogonal output layer.
         generator: CPU generator of the initial weights; the global one is left alone.
         activation: Name of the encoder's non-linearity.
+        lasting: Steps that the memory shall last for: at the start its numbers fade over 2 to ``lasting`` + 1 steps,
+            spread evenly by their logarithms (after Tallec and Ollivier 2018, arXiv 1804.11188).
     """
 
     def __init__(
@@ -37,6 +39,7 @@ class RecurrentNet(nn.Module):
         output_gain: float,
         generator: torch.Generator,
         activation: Activation = "elu",
+        lasting: int = 1,
     ):
         super().__init__()
         last = MLP(inputs, hidden[:-1], hidden[-1], math.sqrt(2.0), generator, activation)
@@ -49,6 +52,9 @@ class RecurrentNet(nn.Module):
                 continue
             for gate in weight.data.chunk(3):
                 nn.init.orthogonal_(gate, generator=generator)
+        # The gates are reset, update, new. An update gate of 1/2 halves the memory, and its gradient, at each step.
+        update = self.gru.get_parameter("bias_ih_l0").data.chunk(3)[1]
+        update.copy_(torch.linspace(0.0, math.log(lasting), memory))
         self.head = MLP(hidden[-1] + memory, (), outputs, output_gain, generator)
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
@@ -114,6 +120,7 @@ class RecurrentPolicy(nn.Module):
         normalise_observations: Whether observations are normalised.
         generator: CPU generator of the initial weights.
         activation: Name of the encoder's non-linearity.
+        lasting: Steps that the memory shall last for.
 
     Attributes:
         inputs: What the networks see: these groups, normalised, and ``last_step``, what the memory is fed beside them.
@@ -131,13 +138,14 @@ class RecurrentPolicy(nn.Module):
         normalise_observations: bool,
         generator: torch.Generator,
         activation: Activation,
+        lasting: int,
     ):
         super().__init__()
         self.num_actions, self.memory, self.reward_unit = actions, memory, reward_unit
         self.inputs = inputs.extended("last_step", actions + 3)
         self.observations = ObservationNormaliser(inputs, normalise_observations)
         self.rewards = ObservationNormaliser(1)
-        self.actor = RecurrentNet(self.inputs, hidden, memory, actions, 0.01, generator, activation)
+        self.actor = RecurrentNet(self.inputs, hidden, memory, actions, 0.01, generator, activation, lasting)
         self.log_std = nn.Parameter(torch.full((actions,), math.log(init_std)))
 
     def see(self, obs: Tensor, action: Tensor, reward: Tensor, known: Tensor, done: Tensor) -> Tensor:
