@@ -12,7 +12,7 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11 python; do \
 
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
-SOURCES := bidex_meta algos examples tests docs/site
+SOURCES := bidex_meta algos tools examples tests docs/site
 
 .DEFAULT_GOAL := help
 .PHONY: help run results test test-all test-parity goldens bench-gpu-compile bench-gpu-sweep bench-gpu-train lint format docs dist clean

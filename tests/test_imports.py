@@ -105,6 +105,17 @@ def test_imports_come_from_earlier_rooms(module: str) -> None:
     assert not wrong, f"{module} imports {sorted(wrong)}, of no earlier room"
 
 
+def test_packages_do_not_know_the_tools() -> None:
+    def names(tree: ast.Module) -> Iterator[str]:
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Import):
+                yield from (alias.name for alias in node.names)
+            elif isinstance(node, ast.ImportFrom):
+                yield node.module or ""
+
+    assert not [name for name, tree in modules().items() if any(n.split(".")[0] == "tools" for n in names(tree))]
+
+
 def test_no_module_imports_itself_through_others() -> None:
     graph = {name: set(imported(tree)) - {name} for name, tree in modules().items()}
     for one, other in MUTUAL:
