@@ -42,7 +42,7 @@ def place_of(out: Path | None, subject: str, kind: str) -> tuple[Path, str]:
     folder = expanded(out)
     try:
         name = folder.resolve().relative_to(root.resolve()).as_posix()
-    except ValueError:
+    except (ValueError, RuntimeError):  # not below it, or a loop of links
         name = "/".join(folder.parts[-2:])
     return folder, next((n for n in (name, folder.name, usual) if valid_name(n)), usual)
 
