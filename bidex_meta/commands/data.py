@@ -24,8 +24,9 @@ class DataFlags:
     """
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="list|info|check")]
-    """list: all, a line each; info: episodes, returns, success and coverage of one; check: every episode of one is
-    whole and consistent, and its rewards follow from what was observed, where that can be computed."""
+    """list: all, a line each; info: episodes, returns, success and coverage of one; check: every file of one has the
+    digest it was written with, every episode is whole and consistent, and its rewards follow from what was observed,
+    where that can be computed."""
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")] = ""
     """info, check: a data set's name or folder."""
     episodes: int | None = None
@@ -97,7 +98,9 @@ def _info(flags: DataFlags) -> None:
             json.dumps({**told, "classes": [asdict(each) for each in classes], "coverage": spread, **about}, indent=2)
         )
         return
-    who = ", ".join(f"{each['algo'] or 'uniform'} ({each['actions']} actions)" for each in about.get("policies", []))
+    who = ", ".join(
+        f"{each.get('algo') or 'uniform'} ({each.get('actions')} actions)" for each in about.get("policies", [])
+    )
     left = ", ".join(
         f"{count:,} {name.replace('_', ' ')}" for name, count in about.get("left_out", {}).items() if count
     )
@@ -142,6 +145,8 @@ def _check(flags: DataFlags) -> None:
             print(f"{name}: {count:,} rewards computed again, largest difference {found.largest[name]:.2g}")
         for name, reason in found.skipped.items():
             print(f"{name}: rewards not computed again: {reason}")
+        if found.unsealed:
+            print(f"Without a digest, since written elsewhere or by an older version: {len(found.unsealed):,} files.")
         for line in found.wrong:
             print(line)
     if found.count:

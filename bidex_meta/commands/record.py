@@ -1,5 +1,6 @@
 """``bidex-meta record``: data sets of whole episodes, for learners that train offline."""
 
+import contextlib
 import math
 import os
 import sys
@@ -85,13 +86,15 @@ def main(arguments: Sequence[str]) -> None:
     if kind == "replay":
         _replay(flags, flags.runs[0])
         return
-    if kind == "demonstrations":
-        from bidex_meta.commands.record_demonstrations import record_demonstrations
+    with contextlib.ExitStack() as held:
+        if kind == "demonstrations":
+            from bidex_meta.commands.record_demonstrations import record_demonstrations
 
-        if (made := record_demonstrations(flags, _say)) is not None:
-            _say_complete(*made)
-        return
-    _record(flags, kind)
+            made = record_demonstrations(flags, _say, held)
+        else:
+            made = _record(flags, kind, held)
+    if made is not None:
+        _say_complete(*made)
 
 
 def _check(flags: RecordFlags, kind: str) -> None:
@@ -116,13 +119,13 @@ def _check(flags: RecordFlags, kind: str) -> None:
         raise BidexError(f"--noise must lie in [0, 10], not {flags.noise:g}.")
 
 
-def _record(flags: RecordFlags, kind: str) -> None:
+def _record(flags: RecordFlags, kind: str, held: contextlib.ExitStack) -> tuple[Path, str] | None:
+    """Records, or goes on with a recording; arguments and result as of ``record_demonstrations``."""
     from bidex_meta.commands.described import described
     from bidex_meta.data import part_files
     from bidex_meta.data.place import check_room, place_of
     from bidex_meta.data.rounds import bytes_held, collect, standing, whole_parts
-    from bidex_meta.data.writer import DatasetWriter, begin, check_place, estimated_bytes, finish
-    from bidex_meta.reading import is_file, read_json
+    from bidex_meta.data.writer import DatasetWriter, begin, begun, claimed, estimated_bytes, finish
     from bidex_meta.world.threads import set_up_torch
 
     part_files.hdf5()
@@ -130,10 +133,8 @@ def _record(flags: RecordFlags, kind: str) -> None:
     size = flags.size or (_SIZE_OF_TWO if RUNS[kind] == 2 else _SIZE)
     source = Source.open(config)
     folder, name = place_of(flags.out, source.name, kind)
-    before = folder / "data" / part_files.RECORDING
-    kept = read_json(before, "a recording's plan") if is_file(before) else {}
     # Sums depend on how torch splits them over threads: a recording keeps those that it began with.
-    config["threads"] = flags.threads or (kept.get("threads") if isinstance(kept, dict) else None) or _cores()
+    config["threads"] = flags.threads or begun(folder).get("threads") or _cores()
     set_up_torch(config["threads"])
     actors, policies = _actors(flags, kind, config["device"])
     rows = flags.num_envs or _rows(source)
@@ -143,13 +144,13 @@ def _record(flags: RecordFlags, kind: str) -> None:
     }
     plan |= {"starts": flags.seed}
     if not flags.estimate:
-        check_place(folder, plan)
+        held.enter_context(claimed(folder, plan))
     world = source.world("train", rows)
     try:
-        held = bytes_held(world)
-        if held > _MOST_HELD:
+        memory = bytes_held(world)
+        if memory > _MOST_HELD:
             raise BidexError(
-                f"The episodes of {rows:,} rows would take {held / 1e9:.1f} GB while they run, and "
+                f"The episodes of {rows:,} rows would take {memory / 1e9:.1f} GB while they run, and "
                 f"{_MOST_HELD / 1e9:.1f} are allowed. Lower --num-envs."
             )
         sizes = world.single_observation_space.shape[0], world.single_action_space.shape[0]
@@ -157,11 +158,11 @@ def _record(flags: RecordFlags, kind: str) -> None:
         needed = estimated_bytes(size, *sizes, float(world.max_episode_steps.float().mean()) / 3)
         _say(
             f"{name}: {size:,} transitions of {len(world.task_names)} task class(es), observations {sizes[0]}, actions "
-            f"{sizes[1]}: at most about {needed / 1e9:.2f} GB on the disk, and up to {held / 1e9:.2f} GB of memory "
+            f"{sizes[1]}: at most about {needed / 1e9:.2f} GB on the disk, and up to {memory / 1e9:.2f} GB of memory "
             "beside the world."
         )
         if flags.estimate:
-            return
+            return None
         there = sum(path.stat().st_size for path in part_files.parts_of(folder / "data"))
         check_room(folder, max(0, needed - there), f"{size:,} transitions")
         begin(folder, plan)
@@ -177,7 +178,7 @@ def _record(flags: RecordFlags, kind: str) -> None:
         finish(folder, name, world.single_observation_space, world.single_action_space, about)
     finally:
         world.close()
-    _say_complete(folder, name)
+    return folder, name
 
 
 def _config(flags: RecordFlags) -> dict[str, Any]:

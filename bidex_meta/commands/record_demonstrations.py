@@ -1,6 +1,7 @@
 """``bidex-meta record demonstrations``: a class's witness or script played, of which what succeeds is kept."""
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,7 @@ _Player = Callable[[Any, float, int], "Played"]
 """Makes an agent for a world, with so much noise from a seed."""
 
 
-def record_demonstrations(flags: Any, say: Callable[[str], None]) -> tuple[Path, str] | None:
+def record_demonstrations(flags: Any, say: Callable[[str], None], held: ExitStack) -> tuple[Path, str] | None:
     """Records, or goes on with a recording; folder and name of the complete data set, None after an estimate.
 
     The class is the one with moving bases, as suites have it. A round is a part; all that it draws follows from the
@@ -32,6 +33,7 @@ def record_demonstrations(flags: Any, say: Callable[[str], None]) -> tuple[Path,
         flags: ``RecordFlags`` with ``task``; read are also ``size``, ``noise``, ``shift``, ``starts``, ``script``,
             ``num_envs``, ``seed``, ``out``, ``threads``, ``estimate``.
         say: Takes lines of progress.
+        held: Keeps the data set's folder from other processes until it is closed.
 
     Raises:
         BidexError: Flags that do not go together, no witness or script, no room, or nothing that succeeds.
@@ -40,7 +42,7 @@ def record_demonstrations(flags: Any, say: Callable[[str], None]) -> tuple[Path,
     from bidex_meta.data import part_files
     from bidex_meta.data.place import check_room, place_of
     from bidex_meta.data.rounds import standing, whole_parts
-    from bidex_meta.data.writer import DatasetWriter, begin, check_place, estimated_bytes, finish
+    from bidex_meta.data.writer import DatasetWriter, begin, claimed, estimated_bytes, finish
     from bidex_meta.witness.shifted import ShiftedStarts
 
     part_files.hdf5()
@@ -59,7 +61,7 @@ def record_demonstrations(flags: Any, say: Callable[[str], None]) -> tuple[Path,
     plan |= {"noise": flags.noise} | ({"starts": "tasks"} if of_tasks else {"shift": flags.shift})
     plan |= {"script": True} if flags.script else {}
     if not flags.estimate:
-        check_place(folder, plan)
+        held.enter_context(claimed(folder, plan))
     world: Any
     if of_tasks:
         world = source.world("train", rows)

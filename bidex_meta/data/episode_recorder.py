@@ -61,9 +61,9 @@ class EpisodeRecorder(PooledWorldWrapper):
             # Pages of memory that no episode reaches are never taken.
             room = int(limits[self._where].max())
         d, a = (int(s.shape[0]) for s in (self.world.single_observation_space, self.world.single_action_space))
-        self._observations = np.empty((num, room + 1, d), np.float32)
-        self._actions = np.empty((num, room, a), np.float32)
-        self._rewards = np.empty((2, num, room), np.float32)  # as given, and unscaled
+        self._observations = np.zeros((num, room + 1, d), np.float32)
+        self._actions = np.zeros((num, room, a), np.float32)
+        self._rewards = np.zeros((2, num, room), np.float32)  # as given, and unscaled
         self._running, self._success = np.zeros(num, bool), np.zeros(num, bool)
         self._length, self._task = np.zeros(num, np.int64), np.zeros(num, np.int64)
 

@@ -29,23 +29,26 @@ def check_spaces(content: Mapping[str, Any], name: str) -> None:
             raise _not_flat(name, what, f"a Box of shape {shortened(shape)}" if kind == "Box" else f"{kind} ones")
 
 
-def numbers(stored: Any, what: str, name: str) -> np.ndarray:
+def numbers(stored: Any, what: str, name: str, length: int | None = None) -> np.ndarray:
     """An episode's array as it is stored.
 
     Args:
         stored: HDF5's group or dataset.
         what: Minari's name of the array: ``observations``, ``rewards``, ...
         name: The data set's.
+        length: How many there must be; None: any number.
 
     Raises:
-        BidexError: It is a group of several, of another number of dimensions, or holds no numbers.
+        BidexError: It is a group of several, of another number of dimensions or length, or holds no numbers.
     """
     if not hasattr(stored, "shape"):
         raise _not_flat(name, what, f"a group of {shortened(', '.join(stored))}")
-    values = np.asarray(stored[()])
-    if values.ndim != 1 + (what in _SPACES) or values.dtype.kind not in "biuf":
-        raise _not_flat(name, what, f"an array of shape {values.shape} and type {values.dtype}")
-    return values
+    shape, kind = stored.shape or (), stored.dtype
+    if len(shape) != 1 + (what in _SPACES) or kind.kind not in "biuf":
+        raise _not_flat(name, what, f"an array of shape {shape} and type {kind}")
+    if length not in (None, len(stored)):
+        raise BidexError(f"{name}: expected {length} {what} in {stored.name}, got {len(stored)}. Record it again.")
+    return np.asarray(stored[()])
 
 
 def action_bounds(content: Mapping[str, Any], name: str, size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -62,7 +65,7 @@ def action_bounds(content: Mapping[str, Any], name: str, size: int) -> tuple[np.
     space = _space(content, "action_space")
     try:
         low, high = (np.array(space[end], np.float64) for end in ("low", "high"))
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         low = high = np.zeros(0)
     fits = low.shape == high.shape == (size,)
     if not fits or not np.isfinite([low, high]).all() or (low >= high).any():

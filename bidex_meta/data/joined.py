@@ -93,10 +93,13 @@ def gathered(
         count: How many they are.
         observations: Entries of an observation, d.
         actions: Actions, a.
+
+    Raises:
+        BidexError: They have fewer transitions.
     """
-    states, acts, rewards = torch.empty(steps + count, observations), torch.empty(steps, actions), torch.empty(steps)
-    at, task, left = torch.empty(3, steps, dtype=torch.int64).unbind()
-    ends = torch.empty(steps, dtype=torch.bool)
+    states, acts, rewards = torch.zeros(steps + count, observations), torch.zeros(steps, actions), torch.zeros(steps)
+    at, task, left = torch.zeros(3, steps, dtype=torch.int64).unbind()
+    ends = torch.zeros(steps, dtype=torch.bool)
     start = 0
     for number, (episode, slot, seen) in enumerate(episodes):
         length, first = len(episode), start + number
@@ -107,6 +110,8 @@ def gathered(
         at[where] = torch.arange(first, first + length)
         left[where], task[where] = torch.arange(length - 1, -1, -1), slot
         start += length
+    if start != steps:
+        raise BidexError(f"Expected {steps:,} transitions, got {start:,}. Check the data sets: bidex-meta data check.")
     return Joined(states, at, acts, rewards, ends, task, left)
 
 

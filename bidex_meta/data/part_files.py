@@ -8,23 +8,27 @@
         main_data.hdf5         Minari's file: episode_0, episode_1, ... as links into the parts
         metadata.json          Minari's entries, and ours under "bidex"; written last, so that it says "complete"
 
-A part is written beside its place and renamed: it is there wholly or not at all. Names alone say how far a recording
-has come. Each episode is a group in Minari's layout, so that ``minari.load_dataset`` opens what is stored here, and no
-byte of an observation is stored twice.
+A part is written beside its place and renamed: it is there wholly or not at all, and with its digest (``seals.py``).
+Names alone say how far a recording has come. Each episode is a group in Minari's layout, so that
+``minari.load_dataset`` opens what is stored here, and no byte of an observation is stored twice.
 """
 
+import io
 import os
 import re
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
+from bidex_meta.data import seals
 from bidex_meta.data.episode import Episode
-from bidex_meta.errors import BidexError
+from bidex_meta.errors import BidexError, one_line
 from bidex_meta.reading import is_file
+from bidex_meta.record.atomic import sync_folder
 
 MAIN, METADATA, RECORDING = "main_data.hdf5", "metadata.json", "recording.json"
 FORMAT = 1
@@ -97,6 +101,88 @@ def _files(folder: Path) -> Iterator[Path]:
     return folder.iterdir() if folder.is_dir() else iter(())
 
 
+class _Disk(io.FileIO):
+    """A file as HDF5 writes it: what the system refuses is kept, not raised.
+
+    HDF5 keeps what it could not write and tries again at each close, with tracebacks from where nobody can catch them,
+    and crashes at the end of the process.
+
+    Attributes:
+        refused: The first refusal.
+    """
+
+    refused: OSError | None = None
+
+    def write(self, data: Any, /) -> int:
+        """Writes all of it."""
+        left, size = memoryview(data), len(data)
+        try:
+            while len(left):
+                left = left[super().write(left) :]
+        except OSError as error:
+            self.refused = self.refused or error
+        return size
+
+    def truncate(self, size: int | None = None, /) -> int:
+        """Makes the file as long as that."""
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self.refused = self.refused or error
+            return size or 0
+
+
+class SealedFile:
+    """A file of HDF5 while it is written: at ``commit`` it gets its digest, is forced to the disk and renamed.
+
+    Args:
+        path: Where it shall lie; nothing is there before ``commit``.
+
+    """
+
+    def __init__(self, path: Path) -> None:
+        h5, self._path = hdf5(), path
+        self._temporary = path.with_name(f".{path.name}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._disk = _Disk(self._temporary, "w+")
+        self._file: Any = h5.File(self._disk, "w", userblock_size=seals.BLOCK)
+
+    @contextmanager
+    def writing(self) -> Iterator[Any]:
+        """h5py's file, to be written into.
+
+        Raises:
+            OSError: The disk did not take it; then all is forgotten.
+        """
+        try:
+            yield self._file
+        finally:
+            if (refused := self._disk.refused) is not None:
+                self.abandon()
+                raise OSError(refused.errno, refused.strerror, str(self._path))
+
+    def commit(self) -> None:
+        """Puts it in its place; errors as of ``writing``."""
+        with self.writing() as file:
+            file.close()
+        with self.writing():
+            seal = seals.block(self._disk)
+            self._disk.seek(0)
+            self._disk.write(seal)
+        os.fsync(self._disk.fileno())
+        self._disk.close()
+        os.replace(self._temporary, self._path)
+        sync_folder(self._path.parent)
+
+    def abandon(self) -> None:
+        """Forgets it; nothing where it was committed."""
+        if not self._disk.closed:
+            with suppress(Exception):  # of a full disk HDF5 may read what was never written
+                self._file.close()
+            self._disk.close()
+            self._temporary.unlink(missing_ok=True)
+
+
 class PartWriter:
     """One part, while its episodes come in: they go to the disk at once.
 
@@ -105,20 +191,13 @@ class PartWriter:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self._h5 = path, hdf5()
-        self._temporary = path.with_name(f".{path.name}")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._file: Any = self._h5.File(self._temporary, "w")
+        self._sealed = SealedFile(path)
         self._rows: list[dict[str, Any]] = []
         self._variations: list[np.ndarray] = []
         self.steps = 0
 
     def add(self, episode: Episode) -> None:
-        """Takes an episode."""
-        group = self._file.create_group(f"episode_{len(self._rows)}")
-        for name, ours in ARRAYS.items():
-            group.create_dataset(name, data=getattr(episode, ours))
-        group.create_group("infos")  # Minari prints its keys
+        """Takes an episode; errors as of ``SealedFile.writing``."""
         row = {
             "steps": len(episode),
             "task": episode.task,
@@ -131,7 +210,14 @@ class PartWriter:
             "return_unscaled": episode.return_unscaled,
         }
         told = {"total_steps": len(episode), "task_name": episode.task_name, "variation": episode.variation}
-        group.attrs.update({name: row[name] for name in ("task", "task_index", "policy", "success", "broken")} | told)
+        with self._sealed.writing() as file:
+            group = file.create_group(f"episode_{len(self._rows)}")
+            for name, ours in ARRAYS.items():
+                group.create_dataset(name, data=getattr(episode, ours))
+            group.create_group("infos")  # Minari prints its keys
+            group.attrs.update(
+                {name: row[name] for name in ("task", "task_index", "policy", "success", "broken")} | told
+            )
         self._rows.append(row)
         self._variations.append(np.asarray(episode.variation, np.float64))
         self.steps += len(episode)
@@ -142,49 +228,67 @@ class PartWriter:
         Args:
             counts: What was left out, by reason.
         """
-        table = self._file.create_group("table")
-        for name, kind in TABLE.items():
-            table.create_dataset(name, data=np.array([row[name] for row in self._rows], kind))
         width = max(map(len, self._variations), default=0)
         variations = np.full((len(self._rows), width), np.nan)
         for place, variation in zip(variations, self._variations, strict=True):
             place[: len(variation)] = variation
-        table.create_dataset("variation", data=variations)
-        self._file.attrs.update(counts)
-        self._file.close()
-        synchronise(self._temporary)
-        os.replace(self._temporary, self.path)
-        synchronise(self.path.parent)
+        with self._sealed.writing() as file:
+            table = file.create_group("table")
+            for name, kind in TABLE.items():
+                table.create_dataset(name, data=np.array([row[name] for row in self._rows], kind))
+            table.create_dataset("variation", data=variations)
+            file.attrs.update(counts)
+        self._sealed.commit()
 
     def abandon(self) -> None:
         """Closes the part and forgets it; nothing where it was committed."""
-        if self._file:
-            self._file.close()
-            self._temporary.unlink(missing_ok=True)
-
-
-def synchronise(path: Path) -> None:
-    """Forces a file, or a folder's names, to the disk."""
-    if path.is_dir() and os.name != "posix":
-        return  # Windows cannot open folders, and needs no such call
-    descriptor = os.open(path, os.O_RDONLY if os.name == "posix" else os.O_RDWR)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+        self._sealed.abandon()
 
 
 def write_main(folder: Path, parts: Iterable[Path]) -> None:
     """Writes Minari's file: a link to every episode of the parts, in their order."""
-    h5, temporary = hdf5(), folder / f".{MAIN}"
-    with h5.File(temporary, "w") as main:
-        number = 0
-        for path in parts:
-            for inner in range(len(read_table(path)["steps"])):
-                main[f"episode_{number}"] = h5.ExternalLink(path.name, f"/episode_{inner}")
-                number += 1
-    synchronise(temporary)
-    os.replace(temporary, folder / MAIN)
+    main, number, h5 = SealedFile(folder / MAIN), 0, hdf5()
+    try:
+        with main.writing() as file:
+            for path in parts:
+                for inner in range(len(read_table(path)["steps"])):
+                    file[f"episode_{number}"] = h5.ExternalLink(path.name, f"/episode_{inner}")
+                    number += 1
+        main.commit()
+    finally:
+        main.abandon()
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[Any]:
+    """h5py's file, to be read.
+
+    Raises:
+        BidexError: It is no file, or whatever was read of it is damaged: all that h5py raises within.
+    """
+    h5 = hdf5()
+    if not is_file(path):
+        raise BidexError(f"Expected a part of a data set at {path}, found none. Record it again.")
+    try:
+        with h5.File(path, "r") as file:
+            yield file
+    except BidexError:
+        raise
+    # h5py raises whatever comes; a group in the place of an array lacks its attributes.
+    except (
+        OSError,
+        LookupError,
+        TypeError,
+        ValueError,
+        RuntimeError,
+        ArithmeticError,
+        MemoryError,
+        AttributeError,
+    ) as error:
+        reason = one_line(str(error).strip("'\"").split("(")[-1].rstrip(")"))[:200] or type(error).__name__
+        raise BidexError(
+            f"{path} is damaged or no part of a data set ({reason}). Delete it and record it again."
+        ) from None
 
 
 def read_table(path: Path) -> dict[str, np.ndarray]:
@@ -193,17 +297,11 @@ def read_table(path: Path) -> dict[str, np.ndarray]:
     Raises:
         BidexError: It is no part, or a damaged one.
     """
-    h5 = hdf5()
-    if not is_file(path):
-        raise BidexError(f"Expected a part of a data set at {path}, found none. Record it again.")
-    try:
-        with h5.File(path, "r") as file:
-            return {name: file["table"][name][()] for name in (*TABLE, "variation")}
-    except (OSError, KeyError) as error:
-        raise damaged(path, error) from None
-
-
-def damaged(path: Path, error: Exception) -> BidexError:
-    """What to raise where h5py cannot read a file."""
-    reason = str(error).strip("'\"").split("(")[-1].rstrip(")")
-    return BidexError(f"{path} is damaged or no part of a data set ({reason}). Delete it and record it again.")
+    with reading(path) as file:
+        table = {name: file["table"][name] for name in (*TABLE, "variation")}
+        rows = table["steps"].shape[:1]
+        for name, column in table.items():
+            width, kind = (1, "f") if name == "variation" else (0, np.dtype(TABLE[name]).kind)
+            if column.shape[:1] != rows or len(column.shape) != 1 + width or column.dtype.kind != kind:
+                raise ValueError(f"column {name} of shape {list(column.shape)} and type {column.dtype}")
+        return {name: column[()] for name, column in table.items()}

@@ -1,21 +1,24 @@
 """A data set as it is written: parts that are there wholly or not at all, then the index."""
 
+import contextlib
 import json
 import math
 import os
 import shutil
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Box
 
-from bidex_meta.data import part_files
+from bidex_meta.data import part_files, seals
 from bidex_meta.data.dataset import valid_name
 from bidex_meta.data.episode import Episode
-from bidex_meta.errors import BidexError
-from bidex_meta.reading import is_file, read_json
+from bidex_meta.errors import BidexError, shortened
+from bidex_meta.reading import check, exists, is_file, read_json, whole
+from bidex_meta.record import RunFolder
 from bidex_meta.record.atomic import check_writable, remove_leftovers, write_atomic, write_json
 
 _MINARI = "0.5.0"
@@ -69,11 +72,55 @@ class DatasetWriter:
             self._part = None
 
 
+@contextlib.contextmanager
+def claimed(folder: Path, plan: dict[str, Any]) -> Iterator[None]:
+    """Keeps other processes from recording into a folder, from before anything is written there to the end.
+
+    The folder is made for that, and gone again where nothing was written into it. Arguments and errors as of
+    ``check_place``.
+
+    Raises:
+        BidexError: Another process records there.
+    """
+    told = f"Another process records into {folder}. Wait for its end, or name another place by --out."
+    missing = [each for each in (folder, *folder.parents) if not exists(each)]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = contextlib.ExitStack()
+        lock.enter_context(RunFolder(folder).locked(told))
+    except OSError as error:
+        raise BidexError(f"{folder} cannot be written: {error.strerror}. Name another place by --out.") from None
+    with lock:
+        if not folder.is_dir():
+            raise BidexError(told)  # made and taken away by one that was refused
+        try:
+            check_place(folder, plan)
+            yield
+        finally:
+            with contextlib.suppress(OSError):  # not empty
+                for each in missing:
+                    each.rmdir()
+
+
 def begin(folder: Path, plan: dict[str, Any]) -> None:
     """Writes down what is recorded; arguments and errors as of ``check_place``."""
     if not check_place(folder, plan):
         (folder / "data").mkdir(parents=True, exist_ok=True)
         write_json(folder / "data" / part_files.RECORDING, plan)
+
+
+def begun(folder: Path) -> dict[str, Any]:
+    """The plan of a recording that has begun in a folder; empty without one.
+
+    Raises:
+        BidexError: The file holds something else.
+    """
+    path = folder / "data" / part_files.RECORDING
+    if not is_file(path):
+        return {}
+    plan = read_json(path, "a recording's plan")
+    check(plan, {"threads": whole(1, 4096)}, path)
+    return plan
 
 
 def check_place(folder: Path, plan: dict[str, Any]) -> bool:
@@ -92,12 +139,12 @@ def check_place(folder: Path, plan: dict[str, Any]) -> bool:
     if is_file(inner / part_files.METADATA) and not is_file(path):
         raise BidexError(f"{folder} holds a complete data set. Name another by --out, or delete it.")
     if is_file(path):
-        before = read_json(path, "a recording's plan")
+        before = begun(folder)
         differ = sorted(name for name in before.keys() | plan.keys() if before.get(name) != plan.get(name))
         if differ:
-            name = differ[0]
+            old, new = (shortened(each.get(differ[0])) for each in (before, plan))
             raise BidexError(
-                f"{folder} is a recording that has not ended, with {name} {before.get(name)}, not {plan.get(name)}. "
+                f"{folder} is a recording that has not ended, with {differ[0]} {old}, not {new}. "
                 "Give its own command to go on, or name another place by --out."
             )
         return True
@@ -143,7 +190,7 @@ def finish(folder: Path, name: str, observations: Box, actions: Box, metadata: d
         "requirements": [],
         "bidex": ours,
     }
-    write_json_compact(inner / part_files.METADATA, content)
+    _write_metadata(inner, content)
     (inner / part_files.RECORDING).unlink(missing_ok=True)
 
 
@@ -160,35 +207,33 @@ def adopt(inner: Path, folder: Path, name: str) -> None:
     """
     if not valid_name(name):
         raise BidexError(f"Expected a name such as CatchUnderarm/replay-v0, got {name!r}. Name another place by --out.")
-    check_place(folder, {})
-    new = folder / "data"
-    new.mkdir(parents=True, exist_ok=True)
-    content = read_json(inner / part_files.METADATA, "a data set's metadata")
-    for path in [*part_files.parts_of(inner), inner / part_files.MAIN]:
-        try:
-            os.link(path, new / path.name)
-        except OSError:
-            shutil.copyfile(path, new / path.name)
-    write_json_compact(new / part_files.METADATA, content | {"dataset_id": name})
+    with claimed(folder, plan := {"kind": "replay", "of": str(inner.resolve())}):
+        begin(folder, plan)
+        new = folder / "data"
+        content = read_json(inner / part_files.METADATA, "a data set's metadata")
+        if "bidex" not in content:
+            raise BidexError(f"{inner} holds no recording of a run. Train one that records: bidex-meta run --record N.")
+        for path in [*part_files.parts_of(inner), inner / part_files.MAIN]:
+            (new / path.name).unlink(missing_ok=True)  # of one that was killed, or found no room
+            try:
+                os.link(path, new / path.name)
+            except OSError:
+                shutil.copyfile(path, new / path.name)
+        _write_metadata(new, content | {"dataset_id": name})
+        (new / part_files.RECORDING).unlink()
 
 
 def left_out(inner: Path) -> dict[str, int]:
     """What all parts say that was left out, by reason."""
-    h5, counts = part_files.hdf5(), Counter()
+    counts: Counter[str] = Counter()
     for path in part_files.parts_of(inner):
-        try:
-            with h5.File(path, "r") as file:
-                counts.update({name: int(value) for name, value in file.attrs.items()})
-        except (OSError, TypeError, ValueError) as error:
-            raise part_files.damaged(path, error) from None
+        with part_files.reading(path) as file:
+            counts.update({name: int(value) for name, value in file.attrs.items()})
     return dict(counts)
 
 
-def write_json_compact(path: Path, content: Any) -> None:
-    """Writes JSON with one entry a line at the top alone: the spaces are long lists."""
-    rows = [f"  {json.dumps(name)}: {json.dumps(value)}" for name, value in content.items()]
-    text = "{\n" + ",\n".join(rows) + "\n}\n"
-    write_atomic(path, lambda file: file.write(text.encode()))
+def _write_metadata(inner: Path, content: dict[str, Any]) -> None:
+    write_atomic(inner / part_files.METADATA, lambda file: file.write(seals.sealed_text(content)))
 
 
 def _space(space: Box) -> str:

@@ -35,7 +35,7 @@ def write_atomic(path: Path, write: Callable[[IO[bytes]], object]) -> None:
         if isinstance(error, RuntimeError) and isinstance(why := error.__context__, OSError):
             raise OSError(why.errno, why.strerror, str(path)) from None
         raise
-    _sync_folder(path.parent)
+    sync_folder(path.parent)
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -94,8 +94,9 @@ def check_writable(path: Path) -> None:
             folder.rmdir()
 
 
-def _sync_folder(folder: Path) -> None:
-    # Without this a power cut may lose the rename itself. Windows cannot open folders, and needs no such call.
+def sync_folder(folder: Path) -> None:
+    """Forces a folder's names to the disk: without this a power cut may lose a rename."""
+    # Windows cannot open folders, and needs no such call.
     if os.name == "posix":
         descriptor = os.open(folder, os.O_RDONLY)
         try:

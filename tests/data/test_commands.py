@@ -1,7 +1,9 @@
 """record, run --record and data, on small worlds and one real one."""
 
+import contextlib
 import json
 import math
+import os
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,10 +22,10 @@ from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder
 from bidex_meta.sources import Source
 from bidex_meta.sources.source import OwnSuite
-from tests.data.worlds import rough
+from tests.data.worlds import changed, rough
 from tests.pages import ROOT
 
-h5py = pytest.importorskip("h5py", reason="needs the extra data")
+pytest.importorskip("h5py", reason="needs the extra data")
 
 SMALL = ["--suite", "MT4", "--num-envs", "6", "--threads", "1", "--device", "cpu", "--learner.hidden", "8"]
 SMALL += ["--learner.rollout-steps", "4", "--no-evaluate"]
@@ -78,11 +80,11 @@ def test_a_real_class_its_rewards_and_a_damaged_copy(real: Dataset, capsys: pyte
     assert verify(real, most).episodes == math.ceil(real.num_episodes / 2) <= most
     # Observations shifted by a step, a reward of another task, a torn end: each is seen.
     path = part_files.parts_of(real.folder)[0]
-    with h5py.File(path, "r+") as file:
+    with changed(path) as file:
         shifted = file["episode_0"]["observations"]
         shifted[1:] = shifted[:-1]
     assert "1 wrong" in told(capsys, "data", "check", real.folder.parent, code=1)
-    with h5py.File(path, "r+") as file:
+    with changed(path) as file:
         file["table"]["variation"][1, 1] += 0.02
         file["episode_2"]["truncations"][0] = True
     wrong = verify(real).wrong
@@ -90,7 +92,7 @@ def test_a_real_class_its_rewards_and_a_damaged_copy(real: Dataset, capsys: pyte
     fresh = verify(Dataset(real.folder, real.content))
     assert fresh.count == 3 and any("not exactly one end" in line for line in fresh.wrong)
     path.write_bytes(path.read_bytes()[:5000])
-    assert "is damaged or no part" in told(capsys, "data", "check", real.name, code=2)
+    assert "is damaged" in told(capsys, "data", "check", real.name, code=2)
     path.unlink()
     assert "Parts are missing" in told(capsys, "data", "info", real.name, code=2)
 
@@ -148,6 +150,34 @@ def test_the_four_kinds_of_a_suite(toy: None, folder: Path, capsys: pytest.Captu
     assert 60 < sets["replay"].num_steps <= 80 and set(sets["replay"].table["row"]) == {0, 3}
     assert sets["replay"].num_steps == open_dataset(folder / "a" / "replay").num_steps
     assert "holds a complete data set" in told(capsys, "record", "replay", runs[0], code=2)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_of_two_recorders_at_once_one_is_refused(toy: None, folder: Path) -> None:
+    """Before it touches anything: the other one's set is whole."""
+    words = ["record", "random", "--suite", "MT4", "--size", "300", "--num-envs", "6", "--threads", "1", "--out"]
+    for number in range(3):
+        out, (start, go), children = folder / f"set-{number}", os.pipe(), []
+        for name in "ab":
+            if child := os.fork():
+                children.append(child)
+                continue
+            code = 70
+            with (folder / name).open("w") as said, contextlib.redirect_stderr(said):
+                os.close(go)
+                os.read(start, 1)  # until the parent lets both go
+                with contextlib.suppress(BaseException):
+                    code = main([*words, str(out)])
+            os._exit(code)
+        os.close(go)
+        codes = [os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children]
+        os.close(start)
+        assert sorted(codes) == [0, 2], [(folder / name).read_text() for name in "ab"]
+        (line,) = (folder / "ab"[codes.index(2)]).read_text().splitlines()
+        assert "Another process records into" in line or "holds a complete data set" in line
+        found = verify(open_dataset(out))
+        assert found.count == 0 and found.steps >= 300 and not list((out / "data").glob(".*"))
 
 
 def test_a_resumed_run_records_as_one_that_was_not_ended(toy: None, folder: Path) -> None:

@@ -1,13 +1,19 @@
 """A world that does all that a recorder must bear, and a plain loop that says what it did."""
 
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.spaces import Box
 from torch import Tensor
 
-from bidex_meta.data import Episode
+from bidex_meta.data import Dataset, Episode, open_dataset, part_files, seals
+from bidex_meta.data.writer import DatasetWriter, finish
 from tests.fake_world import FakeWorld
 from tests.points import PointWorld, ring
 
@@ -121,3 +127,57 @@ def same(a: Episode, b: Episode) -> bool:
         and all(getattr(a, name) == getattr(b, name) for name in words)
         and abs(a.return_unscaled - b.return_unscaled) < 1e-4
     )
+
+
+ABOUT = {
+    "suite": "MT4", "suite_version": 1, "task": None, "object": None, "points": 0, "base": None, "seed": 0,
+    "tasks": ["Near", "Far"], "kind": "random", "reward_scales": {"Near": 1.0, "Far": 0.5}, "hides_goals": False,
+    "observation_groups": [["state", [[0, 3]]], ["task_id", [[3, 5]]]],
+    "policies": [{"algo": None, "actions": "uniform"}], "commit": "abc", "versions": {"mujoco": "4.0.0"},
+    "references": {"Near": {"random": 0.0, "zero": None, "expert": 9.0}, "Far": {"random": 1.0}},
+}  # fmt: skip
+"""Metadata as a recording has them."""
+
+
+def small_set(folder: Path) -> Dataset:
+    """Two parts of three episodes each, of 3 to 8 steps, 5 observations and 2 actions."""
+    draw, writer = np.random.default_rng(0), DatasetWriter(folder)
+    for number in range(6):
+        steps, last = 3 + number, np.arange(3 + number) == 2 + number
+        arrays = [draw.uniform(-1, 1, (n, k)).astype(np.float32) for n, k in ((steps + 1, 5), (steps, 2), (steps, 1))]
+        scaled = float(arrays[2].sum(dtype=np.float64)) / (1.0, 0.5)[number % 2]
+        more = {"task": number % 2, "task_name": ABOUT["tasks"][number % 2], "return_unscaled": scaled}
+        writer.add(Episode(*arrays[:2], arrays[2][:, 0], last, ~last & last, variation=np.ones(2), **more))
+        if number % 3 == 2:
+            writer.commit()
+    finish(folder, "Points/small-v0", Box(-1.0, 1.0, (5,)), Box(-1.0, 1.0, (2,)), ABOUT)
+    return open_dataset(folder)
+
+
+@contextmanager
+def changed(path: Path) -> Iterator[Any]:
+    """h5py's file of a part, to be changed on purpose; then it gets a digest again."""
+    with part_files.hdf5().File(path, "r+") as file:
+        yield file
+    with path.open("r+b") as file:
+        block = seals.block(file)
+        file.seek(0)
+        file.write(block)
+
+
+def without_digests(folder: Path) -> None:
+    """Makes of a data set's files in a folder what they were before there were digests."""
+    h5 = part_files.hdf5()
+    for path in folder.glob("*.hdf5"):
+        with h5.File(path, "r") as new, h5.File(folder / "old", "w") as old:
+            for name in new:
+                if path.name == part_files.MAIN:
+                    old[name] = new.get(name, getlink=True)
+                else:
+                    new.copy(name, old)
+            old.attrs.update(new.attrs)
+        (folder / "old").replace(path)
+    path = folder / part_files.METADATA
+    content = json.loads(path.read_text())
+    del content["digest"], content["bidex"]["sealed"]
+    path.write_text(json.dumps(content))

@@ -1,0 +1,87 @@
+"""Digests of a data set's files, so that no flipped bit is read in silence.
+
+A file of HDF5 may begin with a block of an application's own, the user block; ours says how long the file is and which
+CRC-32 all behind the block has. In ``metadata.json`` the last entry is the digest of all before it. CRC-32 finds every
+single flipped bit, and other damages but for one in four billion; it is no protection against intent.
+"""
+
+import json
+import re
+import zlib
+from pathlib import Path
+from typing import IO, Any
+
+from bidex_meta.errors import BidexError
+from bidex_meta.reading import open_regular
+
+BLOCK = 512
+"""Bytes of the user block: the least that HDF5 takes."""
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+_PIECE = 1 << 20
+_LAST = ',\n  "digest": '
+_MARK = "sealed"
+"""Entry of ours in the metadata, beside the digest itself: one flipped bit cannot take away both."""
+
+
+def block(file: IO[bytes]) -> bytes:
+    """The user block that belongs in front of what stands behind it in an open file."""
+    length, digest = file.seek(0, 2), 0
+    file.seek(BLOCK)
+    while piece := file.read(_PIECE):
+        digest = zlib.crc32(piece, digest)
+    return _line(length, f"{digest:08x}\n").ljust(BLOCK, b"\n")
+
+
+def _line(length: int, digest: str) -> bytes:
+    return f"bidex-meta: {length} bytes, CRC-32 of those after the first {BLOCK}: {digest}".encode()
+
+
+def check_file(path: Path) -> bool:
+    """Holds a file of HDF5 to its digest, reading all of it; false for one without, written before there were any.
+
+    Raises:
+        BidexError: It is no file, or has changed since it was written.
+    """
+    with open_regular(path, "a file of a data set") as file:
+        first = file.read(BLOCK)
+        if first.startswith(_HDF5):
+            return False
+        # The length first: a file of terabytes of nothing is not read.
+        if not first.startswith(_line(file.seek(0, 2), "")) or first != block(file):
+            raise _changed(path, "Bring it back from a copy, or delete it and record it again")
+    return True
+
+
+def sealed_text(content: dict[str, Any]) -> bytes:
+    """A data set's metadata as JSON, an entry a line at the top alone (the spaces are long lists), with a digest.
+
+    Args:
+        content: With ours under ``bidex``.
+    """
+    content = content | {"bidex": content["bidex"] | {_MARK: True}}
+    rows = [f"  {json.dumps(name)}: {json.dumps(value)}" for name, value in content.items() if name != "digest"]
+    text = ("{\n" + ",\n".join(rows)).encode()
+    return text + _ending(text)
+
+
+def _ending(text: bytes) -> bytes:
+    return f'{_LAST}"{zlib.crc32(text):08x}"\n}}\n'.encode()
+
+
+def check_text(path: Path, data: bytes) -> bool:
+    """Holds metadata to their digest; false for those without.
+
+    Raises:
+        BidexError: They have changed since they were written.
+    """
+    text, found, _ = data.rpartition(_LAST.encode())
+    if not found and not re.search(rb'"%s"\s*:\s*true' % _MARK.encode(), data):
+        return False
+    if data != text + _ending(text):
+        mend = f"Bring it back from a copy; if you changed it on purpose, take out its entries digest and {_MARK}"
+        raise _changed(path, mend)
+    return True
+
+
+def _changed(path: Path, mend: str) -> BidexError:
+    return BidexError(f"{path} is damaged: expected the length and digest it was written with, found others. {mend}.")
