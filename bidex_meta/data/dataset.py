@@ -233,8 +233,8 @@ class Dataset:
         """All episodes, read one by one.
 
         Raises:
-            BidexError: A file is damaged, arrays are not as long as the table says, or observations or actions of a data
-                set from elsewhere are not flat.
+            BidexError: A file is damaged, arrays are not as long as the table says, or observations or actions of a
+                data set from elsewhere are not flat.
         """
         foreign.check_spaces(self.content, self.name)
         number, sizes = 0, None
