@@ -165,7 +165,7 @@ def test_steps_are_the_mean_over_seeds_that_time_ended_with_their_range(tmp_path
     [group] = groups(*paths)
     assert (group.steps, group.steps_range) == (2200, (1000, 4000))
     assert main(["compare", *map(str, paths)]) == 0
-    assert "2,200 [1,000, 4,000]" in capsys.readouterr().out
+    assert "2,200 (1,000 to 4,000)" in capsys.readouterr().out
     assert main(["compare", "--json", *map(str, paths)]) == 0
     [row] = json.loads(capsys.readouterr().out)
     assert (row["steps"], row["steps_range"]) == (2200, [1000, 4000])

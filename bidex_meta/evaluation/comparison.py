@@ -45,7 +45,7 @@ class Group:
     def steps_text(self) -> str:
         """The mean number of steps, with its range where seeds differ."""
         low, high = self.steps_range
-        return f"{self.steps:,}" if low == high else f"{self.steps:,} [{low:,}, {high:,}]"
+        return f"{self.steps:,}" if low == high else f"{self.steps:,} ({low:,} to {high:,})"
 
 
 @dataclass(frozen=True)
