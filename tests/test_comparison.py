@@ -156,6 +156,21 @@ def test_a_run_that_time_ended_is_of_the_steps_it_made(tmp_path: Path):
         groups(path)
 
 
+def test_steps_are_the_mean_over_seeds_that_time_ended_with_their_range(tmp_path: Path, capsys):
+    paths = [change(run(tmp_path, seed, {"A": 0.5}), steps=10**9, minutes=4.0) for seed in range(3)]
+    for path, steps in zip(paths, (1000, 1600, 4000), strict=True):
+        found = json.loads((path / "evaluation.json").read_text())
+        (path / "evaluation.json").write_text(json.dumps({"steps": steps, **found}))
+        (path / "metrics.jsonl").write_text(json.dumps({"step": steps}) + "\n")
+    [group] = groups(*paths)
+    assert (group.steps, group.steps_range) == (2200, (1000, 4000))
+    assert main(["compare", *map(str, paths)]) == 0
+    assert "2,200 (1,000 to 4,000)" in capsys.readouterr().out
+    assert main(["compare", "--json", *map(str, paths)]) == 0
+    [row] = json.loads(capsys.readouterr().out)
+    assert (row["steps"], row["steps_range"]) == (2200, [1000, 4000])
+
+
 def test_a_run_that_a_return_or_score_ended_is_of_the_steps_it_made(tmp_path: Path):
     path = run(tmp_path, 0, {"A": 0.5})
     found = json.loads((path / "evaluation.json").read_text())

@@ -67,7 +67,8 @@ def _row(group: "Group", first: "Group") -> dict[str, Any]:
     from bidex_meta.evaluation.comparison import iqm
 
     row: dict[str, Any] = {
-        "group": group.label, "seeds": group.seeds, "steps": group.steps, "hours": round(group.hours, 3)
+        "group": group.label, "seeds": group.seeds, "steps": group.steps, "steps_range": list(group.steps_range),
+        "hours": round(group.hours, 3),
     }  # fmt: skip
     for name, own, other in (("success", group.success, first.success), ("score", group.scores, first.scores)):
         row[f"{name}_iqm"] = None if own is None else vars(iqm(own))
@@ -83,7 +84,7 @@ def _row(group: "Group", first: "Group") -> dict[str, Any]:
 def _line(group: "Group", first: "Group") -> list[object]:
     from bidex_meta.evaluation.comparison import iqm
 
-    cells: list[object] = [group.label, len(group.seeds), f"{group.steps:,}", f"{group.hours:.2f}"]
+    cells: list[object] = [group.label, len(group.seeds), group.steps_text(), f"{group.hours:.2f}"]
     cells.append(_ranged(iqm(group.success), 100.0, " %"))
     cells.append("–" if group.scores is None else _ranged(iqm(group.scores)))
     if group is first:

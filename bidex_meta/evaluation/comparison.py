@@ -34,11 +34,18 @@ class Group:
     scores: np.ndarray | None
     """Normalised score, (seeds, classes); None where a class has no reference."""
     steps: int
-    """Environment steps of a seed, over all its runs."""
+    """Environment steps of a seed, over all its runs; the mean over seeds, which differ where time ended the runs."""
+    steps_range: tuple[int, int]
+    """Fewest and most steps of a seed."""
     hours: float
     """Mean time of a seed's training, over all its runs, without evaluation."""
     paths: list[Path]
     """Its run folders, or files of JSON."""
+
+    def steps_text(self) -> str:
+        """The mean number of steps, with its range where seeds differ."""
+        low, high = self.steps_range
+        return f"{self.steps:,}" if low == high else f"{self.steps:,} ({low:,} to {high:,})"
 
 
 @dataclass(frozen=True)
@@ -218,7 +225,7 @@ def _group(label: str, members: list[dict[str, Any]]) -> Group:
     def table(name: str) -> np.ndarray:
         return np.array([[rows[seed]["classes"][c][name] for c in classes] for seed in seeds], dtype=float)
 
-    scores = table("score")
+    scores, steps = table("score"), [rows[seed]["steps"] for seed in seeds]
     return Group(
         label=label,
         seeds=seeds,
@@ -226,7 +233,8 @@ def _group(label: str, members: list[dict[str, Any]]) -> Group:
         success=table("success"),
         returns=table("return"),
         scores=None if np.isnan(scores).any() else scores,
-        steps=rows[seeds[0]]["steps"],
+        steps=round(sum(steps) / len(steps)),
+        steps_range=(min(steps), max(steps)),
         hours=float(np.mean([rows[seed]["seconds"] for seed in seeds])) / 3600.0,
         paths=[run["path"] for run in members],
     )

@@ -133,7 +133,7 @@ def _final_row(group: Group, first: Group) -> list[str]:
     return [
         group.label,
         seeds,
-        f"{group.steps:,}",
+        group.steps_text(),
         f"{group.hours:.2f}",
         _ranged(iqm(group.success), 100.0),
         score,

@@ -135,7 +135,7 @@ def arms_table(study: Study) -> Iterator[str]:
         cells = [
             group.label,
             str(len(group.seeds)),
-            f"{group.steps:,}",
+            group.steps_text(),
             _ranged(iqm(group.success), 100.0, " %"),
             score,
         ]

@@ -88,5 +88,6 @@ REMEMBERING = RL2Config(
 @pytest.mark.parametrize("chunk", [REMEMBERING.chunk, 25], ids=["default", "25"])
 def test_what_the_first_of_60_steps_shows_is_used_in_the_last(chunk: int | None):
     learner = RL2(Recall(steps=60), replace(REMEMBERING, chunk=chunk), seed=0)
-    success = [learner.iterate()["Train/success_last_episode"] for _ in range(25)][-1]
-    assert success < 0.75 if chunk == 25 else success > 0.9
+    success = [learner.iterate()["Train/success_last_episode"] for _ in range(20)][-1]
+    # Seeds 0 to 3: 0.97, 0.94, 0.97, 0.97 by default; 0.44, 0.48, 0.56, 0.47 with 25, which later learns it too.
+    assert success < 0.65 if chunk == 25 else success > 0.9
