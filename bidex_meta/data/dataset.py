@@ -43,6 +43,7 @@ _OURS = {
     "kind": TEXT,
     "policies": _TABLES,
     "left_out": whole(0).each(),
+    "references": TABLE,
     "reward_scales": number(1e-300, 1e300).each(),
     "hides_goals": Rule("true or false", lambda value: isinstance(value, bool)),
     "base": choice("own", "moving", "fixed").or_none(),
@@ -233,7 +234,7 @@ class Dataset:
         """All episodes, read one by one.
 
         Raises:
-            BidexError: A file is damaged, arrays are not as long as the table says, or observations or actions of a
+            BidexError: A file is damaged, arrays are not as long as its table says, or observations or actions of a
                 data set from elsewhere are not flat.
         """
         foreign.check_spaces(self.content, self.name)

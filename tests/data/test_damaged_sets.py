@@ -14,15 +14,17 @@ import pytest
 import torch
 from gymnasium.spaces import Box
 
+from bidex_meta.commands.run_offline import implied
 from bidex_meta.data import Dataset, open_dataset, part_files
 from bidex_meta.data.checking import verify
 from bidex_meta.data.joined import gathered, join
+from bidex_meta.data.summary import coverage, summary
 from bidex_meta.data.writer import begin, begun
 from bidex_meta.errors import BidexError
 from tests.algos.problems import one_step_bandit
 from tests.data.test_rounds import record
-from tests.data.worlds import changed, rough, same, small_set, without_digests
-from tests.robust.damage import NO_FILES, of_values, remove, replace
+from tests.data.worlds import ABOUT, changed, rough, same, small_set, without_digests
+from tests.robust.damage import NO_FILES, ODD, of_values, remove, replace
 from tests.robust.kills import quick_folder
 from tests.robust.lines import called
 from tests.robust.test_damaged_files import draws, one_line_or
@@ -229,11 +231,27 @@ def test_damaged_metadata_is_one_line_or_read(ours: bool, folder: Path, monkeypa
         for value in values:
             for entry in (b"33", b"6", b"0.5", b"1.0", b"4"):
                 check(("number", lambda data, value=value, entry=entry: data.replace(b" " + entry, b" " + value)))
-        draws(60, of_values(), check)
+        draws(40, of_values(), check)
         for name in NO_FILES:
             check(name)
     finally:
         remove(path)
+
+
+@pytest.mark.parametrize("entry", ABOUT)
+def test_an_odd_entry_of_the_metadata_is_one_line_or_read(entry: str, folder: Path) -> None:
+    """By all that reads it."""
+    without_digests(folder)
+    content = json.loads((folder / part_files.METADATA).read_text())
+
+    def look() -> None:
+        dataset = open_dataset(folder)
+        summary(dataset), coverage(dataset), verify(dataset), implied([dataset]), learned(dataset)
+
+    for value in ODD:
+        content["bidex"][entry] = value
+        (folder / part_files.METADATA).write_text(json.dumps(content))
+        one_line_or(look)
 
 
 @pytest.mark.parametrize("kind", NO_FILES)
