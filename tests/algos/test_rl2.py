@@ -388,6 +388,10 @@ def test_the_paper_preset_has_the_numbers_of_table_48():
     assert (paper.gamma, paper.lam, paper.desired_kl, paper.entropy_weight) == (0.9, 0.95, 0.016, 0.0)
 
 
+def test_presets_pass_gradients_through_150_steps_or_whole_trials():
+    assert all(preset.chunk is None or preset.chunk >= 150 for preset in PRESETS.values())
+
+
 def test_the_config_is_shown_without_importing_torch():
     code = "import sys, bidex_algos.meta.rl2_config as m; assert m.PRESETS; sys.exit('torch' in sys.modules)"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
