@@ -26,6 +26,7 @@ help:
 	@echo "make results   fill the tables and pictures of README.md and docs/results/ from results/data/"
 	@echo "make goldens   record the golden trajectories anew: a change of results (docs/reliability.md)"
 	@echo "make docs      build the documentation site into site/ (open site/index.html)"
+	@echo "make witness ARGS=\"plan --task CLASS\"  search actions that solve a task (plan, steady, whole or script; ARGS=-h)"
 	@echo "make dist      build wheel and sdist into dist/, check them, try the wheel alone (docs/releasing.md)"
 	@echo "make format    format the code and mend what ruff can mend"
 	@echo "make bench-gpu-compile, bench-gpu-sweep, bench-gpu-train  measure a GPU (docs/gpu.md)"
@@ -73,6 +74,10 @@ bench-gpu-train: $(INSTALLED)
 
 results: .venv/.installed-dev
 	$(BIN)/python -m bidex_meta.results
+
+.PHONY: witness
+witness: .venv/.installed
+	$(BIN)/python -m tools.witness_search $(ARGS)
 
 lint: .venv/.installed-dev
 	$(BIN)/ruff format --check $(SOURCES)

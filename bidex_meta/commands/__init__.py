@@ -26,7 +26,7 @@ COMMANDS: dict[str, Command] = {
     "list": Command("bidex_meta.commands.list", "the suites, tasks, algos or objects there are"),
     "render": Command("bidex_meta.commands.render", "a picture or a film of a task, or of all of a run"),
     "play": Command("bidex_meta.commands.play_live", "a policy at work, live: in a window or in the browser"),
-    "witness": Command("bidex_meta.commands.witness", "find or replay actions that solve a task"),
+    "witness": Command("bidex_meta.commands.witness", "replay actions that solve a task"),
     "baseline": Command("bidex_meta.commands.baseline", "measure the references of the normalised score"),
     "gallery": Command("bidex_meta.commands.gallery", "write the page that shows every task"),
     "plot": Command("bidex_meta.commands.plot", "learning curves of runs, as a picture"),

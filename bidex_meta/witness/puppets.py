@@ -1,7 +1,7 @@
-"""Hands led to points in closed loop, for witnesses that a script finds where the planner stays in a local optimum.
+"""Hand controllers: a script moves both hands to points in closed loop, by what it reads from sensors.
 
-A script watches the mean of all copies of the start, in which all hands do the same; for a witness they are shifted, so
-that what it does does not depend on one of them. The actions are recorded; played again they need no script.
+A script reads the mean over all copies of the start, and does the same in each of them. Where the copies are slightly
+shifted, what it does depends on none of them alone. The actions are recorded; played again they need no script.
 """
 
 import torch
@@ -10,10 +10,9 @@ from torch import Tensor
 from bidex_meta.hands.hand import ANGULAR_DAMPING, FORCE_PER_SCALE, LINEAR_DAMPING, TORQUE_PER_SCALE, hand
 from bidex_meta.hands.pair import SIDES
 from bidex_meta.maths import conjugate, multiply, quaternion_from_rpy, rotate, xyzw
-from bidex_meta.witness.planner import quantised, rest_action
 from bidex_meta.witness.simulator import Simulator
+from bidex_meta.witness.store import quantised
 
-_COPIES, _SEED = 16, 7
 GAIN = 8.0
 """Speed of a hand over its distance to where it is led, and of its turn over its angle to how it is held, 1/s."""
 _KNUCKLES, _MIDDLES = ("FFJ2", "MFJ2", "RFJ2", "LFJ2"), ("FFJ1", "MFJ1", "RFJ1", "LFJ1")
@@ -21,16 +20,12 @@ _KNUCKLES, _MIDDLES = ("FFJ2", "MFJ2", "RFJ2", "LFJ2"), ("FFJ1", "MFJ1", "RFJ1",
 Point = tuple[float, float, float]
 
 
-def shifted_puppets(name: str, threads: int | None = None) -> "Puppets":
-    """The hands of a class's task 0, in some shifted copies of its start.
-
-    Args:
-        name: The class.
-        threads: Engine threads; None takes all CPUs.
-    """
-    simulator = Simulator(name, _COPIES, threads)
-    simulator.load(simulator.starts(_COPIES - 1, seed=_SEED))
-    return Puppets(simulator)
+def rest_action(size: int) -> Tensor:
+    """The action (size,) that holds zero joint angles and leaves the bases alone."""
+    low, high = (torch.as_tensor(x).float() for x in (hand().control_low, hand().control_high))
+    one = torch.zeros(size // 2)
+    one[: len(low)] = (-(high + low) / (high - low)).clamp(-1.0, 1.0)
+    return one.repeat(2)
 
 
 class Puppets:

@@ -1,4 +1,4 @@
-"""Scripts for the classes that are solved by a sequence the planner does not find on the printed reward.
+"""Scripts for the classes that are solved by a sequence that no search found on the printed reward.
 
 GraspAndPlace: the reward for the block's nearness is flat where the block starts, and a push pays only after the hand
 has followed. StackBlock: both blocks beside each other at the target pay almost as much as the stack. LiftUnderarm: a

@@ -8,14 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from bidex_meta import paths
 from bidex_meta.errors import BidexError, one_line
 from bidex_meta.reading import bounded, check, number, read_bytes, whole
 from bidex_meta.record.atomic import write_atomic
 from bidex_meta.tasks import registry
-from bidex_meta.witness.planner import LEVELS
 
+LEVELS = 127
+"""Actions are whole multiples of 1/127, so that a byte holds one exactly."""
 _MOST_BYTES, _MOST_STEPS = 50_000_000, 100_000
 _MADE = {"return": number(), "first_success": whole(0).or_none(), "rival": number().or_none()}
 """What is read again of how a witness was made."""
@@ -29,6 +31,11 @@ class Witness:
     """Actions (T, action_size), float32, multiples of 1/127."""
     made: dict[str, Any]
     """Return, step of the first success, the best unsuccessful episode seen (``rival``), how it was found, versions."""
+
+
+def quantised(actions: Tensor) -> Tensor:
+    """Actions rounded to multiples of 1/127, float32."""
+    return (actions.clamp(-1.0, 1.0) * LEVELS).round() / LEVELS
 
 
 def witness_path(name: str) -> Path:
@@ -45,14 +52,14 @@ def load_witness(name: str, path: Path | None = None) -> Witness:
     if path is None:
         path = witness_path(name)
         if not path.is_file():
-            raise BidexError(f"{name} has no witness yet. Search one: bidex-meta witness --task {name} --find")
+            raise BidexError(f"{name} has no witness. `bidex-meta witness --all` shows which classes have one.")
         return _read(path)
     if not path.is_file():
-        raise BidexError(f"Expected a file that `bidex-meta witness --find --file` wrote, got {path}, which is none.")
+        raise BidexError(f"Expected a witness file such as {witness_path(name)}, got {path}, which is no file.")
     witness, size = _read(path), registry.get(name, moving_base=True).action_size
     if witness.actions.shape[1] != size:
         told = f"expected actions of shape (steps, {size}), as {name} has, got {witness.actions.shape}"
-        raise BidexError(f"{path}: {told}. Search one: bidex-meta witness --task {name} --find")
+        raise BidexError(f"{path}: {told}. Give a witness of {name}, or leave --file out.")
     return witness
 
 
@@ -76,7 +83,7 @@ def _read(path: Path) -> Witness:
             levels, made = stored["actions"], bounded(json.loads(str(stored["made"])))
     except Exception as error:  # zipfile, zlib and numpy raise a dozen kinds for a damaged file
         reason = one_line(error)[:150].rstrip(".")
-        raise BidexError(f"Expected a witness at {path}, but {reason}. Search it anew: witness --find.") from None
+        raise BidexError(f"Expected a witness at {path}, but {reason}. Copy the file again.") from None
     if levels.dtype != np.int8 or levels.ndim != 2 or not 1 <= len(levels) <= _MOST_STEPS:
         raise BidexError(
             f"{path}: expected actions as bytes, (steps, actions), got {levels.dtype} of shape {levels.shape}."

@@ -30,8 +30,7 @@ FLAGS = {
     "plot": "evaluation out",
     "report": "out",
     "render": "task out policy checkpoint suite seed steps every width height camera",
-    "witness": "task tries file improve steady whole exchange out camera threads planner.samples "
-    "planner.horizon planner.std",
+    "witness": "task file out camera threads",
     "baseline": "suite episodes seed threads runs out",
     "list": "",
     "completion": "",
@@ -43,7 +42,7 @@ SWITCHES = {
     "verify": ["--json"],
     "plot": ["--adaptation"],
     "render": ["--tiled"],
-    "witness": ["--all", "--find", "--script", "--json"],
+    "witness": ["--all", "--json"],
     "bench": ["--learning", "--classes", "--json"],
 }
 PLACED = {

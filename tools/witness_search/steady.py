@@ -6,20 +6,16 @@ kept if more of them succeed, longer, at a higher return, with fewer deep contac
 the replay.
 """
 
-from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
-
 import numpy as np
 import torch
 
-from bidex_meta.witness.config import PlannerConfig
-from bidex_meta.witness.mutants import mutants
-from bidex_meta.witness.planner import interpolation, quantised
 from bidex_meta.witness.simulator import Simulator
+from bidex_meta.witness.store import quantised
+from tools.witness_search.mutants import mutants
+from tools.witness_search.planner import interpolation
 
 _STARTS, _CHANGES, _KEPT = 10, 12, 3
-_STD = 0.15
+_STD, _MUTATED = 0.15, 0.15
 _SPACING = 5
 """Control steps between knots of a change."""
 _SHALLOW = 0.004
@@ -28,15 +24,8 @@ _BLOW = 3.0
 """What a deeper state in every start costs; a start that succeeds is worth 1."""
 
 
-def steadied(
-    name: str,
-    actions: np.ndarray,
-    rounds: int,
-    seed: int = 0,
-    threads: int | None = None,
-    report: Callable[[int, float, float], None] | None = None,
-) -> np.ndarray:
-    """The best episode found, (T, action_size), multiples of 1/127.
+def steadied(name: str, actions: np.ndarray, rounds: int, seed: int = 0, threads: int | None = None) -> np.ndarray:
+    """The best episode found, (T, action_size), multiples of 1/127; prints what each round's best reaches.
 
     Args:
         name: The class.
@@ -44,22 +33,26 @@ def steadied(
         rounds: Rounds of twelve changes, each played from ten shifted starts.
         seed: Of changes and starts.
         threads: Engine threads; None takes all CPUs.
-        report: Called after every round with how many starts succeed, the mean return, and an episode's deep states.
     """
     simulator = Simulator(name, _STARTS * _CHANGES, threads)
     states = [s for s in simulator.starts(_STARTS - 1, seed=100 + seed) for _ in range(_CHANGES)]
     base, generator = torch.from_numpy(actions), torch.Generator().manual_seed(seed)
     knots = len(base) // _SPACING + 1
-    weights, config = interpolation(len(base), knots), replace(PlannerConfig(), std=_STD)
+    weights = interpolation(len(base), knots)
     kept = torch.zeros(1, knots, base.shape[1])
+    depths: list[list[float]] = []
+
+    def measure() -> None:
+        depths.append([simulator.contact_depth(row) for row in range(simulator.num)])
+
     for _ in range(rounds):
-        changes = mutants(kept, _CHANGES, config, generator)
+        changes = mutants(kept, _CHANGES, _STD, _MUTATED, generator)
         changes[0] = kept[0]
         simulator.load(states)
-        depths: list[list[float]] = []
+        depths.clear()
         trace = simulator.play(
             quantised(base[:, None] + torch.einsum("tk,nka->tna", weights, changes)).repeat(1, _STARTS, 1),
-            partial(_measure, simulator, depths),
+            measure,
         )
         solved = trace.success.any(0).view(_STARTS, _CHANGES).double()
         lasting = trace.success.double().mean(0).view(_STARTS, _CHANGES)
@@ -68,12 +61,10 @@ def steadied(
         worth = solved.sum(0) + 4.0 * lasting.mean(0) + 0.01 * returns.mean(0) - _BLOW * deep
         order = worth.argsort(descending=True)
         kept = changes[order[:_KEPT]]
-        if report is not None:
-            report(int(solved.sum(0)[order[0]]), float(returns.mean(0)[order[0]]), float(deep[order[0]]))
+        solved_starts, total, deep_states = (float(each[order[0]]) for each in (solved.sum(0), returns.mean(0), deep))
+        print(
+            f"{solved_starts:.0f} of 10 shifted starts, mean return {total:.3f}, deep states {deep_states:.1f}",
+            flush=True,
+        )
     simulator.close()
     return quantised(base + weights @ kept[0]).numpy()
-
-
-def _measure(simulator: Simulator, depths: list[list[float]]) -> None:
-    """Adds the deepest contact of every row as it stands."""
-    depths.append([simulator.contact_depth(row) for row in range(simulator.num)])

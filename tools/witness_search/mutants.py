@@ -4,13 +4,12 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.hand import hand
-from bidex_meta.witness.config import PlannerConfig
 
 FINEST = 0.05
 """Deviation of the finest changes, as a share of the coarsest ones': large changes find a way, small ones the rest."""
 
 
-def mutants(elites: Tensor, count: int, config: PlannerConfig, generator: torch.Generator) -> Tensor:
+def mutants(elites: Tensor, count: int, std: float, mutated: float, generator: torch.Generator) -> Tensor:
     """So many elites with some of their knots changed, (count, K, a).
 
     Half of them take the left hand's actions from another elite, since what one hand does well seldom depends on the
@@ -21,7 +20,8 @@ def mutants(elites: Tensor, count: int, config: PlannerConfig, generator: torch.
     Args:
         elites: Plans to change, (E, K, a).
         count: How many mutants.
-        config: Its ``std`` and ``mutated``.
+        std: Standard deviation of the coarsest changes.
+        mutated: Share of the actions that change where not one part of the hands does.
         generator: Of the draws.
     """
 
@@ -34,11 +34,11 @@ def mutants(elites: Tensor, count: int, config: PlannerConfig, generator: torch.
     parents = torch.where(crossed, others, parents)
     parts = parts_of_the_hands(size)
     part = parts[torch.randint(len(parts), (count,), generator=generator)][:, None]
-    which = torch.where(uniform(1, 1) < 0.5, uniform(1, size) < config.mutated, part)
+    which = torch.where(uniform(1, 1) < 0.5, uniform(1, size) < mutated, part)
     noise = torch.randn(count, knots, size, generator=generator)
     since = torch.arange(knots)[:, None] >= torch.randint(knots, (count, 1, 1), generator=generator)
     change = torch.where(uniform(1, 1) < 0.5, noise * (uniform(knots, 1) < 0.5), noise[:, :1] * since)
-    return parents + config.std * FINEST ** uniform(1, 1) * which * change
+    return parents + std * FINEST ** uniform(1, 1) * which * change
 
 
 def parts_of_the_hands(size: int) -> Tensor:

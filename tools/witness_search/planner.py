@@ -4,7 +4,6 @@ From the present state it samples action sequences, keeps the best as elites, mo
 after some rounds plays the first steps of the best sequence; the rest warm-starts the next plan.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,15 +11,55 @@ import torch
 from torch import Tensor
 
 from bidex_meta.errors import BidexError
-from bidex_meta.hands.hand import hand
-from bidex_meta.witness.config import PlannerConfig
-from bidex_meta.witness.mutants import FINEST, mutants, parts_of_the_hands
+from bidex_meta.witness.puppets import rest_action
 from bidex_meta.witness.simulator import Simulator, State, Trace
+from bidex_meta.witness.store import quantised
+from tools.witness_search.mutants import FINEST, mutants, parts_of_the_hands
 
 RIVALS = 16
 """Unsuccessful sequences of each plan that are played to the end of the episode."""
-LEVELS = 127
-"""Actions are whole multiples of 1/127, so that a byte holds one exactly."""
+
+
+@dataclass(frozen=True)
+class PlannerConfig:
+    """Settings of the planner."""
+
+    samples: int = 128
+    """Action sequences per round."""
+    copies: int = 1
+    """Slightly shifted states that are played side by side, a divisor of ``samples``: each sequence meets one of them,
+    the best ones of a plan meet all, and their mean counts: no plan that holds by luck."""
+    rounds: int = 3
+    """Rounds per plan."""
+    first_rounds: int = 10
+    """Rounds of the first plan, which has no predecessor."""
+    rounds_after: int = 1
+    """Rounds per plan once the task has been solved."""
+    elite_share: float = 0.08
+    """Share of the sequences that mean and deviation move towards."""
+    kept_elites: int = 8
+    """Elites that are tried again in the next round, and as parents of mutants."""
+    mutants: float = 0.5
+    """Share of the sequences that are an elite with some of its knots changed; the rest is drawn around the mean."""
+    mutated: float = 0.15
+    """Share of the actions that a mutant changes which does not change one part of the hands."""
+    horizon: int = 41
+    """Control steps a plan looks ahead."""
+    knots: int = 9
+    """Knots of a plan; actions between them are interpolated linearly."""
+    execute: int = 10
+    """Control steps played before the next plan; whole spaces between knots keep the rest of the plan as it was."""
+    std: float = 0.5
+    """Deviation of the knots in a first round; a sequence takes a share of it, from all to a twentieth."""
+    min_std: float = 0.12
+    """The deviation never falls below this."""
+    gamma: float = 0.97
+    """Discount per control step."""
+    effort: float = 0.05
+    """Price of a control step of a base's full force or torque, in units of reward. A full force is up to 800 N: for
+    free, a hand soon presses on its table so hard that nothing moves it any more."""
+    seed: int = 0
+    """Of the samples."""
 
 
 @dataclass(frozen=True)
@@ -65,14 +104,10 @@ class Planner:
         self._weights = interpolation(config.horizon, config.knots)
         self._of_bases = ~parts_of_the_hands(self.simulator.action_size)[:2].any(0)
 
-    def search(
-        self, report: Callable[[int, float, bool], None] | None = None, earlier: np.ndarray | None = None
-    ) -> Plan:
-        """Plays one episode, planning as it goes.
+    def search(self, earlier: np.ndarray | None = None) -> Plan:
+        """Plays one episode, planning as it goes, and prints what has been reached after every plan.
 
         Args:
-            report: Called after every plan with the steps played so far, the sum of their rewards, and whether one of
-                them was a success.
             earlier: Actions (T, action_size) of an earlier search: every plan also tries what they did at that time.
         """
         cfg, sim = self.config, self.simulator
@@ -98,8 +133,7 @@ class Planner:
             rewards += trace.rewards[:, 0].tolist()
             success += trace.success[:, 0].tolist()
             solved |= trace.success.any(0)
-            if report is not None:
-                report(len(rewards), sum(rewards), any(success))
+            print(f"step {len(rewards)}, return {sum(rewards):.3f}{', success' if any(success) else ''}", flush=True)
             if not trace.alive[0]:
                 break
             mean = shifted(mean, steps, cfg.horizon)
@@ -159,7 +193,7 @@ class Planner:
     def _sample(self, mean: Tensor, std: Tensor, elites: Tensor) -> Tensor:
         """Knots to try (samples, K, a): the mean, the elites, mutants of the elites, draws around the mean."""
         cfg, random = self.config, self._generator
-        changed = mutants(elites, round(cfg.mutants * cfg.samples), cfg, random)
+        changed = mutants(elites, round(cfg.mutants * cfg.samples), cfg.std, cfg.mutated, random)
         count = cfg.samples - len(changed)
         scale = FINEST ** torch.rand(count, 1, 1, generator=random)
         drawn = mean + std * scale * torch.randn(count, *mean.shape, generator=random)
@@ -200,16 +234,3 @@ def knots_of(actions: np.ndarray, start: int, config: PlannerConfig) -> Tensor:
     """The knots (K, a) of a plan that plays actions (T, a) from some step on; the last one is held."""
     steps = start + torch.linspace(0.0, config.horizon - 1.0, config.knots).round().long()
     return torch.from_numpy(actions)[steps.clamp(max=len(actions) - 1)]
-
-
-def quantised(actions: Tensor) -> Tensor:
-    """Actions rounded to multiples of 1/127, float32."""
-    return (actions.clamp(-1.0, 1.0) * LEVELS).round() / LEVELS
-
-
-def rest_action(size: int) -> Tensor:
-    """The action (size,) that holds zero joint angles and leaves the bases alone."""
-    low, high = (torch.as_tensor(x).float() for x in (hand().control_low, hand().control_high))
-    one = torch.zeros(size // 2)
-    one[: len(low)] = (-(high + low) / (high - low)).clamp(-1.0, 1.0)
-    return one.repeat(2)

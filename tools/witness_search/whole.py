@@ -5,15 +5,14 @@ Here an episode is judged to its end, by its return and by the least of the rewa
 not raise.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from bidex_meta.hands.pair import SIDES
-from bidex_meta.witness.planner import interpolation, quantised
 from bidex_meta.witness.simulator import SEED, Simulator, Trace
+from bidex_meta.witness.store import quantised
+from tools.witness_search.planner import interpolation
 
 _SAMPLES, _ELITES, _KEPT = 256, 14, 10
 _SPACING = 3
@@ -25,15 +24,8 @@ _TURNED = (20, 21, 23, 24)
 """Forces and torques of a base along x and y: a turn by 180 degrees about the vertical reverses them."""
 
 
-def searched(
-    name: str,
-    actions: np.ndarray,
-    rounds: int,
-    seed: int = 0,
-    threads: int | None = None,
-    report: Callable[[int, Trace, int], None] | None = None,
-) -> np.ndarray:
-    """The best episode of the last round, (T, action_size), multiples of 1/127.
+def searched(name: str, actions: np.ndarray, rounds: int, seed: int = 0, threads: int | None = None) -> np.ndarray:
+    """The best episode of the last round, (T, action_size), multiples of 1/127; prints what each round's best reaches.
 
     Args:
         name: The class.
@@ -41,7 +33,6 @@ def searched(
         rounds: Rounds of 256 episodes, in turns from the start and from one that is shifted.
         seed: Of changes and of the shifted start.
         threads: Engine threads; None takes all CPUs.
-        report: Called after every round with its number, what happened, and the best row.
     """
     simulator, generator = Simulator(name, _SAMPLES, threads), torch.Generator().manual_seed(seed)
     steps = simulator.episode_steps
@@ -62,8 +53,9 @@ def searched(
         mean = 0.5 * (mean + chosen.mean(0))
         std = (0.6 * std + 0.4 * chosen.std(0)).clamp(min=_LEAST_STD)
         best = played[:, order[0]]
-        if report is not None:
-            report(number, trace, int(order[0]))
+        total, least = (float(each[:, order[0]].sum()) for each in (trace.rewards, trace.least))
+        solved = int(trace.success.any(0).sum())
+        print(f"round {number}, return {total:.3f}, least term {least:.3f}, {solved} succeed", flush=True)
     simulator.close()
     return best.numpy()
 

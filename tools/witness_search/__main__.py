@@ -1,0 +1,147 @@
+"""``python -m tools.witness_search``: searches actions that solve a task; ``bidex-meta witness`` replays them."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+
+from bidex_meta.errors import BidexError
+from bidex_meta.record.versions import collect_versions
+from bidex_meta.witness.puppets import Puppets
+from bidex_meta.witness.replay import SHIFTED, Replay, replay
+from bidex_meta.witness.scripts import script_of
+from bidex_meta.witness.simulator import Simulator
+from bidex_meta.witness.store import Witness, load_witness, save_witness
+from tools.witness_search.planner import Planner, PlannerConfig
+from tools.witness_search.steady import steadied
+from tools.witness_search.whole import exchanged, searched
+
+
+@dataclass(frozen=True, kw_only=True)
+class Search:
+    """What every search is given, and where it keeps its episode."""
+
+    task: str
+    """Task class."""
+    file: Path | None = None
+    """Keep the episode here, even if it does not hold; None: in witnesses/TASK.npz, if it holds, that is if it solves
+    the task from its start and from eight of ten shifted ones."""
+    threads: int | None = None
+    """Threads of the physics; None: one per core."""
+
+    def keep(self, actions: np.ndarray, made: dict[str, Any], above: float = -float("inf")) -> Replay:
+        """Replays an episode (T, action_size), prints what it reaches, and stores it.
+
+        Args:
+            actions: Of the episode.
+            made: How it was found.
+            above: Return that one which does not hold must exceed to be stored.
+        """
+        result = replay(self.task, Witness(actions, {}), self.threads)
+        print(
+            f"{self.task}: return {result.total:.3f}, first success {result.first_success}, {result.succeeded} of "
+            f"{SHIFTED} shifted starts, deepest contact {1000.0 * result.deepest:.1f} mm"
+        )
+        if result.found or (self.file is not None and result.total > above):
+            made = made | {"return": result.total, "first_success": result.first_success}
+            made |= {"versions": collect_versions()}
+            path = save_witness(self.file or Path("witnesses") / f"{self.task}.npz", actions, made)
+            print(f"{self.task}: stored {path}")
+        return result
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan(Search):
+    """Plan some steps ahead on the printed reward, as the episode goes on."""
+
+    improve: Path | None = None
+    """Start from the episode in this file."""
+    tries: int = 1
+    """Searches with other seeds before giving up."""
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
+    """The planner."""
+
+    def run(self) -> None:
+        """Searches with one seed after another until an episode holds."""
+        earlier = None if self.improve is None else load_witness(self.task, self.improve)
+        rivals: list[float] = []
+        best = -float("inf")
+        for config in (replace(self.planner, seed=self.planner.seed + i) for i in range(self.tries)):
+            plan = Planner(self.task, config, self.threads).search(None if earlier is None else earlier.actions)
+            lost = plan.total if plan.first_success is None else None
+            rivals += [total for total in (plan.rival, lost) if total is not None]
+            made = {"planner": asdict(config), "rival": max(rivals, default=None)}
+            made |= {} if earlier is None else {"improved": earlier.made}
+            result = self.keep(plan.actions, made, above=best)
+            if result.found:
+                return
+            best = max(best, result.total)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Improvement(Search):
+    """What a search that begins with an episode is given."""
+
+    improve: Path
+    """File of the episode to begin with."""
+    rounds: int
+    """Rounds of the search."""
+    seed: int = 0
+    """Of changes and shifted starts."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Steady(Improvement):
+    """Make an episode succeed from more shifted starts, with softer blows, by small changes."""
+
+    def run(self) -> None:
+        """Changes the episode for so many rounds."""
+        earlier = load_witness(self.task, self.improve)
+        actions = steadied(self.task, earlier.actions, self.rounds, self.seed, self.threads)
+        self.keep(actions, earlier.made | {"steadied": {"rounds": self.rounds, "seed": self.seed}})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Whole(Improvement):
+    """Search whole episodes instead of plans that look some steps ahead."""
+
+    exchange: int = 0
+    """The episode is of a throw from right to left: begin with both hands throwing for so many steps, then catching."""
+
+    def run(self) -> None:
+        """Searches for so many rounds; the last round's best counts."""
+        earlier = load_witness(self.task, self.improve)
+        began = exchanged(earlier.actions, self.exchange) if self.exchange else earlier.actions
+        actions = searched(self.task, began, self.rounds, self.seed, self.threads)
+        how = {"rounds": self.rounds, "exchange": self.exchange, "seed": self.seed, "began_with": earlier.made}
+        self.keep(actions, {"rival": None, "whole": how})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Script(Search):
+    """Play the class's script (bidex_meta/witness/scripts.py) in sixteen slightly shifted copies of the start."""
+
+    def run(self) -> None:
+        """Plays the script once."""
+        play, simulator = script_of(self.task), Simulator(self.task, 16, self.threads)
+        simulator.load(simulator.starts(15, seed=7))
+        hands = Puppets(simulator)
+        play(hands)
+        self.keep(np.stack([action.numpy() for action in hands.actions]), {"script": play.__name__, "rival": None})
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Runs the search that the command line names."""
+    search = tyro.cli(Plan | Steady | Whole | Script, args=arguments, description=__doc__, prog="tools.witness_search")
+    try:
+        search.run()
+    except BidexError as error:
+        sys.exit(str(error))
+
+
+if __name__ == "__main__":
+    main()
