@@ -35,7 +35,7 @@ FLAGS = {
     "baseline": "suite episodes seed threads runs out",
     "list": "",
     "completion": "",
-    "bench": "suite task tasks sizes out num-envs steps repeats threads device engine seed minutes algo",
+    "bench": "suite num-envs steps repeats threads device engine seed",
 }
 SWITCHES = {
     "run": ["--print-config", "--no-evaluate"],
@@ -44,7 +44,7 @@ SWITCHES = {
     "plot": ["--adaptation"],
     "render": ["--tiled"],
     "witness": ["--all", "--find", "--script", "--json"],
-    "bench": ["--learning", "--classes", "--json"],
+    "bench": ["--json"],
 }
 PLACED = {
     "list": 1,

@@ -13,19 +13,21 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from bidex_meta.bench.checkout import HERE, checkout, commit_name, recorded
+import tyro
+
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.engine.cpu import default_threads
 from bidex_meta.errors import BidexError
 from bidex_meta.reading import absolute
 from bidex_meta.record.atomic import write_json
 from bidex_meta.record.versions import git_state
+from tools.bench.checkout import HERE, checkout, commit_name, recorded
 
 _ROWS_OF_A_SUITE_OVER_A_CLASS = 4
 
 
-def world_against(
-    against: str,
+def against(
+    other: tyro.conf.Positional[str],
     suite: str = "MT4",
     num_envs: int = 1024,
     steps: int = 40,
@@ -38,7 +40,7 @@ def world_against(
     """Speed of a suite's world, and of its classes alone, beside that of other code on the same interpreter.
 
     Args:
-        against: A commit of the git checkout that this code runs from, a folder with a checkout, or what ``out`` of an
+        other: A commit of the git checkout that this code runs from, a folder with a checkout, or what ``out`` of an
             earlier run took: that run's commit is measured again, and its ratios stand beside the new ones.
         suite: A suite that both know, each by its own file.
         num_envs: Rows of the suite's world; a class alone has a quarter of them.
@@ -61,11 +63,11 @@ def world_against(
     Benchmark(suite, seed=seed)  # a misspelt suite is told before anything is unpacked
     if out is not None and not absolute(out).parent.is_dir():
         raise BidexError(f"--out {out}: expected a file in a folder that exists, {absolute(out).parent} does not.")
-    against, then = recorded(against)
+    other, then = recorded(other)
     setting = {"suite": suite, "num_envs": num_envs, "threads": threads or default_threads(), "steps": steps}
-    with checkout(against) as folder, _Worker(folder) as old, _Worker(HERE) as new:
+    with checkout(other) as folder, _Worker(folder) as old, _Worker(HERE) as new:
         result: dict[str, Any] = {
-            "old": git_state(folder / "bidex_meta") or {"commit": commit_name(against), "dirty": False},
+            "old": git_state(folder / "bidex_meta") or {"commit": commit_name(other), "dirty": False},
             "new": git_state(HERE / "bidex_meta"),
             **setting,
             "table": [],

@@ -6,10 +6,10 @@ from typing import Any
 
 import torch
 
-from bidex_algos.bench.learner import Noise, Ours
 from bidex_algos.nets.products import is_faster_here
 from bidex_algos.onpolicy.mtppo import PRESETS
 from bidex_meta.errors import unknown_name
+from tools.bench.learner import Noise, Ours
 
 ARCHITECTURES = ("shared", "soft_modules", "paco", "moore")
 

@@ -1,7 +1,7 @@
 """What an accelerator gives: speed over the number of rows, memory a row, and where the time of a step goes."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +13,11 @@ from bidex_meta.memory import resident
 from bidex_meta.reading import TABLE, check, exists, read_json
 from bidex_meta.record.atomic import write_json
 from bidex_meta.world import World
+from tools.bench.soak import chosen_learner
 
 _SIZES = (1024, 4096, 16384, 32768)
 _TASKS = ("CatchUnderarm", "BottleCap", "DoorOpenOutward")
 """A thrown egg, a jointed object and a movable fixture."""
-
-MakeLearner = Callable[[World], Any]
-"""Makes a learner on a world; its ``iterate`` collects one rollout and learns from it."""
 
 
 def gpu(
@@ -31,7 +29,7 @@ def gpu(
     engine: str = "auto",
     seed: int = 0,
     out: Path | None = None,
-    make_learner: MakeLearner | None = None,
+    learning: bool = False,
 ) -> dict[str, Any]:
     """Speed of a suite and of single classes over the number of rows.
 
@@ -44,7 +42,7 @@ def gpu(
         engine: As in ``Benchmark.make_world``.
         seed: Seed of worlds and actions.
         out: File that takes each row as it is measured; what is in it is not measured again.
-        make_learner: Where given, training is measured too.
+        learning: Measure training with MT-PPO too.
 
     Returns:
         By subject and rows: ``env_steps_per_s``, ``training_steps_per_s``, ``mb_per_env`` (device memory) and
@@ -57,7 +55,7 @@ def gpu(
         for size in sizes:
             key = f"{subject} {size}"
             if key not in rows:
-                rows[key] = _measured(subject, subject == suite, size, steps, device, engine, seed, make_learner)
+                rows[key] = _measured(subject, subject == suite, size, steps, device, engine, seed, learning)
                 if out is not None:
                     write_json(out, {"setting": setting, "rows": rows})
     ratios = {str(size): _ratio(rows, suite, tasks, size) for size in sizes} if tasks else {}
@@ -102,7 +100,7 @@ def _ratio(rows: dict[str, Any], suite: str, tasks: Sequence[str], size: int) ->
 
 
 def _measured(
-    subject: str, whole: bool, size: int, steps: int, device: str, engine: str, seed: int, make_learner: Any
+    subject: str, whole: bool, size: int, steps: int, device: str, engine: str, seed: int, learning: bool
 ) -> dict[str, Any]:
     before = _memory(device)
     if whole:
@@ -117,8 +115,9 @@ def _measured(
         "mb_per_env": round((_memory(device) - before) / size / 2**20, 3),
         "stages": _stages(made, steps),
     }
-    if make_learner is not None:
-        learner = make_learner(made)
+    if learning:
+        kind, config = chosen_learner("mtppo", device)
+        learner = kind.make(made, config, 0)
         learner.iterate()
         row["training_steps_per_s"] = round(learner.iterate()["Perf/steps_per_second"])
     made.close()
