@@ -15,7 +15,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.record.versions import git_state
 from tools.bench import against, field
 from tools.bench.__main__ import main
-from tools.bench.checkout import HERE, checkout, commit_name, recorded
+from tools.bench.against import HERE, checkout, commit_name, recorded
 
 
 def test_world_against_the_same_code_finds_the_same_physics(
@@ -65,31 +65,15 @@ def test_a_commit_is_unpacked_for_the_time_being() -> None:
     assert commit_name("HEAD") == (git_state(HERE / "bidex_meta") or {})["commit"]
 
 
-@pytest.mark.parametrize(
-    ("given", "expected"),
-    [
-        ("no-such-commit", "expected a folder"),
-        (".", "found no bidex_meta/"),
-        ("note.json", "such a file"),
-        ("dirty.json", "such a file"),
-    ],
-)
-def test_what_is_no_other_code_is_told_in_one_line(
-    given: str, expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("note.json").write_text("[1, 2]")
-    Path("dirty.json").write_text(json.dumps({"old": {"commit": "e0e28c4", "dirty": True}, "table": []}))
-    with pytest.raises(SystemExit, match=expected):
-        main(["against", given])
-
-
 def test_a_file_names_its_commit_and_the_ratios_of_its_run(tmp_path: Path) -> None:
     file = tmp_path / "then.json"
     table = [{"what": "MT4", "ratio": 1.5}, {"what": "HandOver", "ratio": 2.0}]
     file.write_text(json.dumps({"old": {"commit": "e0e28c4", "dirty": False}, "table": table}))
     assert recorded(str(file)) == ("e0e28c4", {"MT4": 1.5, "HandOver": 2.0})
     assert recorded("e0e28c4") == ("e0e28c4", {})
+    file.write_text(json.dumps({"old": {"commit": "e0e28c4", "dirty": True}, "table": []}))
+    with pytest.raises(BidexError, match="not measured against a commit"):
+        recorded(str(file))
 
 
 def test_bench_field_measures_what_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:

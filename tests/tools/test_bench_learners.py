@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from bidex_algos.onpolicy.mtppo import PRESETS
-from bidex_meta.errors import BidexError
 from tools.bench import learner as bench
 from tools.bench import libraries as compared
 from tools.bench.__main__ import main
@@ -97,5 +96,3 @@ def test_bench_multiagent_has_each_learner_with_each_partition() -> None:
         assert 0.0 < row["update_cpu_s"] < row["cpu_s"] < 60.0
         assert row["steps_per_cpu_s"] == pytest.approx(32 / row["cpu_s"], rel=0.05)
         assert row["ratio"] == pytest.approx(rows["mtppo"]["cpu_s"] / row["cpu_s"], rel=0.05)
-    with pytest.raises(BidexError, match="Unknown preset"):
-        multiagent(preset="none")

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from bidex_meta.memory import resident
 from tools.bench.__main__ import main
 from tools.bench.drift import judge
-from tools.bench.soak import soak
+from tools.bench.soak import resident, soak
 
 
 def table(speeds, memory, unstable=0):

@@ -1,5 +1,6 @@
 """Endurance: does the world, or a learner on it, stay as fast and as small as it was, and how often does it break?"""
 
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -13,7 +14,6 @@ from bidex_meta.commands.learners import LearnerKind, choose_preset, learner_kin
 from bidex_meta.commands.parsing import StepCount
 from bidex_meta.engine.cpu import default_threads
 from bidex_meta.errors import BidexError
-from bidex_meta.memory import resident
 from bidex_meta.record.atomic import write_json
 from bidex_meta.sources import Source
 from bidex_meta.world.contract import PooledWorld
@@ -161,6 +161,15 @@ def _sample(clock: _Clock, world: _Counting) -> dict[str, Any]:
     if world.device.type == "cuda":
         sample["gpu_memory_mb"] = round(torch.cuda.memory_reserved(world.device) / 1e6, 2)
     return sample
+
+
+def resident() -> int | None:
+    """Bytes of memory that this process holds now; None where the system does not tell (beside Linux)."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError, IndexError):
+        return None
 
 
 def _line(sample: dict[str, Any]) -> str:

@@ -1,14 +1,12 @@
-"""Speed as ratios within one process."""
+"""Speed of a suite's world over threads, and over that of its classes alone, as ratios within one process."""
 
 import statistics
-import time
 from typing import Any
-
-import torch
 
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.engine.cpu import default_threads
 from bidex_meta.world import Slot, World
+from tools.bench.timing import random_steps
 
 
 def scaling(
@@ -16,24 +14,28 @@ def scaling(
 ) -> dict[str, Any]:
     """Speed of the world over engine threads, repeats interleaved.
 
+    Args:
+        suite: Suite to step.
+        num_envs: Environments.
+        steps: Environment steps of each repeat.
+        repeats: Interleaved repeats; medians are reported.
+        seed: Seed of the worlds.
+
     Returns:
         ``env_steps_per_s`` by number of threads and ``speedup`` against one thread.
     """
-    counts = sorted({1, 2, default_threads()} & set(range(1, default_threads() + 1)))
+    most = default_threads()
     worlds = {
-        n: Benchmark(suite, seed=seed).make_world("train", device="cpu", num_envs=num_envs, threads=n) for n in counts
+        n: Benchmark(suite, seed=seed).make_world("train", device="cpu", num_envs=num_envs, threads=n)
+        for n in sorted({1, min(2, most), most})
     }
-    speeds: dict[int, list[float]] = {n: [] for n in counts}
-    for made in worlds.values():
-        made.reset(seed=seed)
-    for repeat in range(repeats + 1):
-        for n, made in worlds.items():
-            generator = torch.Generator().manual_seed(repeat)
-            start = time.perf_counter()
-            for _ in range(steps):
-                made.step(2.0 * torch.rand(num_envs, made.action_size, generator=generator) - 1.0)
-            if repeat:  # the first one warms up
-                speeds[n].append(num_envs * steps / (time.perf_counter() - start))
+    speeds: dict[int, list[float]] = {n: [] for n in worlds}
+    for world in worlds.values():
+        world.reset(seed=seed)
+        _speed(world, steps)  # warms up
+    for repeat in range(repeats):
+        for n, world in worlds.items():
+            speeds[n].append(_speed(world, steps, repeat))
     median = {n: statistics.median(v) for n, v in speeds.items()}
     return {
         "suite": suite,
@@ -51,32 +53,39 @@ def mixing(
     threads: int | None = None,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Speed of a suite's world against its classes run alone with as many rows.
+    """Speed of a suite's world against its classes run alone with as many environments.
 
     A world that mixes classes should cost no more than their mean: the yardstick is the harmonic mean of the classes'
-    speeds. The mixed world is measured before, among and after the classes, which are built one at a time.
+    speeds. The mixed world is measured after each class; these are built one at a time.
+
+    Args:
+        suite: Suite to step.
+        num_envs: Environments of each world.
+        steps: Environment steps of each repeat.
+        repeats: Repeats of each class; medians are reported.
+        threads: Engine threads; None takes all CPUs.
+        seed: Seed of the worlds.
 
     Returns:
         ``mixed``, ``harmonic_mean`` (environment steps per second), their ``ratio``, and per class ``env_steps_per_s``,
         ``nv``, ``ngeom`` and ``group``, the number of its engine batch in the mixed world.
     """
-    benchmark = Benchmark(suite, seed=seed)
-    full = benchmark.make_world("train", device="cpu", num_envs=num_envs, threads=threads)
+    full = Benchmark(suite, seed=seed).make_world("train", device="cpu", num_envs=num_envs, threads=threads)
     full.reset(seed=seed)
-    mixed, classes = [_speed(full, steps)], {}
+    _speed(full, steps)  # warms up
+    mixed, classes = [], {}
     for i, slot in enumerate(full.slots):
-        part = next(p for p in full.parts if any(m.slot == i for m in p.group.members))
-        model = next(m for m in part.group.members if m.slot == i).scene.model
+        part, member = next((p, m) for p in full.parts for m in p.group.members if m.slot == i)
         alone = World([Slot(slot.name, slot.task_class, slot.tasks)], num_envs, seed=seed, threads=threads)
         alone.reset(seed=seed)
         _speed(alone, 5)
-        speeds = [_speed(alone, steps) for _ in range(repeats)]
+        speed = statistics.median(_speed(alone, steps) for _ in range(repeats))
         alone.close()
         mixed.append(_speed(full, steps))
         classes[slot.name] = {
-            "env_steps_per_s": round(statistics.median(speeds)),
-            "nv": model.nv,
-            "ngeom": model.ngeom,
+            "env_steps_per_s": round(speed),
+            "nv": member.scene.model.nv,
+            "ngeom": member.scene.model.ngeom,
             "group": full.parts.index(part),
         }
     harmonic = statistics.harmonic_mean([row["env_steps_per_s"] for row in classes.values()])
@@ -84,18 +93,13 @@ def mixing(
         "suite": suite,
         "num_envs": num_envs,
         "threads": threads or default_threads(),
-        "mixed": round(statistics.median(mixed[1:])),
+        "mixed": round(statistics.median(mixed)),
         "harmonic_mean": round(harmonic),
-        "ratio": round(statistics.median(mixed[1:]) / harmonic, 4),
+        "ratio": round(statistics.median(mixed) / harmonic, 4),
         "classes": classes,
     }
 
 
-def _speed(made: World, steps: int) -> float:
+def _speed(world: World, steps: int, seed: int = 0) -> float:
     """Environment steps per second under random actions."""
-    generator = torch.Generator().manual_seed(0)
-    actions = [2.0 * torch.rand(made.num_envs, made.action_size, generator=generator) - 1.0 for _ in range(steps)]
-    start = time.perf_counter()
-    for action in actions:
-        made.step(action)
-    return made.num_envs * steps / (time.perf_counter() - start)
+    return world.num_envs * steps / random_steps(world, steps, seed).wall
