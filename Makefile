@@ -15,7 +15,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c const
 SOURCES := bidex_meta algos tools examples tests docs/site
 
 .DEFAULT_GOAL := help
-.PHONY: help run results test test-all test-parity goldens bench-gpu-compile bench-gpu-sweep bench-gpu-train lint format docs dist clean
+.PHONY: help run results test test-all test-parity goldens bench bench-gpu-compile bench-gpu-sweep bench-gpu-train lint format docs dist clean
 .DELETE_ON_ERROR:
 
 help:
@@ -29,6 +29,7 @@ help:
 	@echo "make witness ARGS=\"plan --task CLASS\"  search actions that solve a task (plan, steady, whole or script; ARGS=-h)"
 	@echo "make dist      build wheel and sdist into dist/, check them, try the wheel alone (docs/releasing.md)"
 	@echo "make format    format the code and mend what ruff can mend"
+	@echo "make bench     measure the project itself: make bench ARGS=\"mixing --suite MT20\", ARGS=--help lists what"
 	@echo "make bench-gpu-compile, bench-gpu-sweep, bench-gpu-train  measure a GPU (docs/gpu.md)"
 	@echo "make clean     remove .venv, caches and built files (never runs/)"
 
@@ -54,15 +55,21 @@ OUT ?= gpu-results
 SIZES ?= 1024 4096 16384 32768
 ROWS ?= 8192
 TRAIN_STEPS ?= 60000000
-CLI ?= $(BIN)/bidex-meta
-INSTALLED := $(if $(filter $(BIN)/bidex-meta,$(CLI)),.venv/.installed)
+CLI ?= $(BIN)/python -m bidex_meta.cli
+BENCH := $(CLI:bidex_meta.cli=tools.bench)
+INSTALLED := $(if $(filter $(BIN)/%,$(CLI)),.venv/.installed)
+
+bench bench-gpu-compile bench-gpu-sweep bench-gpu-train: export PYTHONPATH := .:algos:$(PYTHONPATH)
+
+bench: $(INSTALLED)
+	$(BENCH) $(ARGS)
 
 bench-gpu-compile: $(INSTALLED)
-	$(CLI) bench kernels --suite MT20 --device $(DEVICE)
+	$(BENCH) kernels --suite MT20 --device $(DEVICE)
 
 bench-gpu-sweep: $(INSTALLED)
 	mkdir -p $(OUT)
-	$(CLI) bench gpu --suite MT20 --device $(DEVICE) --engine warp --sizes $(SIZES) --learning --out $(OUT)/sweep.json --json
+	$(BENCH) gpu --suite MT20 --device $(DEVICE) --engine warp --sizes $(SIZES) --learning --out $(OUT)/sweep.json --json
 
 # 225 seconds a suite; 124 says that the time was up.
 bench-gpu-train: $(INSTALLED)

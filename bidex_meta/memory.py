@@ -18,15 +18,6 @@ def available() -> int | None:
     return min(found, default=None)
 
 
-def resident() -> int | None:
-    """Bytes of memory that this process holds now; None where the system does not tell (beside Linux)."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-        return pages * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, OSError, ValueError, IndexError):
-        return None
-
-
 def check_memory(needed: float, what: str, mend: str) -> None:
     """Refuses what does not fit.
 

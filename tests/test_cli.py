@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import time
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -408,18 +407,3 @@ def test_list_suites_and_algos_as_json(capsys):
     assert [name for name, row in algos.items() if "arXiv" not in row["summary"]] == []
     assert main(["list", "algos"]) == 0
     assert "mtppo" in capsys.readouterr().out
-
-
-def test_bench_hands_on_the_flags_that_were_given(monkeypatch, capsys):
-    def world(suite="MT4", num_envs=7, threads=None):
-        return {"suite": suite, "num_envs": num_envs, "ratio": 0.93}
-
-    fake = SimpleNamespace(world=world)
-    monkeypatch.setitem(sys.modules, "bidex_meta.bench", fake)
-    monkeypatch.setattr("bidex_meta.bench", fake, raising=False)
-    assert main(["bench", "world", "--suite", "MT1", "--num-envs", "12", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"suite": "MT1", "num_envs": 12, "ratio": 0.93}
-    assert main(["bench", "world"]) == 0
-    assert "0.93" in capsys.readouterr().out
-    assert main(["bench", "world", "--seed", "3"]) == 2
-    assert "takes no --seed" in capsys.readouterr().err

@@ -27,7 +27,7 @@ ORDER = (
     ("bidex_meta",),  # the package's own names
     ("clients", "witness", "data"),
     ("sources",),
-    ("bench", "gallery", "viewer", "report", "sweep"),  # the first two replay witnesses; bench measures clients too
+    ("speed", "gallery", "viewer", "report", "sweep"),  # gallery replays witnesses
     ("results",),
     ("bidex_algos.checks", "bidex_algos.choices", "bidex_algos.reports"),
     ("bidex_algos.gradients", "bidex_algos.experience"),
@@ -35,7 +35,7 @@ ORDER = (
     ("bidex_algos.learner",),
     ("bidex_algos.onpolicy", "bidex_algos.offpolicy"),
     ("bidex_algos.meta", "bidex_algos.multiagent", "bidex_algos.offline"),  # RL² takes PPO's loss
-    ("bidex_algos.single_task", "bidex_algos.start_from", "bidex_algos.bench"),
+    ("bidex_algos.single_task", "bidex_algos.start_from"),
     ("bidex_algos",),
     ("commands",),
     ("cli",),
@@ -51,9 +51,8 @@ MUTUAL = {
 }
 """Modules that import each other all the same."""
 
-TWICE = {"base", "config", "capacity", "episodes", "gallery", "learner", "replay", "starts"}
-"""Names of several modules. ``base`` and ``config`` are a room's own, ``bench.learner`` is called as what it measures;
-the others are older than this rule."""
+TWICE = {"base", "config", "episodes", "gallery", "replay", "starts"}
+"""Names of several modules. ``base`` and ``config`` are a room's own; the others are older than this rule."""
 
 
 def _name(package: str, path: Path) -> str:

@@ -1,13 +1,11 @@
 """Point clouds from the command line: trained on, evaluated, drawn, measured, refused."""
 
 import copy
-import json
 from pathlib import Path
 
 import pytest
 import torch
 
-from bidex_meta import bench
 from bidex_meta.benchmark import Benchmark, make_task_world
 from bidex_meta.cli import main
 from bidex_meta.commands.policies import checkpoint
@@ -126,10 +124,3 @@ def test_a_copy_of_a_world_with_points_goes_on_alike() -> None:
     other = copy.deepcopy(world)
     action = torch.zeros(2, world.action_size)
     assert torch.equal(world.step(action)[0], other.step(action)[0])
-
-
-def test_bench_points_compares_with_states(capsys: pytest.CaptureFixture[str]) -> None:
-    found = bench.points("HandOver", num_envs=4, count=32, steps=2, repeats=2, threads=1)
-    assert found["points"] == 32 and found["frames_per_s"].keys() == {"points", "state"} and 0 < found["ratio"] < 1.5
-    assert main(["bench", "points", "--num-envs", "4", "--count", "8", "--steps", "1", "--repeats", "1", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["task"] == "HandOver"

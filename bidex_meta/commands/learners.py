@@ -61,9 +61,11 @@ ALGOS: dict[str, str] = {
 _NEEDED = ("iterate", "state_dict", "load_state_dict", "policy_state_dict", "load_policy", "per_process")
 
 
-def shared(name: str) -> Any:
-    """No learner's own module: ``start_from`` (another run's policy), ``bench.learner`` and ``bench.adapt`` (speed)."""
-    return importlib.import_module(f"bidex_algos.{name}")
+def start_from(learner: Any, policy: dict[str, Any]) -> None:
+    """Gives a fresh learner the policy of another run's checkpoint (``bidex_algos.start_from``)."""
+    from bidex_algos.start_from import start_from as give
+
+    give(learner, policy)
 
 
 @dataclass(frozen=True)

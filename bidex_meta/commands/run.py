@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from bidex_meta.commands import run_demonstrations, run_offline, run_recording
 from bidex_meta.commands.conditions import conditions
-from bidex_meta.commands.learners import shared
+from bidex_meta.commands.learners import start_from
 from bidex_meta.commands.run_config import RunPlan, plan_run
 from bidex_meta.errors import BidexError
 from bidex_meta.record.folder import check_new, new_folder_name
@@ -184,7 +184,7 @@ def _make(plan: RunPlan, fresh: bool, held: contextlib.ExitStack) -> tuple[Any, 
         start = RunFolder.open(Path(plan.config["start_from"]))
         state, step = checkpoint(start)
         with fitting(start.path):
-            shared("start_from").start_from(learner, state["learner"]["policy"])
+            start_from(learner, state["learner"]["policy"])
         _say(f"Starting from the policy of {plan.config['start_from']} at {step:,} steps.")
     if launch().rank > 0:
         return world, learner, None

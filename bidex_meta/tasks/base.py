@@ -70,10 +70,10 @@ class TaskClass(ABC):
         start_draws: How many uniform numbers the start of an episode takes.
         moving_base: Whether the hands' bases are driven (52 actions) or fixed (40).
         solver: What the class asks of the contact solver.
-        needs: Most contacts and constraint rows that were seen, for mujoco_warp's fixed room: from ``bidex-meta bench
-            capacity --steps 30000``; contacts and rows of 30,208 states under rough actions (half uniform, half held at
-            +-1), candidate and convex pairs in 3,776 of them. Medians of rows lie between 9 and 56. A class that was
-            not measured has the largest of all.
+        needs: Most contacts and constraint rows that were seen, for mujoco_warp's fixed room: from
+            ``python -m tools.bench capacity --steps 30000``; contacts and rows of 30,208 states under rough actions
+            (half uniform, half held at +-1), candidate and convex pairs in 3,776 of them. Medians of rows lie between
+            9 and 56. A class that was not measured has the largest of all.
         camera_target: Point that pictures look at, world, metres.
         camera_distance: Distance of the camera from it, metres.
         depth_camera: Where the camera of point clouds stands and what it looks at, world, metres; None: it looks down

@@ -37,8 +37,6 @@ def working_folder(folder: Path, patch: pytest.MonkeyPatch) -> Path:
     patch.setattr(metaworld_world.MetaWorldWorld, "__init__", built)
     for what in ("draw_learning", "draw_adaptation", "missing"):  # drawing takes a second
         patch.setattr(f"bidex_meta.record.plots.{what}", built)
-    # What these measure is another project's, or trains on made-up numbers.
-    patch.setattr("bidex_meta.commands.bench._measurement", lambda what: lambda suite=None, num_envs=1, steps=1: {})
     return folder
 
 

@@ -34,7 +34,7 @@ FLAGS = {
     "baseline": "suite episodes seed threads runs out",
     "list": "",
     "completion": "",
-    "bench": "suite task tasks sizes out num-envs steps repeats threads device engine seed minutes algo",
+    "bench": "suite num-envs steps repeats threads device engine seed",
 }
 SWITCHES = {
     "run": ["--print-config", "--no-evaluate"],
@@ -43,7 +43,7 @@ SWITCHES = {
     "plot": ["--adaptation"],
     "render": ["--tiled"],
     "witness": ["--all", "--json"],
-    "bench": ["--learning", "--classes", "--json"],
+    "bench": ["--json"],
 }
 PLACED = {
     "list": 1,

@@ -1,6 +1,5 @@
-"""The speed of MT-PPO's update beside that of rsl-rl-lib (Schwarke et al. 2025), an optional package, on the CPU."""
+"""The speed of MT-PPO's update beside that of rsl-rl-lib (Schwarke et al. 2025; the extra ``rsl-rl``), on the CPU."""
 
-import importlib
 import statistics
 import time
 from dataclasses import replace
@@ -14,7 +13,6 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor, nn
 
 from bidex_algos.onpolicy.mtppo import MTPPO, PRESETS, MTPPOConfig
-from bidex_meta.errors import BidexError, unknown_name
 from bidex_meta.world.contract import plain_groups
 from bidex_meta.world.spaces import make_spaces
 
@@ -60,12 +58,7 @@ def learner(
         For each comparison ``ratio`` (seconds of rsl-rl over those of MT-PPO, 1 = as fast, more = MT-PPO is faster),
         ``update_ratio`` (the same without what prepares the batch: values, advantages), the ``seconds`` of both and
         their ``samples_per_s``: samples of the rollout, each of which is learnt from once a pass.
-
-    Raises:
-        BidexError: rsl-rl-lib is not installed, or there is no such preset.
     """
-    if preset not in PRESETS:
-        raise unknown_name("preset", preset, PRESETS)
     full = replace(PRESETS[preset], autocast="off")
     plain = replace(
         full, value_heads=False, per_task_values=False, per_task_advantages=False, normalise_observations=False
@@ -216,17 +209,14 @@ class Theirs:
     Args:
         world: Where rollouts come from.
         config: Of MT-PPO: the same in rsl-rl's words.
-
-    Raises:
-        BidexError: rsl-rl-lib is not installed.
     """
 
     def __init__(self, world: Noise, config: MTPPOConfig):
-        algorithms, models, storage, tensordict = (
-            _load(f"rsl_rl.{name}" if name != "tensordict" else name)
-            for name in ("algorithms", "models", "storage", "tensordict")
-        )
-        self.world, self.steps, self.Observations = world, config.rollout_steps, tensordict.TensorDict
+        from rsl_rl.algorithms import PPO
+        from rsl_rl.models import MLPModel
+        from rsl_rl.storage import RolloutStorage
+
+        self.world, self.steps = world, config.rollout_steps
         self.obs = self._pack(world.reset()[0])
         groups = {"actor": ["all"], "critic": ["all"]}
         actions = world.single_action_space.shape[0]
@@ -241,10 +231,10 @@ class Theirs:
             "std_range": config.std_range,
             "std_type": "log",
         }
-        actor = models.MLPModel(self.obs, groups, "actor", actions, **network, distribution_cfg=gaussian)
-        critic = models.MLPModel(self.obs, groups, "critic", 1, **network)
-        kept = storage.RolloutStorage("rl", world.num_envs, config.rollout_steps, self.obs, [actions])
-        self.ppo = algorithms.PPO(
+        actor = MLPModel(self.obs, groups, "actor", actions, **network, distribution_cfg=gaussian)
+        critic = MLPModel(self.obs, groups, "critic", 1, **network)
+        kept = RolloutStorage("rl", world.num_envs, config.rollout_steps, self.obs, [actions])
+        self.ppo = PPO(
             actor,
             critic,
             kept,
@@ -282,14 +272,6 @@ class Theirs:
         return [*self.ppo.actor.parameters(), *self.ppo.critic.parameters()]
 
     def _pack(self, obs: Tensor) -> Any:
-        return self.Observations({"all": obs}, batch_size=[len(obs)])
+        from tensordict import TensorDict
 
-
-def _load(name: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        raise BidexError(
-            f"bench learner compares with rsl-rl-lib, but {error.name} is not installed. Add it: "
-            "pip install 'bidex-meta[rsl-rl]'."
-        ) from None
+        return TensorDict({"all": obs}, batch_size=[len(obs)])

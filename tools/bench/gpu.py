@@ -1,7 +1,8 @@
-"""What an accelerator gives: speed over the number of rows, memory a row, and where the time of a step goes."""
+"""What an accelerator gives: speed by the number of environments, memory of each, and where a step's time goes."""
 
+import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,17 +10,14 @@ import torch
 
 from bidex_meta.benchmark import Benchmark, make_task_world
 from bidex_meta.errors import BidexError
-from bidex_meta.memory import resident
-from bidex_meta.reading import TABLE, check, exists, read_json
 from bidex_meta.record.atomic import write_json
 from bidex_meta.world import World
+from tools.bench.soak import chosen_learner, resident
+from tools.bench.timing import now, random_steps
 
 _SIZES = (1024, 4096, 16384, 32768)
 _TASKS = ("CatchUnderarm", "BottleCap", "DoorOpenOutward")
 """A thrown egg, a jointed object and a movable fixture."""
-
-MakeLearner = Callable[[World], Any]
-"""Makes a learner on a world; its ``iterate`` collects one rollout and learns from it."""
 
 
 def gpu(
@@ -31,33 +29,34 @@ def gpu(
     engine: str = "auto",
     seed: int = 0,
     out: Path | None = None,
-    make_learner: MakeLearner | None = None,
+    learning: bool = False,
 ) -> dict[str, Any]:
-    """Speed of a suite and of single classes over the number of rows.
+    """Speed of a suite and of single classes over the number of environments.
 
     Args:
         suite: Suite to step.
         tasks: Classes to step alone.
-        sizes: Numbers of rows.
+        sizes: Numbers of environments.
         steps: Control steps of each measurement, after as many to warm up.
         device: Where the worlds live.
         engine: As in ``Benchmark.make_world``.
         seed: Seed of worlds and actions.
         out: File that takes each row as it is measured; what is in it is not measured again.
-        make_learner: Where given, training is measured too.
+        learning: Measure training with MT-PPO too.
 
     Returns:
-        By subject and rows: ``env_steps_per_s``, ``training_steps_per_s``, ``mb_per_env`` (device memory) and
-        ``stages``, milliseconds of a step and of its physics alone. Beside them, for each number of rows, the suite
-        over the harmonic mean of the classes.
+        By subject and size: ``env_steps_per_s``, ``training_steps_per_s``, ``mb_per_env`` (device memory) and
+        ``stages``, milliseconds of a step and of its physics alone. Beside them, for each size, the suite over the
+        harmonic mean of the classes.
     """
-    setting = {"device": device, "engine": engine, "steps": steps, "machine": _machine(device)}
+    machine = "cpu" if device == "cpu" else torch.cuda.get_device_name(device)
+    setting = {"device": device, "engine": engine, "steps": steps, "machine": machine}
     rows = _known(out, setting)
     for subject in (suite, *tasks):
         for size in sizes:
             key = f"{subject} {size}"
             if key not in rows:
-                rows[key] = _measured(subject, subject == suite, size, steps, device, engine, seed, make_learner)
+                rows[key] = _measured(subject, subject == suite, size, steps, device, engine, seed, learning)
                 if out is not None:
                     write_json(out, {"setting": setting, "rows": rows})
     ratios = {str(size): _ratio(rows, suite, tasks, size) for size in sizes} if tasks else {}
@@ -80,17 +79,16 @@ def kernels(suite: str = "MT20", device: str = "cuda:0", engine: str = "warp") -
         start = time.perf_counter()
         made = make_task_world(name, num_envs=8, device=device, engine=engine, moving_base=True)
         made.reset(seed=0)
-        _seconds(made, 1)
+        random_steps(made, 1)
         made.close()
         took[name] = round(time.perf_counter() - start, 1)
     return took
 
 
 def _known(out: Path | None, setting: dict[str, Any]) -> dict[str, Any]:
-    if out is None or not exists(out):
+    if out is None or not out.exists():
         return {}
-    stored = read_json(out, "what bench gpu measured")
-    check(stored, {"setting": TABLE, "rows": TABLE.each()}, out, ("setting", "rows"))
+    stored = json.loads(out.read_text())
     if stored["setting"] != setting:
         raise BidexError(f"Expected {out} to be measured with {setting}, got {stored['setting']}; name another file.")
     return stored["rows"]
@@ -102,7 +100,7 @@ def _ratio(rows: dict[str, Any], suite: str, tasks: Sequence[str], size: int) ->
 
 
 def _measured(
-    subject: str, whole: bool, size: int, steps: int, device: str, engine: str, seed: int, make_learner: Any
+    subject: str, whole: bool, size: int, steps: int, device: str, engine: str, seed: int, learning: bool
 ) -> dict[str, Any]:
     before = _memory(device)
     if whole:
@@ -110,46 +108,30 @@ def _measured(
     else:
         made = make_task_world(subject, num_envs=size, device=device, engine=engine, seed=seed)
     made.reset(seed=seed)
-    _seconds(made, steps)
-    seconds = _seconds(made, steps)
+    random_steps(made, steps)
+    seconds = random_steps(made, steps).wall
     row: dict[str, Any] = {
         "env_steps_per_s": round(size * steps / seconds),
         "mb_per_env": round((_memory(device) - before) / size / 2**20, 3),
         "stages": _stages(made, steps),
     }
-    if make_learner is not None:
-        learner = make_learner(made)
+    if learning:
+        kind, config = chosen_learner("mtppo", device)
+        learner = kind.make(made, config, 0)
         learner.iterate()
         row["training_steps_per_s"] = round(learner.iterate()["Perf/steps_per_second"])
     made.close()
     return row
 
 
-def _seconds(made: World, steps: int) -> float:
-    """Seconds that random steps take."""
-    generator = torch.Generator(made.device).manual_seed(0)
-    shape = steps, made.num_envs, made.action_size
-    actions = 2.0 * torch.rand(shape, generator=generator, device=made.device) - 1.0
-    start = _now(made.device)
-    for action in actions:
-        made.step(action)
-    return _now(made.device) - start
-
-
 def _stages(made: World, steps: int) -> dict[str, float]:
     """Milliseconds of a step, and of its physics alone: the engines again, from where they stand."""
-    took = {"step": 1000.0 * _seconds(made, steps) / steps}
-    start = _now(made.device)
+    took = {"step": 1000.0 * random_steps(made, steps).wall / steps}
+    start = now(made.device)
     for _ in range(steps):
         list(made.step_engines())
-    took["physics"] = 1000.0 * (_now(made.device) - start) / steps
+    took["physics"] = 1000.0 * (now(made.device) - start) / steps
     return {name: round(value, 3) for name, value in took.items()}
-
-
-def _now(device: torch.device) -> float:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return time.perf_counter()
 
 
 def _memory(device: str) -> int:
@@ -160,13 +142,3 @@ def _memory(device: str) -> int:
         free, total = torch.cuda.mem_get_info(device)
         return total - free
     return resident() or 0
-
-
-def _machine(device: str) -> str:
-    try:
-        kind = torch.device(device).type
-    except RuntimeError:
-        kind = device
-    if kind not in ("cpu", "cuda") or (kind == "cuda" and not torch.cuda.is_available()):
-        raise BidexError(f"--device: expected one that is here, got {device}. Add --device cpu, or go where a GPU is.")
-    return torch.cuda.get_device_name(device) if torch.device(device).type == "cuda" else "cpu"

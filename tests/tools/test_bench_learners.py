@@ -1,17 +1,15 @@
 import json
-import sys
 from dataclasses import replace
 
 import pytest
 import torch
 
-from bidex_algos.bench import learner as bench
-from bidex_algos.bench import libraries as compared
-from bidex_algos.bench.adapt import adapt
-from bidex_algos.bench.multiagent import multiagent
 from bidex_algos.onpolicy.mtppo import PRESETS
-from bidex_meta.cli import main
-from bidex_meta.errors import BidexError
+from tools.bench import learner as bench
+from tools.bench import libraries as compared
+from tools.bench.__main__ import main
+from tools.bench.adapt import adapt
+from tools.bench.multiagent import multiagent
 
 TINY = replace(PRESETS["laptop"], hidden=(8, 8), rollout_steps=4, num_minibatches=2, epochs=2, autocast="off")
 
@@ -22,7 +20,7 @@ def test_bench_learner_prints_both_speeds_and_their_ratio(
     pytest.importorskip("rsl_rl")
     before = torch.get_rng_state()
     monkeypatch.setattr(bench, "PRESETS", {"laptop": TINY})
-    assert main(["bench", "learner", "--num-envs", "16", "--threads", "1", "--json"]) == 0
+    main(["learner", "--num-envs", "16", "--threads", "1", "--json"])
     found = json.loads(capsys.readouterr().out)
     assert (found["preset"], found["num_envs"], found["threads"]) == ("laptop", 16, 1)
     for name in ("defaults", "plain"):
@@ -44,12 +42,11 @@ def test_bench_libraries_measures_every_architecture_in_turns(
     monkeypatch.setattr(
         bench.Ours, "seconds", lambda side: (enabled.append(torch.backends.mkldnn.enabled), iterate(side))[1]
     )
-    assert main(["bench", "libraries", "--num-envs", "16", "--repeats", "2", "--json"]) == 0
+    main(["libraries", "--num-envs", "16", "--repeats", "2", "--json"])
     found = json.loads(capsys.readouterr().out)
     assert [row["architecture"] for row in found["table"]] == list(compared.ARCHITECTURES)
     assert all(0.01 < row["ratio"] < 100.0 and row["oneDNN"] > 0.0 for row in found["table"])
     assert enabled == [False, True, True, False, False, True] * 4
-    assert main(["bench", "libraries", "--preset", "laptob"]) == 2
 
 
 @pytest.mark.parametrize("value_heads", [True, False])
@@ -82,27 +79,6 @@ def test_noise_ends_rows_and_shows_their_task() -> None:
     assert reward.std() > 0.9
 
 
-def test_without_rsl_rl_one_line_says_how_to_get_it(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for name in [name for name in sys.modules if name.split(".")[0] == "rsl_rl"]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "rsl_rl", None)
-    assert main(["bench", "learner", "--num-envs", "16"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "pip install 'bidex-meta[rsl-rl]'" in line
-
-
-@pytest.mark.parametrize(
-    ("flags", "says"), [(["--preset", "laptpo"], "Did you mean 'laptop'"), (["--suite", "MT4"], "takes no --suite")]
-)
-def test_bench_learner_refuses_what_it_does_not_know(
-    flags: list[str], says: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["bench", "learner", *flags]) == 2
-    assert says in capsys.readouterr().err
-
-
 def test_adapting_together_gives_what_a_loop_gives():
     found = adapt(num_tasks=3, rollouts=2, steps=4, repeats=1)
     for name in ("point", "hands"):
@@ -120,5 +96,3 @@ def test_bench_multiagent_has_each_learner_with_each_partition() -> None:
         assert 0.0 < row["update_cpu_s"] < row["cpu_s"] < 60.0
         assert row["steps_per_cpu_s"] == pytest.approx(32 / row["cpu_s"], rel=0.05)
         assert row["ratio"] == pytest.approx(rows["mtppo"]["cpu_s"] / row["cpu_s"], rel=0.05)
-    with pytest.raises(BidexError, match="Unknown preset"):
-        multiagent(preset="none")

@@ -1,4 +1,4 @@
-"""The worker of ``bench world --against``: steps the worlds of whatever checkout stands first on its path.
+"""The worker of ``tools.bench.against``: steps the worlds of whatever checkout stands first on its path.
 
 It is started by its own file name and finds another commit's ``bidex_meta`` under that name, so it may use only what
 commit e0e28c4 has too. A command is a line of JSON on stdin, its answer a line of JSON on stdout.

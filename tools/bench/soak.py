@@ -1,5 +1,6 @@
 """Endurance: does the world, or a learner on it, stay as fast and as small as it was, and how often does it break?"""
 
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -9,14 +10,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bidex_meta.bench.drift import judge
+from bidex_meta.commands.learners import LearnerKind, choose_preset, learner_kind
+from bidex_meta.commands.parsing import StepCount
 from bidex_meta.engine.cpu import default_threads
 from bidex_meta.errors import BidexError
-from bidex_meta.memory import resident
 from bidex_meta.record.atomic import write_json
 from bidex_meta.sources import Source
 from bidex_meta.world.contract import PooledWorld
 from bidex_meta.world.wrapper import PooledWorldWrapper
+from tools.bench.drift import judge
 
 _SAMPLE_SECONDS = 60.0
 _FEWEST_SAMPLES = 20
@@ -40,7 +42,7 @@ class _Counting(PooledWorldWrapper):
 
 def soak(
     suite: str = "MT20",
-    steps: int | None = None,
+    steps: StepCount | None = None,
     minutes: float | None = None,
     num_envs: int = 512,
     threads: int | None = None,
@@ -48,8 +50,7 @@ def soak(
     device: str = "cpu",
     engine: str = "auto",
     out: Path | None = None,
-    make_learner: Callable[[PooledWorld], Any] | None = None,
-    mode: str = "SAME_STEP",
+    algo: str | None = None,
 ) -> dict[str, Any]:
     """Steps a suite's training world for long and takes a sample every minute (of a short soak, twenty in all).
 
@@ -63,8 +64,7 @@ def soak(
         device: Where the world lives.
         engine: As in ``Benchmark.make_world``.
         out: File that takes each sample as it is taken, with what all of them say.
-        make_learner: Makes a learner that trains on the world; None: uniform random actions.
-        mode: Autoreset mode of that learner's world.
+        algo: Learner that trains on the world; None: uniform random actions.
 
     Returns:
         ``table``, of each sample the environment steps per second of the wall and of this process's CPU time, resident
@@ -82,11 +82,13 @@ def soak(
     minutes = _MINUTES if minutes is None and steps is None else minutes
     source = Source.open({"suite": suite, "seed": seed, "threads": threads, "device": device, "engine": engine})
     # The wrapper asks the world for what the protocol declares.
+    kind, config = (None, None) if algo is None else chosen_learner(algo, device)
+    mode = "SAME_STEP" if kind is None else kind.autoreset(vars(config))
     world = _Counting(source.world("train", num_envs, mode))  # pyright: ignore[reportAbstractUsage]
-    act = _learning(make_learner(world)) if make_learner is not None else _random(world, seed)
+    act = _random(world, seed) if kind is None else kind.make(world, config, 0).iterate
     result: dict[str, Any] = {
         "suite": suite,
-        "what": "training" if make_learner is not None else "random actions",
+        "what": "random actions" if algo is None else "training",
         "num_envs": num_envs,
         "threads": threads or default_threads(),
         "device": device,
@@ -104,6 +106,12 @@ def soak(
                 write_json(out, result)
     world.close()
     return result
+
+
+def chosen_learner(algo: str, device: str) -> tuple[LearnerKind, Any]:
+    """A learner, and the config that ``--preset auto`` gives it on a device."""
+    kind = learner_kind(algo)
+    return kind, kind.presets[choose_preset(kind, "auto", device)[0]]
 
 
 class _Clock:
@@ -137,10 +145,6 @@ def _random(world: _Counting, seed: int) -> Callable[[], object]:
     return lambda: world.step(2.0 * torch.rand(shape, generator=generator, device=world.device) - 1.0)
 
 
-def _learning(learner: Any) -> Callable[[], object]:
-    return learner.iterate
-
-
 def _sample(clock: _Clock, world: _Counting) -> dict[str, Any]:
     broken = int(world.broken)
     since, wall, cpu, done = clock.taken(world.steps)
@@ -157,6 +161,15 @@ def _sample(clock: _Clock, world: _Counting) -> dict[str, Any]:
     if world.device.type == "cuda":
         sample["gpu_memory_mb"] = round(torch.cuda.memory_reserved(world.device) / 1e6, 2)
     return sample
+
+
+def resident() -> int | None:
+    """Bytes of memory that this process holds now; None where the system does not tell (beside Linux)."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError, IndexError):
+        return None
 
 
 def _line(sample: dict[str, Any]) -> str:

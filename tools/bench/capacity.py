@@ -6,10 +6,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bidex_meta.bench.physics import rough_actions, variants
 from bidex_meta.benchmark import make_task_world
 from bidex_meta.engine.cpu import CpuEngine
 from bidex_meta.world import World
+from tools.bench.stability import rough_actions, variants
 
 _QUANTILES = {"median": 0.5, "q999": 0.999, "q9999": 0.9999, "max": 1.0}
 _SAMPLES_PER_STEP = 32

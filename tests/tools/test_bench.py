@@ -1,59 +1,27 @@
 import json
 import math
+from pathlib import Path
 
 import pytest
 import torch
 
-from bidex_meta import bench
-from bidex_meta.bench import physics, speed
-from bidex_meta.cli import main
 from bidex_meta.tasks import registry
-from tests.world.play import suite_world
-
-
-def test_bench_world_prints_both_speeds_and_their_ratio(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(bench.world, "__defaults__", ("MT4", 1024, 2, 3, None, 0))  # three repeats of two steps
-    assert main(["bench", "world", "--suite", "MT4", "--num-envs", "8", "--threads", "1", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert (found["suite"], found["num_envs"], found["threads"]) == ("MT4", 8, 1)
-    assert sum(found["groups"]) == 8
-    for name in ("env_steps_per_s", "engine_steps_per_s"):
-        assert 10 < found[name] < 1e6
-    assert 0.05 < found["ratio"] < 20.0
-
-
-def test_bench_world_as_a_table(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(bench.world, "__defaults__", ("MT4", 8, 1, 1, 1, 0))
-    assert main(["bench", "world"]) == 0
-    assert "ratio" in capsys.readouterr().out
-
-
-def test_the_bare_engines_do_the_physics_of_the_world() -> None:
-    full, bare = suite_world("MT4", 12), suite_world("MT4", 12)
-    full.reset(seed=0)
-    bare.reset(seed=0)
-    number = full.episodes.number
-    times = speed._paired_steps(full, bare, 60, torch.Generator().manual_seed(0))
-    assert (full.episodes.number > number).any()  # resets are followed
-    assert min(times) > 0.0
-    for a, b in zip(full.parts, bare.parts, strict=True):
-        mine, its = a.group.engine.state_dict(), b.group.engine.state_dict()
-        for name in ("qpos", "qvel", "ctrl", "xfrc_applied"):
-            begun = (full._action == 0).all(dim=1)[a.group.rows]  # a row just begun has not been stepped by either
-            assert torch.equal(mine[name], its[name]) or begun.any(), name
-            assert torch.equal(mine[name][~begun], its[name][~begun]), name
+from tools.bench import stability as physics
+from tools.bench.__main__ import main
+from tools.bench.capacity import capacity
+from tools.bench.points import points
+from tools.bench.speed import mixing, scaling
+from tools.bench.stability import stability
 
 
 def test_bench_scaling_compares_with_one_thread() -> None:
-    found = bench.scaling("MT4", num_envs=8, steps=2, repeats=1)
+    found = scaling("MT4", num_envs=8, steps=2, repeats=1)
     assert found["speedup"]["1"] == 1.0
     assert found["env_steps_per_s"].keys() == found["speedup"].keys()
 
 
 def test_bench_mixing_compares_with_the_classes_alone() -> None:
-    found = bench.mixing("MT4", num_envs=8, steps=2, repeats=1, threads=1)
+    found = mixing("MT4", num_envs=8, steps=2, repeats=1, threads=1)
     assert list(found["classes"]) == ["CatchUnderarm", "HandOver", "CatchAbreast", "TwoCatchUnderarm"]
     slowest, fastest = (f(row["env_steps_per_s"] for row in found["classes"].values()) for f in (min, max))
     assert slowest - 1 <= found["harmonic_mean"] <= fastest + 1
@@ -64,7 +32,7 @@ def test_bench_mixing_compares_with_the_classes_alone() -> None:
 
 
 def test_bench_stability_counts_what_it_saw() -> None:
-    found = bench.stability(task="HandOver", steps=40, num_envs=8, threads=1)
+    found = stability(task="HandOver", steps=40, num_envs=8, threads=1)
     assert list(found) == ["HandOver", "HandOver (fixed base)"]
     for result in found.values():
         assert (result["env_steps"], result["unstable"], result["warnings"]) == (40, 0, 0)
@@ -77,7 +45,7 @@ def test_bench_stability_counts_what_it_saw() -> None:
 @pytest.mark.timeout(900)  # a cold cache of Warp kernels compiles for a minute and more
 @pytest.mark.xdist_group("warp")
 def test_bench_capacity_counts_what_c_and_the_warp_engine_see() -> None:
-    (result,) = bench.capacity(task="CatchUnderarm", steps=24, num_envs=8, threads=1).values()
+    (result,) = capacity(task="CatchUnderarm", steps=24, num_envs=8, threads=1).values()
     assert [result[name]["samples"] for name in ("contacts", "rows", "candidates", "convex")] == [24, 24, 96, 96]
     for counts in result.values():
         assert 0 <= counts["median"] <= counts["q999"] <= counts["q9999"] <= counts["max"]
@@ -87,10 +55,10 @@ def test_bench_capacity_counts_what_c_and_the_warp_engine_see() -> None:
 
 
 def test_stability_of_a_suite_takes_its_classes_of_both_splits_and_that_of_nothing_all() -> None:
-    found = bench.stability("ML4", steps=2, num_envs=2, threads=1)
-    assert list(found) == ["CatchUnderarm", "HandOver", "CatchAbreast", "TwoCatchUnderarm"]
-    found = bench.stability(steps=2, num_envs=2, threads=1)
-    assert sorted(found) == sorted([*registry.names(), "HandOver (fixed base)"])
+    names = [name for name, _ in physics.variants("ML4", None)]
+    assert names == ["CatchUnderarm", "HandOver", "CatchAbreast", "TwoCatchUnderarm"]
+    every = physics.variants(None, None)
+    assert sorted(every) == sorted([*((name, True) for name in registry.names()), ("HandOver", False)])
 
 
 def test_stability_does_not_hold_when_physics_breaks(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -102,7 +70,7 @@ def test_stability_does_not_hold_when_physics_breaks(monkeypatch: pytest.MonkeyP
         return action
 
     monkeypatch.setattr(physics, "rough_actions", broken)
-    result = bench.stability(task="CatchUnderarm", steps=16, num_envs=4, threads=1)["CatchUnderarm"]
+    result = stability(task="CatchUnderarm", steps=16, num_envs=4, threads=1)["CatchUnderarm"]
     assert result["unstable"] == 4 and result["holds"] is False
 
 
@@ -126,9 +94,28 @@ def test_rough_actions_are_half_uniform_half_held_extremes() -> None:
 @pytest.mark.parametrize(("client", "package"), [("sb3", "stable_baselines3"), ("rsl-rl", "rsl_rl")])
 def test_bench_clients_tells_both_sides(client: str, package: str, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip(package, reason=f"needs the extra {client}")
-    arguments = ["bench", "clients", "--client", client, "--num-envs", "4", "--steps", "8", "--repeats", "1", "--json"]
-    assert main([*arguments, "--threads", "1"]) == 0
+    main(f"clients --client {client} --num-envs 4 --steps 8 --repeats 1 --threads 1 --json".split())
     found = json.loads(capsys.readouterr().out)
     for part in (found["rollout"], found["training"]):
         assert part["ratio"] == pytest.approx(part["through_the_adapter"] / part["own_loop"], rel=0.02)
         assert 0.01 < part["ratio"] < 100 and 0.01 < part["cpu_ratio"] < 100
+
+
+def test_bench_points_compares_with_states(capsys: pytest.CaptureFixture[str]) -> None:
+    found = points("HandOver", num_envs=4, count=32, steps=2, repeats=2, threads=1)
+    assert found["points"] == 32 and found["frames_per_s"].keys() == {"points", "state"} and 0 < found["ratio"] < 1.5
+
+
+def test_bench_gpu_measures_no_row_of_its_file_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "sweep.json"
+    words = ["gpu", "--suite", "MT1", "--tasks", "HandOver", "--sizes", "4", "--steps", "2", "--device", "cpu"]
+    main([*words, "--learning", "--out", str(out)])
+    found = json.loads(out.read_text())
+    assert list(found["rows"]) == ["MT1 4", "HandOver 4"] and found["setting"]["machine"] == "cpu"
+    for row in found["rows"].values():
+        assert min(row["env_steps_per_s"], row["training_steps_per_s"]) > 1
+        assert row["stages"]["physics"] > 0.0
+    monkeypatch.setattr("tools.bench.gpu._measured", None)
+    main([*words, "--out", str(out)])
+    with pytest.raises(SystemExit, match="name another file"):
+        main([*words, "--steps", "3", "--out", str(out)])

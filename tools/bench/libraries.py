@@ -6,10 +6,9 @@ from typing import Any
 
 import torch
 
-from bidex_algos.bench.learner import Noise, Ours
 from bidex_algos.nets.products import is_faster_here
 from bidex_algos.onpolicy.mtppo import PRESETS
-from bidex_meta.errors import unknown_name
+from tools.bench.learner import Noise, Ours
 
 ARCHITECTURES = ("shared", "soft_modules", "paco", "moore")
 
@@ -33,12 +32,7 @@ def libraries(
     Returns:
         ``chosen``: whether this machine takes oneDNN; ``table``: for each architecture the seconds of both and their
         ratio, above 1 where oneDNN is faster. Where it is not chosen both are the same, and the ratio is noise.
-
-    Raises:
-        BidexError: There is no such preset.
     """
-    if preset not in PRESETS:
-        raise unknown_name("preset", preset, PRESETS)
     before, table = torch.get_num_threads(), []
     torch.set_num_threads(threads or before)
     try:

@@ -3,12 +3,11 @@
 import statistics
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 
 from bidex_meta.benchmark import make_task_world
-from bidex_meta.errors import unknown_name
 from bidex_meta.world import World
 
 
@@ -21,7 +20,7 @@ class _Pair(NamedTuple):
 
 
 def clients(
-    client: str = "sb3",
+    client: Literal["sb3", "rsl-rl"] = "sb3",
     task: str = "CatchUnderarm",
     num_envs: int = 256,
     steps: int = 16,
@@ -35,7 +34,7 @@ def clients(
     update needs as tensors; both play in turns. 256-256-128 ELU, 4 passes of 4 mini-batches.
 
     Args:
-        client: ``sb3`` or ``rsl-rl``.
+        client: The library, whose extra must be installed.
         task: Task class.
         num_envs: Rows.
         steps: Steps of a rollout.
@@ -47,15 +46,10 @@ def clients(
         ``rollout``: environment steps per second of both while they collect, the ``ratio``, and that of CPU seconds
         (``cpu_ratio``), which other programs disturb less. ``training``: the same with the library's update added to
         both.
-
-    Raises:
-        BidexError: Unknown client, or its extra is not installed.
     """
-    makers = {"sb3": _sb3, "rsl-rl": _rsl_rl}
-    if client not in makers:
-        raise unknown_name("client", client, makers)
+    maker = _sb3 if client == "sb3" else _rsl_rl
     worlds = [make_task_world(task, num_envs, "cpu", seed, threads=threads) for _ in range(2)]
-    pair = makers[client](worlds[0], worlds[1], steps, seed)
+    pair = maker(worlds[0], worlds[1], steps, seed)
     times = [[_seconds(part) for part in pair] for _ in range(repeats + 2)][2:]  # repeats × parts × (wall, CPU)
     library, plain, update = torch.tensor(times, dtype=torch.float64).unbind(1)
     done = num_envs * steps

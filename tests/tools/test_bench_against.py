@@ -1,4 +1,4 @@
-"""``bench world --against`` and ``bench field``: our worlds beside other code's and other people's."""
+"""``against`` and ``field`` of ``python -m tools.bench``: our worlds beside other code's and other people's."""
 
 import json
 from pathlib import Path
@@ -10,13 +10,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from bidex_meta import bench
-from bidex_meta.bench import against, others
-from bidex_meta.bench.checkout import HERE, checkout, commit_name, recorded
-from bidex_meta.cli import main
 from bidex_meta.clients import metaworld_world
 from bidex_meta.errors import BidexError
 from bidex_meta.record.versions import git_state
+from tools.bench import against, field
+from tools.bench.__main__ import main
+from tools.bench.against import HERE, checkout, commit_name, recorded
 
 
 def test_world_against_the_same_code_finds_the_same_physics(
@@ -32,7 +31,7 @@ def test_world_against_the_same_code_finds_the_same_physics(
     monkeypatch.setattr(against._Worker, "ask", noted)
     out = tmp_path / "against.json"
     flags = "--suite MT1 --num-envs 8 --steps 2 --repeats 2 --threads 1 --classes"
-    assert main(["bench", "world", "--against", str(HERE), *flags.split(), "--out", str(out)]) == 0
+    main(["against", str(HERE), *flags.split(), "--out", str(out)])
     assert "1/" in capsys.readouterr().out
     found = json.loads(out.read_text())
     assert (found["suite"], found["num_envs"], found["threads"], found["steps"]) == ("MT1", 8, 1, 2)
@@ -66,56 +65,26 @@ def test_a_commit_is_unpacked_for_the_time_being() -> None:
     assert commit_name("HEAD") == (git_state(HERE / "bidex_meta") or {})["commit"]
 
 
-@pytest.mark.parametrize(
-    ("given", "expected"),
-    [
-        ("no-such-commit", "expected a folder"),
-        ("--all", "expected a folder"),
-        (".", "found no bidex_meta/"),
-        ("note.json", "such a file"),
-        ("dirty.json", "such a file"),
-    ],
-)
-def test_what_is_no_other_code_is_told_in_one_line(
-    given: str, expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("note.json").write_text("[1, 2]")
-    Path("dirty.json").write_text(json.dumps({"old": {"commit": "e0e28c4", "dirty": True}, "table": []}))
-    assert main(["bench", "world", f"--against={given}"]) == 2
-    said = capsys.readouterr().err
-    assert expected in said and said.count("\n") == 1
-
-
-def test_flags_that_do_not_fit_are_told(capsys: pytest.CaptureFixture[str]) -> None:
-    for words, expected in (
-        ("world --classes", "takes no --classes"),
-        ("scaling --against HEAD", "takes no --against"),
-        ("world --against HEAD --repeats 0", "at least 1"),
-        ("world --against HEAD --suite MT5", "Did you mean 'MT4'?"),
-        ("world --against HEAD --out no/such/folder/a.json", "a folder that exists"),
-    ):
-        assert main(["bench", *words.split()]) == 2
-        assert expected in capsys.readouterr().err
-
-
 def test_a_file_names_its_commit_and_the_ratios_of_its_run(tmp_path: Path) -> None:
     file = tmp_path / "then.json"
     table = [{"what": "MT4", "ratio": 1.5}, {"what": "HandOver", "ratio": 2.0}]
     file.write_text(json.dumps({"old": {"commit": "e0e28c4", "dirty": False}, "table": table}))
     assert recorded(str(file)) == ("e0e28c4", {"MT4": 1.5, "HandOver": 2.0})
     assert recorded("e0e28c4") == ("e0e28c4", {})
+    file.write_text(json.dumps({"old": {"commit": "e0e28c4", "dirty": True}, "table": []}))
+    with pytest.raises(BidexError, match="not measured against a commit"):
+        recorded(str(file))
 
 
 def test_bench_field_measures_what_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str) -> Any:
         raise ModuleNotFoundError(name=name)
 
-    monkeypatch.setattr(others, "importlib", SimpleNamespace(import_module=missing))
-    monkeypatch.setattr(others, "_SUITES", ("MT1",))
+    monkeypatch.setattr(field, "importlib", SimpleNamespace(import_module=missing))
+    monkeypatch.setattr(field, "_SUITES", ("MT1",))
     monkeypatch.setattr(metaworld, "_N_GOALS", 2)  # drawing all fifty tasks of a class takes seconds
     monkeypatch.setattr(metaworld_world, "TASKS_PER_CLASS", 2)
-    found = bench.field(num_envs=4, steps=20, repeats=1, seed=1919)  # no other test's tasks stay cached as two
+    found = field.field(num_envs=4, steps=20, repeats=1, seed=1919)  # no other test's tasks stay cached as two
     assert list(found["skipped"]) == ["gymnasium-robotics"]
     theirs, through_ours, ours = found["table"]
     assert [row["rows"] for row in found["table"]] == [10, 10, 4]
@@ -127,7 +96,7 @@ def test_bench_field_measures_what_is_installed(monkeypatch: pytest.MonkeyPatch)
 
 def test_the_mend_of_gymnasium_robotics_lets_joint_types_be_found() -> None:
     utils = SimpleNamespace(mujoco=mujoco)
-    others._mend(utils)
+    field._mend(utils)
     assert np.int32(3) in (utils.mujoco.mjtJoint.mjJNT_HINGE, utils.mujoco.mjtJoint.mjJNT_SLIDE)
     assert utils.mujoco.mj_forward is mujoco.mj_forward
     assert utils.mujoco.mjtObj is mujoco.mjtObj

@@ -11,7 +11,6 @@ from bidex_algos.multiagent import happo, hatrpo, ippo, mappo
 from bidex_algos.onpolicy import mtppo
 from bidex_algos.onpolicy.base import OnPolicy
 from bidex_meta.benchmark import make_task_world
-from bidex_meta.errors import unknown_name
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.world.threads import set_up_torch
 
@@ -49,12 +48,7 @@ def multiagent(
         The setting, and ``table``: for each learner the median of its training ``steps_per_cpu_s``, of the CPU seconds
         of an iteration and of its update alone, and the median ``ratio`` of MT-PPO's iteration over the learner's
         beside it (1: as fast; more: faster), with the least and the most.
-
-    Raises:
-        BidexError: No such task or preset.
     """
-    if preset not in mtppo.PRESETS or any(preset not in presets for _, presets in _LEARNERS.values()):
-        raise unknown_name("preset", preset, ["laptop", "paper"])
     before = torch.get_num_threads()
     world = make_task_world(task, num_envs, device="cpu", seed=seed, autoreset_mode="SAME_STEP", threads=threads)
     try:

@@ -1,31 +1,36 @@
-"""``bench world --against``: the speed of this code's worlds beside that of another commit, side by side in one run.
+"""The speed of this code's worlds beside that of another commit, side by side in one run.
 
 Speeds on a shared machine drift by more than a change gains, so numbers of two runs say little. Here a process for each
 side holds the same world; they take turns, a repeat each, and what counts is the ratio of a pair of repeats.
 """
 
 import contextlib
+import io
 import json
 import os
 import statistics
 import subprocess
 import sys
+import tarfile
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from bidex_meta.bench.checkout import HERE, checkout, commit_name, recorded
-from bidex_meta.benchmark import Benchmark
+import tyro
+
 from bidex_meta.engine.cpu import default_threads
 from bidex_meta.errors import BidexError
-from bidex_meta.reading import absolute
 from bidex_meta.record.atomic import write_json
 from bidex_meta.record.versions import git_state
 
+HERE = Path(__file__).resolve().parents[2]
+"""The checkout that this code runs from."""
 _ROWS_OF_A_SUITE_OVER_A_CLASS = 4
 
 
-def world_against(
-    against: str,
+def against(
+    other: tyro.conf.Positional[str],
     suite: str = "MT4",
     num_envs: int = 1024,
     steps: int = 40,
@@ -38,10 +43,10 @@ def world_against(
     """Speed of a suite's world, and of its classes alone, beside that of other code on the same interpreter.
 
     Args:
-        against: A commit of the git checkout that this code runs from, a folder with a checkout, or what ``out`` of an
+        other: A commit of the git checkout that this code runs from, a folder with a checkout, or what ``out`` of an
             earlier run took: that run's commit is measured again, and its ratios stand beside the new ones.
         suite: A suite that both know, each by its own file.
-        num_envs: Rows of the suite's world; a class alone has a quarter of them.
+        num_envs: Environments of the suite's world; a class alone has a quarter of them.
         steps: Control steps of each repeat, after as many to warm up.
         repeats: Pairs of repeats; medians are reported.
         classes: Measure each class of the suite alone too, as the suite has it.
@@ -56,16 +61,14 @@ def world_against(
         less, and each side's ``physics``, "time step × substeps" of its engine batches.
 
     Raises:
-        BidexError: No such commit or folder, an unknown suite, too few rows, or no folder for ``out``.
+        BidexError: A file that was not measured against a commit, or what either side's code refuses.
+        CalledProcessError: git does not know the commit.
     """
-    Benchmark(suite, seed=seed)  # a misspelt suite is told before anything is unpacked
-    if out is not None and not absolute(out).parent.is_dir():
-        raise BidexError(f"--out {out}: expected a file in a folder that exists, {absolute(out).parent} does not.")
-    against, then = recorded(against)
+    other, then = recorded(other)
     setting = {"suite": suite, "num_envs": num_envs, "threads": threads or default_threads(), "steps": steps}
-    with checkout(against) as folder, _Worker(folder) as old, _Worker(HERE) as new:
+    with checkout(other) as folder, _Worker(folder) as old, _Worker(HERE) as new:
         result: dict[str, Any] = {
-            "old": git_state(folder / "bidex_meta") or {"commit": commit_name(against), "dirty": False},
+            "old": git_state(folder / "bidex_meta") or {"commit": commit_name(other), "dirty": False},
             "new": git_state(HERE / "bidex_meta"),
             **setting,
             "table": [],
@@ -105,6 +108,39 @@ def _pairs(old: "_Worker", new: "_Worker", world: dict[str, Any], steps: int, re
         "old physics": _told(physics[old]),
         "new physics": _told(physics[new]),
     }
+
+
+def recorded(other: str) -> tuple[str, dict[str, float]]:
+    """What to measure against, and where ``out`` of an earlier run was given the ratios that it found."""
+    if not Path(other).is_file():
+        return other, {}
+    found = json.loads(Path(other).read_text())
+    if found["old"]["dirty"] or not found["old"]["commit"]:
+        raise BidexError(f"{other} was not measured against a commit. Name a commit, or a folder with a checkout.")
+    return found["old"]["commit"], {row["what"]: row["ratio"] for row in found["table"]}
+
+
+@contextlib.contextmanager
+def checkout(other: str) -> Iterator[Path]:
+    """The folder of the other code; a commit is unpacked for as long as the block lasts."""
+    with tempfile.TemporaryDirectory(prefix="bidex-meta-") as unpacked:
+        folder = Path(other).resolve()
+        if not folder.is_dir():
+            folder = Path(unpacked).resolve()
+            with tarfile.open(fileobj=io.BytesIO(_git("archive", other))) as archive:
+                archive.extractall(folder, filter="data")
+        yield folder
+
+
+def commit_name(other: str) -> str | None:
+    """The full name of a commit; None for a folder that git does not know."""
+    if Path(other).is_dir():
+        return None
+    return _git("rev-parse", "--verify", f"{other}^{{commit}}").decode().strip()
+
+
+def _git(*arguments: str) -> bytes:
+    return subprocess.run(["git", *arguments], cwd=HERE, stdout=subprocess.PIPE, check=True).stdout
 
 
 def _ratios(old: list[float], new: list[float]) -> list[float]:
@@ -147,5 +183,5 @@ class _Worker:
         line = self._process.stdout.readline()
         found = json.loads(line) if line else {"error": f"its process ended (code {self._process.wait()})"}
         if "error" in found:
-            raise BidexError(f"bench world --against: the code in {self._checkout} cannot {name}: {found['error']}")
+            raise BidexError(f"The code in {self._checkout} cannot {name}: {found['error']}")
         return found["answer"]
