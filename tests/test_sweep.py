@@ -13,9 +13,10 @@ import pytest
 
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
-from bidex_meta.sweep import workers
+from bidex_meta.record import RunFolder
+from bidex_meta.sweep import queue
 from bidex_meta.sweep.plan import PlannedRun, read_sweep
-from bidex_meta.sweep.states import State, seconds_left, span, state_of
+from bidex_meta.sweep.queue import state_of
 from tests.pages import ROOT
 
 FILE = """
@@ -26,13 +27,14 @@ seeds = [0, 1]
 overrides = { steps = 6, num_envs = 8 }
 """
 FAKE = (sys.executable, str(Path(__file__).with_name("fake_run.py")))
+CORES = os.sched_getaffinity(0) if sys.platform == "linux" else {0}
 CONFIG = {"steps": 6, "minutes": None, "num_envs": 8}
 
 
 @pytest.fixture
 def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(workers, "COMMAND", FAKE)
+    monkeypatch.setattr(queue, "COMMAND", FAKE)
     # Configs are `bidex-meta run`'s matter; the stand-in has but a few entries.
     monkeypatch.setattr(
         "bidex_meta.commands.sweep._configs", lambda sweep, _: {run.words: CONFIG for run in sweep.runs}
@@ -47,13 +49,12 @@ def starts(root: Path) -> dict[str, list[dict[str, Any]]]:
     return {path.parent.name: [json.loads(line) for line in path.read_text().splitlines()] for path in found}
 
 
-def through(run: PlannedRun) -> bool:
+def done(run: PlannedRun) -> bool:
     return state_of(run, CONFIG).state == "done"
 
 
 def test_all_runs_end_in_order_and_on_their_core(file: Path, tmp_path: Path, capsys) -> None:
-    free = os.sched_getaffinity(0) if sys.platform == "linux" else {0}
-    core = max(free)
+    core = max(CORES)
     assert main(["sweep", str(file), "--cores", str(core)]) == 0
     out = capsys.readouterr().out
     assert out.count(" done ") == 2 and "2 done, 0 runs, 0 failed, 0 left" in out
@@ -63,7 +64,7 @@ def test_all_runs_end_in_order_and_on_their_core(file: Path, tmp_path: Path, cap
     assert first["at"] < second["at"]
     if sys.platform == "linux":
         assert first["cores"] == second["cores"] == [core]
-        assert os.sched_getaffinity(0) == free, "the sweep itself stays free"
+        assert os.sched_getaffinity(0) == CORES, "the sweep itself stays free"
     assert main(["sweep", str(file)]) == 0 and starts(tmp_path) == begun, "nothing is run twice"
     assert main(["sweep", str(file), "--dry-run"]) == 0
 
@@ -82,7 +83,7 @@ def test_a_run_that_its_return_ended_is_done_at_the_steps_it_made(
     found = state_of(run, config)
     assert (found.state, found.step, found.goal) == ("done", 4, 4)
     (run.path / "evaluation.json").unlink()
-    assert state_of(run, config).state == "left" and seconds_left([state_of(run, config)]) == [0.0]
+    assert state_of(run, config).state == "left" and state_of(run, config).goal == 4
 
 
 def test_a_failure_is_told_stops_no_other_and_is_tried_again(file: Path, tmp_path: Path, capsys) -> None:
@@ -111,13 +112,7 @@ def test_an_arm_starts_from_another_on_the_same_subject_seed_and_value(tmp_path:
     assert len(runs) == 2 * 2 * 2
     for run in runs:
         assert run.after is not None and run.after.name == run.name.replace("-on-", "-ppo-")
-        assert f"--start-from={run.after}" in run.begin and not any("start" in word for word in run.go_on)
-    path.write_text(FILE + "[grid]\nrollouts = [3]\nnum_envs = [9]\n")
-    go_on = read_sweep(path).runs[0].go_on
-    assert "--rollouts=3" in go_on and "--num-envs=9" not in go_on
-    path.write_text(
-        FILE.replace('["HandOver"]', '["HandOver", "Switch"]') + "[grid]\nlearner.gamma = [0.8, 0.9]\n" + STARTING
-    )
+        assert f"--start-from={run.after}" in run.begin
     path.write_text(
         FILE + STARTING.replace('"on"', '"on"\noverrides = { num_envs = 4 }') + "[grid]\nnum_envs = [8, 16]\n"
     )
@@ -127,16 +122,16 @@ def test_an_arm_starts_from_another_on_the_same_subject_seed_and_value(tmp_path:
     with pytest.raises(BidexError, match=r"'ppo', of which there are 0 runs on Switch"):
         read_sweep(path)
     path.write_text(FILE + STARTING.replace('start_from = "ppo"', 'start_from = "on"'))
-    with pytest.raises(BidexError, match=r"arms\[1\].start_from: expected the name of an arm above it \(ppo\)"):
+    with pytest.raises(BidexError, match="'on', of which there are 0 runs on HandOver above it"):
         read_sweep(path)
 
 
 def test_what_starts_from_another_waits_for_it_and_fails_with_it(file: Path, tmp_path: Path, capsys) -> None:
     file.write_text(FILE.replace("[0, 1]", "[13, 1]") + STARTING)
     with pytest.raises(SystemExit, match="1"):
-        main(["sweep", str(file), "--workers", str(min(2, os.cpu_count() or 1))])
+        main(["sweep", str(file), "--workers", str(min(2, len(CORES)))])
     told = capsys.readouterr()
-    assert "HandOver-on-seed13 cannot start from HandOver-ppo-seed13, which has failed" in told.err
+    assert "HandOver-on-seed13 failed: it starts from HandOver-ppo-seed13, which has" in told.err
     assert "2 done, 0 runs, 1 failed, 1 left" in told.out
     first, second = (tmp_path / "runs/tiny" / f"HandOver-{arm}-seed1" for arm in ("ppo", "on"))
     begun = json.loads((second / "starts").read_text())["at"]
@@ -153,11 +148,12 @@ def test_what_starts_from_another_waits_for_it_and_fails_with_it(file: Path, tmp
 def test_a_sweep_that_was_killed_loses_no_run(file: Path, tmp_path: Path, with_workers: bool) -> None:
     """SIGKILL for the sweep, and for its runs or not, which then go on and are waited for."""
     code = (
-        "import sys; from pathlib import Path; from bidex_meta.sweep import workers; from bidex_meta.sweep.plan import "
-        f"read_sweep; from tests.test_sweep import through; workers.COMMAND = {FAKE!r}; "
-        "sys.exit(workers.work(read_sweep(Path('sweep.toml')).runs, [None, None], through, print))"
+        "import sys; from pathlib import Path; from bidex_meta.sweep import queue; from bidex_meta.sweep.plan import "
+        f"read_sweep; queue.COMMAND = {FAKE!r}; "
+        "sys.exit(queue.work(read_sweep(Path('sweep.toml')).runs, [None, None], print))"
     )
     environment = {**os.environ, "FAKE_SECONDS": "0.4", "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "algos")])}
+    Path("runs/tiny").mkdir(parents=True)
     sweep = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL)
     _wait(lambda: len(list(tmp_path.glob("runs/tiny/*/checkpoints/step"))) == 2)
     runs = [int(path.name) for path in Path("/proc").iterdir() if path.name.isdigit() and _parent(path) == sweep.pid]
@@ -171,7 +167,7 @@ def test_a_sweep_that_was_killed_loses_no_run(file: Path, tmp_path: Path, with_w
     begun = starts(tmp_path)
     assert [[start["resumed"] for start in each] for each in begun.values()] == [[False, True] if with_workers else [False]] * 2  # fmt: skip  # noqa: E501
     for run in read_sweep(file).runs:
-        assert through(run) and [row["step"] for row in run.folder.metrics()] == [1, 2, 3, 4, 5, 6]
+        assert done(run) and [row["step"] for row in run.folder.metrics()] == [1, 2, 3, 4, 5, 6]
 
 
 def _parent(process: Path) -> int | None:
@@ -207,7 +203,8 @@ def test_a_sweep_that_is_not_through_is_collected_as_far_as_it_is(
 
 
 def test_one_sweep_works_in_a_folder_and_a_changed_file_is_noticed(file: Path, tmp_path: Path, capsys) -> None:
-    with workers.alone(tmp_path / "runs" / "tiny"):
+    (tmp_path / "runs" / "tiny").mkdir(parents=True)
+    with RunFolder(tmp_path / "runs" / "tiny").locked():
         assert main(["sweep", str(file)]) == 2
         assert "Another sweep works in" in capsys.readouterr().err
     assert main(["sweep", str(file)]) == 0
@@ -219,32 +216,27 @@ def test_one_sweep_works_in_a_folder_and_a_changed_file_is_noticed(file: Path, t
 
 @pytest.mark.parametrize(
     "asked, count, told",
-    [("x", None, "expected numbers"), ("0-1-2", None, "expected numbers"), ("99999", None, "expected some of"),
-     (None, 100_000, "expected at most")],
+    [("x", None, "expected numbers"), ("1-", None, "expected numbers"), ("99999", None, "expected numbers"),
+     ("9" * 5000, None, "expected numbers"), (None, 100_000, "expected at most")],
 )  # fmt: skip
 def test_cores_that_are_not_there(asked: str | None, count: int | None, told: str) -> None:
     with pytest.raises(BidexError, match=told):
-        workers.choose_cores(asked, count)
+        queue.choose_cores(asked, count)
 
 
-def test_how_long_the_rest_takes() -> None:
-    def state(
-        arm: str, subject: str, step: int, seconds: float, goal: int = 100, minutes: float | None = None
-    ) -> State:
-        run = PlannedRun(Path("x"), arm, subject, 0, ())
-        return State(run, "done" if step == goal else "left", step, goal, minutes, seconds)
-
-    states = [
-        state("a", "MT4", 100, 10.0),  # 10 steps/s
-        state("a", "MT4", 0, 0.0),  # as its like: 10 s
-        state("b", "MT4", 50, 10.0),  # its own 5 steps/s: 10 s
-        state("c", "MT4", 0, 0.0),  # mean of the suite's: 13.3 s
-        state("a", "MT20", 0, 0.0, minutes=0.1),  # time ends it: 6 s
-    ]
-    left = seconds_left(states)
-    assert left == [0.0, 10.0, 10.0, pytest.approx(100 / 7.5), 6.0]
-    assert span(left, 1) == pytest.approx(26 + 100 / 7.5) and span(left, 2) == pytest.approx(10 + 100 / 7.5)
-    assert seconds_left([state("a", "MT4", 0, 0.0)]) == [None]
+def test_how_long_the_rest_takes(file: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+    """At the run's own speed, else at the mean of those on its suite; where time ends it, that."""
+    file.write_text(FILE.replace("[0, 1]", "[0, 1, 2]"))
+    run = read_sweep(file).runs[0]
+    run.path.mkdir(parents=True)
+    (run.path / "config.json").write_text(json.dumps({"suite": None, "task": "HandOver", "algo": "ppo", "seed": 0}))
+    (run.path / "metrics.jsonl").write_text('{"step": 3, "Perf/training_time": 3600}\n')
+    assert main(["sweep", str(file), "--status"]) == 0
+    assert "0 done, 0 runs, 0 failed, 3 left; about 5.00 core-hours" in capsys.readouterr().out, "1 h of 2, and 2 · 2 h"
+    timed = {**CONFIG, "minutes": 90.0}
+    monkeypatch.setattr("bidex_meta.commands.sweep._configs", lambda sweep, _: {r.words: timed for r in sweep.runs})
+    assert main(["sweep", str(file), "--status"]) == 0
+    assert "about 3.50 core-hours" in capsys.readouterr().out, "0.5 h, and 2 · 1.5 h"
 
 
 def test_submit_without_submitit_is_one_line(file: Path, monkeypatch, capsys) -> None:
@@ -255,16 +247,15 @@ def test_submit_without_submitit_is_one_line(file: Path, monkeypatch, capsys) ->
 
 def test_jobs_of_the_local_executor(file: Path, tmp_path: Path, monkeypatch, capsys) -> None:
     pytest.importorskip("submitit", reason="needs the extra slurm")
-    from bidex_meta.sweep import cluster
-
     sweep = read_sweep(file)
-    jobs = cluster.submit(sweep.runs, sweep.out, "local", {"timeout_min": 2})
+    sweep.out.mkdir(parents=True)
+    jobs = queue.submit(sweep.runs, sweep.out, "local", {"timeout_min": 2})
     for job in jobs.values():
         assert job.result() is None
-    assert all(through(run) for run in sweep.runs)
+    assert all(done(run) for run in sweep.runs)
     with pytest.raises(BidexError, match="submitit: "):
-        cluster.submit(sweep.runs, sweep.out, "local", {"timeout": 2})
-    again = cluster.Job(sweep.runs[0]).checkpoint()
+        queue.submit(sweep.runs, sweep.out, "local", {"timeout": 2})
+    again = queue.Job(sweep.runs[0], FAKE).checkpoint()
     assert again.function.run == sweep.runs[0]
 
 

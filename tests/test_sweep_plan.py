@@ -40,7 +40,6 @@ def test_seeds_are_outermost_and_words_are_those_of_run(tmp_path: Path) -> None:
         "--learner.no-policy-heads", "--seed=3", "--threads=1",
         "--run-dir=runs/two-words/HandOver-my-arm-gamma=0.9-seed3",
     ]  # fmt: skip
-    assert sweep.runs[4].go_on == ["run", f"--resume={sweep.runs[4].path}", "--steps=1000"]
 
 
 def test_values_with_slashes_make_no_folders(tmp_path: Path) -> None:
@@ -106,7 +105,7 @@ def test_an_arm_may_leave_seeds_out(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "change, told",
     [
-        (("seeds = [0, 1]", "seeds = []"), "seeds: expected a list, each entry a whole number"),
+        (("seeds = [0, 1]", "seeds = []"), "seeds: expected a list, each a whole number"),
         (("seeds = [0, 1]", "seeds = [0, 0]"), "two runs are called HandOver-ppo-seed0"),
         (("algos", "algoss"), "algoss: Unknown entry 'algoss'"),
         (('algos = ["ppo"]', ""), "expected algos"),
@@ -118,7 +117,7 @@ def test_an_arm_may_leave_seeds_out(tmp_path: Path) -> None:
         (("[0, 1]", '[0, 1]\narms = [{ name = "x" }]'), r"arms\[1\].algo: expected it to be there"),
         (
             ("[0, 1]", '[0, 1]\narms = [{ name = "x", algo = "ppo", seeds = [2] }]'),
-            "expected seeds of the file's .0, 1., got",
+            "expected seeds of the file's, got",
         ),
         (("[0, 1]", "[0, 1"), "expected a sweep in TOML"),
     ],

@@ -1,10 +1,12 @@
 """``bidex-meta sweep``: many runs from one file, so many at a time, resumed where they were stopped."""
 
+import math
 import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import mean
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
@@ -13,8 +15,8 @@ from bidex_meta.commands.parsing import Switch, parse
 from bidex_meta.errors import EXIT_FAILED, BidexError
 
 if TYPE_CHECKING:
-    from bidex_meta.sweep.plan import PlannedRun, Sweep
-    from bidex_meta.sweep.states import State
+    from bidex_meta.sweep.plan import Sweep
+    from bidex_meta.sweep.queue import State
 
 
 @dataclass(frozen=True)
@@ -51,41 +53,36 @@ def main(arguments: Sequence[str]) -> None:
         SystemExit: A run has failed (exit code 1).
     """
     flags = parse(SweepFlags, arguments, "sweep")
+    from bidex_meta.record import RunFolder
     from bidex_meta.sweep.plan import read_sweep
-    from bidex_meta.sweep.workers import alone, choose_cores, work
+    from bidex_meta.sweep.queue import choose_cores, state_of, submit, work
 
     sweep = read_sweep(flags.file, flags.out)
     cores = choose_cores(flags.cores, flags.workers)
     configs = _configs(sweep, flags.file)
-    states = _states(sweep, configs)
+    states = [state_of(run, configs[run.words]) for run in sweep.runs]
     if flags.status:
-        _print(states, len(cores))
+        _print(states)
         return
-    left = [state.run for state in states if state.state != "done"]
+    left = [each.run for each in states if each.state != "done"]
     if flags.dry_run:
         for run in left:
             print(shlex.join(["bidex-meta", *run.begin]))
         return
-    with alone(sweep.out):
+    sweep.out.mkdir(parents=True, exist_ok=True)
+    with RunFolder(sweep.out).locked(f"Another sweep works in {sweep.out}. Wait for its end, or stop it."):
         if flags.submit is not None:
-            from bidex_meta.sweep.cluster import submit
-
             unfinished = {run.path for run in left}
-            left = [state.run for state in states if state.state in ("left", "failed")]
-            later = [run for run in left if run.after in unfinished]
-            left = [run for run in left if run not in later]
-            for name, job in submit(left, sweep.out, flags.submit, sweep.slurm).items():
+            idle = [each.run for each in states if each.state in ("left", "failed")]
+            ready = [run for run in idle if run.after not in unfinished]
+            for name, job in submit(ready, sweep.out, flags.submit, sweep.slurm).items():
                 print(f"{name} is job {job.job_id}")
-            if later:
-                _say(f"{len(later)} start from runs that are not through yet: submit again when those are.")
+            if len(ready) < len(idle):
+                _say(f"{len(idle) - len(ready)} start from runs that have not ended: submit again when those have.")
             return
-
-        def through(run: "PlannedRun") -> bool:
-            return _state(run, configs).state == "done"
-
         _say(f"{len(states) - len(left)} of {len(states)} runs are done; {len(cores)} at a time.")
-        failed = work(left, cores, through, lambda text: _say(f"{text}{_rest(sweep, configs, len(cores))}"))
-    _print(_states(sweep, configs), len(cores))
+        failed = work(left, cores, _say)
+    _print([state_of(run, configs[run.words]) for run in sweep.runs])
     if failed:
         _say(f"{failed} failed. Started again, the sweep tries them anew.")
         raise SystemExit(EXIT_FAILED)
@@ -101,53 +98,31 @@ def _configs(sweep: "Sweep", file: Path) -> dict[tuple[str, ...], dict[str, Any]
 
     configs: dict[tuple[str, ...], dict[str, Any]] = {}
     for run in sweep.runs:
-        if run.words in configs:
-            continue
         try:
-            configs[run.words] = plan_run(run.begin[1:]).config
+            configs[run.words] = configs.get(run.words) or plan_run(run.begin[1:]).config
         except BidexError as error:
             raise BidexError(f"{file}: {run.arm} on {run.subject}: {error}") from None
     return configs
 
 
-def _state(run: "PlannedRun", configs: dict[tuple[str, ...], dict[str, Any]]) -> "State":
-    from bidex_meta.sweep.states import state_of
-
-    return state_of(run, configs[run.words])
-
-
-def _states(sweep: "Sweep", configs: dict[tuple[str, ...], dict[str, Any]]) -> "list[State]":
-    return [_state(run, configs) for run in sweep.runs]
-
-
-def _rest(sweep: "Sweep", configs: dict[tuple[str, ...], dict[str, Any]], workers: int) -> str:
-    """What is still to do, for the end of a line."""
-    from bidex_meta.sweep.states import seconds_left, span
-
-    states = _states(sweep, configs)
-    done = sum(state.state == "done" for state in states)
-    seconds = span(seconds_left(states), workers)
-    return f" ({done} of {len(states)} done" + (f"; about {seconds / 3600:.2g} h left)" if seconds else ")")
-
-
-def _print(states: "Sequence[State]", workers: int) -> None:
+def _print(states: "Sequence[State]") -> None:
+    """A line a run; hours left by the run's own speed, else by the mean of those on its suite."""
     from bidex_meta.commands.tables import plain_table, print_table
-    from bidex_meta.sweep.states import seconds_left, span
 
-    left, rows = seconds_left(states), []
-    for state, seconds in zip(states, left, strict=True):
-        goal = f"{state.goal:,}" if state.minutes is None else f"{state.minutes:g} min"
-        speed = "–" if state.speed is None else f"{state.speed:,.0f}"
-        hours = "–" if seconds is None else f"{seconds / 3600:.2f}"
-        rows.append([state.run.name, state.state, f"{state.step:,}", goal, speed, hours, state.why[:120]])
+    rows, total = [], 0.0
+    for each in states:
+        alike = [other.speed for other in states if other.speed and other.run.subject == each.run.subject]
+        speed = each.speed or (mean(alike) if alike else math.nan)
+        seconds = (each.goal - each.step) / speed if each.minutes is None else 60 * each.minutes - each.seconds
+        hours = 0.0 if each.state == "done" else max(seconds / 3600, 0.0)
+        total += 0.0 if math.isnan(hours) else hours
+        goal = f"{each.goal:,}" if each.minutes is None else f"{each.minutes:g} min"
+        cells = [f"{each.step:,}", goal, f"{each.speed:,.0f}", "unknown" if math.isnan(hours) else f"{hours:.2f}"]
+        rows.append([each.run.name, each.state, *cells, each.why[:120] if each.state == "failed" else ""])
     print_table(plain_table(["run", "state", "steps", "of", "steps/s", "hours left", "why"], rows))
-    counts = {name: sum(state.state == name for state in states) for name in ("done", "runs", "failed", "left")}
-    unknown = sum(seconds is None for seconds in left)
-    print(
-        ", ".join(f"{count} {name}" for name, count in counts.items())
-        + f"; about {span(left, workers) / 3600:.2f} h of training left, {workers} at a time"
-        + (f" (without {unknown} of unknown speed)" if unknown else "")
-    )
+    names = [each.state for each in states]
+    counts = ", ".join(f"{names.count(name)} {name}" for name in ("done", "runs", "failed", "left"))
+    print(f"{counts}; about {total:.2f} core-hours of training left")
 
 
 def _say(text: str) -> None:

@@ -1,1 +1,1 @@
-"""Many runs from one file: what they are, how far each has come, who runs them."""
+"""Many runs from one file: which they are, and the queue that runs them."""
