@@ -72,7 +72,7 @@ bench-gpu-train: $(INSTALLED)
 	done
 
 results: .venv/.installed-dev
-	$(BIN)/python -m bidex_meta.results
+	$(BIN)/python -m tools.pages
 
 lint: .venv/.installed-dev
 	$(BIN)/ruff format --check $(SOURCES)

@@ -27,8 +27,7 @@ ORDER = (
     ("bidex_meta",),  # the package's own names
     ("clients", "witness", "data"),
     ("sources",),
-    ("bench", "gallery", "viewer", "report", "sweep"),  # the first two replay witnesses; bench measures clients too
-    ("results",),
+    ("bench", "viewer", "report", "sweep"),  # bench replays witnesses and measures clients too
     ("bidex_algos.checks", "bidex_algos.choices", "bidex_algos.reports"),
     ("bidex_algos.gradients", "bidex_algos.experience"),
     ("bidex_algos.nets",),
@@ -51,7 +50,7 @@ MUTUAL = {
 }
 """Modules that import each other all the same."""
 
-TWICE = {"base", "config", "capacity", "episodes", "gallery", "learner", "replay", "starts"}
+TWICE = {"base", "config", "capacity", "episodes", "learner", "replay", "starts"}
 """Names of several modules. ``base`` and ``config`` are a room's own, ``bench.learner`` is called as what it measures;
 the others are older than this rule."""
 

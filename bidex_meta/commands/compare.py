@@ -25,7 +25,7 @@ class CompareFlags:
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
-    """Run folders, or their files of JSON (`bidex-meta collect`)."""
+    """Run folders, or files of results/data/."""
     json: Switch = False
     """Print JSON."""
     out: Path | None = None

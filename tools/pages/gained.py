@@ -6,7 +6,7 @@ from typing import Any
 
 from bidex_meta.errors import BidexError
 from bidex_meta.record.stored import StoredRun
-from bidex_meta.results.studies import Study, head_of, row_of
+from tools.pages.studies import Study, head_of, row_of
 
 CONTROL = "control"
 """The arm that every other is held against: the same policy to start from and the same adaptation, no meta-training."""

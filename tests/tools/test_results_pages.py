@@ -8,12 +8,12 @@ import pytest
 
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
-from bidex_meta.results.pages import fill
-from bidex_meta.results.studies import read_studies
-from tests import test_collect
 from tests.pages import ROOT
-from tests.test_collect import collect, evaluated
 from tests.test_histories import log
+from tests.tools import test_collect
+from tests.tools.test_collect import collect, evaluated
+from tools.pages.blocks import fill
+from tools.pages.studies import read_studies
 
 no_weights = test_collect.no_weights
 
@@ -127,10 +127,8 @@ def test_rows_by_learners(tmp_path: Path) -> None:
 
 
 def test_the_best_run_of_each_class(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "bidex_meta.results.best.load", lambda kind: {"C": {"success": 0.125}} if kind == "witness" else {}
-    )
-    monkeypatch.setattr("bidex_meta.results.best.registry.names", lambda: ["D"])  # first, though its file is read last
+    monkeypatch.setattr("tools.pages.best.load", lambda kind: {"C": {"success": 0.125}} if kind == "witness" else {})
+    monkeypatch.setattr("tools.pages.best.registry.names", lambda: ["D"])  # first, though its file is read last
     for name, arm, success, value in (("C", "ppo", 0.5, 9.0), ("C", "sac", 0.75, 2.0), ("D", "ppo", 0.0, 3.0)):
         path = test_collect.run(tmp_path, 0, {name: success}, arm, task=f"place/{name}")
         path = path.rename(tmp_path / f"{name}-{arm}-seed0")
@@ -159,7 +157,7 @@ def test_references_are_a_table_without_a_study(tmp_path: Path, monkeypatch: pyt
         "random": {"Switch": {"return": 8696.25, "success": 0.005}},
         "expert": {"Switch": {"return": 9.0, "source": "x"}},
     }
-    monkeypatch.setattr("bidex_meta.results.reference_ends.load", lambda kind: known.get(kind, {}))
+    monkeypatch.setattr("tools.pages.reference_ends.load", lambda kind: known.get(kind, {}))
     page = tmp_path / "page.md"
     page.write_text("<!-- results: show=references -->\n<!-- end -->\n")
     assert fill(page, tmp_path) == [page]

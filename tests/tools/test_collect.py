@@ -1,18 +1,21 @@
 """Runs as files of JSON: what they keep, that tables and pictures take them like folders, and what is refused."""
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
 
+import tools.collect
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import read_groups
 from bidex_meta.record import RunFolder
 from bidex_meta.record.stored import StoredRun, open_run
-from bidex_meta.results import condensing
+from tests.pages import ROOT
 from tests.test_comparison import run
 from tests.test_histories import log
+from tools import condensing
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 
@@ -32,11 +35,16 @@ def evaluated(root: Path, seed: int, success: float, name: str | None = None, ro
 
 @pytest.fixture(autouse=True)
 def no_weights(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bidex_meta.commands.collect._parameters", lambda folder: 12345)
+    monkeypatch.setattr("tools.collect._parameters", lambda folder: 12345)
 
 
 def collect(*words: object) -> int:
-    return main(["collect", *map(str, words)])
+    try:
+        tools.collect.main(list(map(str, words)))
+    except BidexError as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
 
 
 def test_tables_of_files_are_those_of_the_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -87,7 +95,7 @@ def test_curves_give_way_where_there_are_many_classes(tmp_path: Path) -> None:
 
 def test_no_folder_of_this_machine_stays(tmp_path: Path) -> None:
     path, suite = evaluated(tmp_path, 0, 0.5), tmp_path / "own.toml"
-    suite.write_text((Path(__file__).parents[1] / "suites" / "MT4.toml").read_text().replace('"MT4"', '"own"'))
+    suite.write_text((ROOT / "suites" / "MT4.toml").read_text().replace('"MT4"', '"own"'))
     folder = RunFolder.open(path)
     folder.change_config({**folder.config(), "suite": str(suite), "start_from": str(tmp_path / "other")})
     found = json.loads((path / "evaluation.json").read_text())

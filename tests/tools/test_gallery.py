@@ -5,10 +5,10 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 
-from bidex_meta import gallery
 from bidex_meta.tasks import registry
 from bidex_meta.witness.store import Witness
 from tests.tasks.tables import SIZES
+from tools import gallery
 
 
 def sections() -> dict[str, str]:

@@ -3,8 +3,8 @@
 from collections.abc import Iterator
 
 from bidex_meta.evaluation.references import Kind, load
-from bidex_meta.results.studies import head_of, row_of
 from bidex_meta.tasks import registry
+from tools.pages.studies import head_of, row_of
 
 _PLAYED: dict[Kind, str] = {"random": "random", "zero": "zero", "witness": "witness, open loop", "script": "script"}
 

@@ -1,6 +1,6 @@
 """``make results``: every table and picture that pages make of ``results/data``; run from the repository's root.
 
-``python -m bidex_meta.results [--check] [PAGE...]``; with ``--check`` it writes nothing, and ends with exit code 1
+``python -m tools.pages [--check] [PAGE...]``; with ``--check`` it writes nothing, and ends with exit code 1
 where something is not as the data say.
 """
 
@@ -12,7 +12,7 @@ from bidex_meta.errors import EXIT_BAD_INPUT, EXIT_FAILED, BidexError
 
 def main(words: list[str]) -> int:
     """Fill the pages and print what has changed."""
-    from bidex_meta.results.pages import fill
+    from tools.pages.blocks import fill
 
     check = "--check" in words
     named = [Path(word) for word in words if word != "--check"]

@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 
 from bidex_meta.errors import BidexError
-from bidex_meta.results.condensing import _without_places
-from bidex_meta.results.pages import fill
-from tests import test_collect
-from tests.test_collect import collect
 from tests.test_histories import log
+from tests.tools import test_collect
+from tests.tools.test_collect import collect
+from tools.condensing import _without_places
+from tools.pages.blocks import fill
 
 no_weights = test_collect.no_weights
 RANDOM = {"classes": {"C": {"success": 0.0, "return": 2.0}}}

@@ -10,7 +10,7 @@ from bidex_meta.evaluation.comparison import classes_of
 from bidex_meta.evaluation.histories import curves_of
 from bidex_meta.record import plots
 from bidex_meta.record.stored import StoredRun
-from bidex_meta.results.studies import Study, head_of, refuse_differing, row_of
+from tools.pages.studies import Study, head_of, refuse_differing, row_of
 
 
 def rows_table(study: Study) -> Iterator[str]:

@@ -6,8 +6,8 @@ from typing import Any
 from bidex_meta.evaluation.comparison import scored_classes
 from bidex_meta.evaluation.references import load
 from bidex_meta.record.stored import StoredRun
-from bidex_meta.results.studies import Study, head_of, row_of
 from bidex_meta.tasks import registry
+from tools.pages.studies import Study, head_of, row_of
 
 _OF_RUN = ("arm", "seed", "steps", "hours")
 """Columns that tell which of several runs a row is of."""

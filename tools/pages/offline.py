@@ -12,7 +12,7 @@ import numpy as np
 
 from bidex_meta.evaluation.comparison import classes_of, scored_classes
 from bidex_meta.record.stored import StoredRun
-from bidex_meta.results.studies import Study, head_of, refuse_differing, row_of
+from tools.pages.studies import Study, head_of, refuse_differing, row_of
 
 KINDS = ("random", "replay", "medium", "medium-expert", "expert")
 """Order of the rows, as in the paper's table; others follow by their names."""

@@ -1,5 +1,6 @@
-"""The page that shows every task class: written by ``bidex-meta gallery``, so that it cannot contradict the code."""
+"""``python -m tools.gallery`` writes the page of all task classes from their code."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -20,14 +21,13 @@ STRIP = 5
 """Pictures of a witness."""
 _HEAD = """# The task classes
 
-Written by `bidex-meta gallery`; change the classes, not this page. Pictures show the start of the first task; green is
-a goal. Sizes are those of moving bases. d is a distance in metres, r an angle in radians; *left* and *right* are the
-distances of a hand's point (8 cm along the palm, 2 cm out of it) to its point on the object. Variations are drawn
-uniformly and frozen by a task. ML mask: what of a variation reward or success depends on in a given state and only
-masked entries tell, so that a meta suite hides it; where it is nothing, a class asks of a meta-learner no more than of
-any other. Random: mean return and success of uniform actions. Witness: recorded actions that solve
-the first task; the strip shows them at the start, a third and two thirds of the way to the first success, at the first
-success and at the end of the episode.
+Written by `python -m tools.gallery`; change the classes, not this page. Pictures show the start of the first task;
+green is a goal. Sizes are those of moving bases. d is a distance in metres, r an angle in radians; *left* and *right*
+are the distances of a hand's point (8 cm along the palm, 2 cm out of it) to its point on the object. Variations are
+drawn uniformly and fixed by a task. ML mask: variables of the task that affect reward or success but are hidden in ML
+suites; where none is hidden, the class needs no adaptation. Random: mean return and success of uniform actions.
+Witness: recorded actions that solve the first task; the strip shows them at the start, a third and two thirds of the
+way to the first success, at the first success and at the end of the episode.
 """
 
 
@@ -117,3 +117,7 @@ def _witness(name: str) -> str:
 def _variation(space: VariationSpace) -> str:
     parts = zip(space.names, space.low, space.high, strict=True)
     return ", ".join(f"{name} {low:.3g} … {high:.3g}" for name, low, high in parts)
+
+
+if __name__ == "__main__":
+    write(Path(sys.argv[1] if sys.argv[1:] else "docs/tasks.md"))

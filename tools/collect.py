@@ -1,4 +1,4 @@
-"""``bidex-meta collect``: evaluated runs as files of JSON, small enough for a repository."""
+"""Evaluated runs as files of JSON, small enough for a repository."""
 
 import sys
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 class CollectFlags:
     """Keep of each evaluated run a file of JSON: config, versions, thinned curves, evaluation, parameters.
 
-    Example: bidex-meta collect runs/MT4/mtppo/* --into results/data/mystudy
+    Example: python -m tools.collect runs/MT4/mtppo/* --into results/data/mystudy
 
     `bidex-meta compare`, `plot` and `report` take such files like run folders. A file is at most 40 kB.
     """
@@ -42,10 +42,10 @@ def main(arguments: Sequence[str]) -> None:
     """
     flags = parse(CollectFlags, arguments, "collect")
     if not flags.runs or flags.into is None:
-        raise BidexError("Name runs and a folder: bidex-meta collect RUN RUN... --into results/data/STUDY")
+        raise BidexError("Name runs and a folder: python -m tools.collect RUN RUN... --into results/data/STUDY")
     from bidex_meta.record import RunFolder
     from bidex_meta.record.atomic import check_writable, write_atomic
-    from bidex_meta.results.condensing import arm_of, condensed, told
+    from tools.condensing import arm_of, condensed, told
 
     made: dict[Path, bytes] = {}
     changed: list[Path] = []
@@ -112,3 +112,7 @@ def _parameters(folder: "RunFolder") -> int | None:
     agent, _ = load_policy(folder, "cpu")
     module = agent if isinstance(agent, nn.Module) else getattr(agent, "policy", None)
     return sum(each.numel() for each in module.parameters()) if isinstance(module, nn.Module) else None
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -22,12 +22,12 @@ from bidex_meta.errors import BidexError, known_name
 from bidex_meta.reading import is_file, read_text
 from bidex_meta.record import plots
 from bidex_meta.record.atomic import write_atomic
-from bidex_meta.results.best import best_table
-from bidex_meta.results.gained import gains_table
-from bidex_meta.results.offline import offline_table
-from bidex_meta.results.reference_ends import references_table
-from bidex_meta.results.scaling import rows_figure, rows_table
-from bidex_meta.results.studies import Study, arms_table, classes_table, figures, read_studies
+from tools.pages.best import best_table
+from tools.pages.gained import gains_table
+from tools.pages.offline import offline_table
+from tools.pages.reference_ends import references_table
+from tools.pages.scaling import rows_figure, rows_table
+from tools.pages.studies import Study, arms_table, classes_table, figures, read_studies
 
 _BLOCK = re.compile(r"(?P<head><!-- results: (?P<words>[^\n]*?) -->\n)(?P<old>.*?)(?P<end><!-- end -->)", re.DOTALL)
 _OPTIONS = ("study", "show", "on", "split")
