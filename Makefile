@@ -15,7 +15,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c const
 SOURCES := bidex_meta algos tools examples tests docs/site
 
 .DEFAULT_GOAL := help
-.PHONY: help run results test test-all test-parity goldens bench-gpu-compile bench-gpu-sweep bench-gpu-train lint format docs dist clean
+.PHONY: help run results collect experts gallery test test-all test-parity goldens bench-gpu-compile bench-gpu-sweep bench-gpu-train lint format docs dist clean
 .DELETE_ON_ERROR:
 
 help:
@@ -24,6 +24,7 @@ help:
 	@echo "make test-all  the same with the slow tests"
 	@echo "make test-parity  compare both engines on every class (what CI runs too)"
 	@echo "make results   fill the tables and pictures of README.md and docs/results/ from results/data/"
+	@echo "make collect, experts, gallery  keep runs as data, look up experts, write docs/tasks.md (ARGS=\"...\" or ARGS=--help)"
 	@echo "make goldens   record the golden trajectories anew: a change of results (docs/reliability.md)"
 	@echo "make docs      build the documentation site into site/ (open site/index.html)"
 	@echo "make dist      build wheel and sdist into dist/, check them, try the wheel alone (docs/releasing.md)"
@@ -73,6 +74,9 @@ bench-gpu-train: $(INSTALLED)
 
 results: .venv/.installed-dev
 	$(BIN)/python -m tools.pages
+
+collect experts gallery: .venv/.installed-dev
+	$(BIN)/python -m tools.$@ $(ARGS)
 
 lint: .venv/.installed-dev
 	$(BIN)/ruff format --check $(SOURCES)

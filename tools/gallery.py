@@ -1,14 +1,13 @@
 """``python -m tools.gallery`` writes the page of all task classes from their code."""
 
-import sys
 from pathlib import Path
 
 import numpy as np
+import tyro
 
 from bidex_meta.benchmark import make_task_world
 from bidex_meta.evaluation import references
 from bidex_meta.record import video
-from bidex_meta.record.atomic import write_atomic
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.hidden import hidden
@@ -31,21 +30,22 @@ way to the first success, at the first success and at the end of the episode.
 """
 
 
-def write(page: Path, width: int = 360, height: int = 270) -> None:
-    """Writes the page, and the pictures into ``images/tasks/`` beside it.
+def gallery(out: Path = Path("docs/tasks.md"), width: int = 360, height: int = 270) -> None:
+    """Write the page, and the pictures into ``images/tasks/`` beside it.
 
     Args:
-        page: The Markdown file.
+        out: The Markdown file.
         width: Of the pictures, pixels.
         height: Of the pictures, pixels.
     """
     for name in registry.names():
         for view in VIEWS:
-            _picture(name, view, page.parent / _image(name, view), width, height)
+            _picture(name, view, out.parent / _image(name, view), width, height)
         if witness_path(name).is_file():
             strip = _strip(name, load_witness(name), width * 2 // 3, height * 2 // 3)
-            video.write_image(page.parent / _image(name, "witness"), strip)
-    write_atomic(page, lambda file: file.write(text().encode()))
+            video.write_image(out.parent / _image(name, "witness"), strip)
+    out.write_text(text())
+    print(out)
 
 
 def text() -> str:
@@ -120,4 +120,4 @@ def _variation(space: VariationSpace) -> str:
 
 
 if __name__ == "__main__":
-    write(Path(sys.argv[1] if sys.argv[1:] else "docs/tasks.md"))
+    tyro.cli(gallery)

@@ -122,6 +122,5 @@ def _classes(group: "Group", names: Sequence[str]) -> list[list[object]]:
 
 
 def _ranged(estimate: "Estimate", factor: float = 1.0, unit: str = "", sign: bool = False) -> str:
-    form = "+.1f" if sign else ".1f"
-    ends = "–" if estimate.interval is None else ", ".join(f"{factor * end:{form}}" for end in estimate.interval)
-    return f"{factor * estimate.value:{form}}{unit} [{ends}]"
+    told = estimate.text(factor, unit, "+.1f" if sign else ".1f")
+    return told if estimate.interval else f"{told} [–]"

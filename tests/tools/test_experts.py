@@ -34,7 +34,7 @@ def test_the_expert_is_the_best_of_witness_script_and_runs(tmp_path: Path, monke
     for name, row in (("metrics.jsonl", {"step": 1000}), ("versions.json", {"git": {"commit": "c" * 40}})):
         (suite / name).write_text(json.dumps(row) + "\n")
     monkeypatch.setattr(collect, "_parameters", lambda folder: None)
-    collect.main([str(suite), "--into", str(tmp_path / "data")])
+    collect.collect((suite,), into=tmp_path / "data")
     (stored,) = (tmp_path / "data").iterdir()
     out = tmp_path / "expert.json"
     experts.experts((stored, alone), suite="MT4", out=out)

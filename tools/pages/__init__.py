@@ -1,1 +1,1 @@
-"""Results as data: runs condensed to a file of JSON each, and the tables and pictures that pages make of them."""
+"""Tables and pictures that README.md and docs/results make of results/data."""
