@@ -15,7 +15,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c const
 SOURCES := bidex_meta algos tools examples tests docs/site
 
 .DEFAULT_GOAL := help
-.PHONY: help run results test test-all test-parity goldens bench bench-gpu-compile bench-gpu-sweep bench-gpu-train lint format docs dist clean
+.PHONY: help run results collect experts gallery witness test test-all test-parity goldens bench bench-gpu-compile bench-gpu-sweep bench-gpu-train lint format docs dist clean
 .DELETE_ON_ERROR:
 
 help:
@@ -24,6 +24,7 @@ help:
 	@echo "make test-all  the same with the slow tests"
 	@echo "make test-parity  compare both engines on every class (what CI runs too)"
 	@echo "make results   fill the tables and pictures of README.md and docs/results/ from results/data/"
+	@echo "make collect, experts, gallery  keep runs as data, look up experts, write docs/tasks.md (ARGS=\"...\" or ARGS=--help)"
 	@echo "make goldens   record the golden trajectories anew: a change of results (docs/reliability.md)"
 	@echo "make docs      build the documentation site into site/ (open site/index.html)"
 	@echo "make witness ARGS=\"plan --task CLASS\"  search actions that solve a task (plan, steady, whole or script; ARGS=-h)"
@@ -80,9 +81,11 @@ bench-gpu-train: $(INSTALLED)
 	done
 
 results: .venv/.installed-dev
-	$(BIN)/python -m bidex_meta.results
+	$(BIN)/python -m tools.pages
 
-.PHONY: witness
+collect experts gallery: .venv/.installed-dev
+	$(BIN)/python -m tools.$@ $(ARGS)
+
 witness: .venv/.installed
 	$(BIN)/python -m tools.witness_search $(ARGS)
 

@@ -27,8 +27,7 @@ ORDER = (
     ("bidex_meta",),  # the package's own names
     ("clients", "witness", "data"),
     ("sources",),
-    ("speed", "gallery", "viewer", "report", "sweep"),  # gallery replays witnesses
-    ("results",),
+    ("speed", "viewer", "report", "sweep"),
     ("bidex_algos.checks", "bidex_algos.choices", "bidex_algos.reports"),
     ("bidex_algos.gradients", "bidex_algos.experience"),
     ("bidex_algos.nets",),
@@ -51,7 +50,7 @@ MUTUAL = {
 }
 """Modules that import each other all the same."""
 
-TWICE = {"base", "config", "episodes", "gallery", "replay", "starts"}
+TWICE = {"base", "config", "episodes", "replay", "starts"}
 """Names of several modules. ``base`` and ``config`` are a room's own; the others are older than this rule."""
 
 

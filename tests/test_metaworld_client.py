@@ -310,7 +310,6 @@ def test_defaults_follow_the_suite(capsys: pytest.CaptureFixture[str]) -> None:
         ("run --suite metaworld/MT3 --engine warp", "--device cpu"),
         ("run --suite metaworld/MT3 --preset metaworl", "Did you mean 'metaworld'?"),
         ("baseline random --suite metaworld/MT3", "classes of our own"),
-        ("baseline expert --suite metaworld/MT3", "classes of our own"),
         ("render --suite metaworld/MT3 --task reach-v3 --out a.png", "classes of our own"),
     ],
 )

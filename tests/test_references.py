@@ -5,14 +5,12 @@ import pytest
 
 from bidex_meta import paths
 from bidex_meta.cli import main
-from bidex_meta.commands import experts
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import references
 from bidex_meta.evaluation.scores import Reference
 from bidex_meta.sources import Source
 from bidex_meta.sources.source import OwnSuite
 from bidex_meta.tasks import registry
-from bidex_meta.witness.replay import Replay
 from tests.fakes import ToyWorld
 
 
@@ -92,15 +90,13 @@ def test_baseline_measures_every_class_and_stores_what_it_printed(
         assert row["made"]["suite"] == "MT4" and row["made"]["versions"]["packages"]["mujoco"]
 
 
-@pytest.mark.parametrize("what", ["random", "expert"])
 def test_a_baseline_without_out_writes_nothing(
-    what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(OwnSuite, "world", lambda source: ToyWorld(6, "DISABLED", source.seed))
-    monkeypatch.setattr(experts, "best_known", lambda *_: {"HandOver": {"return": 1.0, "source": "a test"}})
     monkeypatch.setattr(references, "write_json", lambda *_: pytest.fail("something was written"))
     monkeypatch.chdir(tmp_path)
-    assert main(["baseline", what, "--suite", "MT4", "--episodes", "1"]) == 0
+    assert main(["baseline", "random", "--suite", "MT4", "--episodes", "1"]) == 0
     assert capsys.readouterr().out and list(tmp_path.iterdir()) == []
 
 
@@ -117,51 +113,6 @@ def test_an_unknown_baseline_names_the_known_ones(capsys: pytest.CaptureFixture[
     assert "Did you mean 'random'?" in capsys.readouterr().err
 
 
-def evaluated_run(path: Path, task: str | None, suite: str | None, returns: dict[str, float]) -> Path:
-    path.mkdir()
-    config = {"task": task, "suite": suite, "algo": "mtppo", "steps": 1000, "seed": 3, "num_envs": 8, "learner": {}}
-    (path / "config.json").write_text(json.dumps(config))
-    classes = {name: {"success": 0.5, "return": value, "score": None} for name, value in returns.items()}
-    (path / "evaluation.json").write_text(json.dumps({"policy": {"classes": classes}}))
-    return path
-
-
-def test_the_expert_is_the_best_of_witness_script_and_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    totals = {"HandOver": 40.0, "CatchAbreast": 5.0, "CatchUnderarm": 90.0}
-    monkeypatch.setattr(experts, "witness_path", lambda name: Path(__file__) if name in totals else tmp_path / "none")
-    monkeypatch.setattr(experts, "load_witness", lambda name: name)
-    # CatchUnderarm's no longer holds: only three of ten shifted starts succeed.
-    monkeypatch.setattr(
-        experts, "replay", lambda name, *_: Replay(totals[name], 1, 3 if name == "CatchUnderarm" else 9, 0.0)
-    )
-    scripts = {name: {"return": value} for name, value in (("HandOver", 39.0), ("TwoCatchUnderarm", 7.0))}
-    monkeypatch.setattr(experts, "load", lambda kind: scripts if kind == "script" else {})
-    suite = evaluated_run(tmp_path / "a", None, "MT4", {"HandOver": 30.0, "CatchAbreast": 20.0})
-    alone = evaluated_run(tmp_path / "b", "CatchAbreast", None, {"CatchAbreast": 12.0})
-    for name, row in (("metrics.jsonl", {"step": 1000}), ("versions.json", {"git": {"commit": "c" * 40}})):
-        (suite / name).write_text(json.dumps(row) + "\n")
-    monkeypatch.setattr("bidex_meta.commands.collect._parameters", lambda folder: None)
-    assert main(["collect", str(suite), "--into", str(tmp_path / "data")]) == 0
-    (stored,) = (tmp_path / "data").iterdir()
-    capsys.readouterr()
-    out = tmp_path / "expert.json"
-    words = ["baseline", "expert", "--suite", "MT4", "--runs", str(stored), str(alone), "--out", str(out), "--json"]
-    assert main(words) == 0
-    assert json.loads(capsys.readouterr().out) == {
-        "HandOver": {"return": 40.0, "source": "witness, task 0"},
-        "CatchAbreast": {"return": 20.0, "source": "mtppo on MT4, 1,000 steps, seed 3"},
-        "TwoCatchUnderarm": {"return": 7.0, "source": "script"},
-    }
-    assert json.loads(out.read_text())["classes"]["HandOver"]["return"] == 40.0
-
-
-def test_a_run_on_fixed_bases_is_no_expert_of_a_suite(tmp_path: Path) -> None:
-    with pytest.raises(BidexError, match="moving bases"):
-        experts.best_known([], [evaluated_run(tmp_path / "a", "HandOver", None, {"HandOver": 30.0})])
-
-
 def test_a_suite_with_fixed_bases_neither_has_nor_makes_references(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -172,10 +123,3 @@ def test_a_suite_with_fixed_bases_neither_has_nor_makes_references(
     assert Source.open({"suite": "MT1"}).references().keys() >= {"CatchUnderarm"}
     assert main(["baseline", "zero", "--suite", str(suite), "--out", str(tmp_path / "zero.json")]) == 2
     assert 'base = "moving"' in capsys.readouterr().err and not (tmp_path / "zero.json").exists()
-
-
-def test_a_meta_test_is_no_expert(tmp_path: Path) -> None:
-    run = evaluated_run(tmp_path / "a", None, "ML4", {})
-    (run / "evaluation.json").write_text(json.dumps({"splits": {}}))
-    with pytest.raises(BidexError, match="meta-test"):
-        experts.best_known([], [run])

@@ -18,6 +18,7 @@ from bidex_meta.sweep import queue
 from bidex_meta.sweep.plan import PlannedRun, read_sweep
 from bidex_meta.sweep.queue import state_of
 from tests.pages import ROOT
+from tools import collect
 
 FILE = """
 name = "tiny"
@@ -187,16 +188,16 @@ def _wait(so: Any, seconds: float = 60.0) -> None:
 def test_a_sweep_that_is_not_through_is_collected_as_far_as_it_is(
     file: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:
-    monkeypatch.setattr("bidex_meta.commands.collect._parameters", lambda folder: 1)
-    collect = ["collect", "sweep.toml", "--into", "data"]
-    assert main(collect) == 2 and "no run of it has ended" in capsys.readouterr().err
+    monkeypatch.setattr("tools.collect._parameters", lambda folder: 1)
+    with pytest.raises(BidexError, match="no run of it has ended"):
+        collect.collect((file,), into=Path("data"))
     assert main(["sweep", str(file)]) == 0
     file.write_text(FILE.replace("[0, 1]", "[0, 1, 2]"))
     runs = read_sweep(file).runs[:2]
     for run in runs:
         (run.path / "versions.json").write_text('{"git": {"commit": "0123456789"}}')
     capsys.readouterr()
-    assert main(collect) == 0
+    collect.collect((file,), into=Path("data"))
     told = capsys.readouterr()
     assert told.out.split() == [f"data/{run.name}.json" for run in runs] and "1 of 3 runs have not ended" in told.err
     assert json.loads(Path(told.out.split()[0]).read_text())["arm"] == "ppo"

@@ -34,10 +34,10 @@ class BaselineFlags:
     with the worst finished one of its class, elsewhere with what is stored of random actions.
     """
 
-    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="random|zero|witness|script|expert")]
+    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="random|zero|witness|script")]
     """random: uniform actions; zero: the action 0, joints held in the middle of their range and bases at rest;
     witness: the actions that solve task 0 of a class, in all its tasks; script: hands that a script leads, which knows
-    the whole state (seven classes have one); expert: per class the best of witness, script and the runs given."""
+    the whole state (seven classes have one)."""
     suite: str = "MT20"
     """Suite whose train tasks are played."""
     episodes: int = 4
@@ -46,8 +46,6 @@ class BaselineFlags:
     """Seed of tasks, starts and actions."""
     threads: int | None = None
     """Threads of the physics; None: one per core."""
-    runs: tuple[Path, ...] = ()
-    """expert: trained policies: run folders, or files of results/data/."""
     out: Path | None = None
     """JSON file that takes the figures, beside those it has of other classes; None: print them alone. `evaluate` reads
     assets/references/ of the installation, which is not written unless this names it."""
@@ -58,32 +56,13 @@ class BaselineFlags:
 def main(arguments: Sequence[str]) -> None:
     """Measure, print, and store where it was asked."""
     flags = parse(BaselineFlags, arguments, "baseline")
-    what = known_name("baseline", flags.what, [*_POLICIES, "expert"])
+    what = known_name("baseline", flags.what, _POLICIES)
     if flags.out is not None:
         from bidex_meta.evaluation.references import load_from
         from bidex_meta.record.atomic import check_writable
 
         load_from(flags.out)
         check_writable(flags.out)
-    if what == "expert":
-        _expert(flags)
-    else:
-        _measure(what, flags)
-
-
-def _expert(flags: BaselineFlags) -> None:
-    from bidex_meta.commands.experts import best_known
-    from bidex_meta.commands.tables import plain_table, print_table
-
-    known = best_known(Source.open({"suite": flags.suite}).task_classes(), flags.runs, flags.threads)
-    _store(flags.out, known, {})
-    if flags.json:
-        print(json.dumps(known, indent=2))
-        return
-    print_table(plain_table(["class", "return", "source"], [[n, *row.values()] for n, row in known.items()]))
-
-
-def _measure(what: str, flags: BaselineFlags) -> None:
     source = Source.open({"suite": flags.suite, "seed": flags.seed, "threads": flags.threads})
     if not source.moving_bases:
         raise BidexError(f'References are of moving bases, but {flags.suite} has fixed ones. Write base = "moving".')

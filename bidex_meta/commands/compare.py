@@ -25,7 +25,7 @@ class CompareFlags:
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
-    """Run folders, or their files of JSON (`bidex-meta collect`)."""
+    """Run folders, or files of results/data/."""
     json: Switch = False
     """Print JSON."""
     out: Path | None = None
@@ -123,6 +123,5 @@ def _classes(group: "Group", names: Sequence[str]) -> list[list[object]]:
 
 
 def _ranged(estimate: "Estimate", factor: float = 1.0, unit: str = "", sign: bool = False) -> str:
-    form = "+.1f" if sign else ".1f"
-    ends = "–" if estimate.interval is None else ", ".join(f"{factor * end:{form}}" for end in estimate.interval)
-    return f"{factor * estimate.value:{form}}{unit} [{ends}]"
+    told = estimate.text(factor, unit, "+.1f" if sign else ".1f")
+    return told if estimate.interval else f"{told} [–]"

@@ -21,7 +21,7 @@ class PlotFlags:
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
-    """Run folders, or their files of JSON (`bidex-meta collect`)."""
+    """Run folders, or files of results/data/."""
     adaptation: Switch = False
     """Against shots of adaptation, from the meta-test in the run's evaluation.json; of one run."""
     evaluation: Path | None = None

@@ -21,7 +21,7 @@ class ReportFlags:
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
-    """Run folders, or their files of JSON (`bidex-meta collect`)."""
+    """Run folders, or files of results/data/."""
     out: Path | None = None
     """The page; None: report.html, in the run folder or, of several, here."""
 

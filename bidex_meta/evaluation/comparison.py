@@ -57,6 +57,11 @@ class Estimate:
     interval: Interval | None
     """95 % bootstrap interval, seeds resampled; None with a single one."""
 
+    def text(self, factor: float = 1.0, unit: str = "", form: str = ".1f") -> str:
+        """The number times ``factor``, and its interval in brackets where there is one."""
+        ends = "" if self.interval is None else f" [{', '.join(f'{factor * end:{form}}' for end in self.interval)}]"
+        return f"{factor * self.value:{form}}{unit}{ends}"
+
 
 def read_groups(runs: Sequence[Run]) -> list[Group]:
     """Evaluated runs by group, in the order they are named.

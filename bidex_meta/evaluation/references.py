@@ -3,7 +3,7 @@
 They hold for classes with moving bases, as every suite has them. Files under ``assets/references/``: ``random.json``
 and ``zero.json``, the returns of random actions and of doing nothing, the better of which is the score's zero, and
 ``expert.json``; ``witness.json`` and ``script.json`` hold what witnesses get open loop and scripts in closed loop.
-``bidex-meta baseline`` measures them.
+``bidex-meta baseline`` measures all but ``expert.json``, which ``python -m tools.experts`` of the repository writes.
 """
 
 from dataclasses import replace

@@ -7,8 +7,7 @@
      "curves": {"step": [...], "Train/return/<class>": [...], ...},
      "evaluation": {...}}
 
-``bidex-meta collect`` writes such files (:mod:`bidex_meta.results.condensing`); :func:`open_run` reads them and run
-folders alike, so that whatever reads an evaluated run need not know which of the two it has.
+``python -m tools.collect`` of the repository writes such files. :func:`open_run` reads them and run folders alike.
 """
 
 from dataclasses import dataclass
@@ -133,7 +132,7 @@ class StoredRun:
     @property
     def again(self) -> str:
         """As in :class:`Run`."""
-        return f"bidex-meta collect RUN --into {self.path.parent}"
+        return f"python -m tools.collect RUN --into {self.path.parent}"
 
     @property
     def evaluated(self) -> bool:

@@ -14,7 +14,7 @@ from statistics import median
 from typing import Any
 
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.comparison import Estimate, Group, estimates, iqm, iqm_difference, read_groups
+from bidex_meta.evaluation.comparison import Group, estimates, iqm, iqm_difference, read_groups
 from bidex_meta.evaluation.histories import History, read_histories
 from bidex_meta.reading import is_file
 from bidex_meta.record import plots, training_seconds
@@ -127,15 +127,15 @@ def _final(folders: Sequence[Run], short: dict[Path, str]) -> dict[str, Any]:
 def _final_row(group: Group, first: Group) -> list[str]:
     over = "–"
     if group is not first and set(group.classes) == set(first.classes):
-        over = _ranged(iqm_difference(group.success, first.success), 100.0, "+.1f")
-    score = "–" if group.scores is None else _ranged(iqm(group.scores))
+        over = iqm_difference(group.success, first.success).text(100.0, form="+.1f")
+    score = "–" if group.scores is None else iqm(group.scores).text()
     seeds = ", ".join(map(str, group.seeds))
     return [
         group.label,
         seeds,
         group.steps_text(),
         f"{group.hours:.2f}",
-        _ranged(iqm(group.success), 100.0),
+        iqm(group.success).text(100.0),
         score,
         over,
     ]
@@ -145,11 +145,6 @@ def _class_rows(group: Group, names: Sequence[str]) -> Iterator[list[str]]:
     for measure, values, factor in (("success (%)", group.success, 100.0), ("return", group.returns, 1.0)):
         means = {name: f"{factor * column.mean():.4g}" for name, column in zip(group.classes, values.T, strict=True)}
         yield [group.label, measure, *(means.get(name, "–") for name in names)]
-
-
-def _ranged(estimate: Estimate, factor: float = 1.0, form: str = ".1f") -> str:
-    ends = "" if estimate.interval is None else ", ".join(f"{factor * end:{form}}" for end in estimate.interval)
-    return f"{factor * estimate.value:{form}}" + (f" [{ends}]" if ends else "")
 
 
 def _adaptation(folders: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[str, str]]:

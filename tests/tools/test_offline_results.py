@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 
 from bidex_meta.errors import BidexError
-from bidex_meta.results.condensing import _without_places
-from bidex_meta.results.pages import fill
-from tests import test_collect
-from tests.test_collect import collect
 from tests.test_histories import log
+from tests.tools import test_collect
+from tests.tools.test_collect import collect
+from tools.collect import portable
+from tools.pages.blocks import fill
 
 no_weights = test_collect.no_weights
 RANDOM = {"classes": {"C": {"success": 0.0, "return": 2.0}}}
@@ -38,7 +38,7 @@ def test_cells_are_scores_of_seeds_by_kind_of_data_and_learner(tmp_path: Path) -
     runs.append(made(tmp_path, "C-random-bc-s0", "bc", 0, -5.0, str(tmp_path / "C" / "random-v0")))
     page.write_text("<!-- results: study=offline show=offline on=C -->\n<!-- end -->\n")
     assert fill(page, tmp_path / "data") and "No runs yet." in page.read_text()
-    assert collect(*runs, made(tmp_path, "expert", "ppo", 0, 100.0, None), "--into", into) == 0
+    collect(*runs, made(tmp_path, "expert", "ppo", 0, 100.0, None), into=into)
     assert fill(page, tmp_path / "data") == [page] and fill(page, tmp_path / "data") == []
     text = page.read_text()
     assert [line for line in text.splitlines() if line.startswith("|")] == [
@@ -51,12 +51,12 @@ def test_cells_are_scores_of_seeds_by_kind_of_data_and_learner(tmp_path: Path) -
     assert "Returns: expert 22 (success 50 %), uniform actions 2." in text
     assert json.loads((into / "C-random-bc-s0.json").read_text())["config"]["dataset"] == ["C/random-v0"]
     other = made(tmp_path, "C-medium-iql-s3", "iql", 3, 1.0, "C/medium-v0", gamma=0.5)
-    assert collect(other, "--into", into) == 0
+    collect(other, into=into)
     with pytest.raises(BidexError, match=r"both of the arm 'medium iql', but learner.gamma"):
         fill(page, tmp_path / "data")
 
 
 def test_places_of_data_do_not_get_into_files() -> None:
     config = {"suite": None, "task": "C", "dataset": ["/a/b/C/x-v0", "C/y-v0"], "demonstrations": "/a/C/z-v0"}
-    kept = _without_places(config)
+    kept = portable(config)
     assert (kept["dataset"], kept["demonstrations"]) == (["C/x-v0", "C/y-v0"], "C/z-v0")

@@ -8,12 +8,12 @@ import pytest
 
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
-from bidex_meta.results.pages import fill
-from bidex_meta.results.studies import read_studies
-from tests import test_collect
 from tests.pages import ROOT
-from tests.test_collect import collect, evaluated
 from tests.test_histories import log
+from tests.tools import test_collect
+from tests.tools.test_collect import collect, evaluated
+from tools.pages.blocks import fill
+from tools.pages.studies import read_studies
 
 no_weights = test_collect.no_weights
 
@@ -40,7 +40,7 @@ def page(tmp_path: Path) -> Path:
     for run in runs:
         found = json.loads((run / "evaluation.json").read_text())
         (run / "evaluation.json").write_text(json.dumps({**found, "random": {"classes": random}}))
-    assert collect(*runs, "--into", tmp_path / "data" / "tiny") == 0
+    collect(*runs, into=tmp_path / "data" / "tiny")
     path = tmp_path / "page.md"
     path.write_text("# Page\n\n<!-- results: study=tiny -->\nold\n<!-- end -->\n\nafter\n")
     return path
@@ -91,9 +91,9 @@ def test_suites_of_the_same_classes_and_classes_alone_stand_beside_each_other(tm
     for path in (*alone, other):
         log(path, {"step": 1000, "Perf/training_time": 7.0})
         shutil.copy(whole / "versions.json", path)
-    assert collect(whole, "--into", tmp_path / "data" / "x") == 0
-    assert collect(*alone, "--arm", "apart", "--into", tmp_path / "data" / "x") == 0
-    assert collect(other, "--arm", "other", "--into", tmp_path / "data" / "x") == 0
+    collect(whole, into=tmp_path / "data" / "x")
+    collect(*alone, arm="apart", into=tmp_path / "data" / "x")
+    collect(other, arm="other", into=tmp_path / "data" / "x")
     studies = read_studies(tmp_path / "data", "x")
     assert [(study.on, [arm.group.label for arm in study.arms]) for study in studies] == [
         ("C", ["other"]),
@@ -112,7 +112,7 @@ def test_rows_by_learners(tmp_path: Path) -> None:
             folder = log(path, {"step": 500, "Train/return/C": 1.0}, {"step": 1000, "Train/return/C": 2.0})
             folder.change_config({**folder.config(), "num_envs": rows})
             (path / "versions.json").write_text(json.dumps({"git": {"commit": test_collect.COMMIT, "dirty": False}}))
-            assert collect(path, "--into", tmp_path / "data" / "many") == 0
+            collect(path, into=tmp_path / "data" / "many")
     page = tmp_path / "page.md"
     page.write_text("".join(f"<!-- results: study=many show={s} -->\n<!-- end -->\n" for s in ("rows", "row-curves")))
     assert [path.name for path in fill(page, tmp_path / "data")] == ["many-row-curves.png", "page.md"]
@@ -127,10 +127,8 @@ def test_rows_by_learners(tmp_path: Path) -> None:
 
 
 def test_the_best_run_of_each_class(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "bidex_meta.results.best.load", lambda kind: {"C": {"success": 0.125}} if kind == "witness" else {}
-    )
-    monkeypatch.setattr("bidex_meta.results.best.registry.names", lambda: ["D"])  # first, though its file is read last
+    monkeypatch.setattr("tools.pages.tables.load", lambda kind: {"C": {"success": 0.125}} if kind == "witness" else {})
+    monkeypatch.setattr("tools.pages.tables.registry.names", lambda: ["D"])  # first, though its file is read last
     for name, arm, success, value in (("C", "ppo", 0.5, 9.0), ("C", "sac", 0.75, 2.0), ("D", "ppo", 0.0, 3.0)):
         path = test_collect.run(tmp_path, 0, {name: success}, arm, task=f"place/{name}")
         path = path.rename(tmp_path / f"{name}-{arm}-seed0")
@@ -138,7 +136,7 @@ def test_the_best_run_of_each_class(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         row = {"success": success, "success_interval": [0.0, 1.0], "return": value, "score": None}
         (path / "evaluation.json").write_text(json.dumps({"steps": 1000, "policy": {"classes": {name: row}}}))
         (path / "versions.json").write_text(json.dumps({"git": {"commit": test_collect.COMMIT, "dirty": False}}))
-        assert collect(path, "--into", tmp_path / "data" / "alone") == 0
+        collect(path, into=tmp_path / "data" / "alone")
     page = tmp_path / "page.md"
     page.write_text("<!-- results: study=alone show=best -->\n<!-- end -->\n")
     fill(page, tmp_path / "data")
@@ -159,7 +157,7 @@ def test_references_are_a_table_without_a_study(tmp_path: Path, monkeypatch: pyt
         "random": {"Switch": {"return": 8696.25, "success": 0.005}},
         "expert": {"Switch": {"return": 9.0, "source": "x"}},
     }
-    monkeypatch.setattr("bidex_meta.results.reference_ends.load", lambda kind: known.get(kind, {}))
+    monkeypatch.setattr("tools.pages.tables.load", lambda kind: known.get(kind, {}))
     page = tmp_path / "page.md"
     page.write_text("<!-- results: show=references -->\n<!-- end -->\n")
     assert fill(page, tmp_path) == [page]
@@ -180,7 +178,7 @@ def test_gains_of_meta_tests(tmp_path: Path) -> None:
         return path
 
     runs = [made("promp", 0, 3.0, 0.3), made("promp", 1, 0.1, 0.5), made("control", 0, 1.0, 0.4)]
-    assert collect(*runs, "--into", tmp_path / "data" / "meta") == 0
+    collect(*runs, into=tmp_path / "data" / "meta")
     page = tmp_path / "page.md"
     page.write_text("<!-- results: study=meta show=gains -->\n<!-- end -->\n")
     fill(page, tmp_path / "data")
@@ -198,18 +196,17 @@ def test_gains_of_meta_tests(tmp_path: Path) -> None:
 
 def test_an_arm_of_two_kinds_is_refused(page: Path, tmp_path: Path) -> None:
     third = evaluated(tmp_path, 2, 0.5, "MT4-base-seed2", gamma=0.7)
-    assert collect(third, "--into", data(page) / "tiny") == 0
+    collect(third, into=data(page) / "tiny")
     with pytest.raises(BidexError, match=r"both of the arm 'base', but learner.gamma is 0.7 and 0.9"):
         fill(page, data(page))
 
 
 def test_bad_blocks_are_one_line(page: Path) -> None:
     for words, told in (
-        ("show=table", "name its study"),
-        ("study=../up", "name its study"),
-        ("study=tiny show=tabel", "table"),
-        ("study=tiny colour=red", "option of a block"),
-        ("study", "name=value"),
+        ("show=table", "name of a study"),
+        ("study=tiny show=tabel", "tabel"),
+        ("study=tiny colour=red", "colour"),
+        ("study", "cannot make the block"),
     ):
         page.write_text(f"<!-- results: {words} -->\n<!-- end -->\n")
         with pytest.raises(BidexError, match=told):

@@ -1,13 +1,13 @@
-"""The page that shows every task class: written by ``bidex-meta gallery``, so that it cannot contradict the code."""
+"""``python -m tools.gallery`` writes the page of all task classes from their code."""
 
 from pathlib import Path
 
 import numpy as np
+import tyro
 
 from bidex_meta.benchmark import make_task_world
 from bidex_meta.evaluation import references
 from bidex_meta.record import video
-from bidex_meta.record.atomic import write_atomic
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.hidden import hidden
@@ -20,32 +20,32 @@ STRIP = 5
 """Pictures of a witness."""
 _HEAD = """# The task classes
 
-Written by `bidex-meta gallery`; change the classes, not this page. Pictures show the start of the first task; green is
-a goal. Sizes are those of moving bases. d is a distance in metres, r an angle in radians; *left* and *right* are the
-distances of a hand's point (8 cm along the palm, 2 cm out of it) to its point on the object. Variations are drawn
-uniformly and frozen by a task. ML mask: what of a variation reward or success depends on in a given state and only
-masked entries tell, so that a meta suite hides it; where it is nothing, a class asks of a meta-learner no more than of
-any other. Random: mean return and success of uniform actions. Witness: recorded actions that solve
-the first task; the strip shows them at the start, a third and two thirds of the way to the first success, at the first
-success and at the end of the episode.
+Written by `python -m tools.gallery`; change the classes, not this page. Pictures show the start of the first task;
+green is a goal. Sizes are those of moving bases. d is a distance in metres, r an angle in radians; *left* and *right*
+are the distances of a hand's point (8 cm along the palm, 2 cm out of it) to its point on the object. Variations are
+drawn uniformly and fixed by a task. ML mask: variables of the task that affect reward or success but are hidden in ML
+suites; where none is hidden, the class needs no adaptation. Random: mean return and success of uniform actions.
+Witness: recorded actions that solve the first task; the strip shows them at the start, a third and two thirds of the
+way to the first success, at the first success and at the end of the episode.
 """
 
 
-def write(page: Path, width: int = 360, height: int = 270) -> None:
-    """Writes the page, and the pictures into ``images/tasks/`` beside it.
+def gallery(out: Path = Path("docs/tasks.md"), width: int = 360, height: int = 270) -> None:
+    """Write the page, and the pictures into ``images/tasks/`` beside it.
 
     Args:
-        page: The Markdown file.
+        out: The Markdown file.
         width: Of the pictures, pixels.
         height: Of the pictures, pixels.
     """
     for name in registry.names():
         for view in VIEWS:
-            _picture(name, view, page.parent / _image(name, view), width, height)
+            _picture(name, view, out.parent / _image(name, view), width, height)
         if witness_path(name).is_file():
             strip = _strip(name, load_witness(name), width * 2 // 3, height * 2 // 3)
-            video.write_image(page.parent / _image(name, "witness"), strip)
-    write_atomic(page, lambda file: file.write(text().encode()))
+            video.write_image(out.parent / _image(name, "witness"), strip)
+    out.write_text(text())
+    print(out)
 
 
 def text() -> str:
@@ -117,3 +117,7 @@ def _witness(name: str) -> str:
 def _variation(space: VariationSpace) -> str:
     parts = zip(space.names, space.low, space.high, strict=True)
     return ", ".join(f"{name} {low:.3g} … {high:.3g}" for name, low, high in parts)
+
+
+if __name__ == "__main__":
+    tyro.cli(gallery)

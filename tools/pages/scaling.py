@@ -10,11 +10,12 @@ from bidex_meta.evaluation.comparison import classes_of
 from bidex_meta.evaluation.histories import curves_of
 from bidex_meta.record import plots
 from bidex_meta.record.stored import StoredRun
-from bidex_meta.results.studies import Study, head_of, refuse_differing, row_of
+from tools.pages.studies import Study, refuse_differing
+from tools.pages.tables import mean_and_range, random_rows, table
 
 
 def rows_table(study: Study) -> Iterator[str]:
-    """Lines of Markdown: rows by learners, the evaluation's return as mean over seeds (least to most).
+    """Numbers of rows by learners: the evaluation's return as mean over seeds (least to most).
 
     Args:
         study: Runs on one class.
@@ -24,13 +25,16 @@ def rows_table(study: Study) -> Iterator[str]:
     """
     cells = _cells(study)
     algos = list(dict.fromkeys(algo for algo, _ in cells))
-    yield from head_of(["rows", *algos])
-    for rows in sorted({rows for _, rows in cells}):
-        yield row_of([f"{rows:,}", *(_cell(cells.get((algo, rows), [])) for algo in algos)])
+    counts = sorted({rows for _, rows in cells})
+    yield from table(
+        ["rows", *algos], [[f"{rows:,}", *(_cell(cells.get((algo, rows), [])) for algo in algos)] for rows in counts]
+    )
     steps = sorted({run.content["steps"] for runs in cells.values() for run in runs})
     seeds = sorted({len(runs) for runs in cells.values()})
     yield ""
-    yield f"Seeds: {_range(seeds)}. Steps: {_range(steps)}. {_random(study)}"
+    returns = [row["return"] for rows in random_rows(study).values() for row in rows]
+    random = f"Uniform actions: {np.mean(returns):.4g}." if returns else ""
+    yield f"Seeds: {_range(seeds)}. Steps: {_range(steps)}. {random}"
 
 
 def rows_figure(study: Study) -> Any:
@@ -67,15 +71,7 @@ def _class(study: Study) -> str:
 def _cell(runs: Sequence[StoredRun]) -> str:
     if not runs:
         return "–"
-    found = np.array([row["return"] for run in runs for row in classes_of(run.evaluation()).values()])
-    told = f"{found.mean():.4g}"
-    return told if len(found) == 1 else f"{told} ({found.min():.4g} to {found.max():.4g})"
-
-
-def _random(study: Study) -> str:
-    found = [run.evaluation().get("random", {"classes": {}})["classes"].values() for run in study.runs]
-    returns = [row["return"] for rows in found for row in rows]
-    return f"Uniform actions: {np.mean(returns):.4g}." if returns else ""
+    return mean_and_range(np.array([row["return"] for run in runs for row in classes_of(run.evaluation()).values()]))
 
 
 def _range(numbers: Sequence[int]) -> str:

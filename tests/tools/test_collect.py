@@ -10,9 +10,10 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import read_groups
 from bidex_meta.record import RunFolder
 from bidex_meta.record.stored import StoredRun, open_run
-from bidex_meta.results import condensing
+from tests.pages import ROOT
 from tests.test_comparison import run
 from tests.test_histories import log
+from tools import collect as tool
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 
@@ -32,16 +33,16 @@ def evaluated(root: Path, seed: int, success: float, name: str | None = None, ro
 
 @pytest.fixture(autouse=True)
 def no_weights(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bidex_meta.commands.collect._parameters", lambda folder: 12345)
+    monkeypatch.setattr(tool, "_parameters", lambda folder: 12345)
 
 
-def collect(*words: object) -> int:
-    return main(["collect", *map(str, words)])
+def collect(*runs: Path, into: Path, arm: str | None = None) -> None:
+    tool.collect(runs, into, arm=arm)
 
 
 def test_tables_of_files_are_those_of_the_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     paths = [evaluated(tmp_path, seed, 0.5 + seed / 7, f"MT4-arm-x-seed{seed}", gamma=0.9) for seed in (0, 1)]
-    assert collect(*paths, "--into", tmp_path / "data") == 0
+    collect(*paths, into=tmp_path / "data")
     files = capsys.readouterr().out.split()
     assert files == [str(tmp_path / "data" / f"MT4-arm-x-seed{seed}.json") for seed in (0, 1)]
     found = []
@@ -59,7 +60,7 @@ def test_tables_of_files_are_those_of_the_folders(tmp_path: Path, capsys: pytest
 
 def test_what_a_file_keeps(tmp_path: Path) -> None:
     folder = RunFolder.open(evaluated(tmp_path, 0, 1 / 3))
-    content = condensing.condensed(folder, "x", 7)
+    content = tool.condensed(folder, "x", 7)
     curves = content["curves"]
     assert len(curves["step"]) == 60 and curves["step"][-1] == 1000 == content["steps"]
     assert curves["Perf/training_time"][-1] == 1500.0 == content["seconds"]
@@ -70,34 +71,24 @@ def test_what_a_file_keeps(tmp_path: Path) -> None:
     assert (content["suite"], content["parameters"]) == ({"name": "MT4", "version": 1}, 7)
     assert content["engine"] == "c"
     path = tmp_path / "x.json"
-    path.write_bytes(condensing.told(content))
-    assert json.loads(path.read_bytes()) == content and len(path.read_bytes()) < condensing.MOST_BYTES
+    path.write_text(tool.text(content))
+    assert json.loads(path.read_text()) == content
     assert open_run(path).metrics()[-1] == {"step": 1000, **{t: c[-1] for t, c in curves.items() if t != "step"}}
-
-
-def test_curves_give_way_where_there_are_many_classes(tmp_path: Path) -> None:
-    path = evaluated(tmp_path, 0, 0.5)
-    rows = [{"step": 10 * i, **{f"Train/return/class{n}": 1.2345 * i for n in range(100)}} for i in range(1, 101)]
-    log(path, *rows)
-    classes = {f"class{n}": {"success": 0.5, "return": 1.0, "score": None} for n in range(100)}
-    (path / "evaluation.json").write_text(json.dumps({"policy": {"classes": classes}}))
-    content = condensing.condensed(RunFolder.open(path), "x", None)
-    assert len(content["curves"]["step"]) < 60 and len(condensing.told(content)) <= condensing.MOST_BYTES
 
 
 def test_no_folder_of_this_machine_stays(tmp_path: Path) -> None:
     path, suite = evaluated(tmp_path, 0, 0.5), tmp_path / "own.toml"
-    suite.write_text((Path(__file__).parents[1] / "suites" / "MT4.toml").read_text().replace('"MT4"', '"own"'))
+    suite.write_text((ROOT / "suites" / "MT4.toml").read_text().replace('"MT4"', '"own"'))
     folder = RunFolder.open(path)
     folder.change_config({**folder.config(), "suite": str(suite), "start_from": str(tmp_path / "other")})
     found = json.loads((path / "evaluation.json").read_text())
     (path / "evaluation.json").write_text(json.dumps({"run": str(path), **found}))
-    content = condensing.condensed(folder, "x", None)
+    content = tool.condensed(folder, "x", None)
     assert str(tmp_path) not in json.dumps(content)
     assert content["suite"]["name"] == "own" and "CatchUnderarm" in content["suite"]["file"]
     assert content["config"]["suite"] == "own.toml"
     folder.change_config({**folder.config(), "suite": None, "task": "HandOver", "object": str(tmp_path / "mug.xml")})
-    content = condensing.condensed(folder, "x", None)
+    content = tool.condensed(folder, "x", None)
     assert str(tmp_path) not in json.dumps(content) and content["config"]["object"] == "mug.xml"
 
 
@@ -107,20 +98,24 @@ def test_a_run_that_a_return_ended_is_kept_as_it_ended(tmp_path: Path) -> None:
     found = json.loads((path / "evaluation.json").read_text())
     (path / "evaluation.json").write_text(json.dumps({"steps": 1000, **found}))
     folder.change_config({**folder.config(), "steps": 10**9, "stop_at_return": 10.0})
-    assert collect(path, "--into", tmp_path / "data") == 0
+    collect(path, into=tmp_path / "data")
     stored = StoredRun.open(tmp_path / "data" / f"{path.name}.json")
     [group] = read_groups([stored])
     assert (stored.content["steps"], stored.goal, group.steps) == (1000, 1000, 1000)
     folder.change_config({**folder.config(), "stop_at_return": 10.5})
-    assert collect(path, "--into", tmp_path / "data") == 2
+    with pytest.raises(BidexError, match="evaluated at 1,000 steps"):
+        collect(path, into=tmp_path / "data")
 
 
 def test_a_run_of_changed_code_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     clean, changed = (evaluated(tmp_path, seed, 0.5, f"run{seed}") for seed in (0, 1))
     (changed / "versions.json").write_text(json.dumps({"git": {"commit": COMMIT, "dirty": True}}))
-    assert collect(clean, changed, "--into", tmp_path / "data") == 0
+    collect(clean, changed, into=tmp_path / "data")
     told = capsys.readouterr()
-    assert told.err == f"{changed} was made by changed code: its commit alone does not make it again.\n"
+    assert (
+        told.err
+        == f"{tmp_path / 'data' / 'run1.json'} was made by changed code: its commit alone does not make it again.\n"
+    )
     assert len(told.out.split()) == 2
 
 
@@ -130,17 +125,16 @@ def test_a_run_of_changed_code_is_told(tmp_path: Path, capsys: pytest.CaptureFix
      ("MT4", "mtppo"), ("again", "again")],
 )  # fmt: skip
 def test_an_arm_is_the_name_without_suite_and_seed(name: str, arm: str) -> None:
-    assert condensing.arm_of(Path("runs") / name, {"suite": "MT4", "task": None, "algo": "mtppo"}) == arm
+    assert tool.arm_of(Path("runs") / name, {"suite": "MT4", "task": None, "algo": "mtppo"}) == arm
 
 
-def test_what_is_refused_is_one_line_and_nothing_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_refused_leaves_nothing_written(tmp_path: Path) -> None:
     good, into = evaluated(tmp_path, 0, 0.5, "good"), tmp_path / "data"
     bad = evaluated(tmp_path, 1, 0.5, "bad")
 
     def refused(told: str) -> None:
-        assert collect(good, bad, "--into", into) == 2
-        error = capsys.readouterr().err
-        assert told in error and error.count("\n") == 1
+        with pytest.raises(BidexError, match=told):
+            collect(good, bad, into=into)
         assert not into.exists()
 
     evaluation = (bad / "evaluation.json").read_text()
@@ -158,11 +152,12 @@ def test_what_is_refused_is_one_line_and_nothing_is_written(tmp_path: Path, caps
     refused("holds nothing")
     (bad / "config.json").write_text("{}")
     refused("is not a run's config")
-    assert collect(good) == 2 and "--into" in capsys.readouterr().err
-    assert collect(good, "--into", into) == 0 and collect(good, "--into", into) == 0, "once more is no harm"
+    collect(good, into=into)
+    collect(good, into=into)  # once more is no harm
     folder = RunFolder.open(good)
     folder.change_config({**folder.config(), "seed": 5})
-    assert collect(good, "--into", into) == 2 and "is of another run: seed differs" in capsys.readouterr().err
+    with pytest.raises(BidexError, match="is of another run than"):
+        collect(good, into=into)
 
 
 def test_a_meta_test_of_test_tasks_alone_need_not_show_what_was_trained(tmp_path: Path) -> None:
@@ -170,15 +165,15 @@ def test_a_meta_test_of_test_tasks_alone_need_not_show_what_was_trained(tmp_path
     rows = {"classes": {"C": {"success": 1.0, "return": 1.0, "score": None}}}
     of_test = {"before": rows, "after": rows}
     (run / "evaluation.json").write_text(json.dumps({"splits": {"test": of_test}}))
-    assert condensing.condensed(RunFolder.open(run), "x", 7)["evaluation"]["splits"].keys() == {"test"}
+    assert tool.condensed(RunFolder.open(run), "x", 7)["evaluation"]["splits"].keys() == {"test"}
     (run / "evaluation.json").write_text(json.dumps({"splits": {"train": of_test, "test": of_test}}))
     with pytest.raises(BidexError, match="of another run"):
-        condensing.condensed(RunFolder.open(run), "x", 7)
+        tool.condensed(RunFolder.open(run), "x", 7)
 
 
 def test_a_damaged_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "x.json"
-    content = condensing.condensed(RunFolder.open(evaluated(tmp_path, 0, 0.5)), "x", 7)
+    content = tool.condensed(RunFolder.open(evaluated(tmp_path, 0, 0.5)), "x", 7)
     for change, told in (
         ({"format": 2}, "format: expected a whole number from 1 to 1"),
         ({"curves": {"step": [1, 2], "a": [1.0]}}, "curves.a: expected 2 values"),
@@ -190,9 +185,9 @@ def test_a_damaged_file_is_refused(tmp_path: Path) -> None:
         path.write_text(json.dumps({**content, **change}))
         with pytest.raises(BidexError, match=told):
             StoredRun.open(path)
-    path.write_bytes(condensing.told(content)[:-40])
+    path.write_text(tool.text(content)[:-40])
     with pytest.raises(BidexError, match="in JSON"):
         open_run(path)
-    path.write_bytes(condensing.told(content))
+    path.write_text(tool.text(content))
     [group] = read_groups([StoredRun.open(path)])
     assert group.paths == [path]

@@ -1,13 +1,11 @@
-"""A study: the files of ``results/data/STUDY``, seeds of an arm together, as the tables and pictures of a page."""
+"""A study: the files of ``results/data/STUDY``, grouped by arm, and its pictures."""
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import Estimate, Group, classes_of, estimates, group_of, iqm
@@ -17,8 +15,6 @@ from bidex_meta.record import plots
 from bidex_meta.record.folder import flat
 from bidex_meta.record.stored import StoredRun
 
-_FEW = 4
-"""Classes up to which their returns stand in the table of arms."""
 _FREE = ("seed", "start_from", "device", "threads", "logger", "evaluate_every", "video_every", "processes", "preset")
 """Entries of a config in which seeds of an arm may differ."""
 
@@ -31,6 +27,11 @@ class Arm:
     """Its runs' final evaluations, labelled with its name."""
     runs: list[StoredRun]
     """Its runs."""
+
+    @cached_property
+    def success(self) -> Estimate:
+        """Interquartile mean over seeds and classes."""
+        return iqm(self.group.success)
 
     @property
     def parameters(self) -> int | None:
@@ -65,7 +66,7 @@ class Study:
         for name, runs in by_arm.items():
             refuse_differing(name, runs)
         arms = [Arm(self._only(group_of(name, runs)), runs) for name, runs in by_arm.items()]
-        return sorted(arms, key=lambda arm: -iqm(arm.group.success).value)
+        return sorted(arms, key=lambda arm: -arm.success.value)
 
     def _only(self, group: Group) -> Group:
         """Of a meta-test the classes of ``split``, by their own names."""
@@ -125,45 +126,14 @@ def read_studies(data: Path, name: str, on: str | None = None, split: str | None
     return [study for study in sorted(found, key=lambda study: study.on) if on in (None, study.on)]
 
 
-def arms_table(study: Study) -> Iterator[str]:
-    """Lines of Markdown: an arm a row, then uniform actions."""
-    classes = study.classes if len(study.classes) <= _FEW else []
-    yield from head_of(["arm", "seeds", "steps", "success, IQM", "score, IQM", *classes, "parameters", "hours"])
-    for arm in study.arms:
-        group = arm.group
-        score = "–" if group.scores is None else _ranged(iqm(group.scores))
-        cells = [
-            group.label,
-            str(len(group.seeds)),
-            group.steps_text(),
-            _ranged(iqm(group.success), 100.0, " %"),
-            score,
-        ]
-        cells += _means(group, classes, group.returns, 1.0, "")
-        yield row_of([*cells, "–" if arm.parameters is None else f"{arm.parameters:,}", f"{group.hours:.2f}"])
-    random = _random(study)
-    if random.keys() == set(study.classes):
-        success = np.array([[np.mean([row["success"] for row in random[name]]) for name in study.classes]])
-        cells = ["uniform actions", "", "", f"{100 * iqm(success).value:.1f} %", "–"]
-        cells += [f"{np.mean([row['return'] for row in random[name]]):.4g}" for name in classes]
-        yield row_of([*cells, "", ""])
+def curves_figure(study: Study) -> Any:
+    """Learning curves, a line an arm."""
+    return plots.draw_learning([(arm.group.label, curves_of(arm.runs)) for arm in study.arms])
 
 
-def classes_table(study: Study) -> Iterator[str]:
-    """Lines of Markdown: success and return of each class, mean over seeds (least to most)."""
-    yield from head_of(["arm", "", *study.classes])
-    for arm in study.arms:
-        group = arm.group
-        yield row_of([group.label, "success", *_means(group, study.classes, group.success, 100.0, " %", True)])
-        yield row_of([group.label, "return", *_means(group, study.classes, group.returns, 1.0, "", True)])
-
-
-def figures(study: Study) -> dict[str, Callable[[], Any]]:
-    """What is drawn of a study, by name: learning curves, and final success and score as points with intervals."""
-    return {
-        "curves": lambda: plots.draw_learning([(arm.group.label, curves_of(arm.runs)) for arm in study.arms]),
-        "points": lambda: plots.draw_comparison(estimates([arm.group for arm in study.arms])),
-    }
+def points_figure(study: Study) -> Any:
+    """Final success and score of each arm, with intervals."""
+    return plots.draw_comparison(estimates([arm.group for arm in study.arms]))
 
 
 def _subject(runs: Sequence[StoredRun]) -> str:
@@ -191,41 +161,3 @@ def refuse_differing(name: str, runs: Sequence[StoredRun]) -> None:
                     f"{run.path} and {same.path.name} are both of the arm {name!r}, but {key} is {other[key]} and "
                     f"{first[key]}. Collect one anew with --arm."
                 )
-
-
-def _random(study: Study) -> dict[str, list[dict[str, float]]]:
-    """By class what uniform actions got in each evaluation in which they were played."""
-    found: dict[str, list[dict[str, float]]] = {}
-    for run in study.runs:
-        for name, row in run.evaluation().get("random", {"classes": {}})["classes"].items():
-            found.setdefault(name, []).append(row)
-    return found
-
-
-def _means(
-    group: Group, classes: Sequence[str], values: np.ndarray, factor: float, unit: str, ends: bool = False
-) -> list[str]:
-    told = {}
-    for name, column in zip(group.classes, factor * values.T, strict=True):
-        told[name] = f"{column.mean():.4g}{unit}"
-        if ends and len(column) > 1:
-            told[name] += f" ({column.min():.4g} to {column.max():.4g})"
-    return [told.get(name, "–") for name in classes]
-
-
-def _ranged(estimate: Estimate, factor: float = 1.0, unit: str = "") -> str:
-    told = f"{factor * estimate.value:.1f}{unit}"
-    return (
-        told if estimate.interval is None else f"{told} [{', '.join(f'{factor * e:.1f}' for e in estimate.interval)}]"
-    )
-
-
-def head_of(names: Sequence[str]) -> Iterator[str]:
-    """A table's head in Markdown, two lines."""
-    yield row_of(names)
-    yield "|" + "---|" * len(names)
-
-
-def row_of(cells: Sequence[str]) -> str:
-    """A table's row in Markdown."""
-    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"

@@ -12,7 +12,8 @@ import numpy as np
 
 from bidex_meta.evaluation.comparison import classes_of, scored_classes
 from bidex_meta.record.stored import StoredRun
-from bidex_meta.results.studies import Study, head_of, refuse_differing, row_of
+from tools.pages.studies import Study, refuse_differing
+from tools.pages.tables import mean_and_range, table
 
 KINDS = ("random", "replay", "medium", "medium-expert", "expert")
 """Order of the rows, as in the paper's table; others follow by their names."""
@@ -21,7 +22,7 @@ LEARNERS = ("bc", "bcq", "td3bc", "iql")
 
 
 def offline_table(study: Study) -> Iterator[str]:
-    """Lines of Markdown: data sets by learners, score as mean over seeds (least to most) and mean success.
+    """Data sets by learners: score as mean over seeds (least to most) and mean success.
 
     Args:
         study: Runs on data sets; those that play are its experts.
@@ -40,9 +41,10 @@ def offline_table(study: Study) -> Iterator[str]:
     learners = _ordered({algo for row in cells.values() for algo in row}, LEARNERS)
     ends = _ends(study.runs, experts)
     seeds = sorted({len(runs) for row in cells.values() for runs in row.values()})
-    yield from head_of(["data", *learners])
-    for kind in _ordered(cells, KINDS):
-        yield row_of([kind, *(_cell(cells[kind].get(algo, []), ends) for algo in learners)])
+    kinds = _ordered(cells, KINDS)
+    yield from table(
+        ["data", *learners], [[kind, *(_cell(cells[kind].get(algo, []), ends) for algo in learners)] for kind in kinds]
+    )
     updates = []
     for algo in learners:
         found = {run.content["steps"] for row in cells.values() for run in row.get(algo, [])}
@@ -75,10 +77,7 @@ def _cell(runs: Sequence[StoredRun], ends: tuple[float, float] | None) -> str:
         scores = np.array([_of({"classes": scored_classes(run)}, "score") for run in runs])
     else:
         scores = 100 * (np.array([_of(run.evaluation(), "return") for run in runs]) - ends[0]) / (ends[1] - ends[0])
-    told = f"{scores.mean():.1f}"
-    if len(scores) > 1:
-        told += f" ({scores.min():.1f} to {scores.max():.1f})"
-    return f"{told}; {100 * _mean(runs, 'success'):.3g} %"
+    return f"{mean_and_range(scores, '.1f')}; {100 * _mean(runs, 'success'):.3g} %"
 
 
 def _mean(runs: Sequence[StoredRun], name: str) -> float:
@@ -87,8 +86,7 @@ def _mean(runs: Sequence[StoredRun], name: str) -> float:
 
 def _of(found: dict[str, Any], name: str) -> float:
     """Mean over the classes of an evaluation; not a number where one has none."""
-    values = [row.get(name) for row in classes_of(found).values()]
-    return float(np.mean([np.nan if value is None else value for value in values]))
+    return float(np.mean(np.array([row.get(name) for row in classes_of(found).values()], dtype=float)))
 
 
 def _ordered(names: Any, known: Sequence[str]) -> list[str]:

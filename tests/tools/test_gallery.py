@@ -5,10 +5,10 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 
-from bidex_meta import gallery
 from bidex_meta.tasks import registry
 from bidex_meta.witness.store import Witness
 from tests.tasks.tables import SIZES
+from tools import gallery
 
 
 def sections() -> dict[str, str]:
@@ -66,7 +66,7 @@ def test_pictures_are_written_where_the_page_looks_for_them(tmp_path: Path, monk
     witness = Witness(np.zeros((40, 52), np.float32), {"first_success": 11, "return": 3.0})
     monkeypatch.setattr(gallery, "load_witness", lambda name: witness)
     monkeypatch.setattr(gallery, "frames", lambda name, witness, at, width, height: numbered(at, width, height))
-    gallery.write(tmp_path / "tasks.md", width=8, height=6)
+    gallery.gallery(tmp_path / "tasks.md", width=8, height=6)
     links = re.findall(r"!\[[^]]*\]\(([^)]*)\)", (tmp_path / "tasks.md").read_text())
     assert len(links) == 2 * len(registry.names()) + 1 and len(drawn) == 2 * len(registry.names())
     assert set(drawn) == set(gallery.VIEWS)

@@ -5,8 +5,10 @@ from math import hypot
 from typing import Any
 
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.comparison import Estimate
 from bidex_meta.record.stored import StoredRun
-from bidex_meta.results.studies import Study, head_of, row_of
+from tools.pages.studies import Study
+from tools.pages.tables import table
 
 CONTROL = "control"
 """The arm that every other is held against: the same policy to start from and the same adaptation, no meta-training."""
@@ -14,7 +16,7 @@ _HEAD = ("class", "arm", "seed", "steps", "shots × rollouts", "success", "retur
 
 
 def gains_table(study: Study) -> Iterator[str]:
-    """Lines of Markdown: a run a row, class by class; what excludes zero is bold.
+    """One run a row, class by class; a gain whose interval excludes zero is bold.
 
     A gain is the meta-test's own, of returns, with its interval over adaptations and their episodes. Over the control
     stands the difference to the gain of the control's run of the same seed, both sides' half widths added as errors of
@@ -35,33 +37,32 @@ def gains_table(study: Study) -> Iterator[str]:
         if key in parts:
             raise BidexError(f"{run.path} and {parts[key][0].path.name} are both seed {key[1]} of the arm {key[0]!r}.")
         parts[key] = run, part
-    yield from head_of(_HEAD)
-    order = sorted(parts, key=lambda key: (key[0] == CONTROL, *key))
+    order, rows = sorted(parts, key=lambda key: (key[0] == CONTROL, *key)), []
     for name in dict.fromkeys(name for _, part in parts.values() for name in part["gain"]["classes"]):
         for arm, seed in order:
             run, part = parts[arm, seed]  # of the same classes as all: a study's runs are
-            _, control = parts.get((CONTROL, seed), (None, None))
-            more = "" if control is None or arm == CONTROL else _told(_over(_gain(part, name), _gain(control, name)))
-            yield row_of([
+            gain, control = _gain(part, name), None if arm == CONTROL else parts.get((CONTROL, seed))
+            rows.append([
                 name, arm, str(seed), f"{run.content['steps']:,}", f"{part['shots']} × {part['rollouts']}",
                 _both(part, name, "success", 100.0, " %"), _both(part, name, "return"),
-                _told(_gain(part, name)), more,
+                _bold(gain), "" if control is None else _bold(_over(gain, _gain(control[1], name))),
             ])  # fmt: skip
+    return table(_HEAD, rows)
 
 
-def _gain(part: dict[str, Any], name: str) -> dict[str, Any]:
-    """The return's, with its interval."""
-    return part["gain"]["classes"][name]["return"]
+def _gain(part: dict[str, Any], name: str) -> Estimate:
+    """The gain of the return."""
+    return Estimate(**part["gain"]["classes"][name]["return"])
 
 
-def _over(gain: dict[str, Any], control: dict[str, Any]) -> dict[str, Any]:
-    """The difference of two gains that were measured apart."""
-    value = gain["value"] - control["value"]
-    if gain["interval"] is None or control["interval"] is None:
-        return {"value": value, "interval": None}
-    low = hypot(gain["value"] - gain["interval"][0], control["interval"][1] - control["value"])
-    high = hypot(gain["interval"][1] - gain["value"], control["value"] - control["interval"][0])
-    return {"value": value, "interval": [value - low, value + high]}
+def _over(gain: Estimate, control: Estimate) -> Estimate:
+    """The difference of two gains that were measured independently."""
+    value = gain.value - control.value
+    if gain.interval is None or control.interval is None:
+        return Estimate(value, None)
+    low = hypot(gain.value - gain.interval[0], control.interval[1] - control.value)
+    high = hypot(gain.interval[1] - gain.value, control.value - control.interval[0])
+    return Estimate(value, (value - low, value + high))
 
 
 def _both(part: dict[str, Any], name: str, measure: str, factor: float = 1.0, unit: str = "") -> str:
@@ -69,9 +70,8 @@ def _both(part: dict[str, Any], name: str, measure: str, factor: float = 1.0, un
     return f"{before:.4g} → {after:.4g}{unit}"
 
 
-def _told(found: dict[str, Any]) -> str:
-    value, interval = found["value"], found["interval"]
-    if interval is None:
-        return f"{value:+.3g}"
-    sure = interval[0] > 0 or interval[1] < 0
-    return f"{'**' if sure else ''}{value:+.3g}{'**' if sure else ''} [{interval[0]:+.3g}, {interval[1]:+.3g}]"
+def _bold(found: Estimate) -> str:
+    """In bold where the interval excludes zero."""
+    value, space, ends = found.text(form="+.3g").partition(" ")
+    sure = found.interval is not None and (found.interval[0] > 0 or found.interval[1] < 0)
+    return f"**{value}**{space}{ends}" if sure else value + space + ends

@@ -1,0 +1,1 @@
+"""Tables and pictures that README.md and docs/results make of results/data."""

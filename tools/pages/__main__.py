@@ -1,0 +1,25 @@
+"""``python -m tools.pages [--check] [PAGE...]`` (``make results``), from the repository's root."""
+
+import sys
+from pathlib import Path
+
+import tyro
+
+from tools.pages.blocks import fill
+
+
+def main(pages: tyro.conf.Positional[tuple[Path, ...]] = (), check: bool = False) -> None:
+    """Fill the marked blocks of pages from results/data and print the files that changed.
+
+    Args:
+        pages: Markdown files; none: README.md and docs/results.
+        check: Write nothing; end with exit code 1 where a file is not as the data say.
+    """
+    named = pages or (Path("README.md"), *sorted(Path("docs/results").glob("*.md")))
+    changed = [path for page in named for path in fill(page, Path("results/data"), check)]
+    print("\n".join(map(str, changed)) or "nothing changed")
+    sys.exit(check and bool(changed))
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

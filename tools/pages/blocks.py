@@ -1,0 +1,123 @@
+"""Fills the marked blocks of pages with tables and pictures of studies.
+
+::
+
+    <!-- results: study=multitask show=table -->
+    (whatever stands here is replaced)
+    <!-- end -->
+
+``docs/sweeps.md`` lists what ``show`` may be.
+"""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image
+
+from bidex_meta.errors import BidexError
+from bidex_meta.record import plots
+from tools.pages import tables
+from tools.pages.gained import gains_table
+from tools.pages.offline import offline_table
+from tools.pages.scaling import rows_figure, rows_table
+from tools.pages.studies import curves_figure, points_figure, read_studies
+
+_BLOCK = re.compile(r"(?P<head><!-- results: (?P<words>[^\n]*?) -->\n).*?(?P<end><!-- end -->)", re.DOTALL)
+_TABLES = {
+    "table": tables.arms_table,
+    "classes": tables.classes_table,
+    "gains": gains_table,
+    "offline": offline_table,
+    "rows": rows_table,
+}
+_FIGURES = {
+    "curves": (curves_figure, "Return and success over training"),
+    "points": (points_figure, "Success and score, 95 % intervals over seeds"),
+    "row-curves": (rows_figure, "Return over training, by rows"),
+}
+_DIGEST = "Description"
+"""Entry of a picture's PNG metadata that holds the digest of its data."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """What a block asks for."""
+
+    study: str = ""
+    show: str = "table"
+    on: str | None = None
+    """A suite or class alone."""
+    split: str | None = None
+    """A split of meta-tests alone."""
+
+
+def fill(page: Path, data: Path, check: bool = False) -> list[Path]:
+    """Brings a page's blocks and pictures to what the data say.
+
+    Args:
+        page: A file of Markdown.
+        data: Folder of the studies' folders.
+        check: Write nothing.
+
+    Returns:
+        The files that are (or, with ``check``, would be) written; none where everything is as the data say.
+
+    Raises:
+        BidexError: A block does not end, asks for what there is not, or a file of the data cannot be read.
+    """
+    text, changed = page.read_text(), []
+    if text.count("<!-- results:") != text.count("<!-- end -->"):
+        raise BidexError(f"{page}: a block begins with <!-- results: ... --> and ends with <!-- end -->. Mend it.")
+
+    def replaced(found: re.Match[str]) -> str:
+        try:
+            block = Block(**dict(word.split("=") for word in found["words"].split()))
+            lines = list(_lines(block, page, data, check, changed))
+        except (KeyError, TypeError, ValueError) as error:
+            raise BidexError(f"{page}: cannot make the block {found['words']!r}: {error}") from error
+        return f"{found['head']}\n" + "\n".join(lines or ["No runs yet."]) + f"\n\n{found['end']}"
+
+    new = _BLOCK.sub(replaced, text)
+    if new != text:
+        changed.append(page)
+        if not check:
+            page.write_text(new)
+    return changed
+
+
+def _lines(block: Block, page: Path, data: Path, check: bool, changed: list[Path]) -> Iterator[str]:
+    """Lines of Markdown of a block; draws its pictures."""
+    if block.show == "references":
+        yield from tables.references_table()
+        return
+    if not block.study:
+        raise ValueError("expected the name of a study")
+    studies = read_studies(data, block.study, block.on, block.split)
+    if block.show == "best":
+        yield from tables.best_table(studies) if studies else ()
+        return
+    several = len(studies) > 1
+    for number, study in enumerate(studies):
+        if several:
+            yield from ["", f"**{study.on}**", ""] if number else [f"**{study.on}**", ""]
+        if block.show in _TABLES:
+            yield from _TABLES[block.show](study)
+            continue
+        draw, title = _FIGURES[block.show]
+        parts = [study.name, study.on if several or block.on else None, study.split, block.show]
+        picture = page.parent / f"{'-'.join(filter(None, parts))}.png"
+        if _digest_of(picture) != study.digest:
+            changed.append(picture)
+            if not check:
+                plots.save(draw(study), picture, {_DIGEST: study.digest})
+        yield f"![{title}: {study.name}, {study.on}]({picture.name})"
+
+
+def _digest_of(picture: Path) -> str | None:
+    """Digest of the data that a picture shows: its own bytes differ with matplotlib's version."""
+    if not picture.exists():
+        return None
+    with Image.open(picture) as opened:
+        return opened.info.get(_DIGEST)

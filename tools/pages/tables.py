@@ -1,0 +1,127 @@
+"""Tables of studies in Markdown: arms, classes, the best runs, references."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from bidex_meta.evaluation.comparison import Estimate, Group, iqm, scored_classes
+from bidex_meta.evaluation.references import Kind, load
+from bidex_meta.record.stored import StoredRun
+from bidex_meta.tasks import registry
+from tools.pages.studies import Study
+
+_FEW = 4
+"""Classes up to which their returns stand in the table of arms."""
+_PLAYED: dict[Kind, str] = {"random": "random", "zero": "zero", "witness": "witness, open loop", "script": "script"}
+_BEST = ("success [95 %]", "return [95 %]", "score", "uniform actions", "witness, open loop", "script")
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    """Lines of Markdown."""
+    yield _row(head)
+    yield "|" + "---|" * len(head)
+    yield from map(_row, rows)
+
+
+def mean_and_range(values: np.ndarray, form: str = ".4g", unit: str = "") -> str:
+    """``mean (least to most)`` of some seeds (seeds,); of a single one its value."""
+    ends = f" ({values.min():{form}} to {values.max():{form}})" if len(values) > 1 else ""
+    return f"{values.mean():{form}}{unit}{ends}"
+
+
+def random_rows(study: Study) -> dict[str, list[dict[str, float]]]:
+    """By class, the results of uniform actions in each evaluation that has them."""
+    found: dict[str, list[dict[str, float]]] = {}
+    for run in study.runs:
+        for name, row in run.evaluation().get("random", {"classes": {}})["classes"].items():
+            found.setdefault(name, []).append(row)
+    return found
+
+
+def arms_table(study: Study) -> Iterator[str]:
+    """One arm a row, then uniform actions."""
+    classes = study.classes if len(study.classes) <= _FEW else []
+    head = ["arm", "seeds", "steps", "success, IQM", "score, IQM", *classes, "parameters", "hours"]
+    rows = []
+    for arm in study.arms:
+        group, scores = arm.group, arm.group.scores
+        means = dict(zip(group.classes, group.returns.mean(axis=0), strict=True))
+        rows.append([
+            group.label, str(len(group.seeds)), group.steps_text(),
+            arm.success.text(100.0, " %"), "–" if scores is None else iqm(scores).text(),
+            *(f"{means[name]:.4g}" if name in means else "–" for name in classes),
+            "–" if arm.parameters is None else f"{arm.parameters:,}", f"{group.hours:.2f}",
+        ])  # fmt: skip
+    random = random_rows(study)
+    if random.keys() == set(study.classes):
+        success = np.array([[np.mean([row["success"] for row in random[name]]) for name in study.classes]])
+        returns = [f"{np.mean([row['return'] for row in random[name]]):.4g}" for name in classes]
+        rows.append(["uniform actions", "", "", f"{100 * iqm(success).value:.1f} %", "–", *returns, "", ""])
+    return table(head, rows)
+
+
+def classes_table(study: Study) -> Iterator[str]:
+    """Success and return of each class, mean over seeds (least to most)."""
+
+    def cells(group: Group, values: np.ndarray, unit: str = "") -> list[str]:
+        by_class = dict(zip(group.classes, values.T, strict=True))
+        return [mean_and_range(by_class[n], unit=unit) if n in by_class else "–" for n in study.classes]
+
+    rows = []
+    for group in (arm.group for arm in study.arms):
+        rows.append([group.label, "success", *cells(group, 100.0 * group.success, " %")])
+        rows.append([group.label, "return", *cells(group, group.returns)])
+    return table(["arm", "", *study.classes], rows)
+
+
+def best_table(studies: Sequence[Study]) -> Iterator[str]:
+    """One class a row, in MT20's order: of its runs the one of most success; of equals, of the largest return.
+
+    A single run of all classes is not named in the rows.
+    """
+    found: dict[str, list[tuple[StoredRun, dict[str, Any]]]] = {}
+    for run in (run for study in studies for run in study.runs):
+        for name, row in scored_classes(run).items():
+            found.setdefault(name, []).append((run, row))
+    several = sum(len(study.runs) for study in studies) > 1
+    order = registry.names()
+    references = [load("witness"), load("script")]
+    rows = []
+    for name in sorted(found, key=lambda name: order.index(name) if name in order else len(order)):
+        run, best = max(found[name], key=lambda pair: (pair[1]["success"], pair[1]["return"]))
+        random = run.evaluation().get("random", {"classes": {}})["classes"].get(name)
+        content = run.content
+        which = [run.arm, str(run.config()["seed"]), f"{content['steps']:,}", f"{content['seconds'] / 3600:.2f}"]
+        cells = [
+            _measure(best, "success").text(100.0, " %", ".4g"),
+            _measure(best, "return").text(form=".4g"),
+            "–" if best["score"] is None else f"{best['score']:.0f}",
+            "–" if random is None else f"{random['return']:.4g}",
+            *(f"{100 * known[name]['success']:.4g} %" if name in known else "–" for known in references),
+        ]
+        rows.append([name, *which, *cells, str(len(found[name]))] if several else [name, *cells])
+    return table(["class", "arm", "seed", "steps", "hours", *_BEST, "runs"] if several else ["class", *_BEST], rows)
+
+
+def references_table() -> Iterator[str]:
+    """One class a row: return and success of policies that are not trained; the expert and its source."""
+    played, expert = [load(kind) for kind in _PLAYED], load("expert")
+    measures = [f"{who}: {what}" for who in _PLAYED.values() for what in ("return", "success")]
+    rows = []
+    for name in registry.names():
+        cells = [name]
+        for known in played:
+            row = known.get(name)
+            cells += ["–", "–"] if row is None else [f"{row['return']:.4g}", f"{100 * row['success']:.1f} %"]
+        best = expert.get(name)
+        rows.append([*cells, *(["–", "–"] if best is None else [f"{best['return']:.4g}", best["source"]])])
+    return table(["class", *measures, "expert: return", "which"], rows)
+
+
+def _measure(row: Mapping[str, Any], measure: str) -> Estimate:
+    return Estimate(row[measure], row.get(f"{measure}_interval"))
+
+
+def _row(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
