@@ -4,7 +4,7 @@ import math
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -60,7 +60,8 @@ def main(arguments: Sequence[str]) -> None:
     sweep = read_sweep(flags.file, flags.out)
     cores = choose_cores(flags.cores, flags.workers)
     configs = _configs(sweep, flags.file)
-    states = [state_of(run, configs[run.words]) for run in sweep.runs]
+    runs = [replace(run, config=configs[run.words]) for run in sweep.runs]
+    states = [state_of(run) for run in runs]
     if flags.status:
         _print(states)
         return
@@ -82,7 +83,7 @@ def main(arguments: Sequence[str]) -> None:
             return
         _say(f"{len(states) - len(left)} of {len(states)} runs are done; {len(cores)} at a time.")
         failed = work(left, cores, _say)
-    _print([state_of(run, configs[run.words]) for run in sweep.runs])
+    _print([state_of(run) for run in runs])
     if failed:
         _say(f"{failed} failed. Started again, the sweep tries them anew.")
         raise SystemExit(EXIT_FAILED)
