@@ -155,7 +155,7 @@ def test_what_starts_from_another_waits_for_it_and_fails_with_it(file: Path, tmp
 @pytest.mark.skipif(sys.platform != "linux", reason="processes are found by /proc")
 @pytest.mark.parametrize("how", ["all killed", "sweep killed", "sweep asked to stop"])
 def test_a_sweep_that_was_stopped_loses_no_run(file: Path, tmp_path: Path, how: str) -> None:
-    """SIGKILL for the sweep, and for its runs or not, which then go on and are waited for; or SIGTERM for the sweep."""
+    """SIGKILL of the sweep, and of its runs or not, which then go on and are waited for; or SIGTERM of the sweep."""
     code = (
         "import signal; from bidex_meta.sweep import queue; from tests.test_sweep import planned; "
         "signal.signal(signal.SIGTERM, signal.default_int_handler); "

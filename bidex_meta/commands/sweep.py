@@ -107,23 +107,23 @@ def _configs(sweep: "Sweep", file: Path) -> dict[tuple[str, ...], dict[str, Any]
 
 
 def _print(states: "Sequence[State]") -> None:
-    """A line a run; hours left by the run's own speed, else by the mean of those on its suite."""
+    """A line a run; hours left by its own speed, else by the mean on its suite, else by that of all."""
     from bidex_meta.commands.tables import plain_table, print_table
 
-    rows, total = [], 0.0
+    speeds, rows, total = [(each.run.subject, each.speed) for each in states if each.speed], [], 0.0
     for each in states:
-        alike = [other.speed for other in states if other.speed and other.run.subject == each.run.subject]
+        alike = [speed for subject, speed in speeds if subject == each.run.subject] or [speed for _, speed in speeds]
         speed = each.speed or (mean(alike) if alike else math.nan)
         seconds = (each.goal - each.step) / speed if each.minutes is None else 60 * each.minutes - each.seconds
         hours = 0.0 if each.state == "done" else max(seconds / 3600, 0.0)
-        total += 0.0 if math.isnan(hours) else hours
+        total += hours
         goal = f"{each.goal:,}" if each.minutes is None else f"{each.minutes:g} min"
-        cells = [f"{each.step:,}", goal, f"{each.speed:,.0f}", "unknown" if math.isnan(hours) else f"{hours:.2f}"]
+        cells = [f"{each.step:,}", goal, f"{each.speed:,.0f}", "–" if math.isnan(hours) else f"{hours:.2f}"]
         rows.append([each.run.name, each.state, *cells, each.why[:120] if each.state == "failed" else ""])
     print_table(plain_table(["run", "state", "steps", "of", "steps/s", "hours left", "why"], rows))
     names = [each.state for each in states]
     counts = ", ".join(f"{names.count(name)} {name}" for name in ("done", "runs", "failed", "left"))
-    print(f"{counts}; about {total:.2f} core-hours of training left")
+    print(counts + ("" if math.isnan(total) else f"; about {total:.2f} core-hours of training left"))
 
 
 def _say(text: str) -> None:

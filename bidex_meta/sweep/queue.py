@@ -55,7 +55,7 @@ def state_of(run: PlannedRun) -> State:
         known, wanted = flat(run.folder.config()), flat(dict(run.config))
         if run.after is not None:  # another for each seed
             wanted["start_from"] = str(run.after.resolve())
-        for name in (known.keys() & wanted.keys()).difference(_FREE):
+        for name in sorted((known.keys() & wanted.keys()).difference(_FREE)):
             if known[name] != wanted[name]:
                 raise BidexError(
                     f"{run.path} is a run of another config: {name} is {known[name]} there, not {wanted[name]}. Give "
