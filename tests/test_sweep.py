@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder
 from bidex_meta.sweep import queue
 from bidex_meta.sweep.plan import PlannedRun, read_sweep
-from bidex_meta.sweep.queue import state_of
+from bidex_meta.sweep.queue import State, state_of
 from tests.pages import ROOT
 from tools import collect
 
@@ -50,8 +51,16 @@ def starts(root: Path) -> dict[str, list[dict[str, Any]]]:
     return {path.parent.name: [json.loads(line) for line in path.read_text().splitlines()] for path in found}
 
 
+def state(run: PlannedRun, config: dict[str, Any] = CONFIG) -> State:
+    return state_of(replace(run, config=config))
+
+
+def planned() -> list[PlannedRun]:
+    return [replace(run, config=CONFIG) for run in read_sweep(Path("sweep.toml")).runs]
+
+
 def done(run: PlannedRun) -> bool:
-    return state_of(run, CONFIG).state == "done"
+    return state(run).state == "done"
 
 
 def test_all_runs_end_in_order_and_on_their_core(file: Path, tmp_path: Path, capsys) -> None:
@@ -81,10 +90,10 @@ def test_a_run_that_its_return_ended_is_done_at_the_steps_it_made(
     begun = starts(tmp_path)
     assert main(["sweep", str(file)]) == 0 and starts(tmp_path) == begun, "and not trained further"
     run = read_sweep(file).runs[0]
-    found = state_of(run, config)
+    found = state(run, config)
     assert (found.state, found.step, found.goal) == ("done", 4, 4)
     (run.path / "evaluation.json").unlink()
-    assert state_of(run, config).state == "left" and state_of(run, config).goal == 4
+    assert state(run, config).state == "left" and state(run, config).goal == 4
 
 
 def test_a_failure_is_told_stops_no_other_and_is_tried_again(file: Path, tmp_path: Path, capsys) -> None:
@@ -145,28 +154,30 @@ def test_what_starts_from_another_waits_for_it_and_fails_with_it(file: Path, tmp
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="processes are found by /proc")
-@pytest.mark.parametrize("with_workers", [True, False])
-def test_a_sweep_that_was_killed_loses_no_run(file: Path, tmp_path: Path, with_workers: bool) -> None:
-    """SIGKILL for the sweep, and for its runs or not, which then go on and are waited for."""
+@pytest.mark.parametrize("how", ["all killed", "sweep killed", "sweep asked to stop"])
+def test_a_sweep_that_was_stopped_loses_no_run(file: Path, tmp_path: Path, how: str) -> None:
+    """SIGKILL of the sweep, and of its runs or not, which then go on and are waited for; or SIGTERM of the sweep."""
     code = (
-        "import sys; from pathlib import Path; from bidex_meta.sweep import queue; from bidex_meta.sweep.plan import "
-        f"read_sweep; queue.COMMAND = {FAKE!r}; "
-        "sys.exit(queue.work(read_sweep(Path('sweep.toml')).runs, [None, None], print))"
+        "import signal; from bidex_meta.sweep import queue; from tests.test_sweep import planned; "
+        "signal.signal(signal.SIGTERM, signal.default_int_handler); "
+        f"queue.COMMAND = {FAKE!r}; queue.work(planned(), [None, None], print)"
     )
     environment = {**os.environ, "FAKE_SECONDS": "0.4", "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "algos")])}
     Path("runs/tiny").mkdir(parents=True)
-    sweep = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL)
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    sweep = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path, env=environment, **quiet)
     _wait(lambda: len(list(tmp_path.glob("runs/tiny/*/checkpoints/step"))) == 2)
     runs = [int(path.name) for path in Path("/proc").iterdir() if path.name.isdigit() and _parent(path) == sweep.pid]
     assert len(runs) == 2
-    sweep.kill()
+    sweep.send_signal(signal.SIGTERM if how == "sweep asked to stop" else signal.SIGKILL)
     sweep.wait()
-    for pid in runs if with_workers else ():
+    for pid in runs if how == "all killed" else ():
         os.kill(pid, signal.SIGKILL)
-    _wait(lambda: not with_workers or not any(Path(f"/proc/{pid}/cwd").exists() for pid in runs))
+    _wait(lambda: how == "sweep killed" or not any(Path(f"/proc/{pid}/cwd").exists() for pid in runs))
+    assert not list(tmp_path.glob("runs/tiny/*.failed"))
     assert main(["sweep", str(file), "--workers", "1"]) == 0
-    begun = starts(tmp_path)
-    assert [[start["resumed"] for start in each] for each in begun.values()] == [[False, True] if with_workers else [False]] * 2  # fmt: skip  # noqa: E501
+    begun = [[start["resumed"] for start in each] for each in starts(tmp_path).values()]
+    assert begun == [[False] if how == "sweep killed" else [False, True]] * 2
     for run in read_sweep(file).runs:
         assert done(run) and [row["step"] for row in run.folder.metrics()] == [1, 2, 3, 4, 5, 6]
 
@@ -210,8 +221,8 @@ def test_one_sweep_works_in_a_folder_and_a_changed_file_is_noticed(file: Path, t
         assert "Another sweep works in" in capsys.readouterr().err
     assert main(["sweep", str(file)]) == 0
     with pytest.raises(BidexError, match="num_envs is 8 there, not 16"):
-        state_of(read_sweep(file).runs[0], {**CONFIG, "num_envs": 16})
-    more = state_of(read_sweep(file).runs[0], {**CONFIG, "steps": 12})
+        state(read_sweep(file).runs[0], {**CONFIG, "num_envs": 16})
+    more = state(read_sweep(file).runs[0], {**CONFIG, "steps": 12})
     assert (more.state, more.step, more.speed) == ("left", 6, 2.0), "more steps: the run goes on"
 
 
@@ -248,16 +259,14 @@ def test_submit_without_submitit_is_one_line(file: Path, monkeypatch, capsys) ->
 
 def test_jobs_of_the_local_executor(file: Path, tmp_path: Path, monkeypatch, capsys) -> None:
     pytest.importorskip("submitit", reason="needs the extra slurm")
-    sweep = read_sweep(file)
-    sweep.out.mkdir(parents=True)
-    jobs = queue.submit(sweep.runs, sweep.out, "local", {"timeout_min": 2})
-    for job in jobs.values():
+    out, runs = Path("runs/tiny"), planned()
+    out.mkdir(parents=True)
+    for job in queue.submit(runs, out, "local", {"timeout_min": 2}).values():
         assert job.result() is None
-    assert all(done(run) for run in sweep.runs)
+    assert all(done(run) for run in runs)
     with pytest.raises(BidexError, match="submitit: "):
-        queue.submit(sweep.runs, sweep.out, "local", {"timeout": 2})
-    again = queue.Job(sweep.runs[0], FAKE).checkpoint()
-    assert again.function.run == sweep.runs[0]
+        queue.submit(runs, out, "local", {"timeout": 2})
+    assert queue.Job(runs[0], FAKE).checkpoint().function.run == runs[0]
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ import math
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -60,7 +60,8 @@ def main(arguments: Sequence[str]) -> None:
     sweep = read_sweep(flags.file, flags.out)
     cores = choose_cores(flags.cores, flags.workers)
     configs = _configs(sweep, flags.file)
-    states = [state_of(run, configs[run.words]) for run in sweep.runs]
+    runs = [replace(run, config=configs[run.words]) for run in sweep.runs]
+    states = [state_of(run) for run in runs]
     if flags.status:
         _print(states)
         return
@@ -82,7 +83,7 @@ def main(arguments: Sequence[str]) -> None:
             return
         _say(f"{len(states) - len(left)} of {len(states)} runs are done; {len(cores)} at a time.")
         failed = work(left, cores, _say)
-    _print([state_of(run, configs[run.words]) for run in sweep.runs])
+    _print([state_of(run) for run in runs])
     if failed:
         _say(f"{failed} failed. Started again, the sweep tries them anew.")
         raise SystemExit(EXIT_FAILED)
@@ -106,23 +107,23 @@ def _configs(sweep: "Sweep", file: Path) -> dict[tuple[str, ...], dict[str, Any]
 
 
 def _print(states: "Sequence[State]") -> None:
-    """A line a run; hours left by the run's own speed, else by the mean of those on its suite."""
+    """A line a run; hours left by its own speed, else by the mean on its suite, else by that of all."""
     from bidex_meta.commands.tables import plain_table, print_table
 
-    rows, total = [], 0.0
+    speeds, rows, total = [(each.run.subject, each.speed) for each in states if each.speed], [], 0.0
     for each in states:
-        alike = [other.speed for other in states if other.speed and other.run.subject == each.run.subject]
+        alike = [speed for subject, speed in speeds if subject == each.run.subject] or [speed for _, speed in speeds]
         speed = each.speed or (mean(alike) if alike else math.nan)
         seconds = (each.goal - each.step) / speed if each.minutes is None else 60 * each.minutes - each.seconds
         hours = 0.0 if each.state == "done" else max(seconds / 3600, 0.0)
-        total += 0.0 if math.isnan(hours) else hours
+        total += hours
         goal = f"{each.goal:,}" if each.minutes is None else f"{each.minutes:g} min"
-        cells = [f"{each.step:,}", goal, f"{each.speed:,.0f}", "unknown" if math.isnan(hours) else f"{hours:.2f}"]
+        cells = [f"{each.step:,}", goal, f"{each.speed:,.0f}", "–" if math.isnan(hours) else f"{hours:.2f}"]
         rows.append([each.run.name, each.state, *cells, each.why[:120] if each.state == "failed" else ""])
     print_table(plain_table(["run", "state", "steps", "of", "steps/s", "hours left", "why"], rows))
     names = [each.state for each in states]
     counts = ", ".join(f"{names.count(name)} {name}" for name in ("done", "runs", "failed", "left"))
-    print(f"{counts}; about {total:.2f} core-hours of training left")
+    print(counts + ("" if math.isnan(total) else f"; about {total:.2f} core-hours of training left"))
 
 
 def _say(text: str) -> None:

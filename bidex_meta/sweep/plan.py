@@ -3,7 +3,7 @@
 import itertools
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +43,7 @@ class PlannedRun:
         seed: Its seed.
         words: Flags of ``bidex-meta run``, without seed and folder.
         after: The folder of the run whose policy it starts from.
+        config: What the words resolve to; added by the command, which checks them.
     """
 
     path: Path
@@ -51,6 +52,7 @@ class PlannedRun:
     seed: int
     words: tuple[str, ...]
     after: Path | None = None
+    config: Mapping[str, Any] = field(default_factory=dict, compare=False)
 
     @property
     def name(self) -> str:

@@ -44,28 +44,29 @@ class State(NamedTuple):
         return self.step / self.seconds if self.seconds else 0.0
 
 
-def state_of(run: PlannedRun, config: Mapping[str, Any]) -> State:
-    """How far a run has come; ``config`` is what its flags resolve to, on any seed.
+def state_of(run: PlannedRun) -> State:
+    """How far a run, of which the config is known, has come.
 
     Raises:
         BidexError: There is a run of another config in its folder, or files that cannot be read.
     """
-    rows, began = [], exists(run.folder.config_path)
-    if began:
-        known, wanted = flat(run.folder.config()), flat(dict(config))
+    rows, evaluated = [], False
+    if exists(run.folder.config_path):
+        known, wanted = flat(run.folder.config()), flat(dict(run.config))
         if run.after is not None:  # another for each seed
             wanted["start_from"] = str(run.after.resolve())
-        for name in (known.keys() & wanted.keys()).difference(_FREE):
+        for name in sorted((known.keys() & wanted.keys()).difference(_FREE)):
             if known[name] != wanted[name]:
                 raise BidexError(
                     f"{run.path} is a run of another config: {name} is {known[name]} there, not {wanted[name]}. Give "
                     "the arm another name, or move the folder away."
                 )
         rows = last_rows(run.folder.metrics_path) if is_file(run.folder.metrics_path) else []
-    last, why, steps = rows[-1] if rows else {"step": 0}, _last_line(_beside(run, "failed")), goal(config, rows)
-    done = began and _evaluated(run, steps)
+        evaluated = run.folder.evaluated
+    last, steps, why = rows[-1] if rows else {"step": 0}, goal(run.config, rows), _last_line(_beside(run, "failed"))
+    done = evaluated and run.folder.evaluation().get("steps", steps) >= steps
     state = "runs" if _locked(run) else "done" if done else "failed" if why else "left"
-    return State(run, state, last["step"], steps, config["minutes"], last.get("Perf/training_time") or 0.0, why)
+    return State(run, state, last["step"], steps, run.config["minutes"], last.get("Perf/training_time") or 0.0, why)
 
 
 class Job:
@@ -81,10 +82,10 @@ class Job:
         Raises:
             BidexError: It failed: the last line of its log, which a file beside its folder keeps.
         """
-        run, waited = self.run, False
+        run = self.run
         while _locked(run) and not self.stopped:  # a process trains it that a killed sweep has left
-            waited = waited or not time.sleep(1.0)
-        if self.stopped or (waited and _evaluated(run, run.folder.goal)):
+            time.sleep(1.0)
+        if self.stopped or state_of(run).state == "done":
             return
         words = ["run", f"--resume={run.path}", *run.words] if exists(run.folder.config_path) else run.begin
         with _beside(run, "log").open("ab") as log:
@@ -99,7 +100,7 @@ class Job:
         if self.stopped:
             self.process.terminate()
         code = self.process.wait()
-        if code == 0 and _evaluated(run, run.folder.goal):
+        if code == 0 and state_of(run).state == "done":
             _beside(run, "failed").unlink(missing_ok=True)
         elif not self.stopped:
             why = _last_line(_beside(run, "log")) or f"ended with exit code {code}"
@@ -216,10 +217,6 @@ def choose_cores(asked: str | None, workers: int | None) -> list[int | None]:
     if count > len(chosen):
         raise BidexError(f"--workers: expected at most {len(chosen)}, one for each core, got {count}.")
     return chosen[:count]
-
-
-def _evaluated(run: PlannedRun, steps: int) -> bool:
-    return run.folder.evaluated and run.folder.evaluation().get("steps", steps) >= steps
 
 
 def _locked(run: PlannedRun) -> bool:
