@@ -12,6 +12,7 @@ from tests.pages import ROOT
 from tests.test_histories import log
 from tests.tools import test_collect
 from tests.tools.test_collect import collect, evaluated
+from tools.pages import __main__ as pages
 from tools.pages.blocks import fill
 from tools.pages.studies import read_studies
 
@@ -70,6 +71,16 @@ def test_a_block_shows_what_compare_computes(page: Path, capsys: pytest.CaptureF
     assert rows[1]["success, IQM"] == f"{100 * value:.1f} % [{100 * ends[0]:.1f}, {100 * ends[1]:.1f}]"
     assert (rows[1]["seeds"], rows[1]["steps"], rows[1]["parameters"]) == ("2", "1,000", "12,345")
     assert rows[1]["A"] == "5.5" and rows[1]["hours"] == f"{known['hours']:.2f}" and rows[2]["A"] == "0.125"
+
+
+def test_a_check_fails_until_the_pages_are_filled(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(page.parent)
+    (page.parent / "results").mkdir()
+    (page.parent / "data").rename("results/data")
+    for check, code in ((True, 1), (False, 0), (True, 0)):
+        with pytest.raises(SystemExit) as stop:
+            pages.main((page,), check)
+        assert int(stop.value.code or 0) == code
 
 
 def test_pictures_are_drawn_anew_where_the_data_changed(page: Path) -> None:
