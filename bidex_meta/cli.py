@@ -79,10 +79,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         place = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
         return _failed(f"{place}{error.strerror or error}. Mend the path, or make room.", EXIT_BAD_INPUT, debug)
     except (Exception, SystemExit) as error:
-        told = own_fault(error)
-        if told is None:
+        message = own_fault(error)
+        if message is None:
             raise
-        return _failed(f"{told} Mend it there; --debug shows the traceback.", EXIT_BAD_INPUT, debug)
+        return _failed(f"{message} Mend it there; --debug shows the traceback.", EXIT_BAD_INPUT, debug)
 
 
 class _Terminated(KeyboardInterrupt):
@@ -120,11 +120,11 @@ def _failed(reason: str, code: int, debug: bool) -> int:
     """Says why, on one line; within an ``except`` whose error ``--debug`` shows."""
     if debug:
         raise
-    told = one_line(reason)
-    if len(told) > _LONGEST:
-        told = f"{told[: _LONGEST - 300]} ... {told[-200:]}"  # the end says how to mend it
+    message = one_line(reason)
+    if len(message) > _LONGEST:
+        message = f"{message[: _LONGEST - 300]} ... {message[-200:]}"  # the end says how to mend it
     with contextlib.suppress(OSError):  # nobody may read it
-        print(f"bidex-meta: {told}", file=sys.stderr)
+        print(f"bidex-meta: {message}", file=sys.stderr)
     return code
 
 

@@ -54,15 +54,15 @@ def outside_class(name: str, role: str) -> tuple[type[Any], Any]:
             _files[spec.origin] = f"{role} {name}"
         module = importlib.import_module(module_name)
     except (Exception, SystemExit) as error:
-        told = own_fault(error)
+        message = own_fault(error)
         # ValueError and TypeError: an empty or a relative name.
-        if isinstance(error, ModuleNotFoundError) or (told is None and isinstance(error, ValueError | TypeError)):
+        if isinstance(error, ModuleNotFoundError) or (message is None and isinstance(error, ValueError | TypeError)):
             missing = getattr(error, "name", None) or module_name
-            told = (
+            message = (
                 f"{role} {name}: expected a module that can be imported, but there is no {missing}. Install its "
                 "package, or start in the folder that holds it."
             )
-        raise BidexError(told or f"{role} {name}: {_said(error)}.") from error
+        raise BidexError(message or f"{role} {name}: {_said(error)}.") from error
     found = getattr(module, class_name, None)
     if not isinstance(found, type):
         raise BidexError(f"{role} {name}: expected a class {class_name} in {module.__file__}, found none.")

@@ -123,5 +123,5 @@ def _classes(group: "Group", names: Sequence[str]) -> list[list[object]]:
 
 
 def _ranged(estimate: "Estimate", factor: float = 1.0, unit: str = "", sign: bool = False) -> str:
-    told = estimate.text(factor, unit, "+.1f" if sign else ".1f")
-    return told if estimate.interval else f"{told} [–]"
+    shown = estimate.text(factor, unit, "+.1f" if sign else ".1f")
+    return shown if estimate.interval else f"{shown} [–]"

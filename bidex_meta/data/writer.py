@@ -82,17 +82,17 @@ def claimed(folder: Path, plan: dict[str, Any]) -> Iterator[None]:
     Raises:
         BidexError: Another process records there.
     """
-    told = f"Another process records into {folder}. Wait for its end, or name another place by --out."
+    message = f"Another process records into {folder}. Wait for its end, or name another place by --out."
     missing = [each for each in (folder, *folder.parents) if not exists(each)]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = contextlib.ExitStack()
-        lock.enter_context(RunFolder(folder).locked(told))
+        lock.enter_context(RunFolder(folder).locked(message))
     except OSError as error:
         raise BidexError(f"{folder} cannot be written: {error.strerror}. Name another place by --out.") from None
     with lock:
         if not folder.is_dir():
-            raise BidexError(told)  # made and taken away by one that was refused
+            raise BidexError(message)  # made and taken away by one that was refused
         try:
             check_place(folder, plan)
             yield
@@ -238,8 +238,8 @@ def _write_metadata(inner: Path, content: dict[str, Any]) -> None:
 
 def _space(space: Box) -> str:
     """A space in the words that Minari reads."""
-    told = {"type": "Box", "dtype": str(np.dtype(space.dtype)), "shape": list(space.shape)}
-    return json.dumps(told | {"low": space.low.tolist(), "high": space.high.tolist()})
+    entries = {"type": "Box", "dtype": str(np.dtype(space.dtype)), "shape": list(space.shape)}
+    return json.dumps(entries | {"low": space.low.tolist(), "high": space.high.tolist()})
 
 
 def estimated_bytes(steps: int, observation_size: int, action_size: int, episode_steps: float) -> int:

@@ -143,8 +143,8 @@ def _combinations(content: Mapping[str, Any], arm: Mapping[str, Any]) -> Iterato
     grid = {flag: each for flag, each in flat(content.get("grid", {})).items() if flag.replace("-", "_") not in fixed}
     for values in itertools.product(*grid.values()):
         chosen = dict(zip(grid, values, strict=True))
-        told = "".join(f" {flag.rpartition('.')[2]}={_named(value)}" for flag, value in chosen.items())
-        yield told, [word for flag, value in {**shared, **chosen, **own}.items() for word in _words(flag, value)]
+        label = "".join(f" {flag.rpartition('.')[2]}={_named(value)}" for flag, value in chosen.items())
+        yield label, [word for flag, value in {**shared, **chosen, **own}.items() for word in _words(flag, value)]
 
 
 def _check(
