@@ -51,7 +51,7 @@ def test_value_and_gradient_stay_finite_where_tanh_rounds_to_one():
 def test_the_actor_starts_at_zero_with_its_standard_deviation_and_keeps_the_bounds():
     mean, log_std = actor()(torch.randn(100, 5, generator=torch.Generator().manual_seed(0)))
     assert mean.abs().max() < 0.1
-    assert_close(log_std.exp(), torch.full((100, 3), 0.5), rtol=0.05, atol=0)
+    assert_close(log_std.exp(), torch.full((100, 3), 0.5), rtol=0.1, atol=0)
     wild = actor()
     with torch.no_grad():
         wild.net.head.weight.mul_(1e6)
