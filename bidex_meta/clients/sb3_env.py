@@ -72,7 +72,7 @@ class SB3VecEnv(VecEnv):
         return [getattr(self.world, method_name)(*method_args, **method_kwargs)] * len(list(self._get_indices(indices)))
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """True of `Monitor` alone: `infos` tells of whole episodes as it does, which SB3's evaluation then counts."""
+        """True for `Monitor` alone: like it, `infos` reports whole episodes, and SB3 counts those in evaluations."""
         return [wrapper_class is Monitor for _ in self._get_indices(indices)]
 
     def close(self) -> None:

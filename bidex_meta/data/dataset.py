@@ -176,11 +176,11 @@ class Dataset:
             BidexError: Parts are missing or damaged.
         """
         found = {name: _joined([table[name] for table in self._tables]) for name in (*part_files.TABLE, "variation")}
-        told = self.num_episodes, self.num_steps
+        own = self.num_episodes, self.num_steps
         there = len(found["steps"]), int(found["steps"].sum())
-        if told != there:
+        if own != there:
             raise BidexError(
-                f"{self.folder}: expected {told[0]} episodes of {told[1]} steps, found {there[0]} of {there[1]}. Parts "
+                f"{self.folder}: expected {own[0]} episodes of {own[1]} steps, found {there[0]} of {there[1]}. Parts "
                 "are missing: record it again, or bring them back."
             )
         slots = len(self.metadata["tasks"])

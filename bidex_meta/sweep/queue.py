@@ -210,8 +210,8 @@ def choose_cores(asked: str | None, workers: int | None) -> list[int | None]:
         try:
             parts = [[usable.index(int(end)) for end in part.split("-")] for part in asked.split(",")]
         except ValueError:
-            told = f"--cores: expected numbers such as 1 or 0,2-3, of {usable}, got {shortened(asked)}."
-            raise BidexError(told) from None
+            message = f"--cores: expected numbers such as 1 or 0,2-3, of {usable}, got {shortened(asked)}."
+            raise BidexError(message) from None
         chosen = list(dict.fromkeys(core for ends in parts for core in usable[min(ends) : max(ends) + 1]))
     count = workers or (1 if asked is None else len(chosen))
     if count > len(chosen):
