@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, cast
 
 import numpy as np
 
-from bidex_meta.errors import BidexError, shortened, unknown_name, whole_number
+from bidex_meta.errors import BidexError, shortened, unknown_name
 from bidex_meta.memory import POINT_BYTES, ROW_BYTES, check_memory
 from bidex_meta.outside import name_with_object
 from bidex_meta.suite import MOST_POINTS, SPLITS, ListedTask, Split, Suite, SuiteClass, load_suite
 from bidex_meta.tasks import registry
+from bidex_meta.validation import whole_number
 
 if TYPE_CHECKING:
     import torch

@@ -1,10 +1,7 @@
 """The one exception for bad input (a line that names the expected, the received and the mend), and exit codes."""
 
 import difflib
-import operator
 from collections.abc import Iterable
-
-import numpy as np
 
 EXIT_BAD_INPUT = 2
 EXIT_FAILED = 1
@@ -65,39 +62,6 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> BidexError:
     near = nearest(str(name), names)
     hint = f" Did you mean {near!r}?" if near else ""
     return BidexError(f"Unknown {kind} {shortened(name)}.{hint} Known: {', '.join(names) or 'none'}.")
-
-
-def whole_number(name: str, value: object, least: int, most: int | None = None) -> int:
-    """A whole number within bounds, of whatever integer type.
-
-    Args:
-        name: What it is, for the message.
-        value: What was given.
-        least: Lower bound.
-        most: Upper bound, or None.
-
-    Raises:
-        BidexError: Not a whole number (1.0, True and "1" are none), or out of bounds.
-    """
-    try:
-        number = None if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]
-    except TypeError:
-        number = None
-    if number is None or number < least or (most is not None and number > most):
-        bounds = f"from {least} on" if most is None else f"from {least} to {most}"
-        raise BidexError(f"{name}: expected a whole number {bounds}, got {shortened(value)}.")
-    return number
-
-
-def true_or_false(name: str, value: object) -> bool:
-    """A truth value, Python's or NumPy's.
-
-    Raises:
-        BidexError: Neither true nor false; no other value stands for one.
-    """
-    if not isinstance(value, bool | np.bool_):
-        raise BidexError(f"{name}: expected True or False, got {shortened(value)}.")
-    return bool(value)
 
 
 def shortened(value: object) -> str:

@@ -15,7 +15,7 @@ PACKAGES = {package.__name__: Path(next(iter(package.__path__))) for package in 
 
 ORDER = (
     ("errors",),
-    ("paths", "maths", "agents", "drawing", "reading", "fields", "memory", "outside", "streams"),
+    ("paths", "maths", "agents", "drawing", "reading", "fields", "memory", "outside", "streams", "validation"),
     ("engine", "record", "hands", "suite"),
     ("tasks",),
     ("points",),

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from bidex_meta.clients.foreign_world import ForeignWorld, Sizes, Transition
 from bidex_meta.engine.cpu import CpuEngine
-from bidex_meta.errors import BidexError, unknown_name, whole_number
+from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.validation import whole_number
 from bidex_meta.world.checked import fits
 
 NAME = "Humanoid-v5"

@@ -3,7 +3,8 @@
 import torch
 
 from bidex_meta.engine.protocol import EngineMaker
-from bidex_meta.errors import BidexError, shortened, whole_number
+from bidex_meta.errors import BidexError, shortened
+from bidex_meta.validation import whole_number
 
 ENGINES = ("auto", "c", "warp")
 _MOST_THREADS = 1024

@@ -5,13 +5,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bidex_meta.errors import BidexError, shortened, whole_number
+from bidex_meta.errors import BidexError, shortened
 from bidex_meta.points.camera import camera_of
 from bidex_meta.points.cloud import Cloud
 from bidex_meta.points.surfaces import sample
 from bidex_meta.points.told import entries_of_objects
 from bidex_meta.suite import MOST_POINTS
 from bidex_meta.tasks.scene import Scene
+from bidex_meta.validation import whole_number
 
 CANDIDATES = 3072
 """Points fixed on a scene at least: fewer leave gaps through which what is hidden shines."""

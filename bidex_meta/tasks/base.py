@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
-from bidex_meta.errors import true_or_false
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.tasks.layout import Layout
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace
+from bidex_meta.validation import true_or_false
 
 
 @dataclass(frozen=True)

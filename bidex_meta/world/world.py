@@ -16,10 +16,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from torch import Tensor
 
 from bidex_meta.engine.choice import choose_engine
-from bidex_meta.errors import BidexError, true_or_false, whole_number
+from bidex_meta.errors import BidexError
 from bidex_meta.points.sight import PointsRule
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.layout import CLIP
+from bidex_meta.validation import true_or_false, whole_number
 from bidex_meta.world import actions, checked
 from bidex_meta.world.attributes import RowAttributes
 from bidex_meta.world.autoreset import checked_mode, checked_seed, reset_mask

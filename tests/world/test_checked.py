@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from bidex_meta.errors import BidexError, whole_number
+from bidex_meta.errors import BidexError
+from bidex_meta.validation import whole_number
 from bidex_meta.world import World
 from tests.world.play import engine_state, flat, suite_world
 
