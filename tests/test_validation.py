@@ -1,4 +1,4 @@
-"""Values from outside are checked by annotations; each complaint is one line with the place, the expected and the got."""
+"""Values from outside are checked by annotations; a complaint names place, expected and received on one line."""
 
 import dataclasses
 from typing import Any, Literal
