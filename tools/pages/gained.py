@@ -31,7 +31,7 @@ def gains_table(study: Study) -> Iterator[str]:
     split = study.split or "test"
     parts: dict[tuple[str, int], tuple[StoredRun, dict[str, Any]]] = {}
     for run in study.runs:
-        part, key = run.evaluation().get("splits", {}).get(split), (run.arm, run.config()["seed"])
+        part, key = run.evaluation().get("splits", {}).get(split), (run.arm, run.config().seed)
         if part is None or "gain" not in part:
             raise BidexError(f"Study {study.name}: {run.path} has no meta-test of {split} tasks. Leave it out.")
         if key in parts:

@@ -34,8 +34,8 @@ def offline_table(study: Study) -> Iterator[str]:
     experts = []
     for run in study.runs:
         config = run.config()
-        if config.get("dataset"):
-            cells.setdefault(_kind(config["dataset"]), {}).setdefault(config["algo"], []).append(run)
+        if config.dataset:
+            cells.setdefault(_kind(config.dataset), {}).setdefault(config.algo, []).append(run)
         else:
             experts.append(run)
     learners = _ordered({algo for row in cells.values() for algo in row}, LEARNERS)
@@ -72,7 +72,7 @@ def _ends(runs: Sequence[StoredRun], experts: Sequence[StoredRun]) -> tuple[floa
 def _cell(runs: Sequence[StoredRun], ends: tuple[float, float] | None) -> str:
     if not runs:
         return "–"
-    refuse_differing(f"{_kind(runs[0].config()['dataset'])} {runs[0].config()['algo']}", runs)
+    refuse_differing(f"{_kind(runs[0].config().dataset)} {runs[0].config().algo}", runs)
     if ends is None:
         scores = np.array([_of({"classes": scored_classes(run)}, "score") for run in runs])
     else:

@@ -54,7 +54,7 @@ def _cells(study: Study) -> dict[tuple[str, int], list[StoredRun]]:
     cells: dict[tuple[str, int], list[StoredRun]] = {}
     for run in study.runs:
         config = run.config()
-        cells.setdefault((config["algo"], config["num_envs"]), []).append(run)
+        cells.setdefault((config.algo, config.num_envs), []).append(run)
     for (algo, rows), runs in cells.items():
         refuse_differing(f"{algo} with {rows} rows", runs)
     _class(study)

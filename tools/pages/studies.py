@@ -7,12 +7,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from bidex_meta.config import flat
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import Estimate, Group, classes_of, estimates, group_of, iqm
 from bidex_meta.evaluation.histories import curves_of
 from bidex_meta.outside import short_name
 from bidex_meta.record import plots
-from bidex_meta.record.folder import flat
 from bidex_meta.record.stored import StoredRun
 
 _FREE = ("seed", "start_from", "device", "threads", "logger", "evaluate_every", "video_every", "processes", "preset")
@@ -111,17 +111,17 @@ def read_studies(data: Path, name: str, on: str | None = None, split: str | None
         BidexError: A file cannot be read.
     """
     runs = [StoredRun.open(path) for path in sorted((data / name).glob("*.json"))]
-    whole = [run for run in runs if run.config()["task"] is None]
+    whole = [run for run in runs if run.config().task is None]
     by_classes: dict[frozenset[str], list[StoredRun]] = {}
     for run in whole:
         by_classes.setdefault(frozenset(classes_of(run.evaluation())), []).append(run)
-    alone = [run for run in runs if run.config()["task"] is not None]
+    alone = [run for run in runs if run.config().task is not None]
     for classes, members in by_classes.items():
         joining = [run for run in alone if _covered(run, alone) == classes]
         members += joining
         alone = [run for run in alone if run not in joining]
     for run in alone:
-        by_classes.setdefault(frozenset([run.config()["task"]]), []).append(run)
+        by_classes.setdefault(frozenset([str(run.config().task)]), []).append(run)
     found = [Study(name, _subject(members), members, split) for members in by_classes.values()]
     return [study for study in sorted(found, key=lambda study: study.on) if on in (None, study.on)]
 
@@ -140,21 +140,21 @@ def _subject(runs: Sequence[StoredRun]) -> str:
     """The suite or the class; of several suites of the same classes the shipped one."""
     suites = [run.content["suite"] for run in runs if run.content["suite"] is not None]
     if not suites:
-        return short_name(runs[0].config()["task"]).rpartition("/")[2]
+        return short_name(str(runs[0].config().task)).rpartition("/")[2]
     return str(min(suites, key=lambda suite: "file" in suite).get("name"))
 
 
 def _covered(run: StoredRun, runs: Sequence[StoredRun]) -> frozenset[str]:
     """The classes of all runs that share a run's arm and seed."""
-    same = [other for other in runs if (other.arm, other.config()["seed"]) == (run.arm, run.config()["seed"])]
-    return frozenset(other.config()["task"] for other in same)
+    same = [other for other in runs if (other.arm, other.config().seed) == (run.arm, run.config().seed)]
+    return frozenset(str(other.config().task) for other in same)
 
 
 def refuse_differing(name: str, runs: Sequence[StoredRun]) -> None:
     """Seeds of an arm may be of versions that know more or fewer options, but what both know is the same."""
     for run in runs[1:]:
-        same = next(known for known in runs if known.config()["task"] == run.config()["task"])
-        first, other = flat(same.config()), flat(run.config())
+        same = next(known for known in runs if known.config().task == run.config().task)
+        first, other = flat(same.content["config"]), flat(run.content["config"])
         for key in first.keys() & other.keys():
             if key not in _FREE and first[key] != other[key]:
                 raise BidexError(

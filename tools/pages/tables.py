@@ -92,7 +92,7 @@ def best_table(studies: Sequence[Study]) -> Iterator[str]:
         run, best = max(found[name], key=lambda pair: (pair[1]["success"], pair[1]["return"]))
         random = run.evaluation().get("random", {"classes": {}})["classes"].get(name)
         content = run.content
-        which = [run.arm, str(run.config()["seed"]), f"{content['steps']:,}", f"{content['seconds'] / 3600:.2f}"]
+        which = [run.arm, str(run.config().seed), f"{content['steps']:,}", f"{content['seconds'] / 3600:.2f}"]
         cells = [
             _measure(best, "success").text(100.0, " %", ".4g"),
             _measure(best, "return").text(form=".4g"),
