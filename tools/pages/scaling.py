@@ -65,7 +65,9 @@ def _cells(study: Study) -> dict[tuple[str, int], list[StoredRun]]:
 def _class(study: Study) -> str:
     names = {name for run in study.runs for name in classes_of(run.evaluation())}
     if len(names) != 1:
-        raise BidexError(f"Study {study.name}: numbers of environments are compared on one class, got {', '.join(sorted(names))}.")
+        raise BidexError(
+            f"Study {study.name}: numbers of environments are compared on one class, got {', '.join(sorted(names))}."
+        )
     return names.pop()
 
 
