@@ -186,7 +186,7 @@ def test_a_file_without_a_meta_test_is_one_line(text, tmp_path):
 @pytest.mark.parametrize("text", ["[]", '{"algo": "mtppo"}'])
 def test_a_config_that_is_no_runs_is_one_line(text, tmp_path):
     (tmp_path / "config.json").write_text(text)
-    with pytest.raises(BidexError, match="config.json: .*expected"):
+    with pytest.raises(BidexError, match=r"config.json: .*expected"):
         RunFolder.open(tmp_path).config()
 
 
