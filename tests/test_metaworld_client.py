@@ -20,8 +20,7 @@ from bidex_meta.clients import metaworld as client
 from bidex_meta.clients import metaworld_world
 from bidex_meta.clients.metaworld_world import MetaWorldWorld, evaluate_all_tasks
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.play import evaluate
-from bidex_meta.evaluation.untrained import RandomAgent
+from bidex_meta.evaluation.play import RandomAgent, evaluate
 from bidex_meta.record import RunFolder
 from tests.world.play import assert_same, number_of_ends, play
 

@@ -7,7 +7,7 @@ from bidex_meta import paths
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import references
-from bidex_meta.evaluation.scores import Reference
+from bidex_meta.evaluation.references import Reference
 from bidex_meta.sources import Source
 from bidex_meta.sources.source import OwnSuite
 from bidex_meta.tasks import registry

@@ -59,7 +59,7 @@ def main(arguments: Sequence[str]) -> None:
         else:
             figure = plots.draw_adaptation(plots.read_evaluation(source), source)
     else:
-        from bidex_meta.evaluation.histories import read_histories
+        from bidex_meta.evaluation.comparison import read_histories
 
         out = flags.out or home / "curves.png"
         figure = plots.draw_learning([(history.label, history.curves) for history in read_histories(runs)])

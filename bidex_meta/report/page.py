@@ -15,8 +15,7 @@ from typing import Any
 
 from bidex_meta.config import flat, printed
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.comparison import Group, estimates, iqm, iqm_difference, read_groups
-from bidex_meta.evaluation.histories import History, read_histories
+from bidex_meta.evaluation.comparison import Group, History, estimates, iqm, iqm_difference, read_groups, read_histories
 from bidex_meta.reading import is_file
 from bidex_meta.record import plots, training_seconds
 from bidex_meta.record.stored import Run

@@ -8,7 +8,7 @@ from bidex_meta.memory import check_memory
 from bidex_meta.sources.source import Source
 
 if TYPE_CHECKING:
-    from bidex_meta.evaluation.scores import Reference
+    from bidex_meta.evaluation.references import Reference
     from bidex_meta.tasks.base import TaskClass
     from bidex_meta.world.contract import PooledWorld
 

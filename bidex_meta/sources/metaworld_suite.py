@@ -10,8 +10,8 @@ from bidex_meta.sources.source import Source
 
 if TYPE_CHECKING:
     from bidex_meta.agents import Agent
+    from bidex_meta.evaluation.references import Reference
     from bidex_meta.evaluation.results import Evaluation
-    from bidex_meta.evaluation.scores import Reference
     from bidex_meta.tasks.base import TaskClass
     from bidex_meta.world.contract import PooledWorld
 
