@@ -51,7 +51,7 @@ def test_runs_are_grouped_whether_evaluated_or_not(tmp_path: Path):
     folders = [log(path, *rows) for path in (*paths, other)]
     first, second = read_histories(folders)
     assert (first.label, second.label) == ("mtppo, gamma 0.9", "mtppo, gamma 0.8")
-    assert [len(each.folders) for each in (first, second)] == [2, 1]
+    assert [len(each.runs) for each in (first, second)] == [2, 1]
     assert list(first.curves) == ["Train/success/A"]
     with pytest.raises(BidexError, match="holds nothing yet"):
         read_histories([log(paths[0])])

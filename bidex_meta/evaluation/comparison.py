@@ -139,6 +139,20 @@ def iqm_difference(a: np.ndarray, b: np.ndarray) -> Estimate:
     return Estimate(value, interval)
 
 
+def success_over(group: Group, first: Group) -> Estimate | None:
+    """Success above the first group's; None of the first itself, and of other classes than its own."""
+    known = group is not first and set(group.classes) == set(first.classes)
+    return iqm_difference(group.success, first.success) if known else None
+
+
+def score_over(group: Group, first: Group) -> Estimate | None:
+    """Normalised score above the first group's; None too where either is unknown."""
+    known = group is not first and set(group.classes) == set(first.classes)
+    if not known or group.scores is None or first.scores is None:
+        return None
+    return iqm_difference(group.scores, first.scores)
+
+
 def _iqm(values: np.ndarray) -> float:
     from scipy.stats import trim_mean
 
@@ -253,25 +267,23 @@ class History:
 
     label: str
     """The algo, and what tells the group from others of that algo."""
-    folders: list[Run]
+    runs: list[Run]
     """Its runs."""
     curves: dict[str, Curve]
     """Of each tag that a run has logged."""
 
 
-def read_histories(folders: Sequence[Run]) -> list[History]:
+def read_histories(runs: Sequence[Run]) -> list[History]:
     """Runs, evaluated or not, by group, in the order they are named.
 
     Raises:
         BidexError: None of them has logged anything.
     """
-    runs = [{"kind": run_kind(folder.config()), "folder": folder} for folder in folders]
-    histories = []
-    for label, members in by_kind(runs):
-        of_label = [run["folder"] for run in members]
-        histories.append(History(label, of_label, curves_of(of_label)))
+    kinds = [{"kind": run_kind(run.config()), "run": run} for run in runs]
+    groups = [(label, [member["run"] for member in members]) for label, members in by_kind(kinds)]
+    histories = [History(label, members, curves_of(members)) for label, members in groups]
     if not any(history.curves for history in histories):
-        raise BidexError(f"{folders[0].path} holds nothing yet: nothing to draw. Let the run go on.")
+        raise BidexError(f"{runs[0].path} holds nothing yet: nothing to draw. Let the run go on.")
     return histories
 
 
