@@ -28,7 +28,7 @@ ORDER = (
     ("clients", "witness", "data"),
     ("sources",),
     ("speed", "viewer", "report", "sweep"),
-    ("bidex_algos.checks", "bidex_algos.choices", "bidex_algos.reports"),
+    ("bidex_algos.checks", "bidex_algos.choices", "bidex_algos.learner"),
     ("bidex_algos.gradients", "bidex_algos.experience"),
     ("bidex_algos.nets",),
     ("bidex_algos.learner",),

@@ -5,9 +5,10 @@ algorithm its update.
 """
 
 import copy
+import math
 import time
-from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from abc import abstractmethod
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any, ClassVar
@@ -15,21 +16,39 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.experience.rollout import check_autoreset
-from bidex_algos.nets.encoders.inputs import Inputs
-from bidex_algos.nets.encoders.point_net import with_point_net
-from bidex_algos.nets.encoders.task_embedding import with_task_embedding
-from bidex_algos.nets.fitting import check_discounts, check_options
-from bidex_algos.nets.shape import Shape
-from bidex_algos.reports import check_finite
+from bidex_algos.nets.inputs import Inputs, with_task_embedding
+from bidex_algos.nets.point_net import with_point_net
+from bidex_algos.nets.shape import Shape, check_discounts, check_options
+from bidex_algos.rollout import check_autoreset
+from bidex_algos.start_from import start_from
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import broadcast, own_seed
+from bidex_meta.train.learner import Learner as Contract
+from bidex_meta.train.learner import LearnerConfig
 from bidex_meta.world.contract import VectorWorld
 
 
-class Learner(ABC):
-    """What ``bidex_meta.train.runner`` trains.
+def as_numbers(tensors: dict[str, Tensor]) -> dict[str, float]:
+    """Scalars as numbers, in one transfer from the device."""
+    if not tensors:
+        return {}
+    values = torch.stack([value.double() for value in tensors.values()]).tolist()
+    return dict(zip(tensors, values, strict=True))
+
+
+def check_finite(metrics: dict[str, float], losses: Iterable[str], learner: str, steps: int, remedy: str) -> None:
+    """Ends a training that can no longer learn.
+
+    Raises:
+        FloatingPointError: One of the ``losses`` among the metrics is not finite.
+    """
+    if not math.isfinite(sum(metrics.get(name, 0.0) for name in losses)):
+        raise FloatingPointError(f"{learner}: the loss is not finite after {steps} steps; {remedy}.")
+
+
+class Learner(Contract):
+    """Base of all learners of this package.
 
     In a run of several processes each has a world and samples of its own, and all have the same networks: statistics
     and gradients are those of the samples of all.
@@ -52,22 +71,15 @@ class Learner(ABC):
             the task's one-hot where an option of the config needs it.
     """
 
-    name: ClassVar[str]
-    """How the learner calls itself in messages."""
     remedy: ClassVar[str]
     """What helps, mostly, when a loss is no longer finite."""
-    config_type: ClassVar[type[Any]]
+    config_type: ClassVar[type[LearnerConfig]]
     """Its config, a dataclass."""
-    autoreset: ClassVar[Any] = "SAME_STEP"
-    """Mode of the world it trains on, or a function of the config (as a dict) that gives it."""
     discounts_by_class: ClassVar[bool] = False
     """Whether it takes the discount of each class where a world has some (``world.gammas``)."""
-    per_process: tuple[str, ...] = ()
-    """Entries of ``state_dict`` that differ from process to process."""
 
     def __init__(self, world: VectorWorld, config: Any, seed: int):
-        mode = self.autoreset(asdict(config)) if callable(self.autoreset) else self.autoreset
-        check_autoreset(world, self.name, str(mode))
+        check_autoreset(world, self.name, self.autoreset_mode(config))
         self.world, self.config, self.seed = world, config, seed
         self.device = torch.device(world.device)
         self.env_steps = 0
@@ -188,6 +200,17 @@ class Learner(ABC):
         policy = cls._make_policy(config, shape, init, torch.device(device))
         policy.load_state_dict(state["weights"])
         return policy
+
+    def start_from(self, policy: dict[str, Any]) -> None:
+        """Takes network and observation statistics of another learner's policy, and nothing else.
+
+        Args:
+            policy: ``checkpoint["learner"]["policy"]`` of the other.
+
+        Raises:
+            BidexError: Weights of one would not mean the same in the other.
+        """
+        start_from(self.policy, asdict(self.config), self.shape, policy)
 
     def state_dict(self) -> dict[str, Any]:
         """A copy of everything but the world, as tensors and plain values (``torch.load(weights_only=True)``)."""

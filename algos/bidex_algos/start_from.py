@@ -4,55 +4,44 @@ A meta-learner needs a skill to adapt. Plain policy gradients on all train tasks
 spend none on adaptation.
 """
 
-from dataclasses import asdict
-from typing import Any, Protocol
+from typing import Any
 
 from torch import nn
 
+from bidex_algos.nets.policy import SquashedPolicy
 from bidex_algos.nets.shape import Shape
-from bidex_algos.nets.squashed import SquashedActor
 from bidex_meta.errors import BidexError
-
-
-class PolicyLearner(Protocol):
-    """What all learners have."""
-
-    policy: nn.Module
-    """What acts: network and observation statistics."""
-    config: Any
-    """The learner's config."""
-    shape: Shape
-    """Of its world."""
-
 
 # What decides, beside the shapes of the weights, what they compute.
 _WORLD = ("observations", "actions", "task_id")
 _FORM = ("hidden", "activation", "normalise_observations", "reward_unit", "task_embedding", *_WORLD)
 
 
-def start_from(learner: PolicyLearner, state: dict[str, Any]) -> None:
-    """Gives a fresh learner the network and observation statistics of another's policy, and nothing else.
+def start_from(policy: nn.Module, config: dict[str, Any], shape: Shape, state: dict[str, Any]) -> None:
+    """Gives a policy the network and observation statistics of another, and nothing else.
 
     Args:
-        learner: The fresh one.
+        policy: The fresh one.
+        config: Of its learner.
+        shape: Of its world.
         state: ``checkpoint["learner"]["policy"]`` of the other.
 
     Raises:
         BidexError: Weights of one would not mean the same in the other.
     """
-    own, given = asdict(learner.config) | _seen(learner.shape), state["config"] | _seen(Shape.load(state["shape"]))
+    own, given = config | _seen(shape), state["config"] | _seen(Shape.load(state["shape"]))
     _agree(own, given, _FORM)
-    network, weights = _network(learner.policy.state_dict()), _network(state["weights"])
+    network, weights = _network(policy.state_dict()), _network(state["weights"])
     if _shapes(network) != _shapes(weights):
         raise BidexError(
             "Expected a policy to start from of the same kind (mtppo, mttrpo, promp and maml share one; mtsac and rl2 "
             "have their own, other architectures, policy heads and a task embedding others), got one with other "
             "weights. Name another run."
         )
-    if isinstance(getattr(learner.policy, "actor", None), SquashedActor):
+    if isinstance(policy, SquashedPolicy):
         # Its network speaks of a place between these bounds; a Gaussian one has its deviation as a weight.
         _agree(own, given, ("std_range",))
-    learner.policy.load_state_dict(learner.policy.state_dict() | weights)
+    policy.load_state_dict(policy.state_dict() | weights)
 
 
 def _network(weights: dict[str, Any]) -> dict[str, Any]:

@@ -9,13 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from bidex_algos.nets.encoders.inputs import Inputs
-from bidex_algos.nets.multitask.architecture import network_of
-from bidex_algos.nets.multitask.moore import Moore, gram_schmidt
-from bidex_algos.nets.multitask.paco import PaCo
-from bidex_algos.nets.multitask.soft_modules import SoftModules
+from bidex_algos.nets.architecture import network_of
+from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.multitask import Moore, PaCo, SoftModules, gram_schmidt
 from bidex_algos.nets.networks import MLP
-from bidex_algos.offpolicy.fasttd3_config import FastTD3Config
+from bidex_algos.offpolicy.fasttd3 import FastTD3Config
 from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_algos.offpolicy.td3 import TD3, TD3Config
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig

@@ -11,11 +11,9 @@ import torch
 from hypothesis import assume, example, given, settings
 from torch.testing import assert_close
 
-from bidex_algos.experience.rollout import collect
-from bidex_algos.gradients.balancing import balance_of
-from bidex_algos.gradients.conflict_averse import conflict_averse, worst_served
-from bidex_algos.gradients.famo import Famo
+from bidex_algos.balancing import Famo, balance_of, conflict_averse, worst_served
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
+from bidex_algos.rollout import collect
 from bidex_meta.errors import BidexError
 from tests.algos.problems import opposite_bandits
 from tests.algos.resume import resumed

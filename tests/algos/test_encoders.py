@@ -12,13 +12,11 @@ from torch.testing import assert_close
 from bidex_algos.learner import Learner
 from bidex_algos.meta.promp import ProMP, ProMPConfig
 from bidex_algos.meta.rl2 import RL2, RL2Config
-from bidex_algos.nets.encoders.columns import Columns
-from bidex_algos.nets.encoders.inputs import GroupEncoder, Inputs
-from bidex_algos.nets.encoders.task_embedding import with_task_embedding
+from bidex_algos.nets.inputs import Columns, GroupEncoder, Inputs, with_task_embedding
 from bidex_algos.nets.networks import MLP, GaussianActor
 from bidex_algos.nets.normalise import ObservationNormaliser
+from bidex_algos.nets.policy import SquashedActor
 from bidex_algos.nets.shape import Shape
-from bidex_algos.nets.squashed import SquashedActor
 from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from bidex_algos.experience.replay import Transitions
 from bidex_algos.offpolicy.brc import BRC, BRCConfig
 from bidex_algos.offpolicy.fasttd3 import FastTD3, FastTD3Config
+from bidex_algos.replay import Transitions
 from bidex_meta.commands.learners import learner_kind
 from bidex_meta.errors import BidexError
 from bidex_meta.train import distributed
@@ -314,7 +314,7 @@ def test_they_are_found_by_name_and_every_preset_runs(name: str, preset: str) ->
 
 def test_configs_are_shown_without_importing_torch() -> None:
     code = (
-        "import sys, bidex_algos.offpolicy.fasttd3_config as f, bidex_algos.offpolicy.brc_config as b; "
+        "import sys, bidex_algos.offpolicy.fasttd3 as f, bidex_algos.offpolicy.brc as b; "
         "assert f.PRESETS and b.PRESETS; sys.exit('torch' in sys.modules)"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}

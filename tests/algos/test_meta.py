@@ -9,15 +9,15 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from bidex_algos.gradients.trust_region import flatten, write
 from bidex_algos.meta.adaptation import weighted_mean
-from bidex_algos.meta.linear_baseline import features
 from bidex_algos.meta.maml import MAML, MAMLConfig
 from bidex_algos.meta.maml import PRESETS as MAML_PRESETS
 from bidex_algos.meta.meta_policy import make_meta_policy
 from bidex_algos.meta.promp import PRESETS, ProMP, ProMPConfig
-from bidex_algos.nets.encoders.inputs import Inputs
+from bidex_algos.meta.stage import features
+from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import gaussian_log_prob
+from bidex_algos.trust_region import flatten, write
 from bidex_meta.agents import Timestep
 from bidex_meta.errors import BidexError
 from bidex_meta.world.contract import plain_groups

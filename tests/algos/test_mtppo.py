@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from bidex_algos.experience.rollout import collect
 from bidex_algos.nets.networks import gaussian_log_prob
 from bidex_algos.onpolicy.mtppo import MTPPO, PRESETS, MTPPOConfig
+from bidex_algos.rollout import collect
 from bidex_meta.errors import BidexError
 from bidex_meta.world.contract import plain_groups
 from tests.algos.resume import resumed
@@ -234,7 +234,7 @@ def test_the_paper_preset_is_table_47():
 
 
 def test_the_config_is_shown_without_importing_torch():
-    code = "import sys, bidex_algos.onpolicy.mtppo_config as m; assert m.PRESETS; sys.exit('torch' in sys.modules)"
+    code = "import sys, bidex_algos.onpolicy.mtppo as m; assert m.PRESETS; sys.exit('torch' in sys.modules)"
     assert (
         subprocess.run(
             [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}

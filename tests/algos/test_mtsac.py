@@ -361,6 +361,6 @@ def test_both_names_lead_here():
 
 
 def test_the_config_is_shown_without_importing_torch():
-    code = "import sys, bidex_algos.offpolicy.mtsac_config as m; assert m.PRESETS; sys.exit('torch' in sys.modules)"
+    code = "import sys, bidex_algos.offpolicy.mtsac as m; assert m.PRESETS; sys.exit('torch' in sys.modules)"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     assert subprocess.run([sys.executable, "-c", code], env=environment).returncode == 0

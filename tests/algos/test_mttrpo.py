@@ -5,8 +5,8 @@ import torch
 from torch.distributions import Independent, Normal, kl_divergence
 from torch.testing import assert_close
 
-from bidex_algos.experience.rollout import collect
 from bidex_algos.onpolicy.mttrpo import MTTRPO, PRESETS, MTTRPOConfig
+from bidex_algos.rollout import collect
 from bidex_meta.errors import BidexError
 from tests.algos.resume import resumed
 from tests.algos.test_mtppo import equal, mean_errors

@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 from torch.distributions import Normal
 
-from bidex_algos.experience.rollout import collect
 from bidex_algos.multiagent.happo import HAPPO, HAPPOConfig
 from bidex_algos.multiagent.hatrpo import HATRPO, HATRPOConfig
 from bidex_algos.multiagent.ippo import IPPO, IPPOConfig
 from bidex_algos.multiagent.mappo import MAPPO, MAPPOConfig
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig
+from bidex_algos.rollout import collect
 from bidex_meta.errors import BidexError
 from tests.algos.problems import LQR, opposite_bandits
 from tests.algos.resume import resumed

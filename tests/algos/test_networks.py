@@ -4,10 +4,9 @@ from hypothesis import strategies as st
 from torch.distributions import Independent, Normal, kl_divergence
 from torch.testing import assert_close
 
-from bidex_algos.nets.encoders.inputs import Inputs
+from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import MLP, GaussianActor, gaussian_entropy, gaussian_kl, gaussian_log_prob
-from bidex_algos.nets.normalise import ObservationNormaliser, RunningStats
-from bidex_algos.nets.normalise_tasks import TaskNormaliser
+from bidex_algos.nets.normalise import ObservationNormaliser, RunningStats, TaskNormaliser
 from bidex_meta.world.contract import plain_groups
 
 TASKS_LAST = Inputs(plain_groups(5, 2))

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from bidex_algos.nets.encoders.inputs import Inputs
-from bidex_algos.nets.encoders.point_net import PointNet, _largest_of, with_point_net
+from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.point_net import PointNet, _largest_of, with_point_net
 from bidex_algos.offpolicy.mtsac import MTSACConfig
 from bidex_algos.onpolicy.mtppo import MTPPOConfig
 from bidex_meta.errors import BidexError

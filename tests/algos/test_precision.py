@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from bidex_algos.nets.precision import use_bfloat16
+from bidex_algos.nets.networks import use_bfloat16
 
 CPU = torch.device("cpu")
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from bidex_algos.reports import as_numbers, check_finite
+from bidex_algos.learner import as_numbers, check_finite
 
 
 def test_scalars_of_any_type_become_numbers():

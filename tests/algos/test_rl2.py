@@ -393,6 +393,6 @@ def test_presets_pass_gradients_through_150_steps_or_whole_trials():
 
 
 def test_the_config_is_shown_without_importing_torch():
-    code = "import sys, bidex_algos.meta.rl2_config as m; assert m.PRESETS; sys.exit('torch' in sys.modules)"
+    code = "import sys, bidex_algos.meta.rl2 as m; assert m.PRESETS; sys.exit('torch' in sys.modules)"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     assert subprocess.run([sys.executable, "-c", code], env=environment).returncode == 0

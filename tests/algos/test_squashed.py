@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
 from torch.testing import assert_close
 
-from bidex_algos.nets.encoders.inputs import Inputs
-from bidex_algos.nets.squashed import SquashedActor, sample_squashed, squashed_log_prob
+from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.policy import SquashedActor, sample_squashed, squashed_log_prob
 from bidex_meta.world.contract import plain_groups
 
 

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from torch import Tensor, nn
 from torch.testing import assert_close
 
-from bidex_algos.gradients.surgery import per_task_gradients, project_conflicting
+from bidex_algos.balancing import per_task_gradients, project_conflicting
 
 
 def in_a_loop(gradients: Tensor) -> Tensor:

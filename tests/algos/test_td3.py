@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from bidex_algos.experience.replay import Transitions
 from bidex_algos.offpolicy.ddpg import DDPG, DDPGConfig, spread
 from bidex_algos.offpolicy.td3 import TD3, TD3Config
+from bidex_algos.replay import Transitions
 from bidex_meta.commands.learners import learner_kind
 from bidex_meta.errors import BidexError
 from tests.algos.off_policy import errors, trained

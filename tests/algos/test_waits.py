@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bidex_algos.experience import rollout
+from bidex_algos import rollout
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_meta import Benchmark
 from tests.world.play import suite_world

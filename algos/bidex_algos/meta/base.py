@@ -15,18 +15,17 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.experience.rollout import may_look
-from bidex_algos.learner import Learner
+from bidex_algos.learner import Learner, as_numbers
 from bidex_algos.meta.adaptation import Objective, TaskBatch, detached
 from bidex_algos.meta.config import MetaConfig, OuterConfig
 from bidex_algos.meta.meta_policy import MetaPolicy, make_meta_policy
-from bidex_algos.meta.stage import Outcome, Stage, moments, task_batch
-from bidex_algos.meta.task_rows import TaskRows
+from bidex_algos.meta.stage import Outcome, Stage, TaskRows, moments, task_batch
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.shape import Shape
-from bidex_algos.reports import as_numbers
+from bidex_algos.rollout import may_look
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import world_size
+from bidex_meta.train.learner import AutoresetMode
 from bidex_meta.world.contract import PooledWorld
 
 
@@ -50,8 +49,7 @@ class MetaLearner(Learner):
     remedy = "lower inner_learning_rate or the outer step"
     objective: ClassVar[Objective]
     """What its inner step follows."""
-    adapts: ClassVar[bool] = True
-    """Its policy adapts to a task: evaluation measures before and after."""
+    adapts = True
 
     def __init__(self, world: PooledWorld, config: OuterConfig, seed: int):
         if world_size() > 1:
@@ -71,10 +69,10 @@ class MetaLearner(Learner):
             sizes = list(self.policy.step_sizes.parameters())
             self.adam.add_param_group({"params": sizes, "lr": config.step_size_rate})
 
-    @staticmethod
-    def autoreset(config: dict[str, Any]) -> str:
-        """The world's mode: whole episodes wait for each other, slices of them go on."""
-        return "DISABLED" if config["slice_steps"] is None else "SAME_STEP"
+    @classmethod
+    def autoreset_mode(cls, config: OuterConfig) -> AutoresetMode:
+        """Whole episodes wait for each other, slices of them go on."""
+        return "DISABLED" if config.slice_steps is None else "SAME_STEP"
 
     def _check_rows(self) -> None:
         rows = torch.bincount(self.world.task_id, minlength=self.world.num_tasks).tolist()

@@ -5,9 +5,8 @@ from torch import Tensor, nn
 
 from bidex_algos.meta.adaptation import Adapter, Objective, Params, detached
 from bidex_algos.meta.config import MetaConfig
-from bidex_algos.meta.stage import Stage, task_batch
-from bidex_algos.meta.task_rows import TaskRows
-from bidex_algos.nets.encoders.inputs import Inputs
+from bidex_algos.meta.stage import Stage, TaskRows, task_batch
+from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import GaussianActor
 from bidex_algos.nets.normalise import ObservationNormaliser
 from bidex_meta.agents import Timestep

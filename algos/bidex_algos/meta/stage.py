@@ -6,11 +6,116 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from bidex_algos.experience.advantages import gae, normalise_per_task, successor_values, task_moments
+from bidex_algos.advantages import gae, normalise_per_task, successor_values, task_moments
 from bidex_algos.meta.adaptation import TaskBatch
 from bidex_algos.meta.config import MetaConfig
-from bidex_algos.meta.linear_baseline import fitted
-from bidex_algos.meta.task_rows import TaskRows
+
+
+class TaskRows:
+    """Rows by task, as a rectangle: tasks with fewer rows than others repeat one, without weight.
+
+    Args:
+        task_of_row: Task of each row, numbers from 0 on without gaps, int64 (N,).
+
+    Attributes:
+        count: Number of tasks M.
+        task_of_row: As given.
+        weight: 1, or 0 where a row is repeated to fill the rectangle, (M, R) float32.
+    """
+
+    def __init__(self, task_of_row: Tensor):
+        self.task_of_row = task_of_row
+        self.count = int(task_of_row.max()) + 1
+        counts = torch.bincount(task_of_row, minlength=self.count)
+        width = int(counts.max())
+        order = torch.argsort(task_of_row, stable=True)
+        first = counts.cumsum(0) - counts
+        column = torch.arange(width, device=task_of_row.device)
+        self._table = order[first[:, None] + torch.minimum(column, counts[:, None] - 1)]
+        self.weight = (column < counts[:, None]).float()
+        # Where each row stands in the flattened rectangle.
+        place = torch.empty_like(order)
+        rank = torch.arange(len(order), device=order.device) - first[task_of_row[order]]
+        place[order] = task_of_row[order] * width + rank
+        self._place = place
+
+    def by_task(self, x: Tensor) -> Tensor:
+        """(N, ...) to (M, R, ...)."""
+        return x[self._table]
+
+    def by_row(self, x: Tensor) -> Tensor:
+        """(M, R, ...) back to (N, ...)."""
+        return x.flatten(0, 1)[self._place]
+
+    def steps_by_task(self, x: Tensor) -> Tensor:
+        """(T, N, ...) to (M, T * R, ...)."""
+        return x[:, self._table].transpose(0, 1).flatten(1, 2)
+
+    def steps_by_row(self, x: Tensor, steps: int) -> Tensor:
+        """(M, T * R, ...) back to (T, N, ...)."""
+        return x.unflatten(1, (steps, -1)).transpose(0, 1).flatten(1, 2)[:, self._place]
+
+
+_BOUND = 10.0
+
+_OF_TIME = 4
+"""Features at the end that tell of time alone."""
+
+_SOLVABLE = 1e-5
+"""What every diagonal entry gets, relative to their mean, so that features may depend on each other."""
+
+
+def features(obs: Tensor, elapsed: Tensor) -> Tensor:
+    """Observation, its square, three powers of time, and 1.
+
+    Args:
+        obs: Normalised observations (..., d).
+        elapsed: Steps since the episode began (...).
+
+    Returns:
+        (..., 2 d + 4), float32.
+    """
+    bounded = obs.clamp(-_BOUND, _BOUND)
+    t = elapsed[..., None].to(obs.dtype) / 100.0
+    return torch.cat([bounded, bounded.square(), t, t.square(), t**3, torch.ones_like(t)], dim=-1)
+
+
+def fitted(obs: Tensor, elapsed: Tensor, returns: Tensor, weights: Tensor, ridge: float = 1.0) -> Tensor:
+    """Predictions of the returns they are fitted to, by ridge regression in each task.
+
+    Coefficients of observations are held back by ``ridge`` times features per sample, relative to the mean of the
+    Gram matrix's diagonal; the four of time hardly. With 1 that is the best linear prediction if features and noise
+    explain as much of the returns. A fit that is free (1e-5) remembers the returns where there are hundreds of
+    features and as many samples, and leaves advantages that are noise: of 7, 20 and 50 rollouts on ML1-wide they
+    correlated by 0.19, 0.18 and 0.47 with those of a baseline fitted to other rollouts, without any baseline by 0.71,
+    0.63 and 0.62, and with 1 by 0.78, 0.76 and 0.77.
+
+    Args:
+        obs: Normalised observations (tasks, B, d).
+        elapsed: Steps since the episode began (tasks, B).
+        returns: What to predict (tasks, B).
+        weights: 1, or 0 for what does not count (tasks, B).
+        ridge: How strongly coefficients are held back.
+
+    Returns:
+        (tasks, B), in the type of ``returns``.
+    """
+    # Task by task: the features of all tasks at once, and their Gram matrices, take more memory and more time.
+    tasks = zip(obs, elapsed, returns, weights, strict=True)
+    predicted = [_one(features(o, t), r, w, ridge) for o, t, r, w in tasks]
+    return torch.stack(predicted).to(returns.dtype)
+
+
+def _one(x: Tensor, returns: Tensor, weights: Tensor, ridge: float) -> Tensor:
+    """Predictions (B,) of one task from its features (B, f), float64."""
+    weighted = x * weights[:, None]
+    gram = (weighted.T @ x).double()
+    diagonal = gram.diagonal()
+    penalty = torch.full_like(diagonal, _SOLVABLE)
+    penalty[:-_OF_TIME] += ridge * x.shape[1] / weights.sum().clamp_min(1.0)
+    diagonal += penalty * diagonal.mean().clamp_min(1.0)
+    coefficients = torch.linalg.solve(gram, (weighted.T @ returns).double())
+    return x.double() @ coefficients
 
 
 @dataclass

@@ -10,24 +10,43 @@ The original has a critic for each agent, since rewards may differ. Here they ar
 the same targets: there is one.
 """
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from bidex_algos.experience.replay import Transitions
-from bidex_algos.multiagent.maddpg_config import PRESETS, MADDPGConfig
+from bidex_algos.multiagent.base import Partition, keep_partition
 from bidex_algos.multiagent.team import Team
-from bidex_algos.nets.deterministic import DeterministicPolicy
-from bidex_algos.nets.encoders.inputs import Inputs
+from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.networks import use_bfloat16
 from bidex_algos.nets.normalise import ObservationNormaliser
-from bidex_algos.nets.precision import use_bfloat16
+from bidex_algos.nets.policy import DeterministicPolicy
 from bidex_algos.nets.shape import Shape
-from bidex_algos.offpolicy.ddpg import DDPG
+from bidex_algos.offpolicy.ddpg import DDPG, DDPGConfig, of_paper
+from bidex_algos.replay import Transitions
 from bidex_meta.world.agent_views import AgentView, agent_views
 from bidex_meta.world.contract import VectorWorld
 
-__all__ = ["MADDPG", "PRESETS", "MADDPGConfig"]
+
+@dataclass(frozen=True)
+class MADDPGConfig(DDPGConfig):
+    """Everything that can be set about MADDPG; the defaults are the preset ``laptop``."""
+
+    algo: ClassVar[str] = "maddpg"
+
+    agents: Partition = "hands"
+    """Who acts: hands (two agents), fingers (twelve: five fingers and the palm of each hand), single, a TOML file with
+    a table [agents], or name=unit+unit;name=unit (docs/learners/multiagent.md)."""
+
+    def __post_init__(self) -> None:
+        """Checks what annotations cannot say."""
+        super().__post_init__()
+        keep_partition(self)
+
+
+# There is no table for MADDPG (B.2.5 describes it): DDPG's preset of this name.
+PRESETS: dict[str, MADDPGConfig] = {"paper": MADDPGConfig(**of_paper()), "laptop": MADDPGConfig()}
 
 
 class DeterministicTeam(Team):
@@ -75,7 +94,7 @@ class MADDPG(DDPG):
     """
 
     name = "maddpg"
-    config_type = MADDPGConfig
+    config_type, presets = MADDPGConfig, PRESETS
     config: MADDPGConfig
 
     def __init__(self, world: VectorWorld, config: MADDPGConfig, seed: int):

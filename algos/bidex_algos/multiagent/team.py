@@ -7,11 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.nets.encoders.columns import Columns
-from bidex_algos.nets.encoders.inputs import Inputs
-from bidex_algos.nets.encoders.point_net import with_point_net
-from bidex_algos.nets.encoders.task_embedding import with_task_embedding
+from bidex_algos.nets.inputs import Columns, Inputs, with_task_embedding
 from bidex_algos.nets.networks import MLP, stacked_forward
+from bidex_algos.nets.point_net import with_point_net
 from bidex_meta.world.agent_views import AgentView
 
 

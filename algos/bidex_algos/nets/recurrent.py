@@ -7,9 +7,8 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.choices import Activation
-from bidex_algos.nets.encoders.inputs import Inputs
-from bidex_algos.nets.networks import ACTIVATIONS, MLP
+from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.networks import ACTIVATIONS, MLP, Activation
 from bidex_algos.nets.normalise import ObservationNormaliser
 
 

@@ -8,22 +8,92 @@ import copy
 import math
 from abc import abstractmethod
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.experience.advantages import discounts
-from bidex_algos.experience.replay import Transitions
-from bidex_algos.learner import Learner
-from bidex_algos.nets.encoders.inputs import Inputs
-from bidex_algos.nets.precision import autocast, use_bfloat16
+from bidex_algos.advantages import discounts
+from bidex_algos.learner import Learner, as_numbers
+from bidex_algos.nets.architecture import ArchitectureConfig, network_bytes
+from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.networks import Activation, Autocast, Layers, autocast, use_bfloat16
 from bidex_algos.offline.batches import Batches, return_deviation
 from bidex_algos.offpolicy.critics import Critics
-from bidex_algos.reports import as_numbers
+from bidex_algos.replay import Transitions
 from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
+from bidex_meta.validation import BelowOne, Count, NonNegative, Positive, Share, Whole, Widths
 from bidex_meta.world.contract import VectorWorld
+
+
+@dataclass(frozen=True)
+class OfflineConfig(ArchitectureConfig):
+    """Networks, batches, statistics; the defaults are the preset ``laptop``."""
+
+    hidden: Layers = (256, 256)
+    """Widths of the hidden layers, of actor and critics alike."""
+    activation: Activation = "relu"
+    """Non-linearity of the hidden layers."""
+    policy_heads: bool = False
+    """Give the actor an output layer per task; the world must show the task's one-hot."""
+    task_embedding: Whole = 0
+    """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
+    point_widths: Widths = (32, 64)
+    """Widths of the layers that all points of a point cloud share (PointNet), where the data show one."""
+    points_read: Whole = 0
+    """Points of a cloud that they read, evenly out of all; 0: all."""
+    updates_per_iteration: Count = 1000
+    """Updates between two reports; --evaluate-every and --video-every count reports."""
+    batch_size: Count = 256
+    """Transitions of an update, split evenly over the tasks."""
+    batch_per_task: Count | None = None
+    """Take this many of each task instead."""
+    learning_rate: Positive = 3e-4
+    """Adam's step size for the actor."""
+    adam_eps: NonNegative = 1e-8
+    """What Adam adds to its denominators."""
+    max_grad_norm: Positive | None = None
+    """Gradients longer than this are shortened to it, those of each network apart; None: none is."""
+    normalise_observations: bool = True
+    """Give observations zero mean and unit variance by the data's statistics; the task's one-hot stays as it is."""
+    normalise_per_task: bool = False
+    """By the statistics of each task's data apart; the world must show the task's one-hot."""
+    autocast: Autocast = "auto"
+    """Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX."""
+
+    def bytes_held(self, num_envs: int, width: int) -> int:
+        """Of the networks; the data are counted when they are read."""
+        return network_bytes(self.hidden, width, 4)
+
+
+@dataclass(frozen=True)
+class CriticConfig(OfflineConfig):
+    """What learners with critics add."""
+
+    value_heads: bool = True
+    """Give each critic one output per task instead of one for all."""
+    critic_layer_norm: bool = True
+    """Normalise the hidden layers of the critics, which keeps values of actions that no data show from growing."""
+    critic_learning_rate: Positive = 3e-4
+    """Adam's step size for the critics."""
+    gamma: BelowOne = 0.99
+    """Discount per step."""
+    tau: Share = 0.005
+    """Share of the networks that enters their targets in each update (1 - Polyak's factor)."""
+    per_task_rewards: bool = True
+    """Divide rewards by the standard deviation of their task's discounted returns in the data."""
+
+    def __post_init__(self) -> None:
+        """Checks what annotations cannot say."""
+        super().__post_init__()
+        if not 0.0 <= self.gamma < 1.0:
+            raise BidexError(f"{self.algo}: gamma must lie in [0, 1), got {self.gamma}.")
+
+
+PAPER: dict[str, Any] = {"value_heads": False, "critic_layer_norm": False, "per_task_rewards": False}
+"""What the preset ``paper`` leaves out of all learners with critics: Table 46 and the methods' papers know none."""
 
 
 class Offline(Learner):
@@ -42,8 +112,7 @@ class Offline(Learner):
         reward_scale: What rewards of each task are divided by (num_tasks,).
     """
 
-    offline: ClassVar[bool] = True
-    """Whether it learns from data sets."""
+    offline = True
     num_critics: ClassVar[int] = 2
     discounts_by_class = True
 

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from bidex_algos.experience.replay import Transitions
+from bidex_algos.replay import Transitions
 from bidex_meta.data.joined import Joined
 
 _CHUNK = 65_536

@@ -13,25 +13,93 @@ import copy
 import math
 from abc import abstractmethod
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.experience.advantages import discounts
-from bidex_algos.experience.episodes import EpisodeStatistics
-from bidex_algos.experience.n_step import Stretches
-from bidex_algos.experience.replay import Transitions
-from bidex_algos.learner import Learner
-from bidex_algos.nets.encoders.inputs import Inputs
-from bidex_algos.nets.precision import autocast, use_bfloat16
-from bidex_algos.offpolicy.config import OffPolicyConfig
+from bidex_algos.advantages import discounts
+from bidex_algos.learner import Learner, as_numbers
+from bidex_algos.nets.architecture import ArchitectureConfig, network_bytes
+from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.networks import Activation, Autocast, Layers, autocast, use_bfloat16
 from bidex_algos.offpolicy.critics import Critics
-from bidex_algos.offpolicy.replay_within import replay_within
 from bidex_algos.offpolicy.return_scale import ReturnScale
-from bidex_algos.reports import as_numbers
+from bidex_algos.replay import Stretches, Transitions, replay_within
+from bidex_algos.rollout import EpisodeStatistics
 from bidex_meta.train.distributed import all_sum, sum_gradients, world_size
+from bidex_meta.validation import BelowOne, Count, NonNegative, Positive, Share, Whole, Widths
 from bidex_meta.world.contract import VectorWorld
+
+
+@dataclass(frozen=True)
+class OffPolicyConfig(ArchitectureConfig):
+    """Networks, replay, updates, statistics; the defaults are the preset ``laptop``.
+
+    A vector step is one step in every row of the world.
+    """
+
+    hidden: Layers = (256, 256)
+    """Widths of the hidden layers, of actor and critics alike."""
+    activation: Activation = "relu"
+    """Non-linearity of the hidden layers."""
+    policy_heads: bool = False
+    """Give the actor an output layer per task; the world must show the task's one-hot."""
+    task_embedding: Whole = 0
+    """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
+    point_widths: Widths = (32, 64)
+    """Widths of the layers that all points of a point cloud share (PointNet), where the world shows one."""
+    points_read: Whole = 0
+    """Points of a cloud that they read, evenly out of all; 0: all."""
+    value_heads: bool = True
+    """Give each critic one output per task instead of one for all."""
+    critic_layer_norm: bool = True
+    """Normalise the hidden layers of the critics, which keeps many updates per step from blowing values up."""
+    replay_steps: Count = 500
+    """Vector steps that the replay keeps, if replay_memory allows."""
+    replay_memory: Positive = 2.0
+    """The most that the replay of each process may take, in GB (10^9 bytes)."""
+    cut_share: Share = 0.0625
+    """Room in it for last observations before time limits, as a share of all transitions. Too small where episodes are
+    shorter than 1 / cut_share; Train/weightless shows it."""
+    warmup_steps: Whole = 20
+    """Vector steps of uniform actions before the first update."""
+    steps_per_iteration: Count = 8
+    """Vector steps between two reports."""
+    updates_per_step: Count = 4
+    """Updates of all networks after each vector step."""
+    batch_size: Count = 1024
+    """Transitions of an update, split evenly over the tasks."""
+    batch_per_task: Count | None = None
+    """Take this many of each task instead."""
+    gamma: BelowOne = 0.93
+    """Discount per step."""
+    n_steps: Count = 1
+    """Steps whose rewards a target takes as they came, before it asks for the value of what follows."""
+    tau: Share = 0.02
+    """Share of the critics that enters the target critics in each update (1 - Polyak's factor)."""
+    learning_rate: Positive = 3e-4
+    """Adam's step size for the actor."""
+    critic_learning_rate: Positive = 1e-3
+    """Adam's step size for the critics."""
+    weight_decay: NonNegative = 0.0
+    """Share of its step size by which each step shortens all weights of actor and critics (AdamW)."""
+    adam_eps: NonNegative = 1e-8
+    """What Adam adds to its denominators."""
+    max_grad_norm: Positive = 1.0
+    """Gradients longer than this are shortened to it, those of actor and critics apart."""
+    normalise_observations: bool = True
+    """Give observations zero mean and unit variance by running statistics; the task's one-hot stays as it is."""
+    per_task_rewards: bool = True
+    """Divide rewards, when they are drawn, by the running standard deviation of their task's discounted return."""
+    autocast: Autocast = "auto"
+    """Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX or AVX-512's BF16."""
+
+    def bytes_held(self, num_envs: int, width: int) -> int:
+        """As in the base."""
+        replay = min(self.replay_memory * 1e9, 4 * num_envs * width * self.replay_steps)
+        return int(replay) + network_bytes(self.hidden, width, 3)
 
 
 class OffPolicy(Learner):
@@ -69,7 +137,9 @@ class OffPolicy(Learner):
             "actor": self._adam(self.policy.actor.parameters(), config.learning_rate),
             "critic": self._adam(self.critic.parameters(), config.critic_learning_rate),
         }
-        self.replay = replay_within(self.name, world, config, self.shape.observations, self.shape.actions)
+        self.replay = replay_within(
+            self.name, world, self.shape, config.replay_steps, config.replay_memory, config.cut_share
+        )
         self.batch_per_task = config.batch_per_task or math.ceil(config.batch_size / world.num_tasks)
         self.task_of_draw = torch.arange(world.num_tasks, device=self.device).repeat_interleave(self.batch_per_task)
         self.gamma_of_rows = discounts(world, config.gamma, world.task_id)

@@ -17,23 +17,71 @@ policy does and others what lies far from it (the spread of Horgan et al. 2018);
 """
 
 import copy
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from bidex_algos.experience.replay import Transitions
-from bidex_algos.nets.deterministic import DeterministicActor, DeterministicPolicy
-from bidex_algos.nets.multitask.architecture import network_of
+from bidex_algos.nets.architecture import network_of
+from bidex_algos.nets.networks import autocast, use_bfloat16
 from bidex_algos.nets.normalise import ObservationNormaliser
-from bidex_algos.nets.precision import autocast, use_bfloat16
+from bidex_algos.nets.policy import DeterministicActor, DeterministicPolicy
 from bidex_algos.nets.shape import Shape
-from bidex_algos.offpolicy.base import OffPolicy
+from bidex_algos.offpolicy.base import OffPolicy, OffPolicyConfig
 from bidex_algos.offpolicy.critics import follow
-from bidex_algos.offpolicy.ddpg_config import PRESETS, DDPGConfig
+from bidex_algos.replay import Transitions
+from bidex_meta.validation import NonNegative, check_rising
 from bidex_meta.world.contract import VectorWorld
 
-__all__ = ["DDPG", "PRESETS", "DDPGConfig"]
+
+@dataclass(frozen=True)
+class DDPGConfig(OffPolicyConfig):
+    """Everything that can be set about DDPG; the defaults are the preset ``laptop``."""
+
+    algo: ClassVar[str] = "ddpg"
+
+    exploration_std: tuple[NonNegative, NonNegative] = (0.05, 0.5)
+    """Standard deviation of the noise on actions: of the first row of each task, of its last; evenly between."""
+    squash_price: NonNegative = 1.0
+    """Price, in the actor's loss, on the mean square of what tanh makes the actions of; 0: none."""
+
+    def __post_init__(self) -> None:
+        """Checks what annotations cannot say."""
+        super().__post_init__()
+        check_rising(self, self.algo, "exploration_std")
+
+
+def of_paper() -> dict[str, Any]:
+    """What DDPG and TD3 share of the preset ``paper``, by field.
+
+    The Bi-DexHands appendix describes both (B.1.3, B.1.4) and has no table for either. Table 43 (SAC, "other tasks")
+    has layers, step size, discount, Polyak 0.99, gradient norm, 5000 steps of replay and 1 epoch of 4 mini-batches of
+    32 (here of each task); Table 49 32 steps between two reports. The noise of 0.1 is Fujimoto et al.'s (2018, section
+    6.1).
+    """
+    return {
+        "hidden": (1024, 1024, 1024),
+        "value_heads": False,
+        "critic_layer_norm": False,
+        "replay_steps": 5000,
+        "warmup_steps": 32,
+        "steps_per_iteration": 32,
+        "updates_per_step": 4,
+        "batch_per_task": 32,
+        "gamma": 0.96,
+        "tau": 0.01,
+        "learning_rate": 3e-4,
+        "critic_learning_rate": 3e-4,
+        "max_grad_norm": 1.0,
+        "normalise_observations": False,
+        "per_task_rewards": False,
+        "exploration_std": (0.1, 0.1),
+        "squash_price": 0.0,
+    }
+
+
+PRESETS: dict[str, DDPGConfig] = {"paper": DDPGConfig(**of_paper()), "laptop": DDPGConfig()}
 
 
 class DDPG(OffPolicy):
@@ -47,7 +95,7 @@ class DDPG(OffPolicy):
     """
 
     name, remedy = "ddpg", "lower critic_learning_rate"
-    config_type = DDPGConfig
+    config_type, presets = DDPGConfig, PRESETS
     config: DDPGConfig
     policy: DeterministicPolicy
     num_critics = 1

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bidex_algos.experience.advantages import task_moments
+from bidex_algos.advantages import task_moments
 from bidex_algos.nets.normalise import RunningStats
 from bidex_meta.train.distributed import all_max
 from bidex_meta.world.contract import VectorWorld

@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bidex_algos.nets.networks import autocast
 from bidex_algos.nets.policy import GaussianPolicy
-from bidex_algos.nets.precision import autocast
 from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import own_seed, sum_gradients, world_size

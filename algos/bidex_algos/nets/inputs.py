@@ -1,15 +1,45 @@
 """What a network is fed: the named groups of an observation, each as it is or by an encoder of its own."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.nets.encoders.columns import Columns
 from bidex_meta.errors import unknown_name
 from bidex_meta.world.contract import ObservationGroup, plain_groups
+
+
+class Columns(nn.Module):
+    """Reads and writes some columns of tensors (..., d). It has no weights and leaves nothing in a checkpoint.
+
+    Args:
+        ranges: The columns; they are taken in ascending order.
+
+    Attributes:
+        size: How many they are.
+    """
+
+    def __init__(self, ranges: Iterable[slice]):
+        super().__init__()
+        index = sorted(column for part in ranges for column in range(part.start, part.stop))
+        self.size = len(index)
+        first = index[0] if index else 0
+        # A slice is a view; columns with gaps have to be copied.
+        self.range = slice(first, first + self.size) if index == list(range(first, first + self.size)) else None
+        self.index: Tensor
+        self.register_buffer("index", torch.tensor(index, dtype=torch.int64), persistent=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """The columns (..., size) of ``x`` (..., d); a view where they stand side by side."""
+        return x.index_select(-1, self.index) if self.range is None else x[..., self.range]
+
+    def write(self, x: Tensor, values: Tensor) -> None:
+        """Puts ``values`` (..., size) into the columns of ``x`` (..., d)."""
+        x[..., self.index if self.range is None else self.range] = values
+
 
 MakeEncoder = Callable[[int, torch.Generator], nn.Module]
 """Makes an encoder for a group of so many entries, its weights drawn from a CPU generator: a module that maps
@@ -108,3 +138,29 @@ class GroupEncoder(nn.Module):
             return x
         encoded = [encoder(self.columns[name](x)) for name, encoder in self.groups.items()]
         return torch.cat([self.plain(x), *encoded], dim=-1)
+
+
+class TaskEmbedding(nn.Module):
+    """Maps the one-hot of a task (..., tasks) to the task's vector (..., size), at first drawn from N(0, 1).
+
+    Args:
+        tasks: Entries of the one-hot.
+        generator: CPU generator of the initial vectors.
+        size: Entries of a vector.
+        unit: Whether it is shortened or stretched to length 1 when read.
+    """
+
+    def __init__(self, tasks: int, generator: torch.Generator, size: int, unit: bool = False):
+        super().__init__()
+        self.size, self.unit = size, unit
+        self.vectors = nn.Parameter(torch.randn(tasks, size, generator=generator))
+
+    def forward(self, one_hot: Tensor) -> Tensor:
+        """The vectors of the tasks."""
+        vectors = nn.functional.normalize(self.vectors, dim=1) if self.unit else self.vectors
+        return one_hot @ vectors
+
+
+def with_task_embedding(inputs: Inputs, size: int, unit: bool = False) -> Inputs:
+    """The same with the task read by an embedding of so many entries, of length 1 if ``unit``; 0: as it was."""
+    return inputs.encoded("task_id", partial(TaskEmbedding, size=size, unit=unit)) if size else inputs

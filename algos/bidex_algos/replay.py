@@ -6,13 +6,17 @@ has a shape that depends on data, and nothing makes the host wait for the device
 """
 
 import math
-from dataclasses import dataclass
+import sys
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from bidex_algos.nets.shape import Shape
 from bidex_meta.errors import BidexError
+from bidex_meta.train.distributed import is_main
+from bidex_meta.world.contract import VectorWorld
 
 
 @dataclass
@@ -229,3 +233,79 @@ def steps_within(
 def _cuts_kept(steps: int, rows: int, cut_share: float) -> int:
     # A vector step's worth at least: all rows may end together, and no cell may be written twice in a step.
     return max(rows, math.ceil(cut_share * steps * rows))
+
+
+class Stretches:
+    """Up to ``n`` steps in a row from each place.
+
+    Args:
+        replay: Where they lie.
+        places: Of the first steps, int64 (batches, B).
+        n: Steps at most.
+        gamma: Discount per step.
+
+    Attributes:
+        last: Places of the last steps, (batches, B).
+    """
+
+    def __init__(self, replay: Replay, places: Tensor, n: int, gamma: float | Tensor):
+        self.replay, self.first, self.last = replay, places, places
+        self.rewards: Tensor | None = None
+        if n > 1:
+            self._walk(n, gamma)
+
+    def _walk(self, n: int, gamma: float | Tensor) -> None:
+        replay = self.replay
+        newest = replay.added % replay.slots  # the slot of an observation that no step has left yet
+        self.rewards, self.steps = replay.at("rewards", self.first), torch.ones_like(self.first)
+        going = replay.at("valid", self.first) & ~self._ended(self.first)
+        for _ in range(1, n):
+            following = replay.after(self.last)
+            going = going & (following // replay.rows != newest) & replay.at("valid", following)
+            reward = replay.at("rewards", following) * gamma**self.steps
+            self.rewards = self.rewards + reward.masked_fill(~going, 0.0)
+            self.steps = self.steps + going
+            self.last = torch.where(going, following, self.last)
+            going = going & ~self._ended(self.last)
+
+    def _ended(self, places: Tensor) -> Tensor:
+        return self.replay.at("terminated", places) | (self.replay.at("cut", places) > 0)
+
+    def take(self, batch: int) -> Transitions:
+        """One batch of them, as transitions (B,)."""
+        taken = self.replay.take(self.first[batch], self.last[batch])
+        if self.rewards is None:
+            return taken
+        return replace(taken, rewards=self.rewards[batch], steps=self.steps[batch])
+
+
+def replay_within(learner: str, world: VectorWorld, shape: Shape, asked: int, memory: float, share: float) -> Replay:
+    """The replay that was asked for, or as much of it as its memory holds.
+
+    Args:
+        learner: Name for messages.
+        world: Whose transitions it holds.
+        shape: Of the world.
+        asked: Vector steps.
+        memory: The most that it may take, in GB (10^9 bytes).
+        share: ``cut_share`` of :class:`Replay`.
+
+    Raises:
+        BidexError: A task has no environments, or not one vector step fits.
+    """
+    rows, observations, actions = world.num_envs, shape.observations, shape.actions
+    present = torch.bincount(world.task_id, minlength=world.num_tasks).tolist()
+    if 0 in present:
+        raise BidexError(f"{learner}: task {world.task_names[present.index(0)]} has no environments. Raise num_envs.")
+    steps = steps_within(memory * 1e9, asked, rows, observations, actions, share)
+    needed = replay_bytes(asked, rows, observations, actions, share) / 1e9
+    if steps == 0:
+        raise BidexError(f"{learner}: replay_memory {memory:g} GB holds not one step of {rows} environments. Raise it.")
+    if steps < asked and is_main():
+        print(
+            f"{learner}: a replay of {asked:,} vector steps ({asked * rows:,} transitions) needs {needed:.1f} GB; "
+            f"replay_memory is {memory:g} GB: it keeps {steps:,} ({steps * rows:,} transitions).",
+            file=sys.stderr,
+            flush=True,
+        )
+    return Replay(steps, world.task_id, world.num_tasks, observations, actions, world.device, share)

@@ -23,6 +23,11 @@ class _Adam(torch.optim.Adam):
             group["lr"] = rate
 
 
+def _weights(optimiser: torch.optim.Optimizer) -> list[nn.Parameter]:
+    """What an optimiser moves."""
+    return [weight for group in optimiser.param_groups for weight in group["params"]]
+
+
 class AdaptiveAdam:
     """Adam whose step size is divided by 1.5 above twice the desired KL, multiplied below half of it.
 
@@ -56,6 +61,18 @@ class AdaptiveAdam:
 
     def step(self) -> None:
         """One step."""
+        self.actor.step()
+
+    def descend(self, kl: Tensor | None, max_grad_norm: float) -> None:
+        """One step along shortened gradients, its size adapted to the KL of the last one.
+
+        Args:
+            kl: A scalar; None for PPO's first mini-batch, which compares the sampling policy with itself.
+            max_grad_norm: Gradients longer than this are shortened to it.
+        """
+        if kl is not None:
+            self.follow(kl)
+        nn.utils.clip_grad_norm_(_weights(self.actor), max_grad_norm)
         self.actor.step()
 
     def follow(self, kl: Tensor) -> None:
@@ -93,10 +110,22 @@ class AdaptiveAdams(AdaptiveAdam):
         super().zero_grad()
         self.critic.zero_grad()
 
-    def step(self, critic_alone: bool = False) -> None:
-        """One step of both, or of the critic alone."""
+    def descend(self, kl: Tensor | None, max_grad_norm: float, apart: bool = True, critic_alone: bool = False) -> None:
+        """One step of both along shortened gradients, its size adapted to the KL of the last one.
+
+        Args:
+            kl: As in the base.
+            max_grad_norm: As in the base.
+            apart: Whether gradients of actor and critic are shortened apart.
+            critic_alone: Whether the actor stays as it is.
+        """
+        if kl is not None and not critic_alone:
+            self.follow(kl)
+        actor, critic = _weights(self.actor), _weights(self.critic)
+        for weights in [actor, critic] if apart else [actor + critic]:
+            nn.utils.clip_grad_norm_(weights, max_grad_norm)
         if not critic_alone:
-            super().step()
+            self.actor.step()
         self.critic.step()
 
     def parts(self) -> dict[str, Any]:

@@ -1,11 +1,71 @@
 """PPO's loss (Schulman et al. 2017, equations 7 and 9): of MT-PPO's transitions and of RL²'s chunks of trials."""
 
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from bidex_algos.nets.networks import gaussian_entropy, gaussian_kl, gaussian_log_prob
+from bidex_meta.train.distributed import all_sum
+from bidex_meta.train.learner import LearnerConfig
+from bidex_meta.validation import Count, Positive, check_rising
+
+
+@dataclass(frozen=True)
+class PPOConfig(LearnerConfig):
+    """Passes, clip and step sizes. A config that is made of this and others puts its fields behind theirs."""
+
+    num_minibatches: Count = 4
+    """Mini-batches per epoch; each holds shuffled samples of all rows."""
+    epochs: Count = 4
+    """Passes over what was collected, per update."""
+    clip: Positive = 0.2
+    """How far the likelihood ratio may leave 1 before it earns nothing more."""
+    learning_rate: Positive = 3e-4
+    """Adam's step size at the start."""
+    adaptive_learning_rate: bool = True
+    """Divide the step size by 1.5 when the KL exceeds twice desired_kl, multiply it when below half."""
+    desired_kl: Positive = 0.03
+    """KL of the sampling policy from the current one that the adaptive step size aims at."""
+    learning_rate_range: tuple[Positive, Positive] = (1e-5, 1e-2)
+    """Bounds of the adaptive step size."""
+    critic_learning_rate: Positive | None = 1e-3
+    """A fixed step size for the critic; None makes it follow the actor's."""
+
+    def __post_init__(self) -> None:
+        """Checks what annotations cannot say."""
+        super().__post_init__()
+        check_rising(self, self.algo, "learning_rate_range")
+
+
+def mini_batches(
+    weights: Tensor,
+    epochs: int,
+    number: int,
+    generator: torch.Generator,
+    split: Callable[[Tensor, int], Sequence[Tensor]] = Tensor.chunk,
+) -> Iterator[tuple[bool, Tensor, Tensor]]:
+    """Passes over shuffled samples, in the order of PPO's epochs.
+
+    Divided by the count, which is of all processes, losses and gradients become means by being summed over them.
+
+    Args:
+        weights: Of the samples (B,).
+        epochs: Passes.
+        number: Mini-batches of a pass.
+        generator: Of the order, on the device.
+        split: How a pass is split into so many parts.
+
+    Yields:
+        Whether it is the very first, the samples int64 (b,), and the sum of their weights, at least 1.
+    """
+    for epoch in range(epochs):
+        parts = split(torch.randperm(len(weights), generator=generator, device=weights.device), number)
+        counts = all_sum(torch.stack([weights[index].sum() for index in parts])).clamp_min(1.0)
+        for part, (index, count) in enumerate(zip(parts, counts, strict=True)):
+            yield (epoch, part) == (0, 0), index, count
 
 
 class PolicyLoss(NamedTuple):
