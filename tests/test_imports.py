@@ -15,26 +15,26 @@ PACKAGES = {package.__name__: Path(next(iter(package.__path__))) for package in 
 
 ORDER = (
     ("errors",),
-    ("paths", "maths", "agents", "drawing", "reading", "fields", "memory", "outside", "streams", "validation"),
+    ("paths", "maths", "agents", "drawing", "reading", "memory", "outside", "streams", "validation"),
     ("engine", "record", "hands", "suite"),
     ("tasks",),
     ("points",),
     ("world",),
     ("envs",),
-    ("evaluation", "benchmark", "train"),
+    ("evaluation", "benchmark"),
     ("metaworld",),
     ("registration",),
     ("bidex_meta",),  # the package's own names
     ("clients", "witness", "data"),
-    ("sources",),
+    ("sources", "train"),
     ("speed", "viewer", "report", "sweep"),
-    ("bidex_algos.checks", "bidex_algos.choices", "bidex_algos.learner"),
-    ("bidex_algos.gradients", "bidex_algos.experience"),
+    tuple(
+        f"bidex_algos.{name}" for name in ("advantages", "balancing", "replay", "rollout", "step_size", "trust_region")
+    ),
     ("bidex_algos.nets",),
     ("bidex_algos.learner",),
     ("bidex_algos.onpolicy", "bidex_algos.offpolicy"),
     ("bidex_algos.meta", "bidex_algos.multiagent", "bidex_algos.offline"),  # RL² takes PPO's loss
-    ("bidex_algos.single_task", "bidex_algos.start_from"),
     ("bidex_algos",),
     ("commands",),
     ("cli",),
@@ -50,8 +50,8 @@ MUTUAL = {
 }
 """Modules that import each other all the same."""
 
-TWICE = {"base", "config", "episodes", "replay", "starts"}
-"""Names of several modules. ``base`` and ``config`` are a room's own; the others are older than this rule."""
+TWICE = {"base", "learner", "replay", "starts"}
+"""Names of several modules. ``base`` is a room's own, ``learner`` contract and base; the others are older than this rule."""
 
 
 def _name(package: str, path: Path) -> str:

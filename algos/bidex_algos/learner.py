@@ -18,9 +18,9 @@ from torch import Tensor, nn
 
 from bidex_algos.nets.inputs import Inputs, with_task_embedding
 from bidex_algos.nets.point_net import with_point_net
+from bidex_algos.nets.policy import SquashedPolicy
 from bidex_algos.nets.shape import Shape, check_discounts, check_options
 from bidex_algos.rollout import check_autoreset
-from bidex_algos.start_from import start_from
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import broadcast, own_seed
@@ -45,6 +45,11 @@ def check_finite(metrics: dict[str, float], losses: Iterable[str], learner: str,
     """
     if not math.isfinite(sum(metrics.get(name, 0.0) for name in losses)):
         raise FloatingPointError(f"{learner}: the loss is not finite after {steps} steps; {remedy}.")
+
+
+# What decides, beside the shapes of the weights, what they compute.
+_WORLD = ("observations", "actions", "task_id")
+_FORM = ("hidden", "activation", "normalise_observations", "reward_unit", "task_embedding", *_WORLD)
 
 
 class Learner(Contract):
@@ -210,7 +215,20 @@ class Learner(Contract):
         Raises:
             BidexError: Weights of one would not mean the same in the other.
         """
-        start_from(self.policy, asdict(self.config), self.shape, policy)
+        own = asdict(self.config) | _seen(self.shape)
+        given = policy["config"] | _seen(Shape.load(policy["shape"]))
+        _agree(own, given, _FORM)
+        network, weights = _network(self.policy.state_dict()), _network(policy["weights"])
+        if _shapes(network) != _shapes(weights):
+            raise BidexError(
+                "Expected a policy to start from of the same kind (mtppo, mttrpo, promp and maml share one; mtsac and "
+                "rl2 have their own, other architectures, policy heads and a task embedding others), got one with "
+                "other weights. Name another run."
+            )
+        if isinstance(self.policy, SquashedPolicy):
+            # Its network speaks of a place between these bounds; a Gaussian one has its deviation as a weight.
+            _agree(own, given, ("std_range",))
+        self.policy.load_state_dict(self.policy.state_dict() | weights)
 
     def state_dict(self) -> dict[str, Any]:
         """A copy of everything but the world, as tensors and plain values (``torch.load(weights_only=True)``)."""
@@ -262,3 +280,34 @@ def _restore(part: Any, state: Any) -> None:
         part.set_state(state.cpu())
     else:
         part.load_state_dict(state)
+
+
+def _network(weights: dict[str, Any]) -> dict[str, Any]:
+    """Without learned sizes of inner steps, which are no part of what plays."""
+    return {name: weight for name, weight in weights.items() if not name.startswith("step_sizes.")}
+
+
+def _seen(shape: Shape) -> dict[str, Any]:
+    """What of a world's shape a network's weights depend on."""
+    ids = [[part.start, part.stop] for group in shape.groups if group.name == "task_id" for part in group.where]
+    return dict(zip(_WORLD, (shape.observations, shape.actions, ids), strict=True))
+
+
+def _agree(own: dict[str, Any], given: dict[str, Any], names: tuple[str, ...]) -> None:
+    """Refuses what is not alike in both, where both know it."""
+    for name in names:
+        if name in own and name in given and _plain(own[name]) != _plain(given[name]):
+            flag = f"--learner.{name.replace('_', '-')}"
+            mend = "Name a run on the same observations" if name in _WORLD else f"Add {flag} as there"
+            raise BidexError(
+                f"Expected a policy to start from with {name} = {_plain(own[name])}, got {_plain(given[name])}. "
+                f"{mend}, or start afresh."
+            )
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _shapes(weights: dict[str, Any]) -> dict[str, tuple[int, ...]]:
+    return {name: tuple(weight.shape) for name, weight in weights.items()}

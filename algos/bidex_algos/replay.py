@@ -13,7 +13,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bidex_algos.nets.shape import Shape
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import is_main
 from bidex_meta.world.contract import VectorWorld
@@ -279,13 +278,22 @@ class Stretches:
         return replace(taken, rewards=self.rewards[batch], steps=self.steps[batch])
 
 
-def replay_within(learner: str, world: VectorWorld, shape: Shape, asked: int, memory: float, share: float) -> Replay:
+def replay_within(
+    learner: str,
+    world: VectorWorld,
+    observations: int,
+    actions: int,
+    asked: int,
+    memory: float,
+    share: float,
+) -> Replay:
     """The replay that was asked for, or as much of it as its memory holds.
 
     Args:
         learner: Name for messages.
         world: Whose transitions it holds.
-        shape: Of the world.
+        observations: Width of its observations.
+        actions: Width of its actions.
         asked: Vector steps.
         memory: The most that it may take, in GB (10^9 bytes).
         share: ``cut_share`` of :class:`Replay`.
@@ -293,7 +301,7 @@ def replay_within(learner: str, world: VectorWorld, shape: Shape, asked: int, me
     Raises:
         BidexError: A task has no environments, or not one vector step fits.
     """
-    rows, observations, actions = world.num_envs, shape.observations, shape.actions
+    rows = world.num_envs
     present = torch.bincount(world.task_id, minlength=world.num_tasks).tolist()
     if 0 in present:
         raise BidexError(f"{learner}: task {world.task_names[present.index(0)]} has no environments. Raise num_envs.")

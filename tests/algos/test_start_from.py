@@ -11,7 +11,6 @@ from bidex_algos.meta.promp import ProMP, ProMPConfig
 from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.onpolicy.mtppo import PRESETS as PPO_PRESETS
-from bidex_algos.start_from import start_from
 from bidex_meta.errors import BidexError
 from tests.algos.families import PointGoals
 
@@ -31,7 +30,7 @@ def test_a_meta_learner_acts_as_the_policy_it_starts_from_and_learns_on():
     learner = ProMP(PointGoals(rows=16), PROMP, seed=0)
     obs, _ = learner.world.reset(seed=9)
     assert not torch.allclose(learner.eval_action(obs), given.eval_action(obs))
-    start_from(learner, given.policy_state_dict())
+    learner.start_from(given.policy_state_dict())
     assert torch.equal(learner.eval_action(obs), given.eval_action(obs))
     assert torch.equal(learner.policy.actor.log_std, given.policy.actor.log_std)
     before = learner.eval_action(obs)
@@ -41,12 +40,12 @@ def test_a_meta_learner_acts_as_the_policy_it_starts_from_and_learns_on():
 
 def test_learned_step_sizes_are_no_part_of_what_another_run_begins_with():
     sizing = ProMP(PointGoals(rows=16), replace(PROMP, step_sizes="layer"), seed=0)
-    start_from(sizing, trained().policy_state_dict())
+    sizing.start_from(trained().policy_state_dict())
     sizing.iterate()
     assert float(sizing.policy.step_sizes.mean()) != 1.0
     for again in (PROMP, replace(PROMP, step_sizes="weight")):
         learner = ProMP(PointGoals(rows=16), again, seed=0)
-        start_from(learner, sizing.policy_state_dict())
+        learner.start_from(sizing.policy_state_dict())
         assert torch.equal(learner.policy.actor.log_std, sizing.policy.actor.log_std)
         assert learner.policy.step_sizes is None or float(learner.policy.step_sizes.mean()) == 1.0
 
@@ -62,7 +61,7 @@ def test_learned_step_sizes_are_no_part_of_what_another_run_begins_with():
 def test_another_form_is_refused(change, expected):
     learner = ProMP(PointGoals(rows=16), replace(PROMP, **change), seed=0)
     with pytest.raises(BidexError, match=expected):
-        start_from(learner, trained().policy_state_dict())
+        learner.start_from(trained().policy_state_dict())
 
 
 @pytest.mark.parametrize("preset", ["tuned", "unseen"])
@@ -77,13 +76,13 @@ def test_a_squashed_policy_must_have_the_same_bounds():
     config = MTSACConfig(hidden=(8,), activation="tanh", normalise_observations=True, replay_steps=8)
     world = PointGoals(rows=16, autoreset_mode="SAME_STEP")
     state = MTSAC(world, config, seed=0).policy_state_dict()
-    start_from(MTSAC(world, config, seed=1), state)
+    MTSAC(world, config, seed=1).start_from(state)
     with pytest.raises(BidexError, match=r"std_range = \[0.01, 3.0\], got \[0.02, 2.0\]"):
-        start_from(MTSAC(world, replace(config, std_range=(0.01, 3.0)), seed=1), state)
+        MTSAC(world, replace(config, std_range=(0.01, 3.0)), seed=1).start_from(state)
 
 
 def test_another_kind_of_policy_is_refused():
     config = MTSACConfig(hidden=(8,), activation="tanh", normalise_observations=True, replay_steps=8)
     learner = MTSAC(PointGoals(rows=16, autoreset_mode="SAME_STEP"), config, seed=0)
     with pytest.raises(BidexError, match="of the same kind"):
-        start_from(learner, trained().policy_state_dict())
+        learner.start_from(trained().policy_state_dict())

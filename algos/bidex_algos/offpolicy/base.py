@@ -138,7 +138,13 @@ class OffPolicy(Learner):
             "critic": self._adam(self.critic.parameters(), config.critic_learning_rate),
         }
         self.replay = replay_within(
-            self.name, world, self.shape, config.replay_steps, config.replay_memory, config.cut_share
+            self.name,
+            world,
+            self.shape.observations,
+            self.shape.actions,
+            config.replay_steps,
+            config.replay_memory,
+            config.cut_share,
         )
         self.batch_per_task = config.batch_per_task or math.ceil(config.batch_size / world.num_tasks)
         self.task_of_draw = torch.arange(world.num_tasks, device=self.device).repeat_interleave(self.batch_per_task)
