@@ -51,7 +51,7 @@ MUTUAL = {
 """Modules that import each other all the same."""
 
 TWICE = {"base", "learner", "replay", "starts"}
-"""Names of several modules. ``base`` is a room's own, ``learner`` contract and base; the others are older than this rule."""
+"""Names of several modules. ``base`` is a room's own, ``learner`` contract and base; the others are older."""
 
 
 def _name(package: str, path: Path) -> str:

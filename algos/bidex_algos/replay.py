@@ -22,18 +22,12 @@ from bidex_meta.world.contract import VectorWorld
 class Transitions:
     """B transitions as they were stored: raw observations, raw rewards."""
 
-    obs: Tensor
-    """Observations before the step (B, d)."""
-    actions: Tensor
-    """Actions (B, a)."""
-    rewards: Tensor
-    """Rewards (B,)."""
-    next_obs: Tensor
-    """Observations after the step, of the same episode (B, d); read only where not terminated."""
-    terminated: Tensor
-    """Whether nothing follows, bool (B,). A time limit is not such an end."""
-    steps: Tensor | int = 1
-    """Steps from ``obs`` to ``next_obs``, one for all or (B,); ``rewards`` is then their discounted sum."""
+    obs: Tensor  # observations before the step (B, d)
+    actions: Tensor  # actions (B, a)
+    rewards: Tensor  # rewards (B,)
+    next_obs: Tensor  # observations after the step, of the same episode (B, d); read only where not terminated
+    terminated: Tensor  # whether nothing follows, bool (B,). A time limit is not such an end
+    steps: Tensor | int = 1  # steps from obs to next_obs, one for all or (B,); rewards is then their discounted sum
 
 
 class Replay:
@@ -279,13 +273,7 @@ class Stretches:
 
 
 def replay_within(
-    learner: str,
-    world: VectorWorld,
-    observations: int,
-    actions: int,
-    asked: int,
-    memory: float,
-    share: float,
+    learner: str, world: VectorWorld, observations: int, actions: int, asked: int, memory: float, share: float
 ) -> Replay:
     """The replay that was asked for, or as much of it as its memory holds.
 

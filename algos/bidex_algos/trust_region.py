@@ -136,12 +136,9 @@ def line_search(
 class Stepped(NamedTuple):
     """What a trust-region step has come to."""
 
-    objective: float
-    """The objective where it ended."""
-    kl: float
-    """KL from the sampling policy there."""
-    share: float
-    """Share of the natural step that was taken; 0: the parameters are as before."""
+    objective: float  # the objective where it ended
+    kl: float  # KL from the sampling policy there
+    share: float  # share of the natural step that was taken; 0: the parameters are as before
 
     def told(self, kl_tag: str, device: torch.device) -> dict[str, Tensor]:
         """Scalars to be logged."""

@@ -22,8 +22,10 @@ AutoresetMode = Literal["SAME_STEP", "DISABLED"]
 class LearnerConfig(Checked):
     """Base of the learners' configs: fields are checked by their annotations, their docstrings are the flags' help."""
 
-    algo: ClassVar[str] = "learner"
-    """The learner's name in messages."""
+    @property
+    def algo(self) -> str:
+        """The learner's name in messages: that of the class, ``PPO`` of ``PPOConfig``."""
+        return type(self).__name__.removesuffix("Config").lower()
 
     def bytes_held(self, num_envs: int, width: int) -> int:
         """About how much memory a learner takes.

@@ -72,18 +72,12 @@ that all take."""
 class TaskBatch:
     """What was sampled in one stage of adaptation, by task: B transitions of each of M tasks."""
 
-    obs: Tensor
-    """Normalised observations (M, B, d)."""
-    actions: Tensor
-    """Sampled actions (M, B, a)."""
-    old_means: Tensor
-    """Means of the policies that sampled (M, B, a)."""
-    old_log_stds: Tensor
-    """Logarithms of their standard deviations (M, a)."""
-    advantages: Tensor
-    """Normalised within each task (M, B)."""
-    weights: Tensor
-    """1, or 0 for what teaches nothing: after an episode's end, or where physics broke (M, B)."""
+    obs: Tensor  # normalised observations (M, B, d)
+    actions: Tensor  # sampled actions (M, B, a)
+    old_means: Tensor  # means of the policies that sampled (M, B, a)
+    old_log_stds: Tensor  # logarithms of their standard deviations (M, a)
+    advantages: Tensor  # normalised within each task (M, B)
+    weights: Tensor  # 1, or 0 for what teaches nothing: after an episode's end, or where physics broke (M, B)
 
     def tensors(self) -> tuple[Tensor, ...]:
         """The fields, in order."""

@@ -32,8 +32,6 @@ from bidex_meta.world.contract import PooledWorld
 class MetaLearner(Learner):
     """Learns parameters from which one gradient step on a task's own data goes far.
 
-    Arguments and attributes are those of :class:`~bidex_algos.learner.Learner`; the world hides its goals.
-
     Attributes:
         policy: The adapting agent that evaluation uses; the learner itself never adapts it.
         pools: The tasks of each class that meta-batches are drawn from.

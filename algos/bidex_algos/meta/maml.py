@@ -11,7 +11,7 @@ theta_K depends on theta through the inner steps; ``first_order`` leaves their d
 """
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -26,8 +26,6 @@ from bidex_meta.validation import Count, Fraction, NonNegative, Positive
 @dataclass(frozen=True)
 class MAMLConfig(OuterConfig):
     """Everything that can be set about MAML; the defaults are the preset ``laptop``."""
-
-    algo: ClassVar[str] = "maml"
 
     outer: Literal["trpo", "adam"] = "trpo"
     """How the meta-parameters move: a trust-region step, as in the paper, or one step of Adam."""
@@ -57,10 +55,7 @@ PRESETS: dict[str, MAMLConfig] = {
 
 
 class MAML(MetaLearner):
-    """MAML (Finn et al. 2017, arXiv 1703.03400) with a trust region.
-
-    Arguments and attributes are those of its base.
-    """
+    """MAML (Finn et al. 2017, arXiv 1703.03400) with a trust region."""
 
     name, objective = "maml", "likelihood"
     config_type, presets = MAMLConfig, PRESETS

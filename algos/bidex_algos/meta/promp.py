@@ -13,7 +13,6 @@ the data that adaptation needs (their section 4).
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -28,8 +27,6 @@ from bidex_meta.validation import Count, NonNegative, Positive, check_rising
 @dataclass(frozen=True)
 class ProMPConfig(OuterConfig):
     """Everything that can be set about ProMP; the defaults are the preset ``laptop``."""
-
-    algo: ClassVar[str] = "promp"
 
     outer_epochs: Count = 5
     """Steps of the meta-parameters on one meta-batch; each adapts anew."""
@@ -75,10 +72,7 @@ PRESETS: dict[str, ProMPConfig] = {
 
 
 class ProMP(MetaLearner):
-    """ProMP, proximal meta-policy search (Rothfuss et al. 2019, arXiv 1810.06784).
-
-    Arguments and attributes are those of :class:`~bidex_algos.meta.base.MetaLearner`.
-    """
+    """ProMP, proximal meta-policy search (Rothfuss et al. 2019, arXiv 1810.06784)."""
 
     name, objective = "promp", "ratio"
     config_type, presets = ProMPConfig, PRESETS

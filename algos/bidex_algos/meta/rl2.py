@@ -10,7 +10,7 @@ first trial only measures what statistics are made of.
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -35,8 +35,6 @@ from bidex_meta.world.contract import PooledWorld
 @dataclass(frozen=True)
 class RL2Config(PPOConfig, TrialConfig):
     """Everything that can be set about RL²; the defaults are the preset ``laptop``."""
-
-    algo: ClassVar[str] = "rl2"
 
     learning_rate_range: tuple[Positive, Positive] = (1e-5, 3e-3)
     """Bounds of the adaptive step size."""
@@ -83,8 +81,6 @@ PRESETS: dict[str, RL2Config] = {
 
 class RL2(Learner):
     """RL² (Duan et al. 2016, arXiv 1611.02779): a policy with a memory that adapts to a task while it plays it.
-
-    Arguments and attributes are those of :class:`~bidex_algos.learner.Learner`.
 
     Attributes:
         policy: Network and statistics.
@@ -197,13 +193,7 @@ class RL2(Learner):
         return {**dict(zip(NAMES, torch.stack(measured).mean(0), strict=True)), "Policy/lr": self.adams.rate}
 
     def _gradients(self, b: Batch, chosen: Tensor, count: Tensor, old_log_std: Tensor) -> Tensor:
-        """Puts the gradients of some chunks, int64 (B,), into the parameters.
-
-        ``count`` samples are in the mini-batch, over all processes.
-
-        Returns:
-            Surrogate loss, value loss, KL and share of clipped ratios: (4,).
-        """
+        """Puts the gradients of some chunks, int64 (B,), into the parameters."""
         policy, chunk, row = self.policy, b.chunk[chosen], b.row[chosen]
         x = policy.see(b.take(b.obs, chosen), *(b.take(p, chosen) for p in b.previous))
         means, _ = policy.actor(x, b.actor_states[chunk, row])

@@ -122,22 +122,15 @@ def _one(x: Tensor, returns: Tensor, weights: Tensor, ridge: float) -> Tensor:
 class Stage:
     """Transitions of T steps in N rows, in the order they were made; one entry of a list a step."""
 
-    obs: list[Tensor] = field(default_factory=list)
-    """Normalised observations before the step (N, d)."""
-    actions: list[Tensor] = field(default_factory=list)
-    """Sampled actions, not clamped (N, a)."""
-    means: list[Tensor] = field(default_factory=list)
-    """Means of the sampling policies (N, a)."""
-    rewards: list[Tensor] = field(default_factory=list)
-    """(N,); 0 where not valid."""
-    terminated: list[Tensor] = field(default_factory=list)
-    """Bool (N,), the episode came to a true end."""
-    ended: list[Tensor] = field(default_factory=list)
-    """Bool (N,), the episode is over, for whatever reason."""
+    obs: list[Tensor] = field(default_factory=list)  # normalised observations before the step (N, d)
+    actions: list[Tensor] = field(default_factory=list)  # sampled actions, not clamped (N, a)
+    means: list[Tensor] = field(default_factory=list)  # means of the sampling policies (N, a)
+    rewards: list[Tensor] = field(default_factory=list)  # (N,); 0 where not valid
+    terminated: list[Tensor] = field(default_factory=list)  # bool (N,), the episode came to a true end
+    ended: list[Tensor] = field(default_factory=list)  # bool (N,), the episode is over, for whatever reason
+    # Bool (N,), False where the row was frozen or its physics broke: such a transition teaches nothing.
     valid: list[Tensor] = field(default_factory=list)
-    """Bool (N,), False where the row was frozen or its physics broke: such a transition teaches nothing."""
-    elapsed: list[Tensor] = field(default_factory=list)
-    """Steps since the row's episode began, before the step (N,)."""
+    elapsed: list[Tensor] = field(default_factory=list)  # steps since the row's episode began, before the step (N,)
 
     def add(self, **step: Tensor) -> None:
         """Takes a step, with every field by name."""
@@ -198,12 +191,9 @@ def task_batch(stage: Stage, rows: TaskRows, log_std: Tensor, config: MetaConfig
 class Outcome(NamedTuple):
     """What a stage came to."""
 
-    earned: Tensor
-    """Undiscounted, unscaled return of each row (N,)."""
-    success: Tensor
-    """Whether each row succeeded, bool (N,)."""
-    steps: Tensor
-    """Environment steps, int64 (); a row that waits for the others takes none."""
+    earned: Tensor  # undiscounted, unscaled return of each row (N,)
+    success: Tensor  # whether each row succeeded, bool (N,)
+    steps: Tensor  # environment steps, int64 (); a row that waits for the others takes none
 
 
 def moments(x: Tensor, counted: Tensor) -> tuple[Tensor, Tensor, Tensor]:

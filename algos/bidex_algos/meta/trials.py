@@ -201,30 +201,19 @@ def play(
 class Batch:
     """A trial made ready for the update: T slots (a multiple of the chunk C) of N rows, and its S chunks."""
 
-    obs: Tensor
-    """Raw observations (T, N, d)."""
-    actions: Tensor
-    """Sampled actions (T, N, a)."""
+    obs: Tensor  # raw observations (T, N, d)
+    actions: Tensor  # sampled actions (T, N, a)
+    # What the memory is fed beside the observation; see Trials.previous.
     previous: tuple[Tensor, Tensor, Tensor, Tensor]
-    """What the memory is fed beside the observation; see ``Trials.previous``."""
-    old_means: Tensor
-    """Means of the sampling policy (T, N, a)."""
-    old_log_probs: Tensor
-    """Log-density of the actions under it (T, N)."""
-    advantages: Tensor
-    """Normalised advantages (T, N)."""
-    targets: Tensor
-    """What the critic shall predict, in its own units (T, N)."""
-    weights: Tensor
-    """1, or 0 for slots that teach nothing (T, N)."""
-    actor_states: Tensor
-    """The actor's memory before each chunk (T / C, N, memory)."""
-    critic_states: Tensor
-    """The critic's (T / C, N, memory)."""
-    chunk: Tensor
-    """Number of each chunk that holds a step, int64 (S,)."""
-    row: Tensor
-    """Its row, int64 (S,)."""
+    old_means: Tensor  # means of the sampling policy (T, N, a)
+    old_log_probs: Tensor  # log-density of the actions under it (T, N)
+    advantages: Tensor  # normalised advantages (T, N)
+    targets: Tensor  # what the critic shall predict, in its own units (T, N)
+    weights: Tensor  # 1, or 0 for slots that teach nothing (T, N)
+    actor_states: Tensor  # the actor's memory before each chunk (T / C, N, memory)
+    critic_states: Tensor  # the critic's (T / C, N, memory)
+    chunk: Tensor  # number of each chunk that holds a step, int64 (S,)
+    row: Tensor  # its row, int64 (S,)
 
     @property
     def size(self) -> int:

@@ -154,22 +154,14 @@ def keep_values(critics: list[MLP], before: tuple[Tensor, Tensor], after: tuple[
 class AgentBatch:
     """Samples (B,) of one agent with a_i actions. Cut out of the batch once, so that mini-batches take rows alone."""
 
-    seen: Tensor
-    """What its network is fed (B, d_i)."""
-    task: Tensor
-    """The tasks' one-hot (B, heads); without columns where the agent has one head."""
-    actions: Tensor
-    """Its part of the sampled actions (B, a_i)."""
-    old_means: Tensor
-    """Of the sampling policy (B, a_i)."""
-    old_log_std: Tensor
-    """Of the sampling policy (B, a_i)."""
-    old_log_probs: Tensor
-    """Log-density of its part under the sampling policy (B,)."""
-    gain: Tensor
-    """The advantages it shall climb (B,)."""
-    weights: Tensor
-    """As in the batch (B,)."""
+    seen: Tensor  # what its network is fed (B, d_i)
+    task: Tensor  # the tasks' one-hot (B, heads); without columns where the agent has one head
+    actions: Tensor  # its part of the sampled actions (B, a_i)
+    old_means: Tensor  # of the sampling policy (B, a_i)
+    old_log_std: Tensor  # of the sampling policy (B, a_i)
+    old_log_probs: Tensor  # log-density of its part under the sampling policy (B,)
+    gain: Tensor  # the advantages it shall climb (B,)
+    weights: Tensor  # as in the batch (B,)
 
     def select(self, index: Tensor) -> "AgentBatch":
         """The samples at ``index``."""
@@ -184,8 +176,6 @@ class TeamPolicy(GaussianPolicy):
 
 class MultiAgent(OnPolicy):
     """Agents that share a reward, each with a policy on what it sees.
-
-    Arguments and attributes are those of :class:`~bidex_algos.onpolicy.base.OnPolicy`.
 
     Attributes:
         views: The agents.

@@ -9,7 +9,7 @@ Then the critic of all. Each agent's step is to the gain of all, whatever the ot
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -26,8 +26,6 @@ from bidex_meta.world.contract import VectorWorld
 class HAPPOConfig(InTurnConfig, MultiAgentPPOConfig):
     """Everything that can be set about HAPPO; the defaults are the preset ``laptop``."""
 
-    algo: ClassVar[str] = "happo"
-
 
 PRESETS: dict[str, HAPPOConfig] = {
     # Table 44; its replay, Polyak factor and reward scale are of no use to an on-policy learner.
@@ -42,8 +40,6 @@ TASK_PRESETS = {"LiftUnderarm": {"paper": replace(PRESETS["paper"], **LIFT)}}
 
 class HAPPO(Sequential):
     """HAPPO, agents in turn (Kuba et al. 2022, arXiv 2109.11251).
-
-    Arguments, attributes and errors are those of its base.
 
     Attributes:
         adams: An optimiser of each agent.

@@ -5,7 +5,7 @@ trust region, with the advantage times the ratios of the agents before it. Then 
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,8 +23,6 @@ from bidex_meta.world.contract import VectorWorld
 @dataclass(frozen=True)
 class HATRPOConfig(InTurnConfig, MTTRPOConfig, MultiAgentConfig):
     """Everything that can be set about HATRPO; the defaults are the preset ``laptop``."""
-
-    algo: ClassVar[str] = "hatrpo"
 
     max_kl: Positive = 0.05
     """Mean KL of the new policy from the sampling one, of all agents together, that an update may not exceed; each
@@ -47,8 +45,6 @@ TASK_PRESETS = {
 
 class HATRPO(Sequential):
     """HATRPO, agents in turn (Kuba et al. 2022, arXiv 2109.11251).
-
-    Arguments, attributes and errors are those of its base.
 
     Attributes:
         region: The config with an agent's share of ``max_kl``.

@@ -4,7 +4,7 @@ MAPPO but for the critics: each agent has its own values, returns and advantages
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 from torch import Tensor, nn
 
@@ -21,8 +21,6 @@ from bidex_meta.world.contract import VectorWorld
 @dataclass(frozen=True)
 class IPPOConfig(MAPPOConfig):
     """Everything that can be set about IPPO; the defaults are the preset ``laptop``."""
-
-    algo: ClassVar[str] = "ippo"
 
     def __post_init__(self) -> None:
         """Checks what annotations cannot say."""
@@ -42,10 +40,7 @@ TASK_PRESETS = {"LiftUnderarm": {"paper": replace(PRESETS["paper"], **LIFT)}}
 
 
 class IPPO(MAPPO):
-    """IPPO, independent PPO (de Witt et al. 2020, arXiv 2011.09533).
-
-    Arguments, attributes and errors are those of its base.
-    """
+    """IPPO, independent PPO (de Witt et al. 2020, arXiv 2011.09533)."""
 
     name = "ippo"
     config_type, presets, task_presets = IPPOConfig, PRESETS, TASK_PRESETS

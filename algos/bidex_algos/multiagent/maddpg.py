@@ -11,7 +11,7 @@ the same targets: there is one.
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -32,8 +32,6 @@ from bidex_meta.world.contract import VectorWorld
 @dataclass(frozen=True)
 class MADDPGConfig(DDPGConfig):
     """Everything that can be set about MADDPG; the defaults are the preset ``laptop``."""
-
-    algo: ClassVar[str] = "maddpg"
 
     agents: Partition = "hands"
     """Who acts: hands (two agents), fingers (twelve: five fingers and the palm of each hand), single, a TOML file with
@@ -85,8 +83,6 @@ class DeterministicTeam(Team):
 
 class MADDPG(DDPG):
     """MADDPG, multi-agent DDPG (Lowe et al. 2017, arXiv 1706.02275).
-
-    Arguments, attributes and errors are those of its base.
 
     Attributes:
         views: The agents.

@@ -5,7 +5,7 @@ surrogate, the critic its targets. The advantage is of all agents together, norm
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,8 +22,6 @@ from bidex_meta.world.contract import VectorWorld
 @dataclass(frozen=True)
 class MAPPOConfig(MultiAgentPPOConfig):
     """Everything that can be set about MAPPO; the defaults are the preset ``laptop``."""
-
-    algo: ClassVar[str] = "mappo"
 
     share_parameters: bool = False
     """Give agents whose observations and actions are of one form a network together, which is told who acts."""
@@ -42,8 +40,6 @@ TASK_PRESETS = {"LiftUnderarm": {"paper": replace(PRESETS["paper"], **LIFT)}}
 
 class MAPPO(MultiAgent):
     """MAPPO, multi-agent PPO (Yu et al. 2022, arXiv 2103.01955).
-
-    Arguments, attributes and errors are those of its base.
 
     Attributes:
         adams: An optimiser of each network of the actors.
@@ -85,12 +81,7 @@ class MAPPO(MultiAgent):
         return {**dict(zip(NAMES, torch.stack(measured).mean(0), strict=True)), "Policy/lr": rate}
 
     def _gradients(self, b: Batch, count: Tensor, old_log_std: Tensor, old_values: Tensor) -> Tensor:
-        """Puts the gradients of a mini-batch into the parameters; ``count`` samples are in it, over all processes.
-
-        Returns:
-            Surrogate loss, value loss, KL, share of clipped ratios, each the mean over agents, and the KL of the
-            agents of each network (4 + networks,).
-        """
+        """Puts the gradients of a mini-batch into the parameters; ``count`` samples are in it, over all processes."""
         cfg, actor = self.config, self.policy.actor
         weights = b.weights / count
         losses = self._agent_losses(b, weights, old_log_std)

@@ -93,8 +93,6 @@ class Moore(nn.Module):
     The task's one-hot chooses w_k and is not fed to the experts. Heads of tasks are the paper's multi-head variant.
     Ours: the mixture is multiplied by the root of its width, so that its entries are as large as those of another
     layer, and goes through the config's non-linearity; w starts as a random direction of length 1.
-
-    Arguments are those of :class:`~bidex_algos.nets.networks.MLP`, and ``modules``: experts.
     """
 
     def __init__(
@@ -149,8 +147,6 @@ class PaCo(nn.Module):
     Ours: actor and each critic have their own w, which starts as a random direction of length 1; biases of the output
     are not composed, since the actor's hold its initial standard deviation. Of the paper's training, the masking and
     fresh start of tasks whose loss explodes is left out.
-
-    Arguments are those of :class:`~bidex_algos.nets.networks.MLP`, and ``modules``: parameter sets.
     """
 
     def __init__(
@@ -198,8 +194,6 @@ class SoftModules(nn.Module):
     modules. The task's one-hot enters by h alone. Ours: the head takes shares of the last layer, where the paper adds
     its modules up; f is one layer; modules have the config's non-linearity. The paper's loss weights by temperature are
     left out.
-
-    Arguments are those of :class:`~bidex_algos.nets.networks.MLP`, and ``modules``: modules of a layer.
     """
 
     def __init__(

@@ -99,8 +99,6 @@ PAPER: dict[str, Any] = {"value_heads": False, "critic_layer_norm": False, "per_
 class Offline(Learner):
     """A learner from data. ``learn_from`` comes before the first iteration and before a checkpoint is loaded.
 
-    Arguments, attributes and errors are those of :class:`~bidex_algos.learner.Learner`.
-
     Attributes:
         env_steps: Updates so far.
         generator: Of the draws of transitions alone, so that learners of one seed see the same ones.
@@ -189,10 +187,7 @@ class Offline(Learner):
             return critic(obs, actions, self.task_of_draw)
 
     def _bootstrapped(self, draw: Transitions, following: Tensor) -> Tensor:
-        """Targets (B,): scaled reward + gamma * ``following`` (B,), the value of the next state.
-
-        Nothing follows a true end. After a time limit the episode could have gone on.
-        """
+        """Targets (B,): scaled reward + gamma * ``following`` (B,), the value of the next state."""
         rewards = draw.rewards / self.reward_scale[self.task_of_draw]
         return rewards + self.gamma_of_draw * following.masked_fill(draw.terminated, 0.0)
 

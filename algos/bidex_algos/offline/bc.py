@@ -1,7 +1,6 @@
 """BC: an actor that does in each state what the data did (behaviour cloning), by the mean squared distance."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -19,18 +18,13 @@ from bidex_algos.replay import Transitions
 class BCConfig(OfflineConfig):
     """Everything that can be set about BC; the defaults are the preset ``laptop``."""
 
-    algo: ClassVar[str] = "bc"
-
 
 # Bi-DexHands compares with BC and has no table for it: layers, step size and batch are TD3+BC's of Table 46.
 PRESETS: dict[str, BCConfig] = {"paper": BCConfig(), "laptop": BCConfig()}
 
 
 class BC(Offline):
-    """Behaviour cloning on data sets (Pomerleau 1988): TD3+BC (arXiv 2106.06860) without its critics.
-
-    Arguments, errors and attributes are those of :class:`~bidex_algos.offline.base.Offline`.
-    """
+    """Behaviour cloning on data sets (Pomerleau 1988): TD3+BC (arXiv 2106.06860) without its critics."""
 
     name, remedy = "bc", "lower learning_rate"
     config_type, presets = BCConfig, PRESETS

@@ -10,7 +10,7 @@ Q', xi'  a small step towards Q, xi
 
 import copy
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import torch
 from msgspec import Meta
@@ -36,8 +36,6 @@ _LOG_STD = (-4.0, 15.0)
 @dataclass(frozen=True)
 class BCQConfig(CriticConfig):
     """Everything that can be set about BCQ; the defaults are the preset ``laptop``."""
-
-    algo: ClassVar[str] = "bcq"
 
     vae_hidden: Layers = (256, 256)
     """Widths of the hidden layers of the model of the data's actions, a variational autoencoder."""
@@ -175,8 +173,6 @@ class BCQPolicy(nn.Module):
 
 class BCQ(Offline):
     """Batch-constrained deep Q-learning on data sets (Fujimoto et al. 2019, arXiv 1812.02900).
-
-    Arguments, errors and attributes are those of :class:`~bidex_algos.offline.base.Offline`.
 
     Attributes:
         target_actor: Follows the network that changes proposals.

@@ -7,7 +7,7 @@ Q'  a small step towards Q
 """
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import torch
 from msgspec import Meta
@@ -29,8 +29,6 @@ from bidex_meta.world.contract import VectorWorld
 @dataclass(frozen=True)
 class IQLConfig(CriticConfig):
     """Everything that can be set about IQL; the defaults are the preset ``laptop``."""
-
-    algo: ClassVar[str] = "iql"
 
     expectile: Annotated[float, Meta(gt=0.0, lt=1.0)] = 0.7
     """Which expectile of the values of the data's actions a state is worth: 0.5 their mean, towards 1 the best one."""
@@ -65,8 +63,6 @@ class BoundedMean(GaussianActor):
 
 class IQL(Offline):
     """Implicit Q-learning on data sets (Kostrikov et al. 2022, arXiv 2110.06169).
-
-    Arguments, errors and attributes are those of :class:`~bidex_algos.offline.base.Offline`.
 
     Attributes:
         value: Network of the state's value.

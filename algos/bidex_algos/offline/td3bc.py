@@ -8,7 +8,7 @@ mu', Q'  a small step towards mu, Q                    mu and the targets at eve
 
 import copy
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,8 +25,6 @@ from bidex_meta.world.contract import VectorWorld
 @dataclass(frozen=True)
 class TD3BCConfig(CriticConfig):
     """Everything that can be set about TD3+BC; the defaults are the preset ``laptop``."""
-
-    algo: ClassVar[str] = "td3bc"
 
     alpha: NonNegative = 2.5
     """Weight of the value, divided by the mean absolute value of the batch, beside the distance to the data; 0: BC."""
@@ -45,8 +43,6 @@ PRESETS: dict[str, TD3BCConfig] = {"paper": TD3BCConfig(alpha=0.2, **PAPER), "la
 
 class TD3BC(BC):
     """TD3+BC on data sets (Fujimoto and Gu 2021, arXiv 2106.06860).
-
-    Arguments, errors and attributes are those of :class:`~bidex_algos.offline.base.Offline`.
 
     Attributes:
         target_actor: Follows the actor.

@@ -13,7 +13,6 @@ pessimistic. All else is as in ``mtsac.py`` and ``categorical.py``; deviations s
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -79,8 +78,6 @@ class ResidualMLP(MLP):
 class BRCConfig(CategoricalConfig, MTSACConfig):
     """Everything that can be set about BRC; the defaults are the preset ``laptop``."""
 
-    algo: ClassVar[str] = "brc"
-
     critic_hidden: Layers = (256, 256, 256)
     """Width of the critics as often as there are residual blocks of two layers, and once more for the first layer."""
     hidden: Layers = (256, 256)
@@ -133,10 +130,7 @@ PRESETS: dict[str, BRCConfig] = {
 
 
 class BRC(Categorical, MTSAC):
-    """BRC (Nauman et al. 2025, arXiv 2505.23150) on a batched world.
-
-    Arguments, errors and attributes are those of :class:`~bidex_algos.offpolicy.mtsac.MTSAC`.
-    """
+    """BRC (Nauman et al. 2025, arXiv 2505.23150) on a batched world."""
 
     name = "brc"
     config_type, presets = BRCConfig, PRESETS

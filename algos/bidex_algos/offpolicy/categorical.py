@@ -173,13 +173,7 @@ class Categorical(OffPolicy):
         return probs.gather(0, lower.view(1, -1, 1).expand(1, -1, probs.shape[2]))[0]
 
     def _projected(self, draw: Transitions, following: Tensor, bonus: Tensor) -> Tensor:
-        """Targets (B, atoms): the distribution of scaled reward + gamma^steps * (bonus + Z), Z as ``following``.
-
-        Args:
-            draw: Transitions; after a true end nothing follows.
-            following: Shape (B, atoms).
-            bonus: What is added to the value of the state after the transition, (B,).
-        """
+        """Targets (B, atoms): the distribution of scaled reward + gamma^steps * (bonus + Z), Z as ``following``."""
         shift = self._bootstrapped(draw, bonus)
         factor = (self.gamma_of_draw**draw.steps) * (~draw.terminated).to(shift.dtype)
         return self.critic.atoms.projected(following, shift, factor)

@@ -39,8 +39,6 @@ from bidex_meta.world.contract import VectorWorld
 class DDPGConfig(OffPolicyConfig):
     """Everything that can be set about DDPG; the defaults are the preset ``laptop``."""
 
-    algo: ClassVar[str] = "ddpg"
-
     exploration_std: tuple[NonNegative, NonNegative] = (0.05, 0.5)
     """Standard deviation of the noise on actions: of the first row of each task, of its last; evenly between."""
     squash_price: NonNegative = 1.0

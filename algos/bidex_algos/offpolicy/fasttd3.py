@@ -11,7 +11,6 @@ weights decay. All else is as in ``td3.py`` and ``categorical.py``; deviations s
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -25,8 +24,6 @@ from bidex_meta.validation import Count, NonNegative, Share
 @dataclass(frozen=True)
 class FastTD3Config(CategoricalConfig, TD3Config):
     """Everything that can be set about FastTD3; the defaults are the preset ``laptop``."""
-
-    algo: ClassVar[str] = "fasttd3"
 
     value_heads: bool = False
     """Give each critic one distribution per task instead of one for all."""
@@ -63,10 +60,7 @@ PRESETS: dict[str, FastTD3Config] = {
 
 
 class FastTD3(Categorical, TD3):
-    """Multi-task FastTD3 (Seo et al. 2025, arXiv 2505.22642) on a batched world.
-
-    Arguments, errors and attributes are those of :class:`~bidex_algos.offpolicy.td3.TD3`.
-    """
+    """Multi-task FastTD3 (Seo et al. 2025, arXiv 2505.22642) on a batched world."""
 
     name = "fasttd3"
     config_type, presets = FastTD3Config, PRESETS

@@ -39,8 +39,6 @@ from bidex_meta.world.contract import VectorWorld
 class MTSACConfig(OffPolicyConfig):
     """Everything that can be set about MT-SAC; the defaults are the preset ``laptop``."""
 
-    algo: ClassVar[str] = "mtsac"
-
     init_std: Positive = 0.5
     """Standard deviation of the actions at the start, before the squashing."""
     std_range: tuple[Positive, Positive] = (0.02, 2.0)

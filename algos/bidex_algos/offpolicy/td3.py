@@ -8,7 +8,7 @@ All else is as in ``ddpg.py``.
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from torch import Tensor
 
@@ -20,8 +20,6 @@ from bidex_meta.world.contract import VectorWorld
 @dataclass(frozen=True)
 class TD3Config(DDPGConfig):
     """Everything that can be set about TD3; the defaults are the preset ``laptop``."""
-
-    algo: ClassVar[str] = "td3"
 
     target_std: NonNegative = 0.2
     """Standard deviation of the noise on the actions that targets assume."""
@@ -46,8 +44,6 @@ PRESETS: dict[str, TD3Config] = {
 
 class TD3(DDPG):
     """Multi-task TD3 (Fujimoto et al. 2018, arXiv 1802.09477) on a batched world.
-
-    Arguments, errors and attributes are those of :class:`~bidex_algos.offpolicy.ddpg.DDPG`.
 
     Attributes:
         updates: Of the critics so far.

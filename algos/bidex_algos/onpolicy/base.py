@@ -109,22 +109,14 @@ TABLE_47: dict[str, Any] = {
 class Batch:
     """A rollout made ready for the update, steps and rows flattened into B samples."""
 
-    obs: Tensor
-    """Normalised observations (B, d), in the precision the hidden layers run in."""
-    task_id: Tensor
-    """Task of each sample (B,)."""
-    actions: Tensor
-    """Sampled actions (B, a)."""
-    old_means: Tensor
-    """Means of the sampling policy (B, a)."""
-    old_log_probs: Tensor
-    """Log-density of the actions under the sampling policy (B,)."""
-    advantages: Tensor
-    """Normalised advantages (B,); of several critics (B, critics)."""
-    targets: Tensor
-    """What the critic shall predict, in its own units (B,); of several (B, critics)."""
-    weights: Tensor
-    """1, or 0 for a transition where physics broke (B,)."""
+    obs: Tensor  # normalised observations (B, d), in the precision the hidden layers run in
+    task_id: Tensor  # task of each sample (B,)
+    actions: Tensor  # sampled actions (B, a)
+    old_means: Tensor  # means of the sampling policy (B, a)
+    old_log_probs: Tensor  # log-density of the actions under the sampling policy (B,)
+    advantages: Tensor  # normalised advantages (B,); of several critics (B, critics)
+    targets: Tensor  # what the critic shall predict, in its own units (B,); of several (B, critics)
+    weights: Tensor  # 1, or 0 for a transition where physics broke (B,)
 
     def select(self, index: Tensor) -> "Batch":
         """The samples at ``index``."""
@@ -143,8 +135,6 @@ def check_samples(name: str, config: Any, num_envs: int) -> None:
 
 class OnPolicy(Learner):
     """A Gaussian policy and a critic that learn from what the policy has just done.
-
-    Arguments, attributes and errors are those of :class:`~bidex_algos.learner.Learner`.
 
     Attributes:
         policy: The agent that evaluation uses: mean action, clamped.

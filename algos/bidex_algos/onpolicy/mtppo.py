@@ -7,7 +7,7 @@ stands in ``docs/learners/mtppo.md``.
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -27,8 +27,6 @@ from bidex_meta.world.contract import VectorWorld
 @dataclass(frozen=True)
 class MTPPOConfig(PPOConfig, OnPolicyConfig):
     """Everything that can be set about MT-PPO; the defaults are the preset ``laptop``."""
-
-    algo: ClassVar[str] = "mtppo"
 
     value_loss_weight: Finite = 2.0
     """Factor of the value loss. Adam undoes it; it matters only beside max_grad_norm."""
@@ -170,12 +168,7 @@ class MTPPO(OnPolicy):
         return told
 
     def _gradients(self, b: Batch, count: Tensor, old_log_std: Tensor) -> Tensor:
-        """Puts the gradients of a mini-batch into the parameters; ``count`` samples are in it, over all processes.
-
-        Returns:
-            Surrogate loss, value loss, KL, share of clipped ratios; with surgery its own number; with demonstrations
-            the distance from them: (4,) to (6,).
-        """
+        """Puts the gradients of a mini-batch into the parameters; ``count`` samples are in it, over all processes."""
         cfg, actor = self.config, self.policy.actor
         loss = self._loss(b, count, old_log_std, self._critic(b.obs, b.task_id))
         rest = cfg.value_loss_weight * loss.value - cfg.entropy_weight * loss.entropy

@@ -11,7 +11,7 @@ One policy reads the task's one-hot in its observation. An update, in the order 
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -27,8 +27,6 @@ from bidex_meta.world.contract import VectorWorld
 @dataclass(frozen=True)
 class MTTRPOConfig(OnPolicyConfig):
     """Everything that can be set about MT-TRPO; the defaults are the preset ``laptop``."""
-
-    algo: ClassVar[str] = "mttrpo"
 
     max_kl: Positive = 0.1
     """Mean KL of the new policy from the sampling one that an update may not exceed."""
@@ -72,8 +70,6 @@ PRESETS: dict[str, MTTRPOConfig] = {
 
 class MTTRPO(OnPolicy):
     """Multi-task TRPO (Schulman et al. 2015, arXiv 1502.05477) on a batched world.
-
-    Arguments and attributes are those of :class:`~bidex_algos.onpolicy.base.OnPolicy`.
 
     Attributes:
         critic_adam: Moves the critic; the actor has no optimiser.

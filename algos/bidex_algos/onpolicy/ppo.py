@@ -81,18 +81,12 @@ class PolicyLoss(NamedTuple):
 class PPOLoss(NamedTuple):
     """Losses and what is told of them; scalars but for ``earned``. With weights that sum to 1 they are means."""
 
-    surrogate: Tensor
-    """Minus the clipped surrogate objective: min(ratio A, clip(ratio, 1 - eps, 1 + eps) A)."""
-    value: Tensor
-    """Squared error of the critic, in its own units."""
-    entropy: Tensor
-    """Entropy of the policy."""
-    kl: Tensor
-    """KL of the sampling policy from the present one; without a gradient."""
-    outside: Tensor
-    """Share of the ratios outside the clip range; without a gradient."""
-    earned: Tensor
-    """The surrogate objective of each sample, weighted (...)."""
+    surrogate: Tensor  # minus the clipped surrogate objective: min(ratio A, clip(ratio, 1 - eps, 1 + eps) A)
+    value: Tensor  # squared error of the critic, in its own units
+    entropy: Tensor  # entropy of the policy
+    kl: Tensor  # KL of the sampling policy from the present one; without a gradient
+    outside: Tensor  # share of the ratios outside the clip range; without a gradient
+    earned: Tensor  # the surrogate objective of each sample, weighted (...)
 
     def numbers(self) -> list[Tensor]:
         """Surrogate, value loss, KL and share outside, without gradients: what :data:`NAMES` names."""
