@@ -114,7 +114,7 @@ class Learner(Contract):
     @staticmethod
     def _embedded(config: Any, shape: Shape) -> int:
         """Size of a task's embedding, 0 where there is none."""
-        return getattr(config, "task_embedding", 0) if shape.num_id_columns else 0
+        return vars(config).get("task_embedding", 0) if shape.num_id_columns else 0
 
     @abstractmethod
     def _iterate(self) -> dict[str, float]:

@@ -22,7 +22,7 @@ from bidex_algos.nets.architecture import network_bytes
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.recurrent import RecurrentNet, RecurrentPolicy
 from bidex_algos.nets.shape import Shape
-from bidex_algos.onpolicy.ppo import NAMES, PPOConfig, mini_batches, ppo_loss
+from bidex_algos.onpolicy.ppo import NAMES, PPOConfig, mini_batches, policy_loss
 from bidex_algos.rollout import EpisodeStatistics
 from bidex_algos.step_size import AdaptiveAdams
 from bidex_meta.errors import BidexError
@@ -198,7 +198,10 @@ class RL2(Learner):
         x = policy.see(b.take(b.obs, chosen), *(b.take(p, chosen) for p in b.previous))
         means, _ = policy.actor(x, b.actor_states[chunk, row])
         out, _ = self.critic(x, b.critic_states[chunk, row])
-        loss = ppo_loss(
+        weights = b.take(b.weights, chosen) / count
+        values, targets = of_task(out, self.world.task_id[row]), b.take(b.targets, chosen)
+        value = (weights * (values - targets).square()).sum()
+        loss = policy_loss(
             b.take(b.actions, chosen),
             means,
             policy.log_std,
@@ -206,14 +209,12 @@ class RL2(Learner):
             old_log_std,
             b.take(b.old_log_probs, chosen),
             b.take(b.advantages, chosen),
-            of_task(out, self.world.task_id[row]),
-            b.take(b.targets, chosen),
-            weights=b.take(b.weights, chosen) / count,
+            weights=weights,
             clip=self.config.clip,
         )
         self.adams.zero_grad()
-        (loss.surrogate + loss.value - self.config.entropy_weight * loss.entropy).backward()
-        return sum_gradients([*policy.parameters(), *self.critic.parameters()], torch.stack(loss.numbers()))
+        (loss.surrogate + value - self.config.entropy_weight * loss.entropy).backward()
+        return sum_gradients([*policy.parameters(), *self.critic.parameters()], torch.stack(loss.numbers(value)))
 
     def _metrics(self, losses: dict[str, Tensor], explained: Tensor, broken: Tensor) -> dict[str, float]:
         tensors = dict(losses)

@@ -135,18 +135,18 @@ class Stage:
     def add(self, **step: Tensor) -> None:
         """Takes a step, with every field by name."""
         for name, value in step.items():
-            getattr(self, name).append(value)
+            vars(self)[name].append(value)
 
     def __len__(self) -> int:
         return len(self.obs)
 
     def stacked(self, name: str) -> Tensor:
         """A field of all steps (T, N, ...)."""
-        return torch.stack(getattr(self, name))
+        return torch.stack(vars(self)[name])
 
     def by_task(self, name: str, rows: TaskRows) -> Tensor:
         """A field of all steps by task (M, T * R, ...); rearranged step by step, so that nothing large is copied."""
-        return torch.stack([rows.by_task(x) for x in getattr(self, name)], dim=1).flatten(1, 2)
+        return torch.stack([rows.by_task(x) for x in vars(self)[name]], dim=1).flatten(1, 2)
 
 
 @torch.no_grad()

@@ -203,7 +203,7 @@ class MultiAgent(OnPolicy):
         cls, config: MultiAgentConfig, shape: Shape, init: torch.Generator, device: torch.device
     ) -> TeamPolicy:
         views, inputs = agent_views(shape.groups, shape.actions, config.agents), Inputs(shape.groups)
-        heads, share = shape.num_id_columns if config.policy_heads else 1, getattr(config, "share_parameters", False)
+        heads, share = shape.num_id_columns if config.policy_heads else 1, vars(config).get("share_parameters", False)
         actor = TeamActor(views, config, inputs, init, heads, share)
         observations = ObservationNormaliser(inputs, config.normalise_observations)
         policy: Any = TeamPolicy(observations, actor, use_bfloat16(config.autocast, device))  # type: ignore[arg-type]

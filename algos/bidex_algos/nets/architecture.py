@@ -6,10 +6,10 @@ from functools import partial
 from typing import Any, Literal
 
 from bidex_algos.nets.multitask import Moore, PaCo, SoftModules
-from bidex_algos.nets.networks import MLP
+from bidex_algos.nets.networks import MLP, Activation, Layers
 from bidex_meta.errors import BidexError
 from bidex_meta.train.learner import LearnerConfig
-from bidex_meta.validation import Count
+from bidex_meta.validation import Count, Whole, Widths
 
 MakeNetwork = Callable[..., Any]
 """Takes the arguments of :class:`~bidex_algos.nets.networks.MLP`."""
@@ -59,6 +59,24 @@ class ArchitectureConfig(LearnerConfig):
                     f"{self.algo}: moore needs no more modules than the last width of {name}, since no more "
                     f"directions are orthogonal there; got {self.modules} and {widths}."
                 )
+
+
+@dataclass(frozen=True)
+class NetworkConfig(ArchitectureConfig):
+    """Networks of learners from a replay or from data."""
+
+    hidden: Layers = (256, 256)
+    """Widths of the hidden layers, of actor and critics alike."""
+    activation: Activation = "relu"
+    """Non-linearity of the hidden layers."""
+    policy_heads: bool = False
+    """Give the actor an output layer per task; the world must show the task's one-hot."""
+    task_embedding: Whole = 0
+    """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
+    point_widths: Widths = (32, 64)
+    """Widths of the layers that all points of a point cloud share (PointNet), where the world shows one."""
+    points_read: Whole = 0
+    """Points of a cloud that they read, evenly out of all; 0: all."""
 
 
 def network_of(config: ArchitectureConfig) -> MakeNetwork:

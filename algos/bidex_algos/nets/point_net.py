@@ -99,7 +99,7 @@ def with_point_net(inputs: Inputs, config: Any) -> Inputs:
     for group in inputs.groups:
         channels = POINT_GROUPS.get(group.name)
         if channels is not None:
-            if not hasattr(config, "point_widths"):
+            if "point_widths" not in vars(config):
                 raise BidexError(
                     f"{config.algo} does not read point clouds. Take another learner, such as mtppo or mtsac, or leave "
                     "--points (a suite's table [points]) out."

@@ -61,17 +61,7 @@ class GaussianPolicy(ActorPolicy):
 
 
 class DeterministicActor(nn.Module):
-    """One action for each observation, squashed by tanh.
-
-    Args:
-        inputs: The groups of the (normalised) observation, or its width.
-        hidden: Widths of the hidden layers.
-        actions: Number of actions.
-        heads: Output layers; with more than one, the group ``task_id`` is the one-hot that chooses.
-        generator: CPU generator of the initial weights.
-        activation: Name of the non-linearity.
-        network: What makes the network, by the arguments of ``MLP``.
-    """
+    """One action for each observation, squashed by tanh; arguments are those of :class:`GaussianActor`."""
 
     def __init__(
         self,
@@ -122,14 +112,7 @@ def squashed_log_prob(raw: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
     """Log-density of the action tanh(raw), where raw is drawn from N(mean, exp(log_std)^2).
 
     It takes what was squashed: in float32 tanh rounds to 1 from 9 on, and the way back from an action of 1 is infinite.
-
-    Args:
-        raw: Before the squashing, shape (..., a).
-        mean: Shape (..., a).
-        log_std: Shape (..., a).
-
-    Returns:
-        Summed over the last axis, shape (...).
+    All are (..., a); the result is summed over the last axis, (...).
     """
     # log(1 - tanh(u)^2), written so that no difference of almost equal numbers occurs.
     log_slope = 2.0 * (math.log(2.0) - raw - softplus(-2.0 * raw))
@@ -137,13 +120,7 @@ def squashed_log_prob(raw: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
 
 
 def sample_squashed(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Actions (..., a) in [-1, 1] and their log-densities (...), differentiable in mean and log_std.
-
-    Args:
-        mean: Shape (..., a), before the squashing.
-        log_std: Shape (..., a).
-        noise: Standard normal numbers, shape (..., a).
-    """
+    """Actions (..., a) in [-1, 1] and their log-densities (...), from standard normal ``noise`` (..., a)."""
     raw = mean + log_std.exp() * noise
     return torch.tanh(raw), squashed_log_prob(raw, mean, log_std)
 
@@ -154,16 +131,7 @@ class SquashedActor(nn.Module):
     The log standard deviation moves between its bounds on a tanh: a hard clamp would have no gradient beyond them, so
     that an output that went there would never return.
 
-    Args:
-        inputs: The groups of the (normalised) observation, or its width.
-        hidden: Widths of the hidden layers.
-        actions: Number of actions.
-        heads: Output layers; with more than one, the group ``task_id`` is the one-hot that chooses.
-        init_std: Standard deviation at the start, before the squashing.
-        std_range: Its bounds.
-        generator: CPU generator of the initial weights.
-        activation: Name of the non-linearity.
-        network: What makes the network, by the arguments of ``MLP``.
+    Arguments are those of :class:`GaussianActor`, and ``std_range``, the bounds.
     """
 
     def __init__(

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -98,7 +98,7 @@ class Memory:
 
     def replaced(self, mask: Tensor, other: "Memory") -> "Memory":
         """The same with the rows of ``mask``, bool (N,), from another one."""
-        pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
         return Memory(*(torch.where(mask if a.dim() == 1 else mask[:, None], b, a) for a, b in pairs))
 
 

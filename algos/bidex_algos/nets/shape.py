@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
+from bidex_algos.nets.architecture import ArchitectureConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.world.contract import ObservationGroup, VectorWorld, plain_groups
 
@@ -39,7 +40,11 @@ class Shape:
 
     def sizes(self) -> dict[str, int]:
         """The numbers without the places of the groups."""
-        return {name: getattr(self, name) for name in ("observations", "actions", "num_id_columns")}
+        return {
+            "observations": self.observations,
+            "actions": self.actions,
+            "num_id_columns": self.num_id_columns,
+        }
 
     def state_dict(self) -> dict[str, Any]:
         """Plain values for a checkpoint."""
@@ -63,10 +68,10 @@ def check_options(name: str, config: Any, world: VectorWorld, shape: Shape) -> N
     Raises:
         BidexError: The world does not show one.
     """
-    wanted = [option for option in (*_OF_SEVERAL, "policy_heads") if getattr(config, option, False)]
+    wanted = [option for option in (*_OF_SEVERAL, "policy_heads") if vars(config).get(option)]
     if world.num_tasks == 1:
         wanted = [option for option in wanted if option not in _OF_SEVERAL]  # one task needs none; heads it cannot have
-    if not getattr(config, "shares_a_trunk", True):
+    if isinstance(config, ArchitectureConfig) and not config.shares_a_trunk:
         wanted.append(f"architecture {config.architecture}")
     for option in wanted:
         if shape.num_id_columns != world.num_tasks:

@@ -16,34 +16,22 @@ from torch import Tensor, nn
 
 from bidex_algos.advantages import discounts
 from bidex_algos.learner import Learner, as_numbers
-from bidex_algos.nets.architecture import ArchitectureConfig, network_bytes
+from bidex_algos.nets.architecture import NetworkConfig, network_bytes
 from bidex_algos.nets.inputs import Inputs
-from bidex_algos.nets.networks import Activation, Autocast, Layers, autocast, use_bfloat16
+from bidex_algos.nets.networks import Autocast, autocast, use_bfloat16
 from bidex_algos.offline.batches import Batches, return_deviation
 from bidex_algos.offpolicy.critics import Critics
 from bidex_algos.replay import Transitions
 from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
-from bidex_meta.validation import BelowOne, Count, NonNegative, Positive, Share, Whole, Widths
+from bidex_meta.validation import BelowOne, Count, NonNegative, Positive, Share
 from bidex_meta.world.contract import VectorWorld
 
 
 @dataclass(frozen=True)
-class OfflineConfig(ArchitectureConfig):
+class OfflineConfig(NetworkConfig):
     """Networks, batches, statistics; the defaults are the preset ``laptop``."""
 
-    hidden: Layers = (256, 256)
-    """Widths of the hidden layers, of actor and critics alike."""
-    activation: Activation = "relu"
-    """Non-linearity of the hidden layers."""
-    policy_heads: bool = False
-    """Give the actor an output layer per task; the world must show the task's one-hot."""
-    task_embedding: Whole = 0
-    """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
-    point_widths: Widths = (32, 64)
-    """Widths of the layers that all points of a point cloud share (PointNet), where the data show one."""
-    points_read: Whole = 0
-    """Points of a cloud that they read, evenly out of all; 0: all."""
     updates_per_iteration: Count = 1000
     """Updates between two reports; --evaluate-every and --video-every count reports."""
     batch_size: Count = 256

@@ -21,7 +21,6 @@ from bidex_algos.nets.shape import Shape
 from bidex_algos.offline.base import PAPER, CriticConfig, Offline
 from bidex_algos.offpolicy.critics import follow
 from bidex_algos.replay import Transitions
-from bidex_meta.errors import BidexError
 from bidex_meta.validation import NonNegative, Positive, check_rising
 from bidex_meta.world.contract import VectorWorld
 
@@ -45,8 +44,6 @@ class IQLConfig(CriticConfig):
         """Checks what annotations cannot say."""
         super().__post_init__()
         check_rising(self, self.algo, "std_range")
-        if not 0.0 < self.expectile < 1.0:
-            raise BidexError(f"{self.algo}: expectile must lie in (0, 1), got {self.expectile}.")
 
 
 # Table 46's numbers are the defaults. The bound of the weight is that of Kostrikov et al. (2022, their code).

@@ -21,37 +21,25 @@ from torch import Tensor, nn
 
 from bidex_algos.advantages import discounts
 from bidex_algos.learner import Learner, as_numbers
-from bidex_algos.nets.architecture import ArchitectureConfig, network_bytes
+from bidex_algos.nets.architecture import NetworkConfig, network_bytes
 from bidex_algos.nets.inputs import Inputs
-from bidex_algos.nets.networks import Activation, Autocast, Layers, autocast, use_bfloat16
+from bidex_algos.nets.networks import Autocast, autocast, use_bfloat16
 from bidex_algos.offpolicy.critics import Critics
 from bidex_algos.offpolicy.return_scale import ReturnScale
 from bidex_algos.replay import Stretches, Transitions, replay_within
 from bidex_algos.rollout import EpisodeStatistics
 from bidex_meta.train.distributed import all_sum, sum_gradients, world_size
-from bidex_meta.validation import BelowOne, Count, NonNegative, Positive, Share, Whole, Widths
+from bidex_meta.validation import BelowOne, Count, NonNegative, Positive, Share, Whole
 from bidex_meta.world.contract import VectorWorld
 
 
 @dataclass(frozen=True)
-class OffPolicyConfig(ArchitectureConfig):
+class OffPolicyConfig(NetworkConfig):
     """Networks, replay, updates, statistics; the defaults are the preset ``laptop``.
 
     A vector step is one step in every row of the world.
     """
 
-    hidden: Layers = (256, 256)
-    """Widths of the hidden layers, of actor and critics alike."""
-    activation: Activation = "relu"
-    """Non-linearity of the hidden layers."""
-    policy_heads: bool = False
-    """Give the actor an output layer per task; the world must show the task's one-hot."""
-    task_embedding: Whole = 0
-    """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
-    point_widths: Widths = (32, 64)
-    """Widths of the layers that all points of a point cloud share (PointNet), where the world shows one."""
-    points_read: Whole = 0
-    """Points of a cloud that they read, evenly out of all; 0: all."""
     value_heads: bool = True
     """Give each critic one output per task instead of one for all."""
     critic_layer_norm: bool = True

@@ -16,7 +16,7 @@ from bidex_algos.balancing import Balancing, balance_of
 from bidex_algos.nets.networks import autocast
 from bidex_algos.onpolicy.base import TABLE_47, Batch, OnPolicy, OnPolicyConfig, check_samples
 from bidex_algos.onpolicy.demonstrations import Demonstrations
-from bidex_algos.onpolicy.ppo import NAMES, PPOConfig, PPOLoss, ppo_loss
+from bidex_algos.onpolicy.ppo import NAMES, PolicyLoss, PPOConfig, policy_loss
 from bidex_algos.step_size import AdaptiveAdams
 from bidex_meta.data.joined import Joined
 from bidex_meta.train.distributed import sum_gradients, world_size
@@ -170,9 +170,10 @@ class MTPPO(OnPolicy):
     def _gradients(self, b: Batch, count: Tensor, old_log_std: Tensor) -> Tensor:
         """Puts the gradients of a mini-batch into the parameters; ``count`` samples are in it, over all processes."""
         cfg, actor = self.config, self.policy.actor
-        loss = self._loss(b, count, old_log_std, self._critic(b.obs, b.task_id))
-        rest = cfg.value_loss_weight * loss.value - cfg.entropy_weight * loss.entropy
-        numbers, imitated = loss.numbers(), None
+        loss = self._loss(b, count, old_log_std)
+        value = (b.weights / count * (self._critic(b.obs, b.task_id) - b.targets).square()).sum()
+        rest = cfg.value_loss_weight * value - cfg.entropy_weight * loss.entropy
+        numbers, imitated = loss.numbers(value), None
         if self.demonstrations is not None and (weight := self._imitated()):
             imitated = self.demonstrations.loss(self.policy) / world_size()
             rest = rest + weight * imitated
@@ -187,12 +188,12 @@ class MTPPO(OnPolicy):
             numbers.append(imitated.detach())
         return sum_gradients([*actor.parameters(), *self.critic.parameters()], torch.stack(numbers))
 
-    def _loss(self, b: Batch, count: Tensor, old_log_std: Tensor, values: Tensor) -> PPOLoss:
-        """What the present actor and ``values`` (B,) make of a mini-batch."""
+    def _loss(self, b: Batch, count: Tensor, old_log_std: Tensor) -> PolicyLoss:
+        """The present actor's loss on a mini-batch."""
         actor = self.policy.actor
         with autocast(self.device, self.low_precision):
             means = actor(b.obs)
-        return ppo_loss(
+        return policy_loss(
             b.actions,
             means,
             actor.log_std_of(b.obs),
@@ -200,8 +201,6 @@ class MTPPO(OnPolicy):
             actor.log_std_of(b.obs, old_log_std),
             b.old_log_probs,
             b.advantages,
-            values,
-            b.targets,
             weights=b.weights / count,
             clip=self.config.clip,
         )
@@ -212,7 +211,7 @@ class MTPPO(OnPolicy):
 
     def _above_least(self, b: Batch, count: Tensor, old_log_std: Tensor) -> Tensor:
         """How far each task's surrogate loss is above that, (num_tasks,)."""
-        loss = self._loss(b, count, old_log_std, b.targets)
+        loss = self._loss(b, count, old_log_std)
         return self._per_task(-loss.earned - self._least(b, count), b.task_id)
 
     # Checkpoints.

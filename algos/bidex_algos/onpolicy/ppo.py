@@ -69,67 +69,21 @@ def mini_batches(
 
 
 class PolicyLoss(NamedTuple):
-    """The policy's share of a loss; as :class:`PPOLoss`."""
-
-    surrogate: Tensor
-    entropy: Tensor
-    kl: Tensor
-    outside: Tensor
-    earned: Tensor
-
-
-class PPOLoss(NamedTuple):
-    """Losses and what is told of them; scalars but for ``earned``. With weights that sum to 1 they are means."""
+    """Losses of a policy; scalars but for ``earned``. With weights that sum to 1 they are means."""
 
     surrogate: Tensor  # minus the clipped surrogate objective: min(ratio A, clip(ratio, 1 - eps, 1 + eps) A)
-    value: Tensor  # squared error of the critic, in its own units
     entropy: Tensor  # entropy of the policy
     kl: Tensor  # KL of the sampling policy from the present one; without a gradient
     outside: Tensor  # share of the ratios outside the clip range; without a gradient
     earned: Tensor  # the surrogate objective of each sample, weighted (...)
 
-    def numbers(self) -> list[Tensor]:
-        """Surrogate, value loss, KL and share outside, without gradients: what :data:`NAMES` names."""
-        return [self.surrogate.detach(), self.value.detach(), self.kl, self.outside]
+    def numbers(self, value: Tensor) -> list[Tensor]:
+        """What :data:`NAMES` names, without gradients; ``value`` is the critic's loss."""
+        return [self.surrogate.detach(), value.detach(), self.kl, self.outside]
 
 
 NAMES: tuple[str, ...] = ("Loss/surrogate", "Loss/value", "Policy/kl", "Policy/clip_fraction")
-"""Tags of :meth:`PPOLoss.numbers`."""
-
-
-def ppo_loss(
-    actions: Tensor,
-    means: Tensor,
-    log_std: Tensor,
-    old_means: Tensor,
-    old_log_std: Tensor,
-    old_log_probs: Tensor,
-    advantages: Tensor,
-    values: Tensor,
-    targets: Tensor,
-    weights: Tensor,
-    clip: float,
-) -> PPOLoss:
-    """The loss of samples of any shape (...), which the weights sum up.
-
-    Args:
-        actions: What was done (..., a).
-        means: Of the present policy (..., a), with a gradient.
-        log_std: Logarithms of its standard deviations, (a,) or (..., a), with a gradient.
-        old_means: Of the sampling policy (..., a).
-        old_log_std: Of the sampling policy, (a,) or (..., a).
-        old_log_probs: Log-density of the actions under it (...).
-        advantages: Normalised (...).
-        values: What the critic says (...), in its own units, with a gradient.
-        targets: What it shall say (...).
-        weights: Of each sample (...); 0 for those that teach nothing.
-        clip: How far the ratio may leave 1 before it earns nothing more.
-    """
-    policy = policy_loss(
-        actions, means, log_std, old_means, old_log_std, old_log_probs, advantages, weights=weights, clip=clip
-    )
-    value = (weights * (values - targets).square()).sum()
-    return PPOLoss(policy.surrogate, value, policy.entropy, policy.kl, policy.outside, policy.earned)
+"""Tags of :meth:`PolicyLoss.numbers`."""
 
 
 def policy_loss(
@@ -143,7 +97,19 @@ def policy_loss(
     weights: Tensor,
     clip: float,
 ) -> PolicyLoss:
-    """The loss of the policy alone; arguments are those of :func:`ppo_loss`."""
+    """The loss of samples of any shape (...), summed with the weights.
+
+    Args:
+        actions: Sampled actions (..., a).
+        means: Of the present policy (..., a), with a gradient.
+        log_std: Logarithms of its standard deviations, (a,) or (..., a), with a gradient.
+        old_means: Of the sampling policy (..., a).
+        old_log_std: Of the sampling policy, (a,) or (..., a).
+        old_log_probs: Log-density of the actions under it (...).
+        advantages: Normalised (...).
+        weights: Of each sample (...); 0 for those that teach nothing.
+        clip: How far the ratio may leave 1 before it earns nothing more.
+    """
     ratio = torch.exp(gaussian_log_prob(actions, means, log_std) - old_log_probs)
     clipped = ratio.clamp(1.0 - clip, 1.0 + clip)
     earned = weights * torch.minimum(ratio * advantages, clipped * advantages)
