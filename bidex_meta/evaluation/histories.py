@@ -33,7 +33,7 @@ def read_histories(folders: Sequence[Run]) -> list[History]:
     Raises:
         BidexError: None of them has logged anything.
     """
-    runs = [{"kind": run_kind(folder.config("learner", "num_envs", "steps")), "folder": folder} for folder in folders]
+    runs = [{"kind": run_kind(folder.config()), "folder": folder} for folder in folders]
     histories = []
     for label, members in by_kind(runs):
         of_label = [run["folder"] for run in members]

@@ -161,7 +161,7 @@ def draw_adaptation(found: Any, where: object) -> Any:
         raise BidexError(
             f"{where} holds no meta-test: its learner does not adapt, or it is older. {_AGAIN.format(where)}"
         )
-    check_evaluation(found, Path(str(where)))
+    check_evaluation(found, str(where))
     grids = {split: _grid(len(part["before"]["classes"])) for split, part in splits.items()}
     columns, blocks = max(grid[0] for grid in grids.values()), sum(grid[1] for grid in grids.values())
     figure = make_figure(figsize=(3.2 * columns, 4.0 * blocks), layout="constrained")
