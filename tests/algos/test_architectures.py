@@ -247,7 +247,6 @@ def test_an_architecture_needs_the_one_hot(kind: str):
         ({"architecture": "soft_modules", "hidden": (32,)}, "at least two widths"),
         ({"architecture": "moore", "hidden": (32, 3)}, "no more modules than the last width"),
         ({"architecture": "moore", "hidden": ()}, "no more modules than the last width"),
-        ({"modules": 0}, "modules must be at least 1"),
     ],
 )
 def test_what_does_not_go_together_is_refused(options: dict[str, Any], message: str):

@@ -14,7 +14,6 @@ from torch.testing import assert_close
 from bidex_algos.balancing import Famo, balance_of, conflict_averse, worst_served
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.rollout import collect
-from bidex_meta.errors import BidexError
 from tests.algos.problems import opposite_bandits
 from tests.algos.resume import resumed
 from tests.algos.toy import ToyWorld, nearness
@@ -194,5 +193,3 @@ def test_save_load_resume_is_bit_equal(way: Any):
 
 def test_nothing_is_balanced_by_default():
     assert balance_of(SMALL, 2, torch.device("cpu")) is None
-    with pytest.raises(BidexError, match=r"cagrad_radius must lie in \[0, 1\), got 1.0"):
-        replace(SMALL, cagrad_radius=1.0)

@@ -200,8 +200,6 @@ def test_an_embedding_needs_a_task_id(make: Callable[..., Any]) -> None:
     world.observation_groups = plain_groups(3, 0)
     with pytest.raises(BidexError, match="task_embedding needs the one-hot of 2 tasks"):
         make(world, task_embedding=4)
-    with pytest.raises(BidexError, match=r"task_embedding must be .* got -1"):
-        make(opposite_bandits(), task_embedding=-1)
 
 
 def test_in_bfloat16_the_rollout_and_the_update_embed_alike() -> None:

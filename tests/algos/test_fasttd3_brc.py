@@ -1,8 +1,5 @@
 """FastTD3 and BRC: known optima, targets by hand, resume; what they are made of is in ``test_categorical.py``."""
 
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -274,9 +271,6 @@ def test_metrics_and_errors_carry_its_name(kind: Any, config: Any) -> None:
         next(learner.critic.parameters()).fill_(float("nan"))
     with pytest.raises(FloatingPointError, match=rf"{kind.name}: the loss is not finite after \d+ steps; lower crit"):
         learner.iterate()
-    for wrong in ({"tau": 0.0}, {"atoms": 1}, {"value_bound": 0.0}, {"n_steps": 0}, {"weight_decay": -0.1}):
-        with pytest.raises(BidexError, match=f"{kind.name}: {next(iter(wrong))}"):
-            replace(config, **wrong)
 
 
 @both
@@ -284,13 +278,6 @@ def test_wide_critics_are_counted_as_memory(kind: Any, config: Any) -> None:
     wide = replace(config, critic_hidden=(4096, 4096, 4096))
     # Two critics of two more matrices of 4096 by 4096 each, with gradient and two moments, in float32.
     assert wide.bytes_held(64, 500) - config.bytes_held(64, 500) > 2 * 2 * 4096**2 * 4 * 4
-
-
-def test_brc_refuses_widths_that_differ() -> None:
-    with pytest.raises(BidexError, match=r"brc: critic_hidden must be one width, once or more often, got \(8, 16\)"):
-        replace(SMALL, critic_hidden=(8, 16))
-    with pytest.raises(BidexError, match="brc: hidden must be one width"):
-        replace(SMALL, hidden=())
 
 
 def test_one_task_needs_no_embedding_and_several_need_their_one_hot() -> None:
@@ -310,12 +297,3 @@ def test_they_are_found_by_name_and_every_preset_runs(name: str, preset: str) ->
     small: dict[str, Any] = {"hidden": (16, 16), "critic_hidden": (16, 16), "replay_steps": 50, "batch_size": 64}
     config = replace(kind.presets[preset], **small, warmup_steps=1, steps_per_iteration=3)
     assert "Loss/critic" in kind.make(opposite_bandits(), config, seed=0).iterate()
-
-
-def test_configs_are_shown_without_importing_torch() -> None:
-    code = (
-        "import sys, bidex_algos.offpolicy.fasttd3 as f, bidex_algos.offpolicy.brc as b; "
-        "assert f.PRESETS and b.PRESETS; sys.exit('torch' in sys.modules)"
-    )
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    assert subprocess.run([sys.executable, "-c", code], env=environment).returncode == 0

@@ -12,8 +12,6 @@ from torch.testing import assert_close
 from bidex_algos.offpolicy.ddpg import DDPG, DDPGConfig, spread
 from bidex_algos.offpolicy.td3 import TD3, TD3Config
 from bidex_algos.replay import Transitions
-from bidex_meta.commands.learners import learner_kind
-from bidex_meta.errors import BidexError
 from tests.algos.off_policy import errors, trained
 from tests.algos.problems import LQR, PointMass, discounted_return, one_step_bandit, opposite_bandits
 from tests.algos.resume import resumed
@@ -186,23 +184,3 @@ def test_metrics_and_errors_carry_its_name(kind: Any, config: Any) -> None:
         FloatingPointError, match=rf"{kind.name}: the loss is not finite after \d+ steps; lower critic_"
     ):
         learner.iterate()
-    for wrong in (
-        {"tau": 0.0},
-        {"exploration_std": (0.5, 0.1)},
-        {"exploration_std": (-0.1, 0.1)},
-        {"squash_price": -1.0},
-    ):
-        with pytest.raises(BidexError, match=f"{kind.name}: {next(iter(wrong))}"):
-            replace(config, **wrong)
-
-
-def test_td3_refuses_what_could_only_fail_later() -> None:
-    for wrong in ({"target_std": -0.1}, {"target_bound": float("nan")}, {"policy_delay": 0}):
-        with pytest.raises(BidexError, match=f"td3: {next(iter(wrong))}"):
-            replace(SMALL, **wrong)
-
-
-def test_they_are_found_by_name() -> None:
-    assert learner_kind("ddpg").make is DDPG
-    assert learner_kind("td3").make is learner_kind("mttd3").make is TD3
-    assert list(learner_kind("td3").presets) == ["paper", "laptop", "metaworld"]
