@@ -32,7 +32,7 @@ WRONG: dict[str, dict[str, Any]] = {
     "bcq": {"perturbation": 2.5, "lower_weight": -0.1, "latent": 0},
     "td3bc": {"alpha": -1.0, "policy_delay": 0},
 }  # fmt: skip
-HOSTILE: tuple[Any, ...] = ("1e3", None, True, [1], {}, float("inf"), 10**30)
+HOSTILE: tuple[Any, ...] = ("1e3", None, True, [1], {}, float("inf"))
 
 
 @pytest.mark.parametrize(("algo", "field"), [(algo, field) for algo, wrong in WRONG.items() for field in wrong])
