@@ -124,6 +124,6 @@ def test_what_is_no_learner_is_told_in_one_line(
     assert main([*RUN[:-1], algo, "--steps", "64"]) == 2
     error = capsys.readouterr().err
     assert told in error.splitlines()[-1] and error.count("\n") == error.count("bidex-meta: ") + 2 * (
-        "rows on" in error
+        "environments on" in error
     )
     assert not (scratch / "runs").exists()
