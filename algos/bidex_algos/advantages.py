@@ -45,7 +45,7 @@ def gae(
         next_values: V(s'_t) of the true successor (see :func:`successor_values`), shape (T, N).
         terminated: Bool (T, N): nothing follows, V(s') counts as 0. A time limit is not such an end.
         ended: Bool (T, N): the episode ended here, by either flag.
-        gamma: Discount, one for all, one for each row, (N,), or one for each transition, (T, N).
+        gamma: Discount, one for all, one for each environment, (N,), or one for each transition, (T, N).
         lam: Trace decay.
         valid: Bool (T, N); the advantage of an invalid transition is 0 and nothing flows through it. Default: all.
 
@@ -69,7 +69,7 @@ def task_moments(x: Tensor, task_id: Tensor, num_tasks: int, valid: Tensor) -> t
 
     Args:
         x: Shape (T, N).
-        task_id: Task of each row, int64 (N,).
+        task_id: Task of each environment, int64 (N,).
         num_tasks: Number of tasks.
         valid: Bool (T, N).
 

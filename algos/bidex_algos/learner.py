@@ -64,7 +64,7 @@ class Learner(Contract):
         seed: Of the initial weights, all that is drawn, and the world's first reset.
 
     Attributes:
-        env_steps: Environment steps taken so far, over all rows of all processes; a waiting row takes none.
+        env_steps: Environment steps taken so far, over all environments of all processes; a waiting one takes none.
         shape: Sizes of the world's spaces and the groups of its observation.
         inputs: How networks read the observation.
         generator: Of all that is drawn while learning, on the device; another one in each process.
@@ -194,7 +194,7 @@ class Learner(Contract):
 
     @classmethod
     def load_policy(cls, state: dict[str, Any], device: str | torch.device = "cpu") -> Any:
-        """The agent of a checkpoint, for a world of any number of rows.
+        """The agent of a checkpoint, for a world of any number of environments.
 
         Args:
             state: ``checkpoint["learner"]["policy"]``.

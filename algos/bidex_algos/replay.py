@@ -1,4 +1,4 @@
-"""A replay with a part of its own for each task: the last vector steps of all rows, in a ring on the device.
+"""A replay with a part of its own for each task: the last vector steps of all environments, in a ring on the device.
 
 An observation is kept once, since it is both where one transition leads and where the next begins. Only where a time
 limit cut an episode does the world show another one; those last observations lie in a ring of their own. Nothing here
@@ -31,13 +31,13 @@ class Transitions:
 
 
 class Replay:
-    """The last ``steps`` vector steps of all rows.
+    """The last ``steps`` vector steps of all environments.
 
-    Rows of one task are its part of the replay: draws are made per task, and no task can crowd out another.
+    Environments of one task are its part of the replay: draws are made per task, and no task can crowd out another.
 
     Args:
         steps: Vector steps kept.
-        task_id: Task of each row, int64 (N,).
+        task_id: Task of each environment, int64 (N,).
         num_tasks: Number of tasks; each has rows.
         observations: Width of the observation.
         actions: Number of actions.
@@ -145,7 +145,7 @@ class Replay:
         return (self.at("valid", places) & kept).float()
 
     def after(self, places: Tensor) -> Tensor:
-        """Where the row's next transition lies, in the shape of ``places``."""
+        """Where the environment's next transition lies, in the shape of ``places``."""
         return (places + self.rows) % (self.slots * self.rows)
 
     def take(self, places: Tensor, last: Tensor | None = None) -> Transitions:
@@ -224,7 +224,7 @@ def steps_within(
 
 
 def _cuts_kept(steps: int, rows: int, cut_share: float) -> int:
-    # A vector step's worth at least: all rows may end together, and no cell may be written twice in a step.
+    # A vector step's worth at least: all may end together, and no cell may be written twice in a step.
     return max(rows, math.ceil(cut_share * steps * rows))
 
 

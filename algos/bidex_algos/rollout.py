@@ -1,4 +1,4 @@
-"""A stretch of transitions of all rows, and the loop that collects it; shared by the on-policy learners."""
+"""A stretch of transitions of all environments, and the loop that collects it; shared by the on-policy learners."""
 
 from collections.abc import Callable
 from typing import Any
@@ -19,7 +19,7 @@ class EpisodeStatistics:
     none: an average over one rollout would jump.
 
     Args:
-        task_id: Task of each row, int64 (N,).
+        task_id: Task of each environment, int64 (N,).
         task_names: Names of the tasks.
         window: Number of episodes, in each process, after which an old one counts 1/e.
     """
@@ -72,7 +72,7 @@ FinalValue = Callable[[Tensor, Tensor], Tensor]
 
 
 class Rollout:
-    """Transitions of T steps in N rows, preallocated on the device and overwritten by each :func:`collect`.
+    """Transitions of T steps in N environments, preallocated on the device and overwritten by each :func:`collect`.
 
     Attributes:
         obs: Raw observations before each step, (T, N, d).
@@ -155,7 +155,7 @@ def _values_where(cut: Tensor, final_obs: Tensor, task_id: Tensor, final_value: 
     """Values of ``final_obs`` in the rows ``cut``, 0 elsewhere; of the shape of ``like``."""
     values = torch.zeros_like(like)
     if not may_look(cut.device):
-        # A forward of all rows is cheaper than the wait for which rows there are.
+        # A forward of all environments is cheaper than the wait for which rows there are.
         return torch.where(cut.view(-1, *[1] * (like.dim() - 1)), final_value(final_obs, task_id), values)
     rows = cut.nonzero().squeeze(-1)
     if len(rows):

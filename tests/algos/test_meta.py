@@ -327,7 +327,7 @@ def test_bad_input_is_one_line():
     with pytest.raises(BidexError, match=r"8 tasks.*num_envs of at least 8"):
         ProMP(PointGoals(rows=4), PROMP, seed=0)
     learner = ProMP(PointGoals(rows=8), PROMP, seed=0)
-    with pytest.raises(BidexError, match=r"8 rows.*9"):
+    with pytest.raises(BidexError, match=r"8 environments.*9"):
         ProMP(PointGoals(rows=9), PROMP, seed=0).load_state_dict(learner.state_dict())
 
 

@@ -4,7 +4,7 @@ They differ in the outer step alone. An iteration::
 
     draw tasks; every task starts from the meta-parameters
     for each stage k = 0 ... inner_steps:
-        every row plays one episode by its task's parameters          D_k
+        every environment plays one episode by its task's parameters          D_k
         theta_k+1 = theta_k + inner_learning_rate * gradient on D_k   (not after the last)
     outer step of the meta-parameters on D_0 ... D_K
 """
@@ -35,10 +35,10 @@ class MetaLearner(Learner):
     Attributes:
         policy: The adapting agent that evaluation uses; the learner itself never adapts it.
         pools: The tasks of each class that meta-batches are drawn from.
-        rows: Which rows play the same task of the present meta-batch.
+        rows: Which environments play the same task of the present meta-batch.
 
     Raises:
-        BidexError: Several processes, or a class with fewer rows than it has tasks in a meta-batch.
+        BidexError: Several processes, or a class with fewer environments than it has tasks in a meta-batch.
     """
 
     world: PooledWorld
@@ -78,8 +78,8 @@ class MetaLearner(Learner):
             tasks = min(self.config.tasks_per_class, len(pool))
             if count < tasks:
                 raise BidexError(
-                    f"{self.name}: {name} has {count} rows for {tasks} tasks of a meta-batch. Use num_envs of at least "
-                    f"{tasks * self.world.num_tasks}, or lower tasks_per_class."
+                    f"{self.name}: {name} has {count} environments for {tasks} tasks of a meta-batch. Use num_envs of "
+                    f"at least {tasks * self.world.num_tasks}, or lower tasks_per_class."
                 )
 
     # What a learner adds.
@@ -144,7 +144,7 @@ class MetaLearner(Learner):
 
     @torch.no_grad()
     def _sample(self, params: dict[str, Tensor], seen: RunningStats) -> tuple[Stage, Outcome]:
-        """A whole episode, or a slice, in every row. Raw observations go into ``seen``: the stage's are clipped."""
+        """A whole episode, or a slice, in every environment; raw observations go into ``seen``, clipped ones on."""
         policy, rows, stage = self.policy, self.rows, Stage()
         if self.config.slice_steps is None:
             horizon = min(int(self.world.max_episode_steps.max()), self.config.max_adapt_steps)
@@ -221,7 +221,7 @@ class MetaLearner(Learner):
 
     @classmethod
     def load_policy(cls, state: dict[str, Any], device: str | torch.device = "cpu") -> MetaPolicy:
-        """The adapting agent of a checkpoint, for a world of any number of rows.
+        """The adapting agent of a checkpoint, for a world of any number of environments.
 
         Args:
             state: ``checkpoint["learner"]["policy"]``.
@@ -251,4 +251,4 @@ class MetaLearner(Learner):
         self.steps_with_tasks = int(state["steps_with_tasks"])
 
     def _check_size(self, state: dict[str, Any]) -> None:
-        self._expect("", f"{len(state['elapsed'])} rows", f"{self.world.num_envs} rows")
+        self._expect("", f"{len(state['elapsed'])} environments", f"{self.world.num_envs} environments")

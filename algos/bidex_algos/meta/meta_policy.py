@@ -53,7 +53,7 @@ class MetaPolicy(nn.Module):
         self.elapsed: Tensor | None = None
 
     def assign(self, task_of_row: Tensor | None) -> None:
-        """Which rows play the same task and share what they learn (N,); None: each row a task of its own."""
+        """The task (N,) of each environment; those of one task share what they learn. None: each has its own."""
         self.rows = None if task_of_row is None else TaskRows(task_of_row)
         self.init()
 
@@ -72,7 +72,7 @@ class MetaPolicy(nn.Module):
 
     @torch.no_grad()
     def step(self, timestep: Timestep) -> None:
-        """Takes in one transition of every row."""
+        """Takes in one transition of every environment."""
         terminated, truncated = timestep.terminated.bool(), timestep.truncated.bool()
         valid = getattr(timestep, "valid", None)
         valid = torch.ones_like(terminated) if valid is None else valid

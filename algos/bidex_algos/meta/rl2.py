@@ -2,10 +2,10 @@
 
 A trial is a few episodes of one task. The policy reads, beside the observation, its last action, the last reward and
 whether an episode ended, and keeps its memory from one episode of the trial to the next: what it finds out about the
-task in the first it may use in the next. An iteration plays one trial in every row, makes ``epochs`` passes over it in
-shuffled mini-batches of chunks, through which gradients flow back, and starts the next trial without memory. The very
-first trial only measures what statistics are made of.
-``docs/learners/rl2.md`` says what is done otherwise, and why.
+task in the first it may use in the next. An iteration plays one trial in every environment, makes ``epochs`` passes
+over it in shuffled mini-batches of chunks, through which gradients flow back, and starts the next trial without memory.
+The very first trial only measures what statistics are made of. ``docs/learners/rl2.md`` says what is done otherwise,
+and why.
 """
 
 import math
@@ -88,7 +88,7 @@ class RL2(Learner):
         trials: The last trial.
 
     Raises:
-        BidexError: A world that resets by itself, or fewer rows than mini-batches.
+        BidexError: A world that resets by itself, or fewer environments than mini-batches.
     """
 
     name, remedy = "rl2", "lower learning_rate"
@@ -103,8 +103,8 @@ class RL2(Learner):
         super().__init__(world, config, seed)
         if world.num_envs < config.num_minibatches:
             raise BidexError(
-                f"rl2: {config.num_minibatches} mini-batches need as many rows, got {world.num_envs}. Raise num_envs "
-                "or lower num_minibatches."
+                f"rl2: {config.num_minibatches} mini-batches need as many environments, got {world.num_envs}. Raise "
+                "num_envs or lower num_minibatches."
             )
         self.agent = RL2Agent(self.policy, own_seed(seed))
         heads = world.num_tasks if config.value_heads else 1
@@ -136,7 +136,7 @@ class RL2(Learner):
         return "DISABLED"
 
     def _iterate(self) -> dict[str, float]:
-        """Plays one trial in every row and learns from it."""
+        """Plays one trial in every environment and learns from it."""
         counts = [[self.episodes] for _ in range(self.config.episodes_per_trial)]
         counts[0].append(self.firsts)
         counts[-1].append(self.lasts)
@@ -251,7 +251,7 @@ class RL2(Learner):
 
     @classmethod
     def load_policy(cls, state: dict[str, Any], device: str | torch.device = "cpu") -> RL2Agent:
-        """The agent of a checkpoint, for a world of any number of rows; see ``Learner.load_policy``."""
+        """The agent of a checkpoint, for a world of any number of environments; see ``Learner.load_policy``."""
         return RL2Agent(super().load_policy(state, device))
 
     def _parts(self) -> dict[str, Any]:
@@ -272,7 +272,7 @@ class RL2(Learner):
 
 
 def _larger_pools(world: PooledWorld) -> dict[str, tuple[Tensor, int]]:
-    """Pool of tasks (n, ...) and number of rows of each class that has fewer rows than tasks."""
+    """Pool of tasks (n, ...) and number of rows of each class that has fewer environments than tasks."""
     pools = {}
     for i, (name, pool) in enumerate(zip(world.task_names, world.pools, strict=True)):
         rows = int((world.task_id == i).sum())

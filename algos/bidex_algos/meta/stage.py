@@ -1,4 +1,4 @@
-"""One stage of adaptation: what all rows did and got, and the batch by task that is made of it."""
+"""One stage of adaptation: what all environments did and got, and the batch by task that is made of it."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -12,10 +12,10 @@ from bidex_algos.meta.config import MetaConfig
 
 
 class TaskRows:
-    """Rows by task, as a rectangle: tasks with fewer rows than others repeat one, without weight.
+    """Rows by task, as a rectangle: tasks with fewer environments than others repeat one, without weight.
 
     Args:
-        task_of_row: Task of each row, numbers from 0 on without gaps, int64 (N,).
+        task_of_row: Task of each environment, numbers from 0 on without gaps, int64 (N,).
 
     Attributes:
         count: Number of tasks M.
@@ -33,7 +33,7 @@ class TaskRows:
         column = torch.arange(width, device=task_of_row.device)
         self._table = order[first[:, None] + torch.minimum(column, counts[:, None] - 1)]
         self.weight = (column < counts[:, None]).float()
-        # Where each row stands in the flattened rectangle.
+        # Where each environment stands in the flattened rectangle.
         place = torch.empty_like(order)
         rank = torch.arange(len(order), device=order.device) - first[task_of_row[order]]
         place[order] = task_of_row[order] * width + rank
@@ -120,7 +120,7 @@ def _one(x: Tensor, returns: Tensor, weights: Tensor, ridge: float) -> Tensor:
 
 @dataclass
 class Stage:
-    """Transitions of T steps in N rows, in the order they were made; one entry of a list a step."""
+    """Transitions of T steps in N environments, in the order they were made; one entry of a list a step."""
 
     obs: list[Tensor] = field(default_factory=list)  # normalised observations before the step (N, d)
     actions: list[Tensor] = field(default_factory=list)  # sampled actions, not clamped (N, a)
@@ -130,7 +130,7 @@ class Stage:
     ended: list[Tensor] = field(default_factory=list)  # bool (N,), the episode is over, for whatever reason
     # Bool (N,), False where the row was frozen or its physics broke: such a transition teaches nothing.
     valid: list[Tensor] = field(default_factory=list)
-    elapsed: list[Tensor] = field(default_factory=list)  # steps since the row's episode began, before the step (N,)
+    elapsed: list[Tensor] = field(default_factory=list)  # steps of the episode before this one (N,)
 
     def add(self, **step: Tensor) -> None:
         """Takes a step, with every field by name."""
@@ -158,7 +158,7 @@ def task_batch(stage: Stage, rows: TaskRows, log_std: Tensor, config: MetaConfig
 
     Args:
         stage: What was sampled.
-        rows: Which rows play the same task.
+        rows: Which environments play the same task.
         log_std: Logarithms of the standard deviations of the policies that sampled (M, a).
         config: Discount, trace, scale.
     """
@@ -191,8 +191,8 @@ def task_batch(stage: Stage, rows: TaskRows, log_std: Tensor, config: MetaConfig
 class Outcome(NamedTuple):
     """What a stage came to."""
 
-    earned: Tensor  # undiscounted, unscaled return of each row (N,)
-    success: Tensor  # whether each row succeeded, bool (N,)
+    earned: Tensor  # undiscounted, unscaled return of each environment (N,)
+    success: Tensor  # whether each environment succeeded, bool (N,)
     steps: Tensor  # environment steps, int64 (); a row that waits for the others takes none
 
 

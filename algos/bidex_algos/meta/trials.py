@@ -1,8 +1,8 @@
-"""Trials: a few whole episodes of one task in each row, played with one memory; shared by learners that remember.
+"""Trials: a few whole episodes of one task in each environment, played with one memory.
 
-Rows' episodes differ in length, and all rows start the next one together: a row whose episode is over waits, its memory
-untouched. Waiting is not recorded, so that the transitions of a row follow each other without gaps: slot t holds what
-the memory saw at its t-th step.
+Episodes differ in length, and all environments start the next one together: an environment whose episode is over waits,
+its memory untouched. Waiting is not recorded, so that the transitions of a row follow each other without gaps: slot t
+holds what the memory saw at its t-th step.
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ class TrialConfig(LearnerConfig):
     activation: Activation = "elu"
     """Non-linearity of the encoder."""
     memory: Count = 128
-    """Numbers that a row's memory (GRU) holds; actor and critic have one each."""
+    """Numbers that an environment's memory (GRU) holds; actor and critic have one each."""
     value_heads: bool = True
     """Give the critic one output per task class instead of one for all."""
     init_std: Positive = 0.8
@@ -67,10 +67,10 @@ def in_chunks(steps: int, chunk: int | None) -> tuple[int, int]:
 
 
 class Trials:
-    """One trial of N rows, preallocated on the device and overwritten by each :func:`play`.
+    """One trial of N environments, preallocated on the device and overwritten by each :func:`play`.
 
     Attributes:
-        obs: Raw observations before each step; in the slot after a row's last step, what that step led to; (S, N, d).
+        obs: Raw observations before each step; in the slot after the last step, what that step led to; (S, N, d).
         actions: Sampled actions, not clamped, (S, N, a).
         rewards: 0 where not valid, (S, N).
         shown: Whether the policy was shown the reward, bool (S, N).
@@ -78,8 +78,8 @@ class Trials:
         ended: Whether it ended an episode, bool (S, N).
         terminated: Whether it ended an episode truly, not by a time limit, bool (S, N).
         left: Steps that the time limit would still have allowed, int64 (S, N).
-        lengths: Slots that each row has filled, int64 (N,); what lies beyond is void.
-        limits: Most steps of an episode of each row, int64 (N,).
+        lengths: Slots that each environment has filled, int64 (N,); what lies beyond is void.
+        limits: Most steps of an episode of each environment, int64 (N,).
 
     Args:
         episodes: Episodes in a trial.
@@ -231,7 +231,7 @@ class Batch:
 
 
 def of_task(outputs: Tensor, task_id: Tensor) -> Tensor:
-    """A critic's outputs (T, B, heads) as one value (T, B): the only one, or that of each row's task (B,)."""
+    """A critic's outputs (T, B, heads) as one value (T, B): the only one, or that of each environment's task (B,)."""
     if outputs.shape[-1] == 1:
         return outputs.squeeze(-1)
     return outputs.gather(2, task_id.expand(len(outputs), -1)[..., None]).squeeze(-1)
@@ -253,7 +253,7 @@ def make_batch(
         policy: The policy that played it.
         critic: Sees what the policy sees; speaks in units of its task's running mean and deviation of returns.
         return_stats: These (num_tasks,); they take in the trial's returns.
-        task_id: Task of each row, int64 (N,).
+        task_id: Task of each environment, int64 (N,).
         config: Chunk, discount and trace.
 
     Returns:

@@ -61,7 +61,7 @@ class MultiAgentConfig(OnPolicyConfig):
     critic_learning_rate: Positive = 1e-3
     """Adam's step size of the critic."""
     num_minibatches: Count = 4
-    """Mini-batches per epoch; each holds shuffled samples of all rows."""
+    """Mini-batches per epoch; each holds shuffled samples of all environments."""
     adam_eps: NonNegative = 1e-8
     """What Adam adds to its denominators."""
 
@@ -108,25 +108,15 @@ class InTurnConfig(LearnerConfig):
 
 
 PAPER: dict[str, Any] = {
-    "hidden": (1024, 1024, 512),
-    "popart": True,
-    "rollout_steps": 8,
-    "gamma": 0.96,
-    "lam": 0.95,
-    "normalise_observations": False,
-    "huber_delta": 10.0,
-    "value_clip": 0.2,
-}
+    "hidden": (1024, 1024, 512), "popart": True, "rollout_steps": 8, "gamma": 0.96, "lam": 0.95,
+    "normalise_observations": False, "huber_delta": 10.0, "value_clip": 0.2,
+}  # fmt: skip
 """What Tables 44 (HAPPO) and 45 (MAPPO) of the Bi-DexHands appendix agree on, in their columns for other tasks than
 LiftUnderarm; B.2.1 and B.2.4 have the clipped value."""
 
 PAPER_PPO: dict[str, Any] = PAPER | {
-    "num_minibatches": 1,
-    "epochs": 5,
-    "clip": 0.2,
-    "adaptive_learning_rate": False,
-    "entropy_weight": 0.0,
-}
+    "num_minibatches": 1, "epochs": 5, "clip": 0.2, "adaptive_learning_rate": False, "entropy_weight": 0.0,
+}  # fmt: skip
 """The same with the two tables' passes and clip."""
 
 LIFT: dict[str, Any] = {"rollout_steps": 20, "epochs": 10}

@@ -52,7 +52,7 @@ class TaskWeights(nn.Module):
 
 
 def mixed(weights: Tensor, parts: Tensor) -> Tensor:
-    """Sums of parts (K, batch, n) with the weights (batch, K) of each row: (batch, n)."""
+    """Sums of parts (K, batch, n) with the weights (batch, K) of each environment: (batch, n)."""
     return torch.einsum("bk,kbn->bn", weights, parts)
 
 
@@ -69,7 +69,7 @@ class PlainNorm(nn.Module):
 
 
 def gram_schmidt(vectors: Tensor) -> Tensor:
-    """Makes vectors (K, batch, n) orthonormal, each row of the batch for itself; the first keeps its direction.
+    """Makes vectors (K, batch, n) orthonormal, each environment of the batch for itself; the first keeps its direction.
 
     Each is freed of those before it twice: where two are almost parallel the first time leaves rounding errors that are
     large beside what remains.

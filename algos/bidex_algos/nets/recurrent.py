@@ -73,7 +73,7 @@ class RecurrentNet(nn.Module):
 
 @dataclass
 class Memory:
-    """What each row brings along from the step before. A fresh one is all zeros: nothing has happened yet.
+    """What each environment brings along from the step before. A fresh one is all zeros: nothing has happened yet.
 
     Attributes:
         state: The GRU's state, (N, memory).
@@ -172,7 +172,7 @@ class RecurrentPolicy(nn.Module):
         return mean[0], state
 
     def fresh_memory(self, rows: int) -> Memory:
-        """The memory at the start of a trial of so many rows."""
+        """The memory at the start of a trial of so many environments."""
         return Memory.fresh(rows, self.memory, self.num_actions, self.log_std.device)
 
     @torch.no_grad()

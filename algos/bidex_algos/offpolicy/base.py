@@ -3,7 +3,7 @@
 They differ in how the actor explores, in what the critics shall say, and in the actor's update. An iteration is
 ``steps_per_iteration`` times::
 
-    one step in every row, with exploration (uniform actions at first); into the replay
+    one step in every environment, with exploration (uniform actions at first); into the replay
     updates_per_step times: draw equally many transitions of each task; the learner's update
 
 Rewards are divided by the running deviation of their task's discounted return, so that no task outweighs another.
@@ -37,7 +37,7 @@ from bidex_meta.world.contract import VectorWorld
 class OffPolicyConfig(NetworkConfig):
     """Networks, replay, updates, statistics; the defaults are the preset ``laptop``.
 
-    A vector step is one step in every row of the world.
+    A vector step is one step in every environment of the world.
     """
 
     value_heads: bool = True
@@ -103,7 +103,7 @@ class OffPolicy(Learner):
         adams: Optimisers by name; an algorithm may add some.
         batch_per_task: Transitions of each task in an update; B is ``num_tasks`` times as many, task after task:
             ``task_of_draw``, int64 (B,).
-        gamma_of_rows: Discount of all rows, or of each (N,); ``gamma_of_draw``: of the transitions of an update (B,).
+        gamma_of_rows: Discount of all environments, or of each (N,); ``gamma_of_draw``: of a draw (B,).
 
     Raises:
         BidexError: A task without rows, or no room for a replay.
@@ -202,7 +202,7 @@ class OffPolicy(Learner):
 
     @torch.no_grad()
     def _step(self) -> Tensor:
-        """One step in every row; returns how many broke physics."""
+        """One step in every environment; returns how many broke physics."""
         actions = self._act(self.replay.obs)
         obs, reward, terminated, truncated, info = self.world.step(actions)
         self.replay.add(actions, reward, terminated, truncated, obs, info)

@@ -2,7 +2,7 @@
 
 For each vector step of the world::
 
-    a = mu(s) + noise                            one step in every row; into the replay
+    a = mu(s) + noise                            one step in every environment; into the replay
     y = r + gamma (1 - terminated) Q'(s', mu'(s'))
     Q   towards y                                on equally many transitions of each task
     mu  up on Q(s, mu(s))
@@ -12,8 +12,9 @@ A critic's slope drives actions into the corners of their box, where tanh has no
 two hands 86 % of all actions were beyond 0.99 after 0.4 M steps, and the policy stood still. ``squash_price`` on the
 square of what goes into tanh keeps them from there; 0 gives the original.
 
-The noise is normal and without memory. Its size differs from row to row of a task, so that some rows show what the
-policy does and others what lies far from it (the spread of Horgan et al. 2018); two equal numbers give the original.
+The noise is normal and without memory. Its size differs from environment to environment of a task, so that some show
+what the policy does and others what lies far from it (the spread of Horgan et al. 2018); two equal numbers give the
+original.
 """
 
 import copy
@@ -40,7 +41,7 @@ class DDPGConfig(OffPolicyConfig):
     """Everything that can be set about DDPG; the defaults are the preset ``laptop``."""
 
     exploration_std: tuple[NonNegative, NonNegative] = (0.05, 0.5)
-    """Standard deviation of the noise on actions: of the first row of each task, of its last; evenly between."""
+    """Standard deviation of the noise on actions: of each task's first environment, of its last; evenly between."""
     squash_price: NonNegative = 1.0
     """Price, in the actor's loss, on the mean square of what tanh makes the actions of; 0: none."""
 
@@ -59,24 +60,11 @@ def of_paper() -> dict[str, Any]:
     6.1).
     """
     return {
-        "hidden": (1024, 1024, 1024),
-        "value_heads": False,
-        "critic_layer_norm": False,
-        "replay_steps": 5000,
-        "warmup_steps": 32,
-        "steps_per_iteration": 32,
-        "updates_per_step": 4,
-        "batch_per_task": 32,
-        "gamma": 0.96,
-        "tau": 0.01,
-        "learning_rate": 3e-4,
-        "critic_learning_rate": 3e-4,
-        "max_grad_norm": 1.0,
-        "normalise_observations": False,
-        "per_task_rewards": False,
-        "exploration_std": (0.1, 0.1),
-        "squash_price": 0.0,
-    }
+        "hidden": (1024, 1024, 1024), "value_heads": False, "critic_layer_norm": False, "replay_steps": 5000,
+        "warmup_steps": 32, "steps_per_iteration": 32, "updates_per_step": 4, "batch_per_task": 32, "gamma": 0.96,
+        "tau": 0.01, "learning_rate": 3e-4, "critic_learning_rate": 3e-4, "max_grad_norm": 1.0,
+        "normalise_observations": False, "per_task_rewards": False, "exploration_std": (0.1, 0.1), "squash_price": 0.0,
+    }  # fmt: skip
 
 
 PRESETS: dict[str, DDPGConfig] = {"paper": DDPGConfig(**of_paper()), "laptop": DDPGConfig()}
@@ -85,11 +73,9 @@ PRESETS: dict[str, DDPGConfig] = {"paper": DDPGConfig(**of_paper()), "laptop": D
 class DDPG(OffPolicy):
     """Multi-task DDPG (Lillicrap et al. 2016, arXiv 1509.02971) on a batched world.
 
-    Arguments and errors are those of :class:`~bidex_algos.offpolicy.base.OffPolicy`, so are the attributes.
-
     Attributes:
         target_actor: Follows the actor; only with ``delayed_targets``.
-        noise_std: Of each row (N, 1).
+        noise_std: Of each environment (N, 1).
     """
 
     name, remedy = "ddpg", "lower critic_learning_rate"
@@ -176,12 +162,12 @@ class DDPG(OffPolicy):
 
 
 def spread(low: float, high: float, task_id: Tensor, num_tasks: int) -> Tensor:
-    """Numbers (N,) that go evenly from ``low`` in the first row of each task to ``high`` in its last.
+    """Numbers (N,) that go evenly from ``low`` in the first environment of each task to ``high`` in its last.
 
     Args:
         low: The least.
-        high: The greatest; of a task with one row the only one.
-        task_id: Task of each row, int64 (N,).
+        high: The greatest; of a task with one environment the only one.
+        task_id: Task of each environment, int64 (N,).
         num_tasks: How many tasks there are.
     """
     numbers = torch.empty(len(task_id), device=task_id.device)

@@ -1,6 +1,6 @@
 """FastTD3: TD3 with categorical critics and large batches (Seo et al. 2025, arXiv 2505.22642), on all tasks of a world.
 
-    a  = mu(s) + noise                           of another size in each row ("mixed noise")
+    a  = mu(s) + noise                           of another size in each environment ("mixed noise")
     a' = mu(s') + clip(noise, -c, c)             the present actor's: none follows it
     y  = r + gamma (1 - terminated) Z'(s', a')   of the critic with the lower mean, projected on the atoms
     Z_i  towards y by cross-entropy; mu up on min_i E Z_i(s, mu(s)), at every second update; Z' at each

@@ -2,7 +2,7 @@
 
 For each vector step of the world::
 
-    a = tanh(u), u ~ N(mean, std)(s)             one step in every row; into the replay
+    a = tanh(u), u ~ N(mean, std)(s)             one step in every environment; into the replay
     y = r + gamma (1 - terminated) (min_i Q'_i(s', a') - alpha_k log pi(a'|s'))
     Q_i  towards y                               i = 1, 2; on equally many transitions of each task k
     pi   down on alpha_k log pi(a|s) - min_i Q_i(s, a)
@@ -80,8 +80,8 @@ PRESETS: dict[str, MTSACConfig] = {
         updates_per_step=4, batch_per_task=32, gamma=0.96, tau=0.01, init_alpha=0.2,
     ),
     "laptop": MTSACConfig(),
-    # MT-SAC as Meta-World's baselines run it, with one row of each task: 128 transitions of each task in an update, one
-    # update a vector step, 100,000 transitions of each task.
+    # MT-SAC as Meta-World's baselines run it, with one environment of each task: 128 transitions of each task in an
+    # update, one update a vector step, 100,000 transitions of each task.
     "metaworld": replace(
         _PLAIN, hidden=(400, 400, 400), replay_steps=100_000, warmup_steps=4000, steps_per_iteration=500,
         updates_per_step=1, batch_per_task=128, gamma=0.99, tau=0.005, adam_eps=1e-5, init_alpha=1.0,
@@ -104,8 +104,6 @@ TASK_PRESETS: dict[str, dict[str, MTSACConfig]] = {
 
 class MTSAC(OffPolicy):
     """Multi-task SAC (Haarnoja et al. 2018, arXiv 1812.05905) on a batched world.
-
-    Arguments and errors are those of :class:`~bidex_algos.offpolicy.base.OffPolicy`, so are the attributes.
 
     Attributes:
         policy: The agent that evaluation uses: squashed mean.

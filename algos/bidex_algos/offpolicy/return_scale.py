@@ -19,12 +19,12 @@ class ReturnScale:
 
     Args:
         world: Whose rewards they are.
-        gamma: Discount per step, of all rows or of each (N,).
+        gamma: Discount per step, of all environments or of each (N,).
         horizon: Returns of a task after which older ones fade.
 
     Attributes:
         stats: Mean and variance of each task (num_tasks,).
-        discounted: The sum in each row so far (N,).
+        discounted: The sum in each environment so far (N,).
     """
 
     def __init__(self, world: VectorWorld, gamma: float | Tensor, horizon: float):
@@ -33,7 +33,7 @@ class ReturnScale:
         self.discounted = torch.zeros(world.num_envs, device=world.device)
 
     def note(self, reward: Tensor, terminated: Tensor, truncated: Tensor, broken: Tensor) -> None:
-        """Takes one step of all rows: rewards (N,) and how it ended, bool (N,); broken ones do not count."""
+        """Takes one step of all environments: rewards (N,) and how it ended, bool (N,); broken ones do not count."""
         self.discounted = self.gamma * self.discounted + reward
         self._take(truncated & ~terminated, ~broken)
         self.discounted = self.discounted.masked_fill(terminated | truncated | broken, 0.0)
@@ -61,7 +61,7 @@ class ReturnBound(ReturnScale):
 
     Attributes:
         bound: Of each task (num_tasks,); it never falls.
-        mass: The sum in each row, had all rewards been 1 (N,).
+        mass: The sum in each environment, had all rewards been 1 (N,).
         recent: Sum and mass with a discount of :data:`RECENT` at most (2, N).
     """
 

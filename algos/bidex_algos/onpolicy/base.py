@@ -1,6 +1,7 @@
 """What the on-policy learners share: rollouts, a critic per task, statistics, checkpoints. They differ in the update.
 
-An iteration collects ``rollout_steps`` steps in every row, makes them a :class:`Batch`, and hands it to the learner.
+An iteration collects ``rollout_steps`` steps in every environment, makes them a :class:`Batch`, and hands it to the
+learner.
 """
 
 from abc import abstractmethod
@@ -65,7 +66,7 @@ class OnPolicyConfig(ArchitectureConfig):
     std_range: tuple[Positive, Positive] = (0.05, 1.5)
     """Bounds of the standard deviation of the actions."""
     rollout_steps: Count = 8
-    """Steps taken in every row between two updates."""
+    """Steps taken in every environment between two updates."""
     gamma: Fraction = 0.93
     """Discount per step."""
     lam: Fraction = 0.95
@@ -92,16 +93,9 @@ class OnPolicyConfig(ArchitectureConfig):
 
 
 TABLE_47: dict[str, Any] = {
-    "hidden": (2048, 1024, 512),
-    "value_heads": False,
-    "init_std": 0.8,
-    "rollout_steps": 8,
-    "num_minibatches": 4,
-    "gamma": 0.96,
-    "lam": 0.95,
-    "max_grad_norm": 1.0,
-    "normalise_observations": False,
-}
+    "hidden": (2048, 1024, 512), "value_heads": False, "init_std": 0.8, "rollout_steps": 8, "num_minibatches": 4,
+    "gamma": 0.96, "lam": 0.95, "max_grad_norm": 1.0, "normalise_observations": False,
+}  # fmt: skip
 """Networks, rollouts and returns of MT-PPO in the Bi-DexHands appendix."""
 
 
@@ -139,7 +133,7 @@ class OnPolicy(Learner):
     Attributes:
         policy: The agent that evaluation uses: mean action, clamped.
         critic: Values of normalised observations, in units of the task's returns.
-        gamma: Discount of all rows, or of each (N,).
+        gamma: Discount of all environments, or of each (N,).
         num_critics: How many values a state has: more than one where each of several agents has a critic of its own.
     """
 

@@ -18,7 +18,7 @@ class PPOConfig(LearnerConfig):
     """Passes, clip and step sizes. A config that is made of this and others puts its fields behind theirs."""
 
     num_minibatches: Count = 4
-    """Mini-batches per epoch; each holds shuffled samples of all rows."""
+    """Mini-batches per epoch; each holds shuffled samples of all environments."""
     epochs: Count = 4
     """Passes over what was collected, per update."""
     clip: Positive = 0.2
