@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from bidex_meta.train.distributed import all_sum, world_size
+from bidex_meta.train.learner import Parts
 
 Balancing = Literal["none", "pcgrad", "cagrad", "famo"]
 
@@ -157,7 +158,7 @@ class Famo:
         self.logits.grad = z * (fallen - (z * fallen).sum())
         self.adam.step()
 
-    def parts(self) -> dict[str, Any]:
+    def parts(self) -> Parts:
         """What a checkpoint holds of it."""
         return {"famo_logits": self.logits, "famo_adam": self.adam}
 
@@ -184,7 +185,7 @@ class Balance(ABC):
     def learn(self, above: Callable[[], Tensor]) -> None:  # noqa: B027
         """What follows a step; ``above`` tells how far each loss is above its least now, this process's part."""
 
-    def parts(self) -> dict[str, Any]:
+    def parts(self) -> Parts:
         """What a checkpoint holds of it, by name."""
         return {}
 
@@ -228,7 +229,7 @@ class LossBalance(Balance):
         """As in the base."""
         self.famo.learn(lambda: all_sum(above()))
 
-    def parts(self) -> dict[str, Any]:
+    def parts(self) -> Parts:
         """As in the base."""
         return self.famo.parts()
 

@@ -25,7 +25,7 @@ from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import broadcast, own_seed
 from bidex_meta.train.learner import Learner as Contract
-from bidex_meta.train.learner import LearnerConfig
+from bidex_meta.train.learner import LearnerConfig, Parts, State
 from bidex_meta.world.contract import VectorWorld
 
 
@@ -121,22 +121,22 @@ class Learner(Contract):
         """Collects, learns, adds to ``env_steps``; returns all metrics but those of time."""
 
     @abstractmethod
-    def _parts(self) -> dict[str, Any]:
+    def _parts(self) -> Parts:
         """What a checkpoint holds beside the policy, by name.
 
         Modules, optimisers, statistics, tensors that keep their shape, generators, and dicts and lists of these. The
         modules' weights are made the same in all processes when training begins.
         """
 
-    def _place(self) -> dict[str, Any]:
+    def _place(self) -> State:
         """Tensors, numbers and None from which the next iteration goes on, for the checkpoint."""
         return {"env_steps": self.env_steps}
 
-    def _go_on_from(self, state: dict[str, Any]) -> None:
+    def _go_on_from(self, state: State) -> None:
         """Puts back what :meth:`_place` gave, from a whole state."""
         self.env_steps = int(state["env_steps"])
 
-    def _check_size(self, state: dict[str, Any]) -> None:
+    def _check_size(self, state: State) -> None:
         """Refuses a state of a world of another size."""
         self._expect("", Shape.load(state["policy"]["shape"]).sizes(), self.shape.sizes())
 
@@ -188,12 +188,12 @@ class Learner(Contract):
 
     # Checkpoints.
 
-    def policy_state_dict(self) -> dict[str, Any]:
+    def policy_state_dict(self) -> State:
         """What :meth:`load_policy` needs: network, observation statistics, sizes and config."""
         return {"config": asdict(self.config), "shape": self.shape.state_dict(), "weights": self.policy.state_dict()}
 
     @classmethod
-    def load_policy(cls, state: dict[str, Any], device: str | torch.device = "cpu") -> Any:
+    def load_policy(cls, state: State, device: str | torch.device = "cpu") -> Any:
         """The agent of a checkpoint, for a world of any number of environments.
 
         Args:
@@ -206,7 +206,7 @@ class Learner(Contract):
         policy.load_state_dict(state["weights"])
         return policy
 
-    def start_from(self, policy: dict[str, Any]) -> None:
+    def start_from(self, policy: State) -> None:
         """Takes network and observation statistics of another learner's policy, and nothing else.
 
         Args:
@@ -230,11 +230,11 @@ class Learner(Contract):
             _agree(own, given, ("std_range",))
         self.policy.load_state_dict(self.policy.state_dict() | weights)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         """A copy of everything but the world, as tensors and plain values (``torch.load(weights_only=True)``)."""
         return copy.deepcopy({"policy": self.policy_state_dict(), **_saved(self._parts()), **self._place()})
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Restores what :meth:`state_dict` gave.
 
         Raises:
@@ -282,18 +282,18 @@ def _restore(part: Any, state: Any) -> None:
         part.load_state_dict(state)
 
 
-def _network(weights: dict[str, Any]) -> dict[str, Any]:
+def _network(weights: State) -> State:
     """Without learned sizes of inner steps, which are no part of what plays."""
     return {name: weight for name, weight in weights.items() if not name.startswith("step_sizes.")}
 
 
-def _seen(shape: Shape) -> dict[str, Any]:
+def _seen(shape: Shape) -> State:
     """What of a world's shape a network's weights depend on."""
     ids = [[part.start, part.stop] for group in shape.groups if group.name == "task_id" for part in group.where]
     return dict(zip(_WORLD, (shape.observations, shape.actions, ids), strict=True))
 
 
-def _agree(own: dict[str, Any], given: dict[str, Any], names: tuple[str, ...]) -> None:
+def _agree(own: State, given: State, names: tuple[str, ...]) -> None:
     """Refuses what is not alike in both, where both know it."""
     for name in names:
         if name in own and name in given and _plain(own[name]) != _plain(given[name]):
@@ -309,5 +309,5 @@ def _plain(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-def _shapes(weights: dict[str, Any]) -> dict[str, tuple[int, ...]]:
+def _shapes(weights: State) -> dict[str, tuple[int, ...]]:
     return {name: tuple(weight.shape) for name, weight in weights.items()}

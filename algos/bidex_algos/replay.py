@@ -15,6 +15,7 @@ from torch import Tensor
 
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import is_main
+from bidex_meta.train.learner import State
 from bidex_meta.world.contract import VectorWorld
 
 
@@ -169,7 +170,7 @@ class Replay:
 
     # Checkpoints hold what is filled and no more.
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         """A copy of all that was taken in."""
         cuts = min(int(self._cuts), self.cuts_kept)
         return {
@@ -181,7 +182,7 @@ class Replay:
             "cuts": self._cuts.clone(),
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Restores what :meth:`state_dict` gave.
 
         Raises:

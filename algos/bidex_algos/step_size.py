@@ -6,6 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from bidex_meta.train.learner import Parts, State
+
 
 def factor_of(kl: Tensor, desired_kl: float) -> Tensor:
     """What to multiply a step size by: 1 / 1.5 above twice the desired KL, 1.5 below half of it, else 1."""
@@ -16,7 +18,7 @@ def factor_of(kl: Tensor, desired_kl: float) -> Tensor:
 class _Adam(torch.optim.Adam):
     """Adam whose step size stays the tensor that it was given, so that adapting it reaches also a loaded optimiser."""
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+    def load_state_dict(self, state_dict: State) -> None:
         rates = [group["lr"] for group in self.param_groups]
         super().load_state_dict(state_dict)
         for group, rate in zip(self.param_groups, rates, strict=True):
@@ -81,7 +83,7 @@ class AdaptiveAdam:
             return
         self.rate.mul_(factor_of(kl, self.desired_kl)).clamp_(*self.bounds)
 
-    def parts(self) -> dict[str, Any]:
+    def parts(self) -> Parts:
         """Optimiser and step size, by their names in a checkpoint."""
         return {"actor_adam": self.actor, "learning_rate": self.rate}
 
@@ -128,6 +130,6 @@ class AdaptiveAdams(AdaptiveAdam):
             self.actor.step()
         self.critic.step()
 
-    def parts(self) -> dict[str, Any]:
+    def parts(self) -> Parts:
         """Both optimisers and the step size, by their names in a checkpoint."""
         return super().parts() | {"critic_adam": self.critic}

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from bidex_meta.world.contract import VectorWorld
 
 AutoresetMode = Literal["SAME_STEP", "DISABLED"]
+State = dict[str, Any]
+"""Tensors, numbers, texts, None, and dicts and lists of these: a part of a checkpoint."""
+Parts = dict[str, Any]
+"""What goes into a checkpoint, by name: modules, optimisers, generators, tensors, and dicts and lists of these."""
 
 
 @dataclass(frozen=True)
@@ -89,20 +93,20 @@ class Learner(ABC):
         """Collects experience and learns from it; returns metrics by tag (``docs/metrics.md``)."""
 
     @abstractmethod
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         """What is needed to continue bit for bit, beside the world's state; ``policy`` is :meth:`policy_state_dict`."""
 
     @abstractmethod
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Restores what :meth:`state_dict` returned."""
 
     @abstractmethod
-    def policy_state_dict(self) -> dict[str, Any]:
+    def policy_state_dict(self) -> State:
         """What :meth:`load_policy` needs."""
 
     @classmethod
     @abstractmethod
-    def load_policy(cls, state: dict[str, Any], device: "str | torch.device" = "cpu") -> "Agent":
+    def load_policy(cls, state: State, device: "str | torch.device" = "cpu") -> "Agent":
         """The agent of a checkpoint (its entry ``learner.policy``), for a world of any number of environments."""
 
     def learn_from(self, data: "Joined") -> None:
@@ -113,6 +117,6 @@ class Learner(ABC):
         """Takes transitions to imitate, before the first iteration and before a checkpoint is loaded."""
         raise BidexError(f"{self.name}: imitates no demonstrations.")
 
-    def start_from(self, policy: dict[str, Any]) -> None:
+    def start_from(self, policy: State) -> None:
         """Takes the policy of another run's checkpoint in the place of fresh weights."""
         raise BidexError(f"{self.name}: cannot start from another run's policy.")

@@ -10,7 +10,7 @@ They differ in the outer step alone. An iteration::
 """
 
 from abc import abstractmethod
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -25,7 +25,7 @@ from bidex_algos.nets.shape import Shape
 from bidex_algos.rollout import may_look
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import world_size
-from bidex_meta.train.learner import AutoresetMode
+from bidex_meta.train.learner import AutoresetMode, Parts, State
 from bidex_meta.world.contract import PooledWorld
 
 
@@ -215,12 +215,12 @@ class MetaLearner(Learner):
     def _make_policy(cls, config: MetaConfig, shape: Shape, init: torch.Generator, device: torch.device) -> MetaPolicy:
         return make_meta_policy(config, cls.objective, cls._inputs(config, shape), shape.actions, init).to(device)
 
-    def policy_state_dict(self) -> dict[str, Any]:
+    def policy_state_dict(self) -> State:
         """What :meth:`load_policy` needs: network, statistics, sizes, config, and the seed that it explores by."""
         return super().policy_state_dict() | {"seed": self.seed}
 
     @classmethod
-    def load_policy(cls, state: dict[str, Any], device: str | torch.device = "cpu") -> MetaPolicy:
+    def load_policy(cls, state: State, device: str | torch.device = "cpu") -> MetaPolicy:
         """The adapting agent of a checkpoint, for a world of any number of environments.
 
         Args:
@@ -231,10 +231,10 @@ class MetaLearner(Learner):
         policy.seed = state["seed"]
         return policy
 
-    def _parts(self) -> dict[str, Any]:
+    def _parts(self) -> Parts:
         return {**self._optimisers(), "generator": self.generator, "tasks_generator": self.tasks_generator}
 
-    def _place(self) -> dict[str, Any]:
+    def _place(self) -> State:
         return {
             "rows": self.rows.task_of_row,
             "obs": self.obs,
@@ -243,12 +243,12 @@ class MetaLearner(Learner):
             **super()._place(),
         }
 
-    def _go_on_from(self, state: dict[str, Any]) -> None:
+    def _go_on_from(self, state: State) -> None:
         super()._go_on_from(state)
         self.rows = TaskRows(state["rows"].to(self.device))
         self.obs = None if state["obs"] is None else state["obs"].to(self.device, copy=True)
         self.elapsed = state["elapsed"].to(self.device, copy=True)
         self.steps_with_tasks = int(state["steps_with_tasks"])
 
-    def _check_size(self, state: dict[str, Any]) -> None:
+    def _check_size(self, state: State) -> None:
         self._expect("", f"{len(state['elapsed'])} environments", f"{self.world.num_envs} environments")

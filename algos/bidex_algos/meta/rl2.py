@@ -10,7 +10,6 @@ and why.
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -27,7 +26,7 @@ from bidex_algos.rollout import EpisodeStatistics
 from bidex_algos.step_size import AdaptiveAdams
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import all_sum, own_seed, rank, sum_gradients, world_size
-from bidex_meta.train.learner import AutoresetMode
+from bidex_meta.train.learner import AutoresetMode, Parts, State
 from bidex_meta.validation import Finite, Positive, check_rising
 from bidex_meta.world.contract import PooledWorld
 
@@ -250,11 +249,11 @@ class RL2(Learner):
         ).to(device)
 
     @classmethod
-    def load_policy(cls, state: dict[str, Any], device: str | torch.device = "cpu") -> RL2Agent:
+    def load_policy(cls, state: State, device: str | torch.device = "cpu") -> RL2Agent:
         """The agent of a checkpoint, for a world of any number of environments; see ``Learner.load_policy``."""
         return RL2Agent(super().load_policy(state, device))
 
-    def _parts(self) -> dict[str, Any]:
+    def _parts(self) -> Parts:
         return {
             "critic": self.critic,
             "return_stats": self.return_stats,
@@ -263,10 +262,10 @@ class RL2(Learner):
             "episodes": [self.episodes, self.firsts, self.lasts],
         }
 
-    def _place(self) -> dict[str, Any]:
+    def _place(self) -> State:
         return {"trials_played": self.trials_played, **super()._place()}
 
-    def _go_on_from(self, state: dict[str, Any]) -> None:
+    def _go_on_from(self, state: State) -> None:
         super()._go_on_from(state)
         self.trials_played = int(state["trials_played"])
 

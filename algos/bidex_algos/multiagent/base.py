@@ -23,7 +23,7 @@ from bidex_algos.onpolicy.ppo import PPOConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.hands.units import partition_line
 from bidex_meta.train.distributed import sum_gradients
-from bidex_meta.train.learner import LearnerConfig
+from bidex_meta.train.learner import LearnerConfig, Parts
 from bidex_meta.validation import Count, Finite, NonNegative, Positive
 from bidex_meta.world.agent_views import agent_views
 from bidex_meta.world.contract import VectorWorld
@@ -257,7 +257,7 @@ class MultiAgent(OnPolicy):
             self._critic_step()
         return torch.stack(losses).mean()
 
-    def _optimisers(self) -> dict[str, Any]:
+    def _optimisers(self) -> Parts:
         return {"critic_adam": self.critic_adam}
 
 
@@ -307,5 +307,5 @@ class Sequential(MultiAgent):
         with autocast(self.device, self.low_precision):
             return self.policy.actor.distribution_of(agent, share.seen, share.task)
 
-    def _parts(self) -> dict[str, Any]:
+    def _parts(self) -> Parts:
         return super()._parts() | {"order": self.order}

@@ -9,7 +9,6 @@ Then the critic of all. Each agent's step is to the gain of all, whatever the ot
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,6 +18,7 @@ from bidex_algos.onpolicy.base import Batch
 from bidex_algos.onpolicy.ppo import policy_loss
 from bidex_algos.step_size import AdaptiveAdam
 from bidex_meta.train.distributed import sum_gradients
+from bidex_meta.train.learner import Parts
 from bidex_meta.world.contract import VectorWorld
 
 
@@ -57,7 +57,7 @@ class HAPPO(Sequential):
             for i in range(len(self.views))
         ]
 
-    def _optimisers(self) -> dict[str, Any]:
+    def _optimisers(self) -> Parts:
         return super()._optimisers() | {"agents": [adam.parts() for adam in self.adams]}
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:

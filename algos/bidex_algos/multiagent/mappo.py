@@ -5,7 +5,6 @@ surrogate, the critic its targets. The advantage is of all agents together, norm
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,6 +15,7 @@ from bidex_algos.onpolicy.base import Batch
 from bidex_algos.onpolicy.ppo import NAMES, PolicyLoss, policy_loss
 from bidex_algos.step_size import AdaptiveAdam
 from bidex_meta.train.distributed import sum_gradients
+from bidex_meta.train.learner import Parts
 from bidex_meta.world.contract import VectorWorld
 
 
@@ -57,7 +57,7 @@ class MAPPO(MultiAgent):
             for k in range(len(actor.nets))
         ]
 
-    def _optimisers(self) -> dict[str, Any]:
+    def _optimisers(self) -> Parts:
         return super()._optimisers() | {"agents": [adam.parts() for adam in self.adams]}
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:

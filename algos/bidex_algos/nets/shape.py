@@ -5,6 +5,7 @@ from typing import Any
 
 from bidex_algos.nets.architecture import ArchitectureConfig
 from bidex_meta.errors import BidexError
+from bidex_meta.train.learner import State
 from bidex_meta.world.contract import ObservationGroup, VectorWorld, plain_groups
 
 
@@ -46,12 +47,12 @@ class Shape:
             "num_id_columns": self.num_id_columns,
         }
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         """Plain values for a checkpoint."""
         return self.sizes() | {"groups": {g.name: [[w.start, w.stop] for w in g.where] for g in self.groups}}
 
     @classmethod
-    def load(cls, state: dict[str, Any]) -> "Shape":
+    def load(cls, state: State) -> "Shape":
         """What :meth:`state_dict` gave; earlier versions kept the sizes alone, and the one-hot was last."""
         if "groups" not in state:
             return cls.plain(**state)

@@ -24,6 +24,7 @@ from bidex_algos.offpolicy.critics import Critics
 from bidex_algos.replay import Transitions
 from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
+from bidex_meta.train.learner import Parts, State
 from bidex_meta.validation import BelowOne, Count, NonNegative, Positive, Share
 from bidex_meta.world.contract import VectorWorld
 
@@ -148,7 +149,7 @@ class Offline(Learner):
     def _critics(self, inputs: Inputs, heads: int, count: int) -> Critics:
         return Critics(inputs, heads, self.config, self.initial, count).to(self.device)
 
-    def _own_parts(self) -> dict[str, Any]:
+    def _own_parts(self) -> Parts:
         """Networks of its own, beside those of the base, by their names in a checkpoint."""
         return {}
 
@@ -205,15 +206,15 @@ class Offline(Learner):
 
     # Checkpoints.
 
-    def _parts(self) -> dict[str, Any]:
+    def _parts(self) -> Parts:
         critics = {} if self.critic is None else {"critic": self.critic, "target_critic": self.target_critic}
         generators = {"generator": self.generator, "noise": self.noise}
         return {**critics, **self._own_parts(), "adams": self.adams, **generators, "reward_scale": self.reward_scale}
 
-    def _place(self) -> dict[str, Any]:
+    def _place(self) -> State:
         return super()._place() | {"data": self._batches and dict(self._batches.fingerprint)}
 
-    def _check_size(self, state: dict[str, Any]) -> None:
+    def _check_size(self, state: State) -> None:
         super()._check_size(state)
         here = self._batches and self._batches.fingerprint
         if here and state["data"] and here != state["data"]:

@@ -25,6 +25,7 @@ from bidex_algos.nets.shape import Shape
 from bidex_algos.offline.base import PAPER, CriticConfig, Offline
 from bidex_algos.offpolicy.critics import Critics, follow
 from bidex_algos.replay import Transitions
+from bidex_meta.train.learner import Parts
 from bidex_meta.validation import Count, Fraction, NonNegative, Positive
 from bidex_meta.world.contract import VectorWorld
 
@@ -237,12 +238,12 @@ class BCQ(Offline):
         low_precision = use_bfloat16(config.autocast, device)
         return BCQPolicy(config, cls._inputs(config, shape), shape, init, low_precision).to(device)
 
-    def _parts(self) -> dict[str, Any]:
+    def _parts(self) -> Parts:
         parts = super()._parts()
         del parts["critic"]  # the policy's
         return parts
 
-    def _own_parts(self) -> dict[str, Any]:
+    def _own_parts(self) -> Parts:
         return {"target_actor": self.target_actor}
 
 

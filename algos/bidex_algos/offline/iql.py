@@ -7,7 +7,7 @@ Q'  a small step towards Q
 """
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from msgspec import Meta
@@ -21,6 +21,7 @@ from bidex_algos.nets.shape import Shape
 from bidex_algos.offline.base import PAPER, CriticConfig, Offline
 from bidex_algos.offpolicy.critics import follow
 from bidex_algos.replay import Transitions
+from bidex_meta.train.learner import Parts
 from bidex_meta.validation import NonNegative, Positive, check_rising
 from bidex_meta.world.contract import VectorWorld
 
@@ -118,7 +119,7 @@ class IQL(Offline):
         observations = observation_normaliser(config, inputs, shape.num_id_columns)
         return GaussianPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
 
-    def _own_parts(self) -> dict[str, Any]:
+    def _own_parts(self) -> Parts:
         return {"value": self.value}
 
 

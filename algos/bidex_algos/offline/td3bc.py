@@ -8,7 +8,6 @@ mu', Q'  a small step towards mu, Q                    mu and the targets at eve
 
 import copy
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,6 +17,7 @@ from bidex_algos.offline.base import PAPER, CriticConfig
 from bidex_algos.offline.bc import BC
 from bidex_algos.offpolicy.critics import follow
 from bidex_algos.replay import Transitions
+from bidex_meta.train.learner import Parts
 from bidex_meta.validation import Count, NonNegative
 from bidex_meta.world.contract import VectorWorld
 
@@ -82,5 +82,5 @@ class TD3BC(BC):
         loss = imitation - weight * value.mean()
         return loss, {"Loss/actor": loss.detach()}
 
-    def _own_parts(self) -> dict[str, Any]:
+    def _own_parts(self) -> Parts:
         return {"target_actor": self.target_actor}

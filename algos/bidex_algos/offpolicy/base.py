@@ -29,6 +29,7 @@ from bidex_algos.offpolicy.return_scale import ReturnScale
 from bidex_algos.replay import Stretches, Transitions, replay_within
 from bidex_algos.rollout import EpisodeStatistics
 from bidex_meta.train.distributed import all_sum, sum_gradients, world_size
+from bidex_meta.train.learner import Parts, State
 from bidex_meta.validation import BelowOne, Count, NonNegative, Positive, Share, Whole
 from bidex_meta.world.contract import VectorWorld
 
@@ -171,7 +172,7 @@ class OffPolicy(Learner):
             Scalars to be logged, the same ones each time; an iteration tells their means.
         """
 
-    def _own_parts(self) -> dict[str, Any]:
+    def _own_parts(self) -> Parts:
         """Networks and parameters of its own, beside those of the base, by their names in a checkpoint."""
         return {}
 
@@ -292,7 +293,7 @@ class OffPolicy(Learner):
 
     # Checkpoints.
 
-    def _parts(self) -> dict[str, Any]:
+    def _parts(self) -> Parts:
         return {
             "critic": self.critic,
             "target_critic": self.target_critic,
@@ -303,12 +304,12 @@ class OffPolicy(Learner):
             "episodes": self.episodes,
         }
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         """A copy of everything but the world, as tensors and plain values (``torch.load(weights_only=True)``)."""
         # The replay makes its own copy: two of it at once may not fit.
         return super().state_dict() | {"replay": self.replay.state_dict()}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Restores what :meth:`state_dict` gave; a ``BidexError`` where world or replay had another size."""
         self.replay.load_state_dict(state["replay"])
         super().load_state_dict(state)

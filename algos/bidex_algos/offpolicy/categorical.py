@@ -22,6 +22,7 @@ from bidex_algos.nets.networks import MLP, Layers, autocast
 from bidex_algos.offpolicy.base import OffPolicy, OffPolicyConfig
 from bidex_algos.offpolicy.return_scale import ReturnBound
 from bidex_algos.replay import Transitions
+from bidex_meta.train.learner import State
 from bidex_meta.validation import MOST, Positive
 
 
@@ -149,7 +150,7 @@ class Categorical(OffPolicy):
     returns_type = ReturnBound
     returns: ReturnBound
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """As in the base; older checkpoints have no recent rewards, of which the episodes that go on then lack some."""
         super().load_state_dict({"recent": torch.zeros_like(self.returns.recent)} | state)
 

@@ -32,6 +32,7 @@ from bidex_algos.nets.shape import Shape
 from bidex_algos.offpolicy.base import OffPolicy, OffPolicyConfig
 from bidex_algos.offpolicy.critics import follow
 from bidex_algos.replay import Transitions
+from bidex_meta.train.learner import Parts
 from bidex_meta.validation import NonNegative, check_rising
 from bidex_meta.world.contract import VectorWorld
 
@@ -156,7 +157,7 @@ class DDPG(OffPolicy):
         observations = ObservationNormaliser(inputs, config.normalise_observations)
         return DeterministicPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
 
-    def _own_parts(self) -> dict[str, Any]:
+    def _own_parts(self) -> Parts:
         follows = {"target_actor": self.target_actor} if self.delayed_targets else {}
         return {**follows, "actor_loss": self.actor_loss}
 

@@ -31,6 +31,7 @@ from bidex_algos.offpolicy.base import OffPolicy, OffPolicyConfig
 from bidex_algos.offpolicy.critics import follow
 from bidex_algos.replay import Transitions
 from bidex_meta.errors import BidexError
+from bidex_meta.train.learner import Parts
 from bidex_meta.validation import Finite, Positive
 from bidex_meta.world.contract import VectorWorld
 
@@ -172,7 +173,7 @@ class MTSAC(OffPolicy):
         observations = ObservationNormaliser(inputs, config.normalise_observations)
         return SquashedPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
 
-    def _own_parts(self) -> dict[str, Any]:
+    def _own_parts(self) -> Parts:
         return {"log_alpha": self.log_alpha}
 
 

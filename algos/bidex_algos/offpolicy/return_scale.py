@@ -1,13 +1,12 @@
 """How large returns are, task by task, so that no task outweighs another."""
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
 from bidex_algos.advantages import task_moments
 from bidex_algos.nets.normalise import RunningStats
 from bidex_meta.train.distributed import all_max
+from bidex_meta.train.learner import Parts
 from bidex_meta.world.contract import VectorWorld
 
 RECENT = 0.9
@@ -46,7 +45,7 @@ class ReturnScale:
         # Where all returns are about the same, their deviation alone would blow them up.
         return (self.stats.std().square() + (0.1 * self.stats.mean).square()).sqrt().float()
 
-    def parts(self) -> dict[str, Any]:
+    def parts(self) -> Parts:
         """What a checkpoint holds, by name."""
         return {"return_stats": self.stats, "discounted": self.discounted}
 
@@ -87,6 +86,6 @@ class ReturnBound(ReturnScale):
         size = size.masked_fill(~valid, 0.0)
         self.bound = all_max(self.bound.scatter_reduce(0, self.task_id, size, "amax"))
 
-    def parts(self) -> dict[str, Any]:
+    def parts(self) -> Parts:
         """As in the base."""
         return super().parts() | {"return_bound": self.bound, "discounted_ones": self.mass, "recent": self.recent}

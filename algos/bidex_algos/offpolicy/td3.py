@@ -8,11 +8,11 @@ All else is as in ``ddpg.py``.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 from torch import Tensor
 
 from bidex_algos.offpolicy.ddpg import DDPG, DDPGConfig, of_paper
+from bidex_meta.train.learner import State
 from bidex_meta.validation import Count, NonNegative
 from bidex_meta.world.contract import VectorWorld
 
@@ -67,9 +67,9 @@ class TD3(DDPG):
         noise = self.config.target_std * self._normal(action)
         return (action + noise.clamp(-bound, bound)).clamp(-1.0, 1.0)
 
-    def _place(self) -> dict[str, Any]:
+    def _place(self) -> State:
         return {"updates": self.updates, **super()._place()}
 
-    def _go_on_from(self, state: dict[str, Any]) -> None:
+    def _go_on_from(self, state: State) -> None:
         super()._go_on_from(state)
         self.updates = int(state["updates"])

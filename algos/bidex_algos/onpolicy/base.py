@@ -38,6 +38,7 @@ from bidex_algos.onpolicy.ppo import mini_batches
 from bidex_algos.rollout import EpisodeStatistics, Rollout, collect
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import all_sum, world_size
+from bidex_meta.train.learner import Parts, State
 from bidex_meta.validation import Count, Fraction, Positive, Whole, Widths, check_rising
 from bidex_meta.world.contract import VectorWorld
 
@@ -167,7 +168,7 @@ class OnPolicy(Learner):
         """Learns from a batch; returns scalars to be logged."""
 
     @abstractmethod
-    def _optimisers(self) -> dict[str, Any]:
+    def _optimisers(self) -> Parts:
         """The optimisers by their names in a checkpoint."""
 
     def _iterate(self) -> dict[str, float]:
@@ -284,7 +285,7 @@ class OnPolicy(Learner):
         observations = ObservationNormaliser(inputs, config.normalise_observations)
         return GaussianPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
 
-    def _parts(self) -> dict[str, Any]:
+    def _parts(self) -> Parts:
         return {
             "critic": self.critic,
             "return_stats": self.return_stats,
@@ -293,14 +294,14 @@ class OnPolicy(Learner):
             "episodes": self.episodes,
         }
 
-    def _place(self) -> dict[str, Any]:
+    def _place(self) -> State:
         return {"obs": self.obs, **super()._place()}
 
-    def _go_on_from(self, state: dict[str, Any]) -> None:
+    def _go_on_from(self, state: State) -> None:
         super()._go_on_from(state)
         self.obs = None if state["obs"] is None else state["obs"].to(self.device, copy=True)
 
-    def _check_size(self, state: dict[str, Any]) -> None:
+    def _check_size(self, state: State) -> None:
         if state["obs"] is not None:
             expected = tuple(self.rollout.last_obs.shape)
             self._expect("(num_envs, observations) = ", tuple(state["obs"].shape), expected)

@@ -15,6 +15,7 @@ from bidex_algos.nets.policy import GaussianPolicy
 from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import own_seed, sum_gradients, world_size
+from bidex_meta.train.learner import State
 
 _OWN = 0xDE30
 """Told apart from the learner's other draws, which are the same with and without demonstrations."""
@@ -84,7 +85,7 @@ class Demonstrations:
             sum_gradients(weights, loss.detach()[None])
             adam.step()
 
-    def check(self, name: str, stored: dict[str, Any] | None) -> None:
+    def check(self, name: str, stored: State | None) -> None:
         """Refuses a checkpoint of other demonstrations.
 
         Raises:

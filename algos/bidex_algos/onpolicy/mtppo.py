@@ -20,6 +20,7 @@ from bidex_algos.onpolicy.ppo import NAMES, PolicyLoss, PPOConfig, policy_loss
 from bidex_algos.step_size import AdaptiveAdams
 from bidex_meta.data.joined import Joined
 from bidex_meta.train.distributed import sum_gradients, world_size
+from bidex_meta.train.learner import Parts, State
 from bidex_meta.validation import BelowOne, Count, Finite, NonNegative, Positive, Whole
 from bidex_meta.world.contract import VectorWorld
 
@@ -139,7 +140,7 @@ class MTPPO(OnPolicy):
         """Whether the policy stays as it is in this iteration, and with it what it sees."""
         return self.env_steps < self.config.critic_first
 
-    def _optimisers(self) -> dict[str, Any]:
+    def _optimisers(self) -> Parts:
         return self.adams.parts() | (self.balance.parts() if self.balance is not None else {})
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
@@ -216,15 +217,15 @@ class MTPPO(OnPolicy):
 
     # Checkpoints.
 
-    def _parts(self) -> dict[str, Any]:
+    def _parts(self) -> Parts:
         more = {} if self.demonstrations is None else {"demonstrated": self.demonstrations.generator}
         return super()._parts() | more
 
-    def _place(self) -> dict[str, Any]:
+    def _place(self) -> State:
         more = {} if self.demonstrations is None else {"demonstrations": self.demonstrations.fingerprint}
         return super()._place() | more
 
-    def _check_size(self, state: dict[str, Any]) -> None:
+    def _check_size(self, state: State) -> None:
         super()._check_size(state)
         if self.demonstrations is not None:
             self.demonstrations.check(self.name, state.get("demonstrations"))

@@ -11,7 +11,6 @@ One policy reads the task's one-hot in its observation. An update, in the order 
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -20,6 +19,7 @@ from bidex_algos.nets.networks import Autocast, autocast, gaussian_kl, gaussian_
 from bidex_algos.onpolicy.base import TABLE_47, Batch, OnPolicy, OnPolicyConfig
 from bidex_algos.trust_region import trust_region_step
 from bidex_meta.train.distributed import all_sum, sum_gradients
+from bidex_meta.train.learner import Parts
 from bidex_meta.validation import Count, Fraction, NonNegative, Positive
 from bidex_meta.world.contract import VectorWorld
 
@@ -83,7 +83,7 @@ class MTTRPO(OnPolicy):
         super().__init__(world, config, seed)
         self.critic_adam = torch.optim.Adam(self.critic.parameters(), lr=config.critic_learning_rate, fused=True)
 
-    def _optimisers(self) -> dict[str, Any]:
+    def _optimisers(self) -> Parts:
         return {"critic_adam": self.critic_adam}
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
