@@ -65,16 +65,9 @@ def gae(
 
 
 def task_moments(x: Tensor, task_id: Tensor, num_tasks: int, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean, biased variance and count of ``x`` per task over the valid entries of all processes.
+    """Mean, biased variance and count (num_tasks,) of ``x`` (T, N) per task, over the valid entries of all processes.
 
-    Args:
-        x: Shape (T, N).
-        task_id: Task of each environment, int64 (N,).
-        num_tasks: Number of tasks.
-        valid: Bool (T, N).
-
-    Returns:
-        Three tensors of shape (num_tasks,); an empty task has mean, variance and count 0.
+    ``task_id`` is int64 (N,), ``valid`` bool (T, N). An empty task has mean, variance and count 0.
     """
 
     def total(values: Tensor) -> Tensor:

@@ -25,12 +25,7 @@ def project_conflicting(gradients: Tensor) -> tuple[Tensor, Tensor]:
     """PCGrad (Yu et al. 2020, algorithm 1): each gradient loses what points against another task's.
 
     The others are met in cyclic order instead of a random one, so that all processes of a run do the same.
-
-    Args:
-        gradients: One a task, (num_tasks, P).
-
-    Returns:
-        The sum of what is left of them, (P,); the share of pairs of tasks whose gradients point apart, a scalar.
+    Returns the sum (P,) of what is left of ``gradients`` (num_tasks, P), and the share of pairs in conflict, a scalar.
     """
     count = len(gradients)
     gram = gradients @ gradients.T

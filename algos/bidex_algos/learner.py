@@ -194,12 +194,7 @@ class Learner(Contract):
 
     @classmethod
     def load_policy(cls, state: State, device: str | torch.device = "cpu") -> Any:
-        """The agent of a checkpoint, for a world of any number of environments.
-
-        Args:
-            state: ``checkpoint["learner"]["policy"]``.
-            device: Where to run it.
-        """
+        """The agent of a checkpoint (its entry ``learner.policy``), for a world of any number of environments."""
         init = torch.Generator().manual_seed(0)
         config, shape = cls.config_type(**state["config"]), Shape.load(state["shape"])
         policy = cls._make_policy(config, shape, init, torch.device(device))
@@ -207,14 +202,7 @@ class Learner(Contract):
         return policy
 
     def start_from(self, policy: State) -> None:
-        """Takes network and observation statistics of another learner's policy, and nothing else.
-
-        Args:
-            policy: ``checkpoint["learner"]["policy"]`` of the other.
-
-        Raises:
-            BidexError: Weights of one would not mean the same in the other.
-        """
+        """Takes network and statistics of another learner's policy; refuses what would not mean the same here."""
         own = asdict(self.config) | _seen(self.shape)
         given = policy["config"] | _seen(Shape.load(policy["shape"]))
         _agree(own, given, _FORM)

@@ -230,13 +230,7 @@ def _cuts_kept(steps: int, rows: int, cut_share: float) -> int:
 
 
 class Stretches:
-    """Up to ``n`` steps in a row from each place.
-
-    Args:
-        replay: Where they lie.
-        places: Of the first steps, int64 (batches, B).
-        n: Steps at most.
-        gamma: Discount per step.
+    """Up to ``n`` steps in a row from each of ``places``, int64 (batches, B).
 
     Attributes:
         last: Places of the last steps, (batches, B).
@@ -276,16 +270,7 @@ class Stretches:
 def replay_within(
     learner: str, world: VectorWorld, observations: int, actions: int, asked: int, memory: float, share: float
 ) -> Replay:
-    """The replay that was asked for, or as much of it as its memory holds.
-
-    Args:
-        learner: Name for messages.
-        world: Whose transitions it holds.
-        observations: Width of its observations.
-        actions: Width of its actions.
-        asked: Vector steps.
-        memory: The most that it may take, in GB (10^9 bytes).
-        share: ``cut_share`` of :class:`Replay`.
+    """The replay of ``asked`` vector steps, or as much of it as ``memory`` (GB, 10^9 bytes) holds.
 
     Raises:
         BidexError: A task has no environments, or not one vector step fits.

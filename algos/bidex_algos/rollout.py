@@ -13,15 +13,10 @@ from bidex_meta.world.contract import VectorWorld
 
 
 class EpisodeStatistics:
-    """Fading sums over about the last ``window`` finished episodes of each task.
+    """Fading sums over about the last ``window`` finished episodes of each task, in each process.
 
     A rollout is shorter than an episode, so the episodes that happen to end in one are few and, for a slow task, often
-    none: an average over one rollout would jump.
-
-    Args:
-        task_id: Task of each environment, int64 (N,).
-        task_names: Names of the tasks.
-        window: Number of episodes, in each process, after which an old one counts 1/e.
+    none: an average over one rollout would jump. ``task_id`` is that of each environment, int64 (N,).
     """
 
     def __init__(self, task_id: Tensor, task_names: list[str], window: float = 100.0):

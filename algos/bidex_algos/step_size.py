@@ -91,12 +91,7 @@ class AdaptiveAdam:
 class AdaptiveAdams(AdaptiveAdam):
     """An adaptive one for the actor, and one for its critic.
 
-    Args:
-        actor: The actor's parameters.
-        critic: The critic's.
-        config: Of a learner: as for :class:`AdaptiveAdam`, and ``critic_learning_rate``, a fixed step size for the
-            critic (None makes it follow the actor's).
-        device: Where the parameters lie.
+    ``config`` has ``critic_learning_rate`` too, a fixed step size for the critic (None makes it follow the actor's).
     """
 
     def __init__(

@@ -25,16 +25,10 @@ def write(parameters: Sequence[nn.Parameter], vector: Tensor) -> None:
 
 
 def conjugate_gradient(product: Product, b: Tensor, iterations: int, tolerance: float = 1e-10) -> Tensor:
-    """Solves ``product(x) = b`` from x = 0 (Hestenes and Stiefel 1952).
+    """Solves ``product(x) = b`` for x (P,) from 0 (Hestenes and Stiefel 1952).
 
-    Args:
-        product: The matrix.
-        b: Right side (P,).
-        iterations: How many are made; with as many as P the solution is exact but for rounding.
-        tolerance: Once the squared residual is below this share of the first one, x no longer changes.
-
-    Returns:
-        x (P,).
+    With as many iterations as P the solution is exact but for rounding. Once the squared residual is below
+    ``tolerance`` of the first one, x no longer changes.
     """
     x, residual, direction = torch.zeros_like(b), b.clone(), b.clone()
     square = first = residual.dot(residual)
@@ -72,7 +66,7 @@ def fisher_product(kl: Tensor, parameters: Sequence[nn.Parameter], damping: floa
 def natural_step(
     objective: Tensor, kl: Tensor, parameters: Sequence[nn.Parameter], *, max_kl: float, damping: float, iterations: int
 ) -> tuple[Tensor, float]:
-    """The step along F^-1 g that has the KL ``max_kl`` to second order, and the rise of the objective it promises.
+    """The step (P,) along F^-1 g that has the KL ``max_kl`` to second order, and the rise it promises.
 
     Args:
         objective: This process's part of what shall rise, a scalar with a graph.
@@ -81,9 +75,6 @@ def natural_step(
         max_kl: The KL to use.
         damping: Added to the diagonal of the Fisher matrix.
         iterations: Of conjugate gradients.
-
-    Returns:
-        The step (P,) and a number.
     """
     gradient = all_sum(flatten(torch.autograd.grad(objective, parameters, retain_graph=True)))
     product = fisher_product(kl, parameters, damping)

@@ -23,13 +23,7 @@ StepSizeKind = Literal["fixed", "layer", "weight"]
 
 
 class StepSizes(nn.Module):
-    """A factor of the inner step for each tensor, or each weight, that it moves.
-
-    Args:
-        actor: Whose parameters are moved.
-        moved: Their names.
-        kind: ``layer``: a number for each tensor; ``weight``: one for each of its entries.
-    """
+    """A factor of the inner step for each tensor (``layer``), or each entry of it (``weight``), that it moves."""
 
     def __init__(self, actor: nn.Module, moved: list[str], kind: StepSizeKind):
         super().__init__()

@@ -221,12 +221,7 @@ class MetaLearner(Learner):
 
     @classmethod
     def load_policy(cls, state: State, device: str | torch.device = "cpu") -> MetaPolicy:
-        """The adapting agent of a checkpoint, for a world of any number of environments.
-
-        Args:
-            state: ``checkpoint["learner"]["policy"]``.
-            device: Where to run it.
-        """
+        """The adapting agent of a checkpoint (``learner.policy``), for a world of any number of environments."""
         policy = super().load_policy(state, device)
         policy.seed = state["seed"]
         return policy

@@ -15,14 +15,8 @@ from bidex_meta.agents import Timestep
 class MetaPolicy(nn.Module):
     """A Gaussian actor with adapted copies, one a task; follows the protocol of adapting agents (bidex_meta.agents).
 
-    Its own parameters are the meta-parameters. Before the first ``adapt`` every task plays by them.
-
-    Args:
-        observations: Normaliser of raw observations.
-        actor: Network on normalised observations.
-        config: Of the learner.
-        objective: What an inner step follows.
-        seed: Of the exploring actions.
+    Its own parameters are the meta-parameters. Before the first ``adapt`` every task plays by them. ``seed`` is that of
+    the exploring actions.
     """
 
     def __init__(
@@ -129,15 +123,6 @@ class MetaPolicy(nn.Module):
 def make_meta_policy(
     config: MetaConfig, objective: Objective, inputs: Inputs, actions: int, init: torch.Generator, seed: int = 0
 ) -> MetaPolicy:
-    """A policy with fresh weights.
-
-    Args:
-        config: Of the learner.
-        objective: What an inner step follows.
-        inputs: How the network reads an observation. Encoders are meta-learned: no inner step moves them.
-        actions: Number of actions.
-        init: CPU generator of the weights.
-        seed: Of the exploring actions.
-    """
+    """A policy with fresh weights of ``init``, a CPU generator; no inner step moves the encoders of ``inputs``."""
     actor = GaussianActor(inputs, config.hidden, actions, config.init_std, init, config.activation)
     return MetaPolicy(ObservationNormaliser(inputs, config.normalise_observations), actor, config, objective, seed)

@@ -66,15 +66,7 @@ _SOLVABLE = 1e-5
 
 
 def features(obs: Tensor, elapsed: Tensor) -> Tensor:
-    """Observation, its square, three powers of time, and 1.
-
-    Args:
-        obs: Normalised observations (..., d).
-        elapsed: Steps since the episode began (...).
-
-    Returns:
-        (..., 2 d + 4), float32.
-    """
+    """Observation, its square, three powers of time, and 1: of (..., d) and (...) to (..., 2 d + 4), float32."""
     bounded = obs.clamp(-_BOUND, _BOUND)
     t = elapsed[..., None].to(obs.dtype) / 100.0
     return torch.cat([bounded, bounded.square(), t, t.square(), t**3, torch.ones_like(t)], dim=-1)

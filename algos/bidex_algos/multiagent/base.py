@@ -125,13 +125,10 @@ LIFT: dict[str, Any] = {"rollout_steps": 20, "epochs": 10}
 
 @torch.no_grad()
 def keep_values(critics: list[MLP], before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> None:
-    """Moves the output layers of critics, so that std V + mean is as it was before mean and std changed.
+    """Moves the output layers of critics so that std V + mean stays: PopArt (van Hasselt 2016, Hessel et al. 2019).
 
-    Args:
-        critics: Each has an output for each task.
-        before: Mean and standard deviation of the returns by which the critics' units were defined, each
-            (critics * tasks,).
-        after: The same of the new units.
+    Each critic has an output for each task. ``before`` and ``after`` are mean and standard deviation of the returns
+    that define the critics' units, each (critics * tasks,).
     """
     given = [x.view(len(critics), -1) for x in (*before, *after)]
     for critic, old_mean, old_std, mean, std in zip(critics, *given, strict=True):

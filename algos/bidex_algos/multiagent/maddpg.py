@@ -48,15 +48,7 @@ PRESETS: dict[str, MADDPGConfig] = {"paper": MADDPGConfig(**of_paper()), "laptop
 
 
 class DeterministicTeam(Team):
-    """All agents as one actor without a distribution: in the place of a ``DeterministicActor``.
-
-    Args:
-        views: The agents.
-        config: As for :class:`Team`.
-        groups: The groups of the world's observation.
-        generator: CPU generator of the initial weights.
-        heads: Output layers of each agent; the group ``task_id`` chooses.
-    """
+    """All agents as one actor without a distribution, in the place of a ``DeterministicActor``."""
 
     def __init__(
         self, views: tuple[AgentView, ...], config: Any, groups: Inputs, generator: torch.Generator, heads: int

@@ -141,14 +141,7 @@ class GroupEncoder(nn.Module):
 
 
 class TaskEmbedding(nn.Module):
-    """Maps the one-hot of a task (..., tasks) to the task's vector (..., size), at first drawn from N(0, 1).
-
-    Args:
-        tasks: Entries of the one-hot.
-        generator: CPU generator of the initial vectors.
-        size: Entries of a vector.
-        unit: Whether it is shortened or stretched to length 1 when read.
-    """
+    """Maps the one-hot of a task (..., tasks) to its vector (..., size), drawn from N(0, 1); ``unit``: of length 1."""
 
     def __init__(self, tasks: int, generator: torch.Generator, size: int, unit: bool = False):
         super().__init__()

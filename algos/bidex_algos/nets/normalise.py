@@ -114,26 +114,14 @@ class ObservationNormaliser(nn.Module):
 
 
 def observation_normaliser(config: Any, inputs: Inputs, tasks: int) -> ObservationNormaliser:
-    """What a config asks for by ``normalise_observations`` and ``normalise_per_task``.
-
-    Args:
-        config: An offline learner's.
-        inputs: The groups of the observation.
-        tasks: Entries of the one-hot of the tasks, 0 without one.
-    """
+    """What a config asks for by ``normalise_observations`` and ``normalise_per_task``, of so many tasks."""
     if config.normalise_per_task and config.normalise_observations and tasks > 1:
         return TaskNormaliser(inputs, tasks)
     return ObservationNormaliser(inputs, config.normalise_observations)
 
 
 class TaskNormaliser(ObservationNormaliser):
-    """Observations to zero mean and unit variance by statistics of their task, clipped; the task id passes unchanged.
-
-    Args:
-        inputs: The groups of the observation; ``task_id`` is the one-hot that chooses.
-        tasks: Tasks, T.
-        clip: Bound of the normalised values.
-    """
+    """Normalises by the statistics of each of ``tasks`` tasks, which the group ``task_id`` names."""
 
     def __init__(self, inputs: Inputs, tasks: int, clip: float = 10.0):
         super().__init__(inputs, True, clip)

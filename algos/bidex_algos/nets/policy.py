@@ -93,7 +93,7 @@ class DeterministicActor(nn.Module):
 
 
 class DeterministicPolicy(ActorPolicy):
-    """A deterministic actor on raw observations; arguments are those of its base."""
+    """A deterministic actor on raw observations."""
 
     actor: DeterministicActor
 

@@ -106,20 +106,9 @@ class RecurrentPolicy(nn.Module):
     """A Gaussian policy whose memory is fed with observation, last action, last reward and end of episode.
 
     Rewards of task classes differ by orders of magnitude, and a class met in a meta-test has never been seen: no scale
-    of its own is known, nor which class a row plays. One rule serves all: asinh(reward / unit), which is linear below
-    the unit and tells ratios apart above it, normalised by the mean and deviation it had in training.
-
-    Args:
-        inputs: The groups of the raw observation.
-        actions: Number of actions.
-        hidden: Widths of the encoder's layers.
-        memory: Width of the memory.
-        init_std: Standard deviation of the actions at the start.
-        reward_unit: The unit.
-        normalise_observations: Whether observations are normalised.
-        generator: CPU generator of the initial weights.
-        activation: Name of the encoder's non-linearity.
-        lasting: Steps that the memory shall last for.
+    of its own is known, nor which class is played. One rule serves all: asinh(reward / ``reward_unit``), linear below
+    the unit and showing ratios above it, normalised by the mean and deviation it had in training. Other arguments are
+    those of :class:`RecurrentNet`.
 
     Attributes:
         inputs: What the networks see: these groups, normalised, and ``last_step``, what the memory is fed beside them.
@@ -148,17 +137,9 @@ class RecurrentPolicy(nn.Module):
         self.log_std = nn.Parameter(torch.full((actions,), math.log(init_std)))
 
     def see(self, obs: Tensor, action: Tensor, reward: Tensor, known: Tensor, done: Tensor) -> Tensor:
-        """What the networks see: normalised observation, last action, last reward or 0, whether it is known, end.
+        """What the networks see (..., width of ``inputs``): normalised observation, last action, last reward or 0.
 
-        Args:
-            obs: Raw observations (..., d).
-            action: Last actions (..., a).
-            reward: Last rewards (...).
-            known: Whether the rewards are shown, bool (...).
-            done: Whether the last step ended an episode, bool (...).
-
-        Returns:
-            Shape (..., width of ``inputs``).
+        ``obs`` are raw (..., d), ``action`` (..., a); ``known`` and ``done`` as in :class:`Memory`, (...); both go in.
         """
         earned = torch.where(known, self.rewards(self._compressed(reward)).squeeze(-1), 0.0)
         last = torch.stack([earned, known.float(), done.float()], dim=-1)

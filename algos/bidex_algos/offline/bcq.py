@@ -72,12 +72,6 @@ PRESETS: dict[str, BCQConfig] = {
 class ActionModel(nn.Module):
     """A conditional variational autoencoder: which actions the data hold in a state.
 
-    Args:
-        inputs: The groups of the (normalised) observation.
-        config: Layers and size of the code.
-        actions: Number of actions, a.
-        generator: CPU generator of the initial weights.
-
     Attributes:
         codes: Entries of a code, z.
     """
@@ -107,15 +101,8 @@ def bounded(codes: Tensor) -> Tensor:
 class BCQPolicy(nn.Module):
     """The best, by the first critic, of some proposals on raw observations.
 
-    The codes of the proposals are the same in every state, drawn when the policy is made: so the policy is a function
+    The codes of the proposals are the same in every state, drawn when the policy is created: the policy is a function
     of the observation.
-
-    Args:
-        config: Layers, number and change of the proposals.
-        inputs: The groups of the observation.
-        shape: Sizes of the world.
-        generator: CPU generator of the initial weights and of the codes.
-        low_precision: Whether hidden layers run in bfloat16.
 
     Attributes:
         model: Proposes.
@@ -248,12 +235,6 @@ class BCQ(Offline):
 
 
 def best_of(values: Tensor, count: int, lower_weight: float) -> Tensor:
-    """The best proposal's value of each state (B,).
-
-    Args:
-        values: Of both critics, ``count`` proposals of each state behind one another, (2, B * count).
-        count: Proposals of a state.
-        lower_weight: Weight of the lower critic; the higher one has the rest.
-    """
+    """The best proposal's value of each state (B,), of both critics' values (2, B * count), state after state."""
     mixed = lower_weight * values.amin(0) + (1.0 - lower_weight) * values.amax(0)
     return mixed.view(-1, count).amax(1)

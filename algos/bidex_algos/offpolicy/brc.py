@@ -30,13 +30,7 @@ from bidex_meta.validation import Count, Finite, NonNegative, Share, Whole
 
 
 class ResidualBlock(nn.Module):
-    """x plus two normalised layers of it, with the non-linearity between them; sizes stay as they are.
-
-    Args:
-        width: Of x.
-        generator: CPU generator of the initial weights.
-        activation: Name of the non-linearity.
-    """
+    """x plus two normalised layers of it, with the non-linearity between them; sizes stay as they are."""
 
     def __init__(self, width: int, generator: torch.Generator, activation: Activation):
         super().__init__()

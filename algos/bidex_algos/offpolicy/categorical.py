@@ -27,13 +27,7 @@ from bidex_meta.validation import MOST, Positive
 
 
 class Atoms(nn.Module):
-    """Values z_0 < ... < z_{A-1}, evenly spaced, that a distribution gives probabilities to. It has no weights.
-
-    Args:
-        low: The lowest.
-        high: The highest.
-        count: How many, A; at least 2.
-    """
+    """``count`` values (A >= 2), evenly spaced, that a distribution gives probabilities to; it has no weights."""
 
     def __init__(self, low: float, high: float, count: int):
         super().__init__()
@@ -46,18 +40,10 @@ class Atoms(nn.Module):
         return (probs * self.values).sum(-1)
 
     def projected(self, probs: Tensor, shift: Tensor, factor: Tensor) -> Tensor:
-        """The distribution of shift + factor * Z on the atoms, where Z is distributed as ``probs``.
+        """The distribution (B, A) of shift + factor * Z on the atoms, where Z is distributed as ``probs`` (B, A).
 
         What falls between two atoms is split between them so that its mean stays; what falls beyond the range goes to
-        the atom at its end.
-
-        Args:
-            probs: Shape (B, A).
-            shift: Shape (B,).
-            factor: Shape (B,).
-
-        Returns:
-            Shape (B, A).
+        the atom at its end. ``shift`` and ``factor`` are (B,).
         """
         moved = shift[:, None] + factor[:, None] * self.values
         # In units of the distance of two atoms, from the lowest.
@@ -93,16 +79,7 @@ distribution, which is much wider, means move slowly: a cross-entropy pulls at t
 
 
 class CategoricalCritics(nn.Module):
-    """Networks of observation and action that give distributions, alike but for their initial weights.
-
-    Args:
-        inputs: The groups of observation and action together, or their width.
-        heads: Distributions of each network: one per task, or 1 for all.
-        config: Layers and atoms.
-        generator: CPU generator of the initial weights.
-        count: How many networks.
-        network: What makes each, by the arguments of ``MLP``.
-    """
+    """Networks of observation and action that give distributions; arguments as those of ``Critics``."""
 
     def __init__(
         self,

@@ -10,14 +10,10 @@ from bidex_algos.nets.inputs import Inputs
 
 
 class Critics(nn.Module):
-    """Networks of observation and action, alike but for their initial weights.
+    """``count`` networks of observation and action, alike but for their initial weights.
 
-    Args:
-        inputs: The groups of observation and action together, or their width.
-        heads: Outputs of each network: one per task, or 1 for all.
-        config: Of a learner; its architecture, ``hidden``, ``activation`` and ``critic_layer_norm``.
-        generator: CPU generator of the initial weights.
-        count: How many: 2 against overestimation (Fujimoto et al. 2018), or 1.
+    ``inputs`` are the groups of both together, ``heads`` the outputs of each, one per task or 1; ``config`` is a
+    learner's (layers). Two against overestimation (Fujimoto et al. 2018), or one.
     """
 
     def __init__(self, inputs: int | Inputs, heads: int, config: Any, generator: torch.Generator, count: int = 2):

@@ -163,14 +163,7 @@ class DDPG(OffPolicy):
 
 
 def spread(low: float, high: float, task_id: Tensor, num_tasks: int) -> Tensor:
-    """Numbers (N,) that go evenly from ``low`` in the first environment of each task to ``high`` in its last.
-
-    Args:
-        low: The least.
-        high: The greatest; of a task with one environment the only one.
-        task_id: Task of each environment, int64 (N,).
-        num_tasks: How many tasks there are.
-    """
+    """Numbers (N,) that go evenly from ``low`` in each task's first environment to ``high`` in its last, or only."""
     numbers = torch.empty(len(task_id), device=task_id.device)
     for task in range(num_tasks):
         rows = (task_id == task).nonzero().squeeze(1)

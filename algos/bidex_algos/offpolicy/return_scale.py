@@ -16,10 +16,7 @@ RECENT = 0.9
 class ReturnScale:
     """Running statistics of the discounted sum of rewards since an episode began.
 
-    Args:
-        world: Whose rewards they are.
-        gamma: Discount per step, of all environments or of each (N,).
-        horizon: Returns of a task after which older ones fade.
+    Returns of a task fade after ``horizon`` newer ones; ``gamma`` is a discount for all, or of each environment (N,).
 
     Attributes:
         stats: Mean and variance of each task (num_tasks,).

@@ -24,14 +24,7 @@ _CLONING_RATE = 1e-3
 
 
 class Demonstrations:
-    """Transitions to be imitated, and how much they count.
-
-    Args:
-        data: In the form of the learner's world; some of its tasks may have none.
-        config: Its ``demonstration_weight``, ``demonstration_half_life``, ``demonstration_batch`` and
-            ``demonstration_cloning``.
-        seed: Of the draws.
-        device: Where they lie.
+    """Transitions to be imitated, and how much they count; some tasks may have none.
 
     Attributes:
         generator: Of the draws alone, another one in each process.

@@ -47,16 +47,9 @@ def mini_batches(
     generator: torch.Generator,
     split: Callable[[Tensor, int], Sequence[Tensor]] = Tensor.chunk,
 ) -> Iterator[tuple[bool, Tensor, Tensor]]:
-    """Passes over shuffled samples, in the order of PPO's epochs.
+    """Passes over shuffled samples with ``weights`` (B,), in the order of PPO's epochs.
 
     Divided by the count, which is of all processes, losses and gradients become means by being summed over them.
-
-    Args:
-        weights: Of the samples (B,).
-        epochs: Passes.
-        number: Mini-batches of a pass.
-        generator: Of the order, on the device.
-        split: How a pass is split into so many parts.
 
     Yields:
         Whether it is the very first, the samples int64 (b,), and the sum of their weights, at least 1.
