@@ -61,10 +61,6 @@ class AdaptiveAdam:
         """Forgets the gradients."""
         self.actor.zero_grad()
 
-    def step(self) -> None:
-        """One step."""
-        self.actor.step()
-
     def descend(self, kl: Tensor | None, max_grad_norm: float) -> None:
         """One step along shortened gradients, its size adapted to the KL of the last one.
 

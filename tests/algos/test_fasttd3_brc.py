@@ -24,20 +24,10 @@ from tests.algos.test_categorical import slow_projection
 from tests.algos.toy import ToyWorld, nearness
 
 SHARED: dict[str, Any] = {
-    "hidden": (32, 32),
-    "critic_hidden": (32, 32),
-    "replay_steps": 200,
-    "cut_share": 0.3,
-    "warmup_steps": 4,
-    "updates_per_step": 2,
-    "batch_size": 128,
-    "gamma": 0.8,
-    "tau": 0.1,
-    "learning_rate": 3e-3,
-    "critic_learning_rate": 5e-3,
-    "autocast": "off",
-    "atoms": 51,
-}
+    "hidden": (32, 32), "critic_hidden": (32, 32), "replay_steps": 200, "cut_share": 0.3, "warmup_steps": 4,
+    "updates_per_step": 2, "batch_size": 128, "gamma": 0.8, "tau": 0.1, "learning_rate": 3e-3,
+    "critic_learning_rate": 5e-3, "autocast": "off", "atoms": 51,
+}  # fmt: skip
 FAST = FastTD3Config(**SHARED | {"updates_per_step": 4}, critic_layer_norm=False, n_steps=1, squash_price=0.0)
 SMALL = BRCConfig(**SHARED, n_steps=1, task_embedding=4, init_alpha=0.01, target_entropy_per_action=-2.0)
 both = pytest.mark.parametrize(("kind", "config"), [(FastTD3, FAST), (BRC, SMALL)], ids=["fasttd3", "brc"])

@@ -14,20 +14,10 @@ from tests.algos.ranks import same
 from tests.algos.toy import ToyWorld, nearness
 
 SMALL = MTSACConfig(
-    hidden=(32, 32),
-    replay_steps=200,
-    cut_share=0.3,
-    warmup_steps=4,
-    batch_size=128,
-    critic_layer_norm=False,
-    gamma=0.8,
-    tau=0.05,
-    learning_rate=3e-3,
-    critic_learning_rate=5e-3,
-    alpha_learning_rate=3e-3,
-    init_alpha=0.01,
+    hidden=(32, 32), replay_steps=200, cut_share=0.3, warmup_steps=4, batch_size=128, critic_layer_norm=False,
+    gamma=0.8, tau=0.05, learning_rate=3e-3, critic_learning_rate=5e-3, alpha_learning_rate=3e-3, init_alpha=0.01,
     autocast="off",
-)
+)  # fmt: skip
 
 
 def trained(world: Any, config: MTSACConfig, iterations: int) -> MTSAC:

@@ -152,13 +152,9 @@ def test_pacos_layers_are_those_of_the_composed_parameters():
 # In the learners.
 
 PPO = MTPPOConfig(
-    hidden=(32, 32),
-    rollout_steps=8,
-    learning_rate=1e-3,
-    learning_rate_range=(1e-4, 4e-3),
-    std_range=(0.05, 1.0),
+    hidden=(32, 32), rollout_steps=8, learning_rate=1e-3, learning_rate_range=(1e-4, 4e-3), std_range=(0.05, 1.0),
     autocast="off",
-)
+)  # fmt: skip
 TRPO = MTTRPOConfig(
     hidden=(32, 32), rollout_steps=16, gamma=0.8, init_std=0.5, fisher_stride=1, max_kl=0.03, damping=0.01,
     critic_learning_rate=3e-3,

@@ -17,19 +17,10 @@ from tests.algos.problems import opposite_bandits
 from tests.algos.toy import ToyWorld, nearness
 
 SHARED: dict[str, Any] = {
-    "hidden": (32, 32),
-    "replay_steps": 200,
-    "cut_share": 0.3,
-    "warmup_steps": 4,
-    "batch_size": 128,
-    "critic_layer_norm": False,
-    "gamma": 0.8,
-    "tau": 0.05,
-    "learning_rate": 3e-3,
-    "critic_learning_rate": 5e-3,
-    "squash_price": 0.0,
-    "autocast": "off",
-}
+    "hidden": (32, 32), "replay_steps": 200, "cut_share": 0.3, "warmup_steps": 4, "batch_size": 128,
+    "critic_layer_norm": False, "gamma": 0.8, "tau": 0.05, "learning_rate": 3e-3, "critic_learning_rate": 5e-3,
+    "squash_price": 0.0, "autocast": "off",
+}  # fmt: skip
 SMALL = TD3Config(**SHARED)
 both = pytest.mark.parametrize(("kind", "config"), [(DDPG, DDPGConfig(**SHARED)), (TD3, SMALL)], ids=["ddpg", "td3"])
 

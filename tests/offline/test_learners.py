@@ -22,19 +22,11 @@ from tests.algos.resume import resumed
 from tests.offline.stored import as_data, noisy, played
 
 PLAIN: dict[str, Any] = {
-    "hidden": (32, 32),
-    "batch_size": 128,
-    "updates_per_iteration": 200,
-    "learning_rate": 3e-3,
-    "autocast": "off",
-}
+    "hidden": (32, 32), "batch_size": 128, "updates_per_iteration": 200, "learning_rate": 3e-3, "autocast": "off",
+}  # fmt: skip
 VALUED: dict[str, Any] = {
-    **PLAIN,
-    "critic_learning_rate": 5e-3,
-    "gamma": 0.8,
-    "tau": 0.02,
-    "critic_layer_norm": False,
-}
+    **PLAIN, "critic_learning_rate": 5e-3, "gamma": 0.8, "tau": 0.02, "critic_layer_norm": False,
+}  # fmt: skip
 SMALL: dict[str, tuple[Any, Any]] = {
     "bc": (BC, BCConfig(**PLAIN)),
     "td3bc": (TD3BC, TD3BCConfig(**VALUED)),
