@@ -14,6 +14,33 @@ from bidex_meta.train.learner import Parts
 Balancing = Literal["none", "pcgrad", "cagrad", "famo"]
 
 
+class Balance(ABC):
+    """Puts one gradient in the place of the sum of all tasks' losses."""
+
+    tag: ClassVar[str]
+    """Name of the number that it tells, in the log."""
+
+    @abstractmethod
+    def backward(self, losses: Tensor, least: Tensor, parameters: Sequence[nn.Parameter]) -> Tensor:
+        """Puts the gradient into the parameters, which have none yet, and keeps the graph.
+
+        Args:
+            losses: Of each task, this process's part (num_tasks,).
+            least: What each could become at best, its part (num_tasks,).
+            parameters: The shared weights.
+
+        Returns:
+            A number to be told, divided by the processes that will sum it, as they will the gradients.
+        """
+
+    def learn(self, above: Callable[[], Tensor]) -> None:  # noqa: B027
+        """What follows a step; ``above`` tells how far each loss is above its least now, this process's part."""
+
+    def parts(self) -> Parts:
+        """What a checkpoint holds of it, by name."""
+        return {}
+
+
 def per_task_gradients(losses: Tensor, parameters: Sequence[nn.Parameter]) -> Tensor:
     """Gradients (num_tasks, P) of losses (num_tasks,), all parameters flattened; the graph is kept."""
     one_each = torch.eye(len(losses), dtype=losses.dtype, device=losses.device)
@@ -105,10 +132,27 @@ def worst_served(gram: Tensor, even: Tensor, reach: Tensor) -> Tensor:
     return weights
 
 
+class GradientBalance(Balance):
+    """Combines the tasks' gradients (num_tasks, P) to one (P,) and a share of conflicts; a backward pass for each."""
+
+    tag = "Policy/conflicts"
+
+    def __init__(self, combine: Callable[[Tensor], tuple[Tensor, Tensor]]):
+        self.combine = combine
+
+    def backward(self, losses: Tensor, least: Tensor, parameters: Sequence[nn.Parameter]) -> Tensor:
+        """As in the base."""
+        gradient, apart = self.combine(all_sum(per_task_gradients(losses, parameters)))
+        for parameter, part in zip(parameters, gradient.split([p.numel() for p in parameters]), strict=True):
+            # All processes have the whole of it, and sum it.
+            parameter.grad = part.view_as(parameter) / world_size()
+        return apart / world_size()
+
+
 _LEAST = 1e-8
 
 
-class Famo:
+class Famo(Balance):
     """FAMO (Liu et al. 2023): weights of tasks under which all losses fall at the same rate, without a gradient each.
 
         z = softmax(xi)
@@ -128,6 +172,8 @@ class Famo:
         logits: xi (num_tasks,), float64, in checkpoints.
     """
 
+    tag = "Policy/largest_weight"
+
     def __init__(self, num_tasks: int, rate: float, decay: float, device: torch.device):
         self.logits = nn.Parameter(torch.zeros(num_tasks, device=device, dtype=torch.float64))
         self.adam = torch.optim.Adam([self.logits], lr=rate, weight_decay=decay, fused=True)
@@ -144,10 +190,16 @@ class Famo:
         shares = shares.masked_fill(self.above <= _LEAST, 0.0)
         return (len(shares) * shares / shares.sum().clamp_min(1e-30)).to(above.dtype)
 
+    def backward(self, losses: Tensor, least: Tensor, parameters: Sequence[nn.Parameter]) -> Tensor:
+        """As in the base; the number is the largest weight."""
+        weights = self.weights(all_sum((losses - least).detach()))
+        (weights * losses).sum().backward(retain_graph=True)
+        return weights.max() / len(weights) / world_size()
+
     @torch.no_grad()
     def learn(self, above: Callable[[], Tensor]) -> None:
-        """Moves the weights by what the step has done; ``above`` gives the same losses after it."""
-        fallen = self.above.clamp_min(_LEAST).log() - above().double().clamp_min(_LEAST).log()
+        """As in the base: costs another forward pass."""
+        fallen = self.above.clamp_min(_LEAST).log() - all_sum(above()).double().clamp_min(_LEAST).log()
         fallen = fallen.masked_fill(self.above <= _LEAST, 0.0)
         z = self.logits.softmax(0)
         self.logits.grad = z * (fallen - (z * fallen).sum())
@@ -158,77 +210,6 @@ class Famo:
         return {"famo_logits": self.logits, "famo_adam": self.adam}
 
 
-class Balance(ABC):
-    """Puts one gradient in the place of the sum of all tasks' losses."""
-
-    tag: ClassVar[str]
-    """Name of the number that it tells, in the log."""
-
-    @abstractmethod
-    def backward(self, losses: Tensor, least: Tensor, parameters: Sequence[nn.Parameter]) -> Tensor:
-        """Puts the gradient into the parameters, which have none yet, and keeps the graph.
-
-        Args:
-            losses: Of each task, this process's part (num_tasks,).
-            least: What each could become at best, its part (num_tasks,).
-            parameters: The shared weights.
-
-        Returns:
-            A number to be told, divided by the processes that will sum it, as they will the gradients.
-        """
-
-    def learn(self, above: Callable[[], Tensor]) -> None:  # noqa: B027
-        """What follows a step; ``above`` tells how far each loss is above its least now, this process's part."""
-
-    def parts(self) -> Parts:
-        """What a checkpoint holds of it, by name."""
-        return {}
-
-
-class GradientBalance(Balance):
-    """Makes one gradient of the tasks' gradients; costs a backward pass for each.
-
-    Args:
-        combine: Gradients (num_tasks, P) to one (P,) and the share of pairs of tasks in conflict.
-    """
-
-    tag = "Policy/conflicts"
-
-    def __init__(self, combine: Callable[[Tensor], tuple[Tensor, Tensor]]):
-        self.combine = combine
-
-    def backward(self, losses: Tensor, least: Tensor, parameters: Sequence[nn.Parameter]) -> Tensor:
-        """As in the base."""
-        gradient, apart = self.combine(all_sum(per_task_gradients(losses, parameters)))
-        for parameter, part in zip(parameters, gradient.split([p.numel() for p in parameters]), strict=True):
-            # All processes have the whole of it, and sum it.
-            parameter.grad = part.view_as(parameter) / world_size()
-        return apart / world_size()
-
-
-class LossBalance(Balance):
-    """Weighs the losses; costs another forward pass."""
-
-    tag = "Policy/largest_weight"
-
-    def __init__(self, famo: Famo):
-        self.famo = famo
-
-    def backward(self, losses: Tensor, least: Tensor, parameters: Sequence[nn.Parameter]) -> Tensor:
-        """As in the base."""
-        weights = self.famo.weights(all_sum((losses - least).detach()))
-        (weights * losses).sum().backward(retain_graph=True)
-        return weights.max() / len(weights) / world_size()
-
-    def learn(self, above: Callable[[], Tensor]) -> None:
-        """As in the base."""
-        self.famo.learn(lambda: all_sum(above()))
-
-    def parts(self) -> Parts:
-        """As in the base."""
-        return self.famo.parts()
-
-
 def balance_of(config: Any, num_tasks: int, device: torch.device) -> Balance | None:
     """What a config's ``gradient_surgery`` names; None: the losses are summed."""
     if config.gradient_surgery == "pcgrad":
@@ -236,5 +217,5 @@ def balance_of(config: Any, num_tasks: int, device: torch.device) -> Balance | N
     if config.gradient_surgery == "cagrad":
         return GradientBalance(partial(conflict_averse, radius=config.cagrad_radius))
     if config.gradient_surgery == "famo":
-        return LossBalance(Famo(num_tasks, config.famo_rate, config.famo_decay, device))
+        return Famo(num_tasks, config.famo_rate, config.famo_decay, device)
     return None
