@@ -9,7 +9,7 @@ import numpy as np
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import by_kind, run_kind
 from bidex_meta.evaluation.statistics import bootstrap_band
-from bidex_meta.record.curves import Curve
+from bidex_meta.record.plots import Curve
 from bidex_meta.record.stored import Run
 
 _POINTS = 200
