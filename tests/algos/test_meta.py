@@ -231,7 +231,7 @@ def test_save_load_resume_is_bit_equal(kind: Any, config: Any, slice_steps: int 
         config, slice_steps=slice_steps, tasks_per_class=3, max_adapt_steps=30, normalise_observations=True,
         step_sizes=sizes,
     )  # fmt: skip
-    mode = kind.autoreset({"slice_steps": slice_steps})
+    mode = kind.autoreset_mode(replace(config, slice_steps=slice_steps))
     assert mode == ("DISABLED" if slice_steps is None else "SAME_STEP")
     resumed(lambda seed: kind(PointGoals(rows=12, autoreset_mode=mode), config, seed))
 
