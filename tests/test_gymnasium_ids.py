@@ -12,8 +12,8 @@ import torch
 from gymnasium.utils.env_checker import check_env
 
 import bidex_meta
+from bidex_meta.clients.gymnasium_ids import register_ids, suite_ids, task_id
 from bidex_meta.errors import BidexError
-from bidex_meta.registration import register_ids, suite_ids, task_id
 from bidex_meta.tasks import registry
 
 ROOT = Path(__file__).parents[1]

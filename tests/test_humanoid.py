@@ -12,8 +12,8 @@ from bidex_meta.clients.humanoid_world import NAME, HumanoidWorld
 from bidex_meta.commands import watching
 from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder
-from bidex_meta.sources import Source
-from bidex_meta.sources.humanoid_task import HUMANOID
+from bidex_meta.worlds import Worlds
+from bidex_meta.worlds.foreign import HUMANOID
 
 
 def test_as_gymnasiums() -> None:
@@ -96,7 +96,7 @@ def test_there_are_no_pictures_of_it(
 
 
 def test_no_other_split() -> None:
-    source = Source.open({"task": HUMANOID})
+    source = Worlds.open({"task": HUMANOID})
     assert source.splits == ["train"] and source.references() == {}
     for ask in (lambda: source.world("test"), source.task_classes):
         with pytest.raises(BidexError, match=HUMANOID):

@@ -44,8 +44,8 @@ ORDER = (
 LEVEL = {room: level for level, rooms in enumerate(ORDER) for room in rooms}
 
 MUTUAL = {
-    ("bidex_meta.sources.metaworld_suite", "bidex_meta.sources.source"),  # Source.open chooses among its kinds
-    ("bidex_meta.sources.humanoid_task", "bidex_meta.sources.source"),
+    ("bidex_meta.worlds.metaworld_suite", "bidex_meta.worlds.own"),  # Worlds.open chooses among its kinds
+    ("bidex_meta.worlds.foreign", "bidex_meta.worlds.own"),
     ("bidex_meta.world.rendering", "bidex_meta.world.world"),  # rendering names World in an annotation only
 }
 """Modules that import each other all the same."""

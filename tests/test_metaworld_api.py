@@ -21,9 +21,9 @@ from metaworld import evaluation as original_evaluation
 
 import bidex_meta.metaworld as ours
 from bidex_meta import Benchmark, Task
-from bidex_meta.envs.suite_env import SuiteEnv
 from bidex_meta.errors import BidexError
 from bidex_meta.metaworld import evaluation as our_evaluation
+from bidex_meta.world.single_env import SuiteEnv
 
 BOTH = pytest.mark.parametrize(
     ("metaworld", "name"), [(original, "reach-v3"), (ours, "HandOver")], ids=["metaworld", "bidex-meta"]

@@ -16,12 +16,12 @@ from torch import Tensor
 
 from bidex_algos.onpolicy.mtppo import MTPPO, PRESETS, MTPPOConfig
 from bidex_meta.cli import main
-from bidex_meta.clients import metaworld as client
-from bidex_meta.clients import metaworld_world
-from bidex_meta.clients.metaworld_world import MetaWorldWorld, evaluate_all_tasks
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import evaluate
 from bidex_meta.evaluation.untrained import RandomAgent
+from bidex_meta.metaworld import batched
+from bidex_meta.metaworld import library as client
+from bidex_meta.metaworld.batched import MetaWorldWorld, evaluate_all_tasks
 from bidex_meta.record import RunFolder
 from tests.world.play import assert_same, number_of_ends, play
 
@@ -42,13 +42,13 @@ def actions(world: MetaWorldWorld, steps: int, seed: int = 0) -> Tensor:
 @pytest.fixture
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Worlds with episodes of ``SHORT`` steps."""
-    monkeypatch.setattr(metaworld_world, "EPISODE_STEPS", SHORT)
+    monkeypatch.setattr(batched, "EPISODE_STEPS", SHORT)
 
 
 @pytest.fixture
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
     """Worlds with three tasks a class."""
-    monkeypatch.setattr(metaworld_world, "TASKS_PER_CLASS", 3)
+    monkeypatch.setattr(batched, "TASKS_PER_CLASS", 3)
 
 
 class Scripts:

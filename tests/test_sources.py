@@ -1,4 +1,4 @@
-"""``Source.open``: own suites, single classes and Meta-World's suites answer the same questions."""
+"""``Worlds.open``: own suites, single classes and Meta-World's suites answer the same questions."""
 
 import re
 from pathlib import Path
@@ -9,7 +9,7 @@ import pytest
 from bidex_meta import paths
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.untrained import ZeroAgent
-from bidex_meta.sources import Source
+from bidex_meta.worlds import Worlds
 
 CORE = Path(paths.__file__).parent
 
@@ -37,7 +37,7 @@ WORLDS: list[Any] = [
 
 @pytest.mark.parametrize(("named", "expected"), WORLDS, indirect=["named"])
 def test_worlds_of_each_split(named: dict[str, Any], expected: dict[str, tuple[int, ...]]) -> None:
-    source = Source.open(named)
+    source = Worlds.open(named)
     assert source.name == (named.get("suite") or named["task"])
     assert source.splits == list(expected)
     for split, (slots, tasks, rows, observations, actions) in expected.items():
@@ -54,14 +54,14 @@ def test_worlds_of_each_split(named: dict[str, Any], expected: dict[str, tuple[i
 
 
 def test_tasks_are_called_as_the_suite_file_calls_them() -> None:
-    ml1 = Source.open({"suite": "ML1"})
+    ml1 = Worlds.open({"suite": "ML1"})
     assert ml1.tasks("train") == {"CatchUnderarm": ["original", "left", "right"]}
-    assert ml1.tasks("test") == {"CatchUnderarm": ["back"]} and Source.open({"suite": "MT4"}).tasks("test") == {}
+    assert ml1.tasks("test") == {"CatchUnderarm": ["back"]} and Worlds.open({"suite": "MT4"}).tasks("test") == {}
 
 
 def test_defaults_follow_the_source() -> None:
     own, alone, foreign = (
-        Source.open(config) for config in ({"suite": "ML1"}, {"task": "HandOver"}, {"suite": "metaworld/MT10"})
+        Worlds.open(config) for config in ({"suite": "ML1"}, {"task": "HandOver"}, {"suite": "metaworld/MT10"})
     )
     assert [s.hides_goals for s in (own, alone, foreign)] == [True, False, False]
     assert [s.on_gpu for s in (own, alone, foreign)] == [True, True, False]
@@ -73,13 +73,13 @@ def test_defaults_follow_the_source() -> None:
 
 
 def test_references_are_of_moving_bases() -> None:
-    assert Source.open({"suite": "MT4"}).references().keys() >= {"CatchUnderarm"}
-    assert Source.open({"task": "HandOver"}).references() == {} == Source.open({"suite": "metaworld/MT3"}).references()
-    assert Source.open({"task": "HandOver", "base": "moving"}).references()
+    assert Worlds.open({"suite": "MT4"}).references().keys() >= {"CatchUnderarm"}
+    assert Worlds.open({"task": "HandOver"}).references() == {} == Worlds.open({"suite": "metaworld/MT3"}).references()
+    assert Worlds.open({"task": "HandOver", "base": "moving"}).references()
 
 
 def test_a_policy_is_judged_on_every_task_of_its_slots() -> None:
-    source = Source.open({"task": "Switch", "threads": 1})
+    source = Worlds.open({"task": "Switch", "threads": 1})
     world = source.world()
     found = source.judge(ZeroAgent(world.action_space), world, 1, seed=3)
     world.close()
@@ -97,7 +97,7 @@ def test_a_policy_is_judged_on_every_task_of_its_slots() -> None:
 )
 def test_an_unknown_name_is_one_line(config: dict[str, Any], told: str) -> None:
     with pytest.raises(BidexError) as error:
-        Source.open(config)
+        Worlds.open(config)
     assert str(error.value).startswith(told) and "\n" not in str(error.value)
 
 
@@ -113,7 +113,7 @@ def test_an_unknown_name_is_one_line(config: dict[str, Any], told: str) -> None:
 )
 def test_a_world_that_cannot_be_is_refused(config: dict[str, Any], split: str, told: str) -> None:
     with pytest.raises(BidexError) as error:
-        Source.open(config).world(split)
+        Worlds.open(config).world(split)
     assert told in str(error.value) and "\n" not in str(error.value)
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from bidex_meta.benchmark import make_task_world
+from bidex_meta.clients.gymnasium_ids import check_render_mode
 from bidex_meta.errors import BidexError
-from bidex_meta.registration import check_render_mode
 
 
 class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):

@@ -11,7 +11,7 @@ import tyro
 
 from bidex_meta.commands.parsing import Switch, parse
 from bidex_meta.errors import BidexError
-from bidex_meta.sources import Source
+from bidex_meta.worlds import Worlds
 
 if TYPE_CHECKING:
     from bidex_meta.evaluation.control_arms import Control
@@ -68,7 +68,7 @@ def main(arguments: Sequence[str]) -> None:
     metatest.check_numbers(flags, "trials", "episodes", "shots", "rollouts", "num_envs")
     folders = [RunFolder.open(path) for path in flags.runs]
     config = folders[0].config(*_NEEDED)
-    source = Source.open(config)
+    source = Worlds.open(config)
     _check(folders)
     played = [_play(folder, flags) for folder in folders]
     classes = played[0].own.classes
@@ -100,7 +100,7 @@ def _check(folders: "Sequence[RunFolder]") -> None:
             raise BidexError(
                 f"{folder.path}: {config['algo']} does not adapt to tasks. Name runs of maml, promp or rl2."
             )
-        metatest.check_source(Source.open(config), config["algo"])
+        metatest.check_source(Worlds.open(config), config["algo"])
         kinds.append(run_kind(config))
         if (seed := config["seed"]) in seeds:
             raise BidexError(f"{folder.path} and {seeds[seed]} both have seed {seed}. Name one run for each seed.")
@@ -125,8 +125,8 @@ def _play(folder: "RunFolder", flags: ControlFlags) -> "Control":
     from bidex_meta.world.threads import set_up_torch
 
     config = folder.config(*_NEEDED)
-    device = resolve_device(flags.device, Source.open(config).on_gpu)
-    source = Source.open({**config, "device": device, "engine": flags.engine})
+    device = resolve_device(flags.device, Worlds.open(config).on_gpu)
+    source = Worlds.open({**config, "device": device, "engine": flags.engine})
     set_up_torch(config["threads"])
     counts = [len(pool) for pool in source.tasks("test").values()]
     rollouts = metatest.rollouts_of(source, config, flags.rollouts, max(1, flags.num_envs // len(counts)))

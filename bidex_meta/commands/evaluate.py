@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from bidex_meta.commands.parsing import RunPath, Switch, parse
 from bidex_meta.errors import BidexError
-from bidex_meta.sources import Source
+from bidex_meta.worlds import Worlds
 
 
 @dataclass(frozen=True)
@@ -68,9 +68,9 @@ def main(arguments: Sequence[str]) -> None:
 
     folder = RunFolder.open(flags.run)
     stored = folder.config("learner", "num_envs", "threads")
-    device = resolve_device(flags.device, Source.open(stored).on_gpu)
+    device = resolve_device(flags.device, Worlds.open(stored).on_gpu)
     config = {**stored, "device": device, "engine": flags.engine}
-    source = Source.open(config)
+    source = Worlds.open(config)
     set_up_torch(config["threads"])
     kind = learner_kind(stored["algo"])
     if kind.adapts:
@@ -106,7 +106,7 @@ def _refuse_adaptation(flags: EvaluateFlags, algo: str) -> None:
         raise BidexError(f"{algo} does not adapt to tasks: its splits are shown one by one. Use --split train or test.")
 
 
-def _meta_test(flags: EvaluateFlags, folder: Any, config: dict[str, Any], source: Source) -> None:
+def _meta_test(flags: EvaluateFlags, folder: Any, config: dict[str, Any], source: Worlds) -> None:
     import sys
 
     from bidex_meta.commands import metatest

@@ -8,7 +8,7 @@ from bidex_meta.agents import Agent
 from bidex_meta.commands.learners import learner_kind
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import EVALUATION_SEED
-from bidex_meta.sources import Source
+from bidex_meta.worlds import Worlds
 
 SHOTS = 1
 """Shots where nobody says otherwise."""
@@ -44,7 +44,7 @@ class Options:
 
 
 def meta_test(
-    source: Source,
+    source: Worlds,
     config: dict[str, Any],
     load: Callable[[], Agent],
     options: Options,
@@ -105,7 +105,7 @@ def meta_test(
     return found
 
 
-def rollouts_of(source: Source, config: dict[str, Any], asked: int | None, rows: int) -> int:
+def rollouts_of(source: Worlds, config: dict[str, Any], asked: int | None, rows: int) -> int:
     """Episodes of each task in a shot.
 
     Args:
@@ -119,7 +119,7 @@ def rollouts_of(source: Source, config: dict[str, Any], asked: int | None, rows:
     return min(rollouts, rows) if learner_kind(config["algo"]).adapts_by_row else rollouts
 
 
-def trained_rollouts(source: Source, config: dict[str, Any]) -> int:
+def trained_rollouts(source: Worlds, config: dict[str, Any]) -> int:
     """Episodes of each task that the run's learner adapted to."""
     if "tasks_per_class" not in config["learner"]:
         return ROLLOUTS
@@ -140,7 +140,7 @@ def check_numbers(options: Any, *names: str) -> None:
             raise BidexError(f"--{name.replace('_', '-')} must be at least 1, not {number}.")
 
 
-def check_source(source: Source, algo: str) -> None:
+def check_source(source: Worlds, algo: str) -> None:
     """Refuse a source on which there is no meta-test.
 
     Raises:
@@ -153,7 +153,7 @@ def check_source(source: Source, algo: str) -> None:
         )
 
 
-def splits_of(source: Source, asked: str) -> list[str]:
+def splits_of(source: Worlds, asked: str) -> list[str]:
     """The splits that a meta-test plays.
 
     Args:

@@ -22,9 +22,9 @@ from bidex_meta.memory import POINT_BYTES, ROW_BYTES, check_memory
 from bidex_meta.reading import absolute
 from bidex_meta.record.folder import RunFolder, flat
 from bidex_meta.record.stopping import ENDS
-from bidex_meta.sources import Source
 from bidex_meta.suite import MOST_POINTS
 from bidex_meta.train.launch import launch, resume_command
+from bidex_meta.worlds import Worlds
 
 _MAY_CHANGE = ("steps", "minutes", "evaluate_every", "video_every", "logger", *ENDS)
 """What a resumed run may be given anew: nothing of it changes what is learned."""
@@ -142,9 +142,9 @@ class RunPlan:
     """Why this preset."""
 
     @cached_property
-    def source(self) -> Source:
+    def source(self) -> Worlds:
         """Where this process's worlds come from."""
-        return Source.open({**self.config, "device": launch().own_device(self.config["device"])})
+        return Worlds.open({**self.config, "device": launch().own_device(self.config["device"])})
 
 
 def plan_run(arguments: Sequence[str]) -> RunPlan:
@@ -170,8 +170,8 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     suite, task = suite or implied.get("suite"), task or implied.get("task")
     # Where neither is named, `run --help` still has defaults to show; without --help _resolved refuses it.
     thing = peek(arguments, "--object") or stored.get("object") or implied.get("object")
-    source = Source.open({"suite": suite or (None if task else _EXAMPLE), "task": task, "object": thing})
-    alone = getattr(source, "class_name", None)
+    source = Worlds.open({"suite": suite or (None if task else _EXAMPLE), "task": task, "object": thing})
+    alone = source.class_name
     kind = learner_kind(peek(arguments, "--algo") or stored.get("algo", RunFlags.algo), alone)
     device = resolve_device(peek(arguments, "--device") or stored.get("device", RunFlags.device), source.on_gpu)
     asked = peek(arguments, "--preset") or stored.get("preset", RunFlags.preset)
@@ -188,7 +188,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     data["task_seed"] = stored.get("task_seed", run_offline.task_seed(datasets))
     config = _resolved(flags, names, device, stored, data)
     _check_meta_test(flags, kind)
-    run_demonstrations.check(kind, config["demonstrations"], Source.open(config))
+    run_demonstrations.check(kind, config["demonstrations"], Worlds.open(config))
     if folder:
         _refuse_changes(stored, config, folder)
     return RunPlan(flags, kind, flags.learner, config, folder, reason)

@@ -8,7 +8,7 @@ from bidex_meta.commands.learners import ALGOS, LearnerKind, learner_kind
 from bidex_meta.commands.parsing import peek_all
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.reading import absolute, expanded
-from bidex_meta.sources import Source
+from bidex_meta.worlds import Worlds
 
 
 def listed(kept: str | Sequence[str] | None) -> tuple[str, ...]:
@@ -26,7 +26,7 @@ def named(arguments: Sequence[str], stored: Mapping[str, Any]) -> str | list[str
     return names if len(names) > 1 else names[0] if names else None
 
 
-def check(kind: LearnerKind, kept: str | Sequence[str] | None, source: Source) -> None:
+def check(kind: LearnerKind, kept: str | Sequence[str] | None, source: Worlds) -> None:
     """Refuses, before a world is made, what could not be imitated in it; reads the data sets' metadata alone.
 
     Raises:
@@ -45,7 +45,7 @@ def check(kind: LearnerKind, kept: str | Sequence[str] | None, source: Source) -
         _check_dataset(open_dataset(name), source)
 
 
-def _check_dataset(dataset: Any, source: Source) -> None:
+def _check_dataset(dataset: Any, source: Worlds) -> None:
     classes = source.task_classes()
     for slot in dataset.metadata["tasks"]:
         known_name(f"class in {source.name} of", slot.partition("/")[0], classes)
@@ -58,7 +58,7 @@ def _check_dataset(dataset: Any, source: Source) -> None:
         )
 
 
-def check_goals(dataset: Any, source: Source) -> None:
+def check_goals(dataset: Any, source: Worlds) -> None:
     """Refuses data that do not show the goals which the source shows; what it hides, they may show.
 
     Raises:

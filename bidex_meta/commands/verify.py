@@ -10,7 +10,7 @@ from typing import Any
 from bidex_meta.commands.parsing import RunPath, Switch, parse
 from bidex_meta.errors import EXIT_FAILED, BidexError, one_line
 from bidex_meta.reading import exists
-from bidex_meta.sources import Source
+from bidex_meta.worlds import Worlds
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def main(arguments: Sequence[str]) -> None:
     recorded = recorded_evaluation(folder.path, flags.evaluation)
     then = recorded_conditions(recorded, read_versions(folder.path), config)
     config |= _place(flags, then, config)
-    source = Source.open(config)
+    source = Worlds.open(config)
     set_up_torch(config["threads"])
     rows = then["num_envs"] if flags.num_envs is None else flags.num_envs
     state, step = _checkpoint(folder, recorded["steps"])
@@ -118,7 +118,7 @@ def _place(flags: VerifyFlags, then: dict[str, Any], config: dict[str, Any]) -> 
     """Device and engine to evaluate with."""
     from bidex_meta.commands.learners import resolve_device
 
-    on_gpu = Source.open(config).on_gpu
+    on_gpu = Worlds.open(config).on_gpu
     try:
         device = resolve_device(then["device"] if flags.device == "auto" else flags.device, on_gpu)
     except BidexError:
@@ -154,7 +154,7 @@ def _checkpoint(folder: Any, steps: int) -> tuple[dict[str, Any], int]:
 
 
 def _again(
-    folder: Any, config: dict[str, Any], source: Source, recorded: dict[str, Any], rows: int | None, state: Any
+    folder: Any, config: dict[str, Any], source: Worlds, recorded: dict[str, Any], rows: int | None, state: Any
 ) -> dict[str, Any]:
     """The recorded evaluation, made again."""
     from bidex_meta.commands.learners import learner_kind

@@ -10,7 +10,7 @@ from typing import ClassVar, Literal
 
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import BidexError, known_name
-from bidex_meta.suite import ReadOnly, Split, Suite, SuiteClass
+from bidex_meta.suite import Split, Suite, SuiteClass
 from bidex_meta.tasks import registry
 
 _TASKS = 50
@@ -104,7 +104,7 @@ class ML20(Benchmark):
 
 
 def _suite(name: str, observation: Literal["plain", "one-hot", "masked"], classes: dict[Split, Sequence[str]]) -> Suite:
-    """A suite that no file says, of the given classes by split."""
+    """A suite without a file, of the given classes by split."""
     splits: dict[str, tuple[Split, ...]] = {}
     for split, given in classes.items():
         for entry in _named(given):
@@ -121,7 +121,7 @@ def _suite(name: str, observation: Literal["plain", "one-hot", "masked"], classe
         reward="paper",
         base="moving",
         tasks_per_class=_TASKS,
-        classes=tuple(SuiteClass(entry, entry, where, 1.0, None, (), ReadOnly({})) for entry, where in splits.items()),
+        classes=tuple(SuiteClass(entry, entry, where, 1.0, None, (), {}) for entry, where in splits.items()),
         file=Path(f"metaworld.{name}"),
     )
 

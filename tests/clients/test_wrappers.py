@@ -18,7 +18,7 @@ from gymnasium.wrappers import vector as wrap
 
 import bidex_meta  # noqa: F401
 from bidex_meta.errors import BidexError
-from bidex_meta.world.numpy_form import NumpyWorld
+from bidex_meta.world.wrapper import NumpyWorld
 from tests.clients.test_adapters import ROWS, points
 from tests.world.play import class_world, suite_world
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from bidex_meta.engine.cpu import CpuEngine
-from bidex_meta.engine.structure import differing_fields, same_structure
+from bidex_meta.engine.models import differing_fields, same_structure
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import Scene, build_spec, compile_scene
 from bidex_meta.world.groups import build_groups, split_rows

@@ -12,7 +12,7 @@ from bidex_meta.hands.units import UNITS, partition_line
 from bidex_meta.tasks import registry
 from bidex_meta.world.agent_views import agent_views, joint_action
 from bidex_meta.world.contract import plain_groups
-from bidex_meta.world.observation_groups import observation_groups
+from bidex_meta.world.observations import observation_groups
 from tests.tasks.worlds import engine_of, observe, scene_of, world_of
 from tests.world.play import suite_world
 

@@ -11,7 +11,7 @@ import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from torch import Tensor
 
-from bidex_meta.clients.metaworld_world import MetaWorldWorld
+from bidex_meta.metaworld.batched import MetaWorldWorld
 from bidex_meta.world import World
 from tests.points import PointWorld, ring
 from tests.world.play import ENDS, class_world, random_actions, suite_world

@@ -4,7 +4,7 @@ from torch import Tensor
 from bidex_meta.tasks import registry
 from bidex_meta.world import World
 from bidex_meta.world.contract import ObservationGroup
-from bidex_meta.world.observation_groups import observation_groups
+from bidex_meta.world.observations import observation_groups
 from tests.world.play import class_world, random_actions, suite_world
 
 HANDS = {"right_hand": [(0, 199)], "left_hand": [(199, 398)]}

@@ -11,7 +11,7 @@ from torch.utils._pytree import tree_leaves
 
 from bidex_meta.engine.cpu import CpuEngine
 from bidex_meta.world import World, world
-from bidex_meta.world.recording import Recorder, fresh
+from bidex_meta.world.graphs import Recorder, fresh
 from tests.world.play import assert_same, number_of_ends, play, random_actions, suite_world
 from tests.world.test_masked import MaskedEngine, at_work
 

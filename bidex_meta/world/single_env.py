@@ -1,6 +1,6 @@
 """One environment of a task class as a suite has it: `env = cls()`, `env.set_task(task)`, as with Meta-World's classes.
 
-One row of a world at a time: for code that is written so. All rows of a suite at once are `Benchmark.make_world`.
+For code that is written so; all environments of a suite at once are `Benchmark.make_world`.
 """
 
 import copyreg
@@ -14,10 +14,12 @@ import torch
 from gymnasium.spaces import Box
 
 from bidex_meta.errors import BidexError
+from bidex_meta.points.sight import PointsRule
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import CONTROL_RATE, TaskClass
-from bidex_meta.world import PointsRule, Slot, World
+from bidex_meta.world.groups import Slot
 from bidex_meta.world.rendering import CAMERAS
+from bidex_meta.world.world import World
 
 _FAR = 2**31
 
@@ -211,9 +213,9 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
         success = bool(info["success"])
         lost = bool(terminated) or (self.terminate_on_success and success)
         self._over = lost or bool(truncated)
-        told = {"success": float(success), "unscaled_reward": float(info["reward_unscaled"])}
-        told["unstable"] = bool(info["unstable"])
-        return _array(obs), float(reward), lost, bool(truncated) and not lost, told
+        step_info = {"success": float(success), "unscaled_reward": float(info["reward_unscaled"])}
+        step_info["unstable"] = bool(info["unstable"])
+        return _array(obs), float(reward), lost, bool(truncated) and not lost, step_info
 
     def toggle_terminate_on_success(self, on: bool) -> None:
         """Whether an episode ends at its first success."""

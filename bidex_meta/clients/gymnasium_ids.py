@@ -39,7 +39,7 @@ def register_ids() -> None:
             if env_id not in gymnasium.registry:
                 gymnasium.register(
                     env_id,
-                    vector_entry_point="bidex_meta.registration:make_suite_world",
+                    vector_entry_point="bidex_meta.clients.gymnasium_ids:make_suite_world",
                     kwargs={"suite": name, "split": split},
                 )
     for kind in ("mt", "ml"):
@@ -50,7 +50,7 @@ def register_ids() -> None:
             gymnasium.register(
                 task_id(name),
                 entry_point="bidex_meta.clients.gymnasium_env:TaskEnv",
-                vector_entry_point="bidex_meta.registration:make_class_world",
+                vector_entry_point="bidex_meta.clients.gymnasium_ids:make_class_world",
                 kwargs={"task_name": name},
             )
 

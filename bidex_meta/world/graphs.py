@@ -1,10 +1,10 @@
-"""Torch work of a step, recorded once and replayed: launched one by one, it would outlast an accelerator's physics.
+"""How a step keeps an accelerator busy: engines side by side on streams, torch's work as CUDA graphs.
 
-The state that a stretch of work reads and leaves behind lives in tensors of fixed place. What it returns does, too, and
-is overwritten by the next replay of the same stretch.
+Launched one by one, torch's kernels would take longer than the physics. The state that a stretch of work reads and
+leaves behind lives in tensors at fixed addresses; so does what it returns, which its next replay overwrites.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -30,7 +30,7 @@ def cuda_graph(work: Callable[[], Any]) -> tuple[Callable[[], None], Any]:
     return graph.replay, result
 
 
-class Recorder:
+class GraphCache:
     """Stretches of a step by name, over one state.
 
     A stretch is recorded with the tensors that its closures hold at that time: ``forget`` after changing any but the
@@ -107,3 +107,37 @@ def fresh(result: Any) -> Any:
         return copies[id(value)]
 
     return tree_map_only(Tensor, copy, result)
+
+
+class SideBySide:
+    """Runs jobs one after the other on a CPU, at the same time on a GPU."""
+
+    def __init__(self, jobs: int, device: torch.device) -> None:
+        """Makes the streams.
+
+        Args:
+            jobs: The most jobs at a time.
+            device: Where they run.
+        """
+        several = device.type == "cuda" and jobs > 1
+        self._streams = [torch.cuda.Stream(device) for _ in range(jobs)] if several else []
+
+    def run(self, jobs: Sequence[Callable[[], None]]) -> Iterator[int]:
+        """Does the jobs; gives their numbers, in order, as each is done. To be used up.
+
+        On CUDA what comes after in the caller's stream waits for them all, and they for what came before. What they
+        read must live until this ends.
+        """
+        if not self._streams:
+            for number, job in enumerate(jobs):
+                job()
+                yield number
+            return
+        caller = torch.cuda.current_stream()
+        for stream, job in zip(self._streams, jobs, strict=True):
+            stream.wait_stream(caller)
+            with torch.cuda.stream(stream):
+                job()
+        for stream in self._streams:
+            caller.wait_stream(stream)
+        yield from range(len(jobs))

@@ -1,7 +1,7 @@
-"""Meta-World's MT suites as a world: single environments of a foreign library behind the face of ``bidex_meta.World``.
+"""Meta-World's MT suites as a world: single environments of another library behind ``BatchedWorld``.
 
 Our learners, evaluation and checkpoints run on it unchanged: a cross-check on tasks, rewards and physics that no one
-here wrote. Rows are stepped one after the other, since each is an environment of its own; it is not fast.
+here wrote. Environments are stepped one after the other; it is not fast.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,30 +13,30 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from bidex_meta.agents import Agent
-from bidex_meta.clients.foreign_world import ForeignWorld, Sizes, Transition
-from bidex_meta.clients.metaworld import (
+from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.evaluation.play import check_world, play_tasks
+from bidex_meta.evaluation.results import Evaluation, results_by_class
+from bidex_meta.metaworld.library import (
     ACTION_SIZE,
     EPISODE_STEPS,
     OBSERVATION_SIZE,
     TASKS_PER_CLASS,
     Single,
-    class_names,
     make_tasks,
 )
-from bidex_meta.errors import BidexError, unknown_name
-from bidex_meta.evaluation.play import check_world, play_tasks
-from bidex_meta.evaluation.results import Evaluation, results_by_class
-from bidex_meta.world.checked import fits
+from bidex_meta.suite import metaworld_classes
+from bidex_meta.world.base import Transition
+from bidex_meta.world.checks import fits
 from bidex_meta.world.contract import PooledWorld
+from bidex_meta.world.foreign import ForeignWorld, Sizes
 
 
 class MetaWorldWorld(ForeignWorld):
-    """A suite of Meta-World's with ``num_envs`` rows, split evenly and contiguously over its classes, on the CPU.
+    """A suite of Meta-World's on the CPU: a ``contract.PooledWorld`` whose slots are the classes.
 
     Observations are Meta-World's 39 numbers (goal visible) with the class's one-hot behind them; rewards its "v2" in
     [0, 10]; an episode is 500 steps, ended by the time limit alone. Starts are part of Meta-World's tasks: an episode
-    depends on its task and actions alone. A ``contract.PooledWorld`` whose slots are the classes; a task's variation is
-    its number among the class's fifty.
+    depends on its task and actions alone. A task's variation is its number among the class's fifty.
     """
 
     def __init__(
@@ -48,24 +48,25 @@ class MetaWorldWorld(ForeignWorld):
         autoreset_mode: str | AutoresetMode | None = None,
         stagger: bool = True,
     ) -> None:
-        """Makes the environments; no row is started before ``reset``.
+        """Makes the environments; none is started before ``reset``.
 
         Args:
-            suite: A key of ``clients.metaworld.SUITES``.
-            num_envs: Rows over all classes, at least one for each.
-            seed: Chooses Meta-World's tasks, and the draws of tasks until ``reset(seed=...)`` says otherwise.
+            suite: A key of ``suite.METAWORLD_SUITES``.
+            num_envs: Environments over all classes, at least one for each.
+            seed: Chooses Meta-World's tasks, and the draws of tasks until ``reset(seed=...)`` gives another.
             autoreset_mode: SAME_STEP (training) or DISABLED (evaluation), as a member or its name.
             stagger: As in ``bidex_meta.World``.
 
         Raises:
-            BidexError: Unknown suite or mode, too few rows, or Meta-World is not installed.
+            BidexError: Unknown suite or mode, too few environments, or Meta-World is not installed.
         """
         self.suite = suite
         sizes = Sizes(OBSERVATION_SIZE, ACTION_SIZE, EPISODE_STEPS)
-        super().__init__(class_names(suite), num_envs, sizes, seed, autoreset_mode, stagger)
+        super().__init__(metaworld_classes(suite), num_envs, sizes, seed, autoreset_mode, stagger)
         self._task_seed, self._tasks = seed, make_tasks(suite, seed)
         self._singles = [Single(self.task_names[i]) for i in self.task_id.tolist()]
         self._actions = torch.zeros(num_envs, EPISODE_STEPS, ACTION_SIZE)  # of the running episodes, for checkpoints
+        self._pools: dict[str, list[int]] = {}
         self.set_tasks({name: range(TASKS_PER_CLASS) for name in self.task_names})
 
     def set_tasks(self, pools: Mapping[str, Sequence[int] | np.ndarray]) -> None:
@@ -77,7 +78,7 @@ class MetaWorldWorld(ForeignWorld):
         Raises:
             BidexError: Unknown class, an empty pool, a wrong shape or a number out of range.
         """
-        chosen = dict(getattr(self, "_pools", {}))
+        chosen = dict(self._pools)
         for name, pool in pools.items():
             if name not in self.task_names:
                 raise unknown_name(f"class of {self.suite}", name, self.task_names)
@@ -96,7 +97,7 @@ class MetaWorldWorld(ForeignWorld):
         """Numbers of the tasks of each class, each (n, 1), int64."""
         return [np.array(self._pools[name])[:, None] for name in self.task_names]
 
-    def _start(self, mask: Tensor) -> None:
+    def _place(self, mask: Tensor) -> None:
         for row in mask.nonzero().squeeze(1).tolist():
             self._obs[row, :OBSERVATION_SIZE] = torch.from_numpy(self._singles[row].start(self._task(row)))
 
@@ -104,7 +105,8 @@ class MetaWorldWorld(ForeignWorld):
         name = self.task_names[self.task_id[row]]
         return self._tasks[name][self._pools[name][self.task_index[row]]]
 
-    def _advance(self, action: Tensor, active: Tensor, broken: Tensor) -> Transition:
+    def _advance(self, active: Tensor, broken: Tensor) -> Transition:
+        action = self._action
         self._actions[active, self.episodes.length[active]] = action[active]
         obs, reward, success, unstable = self._obs.clone(), torch.zeros(self.num_envs), self._success & ~active, broken
         numbers = action.numpy()
@@ -115,7 +117,7 @@ class MetaWorldWorld(ForeignWorld):
                 continue
             obs[row, :OBSERVATION_SIZE] = torch.from_numpy(new)
             reward[row], success[row] = gained, reached
-        return Transition(obs, reward, success, torch.zeros_like(unstable), unstable)
+        return Transition(obs, reward, success, torch.zeros_like(unstable), unstable, {})
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that decides the future of the world: tensors and plain values, copied."""
@@ -128,13 +130,13 @@ class MetaWorldWorld(ForeignWorld):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Puts back what ``state_dict`` gave, on a world of the same suite, seed and rows.
+        """Puts back what ``state_dict`` gave, on a world of the same suite, seed and size.
 
         Meta-World's environments keep part of their state in Python attributes and in the model, so each running
-        episode is played again from its start: exact, and a fraction of a second for a row.
+        episode is played again from its start: exact, and a fraction of a second for each.
 
         Raises:
-            BidexError: The state is of another suite, seed or number of rows.
+            BidexError: The state is of another suite, seed or size.
         """
         fits(state, self.state_dict())
         here, there = (self.suite, self._task_seed), (state["suite"], state["task_seed"])
@@ -143,7 +145,7 @@ class MetaWorldWorld(ForeignWorld):
                 f"Expected the state of a world of (suite, seed) = {here}, got {there}; build the world with the same."
             )
         self.set_tasks(state["pools"])
-        super().load_state_dict(state)
+        self._restore(state)
         self._actions = state["actions"].clone()
         # What waits for a reset, or was never started, is not looked at before its next start.
         running = ~self.episodes.finished & (self.episodes.number >= 0)
@@ -161,9 +163,9 @@ class MetaWorldWorld(ForeignWorld):
 def evaluate_all_tasks(
     agent: Agent, world: PooledWorld, episodes_per_task: int = 1, *, seed: int | None = None
 ) -> Evaluation:
-    """``evaluate`` over all tasks of all classes, as many at a time as the world has rows for.
+    """``evaluate`` over all tasks of all classes, as many at a time as the world has environments.
 
-    An environment takes some 10 MB, so that a row for each of MT10's five hundred tasks would fill a laptop. Starts are
+    An environment takes some 10 MB: one for each of MT10's five hundred tasks would fill a laptop. Starts are
     part of the tasks: a policy without noise plays every episode of a task alike, and one is enough.
 
     Args:
