@@ -13,7 +13,7 @@ from bidex_meta.commands import watching
 from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder
 from bidex_meta.worlds import Worlds
-from bidex_meta.worlds.foreign import HUMANOID
+from bidex_meta.worlds.external import HUMANOID
 
 
 def test_as_gymnasiums() -> None:

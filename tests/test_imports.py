@@ -20,13 +20,11 @@ ORDER = (
     ("tasks",),
     ("points",),
     ("world",),
-    ("envs",),
     ("evaluation", "benchmark", "train"),
     ("metaworld",),
-    ("registration",),
+    ("clients",),
     ("bidex_meta",),  # the package's own names
-    ("clients", "witness", "data"),
-    ("sources",),
+    ("witness", "data", "worlds"),
     ("speed", "viewer", "report", "sweep"),
     ("bidex_algos.checks", "bidex_algos.choices", "bidex_algos.reports"),
     ("bidex_algos.gradients", "bidex_algos.experience"),
@@ -44,8 +42,8 @@ ORDER = (
 LEVEL = {room: level for level, rooms in enumerate(ORDER) for room in rooms}
 
 MUTUAL = {
-    ("bidex_meta.worlds.metaworld_suite", "bidex_meta.worlds.own"),  # Worlds.open chooses among its kinds
-    ("bidex_meta.worlds.foreign", "bidex_meta.worlds.own"),
+    ("bidex_meta.worlds.base", "bidex_meta.worlds.own"),  # Worlds.open chooses among its kinds
+    ("bidex_meta.worlds.base", "bidex_meta.worlds.external"),
     ("bidex_meta.world.rendering", "bidex_meta.world.world"),  # rendering names World in an annotation only
 }
 """Modules that import each other all the same."""

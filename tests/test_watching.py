@@ -99,7 +99,7 @@ def test_the_best_policy_is_kept_and_judged(toy_worlds, tmp_path, monkeypatch, c
 def test_few_tasks_are_played_ten_times_in_all_and_many_once():
     from bidex_meta.suite import suite_names
     from bidex_meta.worlds import Worlds
-    from bidex_meta.worlds.foreign import HUMANOID
+    from bidex_meta.worlds.external import HUMANOID
 
     shipped = {name: watching.played(Worlds.open({"suite": name}).tasks("train")) for name in suite_names()}
     few = {"MT1": (1, 3), "ML1": (3, 4), "ML1-wide": (3, 4)}

@@ -1,7 +1,8 @@
 """Gymnasium's Humanoid-v5 as a world: its model, observation and reward, many environments on ``mujoco.batch``.
 
-The paper's appendix C compares PPO and SAC over numbers of environments on a humanoid. This is the one that
-everybody has (Gymnasium 1.x, ``gymnasium/envs/mujoco/humanoid_v5.py``, whose constants stand below); starts, actions and steps give its numbers bit for bit, to single precision (``tests/test_humanoid.py``).
+The paper's appendix C compares PPO and SAC over numbers of environments on a humanoid. This is the one that everybody
+has (Gymnasium 1.x, ``gymnasium/envs/mujoco/humanoid_v5.py``, whose constants stand below); starts, actions and steps
+give its numbers bit for bit, to single precision (``tests/clients/test_humanoid_world.py``).
 """
 
 from collections.abc import Mapping
@@ -18,7 +19,7 @@ from bidex_meta.engine.cpu import CpuEngine
 from bidex_meta.errors import BidexError, unknown_name
 from bidex_meta.validation import whole_number
 from bidex_meta.world.base import Transition
-from bidex_meta.world.checks import fits
+from bidex_meta.world.checking import fits
 from bidex_meta.world.foreign import OWN_DRAWS, ForeignWorld, Sizes
 
 NAME = "Humanoid-v5"

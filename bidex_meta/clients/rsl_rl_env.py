@@ -96,8 +96,8 @@ class EpisodeLog:
 
         Returns:
             Values of the environments that ended, (k,), float32, to be averaged; nothing where none did. Of episodes
-            that count `Metrics/success_rate`, `Metrics/return`, `Metrics/length`, `Metrics/success/<task>` and, as sums over
-            an episode, `Episode_Reward/<term>`; of all `Episode_Termination/terminated`, `time_out` and `unstable`.
+            that count `Metrics/success_rate`, `Metrics/return`, `Metrics/length`, `Metrics/success/<task>` and, as sums
+            over an episode, `Episode_Reward/<term>`; of all `Episode_Termination/terminated`, `time_out`, `unstable`.
         """
         ended, counted, world = info["_final_obs"], info["counted"], self._world
         for name, term in info.get("reward_terms", {}).items():

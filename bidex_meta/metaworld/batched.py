@@ -26,7 +26,7 @@ from bidex_meta.metaworld.library import (
 )
 from bidex_meta.suite import metaworld_classes
 from bidex_meta.world.base import Transition
-from bidex_meta.world.checks import fits
+from bidex_meta.world.checking import fits
 from bidex_meta.world.contract import PooledWorld
 from bidex_meta.world.foreign import ForeignWorld, Sizes
 

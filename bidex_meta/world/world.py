@@ -22,7 +22,7 @@ from bidex_meta.points.sight import PointsRule
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.layout import CLIP
 from bidex_meta.validation import whole_number
-from bidex_meta.world import checks
+from bidex_meta.world import checking
 from bidex_meta.world.base import BatchedWorld, Slots, Transition
 from bidex_meta.world.graphs import GraphCache, SideBySide, Work, cuda_graph, fresh
 from bidex_meta.world.groups import Group, Slot, build_groups, sights, with_pool, with_pools
@@ -86,10 +86,10 @@ class World(BatchedWorld):
             BidexError: Fewer environments than slots, unknown device, engine, mode or sampling, too narrow a padding.
         """
         place, make_engine = choose_engine(device, engine, threads)
-        checks.choices(task_sampling, observation, points)
+        checking.choices(task_sampling, observation, points)
         if num_envs is None:
             num_envs = _DEFAULT_SIZES[place.type]
-        num_envs = checks.num_envs(num_envs, len(slots))
+        num_envs = checking.num_envs(num_envs, len(slots))
         if place.type == "cpu":
             needed = num_envs * (ROW_BYTES + (points.count if points else 0) * POINT_BYTES)
             check_memory(needed, f"{num_envs:,} environments", "Lower num_envs.")
@@ -260,7 +260,7 @@ class World(BatchedWorld):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Puts back what ``state_dict`` gave, on a world of the same suite and size; all of it or nothing."""
-        self._set_pools(checks.state(state, self.state_dict(), self.slots, self.task_id))
+        self._set_pools(checking.state(state, self.state_dict(), self.slots, self.task_id))
         self._restore(state)
         self._action = state["action"].to(self.device, copy=True)
         for part, engine in zip(self.parts, state["engines"], strict=True):

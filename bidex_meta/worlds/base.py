@@ -96,18 +96,18 @@ class Worlds(ABC):
         Raises:
             BidexError: Unknown suite or task, with the nearest name; or a faulty suite file.
         """
-        from bidex_meta.worlds import foreign, own
+        from bidex_meta.worlds import external, own
 
         config = WorldConfig.of(config)
         if config.suite is None:
             task = config.task or ""
-            if task.casefold() == foreign.HUMANOID.casefold():
-                return foreign.HumanoidTask(foreign.HUMANOID, config)
+            if task.casefold() == external.HUMANOID.casefold():
+                return external.HumanoidTask(external.HUMANOID, config)
             return own.SingleClass(registry.resolve(task, "task"), config)
         suite = config.suite
         if not suite.endswith(".toml"):
             suite = known_name("suite", suite, suites_to_run())
-        return (foreign.MetaWorldSuite if suite in METAWORLD_SUITES else own.OwnSuite)(suite, config)
+        return (external.MetaWorldSuite if suite in METAWORLD_SUITES else own.OwnSuite)(suite, config)
 
     @abstractmethod
     def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> "PooledWorld":

@@ -9,7 +9,8 @@ from bidex_meta.engine.cpu import CpuEngine
 from bidex_meta.engine.models import differing_fields, same_structure
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import Scene, build_spec, compile_scene
-from bidex_meta.world.groups import build_groups, split_rows
+from bidex_meta.world.base import split_rows
+from bidex_meta.world.groups import build_groups
 from tests.tasks.worlds import CASES, MOVING, slot
 
 ONE_EGG = {(name, True) for name in ("CatchUnderarm", "CatchOver2Underarm", "CatchAbreast")}

@@ -21,7 +21,7 @@ from bidex_meta.record import RunFolder
 from bidex_meta.witness.simulator import task_slot
 from bidex_meta.world import World
 from bidex_meta.world.contract import ObservationGroup
-from bidex_meta.worlds.foreign import HUMANOID
+from bidex_meta.worlds.external import HUMANOID
 from bidex_meta.worlds.own import OwnSuite
 from tests.algos.problems import opposite_bandits
 from tests.data.worlds import rough

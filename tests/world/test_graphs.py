@@ -11,7 +11,7 @@ from torch.utils._pytree import tree_leaves
 
 from bidex_meta.engine.cpu import CpuEngine
 from bidex_meta.world import World, world
-from bidex_meta.world.graphs import Recorder, fresh
+from bidex_meta.world.graphs import GraphCache, fresh
 from tests.world.play import assert_same, number_of_ends, play, random_actions, suite_world
 from tests.world.test_masked import MaskedEngine, at_work
 
@@ -58,7 +58,9 @@ class StillEngine(MaskedEngine):
         return self._told.clone()
 
 
-def taped(recorder: list[Recorder], count: list[int]) -> Callable[[Callable[[], Any]], tuple[Callable[[], None], Any]]:
+def taped(
+    recorder: list[GraphCache], count: list[int]
+) -> Callable[[Callable[[], Any]], tuple[Callable[[], None], Any]]:
     """Records as CUDA does: the work is written down and not done."""
 
     def record(work: Callable[[], Any]) -> tuple[Callable[[], None], Any]:
@@ -81,10 +83,10 @@ def recorded(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str, int], t
             maker = lambda models, of, room: StillEngine(models, of, threads=1)  # noqa: E731
             patch.setattr(world, "choose_engine", lambda *_: (torch.device("cpu"), maker))
             made = suite_world(suite, rows)
-        holder: list[Recorder] = []
+        holder: list[GraphCache] = []
         count: list[int] = []
-        made._recorder = Recorder(made._state, made._put_state, taped(holder, count))
-        holder.append(made._recorder)
+        made._graphs = GraphCache(made._state, made._put_state, taped(holder, count))
+        holder.append(made._graphs)
         return made, count
 
     yield make
@@ -142,7 +144,7 @@ def test_graphs_on_cuda_are_plain_steps() -> None:
     from bidex_meta import Benchmark
 
     plain, graphs = (Benchmark("MT4").make_world("train", num_envs=64, device="cuda:0") for _ in range(2))
-    plain._recorder = None
+    plain._graphs = None
     actions = random_actions(plain, 12)
     for one in (plain, graphs):
         one.reset(seed=0)
@@ -151,4 +153,4 @@ def test_graphs_on_cuda_are_plain_steps() -> None:
         for name in ("obs", "reward", "terminated", "truncated", "info/final_obs", "info/so_far/l"):
             apart = (x[name].float() - y[name].float()).abs().flatten()
             assert apart.quantile(0.95) < 1e-2, name
-    assert graphs._recorder is not None and len(graphs._recorder._recorded) == 4
+    assert graphs._graphs is not None and len(graphs._recorder._recorded) == 4
