@@ -96,7 +96,7 @@ class BatchedWorld(VectorEnv, ABC):
         Raises:
             BidexError: Fewer environments than slots, or an unknown mode.
         """
-        self.num_envs, self.device = checking.num_envs(num_envs, len(slots.names)), device
+        self.num_envs, self.device = checking.num_envs(num_envs, slots.names), device
         self.autoreset_mode = checked_mode(autoreset_mode)
         self.stagger = true_or_false("stagger", stagger)
         self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}

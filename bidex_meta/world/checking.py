@@ -27,15 +27,15 @@ _ROWS = 11
 """Rows that formulas are tried with: as many as no sensor and no block has numbers."""
 
 
-def num_envs(given: object, slots: int) -> int:
-    """The number of environments.
+def num_envs(given: object, slots: Sequence[str]) -> int:
+    """The number of environments of a world with these slots.
 
     Raises:
         BidexError: No whole number, or fewer than slots.
     """
     number = whole_number("num_envs", given, 1, _MOST_ENVIRONMENTS)
-    if number < slots:
-        raise BidexError(f"num_envs: expected at least {slots}, one for each of the suite's classes, got {number}.")
+    if number < len(slots):
+        raise BidexError(f"num_envs: expected at least {len(slots)}, one each for {', '.join(slots)}; got {number}.")
     return number
 
 
@@ -103,9 +103,9 @@ def state(given: Any, own: Mapping[str, Any], slots: Sequence[Slot], task_id: Te
     Raises:
         BidexError: Another world's state, or a damaged one.
     """
-    _check_names("it", given, own)
-    _check_alike(own, given)
     fits(given, own)
+    if given["slots"] != own["slots"]:
+        raise BidexError(f"Expected the state of a world of {own['slots']}, got {shortened(given['slots'])}; {_AGAIN}")
     for name in ("tasks", "engines"):
         if len(given[name]) != len(own[name]):
             raise BidexError(f"Expected {len(own[name])} {name} in a world's state, got others; {_AGAIN}")
@@ -130,7 +130,10 @@ def fits(given: Any, own: Mapping[str, Any], inside: str = "") -> None:
     Raises:
         BidexError: The first difference.
     """
-    _check_names(inside or "it", given, own)
+    if not isinstance(given, Mapping) or not own.keys() <= given.keys():
+        got = sorted(map(str, given)) if isinstance(given, Mapping) else type(given).__name__
+        where = inside or "it"
+        raise BidexError(f"Expected the state of a world with {sorted(own)} in {where}, got {shortened(got)}; {_AGAIN}")
     for name, value in own.items():
         if isinstance(value, Mapping):
             fits(given[name], value, f"{inside}{name}/")
@@ -143,40 +146,18 @@ def fits(given: Any, own: Mapping[str, Any], inside: str = "") -> None:
         seed(given["seed"])
 
 
-def _check_names(inside: str, given: object, own: Mapping[str, Any]) -> None:
-    if not isinstance(given, Mapping) or not own.keys() <= given.keys():
-        got = sorted(map(str, given)) if isinstance(given, Mapping) else type(given).__name__
-        raise BidexError(
-            f"Expected the state of a world with {sorted(own)} in {inside}, got {shortened(got)}; {_AGAIN}"
-        )
-
-
-def _check_alike(own: Mapping[str, Any], given: Mapping[str, Any]) -> None:
-    if not isinstance(given["slots"], list) or not all(isinstance(name, str) for name in given["slots"]):
-        raise BidexError(
-            f"Expected the names of a world's slots in its state, got {shortened(given['slots'])}; {_AGAIN}"
-        )
-    seen = given["observation"]
-    there = given["slots"], tuple(seen.shape) if isinstance(seen, Tensor) else ()
-    here = own["slots"], tuple(own["observation"].shape)
-    if here != there:
-        raise BidexError(
-            f"Expected the state of a world of {here[0]} with observations {here[1]}, got one of {there[0]} with "
-            f"{there[1]}; {_AGAIN}"
-        )
-
-
 def _check_tensor(name: str, given: object, own: Tensor) -> None:
+    what = f"{name} of a world's state"
     usable = isinstance(given, Tensor) and given.layout == torch.strided and not given.is_meta
     if not isinstance(given, Tensor) or not usable or given.shape != own.shape or given.dtype != own.dtype:
         got = f"{given.dtype} {tuple(given.shape)}" if isinstance(given, Tensor) else type(given).__name__
-        raise BidexError(f"Expected {name} of a world's state as {own.dtype} {tuple(own.shape)}, got {got}; {_AGAIN}")
+        raise BidexError(f"Expected {what} as {own.dtype} {tuple(own.shape)}, got {got}; {_AGAIN}")
     if given.requires_grad:
-        raise BidexError(f"Expected {name} of a world's state without gradients; detach it.")
+        raise BidexError(f"Expected {what} without gradients; detach it.")
     if not bool(given.isfinite().all()):
-        raise BidexError(f"Expected finite numbers in {name} of a world's state, got others; take an older state.")
+        raise BidexError(f"Expected finite numbers in {what}, got others; take an older state.")
     if given.dtype == torch.int64 and bool((given < _LEAST.get(name, 0)).any()):
-        raise BidexError(f"Expected counts in {name} of a world's state, got some below zero; take an older state.")
+        raise BidexError(f"Expected counts in {what}, got some below zero; take an older state.")
 
 
 def formulas(scene: Scene, tasks: np.ndarray, sensors: Tensor, observed: bool) -> None:

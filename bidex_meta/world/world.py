@@ -87,9 +87,11 @@ class World(BatchedWorld):
         """
         place, make_engine = choose_engine(device, engine, threads)
         checking.choices(task_sampling, observation, points)
+        checking.seed(seed)
         if num_envs is None:
             num_envs = _DEFAULT_SIZES[place.type]
-        num_envs = checking.num_envs(num_envs, len(slots))
+        names = [slot.name for slot in slots]
+        num_envs = checking.num_envs(num_envs, names)
         if place.type == "cpu":
             needed = num_envs * (ROW_BYTES + (points.count if points else 0) * POINT_BYTES)
             check_memory(needed, f"{num_envs:,} environments", "Lower num_envs.")
@@ -97,7 +99,6 @@ class World(BatchedWorld):
         self.slots = [with_pool(slot, slot.tasks) for slot in slots]
         steps = [slot.task_class.episode_steps for slot in slots]
         scales, gammas = [slot.reward_scale for slot in slots], [slot.gamma for slot in slots]
-        names = [slot.name for slot in slots]
         super().__init__(Slots(names, steps, scales, gammas), num_envs, place, autoreset_mode, stagger)
         self.metadata |= {"render_modes": ["rgb_array"], "render_fps": CONTROL_RATE}
         self.render_mode = "rgb_array"

@@ -23,6 +23,7 @@ from bidex_meta.metaworld import batched
 from bidex_meta.metaworld import library as client
 from bidex_meta.metaworld.batched import MetaWorldWorld, evaluate_all_tasks
 from bidex_meta.record import RunFolder
+from bidex_meta.suite import METAWORLD_SUITES
 from tests.world.play import assert_same, number_of_ends, play
 
 ROWS = 6
@@ -66,26 +67,11 @@ class Scripts:
 
 
 def test_suites_are_those_of_the_library() -> None:
-    assert client.SUITES["metaworld/MT10"] == tuple(MT10_V3)
-    assert set(client.SUITES["metaworld/MT3"]) < set(MT10_V3)
+    assert METAWORLD_SUITES["metaworld/MT10"] == tuple(MT10_V3)
+    assert set(METAWORLD_SUITES["metaworld/MT3"]) < set(MT10_V3)
     tasks = client.make_tasks("metaworld/MT3", 0)
     assert all(len(set(pool)) == client.TASKS_PER_CLASS for pool in tasks.values())
     assert client.make_tasks("metaworld/MT3", 1) != tasks
-
-
-def test_shapes_spaces_and_the_one_hot() -> None:
-    world = make(7)
-    assert (world.num_tasks, world.num_id_columns, world.task_id.tolist()) == (3, 3, [0, 0, 0, 1, 1, 2, 2])
-    obs, info = world.reset(seed=0)
-    assert obs.shape == (7, 42) and obs.dtype == torch.float32 and info == {}
-    for action in actions(world, 20):
-        assert world.observation_space.contains(obs.numpy())
-        assert world.single_observation_space.contains(obs[0].numpy())
-        assert torch.equal(obs[:, 39:].argmax(dim=1), world.task_id) and obs[:, 39:].sum() == 7
-        obs, reward, terminated, truncated, info = world.step(action.numpy())
-        assert reward.shape == terminated.shape == truncated.shape == info["success"].shape == (7,)
-        assert obs.isfinite().all() and (reward >= 0).all() and (reward <= 10).all()
-        assert info["final_obs"].shape == obs.shape and not terminated.any() and not info["unstable"].any()
 
 
 def test_a_row_is_the_library_s_environment() -> None:
@@ -117,30 +103,6 @@ def test_the_library_s_scripts_solve_its_tasks_here() -> None:
         if solved.all():
             break
     assert solved.all()
-
-
-def test_same_step_statistics_are_those_of_a_count_by_hand(short: None) -> None:
-    world = make()
-    world.reset(seed=0)
-    elapsed = world.episodes.elapsed.clone()
-    assert len(elapsed.unique()) > 2 and int(elapsed.max()) < SHORT
-    steps = play(world, actions(world, 100))
-    assert number_of_ends(steps) >= 2 * ROWS
-    whole, total, length = elapsed == 0, torch.zeros(ROWS), torch.zeros(ROWS, dtype=torch.int64)
-    for step in steps:
-        total, length = total + step["reward"], length + 1
-        ended = step["info/_final_obs"]
-        assert torch.equal(step["truncated"], ended) and not step["terminated"].any()
-        assert torch.equal(ended, torch.where(whole, length, length + elapsed) >= SHORT)
-        assert torch.equal(step["info/so_far/r"], total) and torch.equal(step["info/so_far/l"], length)
-        assert torch.equal(step["info/counted"], ended & whole)
-        assert torch.equal(step["info/final_obs"][~ended], step["obs"][~ended])
-        if ended.any():
-            before, after = step["info/final_obs"][ended], step["obs"][ended]
-            assert (before[:, :3] != after[:, :3]).any(dim=1).all()  # the hand is back at its start
-            assert torch.equal(after[:, :18], after[:, 18:36])  # no earlier frame yet
-        whole = whole | ended
-        total, length = total.masked_fill(ended, 0), length.masked_fill(ended, 0)
 
 
 def test_episodes_draw_tasks_and_first_ones_are_shortened(short: None) -> None:
@@ -205,21 +167,6 @@ def test_mt10_steps_and_resumes() -> None:
     assert all(step["obs"].isfinite().all() and step["reward"].isfinite().all() for step in steps)
     world.load_state_dict(state)
     assert_same(steps, play(world, after))
-
-
-def test_finished_rows_are_frozen_and_a_mask_restarts_its_rows(short: None) -> None:
-    world = make(mode="DISABLED")
-    world.reset(seed=0)
-    last = play(world, actions(world, SHORT))[-1]
-    assert last["truncated"].all() and last["info/counted"].all()
-    step = play(world, actions(world, 1, seed=1))[0]
-    for name in ("obs", "truncated", "info/success", "info/so_far/r", "info/so_far/l"):
-        assert torch.equal(step[name], last[name]), name
-    assert not step["reward"].any() and not step["info/_final_obs"].any()
-    mask = torch.tensor([True, False] * 3)
-    obs, _ = world.reset(options={"reset_mask": mask})
-    assert torch.equal(obs[~mask], last["obs"][~mask]) and (obs[mask] != last["obs"][mask]).any()
-    assert torch.equal(world.episodes.finished, ~mask)
 
 
 def test_broken_physics_and_broken_actions_end_their_row_alone() -> None:
@@ -299,14 +246,14 @@ def test_defaults_follow_the_suite(capsys: pytest.CaptureFixture[str]) -> None:
     assert config["learner"]["gamma"] == PRESETS["metaworld"].gamma
     assert main(["list", "suites", "--json"]) == 0
     listed = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
-    assert listed["metaworld/MT3"]["train_classes"] == list(client.SUITES["metaworld/MT3"])
+    assert listed["metaworld/MT3"]["train_classes"] == list(METAWORLD_SUITES["metaworld/MT3"])
 
 
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
         ("run --suite metaworld/MT4", "Unknown suite 'metaworld/MT4'. Did you mean 'metaworld/MT3'?"),
-        ("run --suite metaworld/MT10 --num-envs 9", "at least 10 rows"),
+        ("run --suite metaworld/MT10 --num-envs 9", "num_envs: expected at least 10"),
         ("run --suite metaworld/MT3 --engine warp", "--device cpu"),
         ("run --suite metaworld/MT3 --preset metaworl", "Did you mean 'metaworld'?"),
         ("baseline random --suite metaworld/MT3", "classes of our own"),

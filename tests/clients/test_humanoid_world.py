@@ -92,7 +92,7 @@ def test_there_are_no_pictures_of_it(
 ) -> None:
     assert main(["render", *named, *more, "--out", str(tmp_path / "a.png")]) == 2
     error = capsys.readouterr().err
-    assert f"got {'the suite ' * (named[0] == '--suite')}{named[1]}. Name another." in error and error.count("\n") == 1
+    assert f"got {named[1]}. Name another." in error and error.count("\n") == 1
 
 
 def test_no_other_split() -> None:

@@ -16,7 +16,7 @@ from bidex_meta.clients.gymnasium_ids import register_ids, suite_ids, task_id
 from bidex_meta.errors import BidexError
 from bidex_meta.tasks import registry
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SUITE_IDS = [
     "bidex-meta/MT1-v1",
     "bidex-meta/MT4-v1",
