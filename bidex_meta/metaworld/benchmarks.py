@@ -75,32 +75,25 @@ class CustomML(Benchmark):
         super().__init__(_suite("CustomML", "masked", {"train": train_envs, "test": test_envs}), seed or 0)
 
 
-class MT4(Benchmark):
+class _Shipped(Benchmark):
+    def __init__(self, seed: int | None = None) -> None:
+        super().__init__(type(self).__name__, seed or 0)
+
+
+class MT4(_Shipped):
     """The suite MT4; `seed` chooses the tasks, None: 0."""
 
-    def __init__(self, seed: int | None = None) -> None:
-        super().__init__("MT4", seed or 0)
 
-
-class MT20(Benchmark):
+class MT20(_Shipped):
     """The suite MT20: all classes; `seed` chooses the tasks, None: 0."""
 
-    def __init__(self, seed: int | None = None) -> None:
-        super().__init__("MT20", seed or 0)
 
-
-class ML4(Benchmark):
+class ML4(_Shipped):
     """The suite ML4: three classes, tested on a fourth; `seed` chooses the tasks, None: 0."""
 
-    def __init__(self, seed: int | None = None) -> None:
-        super().__init__("ML4", seed or 0)
 
-
-class ML20(Benchmark):
+class ML20(_Shipped):
     """The suite ML20: fifteen classes, tested on five others; `seed` chooses the tasks, None: 0."""
-
-    def __init__(self, seed: int | None = None) -> None:
-        super().__init__("ML20", seed or 0)
 
 
 def _suite(name: str, observation: Literal["plain", "one-hot", "masked"], classes: dict[Split, Sequence[str]]) -> Suite:
