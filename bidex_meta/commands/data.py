@@ -10,6 +10,7 @@ import tyro
 
 from bidex_meta.commands.parsing import Switch, parse
 from bidex_meta.errors import EXIT_FAILED, BidexError, known_name
+from bidex_meta.validation import Few
 
 _ACTIONS = ("list", "info", "check")
 
@@ -29,7 +30,7 @@ class DataFlags:
     where that can be computed."""
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")] = ""
     """info, check: a data set's name or folder."""
-    episodes: int | None = None
+    episodes: Few | None = None
     """check: look at so many episodes at most, evenly spread; None: all."""
     json: Switch = False
     """Print JSON."""

@@ -12,6 +12,7 @@ import tyro
 from bidex_meta.commands.parsing import Switch, parse
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.outside import name_with_object
+from bidex_meta.validation import Port, Positive, Seed
 
 
 @dataclass(frozen=True)
@@ -36,17 +37,17 @@ class PlayFlags:
     """Of a run: last, best (see `bidex-meta run --help`, --evaluate-every) or a file."""
     suite: str | None = None
     """Show the classes of this suite; None: the run's."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of tasks and starts."""
-    speed: float = 1.0
+    speed: Positive = 1.0
     """Of the clock; 0.5 is slow motion."""
     browser: Switch = False
     """In the browser, also where there is a screen."""
     host: str = "127.0.0.1"
     """Address the browser's page is served at; 0.0.0.0 lets other machines in."""
-    port: int = 8080
+    port: Port = 8080
     """Port of that page; where it is taken, the next free one."""
-    seconds: float | None = None
+    seconds: Positive | None = None
     """End after so many seconds; None: when the window is closed, or Ctrl-C."""
 
 

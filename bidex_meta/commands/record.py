@@ -11,9 +11,11 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from bidex_meta.commands.parsing import RunPath, StepCount, Switch, parse
+from bidex_meta.commands.parsing import RunPath, Switch, parse
+from bidex_meta.config import Steps
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.reading import absolute
+from bidex_meta.validation import Environments, NonNegative, Seed, Threads
 from bidex_meta.worlds import Worlds
 
 RUNS = {"random": 0, "medium": 1, "expert": 1, "medium-expert": 2, "replay": 1, "demonstrations": 0}
@@ -44,14 +46,14 @@ class RecordFlags:
     """random: class to play on its own, in place of a suite; demonstrations: class of the witness."""
     base: Literal["own", "moving", "fixed"] = "own"
     """With --task: whether the hands' bases move; own: as the class has it alone."""
-    size: StepCount = 0
+    size: Steps = 0
     """Transitions; 0: 1e6, of medium-expert 2e6, of demonstrations 2e4. The last episodes are whole: there may be a few
     more."""
     checkpoint: str = "last"
     """Which policy of a run: last, best or a file."""
     actions: Literal["sampled", "mean"] = "sampled"
     """sampled: drawn from the policy's distribution, where it has one; mean: its mean action."""
-    noise: float = 0.0
+    noise: NonNegative = 0.0
     """Standard deviation of Gaussian noise on a policy's actions, for those that have no distribution, or on a
     witness's."""
     starts: Literal["witness", "tasks"] = "witness"
@@ -60,11 +62,11 @@ class RecordFlags:
     script: Switch = False
     """demonstrations, --starts tasks: play in the place of the witness the class's script, led anew from each start
     (about a second for 500 steps): seven classes have one, and it succeeds more often."""
-    shift: float = 1e-4
+    shift: NonNegative = 1e-4
     """demonstrations, --starts witness: how far the objects' start is shifted, metres."""
-    num_envs: int | None = None
+    num_envs: Environments | None = None
     """Rows stepped together; None: one per task, 200 at least."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of starts and actions, and of random's tasks (a run keeps its own tasks)."""
     out: Path | None = None
     """Folder of the data set; None: NAME/KIND-v0 in the folder that BIDEX_DATA names, else in data/."""
@@ -72,7 +74,7 @@ class RecordFlags:
     """auto, cpu or cuda:N."""
     engine: Literal["auto", "c", "warp"] = "auto"
     """Physics; auto: the one that is fast on the device."""
-    threads: int | None = None
+    threads: Threads | None = None
     """Threads of torch and of the physics; None: one per core."""
     estimate: Switch = False
     """Print what it would take, and stop."""
@@ -189,10 +191,10 @@ def _config(flags: RecordFlags) -> dict[str, Any]:
     if flags.runs:
         stored = [RunFolder.open(run).config() for run in flags.runs]
         names = ("suite", "task", "base", "object", "points", "seed")
-        found = [{name: each.get(name, {"base": "own", "points": 0}.get(name)) for name in names} for each in stored]
+        found = [{name: getattr(each, name) for name in names} for each in stored]
         for one, given in zip(found, stored, strict=True):
-            if given.get("task_seed") is not None:  # what learned from data plays the tasks of its data
-                one["seed"] = given["task_seed"]
+            if given.task_seed is not None:  # what learned from data plays the tasks of its data
+                one["seed"] = given.task_seed
         if differ := [name for name in names if found[0][name] != found[-1][name]]:
             raise BidexError(
                 f"The two runs differ in {differ[0]}: {found[0][differ[0]]} and {found[-1][differ[0]]}. Name runs on "
@@ -220,7 +222,7 @@ def _actors(flags: RecordFlags, kind: str, device: str) -> tuple[list[Any], list
     actors, told = [], []
     for path in flags.runs:
         folder = RunFolder.open(path)
-        algo = folder.config()["algo"]
+        algo = folder.config().algo
         if learner_kind(algo).adapts:
             raise BidexError(f"{algo} adapts to tasks: it has no one policy to record. Name a run of another learner.")
         policy, steps = load_policy(folder, device, flags.checkpoint)
@@ -277,10 +279,10 @@ def _replay(flags: RecordFlags, run: RunPath) -> None:
 
     folder = RunFolder.open(run)
     config = folder.config()
-    if not config.get("record"):
+    if not config.record:
         raise BidexError(f"{run} kept nothing of its training. Train one that does: bidex-meta run --record 1e6 ...")
     kept = open_dataset(folder.path / "replay")
-    out, name = place_of(flags.out, Worlds.open(config).name, "replay")
+    out, name = place_of(flags.out, Worlds.open(config.to_json()).name, "replay")
     adopt(kept.folder, out, name)
     _say_complete(out, name)
 

@@ -7,9 +7,11 @@ from typing import Annotated, Any
 
 import tyro
 
-from bidex_meta.commands.parsing import StepCount, Switch, parse
+from bidex_meta.commands.parsing import Switch, parse
+from bidex_meta.config import Steps
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.outside import name_with_object, short_name
+from bidex_meta.validation import Few, Pixels, Seed
 
 
 @dataclass(frozen=True)
@@ -40,15 +42,15 @@ class RenderFlags:
     tiled: Switch = False
     """All classes of the suite beside each other; where an episode ends the next one begins. A name is green from its
     first success to the end of the episode."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of task and start."""
-    steps: StepCount | None = None
+    steps: Steps | None = None
     """Steps to take, 60 a second; None: none for a picture, one episode for a film, with --tiled the longest one."""
-    every: int | None = None
+    every: Few | None = None
     """Steps from one frame of a film to the next; None: 1, with --tiled 2."""
-    width: int | None = None
+    width: Pixels | None = None
     """Pixels, of a tile with --tiled; None: 640, with --tiled 240."""
-    height: int | None = None
+    height: Pixels | None = None
     """Pixels, likewise; None: three quarters of the width."""
     camera: str | None = None
     """front, side, top or back; None: front."""

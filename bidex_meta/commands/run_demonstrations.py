@@ -1,39 +1,21 @@
 """What ``bidex-meta run --demonstrations`` adds: data sets that are imitated beside what is learned by playing."""
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from bidex_meta.commands.learners import ALGOS, LearnerKind, learner_kind
-from bidex_meta.commands.parsing import peek_all
 from bidex_meta.errors import BidexError, known_name
-from bidex_meta.reading import absolute, expanded
 from bidex_meta.worlds import Worlds
 
 
-def listed(kept: str | Sequence[str] | None) -> tuple[str, ...]:
-    """The data sets of a config, which keeps none as None and a single one as its name."""
-    return () if kept is None else (kept,) if isinstance(kept, str) else tuple(kept)
-
-
-def named(arguments: Sequence[str], stored: Mapping[str, Any]) -> str | list[str] | None:
-    """The data sets that the flags name, or those of the run to be resumed, as a config keeps them.
-
-    A folder stands with its whole path.
-    """
-    given = peek_all(arguments, "--demonstrations") or listed(stored.get("demonstrations"))
-    names = [str(absolute(name)) if expanded(name).is_dir() else name for name in given]
-    return names if len(names) > 1 else names[0] if names else None
-
-
-def check(kind: LearnerKind, kept: str | Sequence[str] | None, source: Worlds) -> None:
+def check(kind: LearnerKind, names: Sequence[str], source: Worlds) -> None:
     """Refuses, before a world is made, what could not be imitated in it; reads the data sets' metadata alone.
 
     Raises:
         BidexError: The learner takes none, there is no such data set, or it is of another class, of other bases or with
             other goals shown.
     """
-    names = listed(kept)
     if not names:
         return
     if not kind.imitates:
@@ -73,12 +55,12 @@ def check_goals(dataset: Any, source: Worlds) -> None:
         raise BidexError(f"{dataset.name} has point clouds, where {source.name} hides goals. Record without --points.")
 
 
-def give(kept: str | Sequence[str], learner: Any) -> None:
+def give(names: Sequence[str], learner: Any) -> None:
     """Reads the data sets and hands them to a fresh learner; errors as of ``join``."""
     from bidex_meta.data import open_dataset
     from bidex_meta.data.joined import join
 
-    datasets = [open_dataset(name) for name in listed(kept)]
+    datasets = [open_dataset(name) for name in names]
     steps, episodes = sum(each.num_steps for each in datasets), sum(each.num_episodes for each in datasets)
     print(f"Demonstrations: {steps:,} transitions of {episodes:,} episodes.", file=sys.stderr, flush=True)
     learner.learn_from_demonstrations(join(datasets, learner.world, every=False))

@@ -1,11 +1,10 @@
 """What ``bidex-meta run`` adds for learners from data sets: which data, what they are learned for, reading them."""
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from bidex_meta.commands.learners import ALGOS, LearnerKind, learner_kind
-from bidex_meta.commands.parsing import peek_all
 from bidex_meta.commands.run_demonstrations import check_goals
 from bidex_meta.errors import BidexError
 from bidex_meta.reading import absolute, expanded
@@ -20,13 +19,9 @@ UPDATES = 300_000
 _FORM = ("suite", "task", "base", "object", "points")
 
 
-def named(arguments: Sequence[str], stored: Mapping[str, Any]) -> list[str]:
-    """The data sets that the flags name, or those of the run to be resumed, as a config keeps them.
-
-    A folder stands with its whole path, since a run may be resumed from another one.
-    """
-    given = peek_all(arguments, "--dataset") or stored.get("dataset", [])
-    return [str(absolute(name)) if expanded(name).is_dir() else name for name in given]
+def named(given: Sequence[str]) -> tuple[str, ...]:
+    """The data sets that flags name, as a config keeps them: a folder stands with its whole path."""
+    return tuple(str(absolute(name)) if expanded(name).is_dir() else name for name in given)
 
 
 def opened(names: Sequence[str]) -> "list[Dataset]":

@@ -1,12 +1,11 @@
 """What ``bidex-meta run`` adds for data sets: a recorder around its world, and an early end at a named goal."""
 
 import sys
-from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 from bidex_meta.commands.run_config import RunPlan
 from bidex_meta.memory import check_memory
-from bidex_meta.record import stopping
 from bidex_meta.record.folder import new_folder_name
 from bidex_meta.train.launch import launch
 
@@ -23,17 +22,24 @@ def recorded(plan: RunPlan, world: Any) -> Any:
     from bidex_meta.data.run_recorder import RunRecorder, spread_rows
     from bidex_meta.data.writer import estimated_bytes
 
-    rows = spread_rows(world, plan.config["record_share"])
+    rows = spread_rows(world, plan.config.record_share)
     sizes = world.single_observation_space.shape[0], world.single_action_space.shape[0]
-    needed = estimated_bytes(plan.config["record"], *sizes, 20.0)
+    needed = estimated_bytes(plan.config.record, *sizes, 20.0)
     place = plan.folder.path if plan.folder else plan.flags.run_dir or new_folder_name(plan.config)
     there = sum(path.stat().st_size for path in part_files.parts_of(place / "replay" / "data"))  # of a resumed run
-    check_room(place, max(0, needed - there), f"{plan.config['record']:,} transitions")
+    check_room(place, max(0, needed - there), f"{plan.config.record:,} transitions")
     # A checkpoint copies the episodes that run; each process of this machine has its own.
     held = 2 * launch().local_count * bytes_held(world, rows)
     check_memory(held, f"The running episodes of {len(rows):,} recorded rows", "Lower --record or --num-envs.")
     _say(f"Recording {len(rows)} of {world.num_envs} rows, at most about {needed / 1e9:.2f} GB.")
     return RunRecorder(world, rows, launch().rank)  # pyright: ignore[reportAbstractUsage]
+
+
+def begin(recorder: Any, folder: Path, fresh: bool) -> None:
+    """Recording begins in the run's folder; of a resumed run the checkpoint knows which parts stay."""
+    recorder.folder = folder / "replay"
+    if fresh:
+        recorder.open(recorder.folder)
 
 
 def complete(plan: RunPlan, recorder: Any) -> None:
@@ -42,25 +48,11 @@ def complete(plan: RunPlan, recorder: Any) -> None:
     from bidex_meta.data.place import default_name
     from bidex_meta.data.writer import finish
 
-    told = {"algo": plan.config["algo"], "run": recorder.folder.parent.name, "actions": "as in training"}
+    told = {"algo": plan.config.algo, "run": recorder.folder.parent.name, "actions": "as in training"}
     about = described(plan.source, recorder, "replay", [told])
     name = default_name(plan.source.name, "replay")
     finish(recorder.folder, name, recorder.single_observation_space, recorder.single_action_space, about)
     _say(f"Recorded: {recorder.folder}")
-
-
-def enough(config: dict[str, Any]) -> Callable[[Mapping[str, Any]], bool] | None:
-    """What ends the training early, by its metrics; None where nothing does."""
-    if all(config[name] is None for name in stopping.ENDS):
-        return None
-
-    def reached(metrics: Mapping[str, Any]) -> bool:
-        tag = stopping.enough(config, metrics)
-        if tag is not None:
-            _say(f"Enough: {tag} is {metrics[tag]:.4g}.")
-        return tag is not None
-
-    return reached
 
 
 def _say(text: str) -> None:

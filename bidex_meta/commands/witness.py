@@ -8,6 +8,7 @@ from typing import Any
 
 from bidex_meta.commands.parsing import Switch, parse
 from bidex_meta.errors import BidexError, known_name
+from bidex_meta.validation import Threads
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class WitnessFlags:
     """Also write a film (.mp4) of the witness, or a picture (.png) of its last step."""
     camera: str | None = None
     """front, side, top or back."""
-    threads: int | None = None
+    threads: Threads | None = None
     """Threads of the physics; None: one per core."""
     json: Switch = False
     """Print JSON."""
