@@ -7,7 +7,6 @@ give its numbers bit for bit, to single precision (``tests/clients/test_humanoid
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -20,6 +19,7 @@ from bidex_meta.errors import BidexError, unknown_name
 from bidex_meta.validation import whole_number
 from bidex_meta.world.base import Transition
 from bidex_meta.world.checking import fits
+from bidex_meta.world.contract import State
 from bidex_meta.world.foreign import OWN_DRAWS, ForeignWorld, Sizes
 
 NAME = "Humanoid-v5"
@@ -148,7 +148,7 @@ class HumanoidWorld(ForeignWorld):
             mujoco.mj_rnePostConstraint(self._model, self._data)
             self._contact[row] = torch.from_numpy(self._data.cfrc_ext)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         """Everything that decides the future of the world: tensors and plain values, copied."""
         return {
             **super().state_dict(),
@@ -158,7 +158,7 @@ class HumanoidWorld(ForeignWorld):
             "contact": self._contact.clone(),
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Puts back what ``state_dict`` gave, on a world of the same size.
 
         Raises:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from bidex_meta.clients.needs import check_training, extra, whole_steps
 from bidex_meta.errors import unknown_name
-from bidex_meta.world.contract import TaskWorld, VectorWorld
+from bidex_meta.world.contract import Info, TaskWorld, VectorWorld
 
 with extra("rsl-rl"):
     from rsl_rl.env import VecEnv
@@ -86,7 +86,7 @@ class EpisodeLog:
         self._world = world
         self._terms: dict[str, Tensor] = {}
 
-    def update(self, info: dict[str, Any], terminated: Tensor, truncated: Tensor) -> dict[str, Tensor]:
+    def update(self, info: Info, terminated: Tensor, truncated: Tensor) -> dict[str, Tensor]:
         """What ended in a step.
 
         Args:

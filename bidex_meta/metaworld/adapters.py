@@ -20,7 +20,7 @@ from torch import Tensor
 
 from bidex_meta.agents import Agent, Timestep
 from bidex_meta.errors import BidexError
-from bidex_meta.world.contract import PooledWorld
+from bidex_meta.world.contract import Info, Options, PooledWorld
 
 MetaWorldTimestep = namedtuple("MetaWorldTimestep", Timestep._fields[:6])
 """The six entries of Meta-World's own, for agents that unpack them."""
@@ -57,7 +57,7 @@ class ForMetaWorld:
         self._agent.init()
         self._begins = True
 
-    def adapt_action(self, observations: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
+    def adapt_action(self, observations: np.ndarray) -> tuple[np.ndarray, Info]:
         """Exploring actions (num_envs, a), float32, and the policy's other outputs as arrays."""
         obs = self._tensor(observations)
         if self._begins:  # Meta-World resets the environments here, and does not say so
@@ -117,7 +117,7 @@ class FromMetaWorld:
         """Back to what was meta-learned."""
         self._agent.init()
 
-    def adapt_action(self, obs: Tensor) -> tuple[Tensor, dict[str, Any]]:
+    def adapt_action(self, obs: Tensor) -> tuple[Tensor, Info]:
         """Exploring actions (num_envs, a), and the agent's other outputs as it gave them."""
         self._begun = None
         action, outputs = self._agent.adapt_action(_array(obs))
@@ -164,14 +164,14 @@ class MetaWorldEnvs(VectorEnv):
         self._returns = torch.zeros(self.num_envs, dtype=torch.float64, device=world.task_id.device)
         self._lengths = torch.zeros_like(world.task_id)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+    def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
         """Starts an episode in every environment: observations (num_envs, d)."""
         obs, _ = self.world.reset(seed=seed)
         self._returns.zero_()
         self._lengths.zero_()
         return obs.cpu().numpy(), {}
 
-    def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
         """Advances every environment.
 
         Args:

@@ -27,7 +27,7 @@ from bidex_meta.metaworld.library import (
 from bidex_meta.suite import metaworld_classes
 from bidex_meta.world.base import Transition
 from bidex_meta.world.checking import fits
-from bidex_meta.world.contract import PooledWorld
+from bidex_meta.world.contract import PooledWorld, State
 from bidex_meta.world.foreign import ForeignWorld, Sizes
 
 
@@ -119,7 +119,7 @@ class MetaWorldWorld(ForeignWorld):
             reward[row], success[row] = gained, reached
         return Transition(obs, reward, success, torch.zeros_like(unstable), unstable, {})
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         """Everything that decides the future of the world: tensors and plain values, copied."""
         return {
             **super().state_dict(),
@@ -129,7 +129,7 @@ class MetaWorldWorld(ForeignWorld):
             "actions": self._actions.clone(),
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Puts back what ``state_dict`` gave, on a world of the same suite, seed and size.
 
         Meta-World's environments keep part of their state in Python attributes and in the model, so each running

@@ -17,7 +17,7 @@ from torch import Tensor
 from bidex_meta.errors import BidexError
 from bidex_meta.validation import true_or_false
 from bidex_meta.world import checking
-from bidex_meta.world.contract import ObservationGroup
+from bidex_meta.world.contract import Info, ObservationGroup, Options, State, Step
 from bidex_meta.world.episodes import Clock, Episodes, checked_mode, checked_seed, ended_info, reset_mask
 from bidex_meta.world.random import row_keys
 from bidex_meta.world.threads import one_torch_thread
@@ -137,7 +137,7 @@ class BatchedWorld(VectorEnv, ABC):
         self._keys = torch.cat([row_keys(self.seed, name, r.stop - r.start, self.device) for name, r in pairs])
         self.episodes = Episodes.fresh(self.num_envs, self.device)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
         """Starts episodes of all environments, or those of ``options["reset_mask"]``; see ``VectorWorld.reset``."""
         mask = reset_mask(options, self.num_envs, self.device, self._ready)
         if seed is not None:
@@ -149,7 +149,7 @@ class BatchedWorld(VectorEnv, ABC):
             self._begin(mask, stagger)
         return self._obs.clone(), {}
 
-    def step(self, action: Tensor | np.ndarray) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+    def step(self, action: Tensor | np.ndarray) -> Step:
         """Advances every environment by one control step.
 
         Args:
@@ -203,7 +203,7 @@ class BatchedWorld(VectorEnv, ABC):
     def _write_action(self, action: Tensor, active: Tensor) -> None:
         self._action = action
 
-    def _move(self, active: Tensor, broken: Tensor) -> tuple[Tensor, Tensor, Tensor, dict[str, Any]]:
+    def _move(self, active: Tensor, broken: Tensor) -> tuple[Tensor, Tensor, Tensor, Info]:
         """Physics, then rewards, terminated, truncated and info, before new episodes start."""
         return self._finish(active, broken, self._advance(active, broken))
 
@@ -216,9 +216,7 @@ class BatchedWorld(VectorEnv, ABC):
             broken: Those of them whose action was not finite; of these nothing is read.
         """
 
-    def _finish(
-        self, active: Tensor, broken: Tensor, made: Transition
-    ) -> tuple[Tensor, Tensor, Tensor, dict[str, Any]]:
+    def _finish(self, active: Tensor, broken: Tensor, made: Transition) -> tuple[Tensor, Tensor, Tensor, Info]:
         obs, unstable = made.obs, made.unstable | broken
         valid = active & ~unstable
         success = made.success & ~unstable
@@ -232,7 +230,7 @@ class BatchedWorld(VectorEnv, ABC):
         ended = (terminated | truncated) & active
         if self._masked or not valid.all():  # on the CPU looking costs less than a pass over all observations
             obs = torch.where(valid[:, None], obs, self._obs)
-        info: dict[str, Any] = {
+        info: Info = {
             "success": success,
             "unstable": unstable & active,
             "reward_unscaled": unscaled,
@@ -251,7 +249,7 @@ class BatchedWorld(VectorEnv, ABC):
             episodes.finished = episodes.finished | ended
         return reward, terminated, truncated, info
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         """Everything that decides the future of the world: tensors and plain values, copied."""
         return {
             "seed": self.seed,
@@ -261,10 +259,10 @@ class BatchedWorld(VectorEnv, ABC):
         }
 
     @abstractmethod
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Puts back what ``state_dict`` gave, on a world made alike; all of it or nothing."""
 
-    def _restore(self, state: dict[str, Any]) -> None:
+    def _restore(self, state: State) -> None:
         """Puts back what every world has, from a state that was checked."""
         self._set_seed(int(state["seed"]))
         self.episodes.load_state_dict(state["episodes"])
@@ -323,7 +321,7 @@ def _recreate(
     kind: type[BatchedWorld],
     args: tuple[Any, ...],
     kwargs: dict[str, Any],
-    state: dict[str, Any],
+    state: State,
     ready: bool,
     stagger: bool,
 ) -> BatchedWorld:

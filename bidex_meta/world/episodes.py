@@ -13,7 +13,7 @@ from bidex_meta.engine.health import dense
 from bidex_meta.errors import BidexError, shortened, unknown_name
 from bidex_meta.maths import check_precision
 from bidex_meta.validation import whole_number
-from bidex_meta.world.contract import VectorWorld
+from bidex_meta.world.contract import Info, Options, VectorWorld
 
 _MODES = {"SAME_STEP": AutoresetMode.SAME_STEP, "DISABLED": AutoresetMode.DISABLED}
 _FINAL = ("success", "unstable", "reward_unscaled")
@@ -96,7 +96,7 @@ class Episodes:
             setattr(self, f.name, state[f.name].to(getattr(self, f.name).device, copy=True))
 
 
-def ended_info(info: dict[str, Any]) -> dict[str, Any]:
+def ended_info(info: Info) -> dict[str, Any]:
     """Gymnasium's keys for what ended in a step; environments outside a mask are zero, as theirs.
 
     Args:
@@ -108,7 +108,7 @@ def ended_info(info: dict[str, Any]) -> dict[str, Any]:
     """
     ended, counted = info["_final_obs"], info["counted"]
     episode = {name: value.masked_fill(~counted, 0) for name, value in info["so_far"].items()}
-    final: dict[str, Any] = {name: info[name].masked_fill(~ended, 0) for name in _FINAL}
+    final: Info = {name: info[name].masked_fill(~ended, 0) for name in _FINAL}
     final |= {f"_{name}": ended for name in _FINAL} | {"episode": dict(episode), "_episode": counted}
     return {"episode": episode, "_episode": counted, "final_info": final, "_final_info": ended}
 
@@ -123,7 +123,7 @@ class Clock:
         """Episodes of the environments of a mask begin now."""
         self._began = torch.where(mask, time.perf_counter(), self._began)
 
-    def stamp(self, info: dict[str, Any]) -> None:
+    def stamp(self, info: Info) -> None:
         """Adds ``t``, float32 (N,), where ``info`` has ended episodes."""
         if "episode" in info:
             took = torch.where(info["_episode"], time.perf_counter() - self._began, 0).float()
@@ -160,7 +160,7 @@ def set_stagger(world: VectorWorld, stagger: bool) -> None:
         inner.stagger = stagger
 
 
-def reset_mask(options: dict[str, Any] | None, num_envs: int, device: torch.device, ready: bool) -> Tensor:
+def reset_mask(options: Options | None, num_envs: int, device: torch.device, ready: bool) -> Tensor:
     """The environments that ``reset`` is asked to start, shape (num_envs,), bool: those of ``reset_mask``, else all.
 
     Raises:

@@ -5,7 +5,7 @@ Our learners, evaluation and checkpoints run on them unchanged; a subclass place
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from bidex_meta.world.base import BatchedWorld, Slots, Transition
-from bidex_meta.world.contract import plain_groups
+from bidex_meta.world.contract import Info, State, plain_groups
 from bidex_meta.world.random import uniform
 
 _TASK_DRAW, _ELAPSED_DRAW, OWN_DRAWS = 0, 1, 2
@@ -89,17 +89,15 @@ class ForeignWorld(BatchedWorld):
     def _place(self, mask: Tensor) -> None:
         """Puts the environments of a mask at the start of ``task_index`` and writes their states into ``_obs``."""
 
-    def _finish(
-        self, active: Tensor, broken: Tensor, made: Transition
-    ) -> tuple[Tensor, Tensor, Tensor, dict[str, Any]]:
+    def _finish(self, active: Tensor, broken: Tensor, made: Transition) -> tuple[Tensor, Tensor, Tensor, Info]:
         step = super()._finish(active, broken, made)
         self._success = step[3]["success"].clone()
         return step
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         """Everything that decides the future of the world: tensors and plain values, copied."""
         return super().state_dict() | {"success": self._success.clone()}
 
-    def _restore(self, state: dict[str, Any]) -> None:
+    def _restore(self, state: State) -> None:
         super()._restore(state)
         self._success = state["success"].clone()

@@ -17,6 +17,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.points.sight import PointsRule
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import CONTROL_RATE, TaskClass
+from bidex_meta.world.contract import Info, Options
 from bidex_meta.world.groups import Slot
 from bidex_meta.world.rendering import CAMERAS
 from bidex_meta.world.world import World
@@ -173,7 +174,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
             raise BidexError(f"Expected a task of {size} numbers, got {task.variation.shape}.")
         self._given = task
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+    def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
         """Starts an episode; with a seed, the same one every time.
 
         Returns:
@@ -194,7 +195,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
         self._over = False
         return _array(obs), {}
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
         """One control step of 1/60 s.
 
         Args:

@@ -24,6 +24,7 @@ from bidex_meta.tasks.layout import CLIP
 from bidex_meta.validation import whole_number
 from bidex_meta.world import checking
 from bidex_meta.world.base import BatchedWorld, Slots, Transition
+from bidex_meta.world.contract import Info, State
 from bidex_meta.world.graphs import GraphCache, SideBySide, Work, cuda_graph, fresh
 from bidex_meta.world.groups import Group, Slot, build_groups, sights, with_pool, with_pools
 from bidex_meta.world.observations import Rule, observation_groups
@@ -224,7 +225,7 @@ class World(BatchedWorld):
         for part in self.parts:
             part.control(part.group.take(self._action))
 
-    def _move(self, active: Tensor, broken: Tensor) -> tuple[Tensor, Tensor, Tensor, dict[str, Any]]:
+    def _move(self, active: Tensor, broken: Tensor) -> tuple[Tensor, Tensor, Tensor, Info]:
         if not self._masked:
             return super()._move(active, broken)
         parts = list(self.step_engines(self._frozen_if(active)))
@@ -250,7 +251,7 @@ class World(BatchedWorld):
         jobs = [partial(part.advance, of) for part, of in zip(self.parts, rows, strict=True)]
         return (self.parts[i] for i in self._side_by_side.run(jobs))
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         """Everything that decides the future of the world: tensors and numbers, copied."""
         return super().state_dict() | {
             "slots": list(self.task_names),
@@ -259,7 +260,7 @@ class World(BatchedWorld):
             "engines": [part.group.engine.state_dict() for part in self.parts],
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Puts back what ``state_dict`` gave, on a world of the same suite and size; all of it or nothing."""
         self._set_pools(checking.state(state, self.state_dict(), self.slots, self.task_id))
         self._restore(state)

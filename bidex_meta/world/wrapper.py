@@ -18,7 +18,7 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor
 
-from bidex_meta.world.contract import PooledWorld, TaskWorld, VectorWorld
+from bidex_meta.world.contract import Info, Options, PooledWorld, State, Step, TaskWorld, VectorWorld
 from bidex_meta.world.episodes import ended_info, set_stagger
 
 _OF_THE_CONTRACT = ("so_far", "counted", "final_obs", "_final_obs", "episode", "_episode", "final_info", "_final_info")
@@ -44,19 +44,19 @@ class WorldWrapper(VectorWorld):
         """The world within all wrappers."""
         return getattr(self.world, "unwrapped", self.world)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
         """Starts episodes; see ``VectorWorld``."""
         return self.world.reset(seed=seed, options=options)
 
-    def step(self, action: Tensor, /) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+    def step(self, action: Tensor, /) -> Step:
         """Takes actions (N, a); see ``VectorWorld``."""
         return self.world.step(action)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         """The wrapped world's state: with or without the wrapper a run continues from it."""
         return self.world.state_dict()
 
-    def load_state_dict(self, state: dict[str, Any], /) -> None:
+    def load_state_dict(self, state: State, /) -> None:
         """Puts back what ``state_dict`` gave."""
         self.world.load_state_dict(state)
 
@@ -113,12 +113,12 @@ class NumpyWorld(VectorEnv):
         self.metadata, self.render_mode = world.metadata, getattr(world, "render_mode", None)
         self.autoreset_mode, self.spec = world.metadata["autoreset_mode"], getattr(world, "spec", None)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+    def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
         """Starts episodes; see ``VectorWorld.reset``."""
         obs, info = self.world.reset(seed=seed, options=options)
         return _arrays(obs), info
 
-    def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
         """Takes actions (num_envs, a).
 
         Returns:
