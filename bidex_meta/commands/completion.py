@@ -53,11 +53,11 @@ def main(arguments: Sequence[str]) -> None:
 def _names() -> dict[str, list[str]]:
     """What the values of flags may be."""
     from bidex_meta.commands.learners import ALGOS
-    from bidex_meta.sources import source_names
     from bidex_meta.tasks import registry
     from bidex_meta.tasks.objects.held import EGG, shelf
+    from bidex_meta.worlds import suites_to_run
 
-    names = {"--suite": source_names(), "--task": registry.names(), "--algo": list(ALGOS)}
+    names = {"--suite": suites_to_run(), "--task": registry.names(), "--algo": list(ALGOS)}
     return {**names, "--object": [EGG, *shelf()]}
 
 

@@ -18,11 +18,11 @@ from bidex_meta.data.joined import join
 from bidex_meta.data.writer import DatasetWriter, begin, finish
 from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder
-from bidex_meta.sources.humanoid_task import HUMANOID
-from bidex_meta.sources.source import OwnSuite
 from bidex_meta.witness.simulator import task_slot
 from bidex_meta.world import World
 from bidex_meta.world.contract import ObservationGroup
+from bidex_meta.worlds.external import HUMANOID
+from bidex_meta.worlds.own import OwnSuite
 from tests.algos.problems import opposite_bandits
 from tests.data.worlds import rough
 from tests.offline.stored import noisy, played
@@ -67,7 +67,7 @@ def test_a_run_on_data_sets_is_evaluated_resumed_and_reported(folder: Path, caps
     told(capsys, "run", "--resume", halves, "--steps", "40", "--no-evaluate")
     config = RunFolder.open(whole).config()
     assert (config.suite, config.task, config.task_seed, config.num_envs) == ("MT4", None, 0, 4)
-    assert config.dataset == ("a-v0", str((folder / "sets" / "b-v0").resolve()))
+    assert list(config.dataset) == ["a-v0", str((folder / "sets" / "b-v0").resolve())]
     a, b = (RunFolder.open(name).checkpoints.load()[0]["learner"] for name in (whole, halves))
     for name, weight in a["policy"]["weights"].items():
         assert torch.equal(weight, b["policy"]["weights"][name])
