@@ -9,7 +9,8 @@ import torch
 
 from bidex_meta.cli import main
 from bidex_meta.commands import learners
-from bidex_meta.commands.conditions import conditions, others, recorded_conditions
+from bidex_meta.commands.evaluate import conditions
+from bidex_meta.commands.verify import others, recorded_conditions
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.agreement import agreements, classes_of
 from bidex_meta.evaluation.results import ClassResult

@@ -16,6 +16,7 @@ import tyro
 from torch import nn
 
 from bidex_meta.commands.policies import load_policy
+from bidex_meta.commands.sweep_plan import read_sweep
 from bidex_meta.errors import BidexError
 from bidex_meta.outside import short_name
 from bidex_meta.reading import read_text
@@ -23,7 +24,6 @@ from bidex_meta.record.folder import RunFolder
 from bidex_meta.record.metrics import training_seconds
 from bidex_meta.record.stored import FORMAT, StoredRun
 from bidex_meta.suite import load_suite, suite_names
-from bidex_meta.sweep.plan import read_sweep
 
 POINTS = 60
 """Points of a curve at most."""

@@ -30,5 +30,5 @@ COMMANDS: dict[str, Command] = {
     "plot": Command("bidex_meta.commands.plot", "learning curves of runs, as a picture"),
     "report": Command("bidex_meta.commands.report", "runs as one HTML page: tables, curves, films"),
     "completion": Command("bidex_meta.commands.completion", "a script that completes commands and flags in a shell"),
-    "bench": Command("bidex_meta.commands.bench", "measure speed, scaling or stability of the world"),
+    "bench": Command("bidex_meta.commands.bench", "measure the speed of a suite's world"),
 }

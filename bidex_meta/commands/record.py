@@ -2,7 +2,6 @@
 
 import contextlib
 import math
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ import tyro
 from bidex_meta.commands.parsing import RunPath, Switch, parse
 from bidex_meta.config import Steps
 from bidex_meta.errors import BidexError, known_name
+from bidex_meta.memory import usable_cores
 from bidex_meta.reading import absolute
 from bidex_meta.validation import Environments, NonNegative, Seed, Threads
 from bidex_meta.worlds import Worlds
@@ -136,7 +136,7 @@ def _record(flags: RecordFlags, kind: str, held: contextlib.ExitStack) -> tuple[
     source = Worlds.open(config)
     folder, name = place_of(flags.out, source.name, kind)
     # Sums depend on how torch splits them over threads: a recording keeps those that it began with.
-    config["threads"] = flags.threads or begun(folder).get("threads") or _cores()
+    config["threads"] = flags.threads or begun(folder).get("threads") or usable_cores()
     set_up_torch(config["threads"])
     actors, policies = _actors(flags, kind, config["device"])
     rows = flags.num_envs or _rows(source)
@@ -238,10 +238,6 @@ def _rows(source: Worlds) -> int:
     pools = source.tasks("train")
     tasks = max(map(len, pools.values())) * len(pools)
     return tasks * math.ceil(200 / tasks)
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 class _Told:
