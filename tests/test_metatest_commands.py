@@ -169,7 +169,7 @@ def test_where_rows_share_nothing_each_plays_one_episode_a_shot(monkeypatch):
     config = {"suite": "ML4", "algo": "finder", "num_envs": 1024, "learner": {}}
     source = Worlds.open(config)
     assert [rollouts_of(source, config, asked, 6) for asked in (20, None)] == [20, 10]
-    monkeypatch.setattr(Learner, "adapts_by_row", True, raising=False)
+    monkeypatch.setattr(Learner, "independent_adaptation", True, raising=False)
     assert [rollouts_of(source, config, asked, 6) for asked in (20, None, 4)] == [6, 6, 4]
 
 
