@@ -22,13 +22,12 @@ ORDER = (
     ("tasks",),
     ("points",),
     ("world",),
-    ("envs",),
     ("evaluation", "benchmark"),
     ("metaworld",),
-    ("registration",),
+    ("clients",),
     ("bidex_meta",),  # the package's own names
-    ("clients", "witness", "data"),
-    ("sources", "train"),
+    ("witness", "data", "worlds"),
+    ("train",),
     ("speed", "viewer", "report", "sweep"),
     tuple(
         f"bidex_algos.{name}" for name in ("advantages", "balancing", "replay", "rollout", "step_size", "trust_region")
@@ -46,8 +45,8 @@ ORDER = (
 LEVEL = {room: level for level, rooms in enumerate(ORDER) for room in rooms}
 
 MUTUAL = {
-    ("bidex_meta.sources.metaworld_suite", "bidex_meta.sources.source"),  # Source.open chooses among its kinds
-    ("bidex_meta.sources.humanoid_task", "bidex_meta.sources.source"),
+    ("bidex_meta.worlds.base", "bidex_meta.worlds.own"),  # Worlds.open chooses among its kinds
+    ("bidex_meta.worlds.base", "bidex_meta.worlds.external"),
     ("bidex_meta.world.rendering", "bidex_meta.world.world"),  # rendering names World in an annotation only
 }
 """Modules that import each other all the same."""

@@ -9,7 +9,6 @@ from bidex_meta import paths
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
 from bidex_meta.record.versions import collect_versions
-from bidex_meta.sources.source import OwnSuite
 from bidex_meta.tasks import registry
 from bidex_meta.witness.open_loop import OpenLoop
 from bidex_meta.witness.puppets import rest_action
@@ -17,6 +16,7 @@ from bidex_meta.witness.replay import Replay, replay
 from bidex_meta.witness.simulator import SHIFT, Simulator, task_slot
 from bidex_meta.witness.store import LEVELS, Witness, load_witness, quantised, save_witness, witness_path
 from bidex_meta.world import World
+from bidex_meta.worlds.own import OwnSuite
 
 
 def random_actions(steps: int) -> torch.Tensor:

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from typing import Any
 
 from bidex_meta.record.versions import collect_versions
-from bidex_meta.sources import Source
+from bidex_meta.worlds import Worlds
 
 
-def described(source: Source, world: Any, kind: str, policies: Sequence[dict[str, Any]], **more: Any) -> dict[str, Any]:
+def described(source: Worlds, world: Any, kind: str, policies: Sequence[dict[str, Any]], **more: Any) -> dict[str, Any]:
     """The metadata of a data set.
 
     Args:
@@ -24,18 +24,17 @@ def described(source: Source, world: Any, kind: str, policies: Sequence[dict[str
         index ranges]; ``kind``, ``policies``, ``seed`` of the tasks, ``references`` ({class: {random, zero, expert}},
         unscaled returns), ``versions`` and ``commit``; all ready for JSON.
     """
-    suite = getattr(source, "suite", None)
-    alone = getattr(source, "class_name", None) is not None
+    suite, alone = source.suite, source.class_name is not None
     versions = collect_versions()
     names = {name.partition("/")[0] for name in world.task_names}
     known = source.references()
     return {
         "suite": None if alone else source.name,
-        "suite_version": getattr(suite, "version", None),
-        "task": getattr(source, "class_name", None),
-        "object": getattr(source, "object", None),
+        "suite_version": suite.version if suite else None,
+        "task": source.class_name,
+        "object": source.object,
         "points": source.points,
-        "base": {None: "own", True: "moving", False: "fixed"}[getattr(source, "moving_base", None)] if alone else None,
+        "base": {None: "own", True: "moving", False: "fixed"}[source.moving_base] if alone else None,
         "tasks": list(world.task_names),
         "reward_scales": {slot.name: slot.reward_scale for slot in getattr(world, "slots", ())},
         "hides_goals": source.hides_goals,

@@ -8,8 +8,8 @@ from typing import Any, Literal
 from bidex_meta.commands.parsing import RunPath, Switch, parse
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
-from bidex_meta.sources import Source
 from bidex_meta.validation import Environments, Few, Seed, Shots
+from bidex_meta.worlds import Worlds
 
 
 @dataclass(frozen=True)
@@ -70,9 +70,9 @@ def main(arguments: Sequence[str]) -> None:
 
     folder = RunFolder.open(flags.run)
     stored = folder.config()
-    device = resolve_device(flags.device, Source.open(stored.to_json()).on_gpu)
+    device = resolve_device(flags.device, Worlds.open(stored.to_json()).on_gpu)
     config = replace(stored, device=device, engine=flags.engine)
-    source = Source.open(config.to_json())
+    source = Worlds.open(config.to_json())
     set_up_torch(config.threads)
     kind = learner_kind(stored.algo)
     if kind.adapts:
@@ -108,7 +108,7 @@ def _refuse_adaptation(flags: EvaluateFlags, algo: str) -> None:
         raise BidexError(f"{algo} does not adapt to tasks: its splits are shown one by one. Use --split train or test.")
 
 
-def _meta_test(flags: EvaluateFlags, folder: Any, config: RunConfig[Any], source: Source) -> None:
+def _meta_test(flags: EvaluateFlags, folder: Any, config: RunConfig[Any], source: Worlds) -> None:
     import sys
 
     from bidex_meta.commands import metatest

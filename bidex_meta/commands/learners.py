@@ -139,7 +139,7 @@ def choose_preset(kind: LearnerKind, asked: str, device: str, first: tuple[str, 
         kind: The learner.
         asked: A preset's name, or ``auto``.
         device: ``cpu``, ``cuda``, ``cuda:0``, ...
-        first: A preset that goes before others where the learner has it, and why; ``Source.preset``.
+        first: A preset that goes before others where the learner has it, and why; ``Worlds.preset``.
     """
     if asked.casefold() != "auto":
         return known_name("preset", asked, ["auto", *kind.presets]), "as asked"
@@ -159,7 +159,7 @@ def resolve_device(asked: str, on_gpu: bool) -> str:
 
     Args:
         asked: ``auto``, ``cpu``, ``cuda``, ``cuda:0``, ...
-        on_gpu: Whether a GPU is of use; ``Source.on_gpu``.
+        on_gpu: Whether a GPU is of use; ``Worlds.on_gpu``.
 
     Raises:
         BidexError: torch does not know the device, or it is not there (for each of several processes).

@@ -15,8 +15,8 @@ from bidex_meta.commands.parsing import RunPath, Switch, parse
 from bidex_meta.config import Steps
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.reading import absolute
-from bidex_meta.sources import Source
 from bidex_meta.validation import Environments, NonNegative, Seed, Threads
+from bidex_meta.worlds import Worlds
 
 RUNS = {"random": 0, "medium": 1, "expert": 1, "medium-expert": 2, "replay": 1, "demonstrations": 0}
 """Kinds of data sets, and how many runs each is made of."""
@@ -133,7 +133,7 @@ def _record(flags: RecordFlags, kind: str, held: contextlib.ExitStack) -> tuple[
     part_files.hdf5()
     config = _config(flags)
     size = flags.size or (_SIZE_OF_TWO if RUNS[kind] == 2 else _SIZE)
-    source = Source.open(config)
+    source = Worlds.open(config)
     folder, name = place_of(flags.out, source.name, kind)
     # Sums depend on how torch splits them over threads: a recording keeps those that it began with.
     config["threads"] = flags.threads or begun(folder).get("threads") or _cores()
@@ -206,7 +206,7 @@ def _config(flags: RecordFlags) -> dict[str, Any]:
         config |= {"object": None, "points": 0}
         if flags.suite is not None and flags.suite.endswith(".toml"):
             config["suite"] = str(absolute(flags.suite))
-    on_gpu = Source.open(config).on_gpu
+    on_gpu = Worlds.open(config).on_gpu
     return config | {"device": resolve_device(flags.device, on_gpu), "engine": flags.engine}
 
 
@@ -233,7 +233,7 @@ def _actors(flags: RecordFlags, kind: str, device: str) -> tuple[list[Any], list
     return actors, told
 
 
-def _rows(source: Source) -> int:
+def _rows(source: Worlds) -> int:
     """One row per task; where those are few, several."""
     pools = source.tasks("train")
     tasks = max(map(len, pools.values())) * len(pools)
@@ -282,7 +282,7 @@ def _replay(flags: RecordFlags, run: RunPath) -> None:
     if not config.record:
         raise BidexError(f"{run} kept nothing of its training. Train one that does: bidex-meta run --record 1e6 ...")
     kept = open_dataset(folder.path / "replay")
-    out, name = place_of(flags.out, Source.open(config.to_json()).name, "replay")
+    out, name = place_of(flags.out, Worlds.open(config.to_json()).name, "replay")
     adopt(kept.folder, out, name)
     _say_complete(out, name)
 

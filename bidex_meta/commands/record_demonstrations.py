@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from bidex_meta.errors import BidexError
-from bidex_meta.sources import Source
+from bidex_meta.worlds import Worlds
 
 if TYPE_CHECKING:
     from bidex_meta.witness.open_loop import Played
@@ -50,7 +50,7 @@ def record_demonstrations(flags: Any, say: Callable[[str], None], held: ExitStac
         raise BidexError(
             "Witnesses are of moving bases and of C MuJoCo on the CPU. Leave --base, --engine, --device out."
         )
-    source = Source.open({"task": flags.task, "base": "moving", "seed": 0, "threads": flags.threads})
+    source = Worlds.open({"task": flags.task, "base": "moving", "seed": 0, "threads": flags.threads})
     if source.name not in source.task_classes() or ":" in source.name:
         raise BidexError(f"{source.name} is none of the classes that have witnesses (bidex-meta witness --all).")
     of_tasks, player = flags.starts == "tasks", _script if flags.script else _witness

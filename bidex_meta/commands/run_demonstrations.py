@@ -6,10 +6,10 @@ from typing import Any
 
 from bidex_meta.commands.learners import ALGOS, LearnerKind, learner_kind
 from bidex_meta.errors import BidexError, known_name
-from bidex_meta.sources import Source
+from bidex_meta.worlds import Worlds
 
 
-def check(kind: LearnerKind, names: Sequence[str], source: Source) -> None:
+def check(kind: LearnerKind, names: Sequence[str], source: Worlds) -> None:
     """Refuses, before a world is made, what could not be imitated in it; reads the data sets' metadata alone.
 
     Raises:
@@ -27,7 +27,7 @@ def check(kind: LearnerKind, names: Sequence[str], source: Source) -> None:
         _check_dataset(open_dataset(name), source)
 
 
-def _check_dataset(dataset: Any, source: Source) -> None:
+def _check_dataset(dataset: Any, source: Worlds) -> None:
     classes = source.task_classes()
     for slot in dataset.metadata["tasks"]:
         known_name(f"class in {source.name} of", slot.partition("/")[0], classes)
@@ -40,7 +40,7 @@ def _check_dataset(dataset: Any, source: Source) -> None:
         )
 
 
-def check_goals(dataset: Any, source: Source) -> None:
+def check_goals(dataset: Any, source: Worlds) -> None:
     """Refuses data that do not show the goals which the source shows; what it hides, they may show.
 
     Raises:

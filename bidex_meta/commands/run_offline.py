@@ -8,8 +8,8 @@ from bidex_meta.commands.learners import ALGOS, LearnerKind, learner_kind
 from bidex_meta.commands.run_demonstrations import check_goals
 from bidex_meta.errors import BidexError
 from bidex_meta.reading import absolute, expanded
-from bidex_meta.sources import Source
 from bidex_meta.train.launch import launch
+from bidex_meta.worlds import Worlds
 
 if TYPE_CHECKING:
     from bidex_meta.data import Dataset
@@ -69,12 +69,12 @@ def task_seed(datasets: "Sequence[Dataset]") -> int | None:
     return seeds[0] if seeds else None
 
 
-def rows_and_steps(source: Source) -> tuple[int, int]:
+def rows_and_steps(source: Worlds) -> tuple[int, int]:
     """Rows of the world that tells sizes and names, and updates."""
     return max(1, len(source.tasks("train"))), UPDATES
 
 
-def check(kind: LearnerKind, record: int, datasets: "Sequence[Dataset]", source: Source) -> None:
+def check(kind: LearnerKind, record: int, datasets: "Sequence[Dataset]", source: Worlds) -> None:
     """Refuses what does not go together.
 
     Raises:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bidex_meta.data.episode import Episode
 from bidex_meta.errors import BidexError
-from bidex_meta.world.actions import clean
+from bidex_meta.world.checking import clean
 from bidex_meta.world.contract import PooledWorld, VectorWorld
 from bidex_meta.world.wrapper import PooledWorldWrapper
 

@@ -174,7 +174,7 @@ def test_ippos_critics_see_no_more_than_their_agents() -> None:
     from bidex_algos.multiagent.team import TeamCritic
     from bidex_meta.tasks import registry
     from bidex_meta.world.agent_views import agent_views
-    from bidex_meta.world.observation_groups import observation_groups
+    from bidex_meta.world.observations import observation_groups
 
     layout = registry.get("CatchUnderarm").layout
     views = agent_views(observation_groups([layout], layout.size, 0), 52, "hands")

@@ -15,7 +15,7 @@ from bidex_meta import Benchmark
 from bidex_meta.agents import MetaLearningAgent, Timestep
 from bidex_meta.commands.learners import learner_kind
 from bidex_meta.errors import BidexError
-from bidex_meta.sources import Source
+from bidex_meta.worlds import Worlds
 from tests.algos.families import PointClass, PointGoals, circle
 from tests.algos.resume import resumed
 from tests.algos.test_mtppo import equal
@@ -345,7 +345,7 @@ def test_bad_input_is_named():
 
 
 def test_the_run_makes_the_world_that_the_learner_asks_for():
-    source = Source.open({"suite": "ML1-wide", "threads": 1})
+    source = Worlds.open({"suite": "ML1-wide", "threads": 1})
     for algo, learner, mode in (
         ("rl2", {}, "DISABLED"),
         ("mtppo", {}, "SAME_STEP"),

@@ -11,11 +11,11 @@ from bidex_meta.cli import main
 from bidex_meta.commands import record_demonstrations
 from bidex_meta.data import open_dataset, place
 from bidex_meta.record import RunFolder
-from bidex_meta.sources.source import SingleClass
 from bidex_meta.witness.scripts import SCRIPTS
 from bidex_meta.witness.shifted import ShiftedStarts
 from bidex_meta.witness.simulator import Simulator
 from bidex_meta.witness.store import load_witness
+from bidex_meta.worlds.own import SingleClass
 
 pytest.importorskip("h5py", reason="needs the extra data")
 
