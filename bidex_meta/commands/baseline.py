@@ -113,7 +113,7 @@ def _scripted(source: Worlds, flags: BaselineFlags) -> "Evaluation":
 
 def _agent(what: str, world: Any, seed: int) -> tuple["Agent", list[str]]:
     """The policy, and the classes that it can play."""
-    from bidex_meta.evaluation.untrained import RandomAgent, ZeroAgent
+    from bidex_meta.evaluation.play import RandomAgent, ZeroAgent
     from bidex_meta.witness.open_loop import OpenLoop
     from bidex_meta.witness.store import load_witness, witness_path
 

@@ -62,9 +62,8 @@ def main(arguments: Sequence[str]) -> None:
     from bidex_meta.commands.learners import learner_kind, resolve_device
     from bidex_meta.commands.policies import load_policy
     from bidex_meta.commands.tables import evaluation_table, print_table
-    from bidex_meta.evaluation.play import EVALUATION_SEED
+    from bidex_meta.evaluation.play import EVALUATION_SEED, RandomAgent
     from bidex_meta.evaluation.results import compare
-    from bidex_meta.evaluation.untrained import RandomAgent
     from bidex_meta.record import RunFolder
     from bidex_meta.world.threads import set_up_torch
 

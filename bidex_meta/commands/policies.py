@@ -122,7 +122,7 @@ def acting(policy: str, world: Any, seed: int, which: str = "last") -> Agent:
     Raises:
         BidexError: The policy is of other observations or actions than the world's.
     """
-    from bidex_meta.evaluation.untrained import RandomAgent, ZeroAgent
+    from bidex_meta.evaluation.play import RandomAgent, ZeroAgent
 
     if policy == "zero":
         return ZeroAgent(world.action_space)

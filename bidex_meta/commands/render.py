@@ -105,7 +105,7 @@ def main(arguments: Sequence[str]) -> None:
 
 def _seen(world: Any) -> Any:
     """The world with clouds in its pictures."""
-    from bidex_meta.evaluation.seen import SeenWorld
+    from bidex_meta.evaluation.filming import SeenWorld
     from bidex_meta.points.sight import PointsRule
     from bidex_meta.world import World
 

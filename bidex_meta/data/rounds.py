@@ -20,7 +20,7 @@ from bidex_meta.data import part_files
 from bidex_meta.data.episode_recorder import BROKEN, EpisodeRecorder
 from bidex_meta.data.writer import DatasetWriter
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.untrained import RandomAgent
+from bidex_meta.evaluation.play import RandomAgent
 from bidex_meta.world.contract import PooledWorld
 
 PART_BYTES = 64_000_000

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from bidex_meta.data.dataset import Dataset
-from bidex_meta.evaluation.scores import Reference
+from bidex_meta.evaluation.references import Reference
 
 
 @dataclass(frozen=True)

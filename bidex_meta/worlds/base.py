@@ -14,8 +14,8 @@ from bidex_meta.tasks import registry
 
 if TYPE_CHECKING:
     from bidex_meta.agents import Agent
+    from bidex_meta.evaluation.references import Reference
     from bidex_meta.evaluation.results import Evaluation
-    from bidex_meta.evaluation.scores import Reference
     from bidex_meta.tasks.base import TaskClass
     from bidex_meta.world.contract import PooledWorld
 

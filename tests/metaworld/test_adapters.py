@@ -13,8 +13,7 @@ from bidex_meta import Benchmark
 from bidex_meta.commands.learners import learner_kind
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.meta_test import meta_evaluate
-from bidex_meta.evaluation.play import evaluate
-from bidex_meta.evaluation.untrained import ZeroAgent
+from bidex_meta.evaluation.play import ZeroAgent, evaluate
 from bidex_meta.metaworld.adapters import ForMetaWorld, FromMetaWorld, MetaWorldEnvs
 from bidex_meta.metaworld.evaluation import known_to_metaworld
 from tests.points import SPEED, Finder, PointWorld, Still, ring

@@ -17,8 +17,7 @@ from torch import Tensor
 from bidex_algos.onpolicy.mtppo import MTPPO, PRESETS, MTPPOConfig
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.play import evaluate
-from bidex_meta.evaluation.untrained import RandomAgent
+from bidex_meta.evaluation.play import RandomAgent, evaluate
 from bidex_meta.metaworld import batched
 from bidex_meta.metaworld import library as client
 from bidex_meta.metaworld.batched import MetaWorldWorld, evaluate_all_tasks

@@ -8,8 +8,7 @@ import torch
 
 from bidex_meta import Benchmark, make_task_world
 from bidex_meta.cli import main
-from bidex_meta.evaluation.play import evaluate
-from bidex_meta.evaluation.untrained import RandomAgent
+from bidex_meta.evaluation.play import RandomAgent, evaluate
 from bidex_meta.suite import load_suite
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import compile_scene

@@ -10,7 +10,7 @@ import torch
 
 from bidex_meta import drawing
 from bidex_meta.cli import main
-from bidex_meta.evaluation.untrained import ZeroAgent
+from bidex_meta.evaluation.play import ZeroAgent
 from bidex_meta.viewer import loop
 from bidex_meta.viewer.playback import Stage
 from bidex_meta.viewer.shapes import colour, shape, visible

@@ -8,7 +8,7 @@ import pytest
 
 from bidex_meta import paths
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.untrained import ZeroAgent
+from bidex_meta.evaluation.play import ZeroAgent
 from bidex_meta.worlds import WorldConfig, Worlds
 
 CORE = Path(paths.__file__).parent
