@@ -29,6 +29,12 @@ Whole = Annotated[int, Meta(ge=0, le=MOST)]
 """A count that may be zero."""
 Count = Annotated[int, Meta(ge=1, le=MOST)]
 """A count of at least one."""
+Few = Annotated[int, Meta(ge=1, le=1_000_000)]
+"""A count of episodes, tasks, tries and the like, at least one."""
+Pixels = Annotated[int, Meta(ge=1, le=16_384)]
+"""Width or height of a picture."""
+Port = Annotated[int, Meta(ge=1, le=65_535)]
+"""A port of the network."""
 Environments = Annotated[int, Meta(ge=1, le=10_000_000)]
 """Environments stepped together."""
 Threads = Annotated[int, Meta(ge=1, le=4096)]

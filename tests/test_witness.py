@@ -11,10 +11,9 @@ from bidex_meta.errors import BidexError
 from bidex_meta.record.versions import collect_versions
 from bidex_meta.sources.source import OwnSuite
 from bidex_meta.tasks import registry
-from bidex_meta.witness.open_loop import OpenLoop
-from bidex_meta.witness.puppets import rest_action
-from bidex_meta.witness.replay import Replay, replay
-from bidex_meta.witness.simulator import SHIFT, Simulator, task_slot
+from bidex_meta.witness.controller import rest_action
+from bidex_meta.witness.demonstrators import OpenLoopReplay
+from bidex_meta.witness.replay import SHIFT, Replay, Simulator, replay, task_slot
 from bidex_meta.witness.store import LEVELS, Witness, load_witness, quantised, save_witness, witness_path
 from bidex_meta.world import World
 
@@ -154,7 +153,7 @@ def test_every_stored_witness_holds(name: str) -> None:
 
 def test_a_witness_is_played_in_its_order_by_every_row_of_its_class() -> None:
     known = {"A": Witness(np.arange(6, dtype=np.float32).reshape(3, 2) / 8, {})}
-    agent = OpenLoop(known, ["A", "B"], torch.tensor([0, 1, 0]), 3)
+    agent = OpenLoopReplay(known, ["A", "B"], torch.tensor([0, 1, 0]), 3)
     obs = torch.zeros(3, 5)
     played = [agent.eval_action(obs) for _ in range(2)]
     assert played[1].tolist() == [[0.25, 0.375, 0.0], [0.0, 0.0, 0.0], [0.25, 0.375, 0.0]]

@@ -16,6 +16,7 @@ import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
 from bidex_meta.errors import BidexError, shortened
+from bidex_meta.validation import check_fields
 
 Options = TypeVar("Options")
 
@@ -108,6 +109,7 @@ def parse(options: type[Options], arguments: Sequence[str], command: str, defaul
     if unknown:
         _refuse(unknown[0], options if default is None else default, command)
     _check_numbers(parsed)
+    check_fields(parsed, f"bidex-meta {command}")
     return parsed
 
 

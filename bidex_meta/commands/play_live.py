@@ -9,9 +9,11 @@ from typing import Annotated, Any
 
 import tyro
 
+from bidex_meta import drawing
 from bidex_meta.commands.parsing import Switch, parse
-from bidex_meta.errors import BidexError, known_name
+from bidex_meta.errors import known_name
 from bidex_meta.outside import name_with_object
+from bidex_meta.validation import Port, Positive, Seed
 
 
 @dataclass(frozen=True)
@@ -36,15 +38,15 @@ class PlayFlags:
     """Of a run: last, best (see `bidex-meta run --help`, --evaluate-every) or a file."""
     suite: str | None = None
     """Show the classes of this suite; None: the run's."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of tasks and starts."""
-    speed: float = 1.0
+    speed: Positive = 1.0
     """Of the clock; 0.5 is slow motion."""
     browser: Switch = False
     """In the browser, also where there is a screen."""
     host: str = "127.0.0.1"
     """Address the browser's page is served at; 0.0.0.0 lets other machines in."""
-    port: int = 8080
+    port: Port = 8080
     """Port of that page; where it is taken, the next free one."""
     seconds: float | None = None
     """End after so many seconds; None: when the window is closed, or Ctrl-C."""
@@ -57,11 +59,8 @@ def main(arguments: Sequence[str]) -> None:
         BidexError: Bad flags, a policy that does not fit, or no window and no viser.
     """
     flags = parse(PlayFlags, arguments, "play")
-    if flags.speed <= 0.0:
-        raise BidexError(f"--speed must be above 0, not {flags.speed:g}.")
     from bidex_meta.commands.policies import acting, looked_at, slots_of
-    from bidex_meta.viewer.loop import play
-    from bidex_meta.viewer.playback import Stage
+    from bidex_meta.viewer.playback import Stage, play
 
     policy = flags.policy if flags.run is None else str(flags.run)
     source = looked_at(policy, flags.suite, flags.task, flags.seed, flags.object)
@@ -76,8 +75,6 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _screen(flags: PlayFlags, stage: Any) -> Any:
-    from bidex_meta import drawing
-
     if drawing.has_screen() and not flags.browser:
         from bidex_meta.viewer import desktop
 

@@ -6,10 +6,15 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
+from msgspec import Meta
 
 from bidex_meta.commands.parsing import StepCount, Switch, parse
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.outside import name_with_object, short_name
+from bidex_meta.record import video
+from bidex_meta.record.atomic import check_writable, refuse_links
+from bidex_meta.record.progress import counted
+from bidex_meta.validation import MOST, Few, Pixels, Seed
 
 
 @dataclass(frozen=True)
@@ -40,15 +45,15 @@ class RenderFlags:
     tiled: Switch = False
     """All classes of the suite beside each other; where an episode ends the next one begins. A name is green from its
     first success to the end of the episode."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of task and start."""
-    steps: StepCount | None = None
+    steps: Annotated[StepCount, Meta(ge=0, le=MOST)] | None = None
     """Steps to take, 60 a second; None: none for a picture, one episode for a film, with --tiled the longest one."""
-    every: int | None = None
+    every: Few | None = None
     """Steps from one frame of a film to the next; None: 1, with --tiled 2."""
-    width: int | None = None
+    width: Pixels | None = None
     """Pixels, of a tile with --tiled; None: 640, with --tiled 240."""
-    height: int | None = None
+    height: Pixels | None = None
     """Pixels, likewise; None: three quarters of the width."""
     camera: str | None = None
     """front, side, top or back; None: front."""
@@ -64,9 +69,6 @@ def main(arguments: Sequence[str]) -> None:
         BidexError: Bad flags, a policy that does not fit, or no way to draw here.
     """
     flags = parse(RenderFlags, arguments, "render")
-    from bidex_meta.record import video
-    from bidex_meta.record.atomic import check_writable, refuse_links
-
     policy = flags.policy if flags.run is None else str(flags.run)
     out = _out(flags, policy)
     suffix = video.check_suffix(out)
@@ -79,9 +81,6 @@ def main(arguments: Sequence[str]) -> None:
             raise BidexError(f"A film needs an even width and height, not {width} x {height}.")
         video.check_films()
     every = flags.every or (2 if flags.tiled else 1)
-    if every < 1:
-        raise BidexError(f"--every must be at least 1, not {every}.")
-
     from bidex_meta.commands.policies import acting, looked_at, slots_of
 
     source = looked_at(policy, flags.suite, flags.task, flags.seed, flags.object)
@@ -89,11 +88,11 @@ def main(arguments: Sequence[str]) -> None:
     classes = source.task_classes()  # refuses what is not of ours
     if not flags.tiled:
         task = known_name(f"task of {source.name}", task or slots[0], classes)
-    # One row for each slot is enough to see one of them.
+    # One environment for each slot is enough to see one of them.
     world = source.world("train", len(slots))
     agent = acting(policy, world, flags.seed, flags.checkpoint)
     if flags.points:
-        world = _seen(world)
+        world = _with_clouds(world)
     rows = list(range(len(slots))) if flags.tiled else [world.slot_rows[slots.index(str(task))].start]
     look = {"width": width, "height": height, "camera": flags.camera}
     _write(out, _frames(flags, agent, world, rows, every if suffix != ".png" else None, look), every)
@@ -101,10 +100,10 @@ def main(arguments: Sequence[str]) -> None:
     print(out)
 
 
-def _seen(world: Any) -> Any:
+def _with_clouds(world: Any) -> Any:
     """The world with clouds in its pictures."""
     from bidex_meta.evaluation.seen import SeenWorld
-    from bidex_meta.points.sight import PointsRule
+    from bidex_meta.points.depth_sensor import PointsRule
     from bidex_meta.world import World
 
     if not isinstance(world, World):
@@ -127,7 +126,7 @@ def _out(flags: RenderFlags, policy: str) -> Path:
 
 
 def _frames(
-    flags: RenderFlags, agent: Any, world: Any, rows: list[int], every: int | None, look: dict[str, Any]
+    flags: RenderFlags, agent: Any, world: Any, rows: list[int], every: Few | None, look: dict[str, Any]
 ) -> tuple[Iterator[Any], int]:
     """The frames, and how many there will be at most; with ``every`` None the last one alone."""
     from bidex_meta.evaluation.filming import film_row, film_tiles
@@ -142,8 +141,6 @@ def _frames(
 
 
 def _write(out: Path, frames: tuple[Iterator[Any], int], every: int) -> None:
-    from bidex_meta.record import video
-    from bidex_meta.record.progress import counted
     from bidex_meta.tasks.base import CONTROL_RATE
 
     shown = counted(*frames, "frames")

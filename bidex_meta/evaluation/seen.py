@@ -4,10 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from bidex_meta.points.camera import camera_of
-from bidex_meta.points.cloud import Cloud
+from bidex_meta.points.cloud import Cloud, camera_of
+from bidex_meta.points.depth_sensor import CANDIDATES
 from bidex_meta.points.pictures import beside, draw
-from bidex_meta.points.sight import CANDIDATES
 from bidex_meta.points.surfaces import sample
 
 

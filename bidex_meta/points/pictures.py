@@ -1,8 +1,8 @@
-"""Pictures of a cloud: dots, the nearer the larger and the lighter, coloured by what they are of."""
+"""Pictures of a cloud: dots coloured by kind, the nearer the larger and the lighter."""
 
 import numpy as np
 
-from bidex_meta.points.camera import Camera
+from bidex_meta.points.cloud import Camera
 from bidex_meta.points.surfaces import FIXTURE, HAND, OBJECT
 
 _BACK = (24, 26, 30)
@@ -12,23 +12,20 @@ _DOT = 0.0035
 
 
 def beside(camera: Camera) -> Camera:
-    """A camera as far away, from the side, that looks at the same place."""
+    """A camera at the same distance from the same target, from the side."""
     far = float(np.linalg.norm(np.subtract(camera.eye, camera.target)))
     x, y, z = camera.target
     return Camera((x, y - 0.94 * far, z + 0.34 * far), camera.target, camera.field_of_view)
 
 
 def draw(cloud: np.ndarray, camera: Camera, width: int, height: int) -> np.ndarray:
-    """A cloud as a camera sees its points, none of which hides what lies between them.
+    """A picture (height, width, 3), uint8, of a cloud.
 
     Args:
-        cloud: Points (n, 4): metres in the row's frame, and what each is of (``surfaces.FIXTURE``, ...).
-        camera: From where; its field of view fits the smaller side of the picture.
-        width: Of the picture, pixels.
-        height: Likewise.
-
-    Returns:
-        ``(height, width, 3)`` uint8.
+        cloud: Points (n, 4): world, metres, and their kinds (``surfaces.FIXTURE``, ...).
+        camera: Its field of view fits the smaller side of the picture.
+        width: Pixels.
+        height: Pixels.
     """
     picture = np.empty((height, width, 3), np.uint8)
     picture[:] = _BACK

@@ -8,8 +8,7 @@ import mujoco
 import numpy as np
 
 from bidex_meta import paths
-from bidex_meta.hands.hand import hand
-from bidex_meta.hands.pair import FIXTURE, OBJECT, SIDES, add_hands, damp_bases, set_contact_bits
+from bidex_meta.hands.hand import FIXTURE, OBJECT, SIDES, add_hands, damp_bases, hand, set_contact_bits
 from bidex_meta.maths import quaternion_from_rpy
 from bidex_meta.tasks.state import unknown_sensor
 

@@ -3,8 +3,7 @@
 import torch
 from torch import Tensor
 
-from bidex_meta.hands.hand import FORCE_PER_SCALE, TORQUE_PER_SCALE, hand
-from bidex_meta.hands.pair import SIDES
+from bidex_meta.hands.hand import FORCE_PER_SCALE, SIDES, TORQUE_PER_SCALE, hand
 from bidex_meta.world.groups import Group
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from itertools import groupby
 
-from bidex_meta.hands.pair import SIDES
+from bidex_meta.hands.hand import SIDES
 from bidex_meta.tasks.layout import Layout, hand_blocks
 from bidex_meta.world.contract import ObservationGroup
 

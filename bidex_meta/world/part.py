@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.maths import xyzw
-from bidex_meta.points.sight import Sight
+from bidex_meta.points.depth_sensor import DepthSensor
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.world.actions import Controls
@@ -26,7 +26,13 @@ class Part:
     """
 
     def __init__(
-        self, group: Group, slots: list[Slot], rule: Rule, width: int, num_envs: int, sights: list[Sight] | None = None
+        self,
+        group: Group,
+        slots: list[Slot],
+        rule: Rule,
+        width: int,
+        num_envs: int,
+        sights: list[DepthSensor] | None = None,
     ) -> None:
         """Prepares controls and observers.
 

@@ -6,10 +6,8 @@ import pytest
 import torch
 
 from bidex_meta.errors import BidexError
-from bidex_meta.points.camera import camera_of
-from bidex_meta.points.cloud import Cloud
-from bidex_meta.points.solids import area, inside, surface
-from bidex_meta.points.surfaces import sample
+from bidex_meta.points.cloud import Cloud, camera_of
+from bidex_meta.points.surfaces import area, inside, sample, surface
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import compile_scene
 
@@ -117,7 +115,7 @@ def test_a_wall_hides_and_without_it_nothing_does() -> None:
         )
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
-        from bidex_meta.points.camera import Camera
+        from bidex_meta.points.cloud import Camera
 
         cloud = Cloud(sample(model, 3072), Camera((1.0, 0.0, 0.0), (0.0, 0.0, 0.0)), 256)
         return model, cloud(torch.tensor(data.xpos)[None], torch.tensor(data.xmat).view(1, -1, 3, 3))[0]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bidex_meta.points.camera import Camera
+from bidex_meta.points.cloud import Camera
 from bidex_meta.points.pictures import beside, draw
 from bidex_meta.points.surfaces import FIXTURE, HAND, OBJECT
 

@@ -14,10 +14,10 @@ import pytest
 from bidex_meta import memory
 from bidex_meta.cli import main
 from bidex_meta.commands import run_recording
-from bidex_meta.commands.described import described
-from bidex_meta.data import Dataset, open_dataset, part_files, place, rounds
+from bidex_meta.commands.run_data import dataset_metadata
+from bidex_meta.data import Dataset, collect, open_dataset, part_files, writer
 from bidex_meta.data.checking import verify
-from bidex_meta.data.writer import DatasetWriter, finish
+from bidex_meta.data.writer import DatasetWriter, estimated_bytes, finish
 from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder
 from bidex_meta.sources import Source
@@ -102,8 +102,8 @@ def recorded(folder: Path, **config: Any) -> Dataset:
     source = Source.open({"seed": 0, "threads": 1, **config})
     world, out = source.world("train", 2), DatasetWriter(folder)
     try:
-        rounds.collect(world, [rounds.Actor(None)], out, 60, 0, lambda now, seconds: None)
-        about = described(source, world, "random", [])
+        collect.collect(world, [collect.Actor(None)], out, 60, 0, lambda now, seconds: None)
+        about = dataset_metadata(source, world, "random", [])
         finish(folder, "own/random-v0", world.single_observation_space, world.single_action_space, about)
     finally:
         world.close()
@@ -202,7 +202,7 @@ def test_a_recorded_run_asks_for_memory_and_for_the_rest_of_the_room(
     plan: Any = SimpleNamespace(config={"record": 100, "record_share": 0.5}, folder=None)
     plan.flags = SimpleNamespace(run_dir=folder / "run")
     asked: list[int] = []
-    monkeypatch.setattr(place, "check_room", lambda where, needed, told: asked.append(needed))
+    monkeypatch.setattr(writer, "check_room", lambda where, needed, what: asked.append(needed))
     # Two rows of five steps, two of eight, of three observations, two actions and two rewards; and once more.
     needed = 2 * 4 * (3 + 2 + 2) * (2 * 5 + 2 * 8)
     monkeypatch.setattr(memory, "available", lambda: needed)
@@ -242,7 +242,7 @@ def test_stopping_at_a_return(toy: None, folder: Path, capsys: pytest.CaptureFix
         ("record medium-expert a", "takes 2 run folders, got 1"),
         ("record medium a --suite MT4", "Leave --suite and --task out"),
         ("record random --suite MT4 --base fixed", "goes with --task"),
-        ("record random --suite MT4 --noise -1", "--noise must lie in"),
+        ("record random --suite MT4 --noise -1", "noise: expected"),
         ("record random --suite MT4 --noise nan", "--noise must be a finite number"),
         ("record random --suite MT4 --size -1", "--size"),
         ("record medium nowhere", "is not a run folder"),
@@ -267,8 +267,11 @@ def test_names() -> None:
         ("/home/me/my suite.toml", "my-suite/random-v0"),
         ("my_tasks:SlideBlock", "SlideBlock/random-v0"),
     ):
-        assert place.default_name(subject, "random") == name and place.valid_name(name)
-    assert not place.valid_name("a b-v0") and not place.valid_name("a")
+        assert writer.default_name(subject, "random") == name
+        writer.check_name(name)
+    for name in ("a b-v0", "a"):
+        with pytest.raises(BidexError, match="Expected a name such as"):
+            writer.check_name(name)
 
 
 def test_without_h5py_it_is_said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -279,8 +282,6 @@ def test_without_h5py_it_is_said(monkeypatch: pytest.MonkeyPatch, capsys: pytest
 
 
 def test_estimates(real: Dataset) -> None:
-    from bidex_meta.data.writer import estimated_bytes
-
     mean: Any = real.num_steps / real.num_episodes
     size = sum(path.stat().st_size for path in part_files.parts_of(real.folder))
     assert 0.9 < estimated_bytes(real.num_steps, 422, 52, mean) / size < 1.1

@@ -4,8 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bidex_meta.hands.hand import CENTRE_OF_MASS, hand, hand_spec
-from bidex_meta.hands.pair import INNER, SIDES, add_hands, damp_bases
+from bidex_meta.hands.hand import CENTRE_OF_MASS, INNER, SIDES, add_hands, damp_bases, hand, hand_spec
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import build_spec, compile_scene

@@ -8,13 +8,12 @@ import pytest
 import torch
 
 from bidex_meta.cli import main
-from bidex_meta.commands import record_demonstrations
-from bidex_meta.data import open_dataset, place
+from bidex_meta.data import collect, open_dataset, writer
 from bidex_meta.record import RunFolder
 from bidex_meta.sources.source import SingleClass
+from bidex_meta.witness.demonstrators import ShiftedStarts
+from bidex_meta.witness.replay import Simulator
 from bidex_meta.witness.scripts import SCRIPTS
-from bidex_meta.witness.shifted import ShiftedStarts
-from bidex_meta.witness.simulator import Simulator
 from bidex_meta.witness.store import load_witness
 
 pytest.importorskip("h5py", reason="needs the extra data")
@@ -75,7 +74,7 @@ def test_only_what_succeeds_is_kept_and_a_recording_goes_on(
     assert whole.num_steps >= 300 and bool(whole.table["success"].all())
     assert (whole.metadata["kind"], whole.metadata["base"]) == ("demonstrations", "moving")
     torn = [*RECORD, "--size", "300", "--out", sets / "sets" / "torn-v0"]
-    play, rounds = record_demonstrations._round, []
+    play, rounds = collect.collect_successes, []
 
     def once(*given: Any) -> None:
         if rounds:
@@ -83,11 +82,11 @@ def test_only_what_succeeds_is_kept_and_a_recording_goes_on(
         rounds.append(play(*given))
 
     with monkeypatch.context() as patch:
-        patch.setattr(record_demonstrations, "_round", once)
+        patch.setattr(collect, "collect_successes", once)
         told(capsys, *torn, code=130)
-    asked, room = [], place.check_room
+    asked, room = [], writer.check_room
     with monkeypatch.context() as patch:
-        patch.setattr(place, "check_room", lambda *given: (asked.append(given[1]), room(*given)))
+        patch.setattr(writer, "check_room", lambda *given: (asked.append(given[1]), room(*given)))
         told(capsys, *torn)
         told(capsys, *RECORD, "--size", "300", "--out", sets / "sets" / "fresh-v0")
     assert 0 <= asked[0] < asked[1]  # less what the killed one left

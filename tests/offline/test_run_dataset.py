@@ -11,16 +11,16 @@ import torch
 from gymnasium.spaces import Box
 
 from bidex_meta.cli import main
-from bidex_meta.commands.run_offline import implied
+from bidex_meta.commands.run_data import implied
 from bidex_meta.data import Dataset, open_dataset
-from bidex_meta.data.episode_recorder import EpisodeRecorder
+from bidex_meta.data.collector import EpisodeCollector
 from bidex_meta.data.joined import join
 from bidex_meta.data.writer import DatasetWriter, begin, finish
 from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder
 from bidex_meta.sources.humanoid_task import HUMANOID
 from bidex_meta.sources.source import OwnSuite
-from bidex_meta.witness.simulator import task_slot
+from bidex_meta.witness.replay import task_slot
 from bidex_meta.world import World
 from bidex_meta.world.contract import ObservationGroup
 from tests.algos.problems import opposite_bandits
@@ -196,7 +196,7 @@ def test_goals_that_the_world_hides_are_zero_as_it_shows_them(tmp_path: Path) ->
         for rule, pad in (("plain", None), ("masked", 450))
     )
     episodes: list[Any] = []
-    recorder = EpisodeRecorder(plain, episodes.append)
+    recorder = EpisodeCollector(plain, episodes.append)
     seen, action = [masked.reset(seed=3)[0]], torch.full((1, 52), 0.1)
     recorder.reset(seed=3)
     for _ in range(slot.task_class.episode_steps):

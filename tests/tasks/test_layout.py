@@ -6,7 +6,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidex_meta.hands.pair import SIDES
+from bidex_meta.hands.hand import SIDES
 from bidex_meta.tasks import registry
 from bidex_meta.world import World
 from tests.hands import figures

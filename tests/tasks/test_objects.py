@@ -6,7 +6,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidex_meta.hands.pair import INNER
+from bidex_meta.hands.hand import INNER
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.pour_water import PourWater
 from bidex_meta.tasks.scene import Scene, compile_scene

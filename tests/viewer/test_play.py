@@ -13,8 +13,8 @@ from bidex_meta.cli import main
 from bidex_meta.evaluation.untrained import ZeroAgent
 from bidex_meta.sources import Source
 from bidex_meta.viewer import loop
+from bidex_meta.viewer.browser import colour, shape, visible
 from bidex_meta.viewer.playback import Stage
-from bidex_meta.viewer.shapes import colour, shape, visible
 
 
 @pytest.fixture(scope="module")

@@ -18,8 +18,7 @@ from bidex_meta.hands.poses import PALM_UP_AWAY, HandPose
 from bidex_meta.hands.starts import make_room_for
 from bidex_meta.maths import conjugate, constant, multiply, rotate, wxyz, xyzw
 from bidex_meta.reading import expanded
-from bidex_meta.tasks.objects.outline import extents, outline
-from bidex_meta.tasks.objects.own_file import compiled, read_own, set_contacts
+from bidex_meta.tasks.objects.mjcf import compiled, extents, outline, read_own, set_contacts
 from bidex_meta.tasks.scene import attach
 
 EGG = "egg"

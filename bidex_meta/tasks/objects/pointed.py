@@ -16,8 +16,7 @@ from bidex_meta.engine.capacity import Capacity
 from bidex_meta.errors import BidexError, shortened
 from bidex_meta.reading import absolute
 from bidex_meta.tasks.base import TaskClass
-from bidex_meta.tasks.objects.outline import outline
-from bidex_meta.tasks.objects.own_file import compiled, read_own, set_contacts
+from bidex_meta.tasks.objects.mjcf import compiled, outline, read_own, set_contacts
 from bidex_meta.tasks.scene import SceneObject, attach, compile_scene
 
 _MOST_MASS, _LARGEST, _MOST_GEOMS, _MOST_FRICTION = 10.0, 0.6, 64, 5.0
