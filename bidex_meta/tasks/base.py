@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import HandPose
-from bidex_meta.tasks.layout import Layout
+from bidex_meta.tasks.layout import Block, Layout, both_hands
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace
 from bidex_meta.validation import true_or_false
@@ -68,6 +68,7 @@ class TaskClass(ABC):
         transition_scale: Scale of the base forces (docs/figures.md, base).
         orientation_scale: Scale of the base torques.
         start_draws: How many uniform numbers the start of an episode takes.
+        blocks: The observation behind both hands' blocks.
         moving_base: Whether the hands' bases are driven (52 actions) or fixed (40).
         solver: What the class asks of the contact solver.
         needs: Most contacts and constraint rows that were seen, for mujoco_warp's fixed room: from
@@ -91,6 +92,7 @@ class TaskClass(ABC):
     transition_scale: ClassVar[float]
     orientation_scale: ClassVar[float]
     start_draws: ClassVar[int]
+    blocks: ClassVar[tuple[Block, ...]] = ()
     moves_by_default: ClassVar[bool] = True
     solver: ClassVar[Solver] = Solver()
     needs: Capacity = Capacity(71, 20, 134)
@@ -131,9 +133,9 @@ class TaskClass(ABC):
         """What a task of this class freezes."""
 
     @property
-    @abstractmethod
     def layout(self) -> Layout:
-        """The observation as named blocks."""
+        """The observation as named blocks: both hands', then ``blocks``."""
+        return Layout((*both_hands(self.moving_base), *self.blocks))
 
     @abstractmethod
     def add_objects(self, scene: mujoco.MjSpec) -> None:
@@ -154,9 +156,9 @@ class TaskClass(ABC):
                 nominal start and are written in place; MuJoCo's quaternion order (w, x, y, z).
         """
 
-    @abstractmethod
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """The blocks of the layout that no sensor gives, by name, each (n, size)."""
+        """The blocks of the layout that no sensor gives, by name, each (n, size); none by default."""
+        return {}
 
     @abstractmethod
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
