@@ -109,7 +109,7 @@ def parse(options: type[Options], arguments: Sequence[str], command: str, defaul
     if unknown:
         _refuse(unknown[0], options if default is None else default, command)
     _check_numbers(parsed)
-    check_fields(parsed, f"bidex-meta {command}")
+    check_fields(parsed, command)
     return parsed
 
 

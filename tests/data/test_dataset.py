@@ -66,7 +66,7 @@ def test_a_part_is_held_to_its_digest_before_its_episodes_are_read(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a set too large to be read at once when it is opened."""
-    monkeypatch.setattr("bidex_meta.data.dataset._LOOKED_AT", 8000)
+    monkeypatch.setattr("bidex_meta.data.dataset._CHECKED_AT_OPENING", 8000)
     path = part_files.parts_of(folder)[-1]
     with h5py.File(path, "r+") as file:
         file["episode_2"]["actions"][0, 0] += 0.25
@@ -83,7 +83,7 @@ def test_sets_without_digests_load_as_before(folder: Path, capsys: pytest.Captur
     without_digests(folder)
     assert not unlike(open_dataset(folder), whole)
     done = called(["data", "check", str(folder.parent)])
-    assert done.code == 0 and "Without a digest, since written elsewhere or by an older version: 4 files." in done.out
+    assert done.code == 0 and "Files without a digest, from elsewhere or older versions: 4." in done.out
     make_foreign(folder)
     assert len(verify(open_dataset(folder)).unsealed) == 2
 

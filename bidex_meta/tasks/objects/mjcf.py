@@ -27,18 +27,19 @@ _SOLREF, _SOLIMP, _MARGIN = (0.0084, 1.0), (0.95, 0.99, 0.001), 0.002
 """As those of the files under assets/objects: as stiff as the time step allows (bidex_meta/hands/README.md)."""
 _NOT_FINITE = re.compile(r"(?:^|\s)[+-]?(?:inf(?:inity)?|nan(?:\([^)]*\))?)(?:\s|$)", re.IGNORECASE)
 """MuJoCo takes such numbers, and writes a log file into the working folder."""
+_MOST_FRICTION = 5.0
 _FOLDERS = ("meshdir", "texturedir", "assetdir")
 
 
 def read_own(path: Path, points: bool = False) -> mujoco.MjSpec:
-    """The specification that an MJCF file holds, files that it names with absolute paths.
+    """The specification in an MJCF file, with absolute paths of the files that it names.
 
     Args:
         path: The file.
         points: Whether it may have sensors.
 
     Raises:
-        BidexError: It cannot be read, is no MJCF, holds what no object needs, or names a file that is missing or lies
+        BidexError: It cannot be read, is no MJCF, has a tag that no object needs, or names a file that is missing or
             outside its folder.
     """
     content = read_bytes(path, "an object's MJCF file", _MOST_BYTES)
@@ -78,6 +79,21 @@ def set_contacts(spec: mujoco.MjSpec) -> None:
     for geom in spec.geoms:
         geom.solref[:2], geom.solimp[:3] = _SOLREF, _SOLIMP
         geom.margin, geom.gap = _MARGIN, 0.0
+
+
+def check_collisions(path: Path, model: mujoco.MjModel, most: int) -> int:
+    """The number of geoms that collide.
+
+    Raises:
+        BidexError: None, or more than ``most``, or one with too much friction.
+    """
+    geoms = int(((model.geom_contype != 0) | (model.geom_conaffinity != 0)).sum())
+    if not 0 < geoms <= most:
+        raise BidexError(f"{path}: expected at least one and at most {most} geoms that collide, got {geoms}. Mend it.")
+    friction = float(model.geom_friction[:, 0].max())
+    if not friction <= _MOST_FRICTION:
+        raise BidexError(f"{path}: expected friction of at most {_MOST_FRICTION:g}, got {friction:.4g}. Lower it.")
+    return geoms
 
 
 def _reason(error: Exception) -> str:

