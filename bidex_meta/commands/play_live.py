@@ -66,7 +66,7 @@ def main(arguments: Sequence[str]) -> None:
     source = looked_at(policy, flags.suite, flags.task, flags.seed, flags.object)
     slots, named = slots_of(source), flags.task and name_with_object(flags.task, flags.object)
     task = known_name(f"task of {source.name}", named or slots[0], source.task_classes())
-    world = source.world("train", len(slots))
+    world: Any = source.world("train", len(slots))
     stage = Stage(world, acting(policy, world, flags.seed, flags.checkpoint), slots.index(task), flags.seed)
     screen = _screen(flags, stage)
     with contextlib.suppress(KeyboardInterrupt):  # how the view in the browser is ended

@@ -174,11 +174,7 @@ def _record(flags: RecordFlags, collection: _Collection) -> None:
 
 
 def _checked_memory(world: Any, plan: dict[str, Any]) -> str:
-    """The memory that running episodes take, for a message.
-
-    Raises:
-        BidexError: It is more than allowed.
-    """
+    """The memory of running episodes, for a message; refuses more than is allowed."""
     from bidex_meta.data.collect import bytes_held
 
     memory = bytes_held(world)
@@ -259,11 +255,7 @@ def _actors(flags: RecordFlags, kind: str, device: str) -> "tuple[list[Actor], l
 
 
 def _demonstrations(flags: RecordFlags) -> _Collection:
-    """Successful replays of a class's witness or scripted policy, with moving bases, as suites have them.
-
-    Raises:
-        BidexError: Flags that do not go together, or no witness or script.
-    """
+    """Successful replays of a class's witness or scripted policy, with moving bases, as suites have them."""
     from bidex_meta.data.collect import collect_successes, progress
     from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted, ShiftedStarts
     from bidex_meta.witness.scripts import script_of

@@ -112,11 +112,6 @@ def _with_clouds(world: Any) -> Any:
 
 
 def _out(flags: RenderFlags, policy: str) -> Path:
-    """The file to write.
-
-    Raises:
-        BidexError: None is named and there is no run to put it in.
-    """
     if flags.out is not None:
         return flags.out
     if policy in ("zero", "random"):

@@ -192,11 +192,7 @@ class _Formulas:
         return self._known[name]
 
     def _class(self, name: str) -> TaskClass:
-        """A class with the bases of the data.
-
-        Raises:
-            BidexError: It is unknown, or has other actions than the data with any of them.
-        """
+        """A class with the bases of the data."""
         classes, actions = [registry.get(name, base) for base in self._bases], self._dataset.action_size
         for task in classes:
             if task.action_size == actions:

@@ -51,10 +51,10 @@ CONTROL_RATE = 60
 
 
 class TaskClass(ABC):
-    """One of the manipulation tasks, batched over rows.
+    """One of the manipulation tasks, batched over environments.
 
-    Methods take and return tensors whose first axis counts rows, in the engine's precision. Nothing here loops over
-    rows or keeps state: what a task freezes is in ``frozen``, what an episode draws is in ``draws``.
+    The first axis of all tensors counts environments, in the engine's precision. A class has no loops over them and no
+    state: what a task freezes is in ``frozen``, what an episode draws is in ``draws``.
 
     Attributes:
         name: Name of the class, e.g. ``CatchUnderarm``.
@@ -68,6 +68,7 @@ class TaskClass(ABC):
         transition_scale: Scale of the base forces (docs/figures.md, base).
         orientation_scale: Scale of the base torques.
         start_draws: How many uniform numbers the start of an episode takes.
+        variation_space: What a task of this class freezes; an attribute or a property.
         blocks: The observation behind both hands' blocks.
         moving_base: Whether the hands' bases are driven (52 actions) or fixed (40).
         solver: What the class asks of the contact solver.
@@ -92,6 +93,7 @@ class TaskClass(ABC):
     transition_scale: ClassVar[float]
     orientation_scale: ClassVar[float]
     start_draws: ClassVar[int]
+    variation_space: VariationSpace
     blocks: ClassVar[tuple[Block, ...]] = ()
     moves_by_default: ClassVar[bool] = True
     solver: ClassVar[Solver] = Solver()
@@ -101,20 +103,13 @@ class TaskClass(ABC):
     depth_camera: ClassVar[tuple[tuple[float, float, float], tuple[float, float, float]] | None] = None
 
     def __init__(self, moving_base: bool | None = None) -> None:
-        """Chooses the base.
-
-        Args:
-            moving_base: Drive the bases or fix them; None takes the class's own (fixed for HandOver alone).
-
-        Raises:
-            BidexError: Neither True, False nor None.
-        """
+        """Drives the bases or fixes them; None takes the class's own (fixed for HandOver alone)."""
         chosen = self.moves_by_default if moving_base is None else moving_base
         self.moving_base = true_or_false("moving_base", chosen)
 
     @property
     def scene_key(self) -> tuple[Hashable, ...]:
-        """What its compiled scene depends on: classes of one key may share it."""
+        """What its compiled scene depends on: classes with equal keys may share it."""
         return self.name, self.moving_base
 
     @property
@@ -126,11 +121,6 @@ class TaskClass(ABC):
     def action_size(self) -> int:
         """Number of actions: 26 a hand with a moving base, 20 with a fixed one."""
         return 52 if self.moving_base else 40
-
-    @property
-    @abstractmethod
-    def variation_space(self) -> VariationSpace:
-        """What a task of this class freezes."""
 
     @property
     def layout(self) -> Layout:
@@ -151,7 +141,7 @@ class TaskClass(ABC):
 
         Args:
             draws: Uniform numbers in [-1, 1], shape (n, start_draws).
-            frozen: The rows' frozen numbers, each (n, k).
+            frozen: Frozen numbers, each (n, k).
             qpos: Part name (``right/joints``, an object, ...) to its positions, views of shape (n, k) that hold the
                 nominal start and are written in place; MuJoCo's quaternion order (w, x, y, z).
         """

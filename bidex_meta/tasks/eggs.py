@@ -143,11 +143,7 @@ class OneEgg(TaskClass):
     solver = LIGHT
 
     def __init__(self, moving_base: bool | None = None, object: str = EGG) -> None:
-        """Chooses base and object.
-
-        Args:
-            moving_base: Drive the bases or fix them; None takes the class's own.
-            object: What is thrown: ``"egg"``, a name of the shelf, or the path of an MJCF file (docs/objects.md).
+        """Chooses the base and the object: ``"egg"``, a name of the shelf, or an MJCF file (docs/objects.md).
 
         Raises:
             BidexError: There is no such object, or its file holds none for a hand.

@@ -102,13 +102,7 @@ class OpenScissors(TaskClass):
 
 
 def _opened(position: Tensor, rotation: Tensor, turn: Tensor) -> Tensor:
-    """Pose (n, 7) of the right handle's point on the half that moves, opened by ``turn`` from the other half.
-
-    Args:
-        position: Of the left hand's half (n, 3), metres.
-        rotation: Of that half (n, 4), (x, y, z, w).
-        turn: Rotation of the hinge (n, 4), (x, y, z, w).
-    """
+    """Pose (n, 7) of the right handle's point on the half that is opened by ``turn`` (n, 4) from the other half."""
     opened = multiply(rotation, turn)
     pivot = position + rotate(rotation, constant(_PIVOT, position))
     return torch.cat((pivot + rotate(opened, constant(_RIGHT_HANDLE, position)), opened), dim=1)

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
-from bidex_meta.errors import BidexError
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
 from bidex_meta.maths import conjugate, multiply, norm, quaternion_from_rpy, rotate, xyzw
 from bidex_meta.tasks.base import THIN, TaskClass
@@ -18,6 +17,7 @@ from bidex_meta.tasks.reach import reach
 from bidex_meta.tasks.scene import SceneObject, add_table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import join
+from bidex_meta.validation import whole_number
 
 _KETTLE = SceneObject("kettle", "kettle", (0.0, 0.0, 0.478), (0.0, 0.0, 0.5 * math.pi))
 _BUCKET = SceneObject("bucket", "bucket", (0.0, -0.3, 0.457))
@@ -81,16 +81,9 @@ class PourWater(TaskClass):
     camera_distance = 1.4
 
     def __init__(self, moving_base: bool | None = None, water: int = _WATER) -> None:
-        """Chooses base and water.
-
-        Args:
-            moving_base: Drive the bases or fix them; None takes the class's own.
-            water: Number of drops, 1 to 125.
-        """
+        """Chooses the base and the number of drops, 1 to 125."""
         super().__init__(moving_base)
-        if not 1 <= water <= _MOST_WATER:
-            raise BidexError(f"Expected 1 to {_MOST_WATER} drops of water, got {water}.")
-        self.water = water
+        self.water = whole_number("water", water, 1, _MOST_WATER)
         # Most seen in 600 states each of 12 drops, 30 and 125: contacts 41, 73, 246; convex 16, 34, 129; rows 103, 124,
         # 282. So a drop adds 1.8, 1 and 1.6 at most.
         more = max(0, water - 12)

@@ -110,12 +110,7 @@ class ReOrientation(TaskClass):
 
 
 def _turn_away(cube: Tensor, goal_inverse: Tensor) -> None:
-    """Turns cubes that start near their goal's orientation by half a turn about the world's x axis.
-
-    Args:
-        cube: The cubes' positions (n, 7), quaternion (w, x, y, z), written in place.
-        goal_inverse: Inverse of the goals' rotations, (x, y, z, w), (n, 4).
-    """
+    """Turns cubes (n, 7) near their goal's orientation by half a turn about the world's x axis, in place."""
     now = xyzw(cube[:, 3:])
     near = rotation_angle(multiply(now, goal_inverse)) < _START_ANGLE
     turned = multiply(constant((1.0, 0.0, 0.0, 0.0), now).expand_as(now), now)

@@ -44,15 +44,7 @@ class TwoCatchUnderarm(TaskClass):
     solver = LIGHT
 
     def __init__(self, moving_base: bool | None = None, object: str = EGG) -> None:
-        """Chooses base and object, of which there are two.
-
-        Args:
-            moving_base: Drive the bases or fix them; None takes the class's own.
-            object: What is thrown: ``"egg"``, a name of the shelf, or the path of an MJCF file (docs/objects.md).
-
-        Raises:
-            BidexError: There is no such object, or its file holds none for a hand.
-        """
+        """As of ``OneEgg``; there are two of the object."""
         super().__init__(moving_base)
         self.held = held_object(object)
         if self.held is not None:

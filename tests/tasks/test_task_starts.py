@@ -263,14 +263,6 @@ def world_tasks(name: str, moving: bool) -> np.ndarray:
 
 
 @each_case
-def test_bases_start_at_their_places(qpos: np.ndarray, name: str, moving: bool) -> None:
-    places = scene(name, moving)
-    for side in SIDES if moving else ():
-        start = places.start_qpos[places.qpos[f"{side}/base"]]
-        np.testing.assert_array_equal(qpos[:, places.qpos[f"{side}/base"]], np.tile(start, (RESETS, 1)))
-
-
-@each_case
 def test_the_observation_after_a_reset_is_that_of_the_start(name: str, moving: bool) -> None:
     world = world_of(name, moving, 4)
     obs, _ = world.reset(seed=0)

@@ -56,11 +56,7 @@ class OwnObjectClass(TaskClass):
     usual_stands: ClassVar[bool] = True
 
     def __init__(self, moving_base: bool | None = None, object: str | None = None) -> None:
-        """Chooses base and object.
-
-        Args:
-            moving_base: Drive the bases or fix them; None takes the class's own.
-            object: Path of an MJCF file (docs/objects.md); None takes the class's own.
+        """Chooses the base and the object: the path of an MJCF file (docs/objects.md), or None for the class's own.
 
         Raises:
             BidexError: The file holds no such object, or one that starts inside hands or table.
