@@ -4,7 +4,7 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
@@ -55,7 +55,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _list(flags: DataFlags) -> None:
-    rows = []
+    rows: list[dict[str, object]] = []
     for name in dataset_names():
         try:
             dataset = open_dataset(data_folder() / name)
@@ -140,7 +140,7 @@ def _check(flags: DataFlags) -> None:
         raise SystemExit(EXIT_FAILED)
 
 
-def _print_rows(rows: list[dict[str, Any]], otherwise: str = "Nothing.") -> None:
+def _print_rows(rows: list[dict[str, object]], otherwise: str = "Nothing.") -> None:
     if not rows:
         print(otherwise)
         return

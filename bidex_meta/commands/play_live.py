@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -14,6 +14,9 @@ from bidex_meta.commands.parsing import Switch, parse
 from bidex_meta.errors import known_name
 from bidex_meta.outside import name_with_object
 from bidex_meta.validation import Port, Positive, Seed
+
+if TYPE_CHECKING:
+    from bidex_meta.viewer.playback import Screen, Stage
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,7 @@ def main(arguments: Sequence[str]) -> None:
     world.close()
 
 
-def _screen(flags: PlayFlags, stage: Any) -> Any:
+def _screen(flags: PlayFlags, stage: "Stage") -> "Screen":
     if drawing.has_screen() and not flags.browser:
         from bidex_meta.viewer import desktop
 

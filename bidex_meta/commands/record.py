@@ -23,8 +23,10 @@ from bidex_meta.sources import Source
 from bidex_meta.validation import MOST, Environments, Seed, Threads
 
 if TYPE_CHECKING:
+    from bidex_meta.agents import Agent
     from bidex_meta.data.collect import Actor, Progress
     from bidex_meta.data.writer import DatasetWriter
+    from bidex_meta.world.contract import PooledWorld
 
 RUNS = {"random": 0, "medium": 1, "expert": 1, "medium-expert": 2, "replay": 1, "demonstrations": 0}
 """Kinds of data sets, and how many runs each takes."""
@@ -106,10 +108,10 @@ class _Collection:
     """What decides its content, ready for JSON; it has ``kind``, ``size`` and ``num_envs``."""
     policies: list[dict[str, Any]]
     """Who acts, for the metadata."""
-    world: Callable[[], Any]
+    world: "Callable[[], PooledWorld]"
     episode_share: float
     """Mean length of an episode as a share of the time limit, at least."""
-    collect: Callable[[Any, "DatasetWriter"], None]
+    collect: "Callable[[PooledWorld, DatasetWriter], None]"
     """Plays in the world until the writer has all transitions."""
 
 
@@ -173,7 +175,7 @@ def _record(flags: RecordFlags, collection: _Collection) -> None:
     _say_complete(folder, name)
 
 
-def _checked_memory(world: Any, plan: dict[str, Any]) -> str:
+def _checked_memory(world: "PooledWorld", plan: dict[str, Any]) -> str:
     """The memory of running episodes, for a message; refuses more than is allowed."""
     from bidex_meta.data.collect import bytes_held
 
@@ -202,7 +204,7 @@ def _episodes(flags: RecordFlags, kind: str) -> _Collection:
     plan = {"kind": kind, "size": size, "num_envs": rows, "noise": flags.noise, "policies": policies}
     plan |= config | {"starts": flags.seed}
 
-    def play(world: Any, out: "DatasetWriter") -> None:
+    def play(world: "PooledWorld", out: "DatasetWriter") -> None:
         collect(world, actors, out, size, flags.seed, _Report(size, out, len(actors)))
 
     # Where episodes may end early there are more of them: a third of the time limit is measured on falls.
@@ -269,25 +271,25 @@ def _demonstrations(flags: RecordFlags) -> _Collection:
     name, size, rows = source.name, flags.size or SIZE["demonstrations"], flags.num_envs or _DEMONSTRATORS[flags.starts]
     if name not in source.task_classes() or ":" in name:
         raise BidexError(f"{name} is none of the classes that have witnesses (bidex-meta witness --all).")
+    witness = {} if flags.script else {name: load_witness(name)}
     if flags.script:
         script_of(name)  # refuses a class without one
-        agent: Callable[[Any, int], Any] = lambda world, seed: Scripted(world, flags.noise, seed)  # noqa: E731
-    else:
-        witness = {name: load_witness(name)}
-        agent = lambda world, seed: OpenLoopReplay(  # noqa: E731
-            witness, [name], world.task_id, world.single_action_space.shape[0], flags.noise, seed
-        )
     drawn: dict[str, Any] = {"noise": flags.noise}
     drawn |= {"starts": "tasks"} if flags.starts == "tasks" else {"shift": flags.shift}
     plan = {"kind": "demonstrations", "task": name, "size": size, "num_envs": rows, "seed": flags.seed, **drawn}
     plan |= {"script": True} if flags.script else {}
 
-    def world() -> Any:
+    def world() -> "PooledWorld":
         if flags.starts == "tasks":
             return source.world("train", rows)
         return ShiftedStarts(name, rows, flags.shift, flags.threads)  # pyright: ignore[reportAbstractUsage]
 
-    def play(world: Any, out: "DatasetWriter") -> None:
+    def agent(world: Any, seed: int) -> "Agent":
+        if flags.script:
+            return Scripted(world, flags.noise, seed)
+        return OpenLoopReplay(witness, [name], world.task_id, world.single_action_space.shape[0], flags.noise, seed)
+
+    def play(world: "PooledWorld", out: "DatasetWriter") -> None:
         while (now := progress(out)).steps[0] < size:
             if not now.steps[0] and out.parts >= _PATIENCE:
                 raise _nothing_succeeds(_PATIENCE * rows, name, flags)

@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bidex_meta.commands.learners import ALGOS, LearnerKind, learner_kind
 from bidex_meta.commands.parsing import peek_all
@@ -13,13 +13,16 @@ from bidex_meta.record.versions import collect_versions
 from bidex_meta.sources import Source
 from bidex_meta.train.launch import launch
 
+if TYPE_CHECKING:
+    from bidex_meta.world.contract import VectorWorld
+
 UPDATES = 300_000
 """Updates of an offline run by default."""
 _FORM = ("suite", "task", "base", "object", "points")
 
 
 def dataset_metadata(
-    source: Source, world: Any, kind: str, policies: Sequence[dict[str, Any]], **more: Any
+    source: Source, world: "VectorWorld", kind: str, policies: Sequence[dict[str, Any]], **more: Any
 ) -> dict[str, Any]:
     """Our entry in the metadata of a data set.
 

@@ -119,7 +119,7 @@ def _spread_episodes(dataset: Dataset, most: int | None) -> Iterator[tuple[int, 
     yield from ((number, episode) for number, episode in enumerate(dataset.episodes()) if number % every == 0)
 
 
-def _faults(episode: Episode, row: Mapping[str, Any], dataset: Dataset) -> Iterator[str]:
+def _faults(episode: Episode, row: Mapping[str, np.ndarray], dataset: Dataset) -> Iterator[str]:
     """What is wrong with an episode by itself."""
     steps = len(episode)
     if steps == 0:

@@ -117,7 +117,7 @@ class EpisodeCollector(PooledWorldWrapper):
         """The chosen environments' share of a tensor of all."""
         return of_all.to(self._where.device)[self._where].detach().cpu().numpy()
 
-    def _begin_again(self, info: dict[str, Any], obs: Tensor) -> None:
+    def _begin_again(self, info: dict[str, Tensor], obs: Tensor) -> None:
         """Begins the episodes that a world in SAME_STEP mode has started within the step."""
         if self.world.metadata["autoreset_mode"].name == "SAME_STEP":
             begun = self._own(info["_final_obs"])
@@ -174,7 +174,7 @@ class EpisodeCollector(PooledWorldWrapper):
         self.world.load_state_dict(state)
         self._forget()
 
-    def collector_state(self) -> dict[str, Any]:
+    def collector_state(self) -> dict[str, Tensor]:
         """The running episodes, for a checkpoint: tensors, copied."""
         most = int(self._length.max(initial=0))
         arrays = {
@@ -189,7 +189,7 @@ class EpisodeCollector(PooledWorldWrapper):
         }
         return {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
 
-    def load_collector_state(self, state: dict[str, Any]) -> None:
+    def load_collector_state(self, state: dict[str, Tensor]) -> None:
         """Goes on with the episodes of ``collector_state``; the world must have been restored before.
 
         Raises:

@@ -212,7 +212,7 @@ class _Form:
         return episode, slot, seen
 
 
-def _slots(names: Sequence[str], world: Any, outside: bool) -> Iterator[int]:
+def _slots(names: Sequence[str], world: VectorWorld, outside: bool) -> Iterator[int]:
     """The world's slot of each name."""
     if outside and world.num_tasks == 1:
         yield from [0] * len(names)
