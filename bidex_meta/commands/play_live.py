@@ -13,7 +13,7 @@ from bidex_meta import drawing
 from bidex_meta.commands.parsing import Switch, parse
 from bidex_meta.errors import known_name
 from bidex_meta.outside import name_with_object
-from bidex_meta.validation import Port, Positive, Seed
+from bidex_meta.validation import NonNegative, Port, Positive, Seed
 
 if TYPE_CHECKING:
     from bidex_meta.viewer.playback import Screen, Stage
@@ -51,7 +51,7 @@ class PlayFlags:
     """Address the browser's page is served at; 0.0.0.0 lets other machines in."""
     port: Port = 8080
     """Port of that page; where it is taken, the next free one."""
-    seconds: float | None = None
+    seconds: NonNegative | None = None
     """End after so many seconds; None: when the window is closed, or Ctrl-C."""
 
 
