@@ -30,15 +30,17 @@ Whole = Annotated[int, Meta(ge=0, le=MOST)]
 Count = Annotated[int, Meta(ge=1, le=MOST)]
 """A count of at least one."""
 Few = Annotated[int, Meta(ge=1, le=1_000_000)]
-"""A count of episodes, tasks, tries and the like, at least one."""
-Pixels = Annotated[int, Meta(ge=1, le=16_384)]
-"""Width or height of a picture."""
-Port = Annotated[int, Meta(ge=1, le=65_535)]
-"""A port of the network."""
+"""Episodes, tasks, trials, images: what is done so many times."""
+Shots = Annotated[int, Meta(ge=0, le=1000)]
+"""Adaptations one after the other."""
 Environments = Annotated[int, Meta(ge=1, le=10_000_000)]
 """Environments stepped together."""
 Threads = Annotated[int, Meta(ge=1, le=4096)]
 """Threads; a resumed run may have more than there are cores."""
+Pixels = Annotated[int, Meta(ge=1, le=16_384)]
+"""Width or height of an image."""
+Port = Annotated[int, Meta(ge=1, le=65_535)]
+"""A port of this machine."""
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 """A seed."""
 Width = Annotated[int, Meta(ge=1, le=65_536)]
@@ -71,12 +73,13 @@ class Checked:
         check_fields(self, getattr(self, "algo", type(self).__name__))
 
 
-def check_fields(settings: Any, name: str) -> None:
+def check_fields(settings: Any, name: str, as_flags: bool = False) -> None:
     """Refuses an instance of a dataclass with a field that is not of its annotation.
 
     Args:
         settings: The instance; fields whose annotation is no plain type (a path, a function) are left alone.
         name: What messages call it.
+        as_flags: Whether messages name the field as a flag of the command line.
 
     Raises:
         BidexError: Names the first such field.
@@ -86,7 +89,8 @@ def check_fields(settings: Any, name: str) -> None:
         try:
             msgspec.convert(value, hint)
         except msgspec.ValidationError as error:
-            raise BidexError(f"{name}: {_message(error, value, hint, field)}") from None
+            shown = f"--{field.replace('_', '-')}" if as_flags else field
+            raise BidexError(f"{name}: {_message(error, value, hint, shown)}") from None
 
 
 def check_rising(settings: Any, name: str, *fields: str) -> None:

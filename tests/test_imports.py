@@ -16,7 +16,9 @@ PACKAGES = {package.__name__: Path(next(iter(package.__path__))) for package in 
 ORDER = (
     ("errors",),
     ("paths", "maths", "agents", "drawing", "reading", "fields", "memory", "outside", "streams", "validation"),
-    ("engine", "record", "hands", "suite"),
+    ("engine", "hands", "suite"),
+    ("config",),
+    ("record",),
     ("tasks",),
     ("points",),
     ("world",),

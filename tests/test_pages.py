@@ -136,4 +136,17 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 
 def test_the_readme_is_short() -> None:
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) < 900
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) < 601
+
+
+def _prose(page: Path) -> int:
+    """Words of a page outside of code blocks, comments, tables and image lines."""
+    text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
+    lines = [line for line in text.splitlines() if not line.lstrip().startswith(("|", "!["))]
+    return len(re.findall(r"[\w][\w'’./-]*", "\n".join(lines)))
+
+
+def test_the_documentation_is_short() -> None:
+    words = {page: _prose(page) for page in (ROOT / "docs").rglob("*.md") if page.parent.name != "notes"}
+    assert sum(words.values()) <= 18_000, sorted(words.items(), key=lambda item: -item[1])[:8]

@@ -57,7 +57,7 @@ def collect(
         folder = RunFolder.open(path)
         file = into / f"{folder.path.resolve().name}.json"
         content = condensed(folder, arm or name, _parameters(folder))
-        if file in files or (file.exists() and _is_another(StoredRun.open(file).config(), content["config"])):
+        if file in files or (file.exists() and _is_another(StoredRun.open(file).content["config"], content["config"])):
             raise BidexError(f"{file} is of another run than {path}. Rename the run's folder, or remove the file.")
         files[file] = content
     into.mkdir(parents=True, exist_ok=True)
@@ -80,7 +80,7 @@ def condensed(folder: RunFolder, arm: str | None, parameters: int | None) -> dic
         BidexError: It is not evaluated, its evaluation is of another run or of fewer steps, or its commit is not
             known.
     """
-    config, evaluation = folder.config("learner", "num_envs", "steps"), folder.evaluation()
+    config, evaluation = folder.config().to_json(), folder.evaluation()
     rows, versions = folder.metrics(), folder.versions()
     _check(folder, evaluation, rows, versions)
     return {

@@ -63,8 +63,8 @@ def _of_witness(name: str) -> list[tuple[str, dict[str, Any]]]:
 def _of_run(path: Path) -> list[tuple[str, dict[str, Any]]]:
     """What a run's evaluation says of its classes: the mean over all tasks."""
     run = open_run(path)
-    config = run.config("steps")
-    source = Source.open(config)
+    config = run.config()
+    source = Source.open(config.to_json())
     if not source.moving_bases:
         raise BidexError(
             f"Expected a run with moving bases, as suites have them, but {path} plays {source.name} with fixed ones."
@@ -76,8 +76,8 @@ def _of_run(path: Path) -> list[tuple[str, dict[str, Any]]]:
             "run of mtppo, mttrpo or mtsac."
         )
     classes = found["policy"]["classes"]
-    steps = found.get("steps", config["steps"])  # of what time, a return or a score has ended fewer than were asked for
-    told = f"{config['algo']} on {source.name}, {steps:,} steps, seed {config['seed']}"
+    steps = found.get("steps", config.steps)  # of what time, a return or a score has ended fewer than were asked for
+    told = f"{config.algo} on {source.name}, {steps:,} steps, seed {config.seed}"
     return [(name, {"return": row["return"], "source": told}) for name, row in classes.items()]
 
 

@@ -1,4 +1,4 @@
-"""``python -m tools.gallery`` writes the page of all task classes from their code."""
+"""``python -m tools.gallery`` (``make gallery``) generates the page of all task classes from their code."""
 
 from pathlib import Path
 
@@ -6,37 +6,43 @@ import numpy as np
 import tyro
 
 from bidex_meta.benchmark import make_task_world
+from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import references
 from bidex_meta.record import video
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.hidden import hidden
 from bidex_meta.tasks.variation import VariationSpace
-from bidex_meta.witness.replay import frames
+from bidex_meta.witness.replay import frames, replay
 from bidex_meta.witness.store import Witness, load_witness, witness_path
 
 VIEWS = ("back", "side")
 STRIP = 5
-"""Pictures of a witness."""
+"""Pictures per witness."""
 _HEAD = """# The task classes
 
-Written by `python -m tools.gallery`; change the classes, not this page. Pictures show the start of the first task;
-green is a goal. Sizes are those of moving bases. d is a distance in metres, r an angle in radians; *left* and *right*
-are the distances of a hand's point (8 cm along the palm, 2 cm out of it) to its point on the object. Variations are
-drawn uniformly and fixed by a task. ML mask: variables of the task that affect reward or success but are hidden in ML
-suites; where none is hidden, the class needs no adaptation. Random: mean return and success of uniform actions.
-Witness: recorded actions that solve the first task; the strip shows them at the start, a third and two thirds of the
-way to the first success, at the first success and at the end of the episode.
+Pictures show the start of task 0; green is a goal. Sizes are with moving bases. d is a distance in metres, r an angle
+in radians. *left* and *right* are distances from a [hand's point](figures.md#hand-point) to its point on the object.
+
+| entry | meaning |
+|---|---|
+| variation | variables that a task fixes, drawn uniformly from these ranges |
+| ML mask | task variables that affect reward or success but are hidden in ML suites. None: no need to adapt |
+| uniform actions | mean return and success |
+| witness | a reference solution: recorded actions that solve task 0 |
+
+The last pictures of a class show its witness: at the start, a third and two thirds of the way to the first success, at
+the first success and at the end. `make gallery` generates this page from the task classes.
 """
 
 
 def gallery(out: Path = Path("docs/tasks.md"), width: int = 360, height: int = 270) -> None:
-    """Write the page, and the pictures into ``images/tasks/`` beside it.
+    """Write the page, and its pictures into ``images/tasks/`` beside it.
 
     Args:
         out: The Markdown file.
-        width: Of the pictures, pixels.
-        height: Of the pictures, pixels.
+        width: Width of the pictures, pixels.
+        height: Height of the pictures, pixels.
     """
     for name in registry.names():
         for view in VIEWS:
@@ -49,7 +55,7 @@ def gallery(out: Path = Path("docs/tasks.md"), width: int = 360, height: int = 2
 
 
 def text() -> str:
-    """The page: one section a class."""
+    """The page: one section per class."""
     random = references.load("random")
     return "\n".join((_HEAD, *(_section(registry.get(name, True), random.get(name)) for name in registry.names())))
 
@@ -66,14 +72,17 @@ def _picture(name: str, view: str, path: Path, width: int, height: int) -> None:
 
 
 def moments(first_success: int, steps: int) -> list[int]:
-    """Which frames of a witness are shown: as the page's head says; frame i is the state after i steps."""
+    """Frames of a witness that the page shows; frame i is the state after i steps."""
     solved = first_success + 1
     return [0, round(solved / 3), round(2 * solved / 3), solved, steps]
 
 
 def _strip(name: str, witness: Witness, width: int, height: int) -> np.ndarray:
     """The shown frames side by side, (height, STRIP * width, 3) uint8."""
-    wanted = moments(witness.made["first_success"], len(witness.actions))
+    first = replay(name, witness).first_success  # what its file says may be of older physics
+    if first is None:
+        raise BidexError(f"The witness of {name} does not succeed any more. Search it anew.")
+    wanted = moments(first, len(witness.actions))
     drawn = frames(name, witness, wanted, width=width, height=height)
     shown = dict(zip(sorted(set(wanted)), drawn, strict=True))
     return np.concatenate([shown[i] for i in wanted], axis=1)
@@ -91,7 +100,7 @@ def _section(task: TaskClass, random: dict | None) -> str:
         ("deviations", " ".join(task.deviations) or "none"),
     ]
     if random is not None:
-        rows.append(("random", f"return {random['return']:.4g}, success {100 * random['success']:.1f} %"))
+        rows.append(("uniform actions", f"return {random['return']:.4g}, success {100 * random['success']:.1f} %"))
     rows.append(("witness", _witness(task.name)))
     table = "\n".join(f"| {key} | {value} |" for key, value in rows)
     strip = f"![{task.name}, witness]({_image(task.name, 'witness')})\n" if witness_path(task.name).is_file() else ""
@@ -99,19 +108,18 @@ def _section(task: TaskClass, random: dict | None) -> str:
 
 
 def _mask(task: TaskClass) -> str:
-    """What the mask of meta suites hides, in words."""
+    """What the mask of meta suites hides."""
     found = hidden(task)
     parts = [", ".join(found.reward)] if found.reward else []
     if found.success:
-        parts.append(f"of success alone {', '.join(found.success)}")
-    return f"hides {'; '.join(parts)}" if parts else "hides nothing that reward or success uses"
+        parts.append(f"{', '.join(found.success)} (success only)")
+    return "; ".join(parts) if parts else "none"
 
 
 def _witness(name: str) -> str:
     if not witness_path(name).is_file():
         return "none yet"
-    made = load_witness(name).made
-    return f"return {made['return']:.4g}, first success at step {made['first_success'] + 1}"
+    return "[solves task 0](results/mt20.md#witnesses)"
 
 
 def _variation(space: VariationSpace) -> str:

@@ -11,6 +11,7 @@ import tyro
 from bidex_meta.commands.parsing import Switch, parse
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.sources import Source
+from bidex_meta.validation import Few, Seed, Threads
 
 if TYPE_CHECKING:
     from bidex_meta.agents import Agent
@@ -40,11 +41,11 @@ class BaselineFlags:
     the whole state (seven classes have one)."""
     suite: str = "MT20"
     """Suite whose train tasks are played."""
-    episodes: int = 4
+    episodes: Few = 4
     """Episodes of each task."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of tasks, starts and actions."""
-    threads: int | None = None
+    threads: Threads | None = None
     """Threads of the physics; None: one per core."""
     out: Path | None = None
     """JSON file that takes the figures, beside those it has of other classes; None: print them alone. `evaluate` reads

@@ -7,8 +7,10 @@ from typing import Annotated
 
 import tyro
 
-from bidex_meta.commands.parsing import StepCount, Switch, parse
+from bidex_meta.commands.parsing import Switch, parse
+from bidex_meta.config import Steps
 from bidex_meta.errors import BidexError, known_name
+from bidex_meta.validation import Environments, Few, Seed, Threads
 
 
 @dataclass(frozen=True)
@@ -22,19 +24,19 @@ class BenchFlags:
     """world: environment steps per second of the world and of its bare physics, and their ratio."""
     suite: str = "MT4"
     """Suite to measure."""
-    num_envs: int = 1024
+    num_envs: Environments = 1024
     """Environments stepped together."""
-    steps: StepCount = 40
+    steps: Steps = 40
     """Environment steps of each repeat."""
-    repeats: int = 7
+    repeats: Few = 7
     """Interleaved repeats; medians are reported."""
-    threads: int | None = None
+    threads: Threads | None = None
     """Threads of the physics on a CPU; None takes all cores."""
     device: str = "cpu"
     """auto, cpu or cuda:N."""
     engine: str = "auto"
     """auto, c or warp."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of world and actions."""
     json: Switch = False
     """Print JSON."""

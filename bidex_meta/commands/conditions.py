@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from bidex_meta.config import RunConfig
 from bidex_meta.record.versions import package_versions
 from bidex_meta.sources import Source
 
@@ -26,7 +27,7 @@ def conditions(source: Source, num_envs: int | None = None) -> dict[str, Any]:
     return {**where, "packages": packages, **identity}
 
 
-def recorded_conditions(evaluation: dict[str, Any], versions: dict[str, Any], config: dict[str, Any]) -> dict[str, Any]:
+def recorded_conditions(evaluation: dict[str, Any], versions: dict[str, Any], config: RunConfig[Any]) -> dict[str, Any]:
     """The same of an evaluation as it was recorded; of an older one what its run was trained with.
 
     Args:
@@ -34,7 +35,7 @@ def recorded_conditions(evaluation: dict[str, Any], versions: dict[str, Any], co
         versions: Of ``versions.json``, empty where there is none.
         config: The run's.
     """
-    found = {"device": config.get("device", "cpu"), "engine": config.get("engine", "auto"), "num_envs": None}
+    found = {"device": config.device, "engine": config.engine, "num_envs": None}
     found |= {name: versions.get(name) for name in ("packages", "physics", "suite_version")}
     found |= evaluation.get("conditions", {})
     packages = found["packages"]

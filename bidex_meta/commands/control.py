@@ -12,13 +12,11 @@ import tyro
 from bidex_meta.commands.parsing import Switch, parse
 from bidex_meta.errors import BidexError
 from bidex_meta.sources import Source
+from bidex_meta.validation import Environments, Few, Seed, Shots
 
 if TYPE_CHECKING:
     from bidex_meta.evaluation.control_arms import Control
     from bidex_meta.record import RunFolder
-
-
-_NEEDED = ("learner", "num_envs", "steps", "threads")
 
 
 @dataclass(frozen=True)
@@ -32,17 +30,17 @@ class ControlFlags:
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
     """Run folders that differ in the seed alone."""
-    trials: int = 25
+    trials: Few = 25
     """Adaptations of each task, each from the start and to other episodes."""
-    episodes: int = 80
+    episodes: Few = 80
     """Evaluation episodes after each adaptation."""
-    shots: int = 1
+    shots: Shots = 1
     """Adapt so often, one after the other."""
-    rollouts: int | None = None
+    rollouts: Few | None = None
     """Episodes of each task in a shot; None: as the run was trained, but 40 at most."""
-    num_envs: int = 1024
+    num_envs: Environments = 1024
     """Rows stepped together at most; bounds memory."""
-    seed: int | None = None
+    seed: Seed | None = None
     """Seed of the episodes' starts; None: one that training does not use."""
     device: str = "auto"
     """auto, cpu or cuda:N."""
@@ -67,8 +65,8 @@ def main(arguments: Sequence[str]) -> None:
 
     metatest.check_numbers(flags, "trials", "episodes", "shots", "rollouts", "num_envs")
     folders = [RunFolder.open(path) for path in flags.runs]
-    config = folders[0].config(*_NEEDED)
-    source = Source.open(config)
+    config = folders[0].config()
+    source = Source.open(config.to_json())
     _check(folders)
     played = [_play(folder, flags) for folder in folders]
     classes = played[0].own.classes
@@ -81,7 +79,7 @@ def main(arguments: Sequence[str]) -> None:
     from bidex_meta.commands.tables import control_table, print_table
 
     for name, by_arm in found.items():
-        title = f"{config['algo']} on {source.name}, held-out tasks of {name}, "
+        title = f"{config.algo} on {source.name}, held-out tasks of {name}, "
         title += f"{len(played)} run{'s' * (len(played) > 1)}, {per_arm[name]:,} episodes an arm"
         print_table(control_table(title, by_arm))
 
@@ -95,14 +93,12 @@ def _check(folders: "Sequence[RunFolder]") -> None:
     kinds: list[dict[str, Any]] = []
     seeds: dict[int, Path] = {}
     for folder in folders:
-        config = folder.config(*_NEEDED)
-        if not learner_kind(config["algo"]).adapts:
-            raise BidexError(
-                f"{folder.path}: {config['algo']} does not adapt to tasks. Name runs of maml, promp or rl2."
-            )
-        metatest.check_source(Source.open(config), config["algo"])
+        config = folder.config()
+        if not learner_kind(config.algo).adapts:
+            raise BidexError(f"{folder.path}: {config.algo} does not adapt to tasks. Name runs of maml, promp or rl2.")
+        metatest.check_source(Source.open(config.to_json()), config.algo)
         kinds.append(run_kind(config))
-        if (seed := config["seed"]) in seeds:
+        if (seed := config.seed) in seeds:
             raise BidexError(f"{folder.path} and {seeds[seed]} both have seed {seed}. Name one run for each seed.")
         seeds[seed] = folder.path
     for folder, kind in zip(folders, kinds, strict=True):
@@ -124,10 +120,10 @@ def _play(folder: "RunFolder", flags: ControlFlags) -> "Control":
     from bidex_meta.evaluation.play import EVALUATION_SEED
     from bidex_meta.world.threads import set_up_torch
 
-    config = folder.config(*_NEEDED)
-    device = resolve_device(flags.device, Source.open(config).on_gpu)
-    source = Source.open({**config, "device": device, "engine": flags.engine})
-    set_up_torch(config["threads"])
+    config = folder.config()
+    device = resolve_device(flags.device, Source.open(config.to_json()).on_gpu)
+    source = Source.open({**config.to_json(), "device": device, "engine": flags.engine})
+    set_up_torch(config.threads)
     counts = [len(pool) for pool in source.tasks("test").values()]
     rollouts = metatest.rollouts_of(source, config, flags.rollouts, max(1, flags.num_envs // len(counts)))
     rows = metatest.rows_for(len(counts), max(counts) * flags.trials, rollouts, flags.num_envs)
@@ -142,7 +138,7 @@ def _play(folder: "RunFolder", flags: ControlFlags) -> "Control":
         rollouts=rollouts,
         episodes_per_task=flags.episodes,
         trials=flags.trials,
-        max_adapt_steps=config["learner"].get("max_adapt_steps", MAX_ADAPT_STEPS),
+        max_adapt_steps=config.learner_values.get("max_adapt_steps", MAX_ADAPT_STEPS),
         seed=EVALUATION_SEED if flags.seed is None else flags.seed,
         references=source.references(),
     )

@@ -2,12 +2,14 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from bidex_meta.commands.parsing import RunPath, Switch, parse
+from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.sources import Source
+from bidex_meta.validation import Environments, Few, Seed, Shots
 
 
 @dataclass(frozen=True)
@@ -23,25 +25,25 @@ class EvaluateFlags:
     """Run folder."""
     checkpoint: str = "last"
     """Which policy: last, best (kept by `bidex-meta run --evaluate-every N`) or a file."""
-    episodes: int | None = None
+    episodes: Few | None = None
     """Episodes of each task; None: 4, or 1 where a task fixes its start (metaworld/...); for what adapts, as many as
     --rollouts."""
     split: Literal["auto", "train", "test", "both"] = "auto"
     """Tasks to play: those trained on, or a meta suite's unseen ones; auto: train, and both for what adapts."""
-    shots: int | None = None
+    shots: Shots | None = None
     """Adapt so often, one after the other, to --rollouts episodes each; None: 1."""
-    rollouts: int | None = None
+    rollouts: Few | None = None
     """Episodes of each task in a shot; None: as the run was trained, but 40 at most, else 10."""
-    tasks: int | None = None
+    tasks: Few | None = None
     """Adapt to the first so many tasks of each class; None: 5."""
-    trials: int | None = None
+    trials: Few | None = None
     """Adapt to each task so often, each time from the start and to other episodes; None: once, or
     as often as makes five adaptations of each class."""
     random: Switch = False
     """Also play a random policy, and show the difference."""
-    seed: int | None = None
+    seed: Seed | None = None
     """Seed of the episodes' starts; None: one that training does not use."""
-    num_envs: int | None = None
+    num_envs: Environments | None = None
     """Rows stepped together, a multiple of the number of tasks; None: one per task (metaworld/...: 5 per class). For
     what adapts, at most so many, which bounds memory and not results' meaning; None: 1024."""
     device: str = "auto"
@@ -67,16 +69,16 @@ def main(arguments: Sequence[str]) -> None:
     from bidex_meta.world.threads import set_up_torch
 
     folder = RunFolder.open(flags.run)
-    stored = folder.config("learner", "num_envs", "threads")
-    device = resolve_device(flags.device, Source.open(stored).on_gpu)
-    config = {**stored, "device": device, "engine": flags.engine}
-    source = Source.open(config)
-    set_up_torch(config["threads"])
-    kind = learner_kind(stored["algo"])
+    stored = folder.config()
+    device = resolve_device(flags.device, Source.open(stored.to_json()).on_gpu)
+    config = replace(stored, device=device, engine=flags.engine)
+    source = Source.open(config.to_json())
+    set_up_torch(config.threads)
+    kind = learner_kind(stored.algo)
     if kind.adapts:
         _meta_test(flags, folder, config, source)
         return
-    _refuse_adaptation(flags, stored["algo"])
+    _refuse_adaptation(flags, stored.algo)
     policy, step = load_policy(folder, device, flags.checkpoint)
     split = "train" if flags.split == "auto" else flags.split
     world = source.world(split, flags.num_envs)
@@ -87,7 +89,7 @@ def main(arguments: Sequence[str]) -> None:
         random = source.judge(RandomAgent(world.action_space), world, flags.episodes, seed)
     world.close()
     if not flags.json:
-        title = f"{config['algo']} on {source.name}, {split} tasks, {step:,} steps"
+        title = f"{config.algo} on {source.name}, {split} tasks, {step:,} steps"
         print_table(evaluation_table(title, found, random))
         return
     result = {"run": str(folder.path), "steps": step, "split": split, "seed": seed, "policy": found.to_json()}
@@ -106,7 +108,7 @@ def _refuse_adaptation(flags: EvaluateFlags, algo: str) -> None:
         raise BidexError(f"{algo} does not adapt to tasks: its splits are shown one by one. Use --split train or test.")
 
 
-def _meta_test(flags: EvaluateFlags, folder: Any, config: dict[str, Any], source: Source) -> None:
+def _meta_test(flags: EvaluateFlags, folder: Any, config: RunConfig[Any], source: Source) -> None:
     import sys
 
     from bidex_meta.commands import metatest
@@ -115,12 +117,12 @@ def _meta_test(flags: EvaluateFlags, folder: Any, config: dict[str, Any], source
     from bidex_meta.evaluation.play import EVALUATION_SEED
 
     if flags.random:
-        raise BidexError(f"{config['algo']} is compared with itself before adaptation. Leave --random out.")
-    metatest.check_source(source, config["algo"])
+        raise BidexError(f"{config.algo} is compared with itself before adaptation. Leave --random out.")
+    metatest.check_source(source, config.algo)
     splits = metatest.splits_of(source, flags.split)
     seed = EVALUATION_SEED if flags.seed is None else flags.seed
     numbers = (flags.shots, flags.rollouts, flags.episodes, flags.tasks, flags.trials, flags.num_envs)
-    load, step = policy_loader(folder, config["device"], flags.checkpoint)
+    load, step = policy_loader(folder, config.device, flags.checkpoint)
     found = metatest.meta_test(
         source,
         config,
@@ -130,7 +132,7 @@ def _meta_test(flags: EvaluateFlags, folder: Any, config: dict[str, Any], source
         lambda text: print(text, file=sys.stderr, flush=True),
     )
     if not flags.json:
-        metatest.print_tables(f"{config['algo']} on {source.name}, {step:,} steps", found)
+        metatest.print_tables(f"{config.algo} on {source.name}, {step:,} steps", found)
         return
     result = {"run": str(folder.path), "steps": step, "seed": seed, "splits": metatest.report(found)}
     result["conditions"] = conditions(source, flags.num_envs)

@@ -6,9 +6,11 @@ from typing import Any
 
 from bidex_meta.agents import Agent
 from bidex_meta.commands.learners import learner_kind
+from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import EVALUATION_SEED
 from bidex_meta.sources import Source
+from bidex_meta.validation import Environments, Few, Seed, Shots
 
 SHOTS = 1
 """Shots where nobody says otherwise."""
@@ -26,26 +28,26 @@ ROWS = 1024
 class Options:
     """How much is played; None: as the run was trained, else the default above."""
 
-    shots: int | None = None
+    shots: Shots | None = None
     """Shots of adaptation."""
-    rollouts: int | None = None
+    rollouts: Few | None = None
     """Episodes of each task in a shot."""
-    episodes: int | None = None
+    episodes: Few | None = None
     """Evaluation episodes of each task; None: as many as rollouts, which the same rows play at once."""
-    tasks: int | None = None
+    tasks: Few | None = None
     """Tasks of each class."""
-    trials: int | None = None
+    trials: Few | None = None
     """Adaptations of each task; None: so many that a class has as many as ``TASKS``, since an interval over the
     episodes of a single adaptation says nothing of another."""
-    num_envs: int | None = None
+    num_envs: Environments | None = None
     """Rows stepped together at most."""
-    seed: int = EVALUATION_SEED
+    seed: Seed = EVALUATION_SEED
     """Of all starts."""
 
 
 def meta_test(
     source: Source,
-    config: dict[str, Any],
+    config: RunConfig[Any],
     load: Callable[[], Agent],
     options: Options,
     splits: list[str],
@@ -69,7 +71,7 @@ def meta_test(
     """
     from bidex_meta.evaluation.meta_test import MAX_ADAPT_STEPS, meta_evaluate
 
-    check_source(source, config["algo"])
+    check_source(source, config.algo)
     check_numbers(options, "rollouts", "episodes", "tasks", "trials", "num_envs")
     found = {}
     limit = options.num_envs or ROWS
@@ -96,7 +98,7 @@ def meta_test(
             episodes_per_task=episodes,
             tasks=tasks,
             trials=trials,
-            max_adapt_steps=config["learner"].get("max_adapt_steps", MAX_ADAPT_STEPS),
+            max_adapt_steps=config.learner_values.get("max_adapt_steps", MAX_ADAPT_STEPS),
             seed=options.seed,
             references=source.references(),
             split=split,
@@ -105,7 +107,7 @@ def meta_test(
     return found
 
 
-def rollouts_of(source: Source, config: dict[str, Any], asked: int | None, rows: int) -> int:
+def rollouts_of(source: Source, config: RunConfig[Any], asked: int | None, rows: int) -> int:
     """Episodes of each task in a shot.
 
     Args:
@@ -116,16 +118,17 @@ def rollouts_of(source: Source, config: dict[str, Any], asked: int | None, rows:
             one in a shot: then there are fewer.
     """
     rollouts = asked or trained_rollouts(source, config)
-    return min(rollouts, rows) if learner_kind(config["algo"]).adapts_by_row else rollouts
+    return min(rollouts, rows) if learner_kind(config.algo).adapts_by_row else rollouts
 
 
-def trained_rollouts(source: Source, config: dict[str, Any]) -> int:
+def trained_rollouts(source: Source, config: RunConfig[Any]) -> int:
     """Episodes of each task that the run's learner adapted to."""
-    if "tasks_per_class" not in config["learner"]:
+    of_batch = config.learner_values.get("tasks_per_class")
+    if of_batch is None:
         return ROLLOUTS
     counts = [len(pool) for pool in source.tasks("train").values()]
-    of_class = config["num_envs"] // len(counts)
-    return max(1, min(of_class // min(config["learner"]["tasks_per_class"], max(counts)), MOST_ROLLOUTS))
+    of_class = config.num_envs // len(counts)
+    return max(1, min(of_class // min(of_batch, max(counts)), MOST_ROLLOUTS))
 
 
 def check_numbers(options: Any, *names: str) -> None:

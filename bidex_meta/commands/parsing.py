@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import difflib
 import io
-import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
@@ -13,9 +12,8 @@ from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeVar
 
 import tyro
-from tyro.constructors import PrimitiveConstructorSpec
 
-from bidex_meta.errors import BidexError, shortened
+from bidex_meta.errors import BidexError
 from bidex_meta.validation import check_fields
 
 Options = TypeVar("Options")
@@ -48,28 +46,6 @@ def flags_of(command: Callable[[Sequence[str]], None], arguments: Sequence[str] 
         _asked_for_flags.reset(token)
     raise TypeError(f"{command.__module__}.main parses no flags")
 
-
-def _whole_number(words: list[str]) -> int:
-    try:
-        value = float(words[0].replace("_", ""))
-        if value != int(value) or value < 0:
-            raise ValueError
-    except (ValueError, OverflowError):
-        raise ValueError(f"expected a whole number such as 20000000 or 2e7, not {shortened(words[0])}") from None
-    return int(value)
-
-
-StepCount = Annotated[
-    int,
-    PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="INT",
-        instance_from_str=_whole_number,
-        is_instance=lambda value: isinstance(value, int),
-        str_from_instance=lambda value: [str(value)],
-    ),
-]
-"""A whole number that may be written 2e7."""
 
 Switch = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 """A flag without a value and without a ``--no-`` twin."""
@@ -108,47 +84,8 @@ def parse(options: type[Options], arguments: Sequence[str], command: str, defaul
         raise BidexError(f"{_one_line(complaint.getvalue())}. See bidex-meta {command} --help.") from None
     if unknown:
         _refuse(unknown[0], options if default is None else default, command)
-    _check_numbers(parsed)
-    check_fields(parsed, command)
+    check_fields(parsed, command, as_flags=True)
     return parsed
-
-
-_BOUNDS = {
-    "num_envs": (1, 10_000_000),
-    "threads": (1, 4096),
-    "seed": (0, 2**63 - 1),
-    "steps": (0, 10**15),
-    "width": (1, 16_384),
-    "height": (1, 16_384),
-    "shots": (0, 1000),
-    "steady": (0, 1_000_000),
-    "whole": (0, 1_000_000),
-    "exchange": (0, 1_000),
-    "port": (1, 65_535),
-    "size": (0, 10**12),
-    "record": (0, 10**12),
-    "points": (0, 16_384),
-}
-"""Least and most of whole numbers by the name of their flag; a resumed run may have more threads than cores."""
-_OTHERS = (1, 1_000_000)
-"""Of those that are not listed: they count episodes, tasks, tries, rows."""
-
-
-def _check_numbers(parsed: Any) -> None:
-    """Refuses whole numbers that no flag can mean, before anything is loaded; a learner checks its own."""
-    for entry in dataclasses.fields(parsed):
-        value = getattr(parsed, entry.name)
-        least, most = _BOUNDS.get(entry.name, _OTHERS)
-        for number in value if isinstance(value, tuple) else (value,):
-            flag = "--" + entry.name.replace("_", "-")
-            if type(number) is float and not math.isfinite(number):
-                raise BidexError(f"{flag} must be a finite number, not {number}.")
-            if type(number) is not int:
-                continue
-            if number < least:
-                raise BidexError(f"{flag} must be at least {least}, not {shortened(number)}.")
-            if number > most:
-                raise BidexError(f"{flag} must be at most {most:,}, not {shortened(number)}.")
 
 
 def peek(arguments: Sequence[str], flag: str) -> str | None:
@@ -209,7 +146,7 @@ def _flags(options: Any, prefix: str = "--") -> Iterator[str]:
         name = prefix + field.name.replace("_", "-")
         value = getattr(options, field.name, field.default)
         if dataclasses.is_dataclass(value):
-            yield from _flags(value, f"{name}.")
+            yield from _flags(value, prefix if field.name == "config" else f"{name}.")
         else:
             yield name
             if isinstance(value, bool):

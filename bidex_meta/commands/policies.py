@@ -86,7 +86,7 @@ def policy_shape(state: dict[str, Any]) -> dict[str, Any]:
 def policy_of(folder: RunFolder, state: dict[str, Any], device: str) -> Agent:
     """The policy in a run's ``checkpoint``."""
     with fitting(folder.path):
-        return learner_kind(folder.config()["algo"]).make.load_policy(_checked(state), device)
+        return learner_kind(folder.config().algo).make.load_policy(_checked(state), device)
 
 
 def _checked(state: dict[str, Any]) -> dict[str, Any]:
@@ -160,9 +160,8 @@ def looked_at(policy: str, suite: str | None, task: str | None, seed: int, thing
     config: dict[str, Any] = {"suite": suite, "task": task, "object": thing, "threads": 1}
     if policy not in ("zero", "random"):
         stored = RunFolder.open(Path(policy)).config()
-        config |= {"suite": suite or stored["suite"], "base": stored.get("base", "own")}
-        config |= {"points": stored.get("points", 0)}
-        config |= {"task": task or stored["task"], "object": thing if task or thing else stored.get("object")}
+        config |= {"suite": suite or stored.suite, "base": stored.base, "points": stored.points}
+        config |= {"task": task or stored.task, "object": thing if task or thing else stored.object}
     if config["suite"] is None and config["task"] is None:
         raise BidexError("Name what to show: a run folder, --task TASK or --suite SUITE.")
     return Source.open({**config, "seed": seed})

@@ -13,14 +13,15 @@ import tyro
 from msgspec import Meta
 
 from bidex_meta.commands.learners import learner_kind, resolve_device
-from bidex_meta.commands.parsing import StepCount, Switch, parse
+from bidex_meta.commands.parsing import Switch, parse
 from bidex_meta.commands.run_data import dataset_metadata
+from bidex_meta.config import Steps
 from bidex_meta.data import open_dataset, part_files, writer
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.reading import absolute
 from bidex_meta.record import RunFolder
 from bidex_meta.sources import Source
-from bidex_meta.validation import MOST, Environments, Seed, Threads
+from bidex_meta.validation import Environments, Seed, Threads
 
 if TYPE_CHECKING:
     from bidex_meta.agents import Agent
@@ -39,7 +40,7 @@ _MOST_HELD = 1_200_000_000
 _PATIENCE = 3
 """Rounds of demonstrations that may all fail."""
 _OF_RUN = {"suite": None, "task": None, "base": "own", "object": None, "points": 0, "seed": None}
-"""Entries of a run's config that decide which tasks are played, and what they are in runs older than them."""
+"""Entries of a run's config that decide which tasks are played."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class RecordFlags:
     """random: class to play on its own, in place of a suite; demonstrations: class of the witness."""
     base: Literal["own", "moving", "fixed"] = "own"
     """With --task: whether the hands' bases move; own: as the class has it alone."""
-    size: Annotated[StepCount, Meta(ge=0, le=MOST)] = 0
+    size: Steps = 0
     """Transitions; 0: 1e6, of medium-expert 2e6, of demonstrations 2e4. The last episodes are whole: there may be a few
     more."""
     checkpoint: str = "last"
@@ -217,9 +218,9 @@ def _config(flags: RecordFlags) -> dict[str, Any]:
         configs = []
         for run in flags.runs:
             stored = RunFolder.open(run).config()
-            config = {name: stored.get(name, usual) for name, usual in _OF_RUN.items()}
-            if stored.get("task_seed") is not None:  # an offline learner plays the tasks of its data
-                config["seed"] = stored["task_seed"]
+            config = {name: value for name, value in stored.to_json().items() if name in _OF_RUN}
+            if stored.task_seed is not None:  # an offline learner plays the tasks of its data
+                config["seed"] = stored.task_seed
             configs.append(config)
         first, last = configs[0], configs[-1]
         if differ := [name for name in first if first[name] != last[name]]:
@@ -245,7 +246,7 @@ def _actors(flags: RecordFlags, kind: str, device: str) -> "tuple[list[Actor], l
     actors, policies = [], []
     for path in flags.runs:
         folder = RunFolder.open(path)
-        algo = folder.config()["algo"]
+        algo = folder.config().algo
         if learner_kind(algo).adapts:
             raise BidexError(f"{algo} adapts to tasks: it has no one policy to record. Name a run of another learner.")
         policy, steps = load_policy(folder, device, flags.checkpoint)
@@ -348,10 +349,10 @@ def _publish_replay(flags: RecordFlags) -> None:
     (run,) = flags.runs
     folder = RunFolder.open(run)
     config = folder.config()
-    if not config.get("record"):
+    if not config.record:
         raise BidexError(f"{run} kept nothing of its training. Train one that does: bidex-meta run --record 1e6 ...")
     dataset = open_dataset(folder.path / "replay")
-    out, name = writer.dataset_path(flags.out, Source.open(config).name, "replay")
+    out, name = writer.dataset_path(flags.out, Source.open(config.to_json()).name, "replay")
     writer.adopt(dataset.folder, out, name)
     _say_complete(out, name)
 

@@ -6,15 +6,15 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from msgspec import Meta
 
-from bidex_meta.commands.parsing import StepCount, Switch, parse
+from bidex_meta.commands.parsing import Switch, parse
+from bidex_meta.config import Steps
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.outside import name_with_object, short_name
 from bidex_meta.record import video
 from bidex_meta.record.atomic import check_writable, refuse_links
 from bidex_meta.record.progress import counted
-from bidex_meta.validation import MOST, Few, Pixels, Seed
+from bidex_meta.validation import Few, Pixels, Seed
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class RenderFlags:
     first success to the end of the episode."""
     seed: Seed = 0
     """Seed of task and start."""
-    steps: Annotated[StepCount, Meta(ge=0, le=MOST)] | None = None
+    steps: Steps | None = None
     """Steps to take, 60 a second; None: none for a picture, one episode for a film, with --tiled the longest one."""
     every: Few | None = None
     """Steps from one frame of a film to the next; None: 1, with --tiled 2."""

@@ -1,124 +1,58 @@
 """What ``bidex-meta run`` was asked for, resolved to values: flags, presets, and the config of a run to be resumed."""
 
 import dataclasses
-import json
-import math
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Generic, Literal
 
 import tyro
 
-from bidex_meta.commands import run_demonstrations, run_offline
+from bidex_meta.commands import run_data
 from bidex_meta.commands.learners import LearnerKind, choose_preset, learner_kind, resolve_device
-from bidex_meta.commands.parsing import StepCount, Switch, parse, peek
+from bidex_meta.commands.parsing import Switch, parse, peek, peek_all
+from bidex_meta.config import LearnerSettings, RunConfig
 from bidex_meta.data import part_files
 from bidex_meta.errors import BidexError, one_line
 from bidex_meta.memory import POINT_BYTES, ROW_BYTES, check_memory
 from bidex_meta.reading import absolute
-from bidex_meta.record.folder import RunFolder, flat
-from bidex_meta.record.stopping import ENDS
+from bidex_meta.record.folder import RunFolder
 from bidex_meta.sources import Source
-from bidex_meta.suite import MOST_POINTS
 from bidex_meta.train.launch import launch, resume_command
+from bidex_meta.validation import Count, Few, Shots
 
-_MAY_CHANGE = ("steps", "minutes", "evaluate_every", "video_every", "logger", *ENDS)
-"""What a resumed run may be given anew: nothing of it changes what is learned."""
 _EXAMPLE = "MT4"  # a suite whose defaults `run --help` shows
 
 
 @dataclass(frozen=True)
-class RunFlags:
+class RunFlags(Generic[LearnerSettings]):
     """Train a learner on a suite or on a single task, then evaluate it beside a random policy.
 
     Example: bidex-meta run --suite MT4 --algo mtppo --learner.gamma 0.99
     """
 
-    suite: str | None = None
-    """Suite to train on: a name (see `bidex-meta list suites`) or the path of a TOML file."""
-    task: str | None = None
-    """Train on this task class alone, instead of a suite; or on package.module:Class of your own (docs/own-task.md)."""
-    base: Literal["own", "moving", "fixed"] = "own"
-    """With --task: whether the hands' bases move; own: as the class has it alone. Suites move them, HandOver alone
-    does not."""
-    points: int = 0
-    """Points of the cloud that observations show in the place of objects' states, as a depth camera would (768 in the
-    original; docs/points.md); 0: the states, or what the suite's file says."""
-    object: str | None = None
-    """With --task: what is thrown in the place of the class's own object: a name of the shelf or the path of an MJCF
-    file (docs/objects.md)."""
-    algo: str = "mtppo"
-    """Learner (see `bidex-meta list algos`), or package.module:Class of your own (docs/own-learner.md)."""
-    preset: str = "auto"
-    """Values of the learner's config that no flag sets; auto: metaworld for a suite of Meta-World's, else laptop on a
-    CPU, on a GPU paper (of maml and promp laptop there too)."""
-    num_envs: int = 0
-    """Rows stepped together by each process, over all tasks."""
-    steps: StepCount = 0
-    """Environment steps to train for, over all rows of all processes; 2e7 is understood. Of what learns from --dataset:
-    gradient updates."""
-    dataset: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """Learn from this data set (a name of `bidex-meta data list`, or a folder) instead of playing, with --algo bc, bcq,
-    td3bc or iql, for the suite or task that it was recorded of. Given several times: from all of them."""
-    demonstrations: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """Imitate this data set too (as --dataset; see `bidex-meta record demonstrations`), ever less: with --algo mtppo
-    and ppo, see --learner.demonstration-weight. Given several times: all of them."""
-    minutes: float | None = None
-    """Minutes to train for, counted from the first step of the world and without the evaluation; training ends with
-    whichever is up first, these or --steps. None: as long as --steps take."""
-    seed: int = 0
-    """Seed of tasks, starts and learner."""
-    device: str = "auto"
-    """auto, cpu or cuda:N."""
-    engine: Literal["auto", "c", "warp"] = "auto"
-    """Physics: C MuJoCo on the CPU, mujoco_warp on either; auto: the one that is fast on the device."""
-    threads: int | None = None
-    """Threads of torch and of the physics in each process; None: one per core, shared by the processes of a machine. A
-    resumed run keeps its own."""
-    start_from: Path | None = None
-    """Begin with the policy of this run's last checkpoint, network and observation statistics, instead of a fresh
-    one."""
+    config: Annotated[RunConfig[LearnerSettings], tyro.conf.arg(name="")]
     run_dir: Path | None = None
     """Folder of this run; None: runs/SUITE/ALGO/DATE_seedSEED."""
     resume: Path | None = None
     """Continue this run from its last checkpoint, with its own config; only --steps and --minutes may change, which
-    count what it has done already, and --logger, --evaluate-every and --video-every."""
-    evaluate_every: int | None = None
-    """Evaluate every so many iterations, one episode of ten tasks of each class (ten at least in all; what adapts: one
-    shot on train tasks), and keep the policy that did best as checkpoints/best.pt. Changes nothing of the training.
-    None: never."""
-    video_every: int | None = None
-    """Film every so many iterations, a row of each class, into videos/ and the logger. None: never."""
-    logger: Literal["tensorboard", "wandb", "none"] = "tensorboard"
-    """Where metrics, config and films go beside metrics.jsonl."""
-    record: StepCount = 0
-    """Keep about so many transitions of the training as the data set replay/ in the run's folder, those of whole
-    episodes in some of the rows (docs/data.md). 0: none."""
-    stop_at_return: float | None = None
-    """End as soon as the mean return reaches this: of the evaluations with --evaluate-every, else of training."""
-    stop_at_success: float | None = None
-    """End as soon as this share of the episodes succeeds, such as 0.8: of the evaluations with --evaluate-every, else
-    of training, whose actions explore."""
-    stop_at_score: float | None = None
-    """End as soon as the normalised score of the evaluations reaches this; 33 is a third of the expert's. Needs
-    --evaluate-every."""
+    count what it has done already, and --logger, --evaluate-every, --video-every and --stop-at-...."""
     evaluate: bool = True
     """Evaluate at the end."""
-    episodes: int | None = None
-    """Episodes of each task in that evaluation; None: 4, or 1 where a task fixes its start (metaworld/...); for what
-    adapts, as many as --rollouts."""
+    episodes: Few | None = None
+    """Episodes of each task in that evaluation; None: 4, or 1 where a task fixes its start (metaworld/...); for
+    learners that adapt, as many as --rollouts."""
     split: Literal["auto", "train", "test", "both"] = "auto"
     """Tasks of that evaluation where the learner adapts (maml, promp, rl2, ...). auto: both, on ML20 fifteen classes
     beside the five unseen ones."""
-    shots: int | None = None
+    shots: Shots | None = None
     """There: adapt so often, one after the other. None: 1."""
-    rollouts: int | None = None
+    rollouts: Few | None = None
     """There: episodes of each task in a shot. None: as in training, but 40 at most."""
-    tasks: int | None = None
+    tasks: Count | None = None
     """There: the first so many tasks of each class. None: 5."""
     print_config: Switch = False
     """Print the resolved config as JSON and stop."""
@@ -128,13 +62,11 @@ class RunFlags:
 class RunPlan:
     """Everything decided before anything is made."""
 
-    flags: RunFlags
+    flags: RunFlags[Any]
     """As parsed."""
     kind: LearnerKind
     """The learner."""
-    learner_config: Any
-    """An instance of the learner's config dataclass."""
-    config: dict[str, Any]
+    config: RunConfig[Any]
     """The resolved config as it is written to ``config.json``."""
     folder: RunFolder | None
     """The run to be resumed, if any."""
@@ -144,7 +76,7 @@ class RunPlan:
     @cached_property
     def source(self) -> Source:
         """Where this process's worlds come from."""
-        return Source.open({**self.config, "device": launch().own_device(self.config["device"])})
+        return Source.open({**self.config.to_json(), "device": launch().own_device(self.config.device)})
 
 
 def plan_run(arguments: Sequence[str]) -> RunPlan:
@@ -157,145 +89,109 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     if resume and peek(arguments, "--run-dir"):
         raise BidexError("--resume goes on in the run's own folder. Leave --run-dir out, or start a new run there.")
     folder = RunFolder.open(Path(resume)) if resume else None
-    # What older runs did not know.
-    older = {"engine": "auto", "base": "own", "start_from": None, "minutes": None, "object": None}
-    older |= {"points": 0, "evaluate_every": None, "video_every": None, "logger": "tensorboard"}
-    older |= {"record": 0, "record_share": 0.0, **dict.fromkeys(ENDS)}
-    older |= {"dataset": [], "task_seed": None, "demonstrations": None}
-    stored = {**older, **folder.config("learner", "num_envs", "steps")} if folder else {}
-    suite, task = (peek(arguments, f"--{name}") or stored.get(name) for name in ("suite", "task"))
-    data: dict[str, Any] = {"dataset": run_offline.named(arguments, stored)}
-    datasets = run_offline.opened(data["dataset"])
-    implied = {} if suite or task else run_offline.implied(datasets)
-    suite, task = suite or implied.get("suite"), task or implied.get("task")
+    stored = folder.config() if folder else None
+
+    def given(name: str) -> str | None:
+        return peek(arguments, f"--{name}") or (stored and getattr(stored, name))
+
+    dataset = run_data.whole_paths(peek_all(arguments, "--dataset")) or (stored.dataset if stored else ())
+    datasets = run_data.open_datasets(dataset)
+    implied = {} if given("suite") or given("task") else run_data.implied(datasets)
+    suite, task = (given(name) or implied.get(name) for name in ("suite", "task"))
     # Where neither is named, `run --help` still has defaults to show; without --help _resolved refuses it.
-    thing = peek(arguments, "--object") or stored.get("object") or implied.get("object")
-    source = Source.open({"suite": suite or (None if task else _EXAMPLE), "task": task, "object": thing})
-    alone = getattr(source, "class_name", None)
-    kind = learner_kind(peek(arguments, "--algo") or stored.get("algo", RunFlags.algo), alone)
-    device = resolve_device(peek(arguments, "--device") or stored.get("device", RunFlags.device), source.on_gpu)
-    asked = peek(arguments, "--preset") or stored.get("preset", RunFlags.preset)
-    preset, reason = choose_preset(kind, asked, device, source.preset)
-    learner_default = kind.presets[preset]
-    if folder:
-        learner_default = _stored_learner(type(learner_default), stored, folder)
-        stored["learner"] = json.loads(json.dumps(dataclasses.asdict(learner_default)))  # with options it did not know
-    sizes = run_offline.rows_and_steps(source) if kind.offline else source.rows_and_steps(device, kind.adapts)
-    flags = parse(*_options(arguments, learner_default, {**stored, **implied}, sizes))
-    run_offline.check(kind, flags.record, datasets, source)
-    data["demonstrations"] = run_demonstrations.named(arguments, stored)
-    names = {"source": alone or source.name, "algo": kind.name, "preset": preset}
-    data["task_seed"] = stored.get("task_seed", run_offline.task_seed(datasets))
-    config = _resolved(flags, names, device, stored, data)
-    _check_meta_test(flags, kind)
-    run_demonstrations.check(kind, config["demonstrations"], Source.open(config))
-    if folder:
-        _refuse_changes(stored, config, folder)
-    return RunPlan(flags, kind, flags.learner, config, folder, reason)
+    named = {"suite": suite or (None if task else _EXAMPLE), "task": task}
+    source = Source.open({**named, "object": given("object") or implied.get("object")})
+    kind = learner_kind(given("algo") or "mtppo", getattr(source, "class_name", None))
+    device = resolve_device(given("device") or "auto", source.on_gpu)
+    preset, reason = choose_preset(kind, given("preset") or "auto", device, source.preset)
+    if folder and stored:
+        default = replace(stored, learner=_stored_learner(type(kind.presets[preset]), stored, folder))
+    else:
+        sizes = run_data.rows_and_steps(source) if kind.offline else source.rows_and_steps(device, kind.adapts)
+        default = RunConfig(
+            **{"suite": None, "task": None, **implied},
+            algo=kind.name,
+            learner=kind.presets[preset],
+            num_envs=sizes[0],
+            steps=sizes[1],
+            seed=0,
+            task_seed=run_data.task_seed(datasets),
+            threads=max(1, _cores() // launch().local_count),
+        )
+    flags = _parse(arguments, default)
+    run_data.check_offline(kind, flags.config.record, datasets, source)
+    demonstrations = run_data.whole_paths(flags.config.demonstrations) or default.demonstrations
+    config = replace(flags.config, dataset=dataset, demonstrations=demonstrations, algo=kind.name, preset=preset)
+    config = _resolved(config, source, device, fresh=folder is None)
+    _check(flags, config, kind)
+    run_data.check_demonstrations(kind, config.demonstrations, Source.open(config.to_json()))
+    if folder and stored:
+        _refuse_changes(default, config, folder)
+    return RunPlan(flags, kind, config, folder, reason)
 
 
-def _options(
-    arguments: Sequence[str], learner: Any, stored: dict[str, Any], rows_and_steps: tuple[int, int]
-) -> tuple[Any, ...]:
-    """The arguments of ``parse``: ``RunFlags`` with a field ``learner``, and the defaults."""
-    # The learner's dataclass is known only now, and its fields shall be flags with their help texts.
-    options = dataclasses.make_dataclass(
-        "RunOptions", [("learner", type(learner), field(default=learner))], bases=(RunFlags,), frozen=True
-    )
-    options.__doc__ = RunFlags.__doc__
-    rows, steps = rows_and_steps
-    names = {entry.name for entry in dataclasses.fields(RunFlags)}
-    known = {name: value for name, value in stored.items() if name in names}
-    if known.get("start_from") is not None:
-        known["start_from"] = Path(known["start_from"])
-    if "dataset" in known:
-        known["dataset"] = tuple(known["dataset"])
-        known["demonstrations"] = run_demonstrations.listed(known["demonstrations"])
-    default = options(**{"num_envs": rows, "steps": steps, **known, "learner": learner})
-    return options, arguments, "run", default
+def _parse(arguments: Sequence[str], default: RunConfig[Any]) -> RunFlags[Any]:
+    """The flags, those of the learner's config among them; lists begin empty, since flags add to them."""
+    options: Any = RunFlags[type(default.learner)]
+    return parse(options, arguments, "run", RunFlags(replace(default, dataset=(), demonstrations=())))
 
 
-def _resolved(
-    flags: Any, names: dict[str, str], device: str, stored: dict[str, Any], data: dict[str, Any]
-) -> dict[str, Any]:
-    """The config, with names as they are written (``MT4`` where ``--suite mt4`` was given); ``data``: its data sets."""
-    if (flags.suite is None) == (flags.task is None):
+def _resolved(config: RunConfig[Any], source: Source, device: str, fresh: bool) -> RunConfig[Any]:
+    """The config with names as they are written (``MT4`` where ``--suite mt4`` was given) and whole paths.
+
+    A run may be resumed from another folder.
+    """
+    if (config.suite is None) == (config.task is None):
         raise BidexError("Name what to train on: either --suite SUITE or --task TASK, for example --suite MT4.")
-    if flags.base != "own" and flags.task is None:
-        raise BidexError(f"--base {flags.base} goes with --task; a suite's file says whether bases move.")
-    if flags.object is not None and flags.task is None:
+    if config.base != "own" and config.task is None:
+        raise BidexError(f"--base {config.base} goes with --task; a suite's file says whether bases move.")
+    if config.object is not None and config.task is None:
         raise BidexError("--object goes with --task; a suite's file names objects itself (docs/objects.md).")
-    for name in ("num_envs", "threads", "episodes", "shots", "rollouts", "tasks", "evaluate_every", "video_every"):
-        value = getattr(flags, name)
-        if value is not None and value < 1:
-            raise BidexError(f"--{name.replace('_', '-')} must be at least 1, not {value}.")
-    if not 0 <= flags.points <= MOST_POINTS:
-        raise BidexError(f"--points must be a whole number from 0 to {MOST_POINTS:,}, not {flags.points}.")
-    if flags.minutes is not None and not 0.0 < flags.minutes < math.inf:
-        raise BidexError(f"--minutes must be a number above 0, such as 4 or 0.5, not {flags.minutes:g}.")
-    if flags.stop_at_success is not None and not 0.0 < flags.stop_at_success <= 1.0:
-        raise BidexError(f"--stop-at-success is a share above 0 up to 1, such as 0.8, not {flags.stop_at_success:g}.")
-    if flags.stop_at_score is not None and flags.evaluate_every is None:
+    name = getattr(source, "class_name", None) or source.name
+    suite = None if config.suite is None else str(absolute(name)) if name.endswith(".toml") else name
+    return replace(
+        config,
+        suite=suite,
+        task=None if config.task is None else name,
+        object=_whole_path(config.object),
+        start_from=None if config.start_from is None else str(absolute(config.start_from)),
+        record_share=config.record / max(config.steps, 1) if fresh else config.record_share,
+        processes=launch().count,
+        device=device,
+    )
+
+
+def _whole_path(name: str | None) -> str | None:
+    """An object's name, of a file its whole path."""
+    return str(absolute(name)) if name is not None and name.endswith(".xml") else name
+
+
+def _check(flags: RunFlags[Any], config: RunConfig[Any], kind: LearnerKind) -> None:
+    """Refuses what does not go together, and what this machine has no room for."""
+    if config.stop_at_score is not None and config.evaluate_every is None:
         raise BidexError("--stop-at-score is judged by evaluations while training. Add --evaluate-every 50, say.")
-    if flags.record:
-        part_files.hdf5()  # refuses it where it is not installed
-    if device.startswith("cpu") and not flags.print_config:
-        _check_memory(flags)
-    suite = names["source"] if flags.suite else None
-    if suite is not None and suite.endswith(".toml"):
-        suite = str(absolute(suite))  # a run may be resumed from another folder
-    config = {
-        "suite": suite,
-        "task": names["source"] if flags.task else None,
-        "base": flags.base,
-        "points": flags.points,
-        "object": _placed(flags.object),
-        "start_from": None if flags.start_from is None else str(absolute(flags.start_from)),
-        "algo": names["algo"],
-        "preset": names["preset"],
-        "learner": dataclasses.asdict(flags.learner),
-        "num_envs": flags.num_envs,
-        "steps": flags.steps,
-        "minutes": flags.minutes,
-        "evaluate_every": flags.evaluate_every,
-        "video_every": flags.video_every,
-        "logger": flags.logger,
-        **data,
-        "record": flags.record,
-        # A resumed run that takes more steps goes on with the rows that it began with.
-        "record_share": stored.get("record_share", flags.record / max(flags.steps, 1)),
-        **{name: getattr(flags, name) for name in ENDS},
-        "processes": launch().count,
-        "seed": flags.seed,
-        "device": device,
-        "engine": flags.engine,
-        "threads": flags.threads or stored.get("threads") or max(1, _cores() // launch().local_count),
-    }
-    return json.loads(json.dumps(config))  # tuples to lists, so that it equals what is read back
-
-
-def _check_meta_test(flags: Any, kind: LearnerKind) -> None:
     asked = [name for name in ("split", "shots", "rollouts", "tasks") if getattr(flags, name) not in (None, "auto")]
     if asked and not kind.adapts:
-        raise BidexError(f"--{asked[0]} is of what adapts (maml, promp, rl2, ...), not of {kind.name}. Leave it out.")
-
-
-def _placed(thing: str | None) -> str | None:
-    """An object's name, of a file its whole path: a run may be resumed from another folder."""
-    return str(absolute(thing)) if thing is not None and thing.endswith(".xml") else thing
+        raise BidexError(f"--{asked[0]} is for learners that adapt (maml, promp, rl2), not {kind.name}. Leave it out.")
+    if config.record:
+        part_files.hdf5()  # refuses it where it is not installed
+    if config.device.startswith("cpu") and not flags.print_config:
+        _check_memory(config)
 
 
 _WIDTH = 1200
-"""Numbers that a row's step holds at most: an observation before and after, actions and what was computed of them."""
+"""Numbers that a step of one environment holds at most: observations before and after, actions, what is computed."""
 
 
-def _check_memory(flags: Any) -> None:
+def _check_memory(config: RunConfig[Any]) -> None:
     """Refuses a world, and what the learner says it holds (``bytes_held``), that this machine has no room for."""
-    held = getattr(flags.learner, "bytes_held", None)
-    of_learner = 0 if held is None else held(flags.num_envs, _WIDTH + 3 * flags.points)
-    needed = launch().local_count * (flags.num_envs * (ROW_BYTES + flags.points * POINT_BYTES) + of_learner)
-    told = f"--num-envs {flags.num_envs} ({of_learner / 1e9:,.1f} GB of it the learner's)"
-    check_memory(needed, told, "Lower it, or the learner's layers, steps or replay.")
+    held = getattr(config.learner, "bytes_held", None)
+    of_learner = 0 if held is None else held(config.num_envs, _WIDTH + 3 * config.points)
+    of_world = config.num_envs * (ROW_BYTES + config.points * POINT_BYTES)
+    what = f"--num-envs {config.num_envs} ({of_learner / 1e9:,.1f} GB of it the learner's)"
+    check_memory(
+        launch().local_count * (of_world + of_learner), what, "Lower it, or the learner's layers, steps or replay."
+    )
 
 
 def _cores() -> int:
@@ -303,12 +199,12 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
-def _stored_learner(config_class: Any, stored: dict[str, Any], folder: RunFolder) -> Any:
-    values = {name: tuple(v) if isinstance(v, list) else v for name, v in stored.get("learner", {}).items()}
+def _stored_learner(config_class: Any, stored: RunConfig[dict[str, Any]], folder: RunFolder) -> Any:
+    values = {name: tuple(v) if isinstance(v, list) else v for name, v in stored.learner.items()}
     unknown = set(values) - {entry.name for entry in dataclasses.fields(config_class)}
     if unknown:
         raise BidexError(
-            f"{folder.config_path} sets {', '.join(sorted(unknown))}, which this version of {stored['algo']} does not "
+            f"{folder.config_path} sets {', '.join(sorted(unknown))}, which this version of {stored.algo} does not "
             "have. Resume with the version in versions.json."
         )
     try:
@@ -319,17 +215,15 @@ def _stored_learner(config_class: Any, stored: dict[str, Any], folder: RunFolder
         raise BidexError(f"{folder.config_path}: learner: {one_line(error)}.") from None
 
 
-def _refuse_changes(stored: dict[str, Any], config: dict[str, Any], folder: RunFolder) -> None:
-    before, after = flat({"processes": 1, **stored}), flat(config)
-    if before["processes"] != after["processes"]:
+def _refuse_changes(stored: RunConfig[Any], config: RunConfig[Any], folder: RunFolder) -> None:
+    if stored.processes != config.processes:
         raise BidexError(
-            f"{folder.path} has worlds of {before['processes']} process(es), not {after['processes']}. "
-            f"Continue: {resume_command(folder.path, before['processes'])}"
+            f"{folder.path} has worlds of {stored.processes} process(es), not {config.processes}. "
+            f"Continue: {resume_command(folder.path, stored.processes)}"
         )
-    for name in sorted(before.keys() | after.keys()):
-        if name not in _MAY_CHANGE and before.get(name) != after.get(name):
-            flag = "--" + name.replace("_", "-")
-            raise BidexError(
-                f"{flag} is {before.get(name)} in {folder.path}, not {after.get(name)}: "
-                f"a resumed run keeps its config. Leave {flag} out, or start a new run."
-            )
+    for name, before, after in stored.differences(config, ignored=("record_share",)):
+        flag = "--" + name.replace("_", "-")
+        raise BidexError(
+            f"{flag} is {before} in {folder.path}, not {after}: a resumed run keeps its config. Leave {flag} out, or "
+            "start a new run."
+        )

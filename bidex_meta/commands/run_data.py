@@ -1,11 +1,10 @@
 """Data sets of ``bidex-meta run``: what it learns from (--dataset) or imitates (--demonstrations), and metadata."""
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from bidex_meta.commands.learners import ALGOS, LearnerKind, learner_kind
-from bidex_meta.commands.parsing import peek_all
 from bidex_meta.data import Dataset, open_dataset
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.reading import absolute, expanded
@@ -68,27 +67,9 @@ def dataset_metadata(
     }
 
 
-def given_datasets(arguments: Sequence[str], stored: Mapping[str, Any]) -> list[str]:
-    """The values of --dataset, or those of the run to be resumed, as a config holds them: of folders the whole path."""
-    return _whole_paths(peek_all(arguments, "--dataset") or stored.get("dataset", []))
-
-
-def given_demonstrations(arguments: Sequence[str], stored: Mapping[str, Any]) -> str | list[str] | None:
-    """The values of --demonstrations, as ``given_datasets``; a config holds none as None and a single one as a text."""
-    names = _whole_paths(peek_all(arguments, "--demonstrations") or listed(stored.get("demonstrations")))
-    return names if len(names) > 1 else names[0] if names else None
-
-
-def listed(demonstrations: str | Sequence[str] | None) -> tuple[str, ...]:
-    """The names in a config's entry ``demonstrations``."""
-    if demonstrations is None:
-        return ()
-    return (demonstrations,) if isinstance(demonstrations, str) else tuple(demonstrations)
-
-
-def _whole_paths(names: Sequence[str]) -> list[str]:
-    # A run may be resumed from another folder.
-    return [str(absolute(name)) if expanded(name).is_dir() else name for name in names]
+def whole_paths(names: Sequence[str]) -> tuple[str, ...]:
+    """Data sets as a config holds them: of folders the whole path, since a run may be resumed from another folder."""
+    return tuple(str(absolute(name)) if expanded(name).is_dir() else name for name in names)
 
 
 def open_datasets(names: Sequence[str]) -> list[Dataset]:
@@ -150,14 +131,13 @@ def check_offline(kind: LearnerKind, record: int, datasets: Sequence[Dataset], s
         _check_goals(dataset, source)
 
 
-def check_demonstrations(kind: LearnerKind, demonstrations: str | Sequence[str] | None, source: Source) -> None:
+def check_demonstrations(kind: LearnerKind, names: Sequence[str], source: Source) -> None:
     """Refuses, from the data sets' metadata alone, what could not be imitated.
 
     Raises:
         BidexError: The learner takes none, there is no such data set, or it is of another class, of other bases or with
             other goals shown.
     """
-    names = listed(demonstrations)
     if names and not kind.imitates:
         takers = ", ".join(name for name in ALGOS if learner_kind(name).imitates)
         raise BidexError(f"{kind.name} imitates nothing; --demonstrations goes with {takers}. Leave one of them out.")
@@ -196,11 +176,11 @@ def give_datasets(names: Sequence[str], learner: Any) -> None:
     learner.learn_from(join(_announced(names, "Reading"), learner.world))
 
 
-def give_demonstrations(demonstrations: str | Sequence[str], learner: Any) -> None:
+def give_demonstrations(names: Sequence[str], learner: Any) -> None:
     """Reads demonstrations and hands them to a fresh learner; errors as of ``join``."""
     from bidex_meta.data.joined import join
 
-    datasets = _announced(listed(demonstrations), "Demonstrations:")
+    datasets = _announced(names, "Demonstrations:")
     learner.learn_from_demonstrations(join(datasets, learner.world, every=False))
 
 

@@ -1,14 +1,13 @@
-"""What ``bidex-meta run`` adds for ``--record`` and ``--stop-at-...``: a collector around its world, an early end."""
+"""What ``bidex-meta run --record`` adds: a collector around its world."""
 
 import sys
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bidex_meta.commands.run_config import RunPlan
 from bidex_meta.commands.run_data import dataset_metadata
 from bidex_meta.data import part_files, writer
 from bidex_meta.memory import check_memory
-from bidex_meta.record import stopping
 from bidex_meta.record.folder import new_folder_name
 from bidex_meta.train.launch import launch
 
@@ -26,12 +25,12 @@ def recorded(plan: RunPlan, world: "PooledWorld") -> "RunCollector":
     from bidex_meta.data.collect import bytes_held
     from bidex_meta.data.collector import RunCollector, spread_environments
 
-    rows = spread_environments(world, plan.config["record_share"])
+    rows = spread_environments(world, plan.config.record_share)
     sizes = world.single_observation_space.shape[0], world.single_action_space.shape[0]
-    needed = writer.estimated_bytes(plan.config["record"], *sizes, 20.0)
+    needed = writer.estimated_bytes(plan.config.record, *sizes, 20.0)
     folder = plan.folder.path if plan.folder else plan.flags.run_dir or new_folder_name(plan.config)
     there = sum(path.stat().st_size for path in part_files.parts_of(folder / "replay" / "data"))  # of a resumed run
-    writer.check_room(folder, max(0, needed - there), f"{plan.config['record']:,} transitions")
+    writer.check_room(folder, max(0, needed - there), f"{plan.config.record:,} transitions")
     # A checkpoint copies the running episodes; each process of this machine has its own.
     held = 2 * launch().local_count * bytes_held(world, rows)
     check_memory(held, f"The running episodes of {len(rows):,} recorded rows", "Lower --record or --num-envs.")
@@ -39,27 +38,20 @@ def recorded(plan: RunPlan, world: "PooledWorld") -> "RunCollector":
     return RunCollector(world, rows, launch().rank)  # pyright: ignore[reportAbstractUsage]
 
 
+def begin(collector: "RunCollector", folder: Path, fresh: bool) -> None:
+    """Sets the data set's folder in the run's; a resumed run's checkpoint knows which parts stay."""
+    collector.folder = folder / "replay"
+    if fresh:
+        collector.open(collector.folder)
+
+
 def complete(plan: RunPlan, collector: "RunCollector") -> None:
     """Makes a data set of what all processes collected."""
-    policy = {"algo": plan.config["algo"], "run": collector.folder.parent.name, "actions": "as in training"}
+    policy = {"algo": plan.config.algo, "run": collector.folder.parent.name, "actions": "as in training"}
     about = dataset_metadata(plan.source, collector, "replay", [policy])
     name = writer.default_name(plan.source.name, "replay")
     writer.finish(collector.folder, name, collector.single_observation_space, collector.single_action_space, about)
     _say(f"Recorded: {collector.folder}")
-
-
-def enough(config: dict[str, Any]) -> Callable[[Mapping[str, Any]], bool] | None:
-    """What ends the training early, by its metrics; None where nothing does."""
-    if all(config[name] is None for name in stopping.ENDS):
-        return None
-
-    def reached(metrics: Mapping[str, Any]) -> bool:
-        tag = stopping.enough(config, metrics)
-        if tag is not None:
-            _say(f"Enough: {tag} is {metrics[tag]:.4g}.")
-        return tag is not None
-
-    return reached
 
 
 def _say(text: str) -> None:

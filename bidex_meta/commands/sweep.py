@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from bidex_meta.commands.parsing import Switch, parse
+from bidex_meta.config import RunConfig
 from bidex_meta.errors import EXIT_FAILED, BidexError
+from bidex_meta.validation import Few
 
 if TYPE_CHECKING:
     from bidex_meta.sweep.plan import Sweep
@@ -30,7 +32,7 @@ class SweepFlags:
 
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE.toml")]
     """The sweep."""
-    workers: int | None = None
+    workers: Few | None = None
     """Runs at a time, each on a core of its own; None: one, or one for each of --cores."""
     cores: str | None = None
     """Cores that runs are bound to (Linux), such as 1 or 0,2-3; None: the first of those there are."""
@@ -89,7 +91,7 @@ def main(arguments: Sequence[str]) -> None:
         raise SystemExit(EXIT_FAILED)
 
 
-def _configs(sweep: "Sweep", file: Path) -> dict[tuple[str, ...], dict[str, Any]]:
+def _configs(sweep: "Sweep", file: Path) -> dict[tuple[str, ...], RunConfig[Any]]:
     """The resolved config of each kind of run, by its words: seeds share it.
 
     Raises:
@@ -97,7 +99,7 @@ def _configs(sweep: "Sweep", file: Path) -> dict[tuple[str, ...], dict[str, Any]
     """
     from bidex_meta.commands.run_config import plan_run
 
-    configs: dict[tuple[str, ...], dict[str, Any]] = {}
+    configs: dict[tuple[str, ...], RunConfig[Any]] = {}
     for run in sweep.runs:
         try:
             configs[run.words] = configs.get(run.words) or plan_run(run.begin[1:]).config

@@ -3,14 +3,16 @@
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from bidex_meta.commands.parsing import RunPath, Switch, parse
+from bidex_meta.config import RunConfig
 from bidex_meta.errors import EXIT_FAILED, BidexError, one_line
 from bidex_meta.reading import exists
 from bidex_meta.sources import Source
+from bidex_meta.validation import Environments
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,7 @@ class VerifyFlags:
     """auto, cpu or cuda:N; auto: where the evaluation was made, if that is here, else the CPU."""
     engine: str | None = None
     """auto, c or warp; None: as the evaluation was made, on another device auto."""
-    num_envs: int | None = None
+    num_envs: Environments | None = None
     """Rows stepped together; None: as the evaluation was made."""
     json: Switch = False
     """Print JSON."""
@@ -52,12 +54,12 @@ def main(arguments: Sequence[str]) -> None:
     from bidex_meta.world.threads import set_up_torch
 
     folder = RunFolder.open(flags.run)
-    config = folder.config("learner", "num_envs", "threads")
+    config = folder.config()
     recorded = recorded_evaluation(folder.path, flags.evaluation)
     then = recorded_conditions(recorded, read_versions(folder.path), config)
-    config |= _place(flags, then, config)
-    source = Source.open(config)
-    set_up_torch(config["threads"])
+    config = replace(config, **_place(flags, then, config))
+    source = Source.open(config.to_json())
+    set_up_torch(config.threads)
     rows = then["num_envs"] if flags.num_envs is None else flags.num_envs
     state, step = _checkpoint(folder, recorded["steps"])
     apart = others(then, conditions(source, rows))
@@ -73,7 +75,7 @@ def main(arguments: Sequence[str]) -> None:
         report = {"run": str(folder.path), "steps": step, "conditions": apart, **counts}
         print(json.dumps(report | {"classes": {each.name: each.to_json() for each in found}}, indent=2))
     else:
-        _print(f"{config['algo']} on {source.name}, {step:,} steps, recorded and again", found)
+        _print(f"{config.algo} on {source.name}, {step:,} steps, recorded and again", found)
         print(verdict if not counts[DIFFERS] else f"{verdict}: this run is not what its evaluation says")
     if counts[DIFFERS]:
         raise SystemExit(EXIT_FAILED)
@@ -114,11 +116,11 @@ def recorded_evaluation(run: Path, named: Path | None = None) -> dict[str, Any]:
     return found
 
 
-def _place(flags: VerifyFlags, then: dict[str, Any], config: dict[str, Any]) -> dict[str, Any]:
+def _place(flags: VerifyFlags, then: dict[str, Any], config: RunConfig[Any]) -> dict[str, Any]:
     """Device and engine to evaluate with."""
     from bidex_meta.commands.learners import resolve_device
 
-    on_gpu = Source.open(config).on_gpu
+    on_gpu = Source.open(config.to_json()).on_gpu
     try:
         device = resolve_device(then["device"] if flags.device == "auto" else flags.device, on_gpu)
     except BidexError:
@@ -154,19 +156,19 @@ def _checkpoint(folder: Any, steps: int) -> tuple[dict[str, Any], int]:
 
 
 def _again(
-    folder: Any, config: dict[str, Any], source: Source, recorded: dict[str, Any], rows: int | None, state: Any
+    folder: Any, config: RunConfig[Any], source: Source, recorded: dict[str, Any], rows: int | None, state: Any
 ) -> dict[str, Any]:
     """The recorded evaluation, made again."""
     from bidex_meta.commands.learners import learner_kind
     from bidex_meta.commands.policies import policy_of
 
-    if learner_kind(config["algo"]).adapts != ("splits" in recorded):
+    if learner_kind(config.algo).adapts != ("splits" in recorded):
         kind = "a meta-test" if "splits" in recorded else "no meta-test"
-        raise BidexError(f"{folder.path}: the evaluation is {kind}, which is not how {config['algo']} is judged.")
+        raise BidexError(f"{folder.path}: the evaluation is {kind}, which is not how {config.algo} is judged.")
     if "splits" not in recorded:
         world = source.world(recorded.get("split", "train"), rows)
         episodes = recorded.get("policy", recorded)["episodes_per_task"]
-        found = source.judge(policy_of(folder, state, config["device"]), world, episodes, recorded["seed"])
+        found = source.judge(policy_of(folder, state, config.device), world, episodes, recorded["seed"])
         world.close()
         return {"policy": found.to_json()}
     from bidex_meta.commands import metatest
@@ -186,7 +188,7 @@ def _again(
             seed=recorded["seed"],
         )
         say = lambda text: print(text, file=sys.stderr, flush=True)  # noqa: E731
-        load = lambda: policy_of(folder, state, config["device"])  # noqa: E731
+        load = lambda: policy_of(folder, state, config.device)  # noqa: E731
         splits |= metatest.report(metatest.meta_test(source, config, load, options, [split], say))
     return {"splits": splits}
 

@@ -35,14 +35,29 @@ def check(plan: RunPlan) -> None:
     """
     from bidex_meta.record.writers import check_logger
 
-    check_logger(plan.config["logger"])
-    if plan.config["video_every"] is not None:
+    check_logger(plan.config.logger)
+    if plan.config.video_every is not None:
         from bidex_meta import drawing
         from bidex_meta.record.video import check_films
 
         plan.source.task_classes()
         check_films()
         drawing.prepare()
+
+
+@contextmanager
+def watch(
+    plan: RunPlan, folder: RunFolder, learner: Any, record: Recorder, iterations: int
+) -> Iterator["Watch | None"]:
+    """What the config asks for, with its worlds closed at the end; None where it asks for nothing."""
+    if plan.config.evaluate_every is None and plan.config.video_every is None:
+        yield None
+        return
+    watched = Watch(plan, folder, learner, record, iterations)
+    try:
+        yield watched
+    finally:
+        watched.close()
 
 
 class Watch:
@@ -59,7 +74,7 @@ class Watch:
     def __init__(self, plan: RunPlan, folder: RunFolder, learner: Any, record: Recorder, iterations: int) -> None:
         self._plan, self._folder, self._learner, self._record = plan, folder, learner, record
         self._iterations = iterations
-        self._device = launch().own_device(plan.config["device"])
+        self._device = launch().own_device(plan.config.device)
         self._worlds: dict[str, Any] = {}
         self._best = folder.checkpoints.found_of_best()
 
@@ -68,9 +83,9 @@ class Watch:
         self._iterations += 1
         metrics: dict[str, float] = {}
         with undisturbed(torch.device(self._device)):
-            if self._is_due("evaluate_every"):
+            if self._is_due(self._plan.config.evaluate_every):
                 metrics = self._evaluate()
-            if self._is_due("video_every"):
+            if self._is_due(self._plan.config.video_every):
                 self._film()
         return metrics
 
@@ -79,8 +94,7 @@ class Watch:
         for world in self._worlds.values():
             world.close()
 
-    def _is_due(self, name: str) -> bool:
-        every = self._plan.config[name]
+    def _is_due(self, every: int | None) -> bool:
         return every is not None and self._iterations % every == 0
 
     def _policy(self, device: str) -> Agent:
@@ -129,7 +143,7 @@ class Watch:
 
         try:
             if "film" not in self._worlds:
-                source = Source.open({**self._plan.config, "device": "cpu", "engine": "auto"})
+                source = Source.open({**self._plan.config.to_json(), "device": "cpu", "engine": "auto"})
                 self._worlds["film"] = source.world("train", len(slots_of(source)))
             world = self._worlds["film"]
             steps = min(_MOST_FILM_STEPS, int(world.max_episode_steps.max()))
@@ -138,7 +152,7 @@ class Watch:
                 world,
                 range(world.num_envs),
                 steps,
-                self._plan.config["seed"],
+                self._plan.config.seed,
                 _FILM_EVERY,
                 **_FILM,
             )

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from bidex_meta.agents import Agent
-from bidex_meta.record.tiles import tiled
+from bidex_meta.record.video import tiled
 
 
 def film_row(

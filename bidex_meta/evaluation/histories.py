@@ -9,7 +9,7 @@ import numpy as np
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import by_kind, run_kind
 from bidex_meta.evaluation.statistics import bootstrap_band
-from bidex_meta.record.curves import Curve
+from bidex_meta.record.plots import Curve
 from bidex_meta.record.stored import Run
 
 _POINTS = 200
@@ -33,7 +33,7 @@ def read_histories(folders: Sequence[Run]) -> list[History]:
     Raises:
         BidexError: None of them has logged anything.
     """
-    runs = [{"kind": run_kind(folder.config("learner", "num_envs", "steps")), "folder": folder} for folder in folders]
+    runs = [{"kind": run_kind(folder.config()), "folder": folder} for folder in folders]
     histories = []
     for label, members in by_kind(runs):
         of_label = [run["folder"] for run in members]

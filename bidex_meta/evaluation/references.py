@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from bidex_meta import paths
+from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.scores import Reference
 from bidex_meta.reading import TABLE, check, exists, number, read_json
@@ -91,7 +92,7 @@ def references_of(world: Any) -> dict[str, Reference]:
     return references() if slots and all(slot.task_class.moving_base for slot in slots) else {}
 
 
-def rescored(classes: dict[str, Any], config: dict[str, Any]) -> dict[str, Any]:
+def rescored(classes: dict[str, Any], config: RunConfig[Any]) -> dict[str, Any]:
     """Rows of an evaluation with the scores that today's references give their returns.
 
     A stored score is of the references of its day: beside another day's it would compare nothing.
@@ -104,7 +105,7 @@ def rescored(classes: dict[str, Any], config: dict[str, Any]) -> dict[str, Any]:
     Returns:
         The same rows; those of other bases and of foreign classes as they are.
     """
-    if config.get("base") != "moving" and all(row["score"] is None for row in classes.values()):
+    if config.base != "moving" and all(row["score"] is None for row in classes.values()):
         return classes
     known = references()
     return {

@@ -1,20 +1,26 @@
 """Checkpoints: ``step_<N>.pt`` (the last few), ``last.pt`` and ``best.pt``.
 
-Written atomically, read without unpickling code, each with a digest of its content (:mod:`bidex_meta.record.sealing`).
+Written atomically and read without unpickling code. Each is sealed by a format number and a digest of every number and
+tensor in it: ``torch.load`` checks no checksum, so a flipped bit would be loaded as another weight. Files of format 1,
+which had no seal, are still held to the checksums that every zip archive carries.
 """
 
+import hashlib
 import re
 import shutil
 import sys
+import zipfile
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
-from bidex_meta.errors import BidexError, one_line
-from bidex_meta.reading import exists, is_file
+from bidex_meta.errors import BidexError, one_line, shortened
+from bidex_meta.reading import exists, is_file, open_regular
 from bidex_meta.record.atomic import refuse_links, remove_leftovers, write_atomic
-from bidex_meta.record.sealing import opened, sealed
 
 _STEP_FILE = re.compile(r"step_(\d{1,18})\.pt", re.ASCII)
+FORMAT = 2
+"""Goes up when older code could not read a checkpoint; 1 had no seal."""
+_DEEPEST = 100
 
 
 class Checkpoints:
@@ -52,7 +58,7 @@ class Checkpoints:
         refuse_links(self.folder)
         self.folder.mkdir(exist_ok=True)
         remove_leftovers(self.folder)
-        path, content = self.folder / f"step_{step}.pt", sealed({"step": step, "state": state})
+        path, content = self.folder / f"step_{step}.pt", _sealed({"step": step, "state": state})
         write_atomic(path, lambda file: torch.save(content, file))
         self._follow(path)
 
@@ -93,7 +99,7 @@ class Checkpoints:
         refuse_links(self.folder)
         self.folder.mkdir(exist_ok=True)
         remove_leftovers(self.folder)
-        content = sealed({"step": step, "state": {"learner": {"policy": policy}}, "found": found})
+        content = _sealed({"step": step, "state": {"learner": {"policy": policy}}, "found": found})
         write_atomic(self.best, lambda file: torch.save(content, file))
 
     def found_of_best(self) -> dict[str, float] | None:
@@ -111,7 +117,7 @@ class Checkpoints:
             there = ", ".join(sorted(found.name for found in self.folder.glob("*.pt"))) or "none"
             raise BidexError(f"There is no {path}. Checkpoints in {self.folder}: {there}.")
         try:
-            content = opened(path)
+            content = _opened(path)
         except Exception as error:
             raise BidexError(f"{path} is no checkpoint that can be read ({_reason(error)}). Name another.") from None
         return content["state"], content["step"]
@@ -152,7 +158,7 @@ class Checkpoints:
 
 def _read(path: Path, then: str = "trying an older one") -> dict[str, Any] | None:
     try:
-        return opened(path)
+        return _opened(path)
     except Exception as error:  # torch raises a dozen kinds for a damaged file; each means "try the one before"
         print(f"Checkpoint {path} cannot be read ({_reason(error)}); {then}.", file=sys.stderr)
         return None
@@ -161,3 +167,79 @@ def _read(path: Path, then: str = "trying an older one") -> dict[str, Any] | Non
 def _reason(error: Exception) -> str:
     kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
     return kind + one_line(error)[:100].rstrip(".")
+
+
+def _sealed(content: dict[str, Any]) -> dict[str, Any]:
+    """Content to be saved, with its format and digest."""
+    return {**content, "format": FORMAT, "digest": _digest(content)}
+
+
+def _opened(path: Path) -> dict[str, Any]:
+    """A sealed file's content, read from a file without running any code of it; at least ``step`` and ``state``.
+
+    Raises:
+        BidexError: It is no regular file, or of a newer format.
+        Exception: torch's own, of a dozen kinds, where the file is damaged or something else.
+    """
+    import torch
+
+    with open_regular(path, "a checkpoint") as file:
+        _check_archive(file)
+        # weights_only: a checkpoint from somebody else must not be able to run code.
+        content = torch.load(file, map_location="cpu", weights_only=True)
+    if not isinstance(content, dict) or not isinstance(content.get("state"), dict):
+        raise ValueError("it holds no training's state")
+    if type(content.get("step")) is not int or content["step"] < 0:
+        raise ValueError(f"its step is {shortened(content.get('step'))}, no whole number")
+    version, digest = content.pop("format", 1), content.pop("digest", None)
+    if type(version) is not int or not 1 <= version <= FORMAT:
+        raise BidexError(f"format {shortened(version)} is none this version knows (1 to {FORMAT})")
+    if version > 1 and digest != _digest(content):
+        raise ValueError("its content does not have the digest it was saved with")
+    return content
+
+
+def _check_archive(file: IO[bytes]) -> None:
+    """Refuses an archive that is damaged, or whose parts are larger than the file: torch stores them as they are."""
+    with zipfile.ZipFile(file) as archive:
+        for part in archive.infolist():
+            if part.compress_type != zipfile.ZIP_STORED or part.file_size != part.compress_size:
+                raise ValueError(f"its part {shortened(part.filename)} is compressed")
+        damaged = archive.testzip()
+    if damaged is not None:
+        raise ValueError(f"its part {shortened(damaged)} does not have its checksum")
+    file.seek(0)
+
+
+def _digest(content: dict[str, Any]) -> str:
+    found = hashlib.blake2b(digest_size=32)
+    _feed(content, found, 0)
+    return found.hexdigest()
+
+
+def _feed(value: Any, found: Any, depth: int) -> None:
+    """Feeds a hash with a value, its type and its shape, so that no two contents look alike."""
+    import torch
+
+    if depth > _DEEPEST:
+        raise ValueError(f"it is nested more than {_DEEPEST} deep")
+    if isinstance(value, torch.Tensor):
+        found.update(f"tensor {value.dtype} {tuple(value.shape)}:".encode())
+        flat = value.detach().cpu().contiguous()
+        # Of a single number the stride can be any, and a view of bytes asks for 1.
+        flat = flat.as_strided((flat.numel(),), (1,))
+        found.update(flat.view(torch.uint8).numpy().data)
+    elif isinstance(value, dict):
+        found.update(f"dict {len(value)}:".encode())
+        for name, each in value.items():
+            _feed(name, found, depth + 1)
+            _feed(each, found, depth + 1)
+    elif isinstance(value, list | tuple):
+        found.update(f"{'list' if isinstance(value, list) else 'tuple'} {len(value)}:".encode())
+        for each in value:
+            _feed(each, found, depth + 1)
+    else:
+        # Of floats repr gives every bit but NaN's.
+        told = value if isinstance(value, bytes) else repr(value).encode()
+        found.update(f"{type(value).__name__} {len(told)}:".encode())
+        found.update(told)

@@ -21,14 +21,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from bidex_meta.config import RunConfig, read_config
 from bidex_meta.errors import BidexError
 from bidex_meta.outside import name_with_object, short_name
-from bidex_meta.reading import exists, is_file
+from bidex_meta.reading import exists, is_file, read_json
 from bidex_meta.record.atomic import TEMPORARY_SUFFIX, check_writable, refuse_links, remove_leftovers, write_json
 from bidex_meta.record.checkpoints import Checkpoints
 from bidex_meta.record.metrics import last_rows, read_metrics
-from bidex_meta.record.schemas import read_config, read_evaluation, read_versions
-from bidex_meta.record.stopping import goal
+from bidex_meta.record.schemas import read_evaluation, read_versions
 from bidex_meta.record.versions import collect_versions
 
 _ENTRIES = ("checkpoints", "videos", "metrics.jsonl", "versions.json", "config.json", "replay", "wandb", "wandb-id")
@@ -47,7 +47,7 @@ class RunFolder:
     @classmethod
     def create(
         cls,
-        config: dict[str, Any],
+        config: RunConfig[Any],
         path: Path | None = None,
         root: Path = Path("runs"),
         identity: dict[str, Any] | None = None,
@@ -55,8 +55,7 @@ class RunFolder:
         """Make a new, complete run folder: after this call only metrics, checkpoints and videos are added.
 
         Args:
-            config: The resolved config, ready for JSON; its ``suite`` (or ``task``), ``algo`` and
-                ``seed`` name the folder.
+            config: The resolved config; its ``suite`` (or ``task``), ``algo`` and ``seed`` name the folder.
             path: The folder itself, instead of one under ``root`` named after the config.
             root: Where runs are collected.
             identity: What tells the run's worlds from others of their name; kept in ``versions.json``.
@@ -69,7 +68,7 @@ class RunFolder:
             made.mkdir(exist_ok=True)  # there where a start was killed before its config stood
         folder.metrics_path.touch()
         write_json(folder.path / "versions.json", collect_versions() | (identity or {}))
-        write_json(folder.config_path, config)  # last: a folder with a config.json is a complete one
+        write_json(folder.config_path, config.to_json())  # last: a folder with a config.json is a complete one
         return folder
 
     @classmethod
@@ -113,16 +112,13 @@ class RunFolder:
         """The run's checkpoints."""
         return Checkpoints(self.checkpoints_path)
 
-    def config(self, *needed: str) -> dict[str, Any]:
+    def config(self) -> RunConfig[dict[str, Any]]:
         """The resolved config.
-
-        Args:
-            needed: Entries that must be there beside those of every run.
 
         Raises:
             BidexError: ``config.json`` cannot be read, is not valid JSON, or not a run's.
         """
-        return read_config(self.config_path, needed)
+        return read_config(self.config_path)
 
     @property
     def evaluation_path(self) -> Path:
@@ -146,7 +142,8 @@ class RunFolder:
     @property
     def goal(self) -> int:
         """Steps that it trains for; of a run that time, a return or a score has ended those it made."""
-        return goal(self.config("steps"), last_rows(self.metrics_path))
+        rows = last_rows(self.metrics_path)
+        return self.config().goal(rows[-1] if rows else {"step": 0})
 
     def versions(self) -> dict[str, Any]:
         """``versions.json``; empty where there is none."""
@@ -162,9 +159,10 @@ class RunFolder:
             raise BidexError(f"{self.path} has no evaluation.json. Let the run end, or write one: {self.again}")
         return read_evaluation(self.evaluation_path, self.again)
 
-    def change_config(self, config: dict[str, Any]) -> None:
-        """Replace ``config.json``, atomically."""
-        write_json(self.config_path, config)
+    def change_config(self, config: RunConfig[Any]) -> None:
+        """Replace ``config.json``, atomically, where it says something else."""
+        if read_json(self.config_path, "a run's config") != config.to_json():
+            write_json(self.config_path, config.to_json())
 
     def finish(self, step: int | None) -> None:
         """Clears away what a process that was killed in this folder left half done; only where it is locked.
@@ -251,25 +249,17 @@ def _is_own_leftover(path: Path) -> bool:
     return path.name.startswith(".config.json.") and path.name.endswith(TEMPORARY_SUFFIX) and not path.is_symlink()
 
 
-def flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """A config without nesting: ``{"learner": {"gamma": 0.9}}`` becomes ``{"learner.gamma": 0.9}``."""
-    found: dict[str, Any] = {}
-    for name, value in config.items():
-        found.update(flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value})
-    return found
-
-
-def new_folder_name(config: dict[str, Any], root: Path = Path("runs")) -> Path:
+def new_folder_name(config: RunConfig[Any], root: Path = Path("runs")) -> Path:
     """Where a run is kept that is given no folder, by its config and the present time."""
     # A suite may be a path to a TOML file, task and algo package.module:Class.
-    subject = short_name(Path(str(config.get("suite") or config.get("task"))).stem)
-    subject = name_with_object(subject, config.get("object"))
+    subject = short_name(Path(config.suite or str(config.task)).stem)
+    subject = name_with_object(subject, config.object)
     now = datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S")
-    algo = short_name(str(config["algo"]))
-    return root / subject / algo / f"{now}_seed{config['seed']}"
+    algo = short_name(config.algo)
+    return root / subject / algo / f"{now}_seed{config.seed}"
 
 
-def _new_folder(config: dict[str, Any], root: Path) -> Path:
+def _new_folder(config: RunConfig[Any], root: Path) -> Path:
     base = new_folder_name(config, root)
     base.parent.mkdir(parents=True, exist_ok=True)
     path, count = base, 1

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from bidex_meta.errors import BidexError
-from bidex_meta.reading import bounded, exists, open_regular, read_bytes, whole
+from bidex_meta.reading import bounded, exists, open_regular, read_bytes
 from bidex_meta.record.atomic import write_atomic
 from bidex_meta.record.writers import Writer, make_writer
 
@@ -140,7 +140,7 @@ def _row(line: bytes) -> dict[str, Any] | None:
         row = bounded(json.loads(line, parse_constant=lambda _: None))
     except (ValueError, RecursionError):  # ValueError: also bytes that are no text
         return None
-    if not isinstance(row, dict) or not whole(0).fits(row.get("step")):
+    if not isinstance(row, dict) or type(row.get("step")) is not int or row["step"] < 0:
         return None
     numbers = [value for value in row.values() if value is not None]
     return row if all(type(value) in (int, float) and math.isfinite(value) for value in numbers) else None

@@ -3,14 +3,31 @@
 import io
 import textwrap
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from bidex_meta.errors import BidexError
 from bidex_meta.reading import exists, read_json
 from bidex_meta.record.atomic import write_atomic
-from bidex_meta.record.curves import Curve
 from bidex_meta.record.schemas import check_evaluation
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A metric against environment steps; arrays (points,)."""
+
+    steps: np.ndarray
+    """Environment steps, rising."""
+    mean: np.ndarray
+    """The metric, over several runs their mean."""
+    low: np.ndarray | None
+    """Lower end of the interval over runs; None of a single run."""
+    high: np.ndarray | None
+    """Upper end."""
+
 
 Group = tuple[str, Mapping[str, Curve]]
 """Runs that are drawn in one colour: their label, and curves by tag."""
@@ -161,7 +178,7 @@ def draw_adaptation(found: Any, where: object) -> Any:
         raise BidexError(
             f"{where} holds no meta-test: its learner does not adapt, or it is older. {_AGAIN.format(where)}"
         )
-    check_evaluation(found, Path(str(where)))
+    check_evaluation(found, str(where))
     grids = {split: _grid(len(part["before"]["classes"])) for split, part in splits.items()}
     columns, blocks = max(grid[0] for grid in grids.values()), sum(grid[1] for grid in grids.values())
     figure = make_figure(figsize=(3.2 * columns, 4.0 * blocks), layout="constrained")

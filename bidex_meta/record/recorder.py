@@ -36,7 +36,7 @@ class Recorder:
         self._checkpoints, self._videos = folder.checkpoints, folder.videos_path
         self._metrics = MetricsWriter(folder.path, resume_step, logger)
         if resume_step is None:
-            self._metrics.writer.config(folder.config())
+            self._metrics.writer.config(folder.config().to_json())
         self._progress = Progress(total_steps, total_seconds, start_step=resume_step or 0)
 
     def log(self, metrics: Mapping[str, float], step: int) -> None:

@@ -1,91 +1,51 @@
-"""What the JSON files of a run folder must hold: ``config.json`` and ``evaluation.json``, read and checked."""
+"""What ``evaluation.json`` and ``versions.json`` of a run folder must hold; entries beyond these are free."""
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NotRequired, TypedDict
+
+from msgspec import Meta
 
 from bidex_meta.errors import BidexError
-from bidex_meta.reading import TABLE, TEXT, Rule, check, choice, exists, number, read_json, whole
+from bidex_meta.reading import exists, read_json
+from bidex_meta.validation import Finite, Text, Whole, parse
 
-NAMES = ("suite", "task", "algo", "seed")
-"""What every run's config holds."""
-
-_TEXTS = Rule("a list of texts", lambda value: isinstance(value, list) and all(map(TEXT.fits, value)))
-CONFIG = {
-    "suite": TEXT.or_none(),
-    "task": TEXT.or_none(),
-    "base": choice("own", "moving", "fixed"),
-    "points": whole(0),
-    "object": TEXT.or_none(),
-    "start_from": TEXT.or_none(),
-    "algo": TEXT,
-    "preset": TEXT,
-    "learner": TABLE,
-    "num_envs": whole(1),
-    "steps": whole(0),
-    "minutes": number(0.0, 1e9).or_none(),
-    "evaluate_every": whole(1).or_none(),
-    "video_every": whole(1).or_none(),
-    "logger": TEXT,
-    "dataset": _TEXTS,
-    "task_seed": whole(0).or_none(),
-    "demonstrations": Rule("a text, a list of texts or null", lambda x: x is None or TEXT.fits(x) or _TEXTS.fits(x)),
-    "record": whole(0),
-    "record_share": number(0.0, 1e15),
-    "stop_at_return": number(-1e12, 1e12).or_none(),
-    "stop_at_success": number(0.0, 1.0).or_none(),
-    "stop_at_score": number(-1e12, 1e12).or_none(),
-    "processes": whole(1, 1_000_000),
-    "seed": whole(0),
-    "device": TEXT,
-    "engine": choice("auto", "c", "warp"),
-    "threads": whole(1, 4096),
-}
-"""What the entries of a run's config must be, where they are there: older runs have fewer."""
-
-_CLASS = {"success": number(), "return": number(), "score": number().or_none()}
-"""Entries of a class in an evaluation that are read again, beside the intervals."""
+_Interval = tuple[Finite, Finite] | None
+_ClassResult = TypedDict(
+    "_ClassResult",
+    {
+        "success": Finite,
+        "return": Finite,
+        "score": Finite | None,
+        "success_interval": NotRequired[_Interval],
+        "return_interval": NotRequired[_Interval],
+    },
+)
 
 
-def read_config(path: Path, needed: tuple[str, ...] = ()) -> dict[str, Any]:
-    """A run's config.
-
-    Args:
-        path: Its ``config.json``.
-        needed: Entries that must be there beside those of every run.
-
-    Raises:
-        BidexError: The file cannot be read, is not JSON, or is not a run's.
-    """
-    config = read_json(path, "a run's config")
-    check_config(config, path, needed)
-    return config
+class _Classes(TypedDict):
+    classes: Annotated[dict[str, _ClassResult], Meta(min_length=1)]
 
 
-def check_config(config: Any, path: Path, needed: tuple[str, ...] = (), place: str = "") -> None:
-    """Refuses what is no run's config.
-
-    Args:
-        config: As it was read.
-        path: Its file, for messages.
-        needed: Entries that must be there beside those of every run.
-        place: Where in the file it stands, ending in a dot, for messages.
-
-    Raises:
-        BidexError: Told of the first entry that is not what it must be.
-    """
-    missing = [name for name in NAMES if not isinstance(config, dict) or name not in config]
-    missing = missing or [name for name in needed if name not in config]
-    if missing:
-        raise BidexError(f"{path} is not a run's config: it lacks {', '.join(missing)}. Name a run.")
-    check(config, CONFIG, path, (), place)
-    if (config["suite"] is None) == (config["task"] is None):
-        raise BidexError(f"{path}: expected either a suite or a task, the other null. Name a run.")
+class _Split(TypedDict):
+    before: _Classes
+    after: _Classes
+    by_shot: NotRequired[list[_Classes]]
 
 
-_VERSIONS = {
-    "gpus": Rule("a list of texts", lambda value: isinstance(value, list) and all(map(TEXT.fits, value))).or_none(),
-    "git": TABLE.or_none(),
-}
+class _Evaluation(TypedDict):
+    steps: NotRequired[Whole]
+    split: NotRequired[Text]
+    splits: NotRequired[dict[str, _Split]]
+    policy: NotRequired[_Classes]
+
+
+class _Git(TypedDict):
+    commit: NotRequired[Text | None]
+
+
+class _Versions(TypedDict):
+    gpus: NotRequired[list[Text] | None]
+    git: NotRequired[_Git | None]
 
 
 def read_versions(folder: Path) -> dict[str, Any]:
@@ -95,23 +55,17 @@ def read_versions(folder: Path) -> dict[str, Any]:
         BidexError: The file cannot be read, or holds something else.
     """
     path = folder / "versions.json"
-    if not exists(path):
-        return {}
-    found = read_json(path, "a run's versions")
-    check_versions(found, path)
-    return found
+    return check_versions(read_json(path, "a run's versions"), str(path)) if exists(path) else {}
 
 
-def check_versions(found: Any, path: Path, place: str = "") -> None:
-    """Refuses what are no versions of a run; ``place`` as in :func:`check_config`.
+def check_versions(content: Any, where: str) -> dict[str, Any]:
+    """The same versions; ``where`` for messages.
 
     Raises:
-        BidexError: Told of the first entry that is not what it must be.
+        BidexError: Names the first entry that is not what it must be.
     """
-    check(found, _VERSIONS, path, (), place)
-    commit = (found.get("git") or {}).get("commit")
-    if commit is not None and not TEXT.fits(commit):
-        raise BidexError(f"{path}: {place}git.commit: expected a text.")
+    parse(content, _Versions, where)
+    return content
 
 
 def read_evaluation(path: Path, again: str) -> dict[str, Any]:
@@ -125,48 +79,23 @@ def read_evaluation(path: Path, again: str) -> dict[str, Any]:
         BidexError: The file cannot be read, or holds something else.
     """
     try:
-        found = read_json(path, "an evaluation")
-        check_evaluation(found, path)
+        return check_evaluation(read_json(path, "an evaluation"), str(path))
     except BidexError as error:
         raise BidexError(f"{error} Write it anew: {again}") from None
-    return found
 
 
-def check_evaluation(found: Any, path: Path, within: str = "") -> None:
-    """Refuses what is no evaluation; ``within`` says where in the file it stands, ending in a dot.
+def check_evaluation(content: Any, where: str) -> dict[str, Any]:
+    """The same evaluation; ``where`` for messages.
 
     Raises:
-        BidexError: Told of the first entry that is not what it must be.
+        BidexError: Names the first entry that is not what it must be.
     """
-    check(found, {"steps": whole(0), "split": TEXT, "splits": TABLE, "policy": TABLE}, path, (), within)
-    for name, part in found.get("splits", {}).items():
-        _check_meta_test(part, path, f"{within}splits.{name}.")
-    if "splits" not in found:
-        of_policy = "policy" in found
-        place = f"{within}policy." if of_policy else within
-        _check_classes(found["policy"] if of_policy else found, path, place)
-
-
-def _check_meta_test(part: Any, path: Path, place: str) -> None:
-    check(part, {"before": TABLE, "after": TABLE}, path, ("before", "after"), place)
-    shots = part.get("by_shot", [])
-    if not isinstance(shots, list):
-        raise BidexError(f"{path}: {place}by_shot: expected a list.")
-    parts = {"before": part["before"], "after": part["after"]} | {f"by_shot[{i}]": each for i, each in enumerate(shots)}
-    for name, each in parts.items():
-        _check_classes(each, path, f"{place}{name}.")
-        # Curves over shots are of the classes before them.
-        check(each["classes"], {}, path, tuple(part["before"]["classes"]), f"{place}{name}.classes.")
-
-
-def _check_classes(part: Any, path: Path, place: str) -> None:
-    check(part, {"classes": TABLE}, path, ("classes",), place)
-    if not part["classes"]:
-        raise BidexError(f"{path}: {place}classes: expected at least one class, got none.")
-    for name, row in part["classes"].items():
-        check(row, _CLASS, path, tuple(_CLASS), f"{place}classes.{name}.")
-        for measure in ("success_interval", "return_interval"):
-            ends = row.get(measure)
-            pair = isinstance(ends, list) and len(ends) == 2 and all(number().fits(end) for end in ends)
-            if ends is not None and not pair:
-                raise BidexError(f"{path}: {place}classes.{name}.{measure}: expected two numbers or null.")
+    parse(content, _Evaluation, where)
+    if "splits" not in content and "policy" not in content:
+        parse(content, _Classes, where)
+    for name, split in content.get("splits", {}).items():
+        classes = split["before"]["classes"].keys()
+        for shot in (split["after"], *split.get("by_shot", ())):
+            if missing := classes - shot["classes"].keys():
+                raise BidexError(f"{where}: splits.{name}: expected {min(missing)} after adaptation too, found none.")
+    return content

@@ -13,34 +13,34 @@
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Annotated, Any, Literal, Protocol, TypedDict
 
+from msgspec import Meta
+
+from bidex_meta.config import RunConfig, config_of
 from bidex_meta.errors import BidexError
-from bidex_meta.reading import TABLE, TEXT, Rule, check, choice, number, read_json, whole
+from bidex_meta.reading import read_json
 from bidex_meta.record.folder import RunFolder
-from bidex_meta.record.schemas import check_config, check_evaluation, check_versions
+from bidex_meta.record.schemas import check_evaluation, check_versions
+from bidex_meta.validation import Finite, NonNegative, Text, Whole, parse
 
 FORMAT = 1
 """Of the files; raised where an older reader would misread them."""
 
-_COLUMN = Rule(
-    "a list of numbers or nulls",
-    lambda value: isinstance(value, list) and all(each is None or number().fits(each) for each in value),
-)
-_RULES = {
-    "format": whole(FORMAT, FORMAT),
-    "name": TEXT,
-    "arm": TEXT,
-    "suite": TABLE.or_none(),
-    "config": TABLE,
-    "versions": TABLE,
-    "engine": choice("c", "warp"),
-    "steps": whole(0),
-    "seconds": number(0.0, 1e12),
-    "parameters": whole(0).or_none(),
-    "curves": _COLUMN.each(),
-    "evaluation": TABLE,
-}
+
+class _File(TypedDict):
+    format: Annotated[int, Meta(ge=FORMAT, le=FORMAT)]
+    name: Text
+    arm: Text
+    suite: dict[str, Any] | None
+    config: dict[str, Any]
+    versions: dict[str, Any]
+    engine: Literal["c", "warp"]
+    steps: Whole
+    seconds: NonNegative
+    parameters: Whole | None
+    curves: dict[str, list[Finite | None]]
+    evaluation: dict[str, Any]
 
 
 class Run(Protocol):
@@ -66,7 +66,7 @@ class Run(Protocol):
         """Where its films lie, if it has any."""
         ...
 
-    def config(self, *needed: str) -> dict[str, Any]:
+    def config(self) -> RunConfig[dict[str, Any]]:
         """The resolved config; see :meth:`RunFolder.config`."""
         ...
 
@@ -113,10 +113,10 @@ class StoredRun:
             BidexError: It cannot be read, or is no run.
         """
         found = read_json(self.path, "a run's data")
-        check(found, _RULES, self.path, tuple(_RULES))
-        check_config(found["config"], self.path, ("learner", "num_envs", "steps"), "config.")
-        check_versions(found["versions"], self.path, "versions.")
-        check_evaluation(found["evaluation"], self.path, "evaluation.")
+        parse(found, _File, str(self.path))
+        config_of(found["config"], f"{self.path}: config")
+        check_versions(found["versions"], f"{self.path}: versions")
+        check_evaluation(found["evaluation"], f"{self.path}: evaluation")
         curves = found["curves"]
         steps = curves.get("step", [])
         if not steps or not all(type(step) is int for step in steps) or steps != sorted(steps):
@@ -149,12 +149,9 @@ class StoredRun:
         """What its study calls it."""
         return self.content["arm"]
 
-    def config(self, *needed: str) -> dict[str, Any]:
+    def config(self) -> RunConfig[dict[str, Any]]:
         """As in :class:`Run`; paths of own suites and of other runs are names alone."""
-        missing = [name for name in needed if name not in self.content["config"]]
-        if missing:
-            raise BidexError(f"{self.path}: config.{missing[0]}: expected it to be there, found none.")
-        return self.content["config"]
+        return config_of(self.content["config"], f"{self.path}: config")
 
     def metrics(self) -> list[dict[str, Any]]:
         """As in :class:`Run`: means over stretches of about equal length, told at their ends."""
@@ -164,8 +161,8 @@ class StoredRun:
     @property
     def goal(self) -> int:
         """As in :class:`Run`: what has not come to its end is never collected, so that fewer steps were its end."""
-        config, steps = self.content["config"], self.content["steps"]
-        return steps if config.get("minutes") is not None else min(steps, config["steps"])
+        config, steps = self.config(), self.content["steps"]
+        return steps if config.minutes is not None else min(steps, config.steps)
 
     def versions(self) -> dict[str, Any]:
         """As in :class:`Run`."""

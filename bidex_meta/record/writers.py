@@ -5,35 +5,37 @@ import uuid
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from bidex_meta.errors import BidexError, unknown_name
 
 
-class Writer(Protocol):
-    """What a logger offers; a run tells it everything through these."""
+class Writer:
+    """A logger; this one keeps nothing, so that ``metrics.jsonl`` stands alone.
+
+    Args:
+        folder: The run folder.
+        resume_step: Of the checkpoint a resumed run starts from: what came after is written anew.
+    """
+
+    def __init__(self, folder: Path, resume_step: int | None = None) -> None: ...
 
     def config(self, values: Mapping[str, Any]) -> None:
         """Takes the run's config, once at the beginning."""
-        ...
 
     def scalars(self, values: Mapping[str, float], step: int) -> None:
         """Takes numbers by tag at an environment step."""
-        ...
 
     def film(self, tag: str, path: Path, frames: Sequence[np.ndarray], fps: float, step: int) -> None:
         """Takes a film, as a file and as frames, each ``(height, width, 3)`` uint8."""
-        ...
 
     def flush(self) -> None:
         """Hands over what is buffered."""
-        ...
 
     def close(self) -> None:
         """Ends it."""
-        ...
 
 
 def make_writer(logger: str, folder: Path, resume_step: int | None = None) -> Writer:
@@ -62,7 +64,7 @@ def check_logger(logger: str) -> None:
         _wandb()
 
 
-class TensorBoardWriter:
+class TensorBoardWriter(Writer):
     """An event file in the run folder; ``tensorboard --logdir runs`` shows it. Films are animated pictures."""
 
     def __init__(self, folder: Path, resume_step: int | None = None) -> None:
@@ -99,7 +101,7 @@ class TensorBoardWriter:
         self._board.close()
 
 
-class WandbWriter:
+class WandbWriter(Writer):
     """A run of Weights & Biases; the project is ``WANDB_PROJECT``, or ``bidex-meta``.
 
     Its id is kept in the run folder, so that a resumed run goes on there. Environment steps are the metric
@@ -132,36 +134,12 @@ class WandbWriter:
         """The file."""
         self._run.log({tag: self._wandb.Video(str(path), format="mp4"), "env_steps": step})
 
-    def flush(self) -> None:
-        """It sends by itself."""
-
     def close(self) -> None:
         """End the run."""
         self._run.finish()
 
 
-class NoWriter:
-    """``metrics.jsonl`` alone."""
-
-    def __init__(self, folder: Path, resume_step: int | None = None) -> None: ...
-
-    def config(self, values: Mapping[str, Any]) -> None:
-        """Nothing."""
-
-    def scalars(self, values: Mapping[str, float], step: int) -> None:
-        """Nothing."""
-
-    def film(self, tag: str, path: Path, frames: Sequence[np.ndarray], fps: float, step: int) -> None:
-        """Nothing."""
-
-    def flush(self) -> None:
-        """Nothing."""
-
-    def close(self) -> None:
-        """Nothing."""
-
-
-LOGGERS = {"tensorboard": TensorBoardWriter, "wandb": WandbWriter, "none": NoWriter}
+LOGGERS = {"tensorboard": TensorBoardWriter, "wandb": WandbWriter, "none": Writer}
 
 
 def _wandb() -> Any:

@@ -13,12 +13,12 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from bidex_meta.config import flat, printed
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import Group, estimates, iqm, iqm_difference, read_groups
 from bidex_meta.evaluation.histories import History, read_histories
 from bidex_meta.reading import is_file
 from bidex_meta.record import plots, training_seconds
-from bidex_meta.record.folder import flat
 from bidex_meta.record.stored import Run
 
 FILM_BYTES = 40_000_000
@@ -54,15 +54,15 @@ def render(folders: Sequence[Run]) -> str:
         speed=_picture(lambda: plots.draw_metrics(curves, _SPEED)),
         adaptation=list(_adaptation(folders, names)),
         differences=_differences(folders, names),
-        configs=[(names[folder.path], json.dumps(folder.config(), indent=2)) for folder in folders],
+        configs=[(names[folder.path], printed(folder.config())) for folder in folders],
         films=list(_films(folders, names)),
     )
 
 
 def _title(folders: Sequence[Run]) -> str:
     configs = [folder.config() for folder in folders]
-    algos = ", ".join(dict.fromkeys(config["algo"] for config in configs))
-    subjects = ", ".join(dict.fromkeys(Path(config["suite"] or config["task"]).stem for config in configs))
+    algos = ", ".join(dict.fromkeys(config.algo for config in configs))
+    subjects = ", ".join(dict.fromkeys(Path(config.suite or config.task or "").stem for config in configs))
     return f"{algos} on {subjects}"
 
 
@@ -77,8 +77,8 @@ def _names(histories: Sequence[History], short: Sequence[str]) -> dict[Path, str
     for group, history in zip(short, histories, strict=True):
         for folder in history.folders:
             config = folder.config()
-            of_task = f", {config['task']}" if config["task"] else ""
-            name = f"{group}{of_task}, seed {config['seed']}"
+            of_task = f", {config.task}" if config.task else ""
+            name = f"{group}{of_task}, seed {config.seed}"
             twice = sum(known.split(" (")[0] == name for known in names.values())
             names[folder.path] = f"{name} ({twice + 1})" if twice else name
     return names
@@ -93,12 +93,12 @@ def _run(folder: Run, name: str) -> dict[str, Any]:
     return {
         "name": name,
         "path": str(folder.path),
-        "on": config["suite"] or config["task"],
+        "on": config.suite or config.task or "",
         "steps": f"{max((row['step'] for row in rows), default=0):,}",
         "hours": f"{training_seconds(rows) / 3600.0:.2f}",
         "speed": f"{median(speeds):,.0f}" if speeds else "–",
-        "rows": f"{config['num_envs']:,}",
-        "device": f"{config.get('device', '?')} ({hardware})",
+        "rows": f"{config.num_envs:,}",
+        "device": f"{config.device} ({hardware})",
         "commit": (git.get("commit") or "–")[:10] + ("+" if git.get("dirty") else ""),
     }
 
@@ -163,7 +163,7 @@ def _differences(folders: Sequence[Run], names: dict[Path, str]) -> dict[str, An
     columns = []
     for folder in folders:
         versions = folder.versions()
-        columns.append(flat(folder.config()) | flat({"versions": versions}))
+        columns.append(folder.config().flat() | flat({"versions": versions}))
     keys = dict.fromkeys(key for column in columns for key in column)
     differing = [key for key in keys if len({json.dumps(column.get(key)) for column in columns}) > 1]
     cells = [[key, *(_cell(column.get(key)) for column in columns)] for key in differing]

@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from bidex_meta.config import RunConfig, flat
 from bidex_meta.errors import BidexError, shortened, unknown_name
 from bidex_meta.outside import short_name
 from bidex_meta.reading import TABLE, TEXT, Rule, absolute, check, expanded, read_toml, whole
-from bidex_meta.record.folder import RunFolder, flat
+from bidex_meta.record.folder import RunFolder
 
 _OWN = ("suite", "task", "algo", "seed", "run_dir", "resume", "print_config", "evaluate", "threads", "learner")
 """Flags of a run that no override sets: other entries of the file do, or the sweep."""
@@ -52,7 +53,7 @@ class PlannedRun:
     seed: int
     words: tuple[str, ...]
     after: Path | None = None
-    config: Mapping[str, Any] = field(default_factory=dict, compare=False)
+    config: RunConfig[Any] = field(default=None, compare=False)  # pyright: ignore
 
     @property
     def name(self) -> str:

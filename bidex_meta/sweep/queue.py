@@ -16,15 +16,11 @@ from typing import Any, NamedTuple
 
 from bidex_meta.errors import BidexError, one_line, shortened
 from bidex_meta.reading import exists, is_file, read_text
-from bidex_meta.record.folder import flat
 from bidex_meta.record.metrics import last_rows
-from bidex_meta.record.stopping import goal
 from bidex_meta.sweep.plan import PlannedRun
 
 COMMAND = (sys.executable, "-m", "bidex_meta.cli")
 """What a run's words are given to."""
-_FREE = ("steps", "minutes", "evaluate_every", "video_every", "logger", "threads", "seed", "device")
-"""Entries of a config in which a folder may differ from the file: a resumed run may be given most of them anew."""
 
 
 class State(NamedTuple):
@@ -52,21 +48,20 @@ def state_of(run: PlannedRun) -> State:
     """
     rows, evaluated = [], False
     if exists(run.folder.config_path):
-        known, wanted = flat(run.folder.config()), flat(dict(run.config))
-        if run.after is not None:  # another for each seed
-            wanted["start_from"] = str(run.after.resolve())
-        for name in sorted((known.keys() & wanted.keys()).difference(_FREE)):
-            if known[name] != wanted[name]:
-                raise BidexError(
-                    f"{run.path} is a run of another config: {name} is {known[name]} there, not {wanted[name]}. Give "
-                    "the arm another name, or move the folder away."
-                )
+        wanted = run.config if run.after is None else replace(run.config, start_from=str(run.after.resolve()))
+        # Seeds share a config; the machine may be another one.
+        for name, there, here in run.folder.config().differences(wanted, ignored=("seed", "threads", "device")):
+            raise BidexError(
+                f"{run.path} is a run of another config: {name} is {there} there, not {here}. Give the arm another "
+                "name, or move the folder away."
+            )
         rows = last_rows(run.folder.metrics_path) if is_file(run.folder.metrics_path) else []
         evaluated = run.folder.evaluated
-    last, steps, why = rows[-1] if rows else {"step": 0}, goal(run.config, rows), _last_line(_beside(run, "failed"))
+    last, why = rows[-1] if rows else {"step": 0}, _last_line(_beside(run, "failed"))
+    steps = run.config.goal(last)
     done = evaluated and run.folder.evaluation().get("steps", steps) >= steps
     state = "runs" if _locked(run) else "done" if done else "failed" if why else "left"
-    return State(run, state, last["step"], steps, run.config["minutes"], last.get("Perf/training_time") or 0.0, why)
+    return State(run, state, last["step"], steps, run.config.minutes, last.get("Perf/training_time") or 0.0, why)
 
 
 class Job:

@@ -189,7 +189,7 @@ def test_a_recorded_run_asks_for_memory_and_for_the_rest_of_the_room(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a share of the rows, with a checkpoint's copy; of a resumed run less the parts that are there."""
-    plan: Any = SimpleNamespace(config={"record": 100, "record_share": 0.5}, folder=None)
+    plan: Any = SimpleNamespace(config=SimpleNamespace(record=100, record_share=0.5), folder=None)
     plan.flags = SimpleNamespace(run_dir=folder / "run")
     asked: list[int] = []
     monkeypatch.setattr(writer, "check_room", lambda where, needed, what: asked.append(needed))

@@ -6,15 +6,15 @@ import os
 import numpy as np
 import pytest
 
+from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.record import MetricsWriter, Progress, RunFolder, read_metrics, training_seconds
 from bidex_meta.record import progress as progress_module
-from bidex_meta.record.curves import Curve
 from bidex_meta.record.metrics import last_rows
-from bidex_meta.record.plots import draw_adaptation, draw_learning, read_evaluation, save, svg
+from bidex_meta.record.plots import Curve, draw_adaptation, draw_learning, read_evaluation, save, svg
 from bidex_meta.record.video import check_suffix, write_animation, write_image, write_video
 
-CONFIG = {"suite": "MT4", "task": None, "algo": "mtppo", "seed": 3, "learner": {"hidden": [8]}}
+CONFIG = RunConfig(suite="MT4", task=None, algo="mtppo", seed=3, learner={"hidden": [8]}, num_envs=8, steps=100)
 
 
 def board_points(folder, tag):
@@ -186,7 +186,7 @@ def test_a_file_without_a_meta_test_is_one_line(text, tmp_path):
 @pytest.mark.parametrize("text", ["[]", '{"algo": "mtppo"}'])
 def test_a_config_that_is_no_runs_is_one_line(text, tmp_path):
     (tmp_path / "config.json").write_text(text)
-    with pytest.raises(BidexError, match=r"lacks .*seed"):
+    with pytest.raises(BidexError, match=r"config.json: .*expected"):
         RunFolder.open(tmp_path).config()
 
 

@@ -129,9 +129,9 @@ def test_rows_by_learners(tmp_path: Path) -> None:
     assert [path.name for path in fill(page, tmp_path / "data")] == ["many-row-curves.png", "page.md"]
     text = page.read_text()
     head, _, *rows = [cells(line) for line in text.splitlines() if line.startswith("|")]
-    assert head == ["rows", "ppo", "sac"] and [row[0] for row in rows] == ["8", "64"]
+    assert head == ["environments", "ppo", "sac"] and [row[0] for row in rows] == ["8", "64"]
     assert rows == [["8", "–", "9.5 (9 to 10)"], ["64", "5.5 (5 to 6)", "1.5 (1 to 2)"]]
-    assert "Seeds: 2. Steps: 1,000." in text and "![Return over training, by rows: many, C]" in text
+    assert "Seeds: 2. Steps: 1,000." in text and "![Return over training, by number of environments: many, C]" in text
     assert fill(page, tmp_path / "data", check=True) == []
     page.write_text("<!-- results: study=many on=C show=row-curves -->\n<!-- end -->\n")
     assert [path.name for path in fill(page, tmp_path / "data")] == ["many-C-row-curves.png", "page.md"]

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.commands.learners import LearnerKind, choose_preset, learner_kind
-from bidex_meta.commands.parsing import StepCount
+from bidex_meta.config import Steps
 from bidex_meta.engine.cpu import default_threads
 from bidex_meta.errors import BidexError
 from bidex_meta.record.atomic import write_json
@@ -42,7 +42,7 @@ class _Counting(PooledWorldWrapper):
 
 def soak(
     suite: str = "MT20",
-    steps: StepCount | None = None,
+    steps: Steps | None = None,
     minutes: float | None = None,
     num_envs: int = 512,
     threads: int | None = None,

@@ -1,1 +1,1 @@
-"""Tables and pictures that README.md and docs/results make of results/data."""
+"""Generates the tables and pictures of README.md and docs/results from results/data."""

@@ -12,8 +12,8 @@ def main(pages: tyro.conf.Positional[tuple[Path, ...]] = (), check: bool = False
     """Fill the marked blocks of pages from results/data and print the files that changed.
 
     Args:
-        pages: Markdown files; none: README.md and docs/results.
-        check: Write nothing; end with exit code 1 where a file is not as the data say.
+        pages: Markdown files; default: README.md and docs/results.
+        check: Write nothing; exit code 1 if a file is out of date.
     """
     named = pages or (Path("README.md"), *sorted(Path("docs/results").glob("*.md")))
     changed = [path for page in named for path in fill(page, Path("results/data"), check)]

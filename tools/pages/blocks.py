@@ -3,10 +3,10 @@
 ::
 
     <!-- results: study=multitask show=table -->
-    (whatever stands here is replaced)
+    (replaced)
     <!-- end -->
 
-``docs/sweeps.md`` lists what ``show`` may be.
+``docs/sweeps.md`` lists the values of ``show``.
 """
 
 import re
@@ -35,26 +35,26 @@ _TABLES = {
 _FIGURES = {
     "curves": (curves_figure, "Return and success over training"),
     "points": (points_figure, "Success and score, 95 % intervals over seeds"),
-    "row-curves": (rows_figure, "Return over training, by rows"),
+    "row-curves": (rows_figure, "Return over training, by number of environments"),
 }
 _DIGEST = "Description"
-"""Entry of a picture's PNG metadata that holds the digest of its data."""
+"""Entry of a picture's PNG metadata: the digest of its data."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """What a block asks for."""
+    """The options of a block."""
 
     study: str = ""
     show: str = "table"
     on: str | None = None
-    """A suite or class alone."""
+    """Only this suite or class."""
     split: str | None = None
-    """A split of meta-tests alone."""
+    """Only this split of meta-tests."""
 
 
 def fill(page: Path, data: Path, check: bool = False) -> list[Path]:
-    """Brings a page's blocks and pictures to what the data say.
+    """Updates a page's blocks and pictures from the data.
 
     Args:
         page: A file of Markdown.
@@ -62,10 +62,10 @@ def fill(page: Path, data: Path, check: bool = False) -> list[Path]:
         check: Write nothing.
 
     Returns:
-        The files that are (or, with ``check``, would be) written; none where everything is as the data say.
+        The files that are (or, with ``check``, would be) written; none if everything is up to date.
 
     Raises:
-        BidexError: A block does not end, asks for what there is not, or a file of the data cannot be read.
+        BidexError: A block does not end, names an unknown study or table, or a data file cannot be read.
     """
     text, changed = page.read_text(), []
     if text.count("<!-- results:") != text.count("<!-- end -->"):
@@ -88,7 +88,7 @@ def fill(page: Path, data: Path, check: bool = False) -> list[Path]:
 
 
 def _lines(block: Block, page: Path, data: Path, check: bool, changed: list[Path]) -> Iterator[str]:
-    """Lines of Markdown of a block; draws its pictures."""
+    """Markdown lines of a block; draws its pictures."""
     if block.show == "references":
         yield from tables.references_table()
         return
@@ -116,7 +116,7 @@ def _lines(block: Block, page: Path, data: Path, check: bool, changed: list[Path
 
 
 def _digest_of(picture: Path) -> str | None:
-    """Digest of the data that a picture shows: its own bytes differ with matplotlib's version."""
+    """Digest of the data of a picture (its own bytes depend on matplotlib's version)."""
     if not picture.exists():
         return None
     with Image.open(picture) as opened:

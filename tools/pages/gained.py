@@ -1,4 +1,4 @@
-"""What adaptation gained in each run's meta-test, and how much more than in a control without meta-training."""
+"""Gain from adaptation in each run's meta-test, and its difference to a control without meta-training."""
 
 from collections.abc import Iterator
 from math import hypot
@@ -11,19 +11,19 @@ from tools.pages.studies import Study
 from tools.pages.tables import table
 
 CONTROL = "control"
-"""The arm that every other is held against: the same policy to start from and the same adaptation, no meta-training."""
+"""The arm that others are compared with: same starting policy and adaptation, no meta-training."""
 _HEAD = ("class", "arm", "seed", "steps", "shots × rollouts", "success", "return", "gain [95 %]", "over control [95 %]")
 
 
 def gains_table(study: Study) -> Iterator[str]:
-    """One run a row, class by class; a gain whose interval excludes zero is bold.
+    """One row per run, class by class; a gain whose interval excludes zero is bold.
 
-    A gain is the meta-test's own, of returns, with its interval over adaptations and their episodes. Over the control
-    stands the difference to the gain of the control's run of the same seed, both sides' half widths added as errors of
-    independent measurements are (the root of the sum of squares).
+    A gain is the meta-test's gain in return, with its interval over adaptations and their episodes. "Over control" is
+    the difference to the gain of the control's run of the same seed; half widths add as independent errors (the root
+    of the sum of squares).
 
     Args:
-        study: Runs with a meta-test; of the test split where the study names none.
+        study: Runs with a meta-test; the test split if the study names none.
 
     Raises:
         BidexError: A run has no meta-test of the split, or an arm several runs of one seed.
@@ -31,7 +31,7 @@ def gains_table(study: Study) -> Iterator[str]:
     split = study.split or "test"
     parts: dict[tuple[str, int], tuple[StoredRun, dict[str, Any]]] = {}
     for run in study.runs:
-        part, key = run.evaluation().get("splits", {}).get(split), (run.arm, run.config()["seed"])
+        part, key = run.evaluation().get("splits", {}).get(split), (run.arm, run.config().seed)
         if part is None or "gain" not in part:
             raise BidexError(f"Study {study.name}: {run.path} has no meta-test of {split} tasks. Leave it out.")
         if key in parts:
@@ -40,7 +40,7 @@ def gains_table(study: Study) -> Iterator[str]:
     order, rows = sorted(parts, key=lambda key: (key[0] == CONTROL, *key)), []
     for name in dict.fromkeys(name for _, part in parts.values() for name in part["gain"]["classes"]):
         for arm, seed in order:
-            run, part = parts[arm, seed]  # of the same classes as all: a study's runs are
+            run, part = parts[arm, seed]  # all runs of a study cover the same classes
             gain, control = _gain(part, name), None if arm == CONTROL else parts.get((CONTROL, seed))
             rows.append([
                 name, arm, str(seed), f"{run.content['steps']:,}", f"{part['shots']} × {part['rollouts']}",

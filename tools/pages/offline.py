@@ -1,8 +1,8 @@
-"""Scores of learners from data sets as a table: kinds of data by learners, beside the expert of the same study.
+"""Table of offline learners' scores: kinds of data by learners.
 
-The score is the paper's (appendix A.3): 100 (R - R_random) / (R_expert - R_random), with the returns that the study's
-own runs found. The expert is the study's run on the same class that plays; without one (a suite) scores are those of
-the evaluations.
+The score is the paper's (appendix A.3): 100 (R - R_random) / (R_expert - R_random), with returns from the study's own
+evaluations. The expert is the study's online run on the same class. Without one (a suite), scores are those of the
+evaluations.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,16 +16,16 @@ from tools.pages.studies import Study, refuse_differing
 from tools.pages.tables import mean_and_range, table
 
 KINDS = ("random", "replay", "medium", "medium-expert", "expert")
-"""Order of the rows, as in the paper's table; others follow by their names."""
+"""Order of the rows, as in the paper's table; others follow by name."""
 LEARNERS = ("bc", "bcq", "td3bc", "iql")
-"""Order of the columns, the same."""
+"""Order of the columns."""
 
 
 def offline_table(study: Study) -> Iterator[str]:
     """Data sets by learners: score as mean over seeds (least to most) and mean success.
 
     Args:
-        study: Runs on data sets; those that play are its experts.
+        study: Runs on data sets; its online runs are the experts.
 
     Raises:
         BidexError: Seeds of one cell differ in more than the seed.
@@ -34,8 +34,8 @@ def offline_table(study: Study) -> Iterator[str]:
     experts = []
     for run in study.runs:
         config = run.config()
-        if config.get("dataset"):
-            cells.setdefault(_kind(config["dataset"]), {}).setdefault(config["algo"], []).append(run)
+        if config.dataset:
+            cells.setdefault(_kind(config.dataset), {}).setdefault(config.algo, []).append(run)
         else:
             experts.append(run)
     learners = _ordered({algo for row in cells.values() for algo in row}, LEARNERS)
@@ -57,7 +57,7 @@ def offline_table(study: Study) -> Iterator[str]:
 
 
 def _kind(names: Sequence[str]) -> str:
-    """What kind of data a run learned from: ``medium`` of ``HandOver/medium-v0``."""
+    """Kind of data of a run: ``medium`` for ``HandOver/medium-v0``."""
     return " + ".join(name.rpartition("/")[2].rpartition("-v")[0] or name for name in names)
 
 
@@ -72,7 +72,7 @@ def _ends(runs: Sequence[StoredRun], experts: Sequence[StoredRun]) -> tuple[floa
 def _cell(runs: Sequence[StoredRun], ends: tuple[float, float] | None) -> str:
     if not runs:
         return "–"
-    refuse_differing(f"{_kind(runs[0].config()['dataset'])} {runs[0].config()['algo']}", runs)
+    refuse_differing(f"{_kind(runs[0].config().dataset)} {runs[0].config().algo}", runs)
     if ends is None:
         scores = np.array([_of({"classes": scored_classes(run)}, "score") for run in runs])
     else:
@@ -85,7 +85,7 @@ def _mean(runs: Sequence[StoredRun], name: str) -> float:
 
 
 def _of(found: dict[str, Any], name: str) -> float:
-    """Mean over the classes of an evaluation; not a number where one has none."""
+    """Mean over the classes of an evaluation; NaN if a class has no value."""
     return float(np.mean(np.array([row.get(name) for row in classes_of(found).values()], dtype=float)))
 
 

@@ -1,4 +1,4 @@
-"""What more rows are worth at equal steps: numbers of rows by learners (the paper's Figure 6)."""
+"""Numbers of parallel environments by learners, at equal environment steps (the paper's Figure 6)."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -15,7 +15,7 @@ from tools.pages.tables import mean_and_range, random_rows, table
 
 
 def rows_table(study: Study) -> Iterator[str]:
-    """Numbers of rows by learners: the evaluation's return as mean over seeds (least to most).
+    """Environments by learners: the evaluation's return, mean over seeds (least to most).
 
     Args:
         study: Runs on one class.
@@ -25,9 +25,10 @@ def rows_table(study: Study) -> Iterator[str]:
     """
     cells = _cells(study)
     algos = list(dict.fromkeys(algo for algo, _ in cells))
-    counts = sorted({rows for _, rows in cells})
+    counts = sorted({envs for _, envs in cells})
     yield from table(
-        ["rows", *algos], [[f"{rows:,}", *(_cell(cells.get((algo, rows), [])) for algo in algos)] for rows in counts]
+        ["environments", *algos],
+        [[f"{envs:,}", *(_cell(cells.get((algo, envs), [])) for algo in algos)] for envs in counts],
     )
     steps = sorted({run.content["steps"] for runs in cells.values() for run in runs})
     seeds = sorted({len(runs) for runs in cells.values()})
@@ -38,25 +39,25 @@ def rows_table(study: Study) -> Iterator[str]:
 
 
 def rows_figure(study: Study) -> Any:
-    """Return over training: a panel a learner, a line for each number of rows.
+    """Return over training: one panel per learner, one line per number of environments.
 
     Raises:
         BidexError: As for ``rows_table``, or matplotlib is missing.
     """
     panels: dict[str, list[plots.Group]] = {}
-    for (algo, rows), runs in sorted(_cells(study).items()):
-        panels.setdefault(algo, []).append((f"{rows} rows", curves_of(runs)))
+    for (algo, envs), runs in sorted(_cells(study).items()):
+        panels.setdefault(algo, []).append((f"{envs} envs", curves_of(runs)))
     return plots.draw_panels(panels, f"Train/return/{_class(study)}", "return in training")
 
 
 def _cells(study: Study) -> dict[tuple[str, int], list[StoredRun]]:
-    """Runs by learner and rows."""
+    """Runs by learner and number of environments."""
     cells: dict[tuple[str, int], list[StoredRun]] = {}
     for run in study.runs:
         config = run.config()
-        cells.setdefault((config["algo"], config["num_envs"]), []).append(run)
-    for (algo, rows), runs in cells.items():
-        refuse_differing(f"{algo} with {rows} rows", runs)
+        cells.setdefault((config.algo, config.num_envs), []).append(run)
+    for (algo, envs), runs in cells.items():
+        refuse_differing(f"{algo} with {envs} environments", runs)
     _class(study)
     return cells
 
@@ -64,7 +65,9 @@ def _cells(study: Study) -> dict[tuple[str, int], list[StoredRun]]:
 def _class(study: Study) -> str:
     names = {name for run in study.runs for name in classes_of(run.evaluation())}
     if len(names) != 1:
-        raise BidexError(f"Study {study.name}: rows are compared on one class, got {', '.join(sorted(names))}.")
+        raise BidexError(
+            f"Study {study.name}: numbers of environments are compared on one class, got {', '.join(sorted(names))}."
+        )
     return names.pop()
 
 

@@ -7,24 +7,24 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from bidex_meta.config import flat
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import Estimate, Group, classes_of, estimates, group_of, iqm
 from bidex_meta.evaluation.histories import curves_of
 from bidex_meta.outside import short_name
 from bidex_meta.record import plots
-from bidex_meta.record.folder import flat
 from bidex_meta.record.stored import StoredRun
 
 _FREE = ("seed", "start_from", "device", "threads", "logger", "evaluate_every", "video_every", "processes", "preset")
-"""Entries of a config in which seeds of an arm may differ."""
+"""Config entries in which seeds of an arm may differ."""
 
 
 @dataclass(frozen=True)
 class Arm:
-    """What a study compares: the same on several seeds."""
+    """One setting of a study, on several seeds."""
 
     group: Group
-    """Its runs' final evaluations, labelled with its name."""
+    """Final evaluations of its runs, labelled with its name."""
     runs: list[StoredRun]
     """Its runs."""
 
@@ -35,7 +35,7 @@ class Arm:
 
     @property
     def parameters(self) -> int | None:
-        """Numbers that its policy has learned; None where that is not known."""
+        """Number of learned parameters of its policy; None if unknown."""
         counts = {run.content["parameters"] for run in self.runs}
         return counts.pop() if len(counts) == 1 else None
 
@@ -45,13 +45,13 @@ class Study:
     """Arms on one suite or class."""
 
     name: str
-    """Of its folder."""
+    """Name of its folder."""
     on: str
     """The suite or class."""
     runs: list[StoredRun]
-    """By the names of their files."""
+    """Sorted by file name."""
     split: str | None = None
-    """Of a meta-test the split whose classes are shown; None: all."""
+    """Split of a meta-test to show; None: all."""
 
     @cached_property
     def arms(self) -> list[Arm]:
@@ -69,7 +69,7 @@ class Study:
         return sorted(arms, key=lambda arm: -arm.success.value)
 
     def _only(self, group: Group) -> Group:
-        """Of a meta-test the classes of ``split``, by their own names."""
+        """The classes of ``split`` of a meta-test, without its suffix."""
         ending = f" ({self.split})"
         if self.split is None:
             return group
@@ -86,75 +86,75 @@ class Study:
 
     @property
     def classes(self) -> list[str]:
-        """Every class of its arms."""
+        """All classes of its arms."""
         return list(dict.fromkeys(name for arm in self.arms for name in arm.group.classes))
 
     @property
     def digest(self) -> str:
-        """Of all that its pictures show."""
+        """Digest of all data that its pictures show."""
         return hashlib.sha256(b"".join(run.path.read_bytes() for run in self.runs)).hexdigest()
 
 
 def read_studies(data: Path, name: str, on: str | None = None, split: str | None = None) -> list[Study]:
-    """The studies in ``data/name``, none where there are no files: one for each set of classes that runs were made on.
+    """The studies in ``data/name``: one for each set of classes; none if there are no files.
 
-    Suites of the same classes, such as one with other discounts, are one study. Runs on single classes stand beside a
-    suite's where an arm's cover all its classes, and else are a study a class.
+    Suites with the same classes, such as one with other discounts, are one study. Runs on single classes join a suite's
+    study if an arm covers all its classes, and otherwise are one study per class.
 
     Args:
         data: Folder of the studies' folders.
-        name: The study's.
-        on: A suite or class alone.
+        name: Name of the study.
+        on: Only this suite or class.
         split: See :class:`Study`.
 
     Raises:
         BidexError: A file cannot be read.
     """
     runs = [StoredRun.open(path) for path in sorted((data / name).glob("*.json"))]
-    whole = [run for run in runs if run.config()["task"] is None]
+    whole = [run for run in runs if run.config().task is None]
     by_classes: dict[frozenset[str], list[StoredRun]] = {}
     for run in whole:
         by_classes.setdefault(frozenset(classes_of(run.evaluation())), []).append(run)
-    alone = [run for run in runs if run.config()["task"] is not None]
+    alone = [run for run in runs if run.config().task is not None]
     for classes, members in by_classes.items():
         joining = [run for run in alone if _covered(run, alone) == classes]
         members += joining
         alone = [run for run in alone if run not in joining]
     for run in alone:
-        by_classes.setdefault(frozenset([run.config()["task"]]), []).append(run)
+        by_classes.setdefault(frozenset([str(run.config().task)]), []).append(run)
     found = [Study(name, _subject(members), members, split) for members in by_classes.values()]
     return [study for study in sorted(found, key=lambda study: study.on) if on in (None, study.on)]
 
 
 def curves_figure(study: Study) -> Any:
-    """Learning curves, a line an arm."""
+    """Learning curves, one line per arm."""
     return plots.draw_learning([(arm.group.label, curves_of(arm.runs)) for arm in study.arms])
 
 
 def points_figure(study: Study) -> Any:
-    """Final success and score of each arm, with intervals."""
+    """Final success and score per arm, with intervals."""
     return plots.draw_comparison(estimates([arm.group for arm in study.arms]))
 
 
 def _subject(runs: Sequence[StoredRun]) -> str:
-    """The suite or the class; of several suites of the same classes the shipped one."""
+    """The suite or class; among several suites with the same classes the shipped one."""
     suites = [run.content["suite"] for run in runs if run.content["suite"] is not None]
     if not suites:
-        return short_name(runs[0].config()["task"]).rpartition("/")[2]
+        return short_name(str(runs[0].config().task)).rpartition("/")[2]
     return str(min(suites, key=lambda suite: "file" in suite).get("name"))
 
 
 def _covered(run: StoredRun, runs: Sequence[StoredRun]) -> frozenset[str]:
     """The classes of all runs that share a run's arm and seed."""
-    same = [other for other in runs if (other.arm, other.config()["seed"]) == (run.arm, run.config()["seed"])]
-    return frozenset(other.config()["task"] for other in same)
+    same = [other for other in runs if (other.arm, other.config().seed) == (run.arm, run.config().seed)]
+    return frozenset(str(other.config().task) for other in same)
 
 
 def refuse_differing(name: str, runs: Sequence[StoredRun]) -> None:
-    """Seeds of an arm may be of versions that know more or fewer options, but what both know is the same."""
+    """Refuses seeds of an arm whose shared config entries differ (versions may know more or fewer entries)."""
     for run in runs[1:]:
-        same = next(known for known in runs if known.config()["task"] == run.config()["task"])
-        first, other = flat(same.config()), flat(run.config())
+        same = next(known for known in runs if known.config().task == run.config().task)
+        first, other = flat(same.content["config"]), flat(run.content["config"])
         for key in first.keys() & other.keys():
             if key not in _FREE and first[key] != other[key]:
                 raise BidexError(

@@ -12,9 +12,21 @@ from bidex_meta.tasks import registry
 from tools.pages.studies import Study
 
 _FEW = 4
-"""Classes up to which their returns stand in the table of arms."""
-_PLAYED: dict[Kind, str] = {"random": "random", "zero": "zero", "witness": "witness, open loop", "script": "script"}
-_BEST = ("success [95 %]", "return [95 %]", "score", "uniform actions", "witness, open loop", "script")
+"""The table of arms shows returns per class for at most this many classes."""
+_PLAYED: dict[Kind, str] = {
+    "random": "uniform actions",
+    "zero": "zero actions",
+    "witness": "open-loop replay",
+    "script": "scripted policy",
+}
+_BEST = (
+    "success [95 %]",
+    "return [95 %]",
+    "score",
+    "uniform actions: return",
+    "open-loop replay: success",
+    "scripted policy: success",
+)
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
@@ -25,13 +37,13 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
 
 
 def mean_and_range(values: np.ndarray, form: str = ".4g", unit: str = "") -> str:
-    """``mean (least to most)`` of some seeds (seeds,); of a single one its value."""
+    """``mean (least to most)`` of the values (seeds,); a single seed's value alone."""
     ends = f" ({values.min():{form}} to {values.max():{form}})" if len(values) > 1 else ""
     return f"{values.mean():{form}}{unit}{ends}"
 
 
 def random_rows(study: Study) -> dict[str, list[dict[str, float]]]:
-    """By class, the results of uniform actions in each evaluation that has them."""
+    """Results of uniform actions by class, from each evaluation that has them."""
     found: dict[str, list[dict[str, float]]] = {}
     for run in study.runs:
         for name, row in run.evaluation().get("random", {"classes": {}})["classes"].items():
@@ -40,7 +52,7 @@ def random_rows(study: Study) -> dict[str, list[dict[str, float]]]:
 
 
 def arms_table(study: Study) -> Iterator[str]:
-    """One arm a row, then uniform actions."""
+    """One row per arm, then one for uniform actions."""
     classes = study.classes if len(study.classes) <= _FEW else []
     head = ["arm", "seeds", "steps", "success, IQM", "score, IQM", *classes, "parameters", "hours"]
     rows = []
@@ -62,7 +74,7 @@ def arms_table(study: Study) -> Iterator[str]:
 
 
 def classes_table(study: Study) -> Iterator[str]:
-    """Success and return of each class, mean over seeds (least to most)."""
+    """Success and return per class: mean over seeds (least to most)."""
 
     def cells(group: Group, values: np.ndarray, unit: str = "") -> list[str]:
         by_class = dict(zip(group.classes, values.T, strict=True))
@@ -76,9 +88,9 @@ def classes_table(study: Study) -> Iterator[str]:
 
 
 def best_table(studies: Sequence[Study]) -> Iterator[str]:
-    """One class a row, in MT20's order: of its runs the one of most success; of equals, of the largest return.
+    """One row per class, in MT20's order: the run with the highest success, ties broken by return.
 
-    A single run of all classes is not named in the rows.
+    The run is not named in the rows when there is only one.
     """
     found: dict[str, list[tuple[StoredRun, dict[str, Any]]]] = {}
     for run in (run for study in studies for run in study.runs):
@@ -92,7 +104,7 @@ def best_table(studies: Sequence[Study]) -> Iterator[str]:
         run, best = max(found[name], key=lambda pair: (pair[1]["success"], pair[1]["return"]))
         random = run.evaluation().get("random", {"classes": {}})["classes"].get(name)
         content = run.content
-        which = [run.arm, str(run.config()["seed"]), f"{content['steps']:,}", f"{content['seconds'] / 3600:.2f}"]
+        which = [run.arm, str(run.config().seed), f"{content['steps']:,}", f"{content['seconds'] / 3600:.2f}"]
         cells = [
             _measure(best, "success").text(100.0, " %", ".4g"),
             _measure(best, "return").text(form=".4g"),
@@ -105,7 +117,7 @@ def best_table(studies: Sequence[Study]) -> Iterator[str]:
 
 
 def references_table() -> Iterator[str]:
-    """One class a row: return and success of policies that are not trained; the expert and its source."""
+    """One row per class: return and success of untrained policies; the expert and its source."""
     played, expert = [load(kind) for kind in _PLAYED], load("expert")
     measures = [f"{who}: {what}" for who in _PLAYED.values() for what in ("return", "success")]
     rows = []
@@ -116,7 +128,7 @@ def references_table() -> Iterator[str]:
             cells += ["–", "–"] if row is None else [f"{row['return']:.4g}", f"{100 * row['success']:.1f} %"]
         best = expert.get(name)
         rows.append([*cells, *(["–", "–"] if best is None else [f"{best['return']:.4g}", best["source"]])])
-    return table(["class", *measures, "expert: return", "which"], rows)
+    return table(["class", *measures, "expert: return", "expert"], rows)
 
 
 def _measure(row: Mapping[str, Any], measure: str) -> Estimate:

@@ -1,0 +1,227 @@
+"""A run's config: what flags become, what ``config.json`` holds, what a resumed run and a sweep compare."""
+
+import dataclasses
+import json
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Generic, Literal, TypeVar
+
+import msgspec
+import tyro
+from msgspec import Meta
+from tyro.constructors import PrimitiveConstructorSpec
+
+from bidex_meta.errors import BidexError, shortened
+from bidex_meta.reading import read_json
+from bidex_meta.suite import MOST_POINTS
+from bidex_meta.validation import (
+    Count,
+    Environments,
+    Finite,
+    NonNegative,
+    Positive,
+    Seed,
+    Text,
+    Threads,
+    Whole,
+    check_fields,
+    parse,
+)
+
+LearnerSettings = TypeVar("LearnerSettings")
+
+MAY_CHANGE = {"may_change": True}
+"""Metadata of a field that a resumed run may be given anew: it changes nothing of what is learned."""
+
+
+def _whole_number(words: list[str]) -> int:
+    try:
+        value = float(words[0].replace("_", ""))
+        if value != int(value) or value < 0:
+            raise ValueError
+    except (ValueError, OverflowError):
+        raise ValueError(f"expected a whole number such as 20000000 or 2e7, not {shortened(words[0])}") from None
+    return int(value)
+
+
+Steps = Annotated[
+    int,
+    Meta(ge=0, le=10**15),
+    PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="INT",
+        instance_from_str=_whole_number,
+        is_instance=lambda value: isinstance(value, int),
+        str_from_instance=lambda value: [str(value)],
+    ),
+]
+"""A whole number that may be written 2e7 on the command line."""
+
+Several = Annotated[tuple[Text, ...], tyro.conf.UseAppendAction]
+"""A flag that may be given several times."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig(Generic[LearnerSettings]):
+    """Everything that decides what a run does. ``learner`` is the learner's own config, or as a file holds it.
+
+    Raises:
+        BidexError: A field is out of its bounds, or there is not either a suite or a task.
+    """
+
+    suite: Text | None
+    """Suite to train on: a name (see `bidex-meta list suites`) or the path of a TOML file."""
+    task: Text | None
+    """Train on this task class alone, instead of a suite; or on package.module:Class of your own (docs/own-task.md)."""
+    base: Literal["own", "moving", "fixed"] = "own"
+    """With --task: whether the hands' bases move; own: as the class has it alone. Suites move them, HandOver alone
+    does not."""
+    points: Annotated[int, Meta(ge=0, le=MOST_POINTS)] = 0
+    """Points of the cloud that observations show in place of objects' states, as a depth camera would (768 in the
+    original; docs/points.md); 0: the states, or what the suite's file says."""
+    object: Text | None = None
+    """With --task: what is thrown in place of the class's own object: a name of the shelf or the path of an MJCF file
+    (docs/objects.md)."""
+    start_from: Text | None = None
+    """Begin with the policy of this run's last checkpoint, network and observation statistics, instead of a fresh
+    one."""
+    algo: Text
+    """Learner (see `bidex-meta list algos`), or package.module:Class of your own (docs/own-learner.md)."""
+    preset: Text = "auto"
+    """Values of the learner's config that no flag sets; auto: metaworld for a suite of Meta-World's, else laptop on a
+    CPU, on a GPU paper (of maml and promp laptop there too)."""
+    learner: LearnerSettings
+    num_envs: Environments
+    """Environments stepped together by each process, over all tasks."""
+    steps: Steps = field(metadata=MAY_CHANGE)
+    """Environment steps to train for, over all environments of all processes; 2e7 is understood. With --dataset:
+    gradient updates."""
+    minutes: Positive | None = field(default=None, metadata=MAY_CHANGE)
+    """Minutes to train for, counted from the first step of the world and without the evaluation; training ends with
+    whichever is up first, these or --steps. None: as long as --steps take."""
+    evaluate_every: Count | None = field(default=None, metadata=MAY_CHANGE)
+    """Evaluate every so many iterations, one episode for up to ten tasks of each class (at least ten overall; learners
+    that adapt: one shot on train tasks), and keep the best policy as checkpoints/best.pt. Does not affect training.
+    None: never."""
+    video_every: Count | None = field(default=None, metadata=MAY_CHANGE)
+    """Film one environment of each class every so many iterations, into videos/ and the logger. None: never."""
+    logger: Literal["tensorboard", "wandb", "none"] = field(default="tensorboard", metadata=MAY_CHANGE)
+    """Where metrics, config and films go beside metrics.jsonl."""
+    dataset: Several = ()
+    """Learn from this data set (a name of `bidex-meta data list`, or a folder) instead of acting, with --algo bc, bcq,
+    td3bc or iql, for the suite or task that it was recorded on. Given several times: from all of them."""
+    task_seed: tyro.conf.Suppress[tyro.conf.Fixed[Seed | None]] = None
+    """Seed of the tasks that the data sets were recorded on."""
+    demonstrations: Several = ()
+    """Imitate this data set too (as --dataset; see `bidex-meta record demonstrations`), with a weight that decays: with
+    --algo mtppo and ppo, see --learner.demonstration-weight. Given several times: all of them."""
+    record: Whole = 0
+    """Keep about so many transitions of the training as the data set replay/ in the run's folder, whole episodes of
+    some of the environments (docs/data.md). 0: none."""
+    record_share: tyro.conf.Suppress[tyro.conf.Fixed[NonNegative]] = 0.0
+    """``record`` by the steps that the run began with, so that one resumed for more keeps its environments."""
+    stop_at_return: Finite | None = field(default=None, metadata=MAY_CHANGE)
+    """End as soon as the mean return reaches this: of the evaluations with --evaluate-every, else of training."""
+    stop_at_success: Annotated[float, Meta(gt=0.0, le=1.0)] | None = field(default=None, metadata=MAY_CHANGE)
+    """End as soon as this fraction of the episodes succeeds, such as 0.8: of the evaluations with --evaluate-every,
+    else of training, whose actions explore."""
+    stop_at_score: Finite | None = field(default=None, metadata=MAY_CHANGE)
+    """End as soon as the normalised score of the evaluations reaches this; 33 is a third of the expert's. Needs
+    --evaluate-every."""
+    processes: tyro.conf.Suppress[tyro.conf.Fixed[Count]] = 1
+    """Processes that train together."""
+    seed: Seed
+    """Seed of tasks, starts and learner."""
+    device: Text = "auto"
+    """auto, cpu or cuda:N."""
+    engine: Literal["auto", "c", "warp"] = "auto"
+    """Physics: C MuJoCo on the CPU, mujoco_warp on either; auto: the one that is fast on the device."""
+    threads: Threads = 1
+    """Threads of torch and of the physics in each process; by default one per core, shared by the processes of a
+    machine. A resumed run keeps its own."""
+
+    def __post_init__(self) -> None:
+        """Checks all fields."""
+        check_fields(self, "run", as_flags=True)
+
+    @property
+    def learner_values(self) -> dict[str, Any]:
+        """The learner's config as plain values."""
+        return json.loads(msgspec.json.encode(self.learner))
+
+    def to_json(self) -> dict[str, Any]:
+        """As ``config.json`` holds it."""
+        return json.loads(msgspec.json.encode(self))
+
+    def flat(self) -> dict[str, Any]:
+        """Plain values without nesting: ``learner.gamma`` beside ``seed``."""
+        return flat(self.to_json())
+
+    def differences(self, other: "RunConfig[Any]", ignored: Collection[str] = ()) -> Iterator[tuple[str, Any, Any]]:
+        """Name, value here and value there of all entries that differ, but for those that a resumed run may change."""
+        free = {entry.name for entry in dataclasses.fields(self) if entry.metadata.get("may_change")}
+        here, there = self.flat(), other.flat()
+        for name in sorted((here.keys() | there.keys()) - free - set(ignored)):
+            if here.get(name) != there.get(name):
+                yield name, here.get(name), there.get(name)
+
+    def early_end(self, metrics: Mapping[str, Any]) -> str | None:
+        """The tag of the metrics that has reached what ends the run early; None where the run goes on."""
+        prefix = "Train" if self.evaluate_every is None else "Eval"
+        limits = {
+            f"{prefix}/mean_return": self.stop_at_return,
+            f"{prefix}/success_rate": self.stop_at_success,
+            "Eval/score": self.stop_at_score,
+        }
+        for tag, limit in limits.items():
+            value = metrics.get(tag)
+            if limit is not None and value is not None and value >= limit:
+                return tag
+        return None
+
+    def goal(self, last: Mapping[str, Any]) -> int:
+        """Steps that a run trains for: those of its last metrics where time or these ended it, else ``steps``."""
+        return last["step"] if self.minutes is not None or self.early_end(last) else self.steps
+
+
+def flat(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Tables without nesting: ``{"learner": {"gamma": 0.9}}`` becomes ``{"learner.gamma": 0.9}``."""
+    found: dict[str, Any] = {}
+    for name, value in content.items():
+        found.update(flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value})
+    return found
+
+
+def read_config(path: Path) -> RunConfig[dict[str, Any]]:
+    """A run's ``config.json``, of this version or an older one.
+
+    Raises:
+        BidexError: The file cannot be read, or is not a run's config.
+    """
+    return config_of(read_json(path, "a run's config"), str(path))
+
+
+def config_of(content: object, where: str) -> RunConfig[dict[str, Any]]:
+    """A run's config from what a file holds; ``where`` for messages.
+
+    Raises:
+        BidexError: It is not a run's config.
+    """
+    if isinstance(content, dict):
+        content = _brought_up(content)
+    config = parse(content, RunConfig[dict[str, Any]], where)
+    if (config.suite is None) == (config.task is None):
+        raise BidexError(f"{where}: expected either a suite or a task, the other null. Name a run.")
+    return config
+
+
+def _brought_up(content: dict[str, Any]) -> dict[str, Any]:
+    """What a run of 0.2.0 or before wrote, as this version writes it; what it lacks has its default."""
+    given = content.get("demonstrations")
+    return {**content, "demonstrations": [given] if isinstance(given, str) else [] if given is None else given}
+
+
+def printed(config: RunConfig[Any]) -> str:
+    """The config as JSON for reading."""
+    return json.dumps(config.to_json(), indent=2)
