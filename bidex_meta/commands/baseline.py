@@ -95,7 +95,7 @@ def _scripted(source: Worlds, flags: BaselineFlags) -> "Evaluation":
     """Each class that has a script on its own: alone it has the tasks that it has in suites."""
     from bidex_meta.evaluation.play import EVALUATION_SEED, evaluate
     from bidex_meta.evaluation.results import Evaluation
-    from bidex_meta.witness.scripted import Scripted
+    from bidex_meta.witness.demonstrators import Scripted
     from bidex_meta.witness.scripts import SCRIPTS
 
     names = [name for name in source.task_classes() if name in SCRIPTS]
@@ -114,7 +114,7 @@ def _scripted(source: Worlds, flags: BaselineFlags) -> "Evaluation":
 def _agent(what: str, world: Any, seed: int) -> tuple["Agent", list[str]]:
     """The policy, and the classes that it can play."""
     from bidex_meta.evaluation.play import RandomAgent, ZeroAgent
-    from bidex_meta.witness.open_loop import OpenLoop
+    from bidex_meta.witness.demonstrators import OpenLoopReplay
     from bidex_meta.witness.store import load_witness, witness_path
 
     names = list(world.task_names)
@@ -123,7 +123,7 @@ def _agent(what: str, world: Any, seed: int) -> tuple["Agent", list[str]]:
     if what == "zero":
         return ZeroAgent(world.action_space), names
     witnesses = {name: load_witness(name) for name in names if witness_path(name).is_file()}
-    agent = OpenLoop(witnesses, names, world.task_id, world.single_action_space.shape[0])
+    agent = OpenLoopReplay(witnesses, names, world.task_id, world.single_action_space.shape[0])
     return agent, list(witnesses)
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from bidex_meta.engine.choice import choose_engine
 from bidex_meta.errors import BidexError
 from bidex_meta.memory import POINT_BYTES, ROW_BYTES, check_memory
-from bidex_meta.points.sight import PointsRule
+from bidex_meta.points.depth_sensor import PointsRule
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.layout import CLIP
 from bidex_meta.validation import whole_number
