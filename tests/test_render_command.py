@@ -65,7 +65,7 @@ def test_a_run_is_filmed_with_all_its_classes_beside_each_other(monkeypatch, toy
     capsys.readouterr()
     for flags, told in (
         (["--task", "Near"], "--out film.mp4"),
-        (["--task", "Near", "--out", "a.mp4", "--every", "-1"], "--every must be at least 1"),
+        (["--task", "Near", "--out", "a.mp4", "--every", "-1"], "every"),
         ([str(path), "--checkpoint", "best"], "no best.pt"),
     ):
         assert main(["render", *flags]) == 2

@@ -144,10 +144,8 @@ def test_what_run_would_refuse_is_told_before_anything_begins(tmp_path: Path, mo
 def test_the_sweeps_of_the_repository_are_what_run_takes(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     # Data sets are recorded before; which, the files say.
-    monkeypatch.setattr("bidex_meta.commands.run_offline.opened", lambda names: [])
-    monkeypatch.setattr("bidex_meta.commands.run_offline.check", lambda *_: None)
-    monkeypatch.setattr("bidex_meta.data.open_dataset", lambda name: None)
-    monkeypatch.setattr("bidex_meta.commands.run_demonstrations._check_dataset", lambda *_: None)
+    monkeypatch.setattr("bidex_meta.commands.run_data.open_datasets", lambda names: [])
+    monkeypatch.setattr("bidex_meta.commands.run_data.check_offline", lambda *_: None)
     for path in sorted((ROOT / "results" / "sweeps").glob("*.toml")):
         if "seeds" in path.read_text():
             assert main(["sweep", str(path), "--dry-run"]) == 0

@@ -18,8 +18,7 @@ from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.record.atomic import check_writable
 from bidex_meta.record.versions import collect_versions
 from bidex_meta.validation import Few, Seed, Threads
-from bidex_meta.witness.open_loop import OpenLoop
-from bidex_meta.witness.scripted import Scripted
+from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted
 from bidex_meta.witness.scripts import SCRIPTS
 from bidex_meta.witness.store import load_witness, witness_path
 from bidex_meta.world.contract import TaskWorld
@@ -119,5 +118,5 @@ def _agent(what: str, world: TaskWorld, seed: int) -> tuple[Agent, list[str]]:
     if what == "zero":
         return ZeroAgent(world.action_space), names
     witnesses = {name: load_witness(name) for name in names if witness_path(name).is_file()}
-    agent = OpenLoop(witnesses, names, world.task_id, world.single_action_space.shape[0])
+    agent = OpenLoopReplay(witnesses, names, world.task_id, world.single_action_space.shape[0])
     return agent, list(witnesses)

@@ -1,14 +1,16 @@
-"""``bidex-meta data``: the data sets there are, what one holds, and whether it is sound."""
+"""``bidex-meta data``: lists, describes and checks data sets."""
 
 import json
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
 from bidex_meta.commands.parsing import Switch, parse
+from bidex_meta.commands.tables import plain_table, print_table
+from bidex_meta.data.dataset import data_folder, dataset_names, open_dataset
 from bidex_meta.errors import EXIT_FAILED, BidexError, known_name
 from bidex_meta.validation import Few
 
@@ -17,7 +19,7 @@ _ACTIONS = ("list", "info", "check")
 
 @dataclass(frozen=True)
 class DataFlags:
-    """The data sets there are; what one holds; whether one is sound.
+    """List data sets; describe one; check one.
 
     Example: bidex-meta data info CatchUnderarm/random-v0
 
@@ -31,7 +33,7 @@ class DataFlags:
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")] = ""
     """info, check: a data set's name or folder."""
     episodes: Few | None = None
-    """check: look at so many episodes at most, evenly spread; None: all."""
+    """check: at most so many episodes, evenly spread; None: all."""
     json: Switch = False
     """Print JSON."""
 
@@ -45,38 +47,30 @@ def main(arguments: Sequence[str]) -> None:
     flags = parse(DataFlags, arguments, "data")
     what = known_name("data command", flags.what, _ACTIONS)
     if (what == "list") == bool(flags.name):
-        told = "takes no name" if flags.name else "needs the name of a data set (see bidex-meta data list)"
-        raise BidexError(f"bidex-meta data {what} {told}.")
+        mend = "takes no name" if flags.name else "needs the name of a data set (see bidex-meta data list)"
+        raise BidexError(f"bidex-meta data {what} {mend}.")
     if flags.episodes is not None and what != "check":
         raise BidexError(f"--episodes goes with check, not with {what}. Leave it out.")
-    if what == "list":
-        _list(flags)
-    elif what == "info":
-        _info(flags)
-    else:
-        _check(flags)
+    {"list": _list, "info": _info, "check": _check}[what](flags)
 
 
 def _list(flags: DataFlags) -> None:
-    from bidex_meta.data import open_dataset
-    from bidex_meta.data.dataset import data_folder, dataset_names
-
-    rows = []
+    rows: list[dict[str, object]] = []
     for name in dataset_names():
         try:
-            found = open_dataset(data_folder() / name)
+            dataset = open_dataset(data_folder() / name)
         except BidexError as error:
             print(f"{name}: {error}", file=sys.stderr)
             continue
-        about = found.metadata
+        about = dataset.metadata
         rows.append(
             {
                 "name": name,
                 "kind": about.get("kind"),
                 "source": about.get("suite") or about.get("task"),
-                "transitions": found.num_steps,
-                "episodes": found.num_episodes,
-                "megabytes": found.content.get("dataset_size"),
+                "transitions": dataset.num_steps,
+                "episodes": dataset.num_episodes,
+                "megabytes": dataset.content.get("dataset_size"),
             }
         )
     if flags.json:
@@ -86,30 +80,24 @@ def _list(flags: DataFlags) -> None:
 
 
 def _info(flags: DataFlags) -> None:
-    from bidex_meta.data import open_dataset
-    from bidex_meta.data.summary import coverage, summary
+    from bidex_meta.data.checking import coverage, summary
 
     dataset = open_dataset(flags.name)
     classes, spread = summary(dataset), coverage(dataset)
     about = {name: value for name, value in dataset.metadata.items() if name != "observation_groups"}
     sizes = {"observations": dataset.observation_size, "actions": dataset.action_size}
     if flags.json:
-        told = {"name": dataset.name, "transitions": dataset.num_steps, "episodes": dataset.num_episodes, **sizes}
-        print(
-            json.dumps({**told, "classes": [asdict(each) for each in classes], "coverage": spread, **about}, indent=2)
-        )
+        totals = {"name": dataset.name, "transitions": dataset.num_steps, "episodes": dataset.num_episodes, **sizes}
+        content = {**totals, "classes": [asdict(each) for each in classes], "coverage": spread, **about}
+        print(json.dumps(content, indent=2))
         return
-    who = ", ".join(
-        f"{each.get('algo') or 'uniform'} ({each.get('actions')} actions)" for each in about.get("policies", [])
-    )
-    left = ", ".join(
-        f"{count:,} {name.replace('_', ' ')}" for name, count in about.get("left_out", {}).items() if count
-    )
+    policies, left_out = about.get("policies", []), about.get("left_out", {})
+    acted = ", ".join(f"{policy.get('algo') or 'uniform'} ({policy.get('actions')} actions)" for policy in policies)
+    left = ", ".join(f"{count:,} {name.replace('_', ' ')}" for name, count in left_out.items() if count)
+    episodes = f"{dataset.num_steps:,} transitions, {dataset.num_episodes:,} episodes"
     print(f"{dataset.name}: {about['kind']} data of {about.get('suite') or about.get('task') or 'elsewhere'}")
-    print(
-        f"{dataset.num_steps:,} transitions, {dataset.num_episodes:,} episodes; {sizes}; commit {about.get('commit')}"
-    )
-    print(f"Acted: {who or 'unknown'}. Left out: {left or 'nothing'}.")
+    print(f"{episodes}; {sizes}; commit {about.get('commit')}")
+    print(f"Acted: {acted or 'unknown'}. Left out: {left or 'nothing'}.")
     _print_rows(
         [
             {
@@ -128,35 +116,31 @@ def _info(flags: DataFlags) -> None:
     )
     groups = ", ".join(f"{name} {value:.3g}" for name, value in spread["observation_std"].items())
     print(f"Spread (standard deviation over states, mean over entries): {groups}")
-    print(
-        f"Actions: standard deviation {spread['action_std']:.3g}, {100 * spread['action_at_bounds']:.1f} % at a bound"
-    )
+    at_bounds = f"{100 * spread['action_at_bounds']:.1f} % at a bound"
+    print(f"Actions: standard deviation {spread['action_std']:.3g}, {at_bounds}")
 
 
 def _check(flags: DataFlags) -> None:
-    from bidex_meta.data import open_dataset
     from bidex_meta.data.checking import verify
 
-    found = verify(open_dataset(flags.name), flags.episodes)
+    findings = verify(open_dataset(flags.name), flags.episodes)
     if flags.json:
-        print(json.dumps(asdict(found), indent=2))
+        print(json.dumps(asdict(findings), indent=2))
     else:
-        print(f"{found.episodes:,} episodes of {found.steps:,} transitions looked at, {found.count:,} wrong.")
-        for name, count in found.recomputed.items():
-            print(f"{name}: {count:,} rewards computed again, largest difference {found.largest[name]:.2g}")
-        for name, reason in found.skipped.items():
+        print(f"{findings.episodes:,} episodes of {findings.steps:,} transitions checked, {findings.count:,} wrong.")
+        for name, count in findings.recomputed.items():
+            print(f"{name}: {count:,} rewards computed again, largest difference {findings.largest[name]:.2g}")
+        for name, reason in findings.skipped.items():
             print(f"{name}: rewards not computed again: {reason}")
-        if found.unsealed:
-            print(f"Without a digest, since written elsewhere or by an older version: {len(found.unsealed):,} files.")
-        for line in found.wrong:
+        if findings.unsealed:
+            print(f"Files without a digest, from elsewhere or older versions: {len(findings.unsealed):,}.")
+        for line in findings.wrong:
             print(line)
-    if found.count:
+    if findings.count:
         raise SystemExit(EXIT_FAILED)
 
 
-def _print_rows(rows: list[dict[str, Any]], otherwise: str = "Nothing.") -> None:
-    from bidex_meta.commands.tables import plain_table, print_table
-
+def _print_rows(rows: list[dict[str, object]], otherwise: str = "Nothing.") -> None:
     if not rows:
         print(otherwise)
         return

@@ -5,14 +5,18 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from bidex_meta import drawing
 from bidex_meta.commands.parsing import Switch, parse
-from bidex_meta.errors import BidexError, known_name
+from bidex_meta.errors import known_name
 from bidex_meta.outside import name_with_object
-from bidex_meta.validation import Port, Positive, Seed
+from bidex_meta.validation import NonNegative, Port, Positive, Seed
+
+if TYPE_CHECKING:
+    from bidex_meta.viewer.playback import Screen, Stage
 
 
 @dataclass(frozen=True)
@@ -47,7 +51,7 @@ class PlayFlags:
     """Address the browser's page is served at; 0.0.0.0 lets other machines in."""
     port: Port = 8080
     """Port of that page; where it is taken, the next free one."""
-    seconds: Positive | None = None
+    seconds: NonNegative | None = None
     """End after so many seconds; None: when the window is closed, or Ctrl-C."""
 
 
@@ -58,17 +62,14 @@ def main(arguments: Sequence[str]) -> None:
         BidexError: Bad flags, a policy that does not fit, or no window and no viser.
     """
     flags = parse(PlayFlags, arguments, "play")
-    if flags.speed <= 0.0:
-        raise BidexError(f"--speed must be above 0, not {flags.speed:g}.")
     from bidex_meta.commands.policies import acting, looked_at, slots_of
-    from bidex_meta.viewer.loop import play
-    from bidex_meta.viewer.playback import Stage
+    from bidex_meta.viewer.playback import Stage, play
 
     policy = flags.policy if flags.run is None else str(flags.run)
     source = looked_at(policy, flags.suite, flags.task, flags.seed, flags.object)
     slots, named = slots_of(source), flags.task and name_with_object(flags.task, flags.object)
     task = known_name(f"task of {source.name}", named or slots[0], source.task_classes())
-    world = source.world("train", len(slots))
+    world: Any = source.world("train", len(slots))
     stage = Stage(world, acting(policy, world, flags.seed, flags.checkpoint), slots.index(task), flags.seed)
     screen = _screen(flags, stage)
     with contextlib.suppress(KeyboardInterrupt):  # how the view in the browser is ended
@@ -76,9 +77,7 @@ def main(arguments: Sequence[str]) -> None:
     world.close()
 
 
-def _screen(flags: PlayFlags, stage: Any) -> Any:
-    from bidex_meta import drawing
-
+def _screen(flags: PlayFlags, stage: "Stage") -> "Screen":
     if drawing.has_screen() and not flags.browser:
         from bidex_meta.viewer import desktop
 

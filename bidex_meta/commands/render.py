@@ -11,6 +11,9 @@ from bidex_meta.commands.parsing import Switch, parse
 from bidex_meta.config import Steps
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.outside import name_with_object, short_name
+from bidex_meta.record import video
+from bidex_meta.record.atomic import check_writable, refuse_links
+from bidex_meta.record.progress import counted
 from bidex_meta.validation import Few, Pixels, Seed
 
 
@@ -66,9 +69,6 @@ def main(arguments: Sequence[str]) -> None:
         BidexError: Bad flags, a policy that does not fit, or no way to draw here.
     """
     flags = parse(RenderFlags, arguments, "render")
-    from bidex_meta.record import video
-    from bidex_meta.record.atomic import check_writable, refuse_links
-
     policy = flags.policy if flags.run is None else str(flags.run)
     out = _out(flags, policy)
     suffix = video.check_suffix(out)
@@ -81,9 +81,6 @@ def main(arguments: Sequence[str]) -> None:
             raise BidexError(f"A film needs an even width and height, not {width} x {height}.")
         video.check_films()
     every = flags.every or (2 if flags.tiled else 1)
-    if every < 1:
-        raise BidexError(f"--every must be at least 1, not {every}.")
-
     from bidex_meta.commands.policies import acting, looked_at, slots_of
 
     source = looked_at(policy, flags.suite, flags.task, flags.seed, flags.object)
@@ -91,11 +88,11 @@ def main(arguments: Sequence[str]) -> None:
     classes = source.task_classes()  # refuses what is not of ours
     if not flags.tiled:
         task = known_name(f"task of {source.name}", task or slots[0], classes)
-    # One row for each slot is enough to see one of them.
+    # One environment for each slot is enough to see one of them.
     world = source.world("train", len(slots))
     agent = acting(policy, world, flags.seed, flags.checkpoint)
     if flags.points:
-        world = _seen(world)
+        world = _with_clouds(world)
     rows = list(range(len(slots))) if flags.tiled else [world.slot_rows[slots.index(str(task))].start]
     look = {"width": width, "height": height, "camera": flags.camera}
     _write(out, _frames(flags, agent, world, rows, every if suffix != ".png" else None, look), every)
@@ -103,10 +100,10 @@ def main(arguments: Sequence[str]) -> None:
     print(out)
 
 
-def _seen(world: Any) -> Any:
+def _with_clouds(world: Any) -> Any:
     """The world with clouds in its pictures."""
     from bidex_meta.evaluation.filming import SeenWorld
-    from bidex_meta.points.sight import PointsRule
+    from bidex_meta.points.depth_sensor import PointsRule
     from bidex_meta.world import World
 
     if not isinstance(world, World):
@@ -115,11 +112,6 @@ def _seen(world: Any) -> Any:
 
 
 def _out(flags: RenderFlags, policy: str) -> Path:
-    """The file to write.
-
-    Raises:
-        BidexError: None is named and there is no run to put it in.
-    """
     if flags.out is not None:
         return flags.out
     if policy in ("zero", "random"):
@@ -129,7 +121,7 @@ def _out(flags: RenderFlags, policy: str) -> Path:
 
 
 def _frames(
-    flags: RenderFlags, agent: Any, world: Any, rows: list[int], every: int | None, look: dict[str, Any]
+    flags: RenderFlags, agent: Any, world: Any, rows: list[int], every: Few | None, look: dict[str, Any]
 ) -> tuple[Iterator[Any], int]:
     """The frames, and how many there will be at most; with ``every`` None the last one alone."""
     from bidex_meta.evaluation.filming import film_row, film_tiles
@@ -144,8 +136,6 @@ def _frames(
 
 
 def _write(out: Path, frames: tuple[Iterator[Any], int], every: int) -> None:
-    from bidex_meta.record import video
-    from bidex_meta.record.progress import counted
     from bidex_meta.tasks.base import CONTROL_RATE
 
     shown = counted(*frames, "frames")

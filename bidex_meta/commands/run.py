@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bidex_meta.commands import metatest, run_demonstrations, run_offline, run_recording, watching
+from bidex_meta.commands import metatest, run_data, run_recording, watching
 from bidex_meta.commands.evaluate import conditions
 from bidex_meta.commands.learners import start_from
 from bidex_meta.commands.policies import checkpoint, fitting
@@ -165,9 +165,9 @@ def _make_learner(plan: RunPlan, world: VectorWorld, fresh: bool) -> Any:
     config = plan.config
     learner = plan.kind.make(world, config.learner, config.seed)
     if plan.kind.offline:
-        run_offline.give(config.dataset, learner)
+        run_data.give_datasets(config.dataset, learner)
     if config.demonstrations:
-        run_demonstrations.give(config.demonstrations, learner)
+        run_data.give_demonstrations(config.demonstrations, learner)
     if fresh and config.start_from is not None:
         start = RunFolder.open(Path(config.start_from))
         state, step = checkpoint(start)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Generic, Literal
 
 import tyro
 
-from bidex_meta.commands import run_demonstrations, run_offline
+from bidex_meta.commands import run_data
 from bidex_meta.commands.learners import LearnerKind, choose_preset, learner_kind, resolve_device
 from bidex_meta.commands.parsing import Switch, parse, peek, peek_all
 from bidex_meta.config import LearnerSettings, RunConfig
@@ -92,9 +92,9 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     def given(name: str) -> str | None:
         return peek(arguments, f"--{name}") or (stored and getattr(stored, name))
 
-    dataset = run_offline.named(peek_all(arguments, "--dataset")) or (stored.dataset if stored else ())
-    datasets = run_offline.opened(dataset)
-    implied = {} if given("suite") or given("task") else run_offline.implied(datasets)
+    dataset = run_data.whole_paths(peek_all(arguments, "--dataset")) or (stored.dataset if stored else ())
+    datasets = run_data.open_datasets(dataset)
+    implied = {} if given("suite") or given("task") else run_data.implied(datasets)
     suite, task = (given(name) or implied.get(name) for name in ("suite", "task"))
     # Where neither is named, `run --help` still has defaults to show; without --help _resolved refuses it.
     named = {"suite": suite or (None if task else _EXAMPLE), "task": task}
@@ -105,7 +105,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     if folder and stored:
         default = replace(stored, learner=_stored_learner(type(kind.presets[preset]), stored, folder))
     else:
-        sizes = run_offline.rows_and_steps(source) if kind.offline else source.rows_and_steps(device, kind.adapts)
+        sizes = run_data.rows_and_steps(source) if kind.offline else source.rows_and_steps(device, kind.adapts)
         default = RunConfig(
             **{"suite": None, "task": None, **implied},
             algo=kind.name,
@@ -113,16 +113,16 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
             num_envs=sizes[0],
             steps=sizes[1],
             seed=0,
-            task_seed=run_offline.task_seed(datasets),
+            task_seed=run_data.task_seed(datasets),
             threads=max(1, usable_cores() // launch().local_count),
         )
     flags = _parse(arguments, default)
-    run_offline.check(kind, flags.config.record, datasets, source)
-    demonstrations = run_offline.named(flags.config.demonstrations) or default.demonstrations
+    run_data.check_offline(kind, flags.config.record, datasets, source)
+    demonstrations = run_data.whole_paths(flags.config.demonstrations) or default.demonstrations
     config = replace(flags.config, dataset=dataset, demonstrations=demonstrations, algo=kind.name, preset=preset)
     config = _resolved(config, source, device, fresh=folder is None)
     _check(flags, config, kind)
-    run_demonstrations.check(kind, config.demonstrations, Worlds.open(config.to_json()))
+    run_data.check_demonstrations(kind, config.demonstrations, Worlds.open(config.to_json()))
     if folder and stored:
         _refuse_changes(default, config, folder)
     return RunPlan(flags, kind, config, folder, reason)

@@ -1,58 +1,57 @@
-"""What ``bidex-meta run`` adds for data sets: a recorder around its world, and an early end at a named goal."""
+"""What ``bidex-meta run --record`` adds: a collector around its world."""
 
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from bidex_meta.commands.run_config import RunPlan
+from bidex_meta.commands.run_data import dataset_metadata
+from bidex_meta.data import part_files, writer
 from bidex_meta.memory import check_memory
 from bidex_meta.record.folder import new_folder_name
 from bidex_meta.train.launch import launch
 
+if TYPE_CHECKING:
+    from bidex_meta.data.collector import RunCollector
+    from bidex_meta.world.contract import PooledWorld
 
-def recorded(plan: RunPlan, world: Any) -> Any:
-    """The world with a recorder around it, of as many rows as make the transitions that were asked for.
+
+def recorded(plan: RunPlan, world: "PooledWorld") -> "RunCollector":
+    """The world with a collector around it, of as many environments as give the transitions that were asked for.
 
     Raises:
-        BidexError: There is no room for them on the disk, or in memory for the episodes that run.
+        BidexError: There is no room for them on the disk, or in memory for the running episodes.
     """
-    from bidex_meta.data import part_files
-    from bidex_meta.data.place import check_room
-    from bidex_meta.data.rounds import bytes_held
-    from bidex_meta.data.run_recorder import RunRecorder, spread_rows
-    from bidex_meta.data.writer import estimated_bytes
+    from bidex_meta.data.collect import bytes_held
+    from bidex_meta.data.collector import RunCollector, spread_environments
 
-    rows = spread_rows(world, plan.config.record_share)
+    rows = spread_environments(world, plan.config.record_share)
     sizes = world.single_observation_space.shape[0], world.single_action_space.shape[0]
-    needed = estimated_bytes(plan.config.record, *sizes, 20.0)
-    place = plan.folder.path if plan.folder else plan.flags.run_dir or new_folder_name(plan.config)
-    there = sum(path.stat().st_size for path in part_files.parts_of(place / "replay" / "data"))  # of a resumed run
-    check_room(place, max(0, needed - there), f"{plan.config.record:,} transitions")
-    # A checkpoint copies the episodes that run; each process of this machine has its own.
+    needed = writer.estimated_bytes(plan.config.record, *sizes, 20.0)
+    folder = plan.folder.path if plan.folder else plan.flags.run_dir or new_folder_name(plan.config)
+    there = sum(path.stat().st_size for path in part_files.parts_of(folder / "replay" / "data"))  # of a resumed run
+    writer.check_room(folder, max(0, needed - there), f"{plan.config.record:,} transitions")
+    # A checkpoint copies the running episodes; each process of this machine has its own.
     held = 2 * launch().local_count * bytes_held(world, rows)
     check_memory(held, f"The running episodes of {len(rows):,} recorded rows", "Lower --record or --num-envs.")
     _say(f"Recording {len(rows)} of {world.num_envs} rows, at most about {needed / 1e9:.2f} GB.")
-    return RunRecorder(world, rows, launch().rank)  # pyright: ignore[reportAbstractUsage]
+    return RunCollector(world, rows, launch().rank)  # pyright: ignore[reportAbstractUsage]
 
 
-def begin(recorder: Any, folder: Path, fresh: bool) -> None:
-    """Recording begins in the run's folder; of a resumed run the checkpoint knows which parts stay."""
-    recorder.folder = folder / "replay"
+def begin(collector: "RunCollector", folder: Path, fresh: bool) -> None:
+    """Sets the data set's folder in the run's; a resumed run's checkpoint knows which parts stay."""
+    collector.folder = folder / "replay"
     if fresh:
-        recorder.open(recorder.folder)
+        collector.open(collector.folder)
 
 
-def complete(plan: RunPlan, recorder: Any) -> None:
-    """Makes what all processes recorded a data set."""
-    from bidex_meta.commands.described import described
-    from bidex_meta.data.place import default_name
-    from bidex_meta.data.writer import finish
-
-    told = {"algo": plan.config.algo, "run": recorder.folder.parent.name, "actions": "as in training"}
-    about = described(plan.source, recorder, "replay", [told])
-    name = default_name(plan.source.name, "replay")
-    finish(recorder.folder, name, recorder.single_observation_space, recorder.single_action_space, about)
-    _say(f"Recorded: {recorder.folder}")
+def complete(plan: RunPlan, collector: "RunCollector") -> None:
+    """Makes a data set of what all processes collected."""
+    policy = {"algo": plan.config.algo, "run": collector.folder.parent.name, "actions": "as in training"}
+    about = dataset_metadata(plan.source, collector, "replay", [policy])
+    name = writer.default_name(plan.source.name, "replay")
+    writer.finish(collector.folder, name, collector.single_observation_space, collector.single_action_space, about)
+    _say(f"Recorded: {collector.folder}")
 
 
 def _say(text: str) -> None:

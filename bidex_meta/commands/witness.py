@@ -1,4 +1,4 @@
-"""``bidex-meta witness``: replays actions that prove that a task can be solved."""
+"""``bidex-meta witness``: replays stored reference solutions."""
 
 import json
 from collections.abc import Sequence
@@ -7,13 +7,18 @@ from pathlib import Path
 from typing import Any
 
 from bidex_meta.commands.parsing import Switch, parse
+from bidex_meta.commands.tables import plain_table, print_table
 from bidex_meta.errors import BidexError, known_name
+from bidex_meta.record import video
+from bidex_meta.record.atomic import check_writable
+from bidex_meta.tasks import registry
 from bidex_meta.validation import Threads
+from bidex_meta.witness.store import load_witness, witness_path
 
 
 @dataclass(frozen=True)
 class WitnessFlags:
-    """Replay the recorded actions that solve a task, from its start and from ten slightly shifted ones.
+    """Replay the witness of a task, recorded actions that solve it, from its start and from ten shifted ones.
 
     Example: bidex-meta witness --task CatchUnderarm
     """
@@ -21,7 +26,7 @@ class WitnessFlags:
     task: str | None = None
     """Task class."""
     all: Switch = False
-    """Every class there is, instead of one."""
+    """All classes."""
     file: Path | None = None
     """Replay this file, not the stored witness."""
     out: Path | None = None
@@ -35,29 +40,12 @@ class WitnessFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Replays the witnesses of one class or of all, and prints what they reach."""
-    flags = parse(WitnessFlags, arguments, "witness")
-    from bidex_meta.commands.tables import plain_table, print_table
-
-    rows = [_replay(name, flags) for name in _names(flags)]
-    if flags.out is not None:
-        _film(rows[0]["task"], flags.out, flags)
-    if flags.json:
-        print(json.dumps(rows, indent=2))
-    else:
-        print_table(plain_table(list(rows[0]), [list(row.values()) for row in rows]))
-
-
-def _names(flags: WitnessFlags) -> list[str]:
-    """The classes to replay.
+    """Replays the witnesses of one class or of all, and prints what they reach.
 
     Raises:
         BidexError: The flags contradict each other, there is no such class, or the film could not be written.
     """
-    from bidex_meta.record import video
-    from bidex_meta.record.atomic import check_writable
-    from bidex_meta.tasks import registry
-
+    flags = parse(WitnessFlags, arguments, "witness")
     if flags.all == (flags.task is not None):
         raise BidexError("witness: expected --task T or --all, got " + ("both." if flags.all else "neither."))
     if flags.all and (flags.out is not None or flags.file is not None):
@@ -66,36 +54,39 @@ def _names(flags: WitnessFlags) -> list[str]:
     if flags.out is not None:
         video.check_suffix(flags.out)
         check_writable(flags.out)
-    return names
+    rows = [_replay(name, flags) for name in names]
+    if flags.out is not None:
+        _film(names[0], flags.out, flags)
+    if flags.json:
+        print(json.dumps(rows, indent=2))
+    else:
+        print_table(plain_table(list(rows[0]), [list(row.values()) for row in rows]))
 
 
 def _replay(name: str, flags: WitnessFlags) -> dict[str, Any]:
-    """A row of the table: of the witness in the given file, or the installation's."""
+    """A row of the table."""
     from bidex_meta.witness.replay import replay
-    from bidex_meta.witness.store import load_witness, witness_path
 
-    keys = ("found", "return", "first_success", "shifted", "steps", "deepest_mm", "rival")
     if flags.file is None and not witness_path(name).is_file():
-        return {"task": name, **dict.fromkeys(keys), "found": False}
+        keys = ("return", "first_success", "shifted", "steps", "deepest_mm", "rival")
+        return {"task": name, "found": False, **dict.fromkeys(keys)}
     witness = load_witness(name, flags.file)
     result, rival = replay(name, witness, flags.threads), witness.made.get("rival")
-    values = (
-        result.found,
-        round(result.total, 3),
-        result.first_success,
-        result.succeeded,
-        len(witness.actions),
-        round(1000.0 * result.deepest, 1),
-        None if rival is None else round(rival, 3),
-    )
-    return {"task": name, **dict(zip(keys, values, strict=True))}
+    return {
+        "task": name,
+        "found": result.found,
+        "return": round(result.total, 3),
+        "first_success": result.first_success,
+        "shifted": result.succeeded,
+        "steps": len(witness.actions),
+        "deepest_mm": round(1000.0 * result.deepest, 1),
+        "rival": None if rival is None else round(rival, 3),
+    }
 
 
 def _film(name: str, out: Path, flags: WitnessFlags) -> None:
-    from bidex_meta.record import video
     from bidex_meta.tasks.base import CONTROL_RATE
     from bidex_meta.witness.replay import frames
-    from bidex_meta.witness.store import load_witness
 
     pictures = frames(name, load_witness(name, flags.file), camera=flags.camera)
     if video.check_suffix(out) == ".mp4":

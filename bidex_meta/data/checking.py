@@ -1,10 +1,9 @@
-"""Checks of a data set: files are as they were written, episodes whole, rewards follow from what was observed.
+"""Checks and summaries of a data set.
 
-The reward is computed again by the class's own formula (``TaskClass.reward_terms``), from sensors that the observation
-shows and the variation that the episode stores; so it holds observations, variations and rewards to each other, where
-an error of the recorder (a shifted row, a wrong task, a wrong start) would part them. A formula that asks for more
-than the observation shows (the hand's point of most table classes; with point clouds the objects' states) cannot be
-computed again, and the check says so.
+The check computes rewards again by the class's own formula (``TaskClass.reward_terms``), from the sensors that the
+observation shows and the variation that the episode stores. So it finds errors of a collector: shifted rows, wrong
+tasks or starts. A formula that reads more than the observation shows (the hand's point of most classes with tables, or
+the objects' states where point clouds take their place) cannot be computed again, and the check reports that.
 """
 
 import math
@@ -19,9 +18,9 @@ from torch import Tensor
 from bidex_meta.data.dataset import Dataset
 from bidex_meta.data.episode import Episode
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.references import Reference
 from bidex_meta.outside import name_without_object
-from bidex_meta.points.sight import POINT_ENTRIES
-from bidex_meta.points.told import entries_of_objects
+from bidex_meta.points.depth_sensor import POINT_ENTRIES, privileged_columns
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.layout import CLIP, Block
@@ -36,17 +35,17 @@ _EXAMPLES = 5
 
 @dataclass
 class Findings:
-    """What a check found.
+    """Result of a check.
 
     Attributes:
-        episodes: Episodes looked at.
+        episodes: Episodes checked.
         steps: Their transitions.
-        wrong: What is wrong, a line for each of the first few episodes of each kind.
-        count: How many episodes are wrong.
+        wrong: What is wrong, a line for each of the first few wrong episodes.
+        count: Number of wrong episodes.
         recomputed: Transitions whose reward was computed again, by class.
         largest: Largest difference between a stored reward and a computed one, in the formula's units, by class.
         skipped: Why rewards of a class were not computed again, by class.
-        unsealed: Files that carry no digest.
+        unsealed: Files without a digest.
     """
 
     episodes: int = 0
@@ -59,17 +58,17 @@ class Findings:
     unsealed: list[str] = field(default_factory=list)
 
 
-class _Unseen(Exception):
-    """The formula asks for a sensor that the observation does not show."""
+class _NotShown(Exception):
+    """The formula reads a sensor that the observation does not show."""
 
 
-class _Seen(TaskState):
+class _ShownState(TaskState):
     """The state as far as an observation shows it.
 
     Args:
-        shown: Where each sensor stands in an observation, and the factor that it was shown with.
+        shown: Index range of each sensor in an observation, and the factor that it was shown with.
         observations: (n, d), float64.
-        frozen: What the class computed of each row's variation.
+        frozen: As of ``TaskClass.freeze``.
     """
 
     def __init__(
@@ -80,7 +79,7 @@ class _Seen(TaskState):
 
     def __getitem__(self, name: str) -> Tensor:
         if name not in self._shown:
-            raise _Unseen(name)
+            raise _NotShown(name)
         where, scale = self._shown[name]
         values = self._sensors[:, where]
         self.clipped |= (values.abs() >= CLIP).any(1)
@@ -95,28 +94,32 @@ def verify(dataset: Dataset, most: int | None = None) -> Findings:
     """Checks every file's digest, and every episode.
 
     Args:
-        dataset: What to check.
-        most: Episodes to look at at most, from 1 on, evenly spread; None: all.
+        dataset: The data set.
+        most: Episodes to check at most, from 1 on, evenly spread; None: all.
 
     Raises:
         BidexError: Files are missing or damaged.
     """
-    found, task_classes = Findings(unsealed=dataset.check_digests()), _Formulas(dataset)
-    table, every = dataset.table, 1 if most is None else max(1, math.ceil(dataset.num_episodes / most))
-    for number, episode in enumerate(dataset.episodes()):
-        if number % every:
-            continue
-        found.episodes += 1
-        found.steps += len(episode)
-        told = list(_faults(episode, {name: column[number] for name, column in table.items()}, dataset))
-        told += list(task_classes.check(episode, found))
-        found.count += bool(told)
-        if told and len(found.wrong) < _EXAMPLES:
-            found.wrong.append(f"episode {number} ({episode.task_name}): {'; '.join(told)}")
-    return found
+    findings, formulas = Findings(unsealed=dataset.check_digests()), _Formulas(dataset)
+    table = dataset.table
+    for number, episode in _spread_episodes(dataset, most):
+        findings.episodes += 1
+        findings.steps += len(episode)
+        faults = list(_faults(episode, {name: column[number] for name, column in table.items()}, dataset))
+        faults += list(formulas.check(episode, findings))
+        findings.count += bool(faults)
+        if faults and len(findings.wrong) < _EXAMPLES:
+            findings.wrong.append(f"episode {number} ({episode.task_name}): {'; '.join(faults)}")
+    return findings
 
 
-def _faults(episode: Episode, row: Mapping[str, Any], dataset: Dataset) -> Iterator[str]:
+def _spread_episodes(dataset: Dataset, most: int | None) -> Iterator[tuple[int, Episode]]:
+    """At most so many episodes with their numbers, evenly spread; None: all."""
+    every = 1 if most is None else max(1, math.ceil(dataset.num_episodes / most))
+    yield from ((number, episode) for number, episode in enumerate(dataset.episodes()) if number % every == 0)
+
+
+def _faults(episode: Episode, row: Mapping[str, np.ndarray], dataset: Dataset) -> Iterator[str]:
     """What is wrong with an episode by itself."""
     steps = len(episode)
     if steps == 0:
@@ -134,71 +137,62 @@ def _faults(episode: Episode, row: Mapping[str, Any], dataset: Dataset) -> Itera
         yield "broken, but not truncated"
     total = float(episode.rewards.sum(dtype=np.float64))
     if int(row["steps"]) != steps or not np.isclose(float(row["return"]), total, rtol=1e-9, atol=1e-9):
-        yield f"a table that says {int(row['steps'])} steps and return {float(row['return']):.6g}, found {total:.6g}"
+        yield f"a table with {int(row['steps'])} steps and return {float(row['return']):.6g}, found {total:.6g}"
     scale = dataset.metadata.get("reward_scales", {}).get(episode.task_name)
     if scale and not np.isclose(total, scale * episode.return_unscaled, rtol=1e-3, atol=1e-3 * steps):
         yield f"return {total:.6g} is not {scale:g} times the unscaled {episode.return_unscaled:.6g}"
 
 
 class _Formulas:
-    """The formulas of a data set's classes.
-
-    Args:
-        dataset: Whose episodes are checked.
-    """
+    """The formulas of a data set's classes."""
 
     def __init__(self, dataset: Dataset) -> None:
         self._dataset, about = dataset, dataset.metadata
         self._scales = about.get("reward_scales", {})
-        told = {"own": (None,), "moving": (True,), "fixed": (False,)}
-        # What a suite says of bases stands in its file, which may have gone; its actions tell.
-        self._bases = told.get(about.get("base") or "", (True, None))
+        # A suite's file, which says whether bases move, may have gone: the number of actions shows it.
+        self._bases = {"own": (None,), "moving": (True,), "fixed": (False,)}.get(about.get("base") or "", (True, None))
         self._clouds = any(name in POINT_ENTRIES for name, _ in about.get("observation_groups", ()))
         self._known: dict[str, tuple[TaskClass, dict[str, tuple[slice, float]]] | None] = {}
 
-    def check(self, episode: Episode, found: Findings) -> Iterator[str]:
-        """What is wrong with an episode's rewards; notes in ``found`` what was computed."""
+    def check(self, episode: Episode, findings: Findings) -> Iterator[str]:
+        """What is wrong with an episode's rewards; adds to ``findings`` what was computed."""
         name = episode.task_name.partition("/")[0]
-        known = self._of(name, found)
+        known = self._of(name, findings)
         scale = self._scales.get(episode.task_name)
         if known is None or not scale:
-            found.skipped.setdefault(name, "its formula is not known here")
+            findings.skipped.setdefault(name, "its formula is not known here")
             return
         task, shown = known
         variation = torch.from_numpy(np.array(episode.variation, np.float64)).expand(len(episode), -1)
         observations = torch.from_numpy(episode.observations[1:].astype(np.float64))
-        state = _Seen(shown, observations, task.freeze(variation))
+        state = _ShownState(shown, observations, task.freeze(variation))
         try:
             reward = torch.stack(list(task.reward_terms(state).values())).sum(0)
-        except _Unseen as unseen:
-            found.skipped[name] = f"its formula asks for {unseen}, which no observation shows"
+        except _NotShown as error:
+            findings.skipped[name] = f"its formula asks for {error}, which no observation shows"
             self._known[name] = None
             return
         stored = torch.from_numpy(episode.rewards.astype(np.float64)) / scale
         difference = (reward - stored).abs().masked_fill(state.clipped, 0.0)
-        found.recomputed[name] = found.recomputed.get(name, 0) + int((~state.clipped).sum())
-        found.largest[name] = max(found.largest.get(name, 0.0), float(difference.max()))
+        findings.recomputed[name] = findings.recomputed.get(name, 0) + int((~state.clipped).sum())
+        findings.largest[name] = max(findings.largest.get(name, 0.0), float(difference.max()))
         late = difference > _TOLERANCE * (1.0 + stored.abs())
         if bool(late.any()):
             step = int(late.nonzero()[0])
             yield f"reward {float(stored[step]):.6g} at step {step}, but the formula gives {float(reward[step]):.6g}"
 
-    def _of(self, name: str, found: Findings) -> tuple[TaskClass, dict[str, tuple[slice, float]]] | None:
+    def _of(self, name: str, findings: Findings) -> tuple[TaskClass, dict[str, tuple[slice, float]]] | None:
         if name not in self._known:
             self._known[name] = None
             try:
                 task = self._class(name_without_object(name))
                 self._known[name] = task, shown_sensors(task, hidden=self._hidden(task))
             except BidexError as error:
-                found.skipped[name] = str(error)
+                findings.skipped[name] = str(error)
         return self._known[name]
 
     def _class(self, name: str) -> TaskClass:
-        """A class with the bases of the recording.
-
-        Raises:
-            BidexError: It is unknown, or has other actions than the data with any of them.
-        """
+        """A class with the bases of the data."""
         classes, actions = [registry.get(name, base) for base in self._bases], self._dataset.action_size
         for task in classes:
             if task.action_size == actions:
@@ -207,8 +201,8 @@ class _Formulas:
         raise BidexError(f"{name} has {sizes} actions here, the data {actions}")
 
     def _hidden(self, task: TaskClass) -> frozenset[int]:
-        """Entries of a class's observation that are zero since clouds stand in their place."""
-        return frozenset(entries_of_objects(compile_scene(task)) if self._clouds else ())
+        """Entries of a class's observation that are zero because clouds take their place."""
+        return frozenset(privileged_columns(compile_scene(task)) if self._clouds else ())
 
 
 def shown_sensors(task: TaskClass, hidden: frozenset[int] = frozenset()) -> dict[str, tuple[slice, float]]:
@@ -218,19 +212,106 @@ def shown_sensors(task: TaskClass, hidden: frozenset[int] = frozenset()) -> dict
         task: The class.
         hidden: Entries that show nothing.
     """
-    found: dict[str, tuple[slice, float]] = {}
+    shown: dict[str, tuple[slice, float]] = {}
     for block, where in task.layout:
         if block.sensors and not block.name.endswith("joint_position"):  # those are mapped from the joint's range
             start = where.start
             for sensor in block.sensors:
                 size = _size(block, sensor)
                 if hidden.isdisjoint(range(start, start + size)):
-                    found[sensor] = slice(start, start + size), block.scale
+                    shown[sensor] = slice(start, start + size), block.scale
                 start += size
-    return found
+    return shown
 
 
 def _size(block: Block, sensor: str) -> int:
     if len(block.sensors) == block.size:
         return 1
     return 4 if sensor.endswith("quaternion") else block.size if len(block.sensors) == 1 else 3
+
+
+@dataclass(frozen=True)
+class ClassSummary:
+    """One slot of a data set.
+
+    Attributes:
+        name: Class, or class and task.
+        episodes: Episodes.
+        steps: Transitions.
+        length: Mean length of an episode, steps.
+        returns: Unscaled returns: least, median, mean, largest.
+        success: Share of episodes that met their goal.
+        score: Mean normalised score (``evaluation.references``); None where a reference is missing.
+        tasks: Different tasks played.
+        broken: Episodes ended by broken physics.
+    """
+
+    name: str
+    episodes: int
+    steps: int
+    length: float
+    returns: tuple[float, float, float, float]
+    success: float
+    score: float | None
+    tasks: int
+    broken: int
+
+
+def summary(dataset: Dataset) -> list[ClassSummary]:
+    """A summary of each slot that has episodes, from the tables alone."""
+    table, summaries = dataset.table, []
+    for number, name in enumerate(dataset.metadata["tasks"]):
+        own = table["task"] == number
+        if not own.any():
+            continue
+        returns, steps = table["return_unscaled"][own], table["steps"][own]
+        scores = None
+        if known := dataset.metadata.get("references", {}).get(name.partition("/")[0]):
+            scores = Reference(known["random"], known.get("expert"), known.get("zero")).scores(returns)
+        summaries.append(
+            ClassSummary(
+                name=name,
+                episodes=int(own.sum()),
+                steps=int(steps.sum()),
+                length=float(steps.mean()),
+                returns=(returns.min(), float(np.median(returns)), returns.mean(), returns.max()),
+                success=float(table["success"][own].mean()),
+                score=None if scores is None else float(scores.mean()),
+                tasks=len(np.unique(table["task_index"][own])),
+                broken=int(table["broken"][own].sum()),
+            )
+        )
+    return summaries
+
+
+def coverage(dataset: Dataset, most: int = 2000) -> dict[str, Any]:
+    """How widely states and actions are spread, over at most so many episodes.
+
+    Returns:
+        ``observation_std`` by group of the observation: mean over its entries of the standard deviation over all
+        states; ``constant``: share of its entries that never change; ``action_std``: mean over actions;
+        ``action_at_bounds``: share of actions at -1 or 1.
+    """
+    d, a = dataset.observation_size, dataset.action_size
+    count, taken = 0, 0
+    sums, squares = np.zeros(d + a), np.zeros(d + a)
+    low, high, bounds = np.full(d, np.inf), np.full(d, -np.inf), 0
+    first = np.zeros(0)
+    for _, episode in _spread_episodes(dataset, most):
+        values = np.concatenate([episode.observations[:-1], episode.actions], 1).astype(np.float64)
+        if len(first) == 0:
+            first = values[0].copy()
+        values -= first  # sums of squares lose fewer digits
+        sums, squares, count = sums + values.sum(0), squares + (values**2).sum(0), count + len(values)
+        low = np.minimum(low, values[:, :d].min(0))
+        high = np.maximum(high, values[:, :d].max(0))
+        bounds, taken = bounds + int((np.abs(episode.actions) >= 1.0).sum()), taken + episode.actions.size
+    std = np.sqrt(np.maximum(squares / count - (sums / count) ** 2, 0.0))
+    groups = dataset.metadata.get("observation_groups", [["state", [[0, d]]]])
+    where = {name: np.concatenate([np.arange(*part) for part in parts]) for name, parts in groups}
+    return {
+        "observation_std": {name: float(std[:d][own].mean()) for name, own in where.items()},
+        "constant": {name: float((low[own] == high[own]).mean()) for name, own in where.items()},
+        "action_std": float(std[d:].mean()),
+        "action_at_bounds": bounds / max(taken, 1),
+    }

@@ -1,4 +1,4 @@
-"""Data sets that were not recorded here, such as Minari's: what of them can be read, and the range of their actions."""
+"""Data sets from elsewhere, such as Minari's: which of their arrays can be read, and the range of their actions."""
 
 import json
 from collections.abc import Mapping
@@ -9,18 +9,18 @@ import numpy as np
 from bidex_meta.errors import BidexError, shortened
 
 _SPACES = {"observations": "observation_space", "actions": "action_space"}
-"""Of an episode's arrays, those of several numbers a step, and where their spaces stand."""
+"""Arrays of several numbers a step, and the entries of their spaces."""
 
 
 def check_spaces(content: Mapping[str, Any], name: str) -> None:
-    """Refuses observations or actions that are no flat numbers, where the metadata tell their spaces.
+    """Refuses observations or actions that are not flat, where the metadata have their spaces.
 
     Args:
         content: All of ``metadata.json``.
         name: The data set's.
 
     Raises:
-        BidexError: One is a dictionary, discrete, an image, or anything else than a Box of one dimension.
+        BidexError: One is anything else than a Box of one dimension.
     """
     for what, entry in _SPACES.items():
         space = _space(content, entry)
@@ -36,10 +36,10 @@ def numbers(stored: Any, what: str, name: str, length: int | None = None) -> np.
         stored: HDF5's group or dataset.
         what: Minari's name of the array: ``observations``, ``rewards``, ...
         name: The data set's.
-        length: How many there must be; None: any number.
+        length: Required length; None: any.
 
     Raises:
-        BidexError: It is a group of several, of another number of dimensions or length, or holds no numbers.
+        BidexError: It is a group, has another shape, or holds no numbers.
     """
     if not hasattr(stored, "shape"):
         raise _not_flat(name, what, f"a group of {shortened(', '.join(stored))}")
@@ -52,7 +52,7 @@ def numbers(stored: Any, what: str, name: str, length: int | None = None) -> np.
 
 
 def action_bounds(content: Mapping[str, Any], name: str, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Least and largest actions, (a,) each, float64: what becomes -1 and 1 here.
+    """Least and largest actions, (a,) each, float64, which become -1 and 1 here.
 
     Args:
         content: All of ``metadata.json``.
@@ -60,7 +60,7 @@ def action_bounds(content: Mapping[str, Any], name: str, size: int) -> tuple[np.
         size: Actions, a.
 
     Raises:
-        BidexError: They are not told, not finite, or not one below the other.
+        BidexError: There are none, or not finite and rising ones.
     """
     space = _space(content, "action_space")
     try:
@@ -69,22 +69,22 @@ def action_bounds(content: Mapping[str, Any], name: str, size: int) -> tuple[np.
         low = high = np.zeros(0)
     fits = low.shape == high.shape == (size,)
     if not fits or not np.isfinite([low, high]).all() or (low >= high).any():
-        told = " to ".join(shortened(space.get(end)) for end in ("low", "high"))
+        got = " to ".join(shortened(space.get(end)) for end in ("low", "high"))
         raise BidexError(
-            f"Expected finite bounds of the {size} actions of {name}, which become -1 and 1, got {told}. Store it "
+            f"Expected finite bounds of the {size} actions of {name}, which become -1 and 1, got {got}. Store it "
             "with an action_space that has them."
         )
     return low, high
 
 
 def _space(content: Mapping[str, Any], entry: str) -> dict[str, Any]:
-    """A space in Minari's words, JSON within JSON; empty where none is told."""
-    told = content.get(entry)
+    """A space as Minari writes it, JSON within JSON; empty without one."""
+    space = content.get(entry)
     try:
-        found = json.loads(told) if isinstance(told, str) else told
+        space = json.loads(space) if isinstance(space, str) else space
     except (ValueError, RecursionError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return space if isinstance(space, dict) else {}
 
 
 def _not_flat(name: str, what: str, found: str) -> BidexError:

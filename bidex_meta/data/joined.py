@@ -1,7 +1,6 @@
 """Data sets in memory as one, in the form of the world that a policy is learned for.
 
-Observations of an episode stand one behind the other, each once: a transition leads from its place to the next one.
-That is half of what two tensors of observations would take.
+Each observation of an episode is held once, in half of the memory that observations and next observations would take.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -16,7 +15,7 @@ from bidex_meta.data.dataset import Dataset
 from bidex_meta.data.episode import Episode
 from bidex_meta.errors import BidexError, unknown_name
 from bidex_meta.memory import check_memory
-from bidex_meta.points.sight import POINT_ENTRIES
+from bidex_meta.points.depth_sensor import POINT_ENTRIES
 from bidex_meta.world.contract import VectorWorld
 
 
@@ -27,7 +26,7 @@ class Joined:
     observations: Tensor
     """All states, episode after episode, (N + E, d), float32."""
     at: Tensor
-    """Place of each transition's observation, int64 (N,); the next observation stands behind it."""
+    """Row of each transition's observation, int64 (N,); the next row is its next observation."""
     actions: Tensor
     """(N, a), float32."""
     rewards: Tensor
@@ -37,24 +36,27 @@ class Joined:
     task: Tensor
     """Slot of the world, int64 (N,)."""
     left: Tensor
-    """Transitions of the same episode behind this one, int64 (N,)."""
+    """Later transitions of the same episode, int64 (N,)."""
 
     def __len__(self) -> int:
         """Transitions, N."""
         return len(self.rewards)
 
     def fingerprint(self) -> dict[str, float]:
-        """Numbers that other data would not share, for a checkpoint: a run goes on with its own data."""
-        sums = {"rewards": self.rewards, "actions": self.actions, "task": self.task}
-        return {"transitions": len(self), **{name: float(each.sum(dtype=torch.float64)) for name, each in sums.items()}}
+        """Sums by which a checkpoint recognises the data that its run must go on with."""
+        parts = {"rewards": self.rewards, "actions": self.actions, "task": self.task}
+        return {
+            "transitions": len(self),
+            **{name: float(part.sum(dtype=torch.float64)) for name, part in parts.items()},
+        }
 
 
 def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) -> Joined:
     """Reads data sets for a world.
 
-    Classes are found by the names of their slots. Of a class recorded on its own, observations get the padding and the
-    one-hot that the world shows, and rewards its scale; goals that the world hides are zero, as it shows them. Actions
-    of a data set from elsewhere are brought to [-1, 1].
+    Slots are matched by name. Observations of a class recorded on its own get the world's padding and one-hot, and
+    rewards its scale; goals that the world hides become zero. Actions of a data set from elsewhere are mapped to
+    [-1, 1].
 
     Args:
         datasets: At least one.
@@ -62,15 +64,15 @@ def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) ->
         every: Whether each of the world's classes needs data.
 
     Raises:
-        BidexError: Actions, states or clouds of another form, actions from elsewhere without bounds, a class that the
-            world does not have, one of the world's that no data set holds, or no room in memory.
+        BidexError: Actions, states or clouds of another form, actions from elsewhere without bounds, classes that do
+            not match, or too little memory.
     """
     ids = world.num_id_columns
     plain, actions = world.single_observation_space.shape[0] - ids, world.single_action_space.shape[0]
-    forms = [_Form(each, world, plain, actions) for each in datasets]
-    steps, episodes = (sum(getattr(each, name) for each in datasets) for name in ("num_steps", "num_episodes"))
-    found = {each.slots[task] for each in forms for task in np.unique(each.dataset.table["task"])}
-    missing = [name for slot, name in enumerate(world.task_names) if slot not in found]
+    forms = [_Form(dataset, world, plain, actions) for dataset in datasets]
+    steps, episodes = sum(dataset.num_steps for dataset in datasets), sum(dataset.num_episodes for dataset in datasets)
+    slots = {form.slots[task] for form in forms for task in np.unique(form.dataset.table["task"])}
+    missing = [name for slot, name in enumerate(world.task_names) if slot not in slots]
     if missing and every:
         raise BidexError(
             f"Expected data of every class, found none of {', '.join(missing)}. Add a data set, or name a suite of the "
@@ -78,19 +80,19 @@ def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) ->
         )
     needed = 4 * (steps + episodes) * (plain + ids) + steps * (4 * (actions + 1) + 1 + 3 * 8)
     check_memory(needed, f"The {steps:,} transitions", "Name fewer data sets, or record smaller ones.")
-    taken = (form.fitted(episode, ids) for form in forms for episode in form.dataset.episodes())
-    return gathered(taken, steps, episodes, plain + ids, actions)
+    fitted = (form.fitted(episode, ids) for form in forms for episode in form.dataset.episodes())
+    return gathered(fitted, steps, episodes, plain + ids, actions)
 
 
 def gathered(
     episodes: Iterable[tuple[Episode, int, np.ndarray]], steps: int, count: int, observations: int, actions: int
 ) -> Joined:
-    """Puts episodes behind each other.
+    """Concatenates episodes.
 
     Args:
-        episodes: Each with its slot, and observations (T + 1, d) as the world would show them.
+        episodes: Each with its slot, and observations (T + 1, d) in the world's form.
         steps: Transitions of all.
-        count: How many they are.
+        count: Number of episodes.
         observations: Entries of an observation, d.
         actions: Actions, a.
 
@@ -116,24 +118,24 @@ def gathered(
 
 
 class _Columns(NamedTuple):
-    """Where an observation has what, task id aside: a padded state stands before its cloud, not behind it."""
+    """Columns of an observation without its task id; padding stands before the cloud."""
 
     state: np.ndarray
-    """Columns beside the cloud, ascending."""
+    """Without the cloud, ascending."""
     cloud: np.ndarray
-    """Columns of the point cloud, point after point; none without one."""
-    told: str
-    """What cloud it is, for messages."""
+    """Of the point cloud, point after point."""
+    label: str
+    """Form of the cloud, for messages."""
 
     @staticmethod
     def of(groups: Iterable[tuple[str, Sequence[tuple[int, int]]]], size: int) -> "_Columns":
-        """Those of an observation of so many entries before the task id, by its groups' names and index ranges."""
+        """Those of ``size`` entries, by groups' names and index ranges."""
         every = np.arange(size)
         for name, parts in groups:
             if name in POINT_ENTRIES:
                 cloud = np.concatenate([np.arange(start, stop) for start, stop in parts])
-                told = f"{name} of {len(cloud) // POINT_ENTRIES[name]:,}"
-                return _Columns(np.setdiff1d(every, cloud), cloud, told)
+                label = f"{name} of {len(cloud) // POINT_ENTRIES[name]:,}"
+                return _Columns(np.setdiff1d(every, cloud), cloud, label)
         return _Columns(every, every[:0], "none")
 
 
@@ -166,10 +168,10 @@ class _Form:
         self._theirs = _Columns.of(seen, plain)
         self._bounds = dataset.action_bounds
         hide = getattr(world, "hides_goals", False) and not about.get("hides_goals", True)
-        slots: Sequence[Any] = getattr(world, "slots", ())
+        slots: Sequence[Any] = getattr(world, "slots", ())  # of Meta-World's there are none
         self._hidden = [slots[slot].task_class.layout.goal_indices() if hide else [] for slot in self.slots]
         self._check_observations(world.num_tasks > 1 and len(names) == 1)
-        own, theirs = about.get("reward_scales", {}), {s.name: s.reward_scale for s in getattr(world, "slots", ())}
+        own, theirs = about.get("reward_scales", {}), {slot.name: slot.reward_scale for slot in slots}
         self._factors = [
             theirs.get(world.task_names[slot], 1.0) / own.get(name, 1.0) if own and theirs else 1.0
             for name, slot in zip(names, self.slots, strict=True)
@@ -178,9 +180,9 @@ class _Form:
     def _check_observations(self, may_pad: bool) -> None:
         """Refuses states and clouds of other sizes; ``may_pad``: whether the world's states may be wider."""
         name, own, theirs = self.dataset.name, self._own, self._theirs
-        if own.told != theirs.told:
+        if own.label != theirs.label:
             raise BidexError(
-                f"{name} has point clouds: {own.told}, the world: {theirs.told}. Learn with the points that it was "
+                f"{name} has point clouds: {own.label}, the world: {theirs.label}. Learn with the points that it was "
                 "recorded with (--points, or [points] in the suite's file)."
             )
         here, there = len(own.state), len(theirs.state)
@@ -202,7 +204,7 @@ class _Form:
             seen[:, self._width + slot] = 1.0
         if self._bounds is not None:
             low, high = self._bounds
-            # What lies outside is clipped, as the data set's own environment does and the world would.
+            # Clipped as the data set's own environment does.
             mapped = (episode.actions - (high / 2.0 + low / 2.0)) / (high / 2.0 - low / 2.0)
             episode = replace(episode, actions=mapped.clip(-1.0, 1.0))
         if factor != 1.0:
@@ -210,7 +212,7 @@ class _Form:
         return episode, slot, seen
 
 
-def _slots(names: Sequence[str], world: Any, outside: bool) -> Iterator[int]:
+def _slots(names: Sequence[str], world: VectorWorld, outside: bool) -> Iterator[int]:
     """The world's slot of each name."""
     if outside and world.num_tasks == 1:
         yield from [0] * len(names)

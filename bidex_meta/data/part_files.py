@@ -3,14 +3,13 @@
 ::
 
     <name>/data/
-        recording.json         what is recorded here: written first, compared when the recording goes on
+        recording.json         the plan: written first, compared when the collection goes on
         part-<p>-<n>.hdf5      part n of process p: episodes, and a table of them
         main_data.hdf5         Minari's file: episode_0, episode_1, ... as links into the parts
-        metadata.json          Minari's entries, and ours under "bidex"; written last, so that it says "complete"
+        metadata.json          Minari's entries, and ours under "bidex"; written last: it marks a complete data set
 
-A part is written beside its place and renamed: it is there wholly or not at all, and with its digest (``seals.py``).
-Names alone say how far a recording has come. Each episode is a group in Minari's layout, so that
-``minari.load_dataset`` opens what is stored here, and no byte of an observation is stored twice.
+A part is written under a temporary name and renamed: it is there wholly or not at all, with its digest (``seals.py``).
+Each episode is a group in Minari's layout, so that ``minari.load_dataset`` opens it, and no byte is stored twice.
 """
 
 import io
@@ -35,7 +34,7 @@ FORMAT = 1
 """Raised when older code could no longer read what is written."""
 _PART = re.compile(r"part-(\d{1,4})-(\d{1,6})\.hdf5", re.ASCII)
 EPISODE_BYTES = 3800
-"""What HDF5 takes for an episode beside its numbers: measured 3,675 with five attributes."""
+"""Bytes of an episode in HDF5 beside its numbers: measured 3,675 with five attributes."""
 ARRAYS = {
     "observations": "observations",
     "actions": "actions",
@@ -55,7 +54,7 @@ TABLE = {
     "return": np.float64,
     "return_unscaled": np.float64,
 }
-"""Columns of the table of a part's episodes; ``variation`` (episodes, v) stands beside them, filled up with NaN."""
+"""Columns of the table of a part's episodes, beside ``variation`` (episodes, v), padded with NaN."""
 
 
 def hdf5() -> ModuleType:
@@ -74,23 +73,18 @@ def hdf5() -> ModuleType:
 
 
 def parts_of(folder: Path, process: int | None = None) -> list[Path]:
-    """The parts in a folder, by process and number.
-
-    Args:
-        folder: The folder ``data`` of a data set.
-        process: Of this one alone.
-    """
-    found = [(int(match[1]), int(match[2]), path) for path in _files(folder) if (match := _PART.fullmatch(path.name))]
-    return [path for owner, _, path in sorted(found) if process in (None, owner)]
+    """The parts in a folder ``data``, of all processes or of one, by process and number."""
+    parts = [(int(match[1]), int(match[2]), path) for path in _files(folder) if (match := _PART.fullmatch(path.name))]
+    return [path for owner, _, path in sorted(parts) if process in (None, owner)]
 
 
 def part_path(folder: Path, process: int, number: int) -> Path:
-    """Where a part lies."""
+    """Path of a part."""
     return folder / f"part-{process}-{number:05d}.hdf5"
 
 
 def remove_parts(folder: Path, process: int, keep: int) -> None:
-    """Deletes a process's parts from number ``keep`` on, and what a killed process left half written."""
+    """Deletes a process's parts from number ``keep`` on, and its half-written files."""
     for path in _files(folder):
         match = _PART.fullmatch(path.name)
         if (match and int(match[1]) == process and int(match[2]) >= keep) or path.name.startswith(f".part-{process}-"):
@@ -102,19 +96,18 @@ def _files(folder: Path) -> Iterator[Path]:
 
 
 class _Disk(io.FileIO):
-    """A file as HDF5 writes it: what the system refuses is kept, not raised.
+    """A file for HDF5 that stores the system's first error instead of raising it.
 
-    HDF5 keeps what it could not write and tries again at each close, with tracebacks from where nobody can catch them,
-    and crashes at the end of the process.
+    HDF5 would try again at each close, print tracebacks that nobody can catch, and crash at the end of the process.
 
     Attributes:
-        refused: The first refusal.
+        refused: The first error.
     """
 
     refused: OSError | None = None
 
     def write(self, data: Any, /) -> int:
-        """Writes all of it."""
+        """Writes all data."""
         left, size = memoryview(data), len(data)
         try:
             while len(left):
@@ -124,7 +117,7 @@ class _Disk(io.FileIO):
         return size
 
     def truncate(self, size: int | None = None, /) -> int:
-        """Makes the file as long as that."""
+        """Sets the file's length."""
         try:
             return super().truncate(size)
         except OSError as error:
@@ -133,12 +126,7 @@ class _Disk(io.FileIO):
 
 
 class SealedFile:
-    """A file of HDF5 while it is written: at ``commit`` it gets its digest, is forced to the disk and renamed.
-
-    Args:
-        path: Where it shall lie; nothing is there before ``commit``.
-
-    """
+    """A file of HDF5 while it is written; ``commit`` adds its digest, forces it to the disk and renames it."""
 
     def __init__(self, path: Path) -> None:
         h5, self._path = hdf5(), path
@@ -152,7 +140,7 @@ class SealedFile:
         """h5py's file, to be written into.
 
         Raises:
-            OSError: The disk did not take it; then all is forgotten.
+            OSError: The disk did not take it; the file is dropped.
         """
         try:
             yield self._file
@@ -162,7 +150,7 @@ class SealedFile:
                 raise OSError(refused.errno, refused.strerror, str(self._path))
 
     def commit(self) -> None:
-        """Puts it in its place; errors as of ``writing``."""
+        """Completes the file; errors as of ``writing``."""
         with self.writing() as file:
             file.close()
         with self.writing():
@@ -175,7 +163,7 @@ class SealedFile:
         sync_folder(self._path.parent)
 
     def abandon(self) -> None:
-        """Forgets it; nothing where it was committed."""
+        """Drops the file, unless it was committed."""
         if not self._disk.closed:
             with suppress(Exception):  # of a full disk HDF5 may read what was never written
                 self._file.close()
@@ -184,11 +172,7 @@ class SealedFile:
 
 
 class PartWriter:
-    """One part, while its episodes come in: they go to the disk at once.
-
-    Args:
-        path: Where it shall lie; nothing is there before ``commit``.
-    """
+    """One part while it is written: episodes go to the disk at once; nothing is at ``path`` before ``commit``."""
 
     def __init__(self, path: Path) -> None:
         self._sealed = SealedFile(path)
@@ -197,7 +181,7 @@ class PartWriter:
         self.steps = 0
 
     def add(self, episode: Episode) -> None:
-        """Takes an episode; errors as of ``SealedFile.writing``."""
+        """Writes an episode; errors as of ``SealedFile.writing``."""
         row = {
             "steps": len(episode),
             "task": episode.task,
@@ -209,29 +193,25 @@ class PartWriter:
             "return": float(episode.rewards.astype(np.float64).sum()),
             "return_unscaled": episode.return_unscaled,
         }
-        told = {"total_steps": len(episode), "task_name": episode.task_name, "variation": episode.variation}
+        named = {"total_steps": len(episode), "task_name": episode.task_name, "variation": episode.variation}
         with self._sealed.writing() as file:
             group = file.create_group(f"episode_{len(self._rows)}")
             for name, ours in ARRAYS.items():
                 group.create_dataset(name, data=getattr(episode, ours))
             group.create_group("infos")  # Minari prints its keys
             group.attrs.update(
-                {name: row[name] for name in ("task", "task_index", "policy", "success", "broken")} | told
+                {name: row[name] for name in ("task", "task_index", "policy", "success", "broken")} | named
             )
         self._rows.append(row)
         self._variations.append(np.asarray(episode.variation, np.float64))
         self.steps += len(episode)
 
     def commit(self, counts: dict[str, int]) -> None:
-        """Closes the part and puts it in its place.
-
-        Args:
-            counts: What was left out, by reason.
-        """
+        """Completes the part, with counts of what was left out, by reason."""
         width = max(map(len, self._variations), default=0)
         variations = np.full((len(self._rows), width), np.nan)
-        for place, variation in zip(variations, self._variations, strict=True):
-            place[: len(variation)] = variation
+        for row, variation in zip(variations, self._variations, strict=True):
+            row[: len(variation)] = variation
         with self._sealed.writing() as file:
             table = file.create_group("table")
             for name, kind in TABLE.items():
@@ -241,7 +221,7 @@ class PartWriter:
         self._sealed.commit()
 
     def abandon(self) -> None:
-        """Closes the part and forgets it; nothing where it was committed."""
+        """Drops the part, unless it was committed."""
         self._sealed.abandon()
 
 
@@ -274,17 +254,7 @@ def reading(path: Path) -> Iterator[Any]:
             yield file
     except BidexError:
         raise
-    # h5py raises whatever comes; a group in the place of an array lacks its attributes.
-    except (
-        OSError,
-        LookupError,
-        TypeError,
-        ValueError,
-        RuntimeError,
-        ArithmeticError,
-        MemoryError,
-        AttributeError,
-    ) as error:
+    except Exception as error:  # h5py raises all kinds; a group in the place of an array lacks its attributes
         reason = one_line(str(error).strip("'\"").split("(")[-1].rstrip(")"))[:200] or type(error).__name__
         raise BidexError(
             f"{path} is damaged or no part of a data set ({reason}). Delete it and record it again."

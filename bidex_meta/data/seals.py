@@ -1,8 +1,8 @@
 """Digests of a data set's files, so that no flipped bit is read in silence.
 
-A file of HDF5 may begin with a block of an application's own, the user block; ours says how long the file is and which
-CRC-32 all behind the block has. In ``metadata.json`` the last entry is the digest of all before it. CRC-32 finds every
-single flipped bit, and other damages but for one in four billion; it is no protection against intent.
+The user block of a file of HDF5 holds the file's length and the CRC-32 of all that follows the block. In
+``metadata.json`` the last entry is the digest of all before it. CRC-32 finds every single flipped bit and all but one
+in four billion other damages; it is no protection against intent.
 """
 
 import json
@@ -20,11 +20,11 @@ _HDF5 = b"\x89HDF\r\n\x1a\n"
 _PIECE = 1 << 20
 _LAST = ',\n  "digest": '
 _MARK = "sealed"
-"""Entry of ours in the metadata, beside the digest itself: one flipped bit cannot take away both."""
+"""Entry in the metadata beside the digest: one flipped bit cannot remove both."""
 
 
 def block(file: IO[bytes]) -> bytes:
-    """The user block that belongs in front of what stands behind it in an open file."""
+    """The user block for the content of an open file."""
     length, digest = file.seek(0, 2), 0
     file.seek(BLOCK)
     while piece := file.read(_PIECE):
@@ -37,7 +37,7 @@ def _line(length: int, digest: str) -> bytes:
 
 
 def check_file(path: Path) -> bool:
-    """Holds a file of HDF5 to its digest, reading all of it; false for one without, written before there were any.
+    """Checks the digest of a file of HDF5, reading all of it; false for one without.
 
     Raises:
         BidexError: It is no file, or has changed since it was written.
@@ -53,11 +53,7 @@ def check_file(path: Path) -> bool:
 
 
 def sealed_text(content: dict[str, Any]) -> bytes:
-    """A data set's metadata as JSON, an entry a line at the top alone (the spaces are long lists), with a digest.
-
-    Args:
-        content: With ours under ``bidex``.
-    """
+    """A data set's metadata, ours under ``bidex``, as JSON with one entry a line and a digest."""
     content = content | {"bidex": content["bidex"] | {_MARK: True}}
     rows = [f"  {json.dumps(name)}: {json.dumps(value)}" for name, value in content.items() if name != "digest"]
     text = ("{\n" + ",\n".join(rows)).encode()
@@ -69,7 +65,7 @@ def _ending(text: bytes) -> bytes:
 
 
 def check_text(path: Path, data: bytes) -> bool:
-    """Holds metadata to their digest; false for those without.
+    """Checks the digest of metadata; false for those without.
 
     Raises:
         BidexError: They have changed since they were written.

@@ -1,12 +1,14 @@
-"""A data set as it is written: parts that are there wholly or not at all, then the index."""
+"""A data set as it is written: its path and name, parts that are there wholly or not at all, then the index."""
 
 import contextlib
 import json
 import math
 import os
+import re
 import shutil
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +16,92 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from bidex_meta.data import part_files, seals
-from bidex_meta.data.dataset import valid_name
+from bidex_meta.data.dataset import data_folder
 from bidex_meta.data.episode import Episode
 from bidex_meta.errors import BidexError, shortened
-from bidex_meta.reading import check, exists, is_file, read_json, whole
+from bidex_meta.outside import short_name
+from bidex_meta.reading import absolute, exists, expanded, is_file, read_json
 from bidex_meta.record import RunFolder
 from bidex_meta.record.atomic import check_writable, remove_leftovers, write_atomic, write_json
+from bidex_meta.validation import Threads, parse
 
+_MARGIN = 1.05
+"""What file systems take beside the files."""
 _MINARI = "0.5.0"
 """The version of Minari whose layout is written."""
+_NAME = re.compile(r"(?:[-\w]+/)*[-\w]+-v\d{1,4}", re.ASCII)
+"""Names that Minari takes: words of letters, digits, - and _, parted by /, and a version such as -v0."""
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What is read again of a collection's plan."""
+
+    threads: Threads | None = None
+
+
+def default_name(subject: str, kind: str) -> str:
+    """The name of a new data set: ``CatchUnderarm/random-v0``.
+
+    Args:
+        subject: A suite, a suite file's path, or a class.
+        kind: ``random``, ``medium``, ...
+    """
+    words = [re.sub(r"[^\w-]+", "-", word) for word in subject.split("/")]
+    if subject.endswith(".toml"):
+        words = [re.sub(r"[^\w-]+", "-", Path(subject).stem)]
+    if ":" in subject:
+        words = [short_name(subject)]
+    return f"{'/'.join(words)}/{kind}-v0"
+
+
+def dataset_path(out: Path | None, subject: str, kind: str) -> tuple[Path, str]:
+    """Folder and name of a new data set.
+
+    Args:
+        out: Its folder; None: ``default_name`` in the data folder.
+        subject: A suite or a class.
+        kind: ``random``, ``medium``, ...
+    """
+    root, usual = data_folder(), default_name(subject, kind)
+    if out is None:
+        return root / usual, usual
+    folder = expanded(out)
+    try:
+        name = absolute(folder).relative_to(absolute(root)).as_posix()
+    except ValueError:
+        name = "/".join(folder.parts[-2:])
+    return folder, next((n for n in (name, folder.name, usual) if _NAME.fullmatch(n)), usual)
+
+
+def check_name(name: str) -> None:
+    """Refuses a name that Minari would not take.
+
+    Raises:
+        BidexError: It would not.
+    """
+    if not _NAME.fullmatch(name):
+        raise BidexError(f"Expected a name such as CatchUnderarm/random-v0, got {name!r}. Name another path by --out.")
+
+
+def check_room(folder: Path, needed: int, what: str) -> None:
+    """Refuses what does not fit on the disk.
+
+    Args:
+        folder: Where it goes; folders above it may be missing.
+        needed: Bytes.
+        what: What takes them, for the message.
+
+    Raises:
+        BidexError: There are fewer.
+    """
+    there = next(above for above in (folder.absolute(), *folder.absolute().parents) if exists(above))
+    free = shutil.disk_usage(there).free
+    if needed * _MARGIN > free:
+        raise BidexError(
+            f"{what} would take about {needed / 1e9:,.1f} GB, and {free / 1e9:,.1f} are free at {there}. Lower --size, "
+            "or name another path by --out."
+        )
 
 
 class DatasetWriter:
@@ -31,11 +110,11 @@ class DatasetWriter:
     Args:
         folder: The data set's folder; its name within the data folder is how it is opened.
         process: Number of this process; each has parts of its own.
-        keep: Parts of this process that stay: those that the state knows from which the recording goes on.
+        keep: Parts of this process that stay; later ones are deleted.
 
     Attributes:
         parts: How many this process has committed.
-        left_out: Counts, by reason, of what was not stored since the last commit; whoever records adds to it.
+        left_out: Counts, by reason, of what was not stored since the last commit; the collector adds to it.
     """
 
     def __init__(self, folder: Path, process: int = 0, keep: int = 0) -> None:
@@ -58,7 +137,7 @@ class DatasetWriter:
         self._part.add(episode)
 
     def commit(self) -> None:
-        """Makes a part of what was added since the last time; nothing where nothing was."""
+        """Makes a part of what was added since the last one, if anything was."""
         if self._part is None and not self.left_out:
             return
         part = self._part or part_files.PartWriter(part_files.part_path(self.folder, self.process, self.parts))
@@ -66,7 +145,7 @@ class DatasetWriter:
         self._part, self.parts, self.left_out = None, self.parts + 1, Counter()
 
     def close(self) -> None:
-        """Forgets what was not committed."""
+        """Drops what was not committed."""
         if self._part is not None:
             self._part.abandon()
             self._part = None
@@ -74,43 +153,43 @@ class DatasetWriter:
 
 @contextlib.contextmanager
 def claimed(folder: Path, plan: dict[str, Any]) -> Iterator[None]:
-    """Keeps other processes from recording into a folder, from before anything is written there to the end.
+    """Locks a folder against other processes, from before anything is written there to the end.
 
-    The folder is made for that, and gone again where nothing was written into it. Arguments and errors as of
-    ``check_place``.
+    It creates the folder, and removes it again if nothing was written into it. Arguments and errors as of
+    ``has_begun``.
 
     Raises:
         BidexError: Another process records there.
     """
-    message = f"Another process records into {folder}. Wait for its end, or name another place by --out."
-    missing = [each for each in (folder, *folder.parents) if not exists(each)]
+    message = f"Another process records into {folder}. Wait for its end, or name another path by --out."
+    missing = [above for above in (folder, *folder.parents) if not exists(above)]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = contextlib.ExitStack()
         lock.enter_context(RunFolder(folder).locked(message))
     except OSError as error:
-        raise BidexError(f"{folder} cannot be written: {error.strerror}. Name another place by --out.") from None
+        raise BidexError(f"{folder} cannot be written: {error.strerror}. Name another path by --out.") from None
     with lock:
         if not folder.is_dir():
-            raise BidexError(message)  # made and taken away by one that was refused
+            raise BidexError(message)  # a process that was refused has removed it
         try:
-            check_place(folder, plan)
+            has_begun(folder, plan)
             yield
         finally:
             with contextlib.suppress(OSError):  # not empty
-                for each in missing:
-                    each.rmdir()
+                for above in missing:
+                    above.rmdir()
 
 
 def begin(folder: Path, plan: dict[str, Any]) -> None:
-    """Writes down what is recorded; arguments and errors as of ``check_place``."""
-    if not check_place(folder, plan):
+    """Writes the plan of a collection; arguments and errors as of ``has_begun``."""
+    if not has_begun(folder, plan):
         (folder / "data").mkdir(parents=True, exist_ok=True)
         write_json(folder / "data" / part_files.RECORDING, plan)
 
 
-def begun(folder: Path) -> dict[str, Any]:
-    """The plan of a recording that has begun in a folder; empty without one.
+def stored_plan(folder: Path) -> dict[str, Any]:
+    """The plan of a collection that has begun in a folder; empty without one.
 
     Raises:
         BidexError: The file holds something else.
@@ -119,16 +198,16 @@ def begun(folder: Path) -> dict[str, Any]:
     if not is_file(path):
         return {}
     plan = read_json(path, "a recording's plan")
-    check(plan, {"threads": whole(1, 4096)}, path)
+    parse(plan, _Plan, str(path))
     return plan
 
 
-def check_place(folder: Path, plan: dict[str, Any]) -> bool:
-    """Whether the same recording has begun here, so that the same command goes on with it and no other one does.
+def has_begun(folder: Path, plan: dict[str, Any]) -> bool:
+    """Whether the same collection has begun here, so that the same command goes on with it.
 
     Args:
         folder: The data set's folder.
-        plan: Everything that decides what is recorded, ready for JSON.
+        plan: Everything that decides what is collected, ready for JSON.
 
     Raises:
         BidexError: The folder holds a complete data set, the recording of something else, or something else.
@@ -139,19 +218,19 @@ def check_place(folder: Path, plan: dict[str, Any]) -> bool:
     if is_file(inner / part_files.METADATA) and not is_file(path):
         raise BidexError(f"{folder} holds a complete data set. Name another by --out, or delete it.")
     if is_file(path):
-        before = begun(folder)
+        before = stored_plan(folder)
         differ = sorted(name for name in before.keys() | plan.keys() if before.get(name) != plan.get(name))
         if differ:
-            old, new = (shortened(each.get(differ[0])) for each in (before, plan))
+            old, new = (shortened(one.get(differ[0])) for one in (before, plan))
             raise BidexError(
                 f"{folder} is a recording that has not ended, with {differ[0]} {old}, not {new}. "
-                "Give its own command to go on, or name another place by --out."
+                "Give its own command to go on, or name another path by --out."
             )
         return True
     if inner.is_dir():
-        remove_leftovers(inner)  # of a recording that was killed as it began
+        remove_leftovers(inner)  # of a collection that was killed as it began
     if folder.exists() and any(folder.iterdir()) and not (inner.is_dir() and not any(inner.iterdir())):
-        raise BidexError(f"{folder} exists and is not empty. Name another place by --out.")
+        raise BidexError(f"{folder} exists and is not empty. Name another path by --out.")
     check_writable(path)
     return False
 
@@ -164,49 +243,45 @@ def finish(folder: Path, name: str, observations: Box, actions: Box, metadata: d
         name: Its name, as Minari takes it: ``CatchUnderarm/random-v0``.
         observations: Space of one observation, (d,).
         actions: Space of one action, (a,).
-        metadata: What ``Dataset.metadata`` tells; ``tasks`` must be there. ``left_out`` is added.
+        metadata: Our entry; ``tasks`` must be there, ``left_out`` is added.
 
     Raises:
         BidexError: Minari would not take the name, or a part is damaged.
     """
-    if not valid_name(name):
-        raise BidexError(f"Expected a name such as CatchUnderarm/random-v0, got {name!r}. Name another place by --out.")
+    check_name(name)
     inner = folder / "data"
     parts = part_files.parts_of(inner)
     steps = [part_files.read_table(path)["steps"] for path in parts]
     part_files.write_main(inner, parts)
-    ours = {"format": part_files.FORMAT, **metadata, "left_out": left_out(inner)}
-    size = sum(path.stat().st_size for path in parts)
     content = {
         "total_episodes": sum(map(len, steps)),
-        "total_steps": int(sum(each.sum() for each in steps)),
+        "total_steps": int(sum(of_part.sum() for of_part in steps)),
         "data_format": "hdf5",
         "observation_space": _space(observations),
         "action_space": _space(actions),
         "dataset_id": name,
         "minari_version": _MINARI,
-        "dataset_size": round(size / 1e6, 1),
+        "dataset_size": round(sum(path.stat().st_size for path in parts) / 1e6, 1),
         "algorithm_name": str(metadata.get("kind", "")),
         "requirements": [],
-        "bidex": ours,
+        "bidex": {"format": part_files.FORMAT, **metadata, "left_out": left_out(inner)},
     }
     _write_metadata(inner, content)
     (inner / part_files.RECORDING).unlink(missing_ok=True)
 
 
 def adopt(inner: Path, folder: Path, name: str) -> None:
-    """Makes a complete data set of another one's files: links to them, or copies on another disk.
+    """Publishes the files of a data set under another name: as links, or as copies on another disk.
 
     Args:
-        inner: The folder ``data`` of the other one.
+        inner: The folder ``data`` of the first one.
         folder: The new data set's folder.
         name: Its name.
 
     Raises:
         BidexError: There is something in the folder already, or Minari would not take the name.
     """
-    if not valid_name(name):
-        raise BidexError(f"Expected a name such as CatchUnderarm/replay-v0, got {name!r}. Name another place by --out.")
+    check_name(name)
     with claimed(folder, plan := {"kind": "replay", "of": str(inner.resolve())}):
         begin(folder, plan)
         new = folder / "data"
@@ -214,7 +289,7 @@ def adopt(inner: Path, folder: Path, name: str) -> None:
         if "bidex" not in content:
             raise BidexError(f"{inner} holds no recording of a run. Train one that records: bidex-meta run --record N.")
         for path in [*part_files.parts_of(inner), inner / part_files.MAIN]:
-            (new / path.name).unlink(missing_ok=True)  # of one that was killed, or found no room
+            (new / path.name).unlink(missing_ok=True)  # left by a command that was killed or found no room
             try:
                 os.link(path, new / path.name)
             except OSError:
@@ -224,7 +299,7 @@ def adopt(inner: Path, folder: Path, name: str) -> None:
 
 
 def left_out(inner: Path) -> dict[str, int]:
-    """What all parts say that was left out, by reason."""
+    """Counts over all parts of what was left out, by reason."""
     counts: Counter[str] = Counter()
     for path in part_files.parts_of(inner):
         with part_files.reading(path) as file:
@@ -237,13 +312,13 @@ def _write_metadata(inner: Path, content: dict[str, Any]) -> None:
 
 
 def _space(space: Box) -> str:
-    """A space in the words that Minari reads."""
+    """A space as Minari writes it."""
     entries = {"type": "Box", "dtype": str(np.dtype(space.dtype)), "shape": list(space.shape)}
     return json.dumps(entries | {"low": space.low.tolist(), "high": space.high.tolist()})
 
 
 def estimated_bytes(steps: int, observation_size: int, action_size: int, episode_steps: float) -> int:
-    """Bytes on the disk of so many transitions.
+    """Bytes on the disk, estimated.
 
     Args:
         steps: Transitions.

@@ -6,10 +6,8 @@ from typing import Any
 import numpy as np
 
 from bidex_meta.agents import Agent
-from bidex_meta.points.camera import camera_of
-from bidex_meta.points.cloud import Cloud
-from bidex_meta.points.pictures import beside, draw
-from bidex_meta.points.sight import CANDIDATES
+from bidex_meta.points.cloud import Cloud, beside, camera_of, draw
+from bidex_meta.points.depth_sensor import CANDIDATES
 from bidex_meta.points.surfaces import sample
 from bidex_meta.record.video import tiled
 

@@ -1,1 +1,1 @@
-"""The pair of hands: scene part, joints, actuators and their share of the observation."""
+"""The pair of hands: scene part, joints, start poses and angles, units as agents."""

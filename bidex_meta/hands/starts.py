@@ -1,4 +1,4 @@
-"""Joint angles at the start of an episode, and room for what lies on the hand (docs/figures.md, start noise)."""
+"""Joint angles at the start of an episode, and room for an object on the hand (docs/figures.md, start noise)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -66,14 +66,11 @@ def _thumb() -> list[int]:
 
 
 def noisy_joints(draws: Tensor, scale: float) -> Tensor:
-    """Joint angles clip(scale * range * u, limits), distal joints by the coupling, neighbouring fingers uncrossed.
+    """Joint angles (n, 24), rad: clip(scale * range * u, limits), distal joints coupled, neighbours uncrossed.
 
     Args:
         draws: u in [-1, 1], shape (n, 24).
         scale: Joint noise of the class, a share of each joint's range.
-
-    Returns:
-        Angles, rad, shape (n, 24).
     """
     low, high = (constant(tuple(x.tolist()), draws) for x in (hand().low, hand().high))
     where = _indices(draws.device)

@@ -1,29 +1,40 @@
 """Fingers and palms as agents: partitions of the hands' units as a user writes them (appendix A.2). Imports no torch.
 
-A partition is one line of text, which a run's config and its checkpoints keep:
+A partition is one line of text, which a run's config and its checkpoints hold:
 
 * ``single``: one agent is both hands; ``hands``: one agent a hand; ``fingers``: each unit by itself, twelve agents;
 * ``thrower=right/palm+right/thumb;helper=...``: agents by name, with the units that each has;
 * the path of a TOML file with a table ``[agents]`` of the same: ``thrower = ["right/palm", "right/thumb"]``.
 """
 
-import tomllib
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
+
+from msgspec import Meta
 
 from bidex_meta.errors import BidexError
+from bidex_meta.reading import expanded, read_toml
+from bidex_meta.validation import Text, parse
 
 UNITS: dict[str, str] = {
     "palm": "WR", "first": "FF", "middle": "MF", "ring": "RF", "little": "LF", "thumb": "TH",
 }  # fmt: skip
-"""The smallest agents of a hand, with what the names of their joints begin with. The palm has the wrist, and the base
-where it moves."""
+"""The smallest agents of a hand, with the prefix of their joints' names. The palm has the wrist, and the base where it
+moves."""
 NAMED = ("single", "hands", "fingers")
 """Partitions that need no list."""
 
 Agents = str | Path | Mapping[str, Sequence[str]]
 """A partition: a name of :data:`NAMED`, a line, a TOML file, or units by the agent's name."""
+
+
+@dataclass(frozen=True)
+class _Partition:
+    """Units by the agent's name."""
+
+    agents: Annotated[dict[Text, Annotated[list[Text], Meta(min_length=1)]], Meta(min_length=1)]
 
 
 def partition_line(agents: Agents) -> str:
@@ -32,16 +43,16 @@ def partition_line(agents: Agents) -> str:
     Whether all units are there, and each once, is checked where the world is known (``agent_views``).
 
     Raises:
-        BidexError: A file that cannot be read, or what names no agents.
+        BidexError: A file that cannot be read, or no agents in it.
     """
     if isinstance(agents, Mapping):
-        return _line(agents, "agents")
+        return _line({"agents": dict(agents)}, "partition")
     text = str(agents)
     if text.endswith(".toml"):
-        return _line(_read(Path(text).expanduser()), text)
+        return _line(read_toml(expanded(text), "a partition of agents"), text)
     if text in NAMED:
         return text
-    return _line(units_by_agent(text), "agents")
+    return _line({"agents": units_by_agent(text)}, "partition")
 
 
 def units_by_agent(line: str) -> dict[str, list[str]]:
@@ -63,28 +74,9 @@ def units_by_agent(line: str) -> dict[str, list[str]]:
     return found
 
 
-def _read(file: Path) -> Any:
-    """The table ``[agents]`` of a file."""
-    try:
-        content = tomllib.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise BidexError(f"agents: expected a file at {file}, but {error.strerror or error}. Mend the path.") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise BidexError(f"{file}: expected TOML in UTF-8, but {error}.") from error
-    if list(content) != ["agents"]:
-        raise BidexError(f"{file}: expected one table [agents], got {', '.join(content) or 'nothing'}.")
-    return content["agents"]
-
-
-def _line(agents: Any, where: str) -> str:
-    """Agents with their units, as one line."""
-    example = 'thrower = ["right/palm", "right/thumb"]'
-    if not isinstance(agents, Mapping) or not agents:
-        raise BidexError(f"{where}: expected at least one agent with its units, got {agents!r}. Add {example}.")
+def _line(content: object, where: str) -> str:
+    agents = parse(content, _Partition, where, exact=True).agents
     for name, units in agents.items():
-        texts = (
-            isinstance(units, list | tuple) and bool(units) and all(isinstance(unit, str) and unit for unit in units)
-        )
-        if not texts or any(sign in text for text in (name, *units) for sign in ";=+"):
-            raise BidexError(f"{where}: {name}: expected a list of units, such as {example}, got {units!r}.")
+        if any(sign in text for text in (name, *units) for sign in ";=+"):
+            raise BidexError(f"{where}: agents.{name}: expected names without ; = and +, got {units!r}.")
     return ";".join(f"{name}={'+'.join(units)}" for name, units in agents.items())

@@ -1,1 +1,1 @@
-"""Point clouds: what a depth camera would see of every row, from points fixed on the surfaces of geoms."""
+"""Point clouds: what a depth camera would see of every environment, from points fixed on the surfaces of geoms."""

@@ -1,31 +1,79 @@
-"""From the poses of bodies to what a depth camera sees of them: torch operations on all rows, no loop over rows.
-
-A candidate is seen if it faces the camera, lies in its frustum, and nothing nearer was drawn around its pixel of a
-coarse depth buffer. Shapes depend on no value, so that CUDA graphs can hold it.
-"""
+"""A depth camera, point clouds of what it sees, and pictures of clouds: torch operations on all environments."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from bidex_meta.tasks.base import TaskClass
+
+
 import torch
 from torch import Tensor
 
-from bidex_meta.points.camera import Camera
-from bidex_meta.points.surfaces import Surfaces
+from bidex_meta.points.surfaces import FIXTURE, HAND, OBJECT, Surfaces
+
+_DIRECTION = (0.49, 0.0, 0.75)
+"""From the target to the camera, of HandOver in the original code."""
+FIELD_OF_VIEW = 60.0
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera with a square image, upright.
+
+    Attributes:
+        eye: Its position, world, metres.
+        target: Point in the middle of its image, world, metres.
+        field_of_view: Full angle of the image, degrees.
+        near: Nearest distance that it sees, metres.
+        far: Farthest distance that it sees, metres.
+    """
+
+    eye: tuple[float, float, float]
+    target: tuple[float, float, float]
+    field_of_view: float = FIELD_OF_VIEW
+    near: float = 0.05
+    far: float = 10.0
+
+    @property
+    def axes(self) -> np.ndarray:
+        """Unit vectors to the right, down and forward in the image, as rows, (3, 3)."""
+        forward = np.subtract(self.target, self.eye)
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, (0.0, 0.0, 1.0))
+        right /= np.linalg.norm(right)
+        return np.stack((right, np.cross(forward, right), forward))
+
+    @property
+    def focal(self) -> float:
+        """Focal length in widths of the image."""
+        return float(0.5 / np.tan(np.radians(0.5 * self.field_of_view)))
+
+
+def camera_of(task: "TaskClass") -> Camera:
+    """The depth camera of a class: its own, or one that looks down at the target of its pictures."""
+    if task.depth_camera is not None:
+        return Camera(*task.depth_camera)
+    away = np.array(_DIRECTION) / np.linalg.norm(_DIRECTION)
+    x, y, z = np.array(task.camera_target) + task.camera_distance * 0.8 * away
+    return Camera((float(x), float(y), float(z)), task.camera_target)
+
 
 _CHUNK = 32
-"""Rows that a CPU computes at once: what they need fits its cache."""
+"""Environments that a CPU computes at once: their numbers fit its cache."""
 
 
 @dataclass(frozen=True)
 class Sharpness:
-    """How finely hidden points are told from seen ones.
+    """Tolerances of the visibility test.
 
     Attributes:
         pixels: Width and height of the depth buffer.
-        depth: How far behind the nearest depth around its pixel a point may lie, metres.
-        slope: The same for surfaces that are seen at a slant, as a share of what depth changes across a pixel.
-        most: Most that slant may add, metres.
+        depth: How far behind the nearest depth around its pixel a visible point may lie, metres.
+        slope: Addition for slanted surfaces, as a share of the change of depth across a pixel.
+        most: Largest such addition, metres.
     """
 
     pixels: int = 128
@@ -35,18 +83,21 @@ class Sharpness:
 
 
 class Cloud:
-    """Clouds of rows of one model.
+    """Clouds of environments of one model.
+
+    A candidate is visible if it faces the camera, lies in its frustum, and nothing nearer was drawn around its pixel of
+    a coarse depth buffer. Shapes depend on no value, so that CUDA graphs can hold it.
 
     Args:
         surfaces: The candidates, P.
-        camera: What sees them.
+        camera: The depth camera.
         count: Points of a cloud.
-        kinds: Whether each point has a fourth entry, what it is of (``surfaces.FIXTURE``, ...).
+        kinds: Whether each point has a fourth entry, its kind (``surfaces.FIXTURE``, ...).
         device: Where to compute.
-        sharpness: How hidden points are found.
+        sharpness: Tolerances.
 
     Attributes:
-        shape: Of a row's cloud, (count, 3) or (count, 4).
+        shape: Of a cloud, (count, 3) or (count, 4).
     """
 
     def __init__(
@@ -77,10 +128,9 @@ class Cloud:
         self._size = len(surfaces.points)
 
     def __call__(self, position: Tensor, rotation: Tensor) -> Tensor:
-        """Clouds of n rows, in the rows' frames, metres: (n, *shape), float32. A row that sees nothing gets zeros.
+        """Clouds of n environments, world frame, metres: (n, *shape), float32; zeros where nothing is visible.
 
-        Where fewer candidates are seen than a cloud has points, some stand there several times; where more, every so
-        many-th of them is left out. What is not seen changes nothing, to the last bit.
+        Fewer visible candidates than points are repeated, of more an even share is taken. Hidden ones change no bit.
 
         Args:
             position: Of the model's bodies, metres, (n, nbody, 3).
@@ -102,11 +152,11 @@ class Cloud:
         cloud = chosen @ self._axes + self._eye
         if self._kinds is not None:
             cloud = torch.cat((cloud, self._kinds[index][..., None]), dim=2)
-        # where, not a product: candidates of a row whose physics broke are NaN.
+        # where, not a product: where physics broke, candidates are NaN.
         return torch.where(total[..., None] > 0, cloud, 0.0)
 
     def seen(self, position: Tensor, rotation: Tensor) -> Tensor:
-        """Which candidates are seen, (n, P), bool; arguments as those of a call."""
+        """Which candidates are visible, (n, P), bool; arguments as of a call."""
         return self._seen(*self._in_camera(position, rotation))
 
     def _in_camera(self, position: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -128,7 +178,7 @@ class Cloud:
         focal = camera.focal * s.pixels
         scale = focal / depth
         column, row = x * scale + 0.5 * s.pixels, y * scale + 0.5 * s.pixels
-        # False where NaN: a row whose physics broke sees nothing.
+        # False for NaN, where physics broke.
         inside = (column >= 0) & (column < s.pixels) & (row >= 0) & (row < s.pixels)
         candidate = inside & (depth > camera.near) & (depth < camera.far) & (facing > 0)
         pixel = torch.where(candidate, row.floor() * s.pixels + column.floor(), 0.0).long()
@@ -145,7 +195,7 @@ class Cloud:
 
 
 def _spread(buffer: Tensor) -> Tensor:
-    """Each pixel gets the nearest of itself and its eight neighbours: what is drawn there hides what lies behind."""
+    """The minimum over each pixel and its eight neighbours."""
     wide = buffer.clone()
     torch.minimum(wide[:, :, 1:], buffer[:, :, :-1], out=wide[:, :, 1:])
     torch.minimum(wide[:, :, :-1], buffer[:, :, 1:], out=wide[:, :, :-1])
@@ -153,3 +203,46 @@ def _spread(buffer: Tensor) -> Tensor:
     torch.minimum(tall[:, 1:], wide[:, :-1], out=tall[:, 1:])
     torch.minimum(tall[:, :-1], wide[:, 1:], out=tall[:, :-1])
     return tall
+
+
+_BACK = (24, 26, 30)
+_COLOURS = {FIXTURE: (120, 126, 138), HAND: (92, 160, 235), OBJECT: (245, 150, 60)}
+_DOT = 0.0035
+"""Radius of a dot, metres."""
+
+
+def beside(camera: Camera) -> Camera:
+    """A camera at the same distance from the same target, from the side."""
+    far = float(np.linalg.norm(np.subtract(camera.eye, camera.target)))
+    x, y, z = camera.target
+    return Camera((x, y - 0.94 * far, z + 0.34 * far), camera.target, camera.field_of_view)
+
+
+def draw(cloud: np.ndarray, camera: Camera, width: int, height: int) -> np.ndarray:
+    """A picture (height, width, 3), uint8, of a cloud.
+
+    Args:
+        cloud: Points (n, 4): world, metres, and their kinds (``surfaces.FIXTURE``, ...).
+        camera: Its field of view fits the smaller side of the picture.
+        width: Pixels.
+        height: Pixels.
+    """
+    picture = np.empty((height, width, 3), np.uint8)
+    picture[:] = _BACK
+    seen = (cloud[:, :3] - camera.eye) @ camera.axes.T
+    kept = (seen[:, 2] > camera.near) & np.isfinite(seen).all(axis=1)
+    seen, kinds = seen[kept], cloud[kept, 3]
+    if not len(seen):
+        return picture
+    scale = camera.focal * min(width, height) / seen[:, 2]
+    columns, rows = seen[:, 0] * scale + 0.5 * width, seen[:, 1] * scale + 0.5 * height
+    near, far = seen[:, 2].min(), seen[:, 2].max()
+    light = 1.0 - 0.55 * (seen[:, 2] - near) / max(far - near, 1e-6)
+    down, across = np.mgrid[:height, :width]
+    for i in np.argsort(-seen[:, 2]):
+        size = max(_DOT * scale[i], 0.8)
+        top, left = max(int(rows[i] - size), 0), max(int(columns[i] - size), 0)
+        part = (slice(top, int(rows[i] + size) + 2), slice(left, int(columns[i] + size) + 2))
+        dot = (down[part] - rows[i]) ** 2 + (across[part] - columns[i]) ** 2 <= size * size
+        picture[part][dot] = (light[i] * np.array(_COLOURS[float(kinds[i])])).astype(np.uint8)
+    return picture

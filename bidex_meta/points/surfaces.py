@@ -1,18 +1,190 @@
-"""Points on all that can be seen of a scene, fixed to its bodies: the candidates that a cloud is cut from."""
+"""Points with normals on the visible surfaces of a scene, fixed to its bodies: the candidates of a cloud.
 
+Surfaces are of MuJoCo's primitives and meshes in a geom's own frame, sizes those of ``mjModel.geom_size`` (metres). The
+formulas are textbook geometry; even coverage comes from the additive recurrence R2 (Roberts 2018, "The Unreasonable
+Effectiveness of Quasirandom Sequences").
+"""
+
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
 from bidex_meta.errors import BidexError
-from bidex_meta.hands.pair import SIDES
-from bidex_meta.points.solids import DRAWN, area, inside, surface
+from bidex_meta.hands.hand import SIDES
+
+Surface = tuple[np.ndarray, np.ndarray]
+"""Points (n, 3) in metres and outward unit normals (n, 3), in the geom's frame."""
+_PLASTIC = 1.32471795724474602596
+_STEP = np.array([1.0 / _PLASTIC, 1.0 / _PLASTIC**2])
+_Kind = mujoco.mjtGeom
+_SPHERE, _ELLIPSOID, _CAPSULE = int(_Kind.mjGEOM_SPHERE), int(_Kind.mjGEOM_ELLIPSOID), int(_Kind.mjGEOM_CAPSULE)
+_CYLINDER, _BOX, _MESH = int(_Kind.mjGEOM_CYLINDER), int(_Kind.mjGEOM_BOX), int(_Kind.mjGEOM_MESH)
+DRAWN = frozenset((_SPHERE, _ELLIPSOID, _CAPSULE, _CYLINDER, _BOX, _MESH))
+"""Types of geoms that have a surface here: all but planes and height fields."""
+
+
+def even_numbers(count: int, offset: np.ndarray) -> np.ndarray:
+    """Evenly spread pairs in [0, 1), shape (count, 2), from an offset (2,)."""
+    return (offset + np.arange(1, count + 1)[:, None] * _STEP) % 1.0
+
+
+def area(model: mujoco.MjModel, geom: int) -> float:
+    """Area of a geom's surface, m²; that of an ellipsoid to 1.1 % (Thomsen's formula)."""
+    a, b, c = (float(x) for x in model.geom_size[geom])
+    kind = int(model.geom_type[geom])
+    if kind == _SPHERE:
+        return 4.0 * np.pi * a * a
+    if kind == _CAPSULE:
+        return 4.0 * np.pi * a * (a + b)
+    if kind == _CYLINDER:
+        return 2.0 * np.pi * a * (a + 2.0 * b)
+    if kind == _BOX:
+        return 8.0 * (a * b + b * c + c * a)
+    if kind == _ELLIPSOID:
+        p = 1.6075
+        return 4.0 * np.pi * float((((a * b) ** p + (b * c) ** p + (c * a) ** p) / 3.0) ** (1.0 / p))
+    return float(_faces(model, geom)[1].sum())
+
+
+def surface(model: mujoco.MjModel, geom: int, count: int, offset: np.ndarray) -> Surface:
+    """Points spread over a geom's surface in proportion to area.
+
+    Args:
+        model: The compiled model.
+        geom: A geom of a type in ``DRAWN``.
+        count: How many, n.
+        offset: Where the even numbers begin, (2,) in [0, 1).
+    """
+    size, kind = np.asarray(model.geom_size[geom], dtype=np.float64), int(model.geom_type[geom])
+    if kind == _SPHERE:
+        size = np.repeat(size[:1], 3)
+    if kind in (_SPHERE, _ELLIPSOID):
+        return _ellipsoid(size, count, offset)
+    u = even_numbers(count, offset)
+    return _OF_UNIT[kind](size, u) if kind in _OF_UNIT else _mesh(model, geom, u)
+
+
+def inside(model: mujoco.MjModel, geom: int, points: np.ndarray, margin: float) -> np.ndarray:
+    """Which points (n, 3) of a geom's frame lie deeper than ``margin`` (m) in it; of meshes none. Shape (n,), bool."""
+    size = np.asarray(model.geom_size[geom], dtype=np.float64)
+    kind = int(model.geom_type[geom])
+    if kind == _SPHERE:
+        return np.asarray(np.linalg.norm(points, axis=1) < size[0] - margin)
+    if kind == _ELLIPSOID:
+        return np.asarray(np.linalg.norm(points / (size - margin), axis=1) < 1.0)
+    across, along = np.linalg.norm(points[:, :2], axis=1), np.abs(points[:, 2])
+    if kind == _CAPSULE:
+        return np.hypot(across, np.maximum(along - size[1], 0.0)) < size[0] - margin
+    if kind == _CYLINDER:
+        return (across < size[0] - margin) & (along < size[1] - margin)
+    if kind == _BOX:
+        return np.asarray((np.abs(points) < size - margin).all(axis=1))
+    return np.zeros(len(points), dtype=bool)
+
+
+def _sphere(u: np.ndarray) -> np.ndarray:
+    """Unit vectors (n, 3) from even numbers (n, 2)."""
+    z, turn = 2.0 * u[:, 0] - 1.0, 2.0 * np.pi * u[:, 1]
+    across = np.sqrt(1.0 - z * z)
+    return np.stack((across * np.cos(turn), across * np.sin(turn), z), axis=1)
+
+
+def _ellipsoid(size: np.ndarray, count: int, offset: np.ndarray) -> Surface:
+    # The sphere's points stretched are too dense at the ends; each stays with a chance in proportion to how much its
+    # place was stretched.
+    tries = 4 * count + 64
+    unit = _sphere(even_numbers(tries, offset))
+    stretch = np.linalg.norm(unit / size, axis=1)
+    chance = (np.arange(tries) * 0.6180339887498949 + offset[0]) % 1.0
+    kept = unit[chance * stretch.max() < stretch]
+    unit = kept[np.arange(count) % len(kept)]
+    normals = unit / size
+    return unit * size, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def _capsule(size: np.ndarray, u: np.ndarray) -> Surface:
+    # Archimedes: the caps' area is that of the cylinder around them, so height is uniform over the whole length.
+    radius, half = size[0], size[1]
+    height = (2.0 * u[:, 0] - 1.0) * (half + radius)
+    z = np.sign(height) * np.maximum(np.abs(height) - half, 0.0) / radius
+    across, turn = np.sqrt(np.maximum(1.0 - z * z, 0.0)), 2.0 * np.pi * u[:, 1]
+    normals = np.stack((across * np.cos(turn), across * np.sin(turn), z), axis=1)
+    points = radius * normals
+    points[:, 2] += np.clip(height, -half, half)
+    return points, normals
+
+
+def _cylinder(size: np.ndarray, u: np.ndarray) -> Surface:
+    radius, half = size[0], size[1]
+    side = 2.0 * half / (2.0 * half + radius)
+    turn = 2.0 * np.pi * u[:, 1]
+    circle = np.stack((np.cos(turn), np.sin(turn)), axis=1)
+    on_side = u[:, 0] < side
+    rest = (u[:, 0] - side) / (1.0 - side)  # in [0, 1): both discs, one after the other
+    end, share = np.where(rest < 0.5, -1.0, 1.0), 2.0 * rest % 1.0
+    points = np.empty((len(u), 3))
+    points[:, :2] = radius * circle * np.where(on_side, 1.0, np.sqrt(share))[:, None]
+    points[:, 2] = np.where(on_side, (2.0 * u[:, 0] / side - 1.0) * half, end * half)
+    normals = np.zeros_like(points)
+    normals[on_side, :2] = circle[on_side]
+    normals[~on_side, 2] = end[~on_side]
+    return points, normals
+
+
+def _box(size: np.ndarray, u: np.ndarray) -> Surface:
+    areas = np.array([size[1] * size[2], size[2] * size[0], size[0] * size[1]])
+    ends = np.cumsum(np.repeat(areas, 2)) / (2.0 * areas.sum())
+    face = np.minimum(np.searchsorted(ends, u[:, 0], side="right"), 5)
+    starts = np.concatenate(([0.0], ends[:-1]))
+    first = (u[:, 0] - starts[face]) / (ends - starts)[face]
+    axis, sign = face // 2, 1.0 - 2.0 * (face % 2)
+    rows = np.arange(len(u))
+    points, normals = np.empty((len(u), 3)), np.zeros((len(u), 3))
+    normals[rows, axis] = sign
+    for step, value in ((1, first), (2, u[:, 1])):
+        other = (axis + step) % 3
+        points[rows, other] = (2.0 * value - 1.0) * size[other]
+    points[rows, axis] = sign * size[axis]
+    return points, normals
+
+
+def _faces(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Corners (f, 3, 3), areas (f,) and unit normals (f, 3) of a mesh geom's triangles that have an area."""
+    mesh = int(model.geom_dataid[geom])
+    first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+    vertices = np.asarray(model.mesh_vert[first : first + count], dtype=np.float64)
+    first, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
+    corners = vertices[model.mesh_face[first : first + count]]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(cross, axis=1)
+    real = length > 0.0
+    return corners[real], 0.5 * length[real], cross[real] / length[real, None]
+
+
+def _mesh(model: mujoco.MjModel, geom: int, u: np.ndarray) -> Surface:
+    corners, areas, normals = _faces(model, geom)
+    ends = np.cumsum(areas) / areas.sum()
+    face = np.minimum(np.searchsorted(ends, u[:, 0], side="right"), len(ends) - 1)
+    starts = np.concatenate(([0.0], ends[:-1]))
+    root = np.sqrt((u[:, 0] - starts[face]) / (ends - starts)[face])[:, None]
+    a, b, c = corners[face].transpose(1, 0, 2)
+    second = u[:, 1:]
+    return (1.0 - root) * a + root * (1.0 - second) * b + root * second * c, normals[face]
+
+
+_OF_UNIT: dict[int, Callable[[np.ndarray, np.ndarray], Surface]] = {
+    _CAPSULE: _capsule,
+    _CYLINDER: _cylinder,
+    _BOX: _box,
+}
+
 
 FIXTURE, HAND, OBJECT = -1.0, 0.0, 1.0
-"""What a point is of, where a cloud has kinds: what stands still in an episode; either hand; what physics moves."""
+"""Kinds of points: what stands still in an episode; either hand; what physics moves."""
 _SHARES = {HAND: 0.5, OBJECT: 0.35, FIXTURE: 0.15}
-"""Of the candidates: by area alone a table would leave an egg a handful."""
+"""Shares of the candidates: by area alone a table would leave an egg a handful."""
 _SHOWN_GROUPS = 3
 """MuJoCo's viewers draw geoms of groups 0 to 2."""
 _PROBES = 512
@@ -22,7 +194,7 @@ _BURIED = 5e-4
 
 @dataclass(frozen=True)
 class Surfaces:
-    """P points on P places of bodies, those of a body side by side.
+    """P points fixed to bodies, those of a body side by side.
 
     Attributes:
         bodies: Bodies that carry points, ascending, (k,).
@@ -42,7 +214,7 @@ class Surfaces:
 
 
 def visible_geoms(model: mujoco.MjModel) -> list[int]:
-    """Geoms that a picture shows: of a type with a surface, in a shown group, not transparent."""
+    """Geoms with a surface, in a shown group, not transparent."""
     materials = model.geom_matid
     return [
         geom
@@ -61,15 +233,15 @@ def body_kinds(model: mujoco.MjModel) -> list[float]:
 
 
 def sample(model: mujoco.MjModel, count: int, seed: int = 0) -> Surfaces:
-    """Spreads points over what can be seen of a model, by area within hands, objects and fixtures.
+    """Spreads points over the visible surfaces of a model, by area within hands, objects and fixtures.
 
     Args:
         model: The compiled scene.
         count: Points, P.
-        seed: Of where on each geom they begin; the same seed gives the same points.
+        seed: Seed of the points.
 
     Raises:
-        BidexError: Fewer points than visible geoms, or nothing that could be seen.
+        BidexError: Fewer points than visible geoms, or none visible.
     """
     geoms = visible_geoms(model)
     if not 0 < len(geoms) <= count:

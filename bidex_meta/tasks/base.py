@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import HandPose
-from bidex_meta.tasks.layout import Layout
+from bidex_meta.tasks.layout import Block, Layout, both_hands
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace
 from bidex_meta.validation import true_or_false
@@ -51,10 +51,10 @@ CONTROL_RATE = 60
 
 
 class TaskClass(ABC):
-    """One of the manipulation tasks, batched over rows.
+    """One of the manipulation tasks, batched over environments.
 
-    Methods take and return tensors whose first axis counts rows, in the engine's precision. Nothing here loops over
-    rows or keeps state: what a task freezes is in ``frozen``, what an episode draws is in ``draws``.
+    The first axis of all tensors counts environments, in the engine's precision. A class has no loops over them and no
+    state: what a task freezes is in ``frozen``, what an episode draws is in ``draws``.
 
     Attributes:
         name: Name of the class, e.g. ``CatchUnderarm``.
@@ -68,6 +68,8 @@ class TaskClass(ABC):
         transition_scale: Scale of the base forces (docs/figures.md, base).
         orientation_scale: Scale of the base torques.
         start_draws: How many uniform numbers the start of an episode takes.
+        variation_space: What a task of this class freezes; an attribute or a property.
+        blocks: The observation behind both hands' blocks.
         moving_base: Whether the hands' bases are driven (52 actions) or fixed (40).
         solver: What the class asks of the contact solver.
         needs: Most contacts and constraint rows that were seen, for mujoco_warp's fixed room: from
@@ -91,6 +93,8 @@ class TaskClass(ABC):
     transition_scale: ClassVar[float]
     orientation_scale: ClassVar[float]
     start_draws: ClassVar[int]
+    variation_space: VariationSpace
+    blocks: ClassVar[tuple[Block, ...]] = ()
     moves_by_default: ClassVar[bool] = True
     solver: ClassVar[Solver] = Solver()
     needs: Capacity = Capacity(71, 20, 134)
@@ -99,20 +103,13 @@ class TaskClass(ABC):
     depth_camera: ClassVar[tuple[tuple[float, float, float], tuple[float, float, float]] | None] = None
 
     def __init__(self, moving_base: bool | None = None) -> None:
-        """Chooses the base.
-
-        Args:
-            moving_base: Drive the bases or fix them; None takes the class's own (fixed for HandOver alone).
-
-        Raises:
-            BidexError: Neither True, False nor None.
-        """
+        """Drives the bases or fixes them; None takes the class's own (fixed for HandOver alone)."""
         chosen = self.moves_by_default if moving_base is None else moving_base
         self.moving_base = true_or_false("moving_base", chosen)
 
     @property
     def scene_key(self) -> tuple[Hashable, ...]:
-        """What its compiled scene depends on: classes of one key may share it."""
+        """What its compiled scene depends on: classes with equal keys may share it."""
         return self.name, self.moving_base
 
     @property
@@ -126,14 +123,9 @@ class TaskClass(ABC):
         return 52 if self.moving_base else 40
 
     @property
-    @abstractmethod
-    def variation_space(self) -> VariationSpace:
-        """What a task of this class freezes."""
-
-    @property
-    @abstractmethod
     def layout(self) -> Layout:
-        """The observation as named blocks."""
+        """The observation as named blocks: both hands', then ``blocks``."""
+        return Layout((*both_hands(self.moving_base), *self.blocks))
 
     @abstractmethod
     def add_objects(self, scene: mujoco.MjSpec) -> None:
@@ -149,14 +141,14 @@ class TaskClass(ABC):
 
         Args:
             draws: Uniform numbers in [-1, 1], shape (n, start_draws).
-            frozen: The rows' frozen numbers, each (n, k).
+            frozen: Frozen numbers, each (n, k).
             qpos: Part name (``right/joints``, an object, ...) to its positions, views of shape (n, k) that hold the
                 nominal start and are written in place; MuJoCo's quaternion order (w, x, y, z).
         """
 
-    @abstractmethod
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """The blocks of the layout that no sensor gives, by name, each (n, size)."""
+        """The blocks of the layout that no sensor gives, by name, each (n, size); none by default."""
+        return {}
 
     @abstractmethod
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:

@@ -11,7 +11,7 @@ from bidex_meta.hands.hand import hand
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.maths import constant, dot, indices
 from bidex_meta.tasks.base import FIRM
-from bidex_meta.tasks.layout import Layout, both_hands, object_blocks, point_block
+from bidex_meta.tasks.layout import object_blocks, point_block
 from bidex_meta.tasks.objects.pointed import OwnObjectClass
 from bidex_meta.tasks.placement import DRAWS, SHIFT, TURN, place
 from bidex_meta.tasks.reach import apart, reach
@@ -37,12 +37,9 @@ _THUMB = {"THJ4": -1.04, "THJ3": 1.2, "THJ0": -1.57}
 class BottleCap(OwnObjectClass):
     """Pull the cap off a bottle that lies in the right hand, with the left.
 
-    Observation: Table 24 (414). Reward: equation 11, left hand to cap and right hand to bottle as printed; so the two
-    hands' start poses of the original are exchanged and the left one starts over the cap. Success: the cap more than
-    3 cm off.
-    The cap's point is its centre, which moves with it, everywhere: d_target is about 14 cm more
-    than the original's, which measures a link frame near the bottle's origin. Tasks shift the bottle in the palm's
-    plane, not through the palm: 3 cm either way along its axis, and 1 cm to the fingers only, for the thumb is behind.
+    Observation: Table 24 (414). Reward: equation 11, left hand to cap and right hand to bottle as printed. The cap's
+    point is its centre; the original measures from a link frame near the bottle's origin. Tasks shift the bottle in the
+    palm's plane: 3 cm either way along its axis, and 1 cm to the fingers only, since the thumb is behind it.
     """
 
     needs = Capacity(47, 4, 65)
@@ -66,23 +63,17 @@ class BottleCap(OwnObjectClass):
     usual_stands = False
     camera_target = (0.0, -0.62, 0.52)
 
-    @property
-    def variation_space(self) -> VariationSpace:
-        """The bottle's place: ``bottle_x`` along its axis, ``bottle_y`` along the fingers (metres), ``bottle_yaw``."""
-        names = ("bottle_x", "bottle_y", "bottle_yaw")
-        return VariationSpace(names, (-SHIFT, -_AHEAD_RANGE, -TURN), (SHIFT, 0.0, TURN))
+    variation_space = VariationSpace(
+        ("bottle_x", "bottle_y", "bottle_yaw"), (-SHIFT, -_AHEAD_RANGE, -TURN), (SHIFT, 0.0, TURN)
+    )
+    """The bottle's place: ``bottle_x`` along its axis, ``bottle_y`` along the fingers (metres), ``bottle_yaw``."""
 
-    @property
-    def layout(self) -> Layout:
-        """Table 24."""
-        tail = (
-            *object_blocks("bottle", "bottle"),
-            point_block("bottle_cap_position", "bottle/cap_position", "centre of the cap"),
-        )
-        return Layout((*both_hands(self.moving_base), *tail))
+    blocks = (
+        *object_blocks("bottle", "bottle"),
+        point_block("bottle_cap_position", "bottle/cap_position", "centre of the cap"),
+    )
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
-        """A low table and the bottle on the right palm."""
         add_table(scene, (0.3, 0.3, 0.1), (0.0, -0.6, 0.05))
         self.own.add_to(scene)
 
@@ -91,7 +82,6 @@ class BottleCap(OwnObjectClass):
         return {"bottle": variation}
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        """Thumbs bent, the bottle on the right palm, cap on."""
         for side in ("right", "left"):
             joints = qpos[f"{side}/joints"]
             joints[:, indices(hand().index(*_THUMB), joints)] = constant(tuple(_THUMB.values()), joints)
@@ -100,10 +90,6 @@ class BottleCap(OwnObjectClass):
         place(bottle, frozen["bottle"], draws)
         bottle[:, :3] -= dot(bottle[:, :3] - nominal, normal)[:, None] * normal
 
-    def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """Nothing: every block is read from sensors."""
-        return {}
-
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
         """Equation 11: ``left`` -d_left, ``right`` -d_right, ``target`` 30 d_target, ``constant`` 0.2."""
         left, right = reach(state, "left", "bottle/cap_position"), reach(state, "right", "bottle/position")
@@ -111,5 +97,4 @@ class BottleCap(OwnObjectClass):
         return {"left": -left, "right": -right, "target": target, "constant": torch.full_like(left, 0.2)}
 
     def success(self, state: TaskState) -> Tensor:
-        """The cap more than 3 cm off."""
         return state["bottle/slide"][:, 0] > _OPENED

@@ -16,8 +16,7 @@ _ANCHOR_RADIUS = 0.1
 class CatchOver2Underarm(OneEgg):
     """Throw an egg from an upright hand down to an upturned palm.
 
-    Observation: Table 12 (422). Reward: equation 3 with alpha 20. Deviation: the egg starts at z 1.03, not 1.0, where
-    it would stick in the fingertips (docs/figures.md, decisions). The episode also fails when a mount is 0.1 m off its
+    Observation: Table 12 (422). Reward: equation 3 with alpha 20. The episode also fails when a mount is 0.1 m off its
     start.
     """
 

@@ -12,7 +12,7 @@ from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
 from bidex_meta.maths import quaternion_from_rpy, xyzw
 from bidex_meta.tasks.base import FAST, TaskClass
 from bidex_meta.tasks.goals import frozen_goal, observe_goal
-from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
+from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.reach import apart, reach
 from bidex_meta.tasks.scene import SceneObject
 from bidex_meta.tasks.state import TaskState
@@ -41,16 +41,11 @@ _SHUT = (
 class _Door(TaskClass):
     """A double swing door that two hands open or close.
 
-    Observation: Tables 20 and 22 (428). Leaf and handle of the right hand are those at +y. The two classes that open
-    succeed when the handle points are more than 0.5 m apart along y, each at least 10 cm from the middle: of the full
-    distance, which the reward counts, a leaf alone makes as much at 1.26 rad. Those that close succeed when both leaves
-    are within a tenth of their travel of shut: the published test, handle points less than 0.5 m apart, accepts leaves
-    that stand open by 60 degrees.
-
-    Decided here: a task freezes the door's place along y and one start angle for both leaves, which start at rest;
-    an episode draws nothing. The goal block holds the base pose, which is also the object's. d_target is the full
-    distance of the two handle points. The Inward classes have the same door turned upside down, so that it swings
-    towards the hands; their handle points lie behind the pulls that then face the hands.
+    Leaf and handle of the right hand are those at +y. Success of the classes that open is measured along y, since a
+    leaf alone makes a full distance of 0.5 m at 1.26 rad. A task freezes the door's place along y and one start angle
+    for both leaves, which start at rest; an episode draws nothing. The goal block holds the base pose, which is also
+    the object's. d_target is the full distance of the two handle points. The Inward classes have the same door turned
+    upside down, so that it swings towards the hands; their handle points lie behind the pulls that then face the hands.
 
     Attributes:
         opens: Whether the class opens the door or closes it.
@@ -76,19 +71,14 @@ class _Door(TaskClass):
         angles = _NEARLY_SHUT if self.opens else _NEARLY_OPEN
         return join(component("base_y", -_SHIFT, _SHIFT), component("start_angle", *angles))
 
-    @property
-    def layout(self) -> Layout:
-        """Tables 20 and 22."""
-        handles = [
-            point_block(f"{side}_handle_position", f"object/{side}_handle_position", f"behind the {side} leaf's pull")
-            for side in ("right", "left")
-        ]
-        return Layout(
-            (*both_hands(self.moving_base), *object_blocks("object", "object"), *goal_blocks("goal"), *handles)
-        )
+    blocks = (
+        *object_blocks("object", "object"),
+        *goal_blocks("goal"),
+        point_block("right_handle_position", "object/right_handle_position", "behind the right leaf's pull"),
+        point_block("left_handle_position", "object/left_handle_position", "behind the left leaf's pull"),
+    )
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
-        """The door, its handle points on the side of the hands."""
         SceneObject("object", "door", _BASE, self._base_rpy).add_to(scene)
         if self.inward:
             for side in ("right", "left"):
@@ -103,13 +93,11 @@ class _Door(TaskClass):
         return {**frozen_goal(torch.cat((position, turn), dim=1)), "angle": variation[:, 1:]}
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        """The door at the task's place, both leaves at the task's angle."""
         qpos["object"][:, :3] = frozen["goal"][:, :3]
         for leaf in (1, 2):
             qpos[f"object/hinge{leaf}"].copy_(frozen["angle"])
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """The goal blocks."""
         return observe_goal(state, "object/quaternion")
 
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
@@ -123,7 +111,6 @@ class _Door(TaskClass):
         }
 
     def success(self, state: TaskState) -> Tensor:
-        """Open: handles more than 0.5 m apart along y, by both leaves. Close: both within a tenth of their travel."""
         if self.opens:
             middle = state["object/position"][:, 1]
             right = state["object/right_handle_position"][:, 1] - middle
@@ -145,7 +132,7 @@ class _Door(TaskClass):
 class DoorOpenOutward(_Door):
     """Push a double door open.
 
-    Observation: Table 20 (428). Reward: equation 7. Success: handles more than 0.5 m apart along y.
+    Observation: Table 20 (428). Reward: equation 7.
     """
 
     needs = Capacity(44, 0, 96)
@@ -160,7 +147,7 @@ class DoorOpenOutward(_Door):
 class DoorCloseInward(_Door):
     """Push a double door shut that stands open towards the hands.
 
-    Observation: Table 20 (428). Reward: equation 8. Success: both leaves within 0.157 rad of shut. The hands start
+    Observation: Table 20 (428). Reward: equation 8. The hands start
     farther out than in the other door classes, beside the open leaves.
     """
 
@@ -181,7 +168,7 @@ class DoorCloseInward(_Door):
 class DoorOpenInward(_Door):
     """Pull a double door open by its handles.
 
-    Observation: Table 22 (428). Reward: equation 9. Success: handles more than 0.5 m apart along y.
+    Observation: Table 22 (428). Reward: equation 9.
     """
 
     needs = Capacity(40, 0, 88)
@@ -196,7 +183,7 @@ class DoorOpenInward(_Door):
 class DoorCloseOutward(_Door):
     """Pull a double door shut by its handles that stands open away from the hands.
 
-    Observation: Table 22 (428). Reward: equation 10. Success: both leaves within 0.157 rad of shut.
+    Observation: Table 22 (428). Reward: equation 10.
     """
 
     needs = Capacity(37, 0, 98)

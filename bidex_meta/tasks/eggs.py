@@ -15,7 +15,7 @@ from bidex_meta.hands.starts import make_room, noisy_joints
 from bidex_meta.maths import conjugate, constant, norm, random_orientation, rotate, rotation_angle, wxyz, xyzw
 from bidex_meta.tasks.base import LIGHT, TaskClass
 from bidex_meta.tasks.goals import frozen_goal, observe_goal, rotation_difference
-from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks
+from bidex_meta.tasks.layout import goal_blocks, object_blocks
 from bidex_meta.tasks.objects.held import EGG, HeldObject, held_object
 from bidex_meta.tasks.scene import SceneObject
 from bidex_meta.tasks.state import TaskState
@@ -143,11 +143,7 @@ class OneEgg(TaskClass):
     solver = LIGHT
 
     def __init__(self, moving_base: bool | None = None, object: str = EGG) -> None:
-        """Chooses base and object.
-
-        Args:
-            moving_base: Drive the bases or fix them; None takes the class's own.
-            object: What is thrown: ``"egg"``, a name of the shelf, or the path of an MJCF file (docs/objects.md).
+        """Chooses the base and the object: ``"egg"``, a name of the shelf, or an MJCF file (docs/objects.md).
 
         Raises:
             BidexError: There is no such object, or its file holds none for a hand.
@@ -159,7 +155,6 @@ class OneEgg(TaskClass):
 
     @property
     def scene_key(self) -> tuple[Hashable, ...]:
-        """As in ``TaskClass``, and the object."""
         return (*super().scene_key, self.held)
 
     @property
@@ -167,13 +162,9 @@ class OneEgg(TaskClass):
         """Goal position (world, metres) and the two draws of its orientation."""
         return join(box("goal", self.goal_centre, GOAL_RANGE), orientation("goal"))
 
-    @property
-    def layout(self) -> Layout:
-        """Tables 8, 10, 12 and 16."""
-        return Layout((*both_hands(self.moving_base), *object_blocks("object", "object"), *goal_blocks("goal")))
+    blocks = (*object_blocks("object", "object"), *goal_blocks("goal"))
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
-        """One egg, or what is thrown in its place."""
         if self.held is None:
             SceneObject("object", "egg", self.egg_start).add_to(scene)
         else:
@@ -184,13 +175,11 @@ class OneEgg(TaskClass):
         return frozen_goal(goal_pose(variation[:, :3], variation[:, 3:]))
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        """Noisy hands, the egg on the right one."""
         start_hands(draws[:, :JOINT_DRAWS], self.joint_noise, qpos)
         joints = qpos["right/joints"] if self.lies_on_right_hand else None
         put_down(qpos["object"], self.held, draws[:, JOINT_DRAWS:], self.position_noise, joints, self.right)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """The goal blocks."""
         return observe_goal(state, "object/quaternion")
 
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
@@ -198,7 +187,6 @@ class OneEgg(TaskClass):
         return {"pose": pose_reward(state, "object", "goal", self.alpha)}
 
     def success(self, state: TaskState) -> Tensor:
-        """The egg within 3 cm of its goal, in whatever orientation."""
         return distances(state, "object", "goal")[0] < SUCCESS_DISTANCE
 
     def failed(self, state: TaskState) -> Tensor:
@@ -206,5 +194,4 @@ class OneEgg(TaskClass):
         return state["object/position"][:, 2] <= self.floor
 
     def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
-        """The goal."""
         return [(frozen["goal"], SEMI_AXES if self.held is None else self.held.half_extents)]

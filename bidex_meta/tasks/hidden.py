@@ -1,7 +1,7 @@
-"""What of a class's variation only masked entries tell, though reward or success depend on it: found, not written down.
+"""Task variables that affect reward or success but are hidden in ML suites (only masked entries show them).
 
-Every number that a task freezes is replaced by NaN in turn: what becomes NaN depends on it. So it needs no state near a
-goal, and a class cannot say one thing and do another.
+They are computed: each frozen number of a task is replaced by NaN in turn, and what becomes NaN depends on it. So no
+state near a goal is needed, and a class cannot declare one thing and do another.
 """
 
 from collections.abc import Callable, Iterable
@@ -24,19 +24,16 @@ Frozen = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class Hidden:
-    """Components of a variation that masked entries alone tell, in the order of the variation space."""
+    """Components of a variation that only masked entries show, in the order of the variation space."""
 
     reward: tuple[str, ...]
-    """Those that enter the reward of a given state."""
+    """Those that affect the reward of a given state."""
     success: tuple[str, ...]
-    """Those that enter its success alone."""
+    """Those that affect its success alone."""
 
 
 def hidden(task: TaskClass) -> Hidden:
-    """What the mask of meta suites hides of a class's variation.
-
-    A place of a fixture is not hidden: it is a part of the state, which other entries show.
-    """
+    """The task variables that meta suites hide; a fixture's pose is not among them, since other entries show it."""
     scene = compile_scene(task)
     sensors = _sensors(scene)
     names, variations = task.variation_space.names, _one_changed_at_a_time(task)
@@ -44,16 +41,16 @@ def hidden(task: TaskClass) -> Hidden:
     goal = [block.name for block in task.layout.blocks if block.goal]
 
     def moved(judge: Callable[[TaskState], Iterable[Tensor]]) -> set[str]:
-        """Components that change a frozen number on which what a function gives depends."""
+        """Components that change a frozen number on which a function's values depend."""
         found = set()
         for key, column in _used(judge, sensors, scene, {key: values[:1] for key, values in frozen.items()}):
             values = frozen[key][:, column]
             found |= {name for name, other in zip(names, values[1:].tolist(), strict=True) if other != values[0]}
         return found
 
-    told = moved(lambda state: [task.observe(state)[name] for name in goal]) - _fixtures(task, scene, frozen)
-    of_reward = moved(lambda state: task.reward_terms(state).values()) & told
-    of_success = (moved(lambda state: _compared(task, state)) & told) - of_reward
+    shown = moved(lambda state: [task.observe(state)[name] for name in goal]) - _fixtures(task, scene, frozen)
+    of_reward = moved(lambda state: task.reward_terms(state).values()) & shown
+    of_success = (moved(lambda state: _compared(task, state)) & shown) - of_reward
     return Hidden(*(tuple(name for name in names if name in chosen) for chosen in (of_reward, of_success)))
 
 
@@ -89,7 +86,7 @@ def _used(
 
 
 class _Comparisons(TorchFunctionMode):
-    """Keeps the tensors that are compared while it lasts: a comparison with NaN is False, which would not show."""
+    """Collects all tensors that are compared: a comparison with NaN is False, and would not show it."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -102,7 +99,7 @@ class _Comparisons(TorchFunctionMode):
 
 
 def _compared(task: TaskClass, state: TaskState) -> list[Tensor]:
-    """All that success compares."""
+    """All tensors that success compares."""
     with _Comparisons() as comparisons:
         task.success(state)
     return comparisons.seen

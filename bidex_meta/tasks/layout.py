@@ -4,8 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
-from bidex_meta.hands.hand import FINGERS, hand
-from bidex_meta.hands.pair import SIDES
+from bidex_meta.hands.hand import FINGERS, SIDES, hand
 
 VELOCITY_SCALE = 0.2
 """Scale of joint velocities and of objects' angular velocities (docs/figures.md, observation)."""

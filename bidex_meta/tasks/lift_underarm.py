@@ -11,13 +11,13 @@ from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
 from bidex_meta.maths import norm, uprightness
 from bidex_meta.tasks.base import FAST
 from bidex_meta.tasks.goals import frozen_goal, observe_goal
-from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
+from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.objects.pointed import OwnObjectClass
 from bidex_meta.tasks.placement import DRAWS, place, placed, yaw_quaternion
 from bidex_meta.tasks.reach import reach
 from bidex_meta.tasks.scene import SceneObject, add_table
 from bidex_meta.tasks.state import TaskState
-from bidex_meta.tasks.variation import VariationSpace, component, join
+from bidex_meta.tasks.variation import component, join
 
 _START = (0.0, -0.6, 0.465)
 _GOAL_SHIFT = 0.05
@@ -30,13 +30,9 @@ _SEMI_AXES = (0.12, 0.12, 0.06)
 class LiftUnderarm(OwnObjectClass):
     """Lift a pot off a table by its two grips.
 
-    Observation: Table 18 (428). Reward: equation 6. Success: the pot's origin within 5 cm of the goal,
-    the pot within 30 degrees of upright.
-
-    Decided here: the goal lies 25 to 45 cm above the task's own start place and up to 5 cm beside it, and has the
-    start's orientation, yaw included. The pot starts at rest on the table; at the original's height it would start
-    1.5 cm inside. Its inertia follows from its hollow shape, since the original's figure is far too large for the size.
-    Friction: 3 where the table takes part, 2 between wall and hand.
+    Observation: Table 18 (428). Reward: equation 6. The goal lies 25 to 45 cm above the task's own start and up to 5 cm
+    beside it, and has the start's orientation, yaw included. The pot starts at rest on the table; at the original's
+    height it would start 1.5 cm inside. Friction: 3 on the table, 2 between wall and hand.
     """
 
     needs = Capacity(36, 4, 82)
@@ -59,25 +55,20 @@ class LiftUnderarm(OwnObjectClass):
     camera_target = (0.0, -0.6, 0.55)
     camera_distance = 1.5
 
-    @property
-    def variation_space(self) -> VariationSpace:
-        """The pot's shift and turn; the goal's place relative to the start it leaves, metres."""
-        shifts = [component(f"goal_{axis}", -_GOAL_SHIFT, _GOAL_SHIFT) for axis in "xy"]
-        return join(placed("object"), *shifts, component("goal_height", *_GOAL_HEIGHT))
-
-    @property
-    def layout(self) -> Layout:
-        """Table 18."""
-        handles = [
-            point_block(f"{side}_handle_position", f"object/{side}_handle_position", f"beside the grip at {end}y")
-            for side, end in (("right", "+"), ("left", "-"))
-        ]
-        return Layout(
-            (*both_hands(self.moving_base), *object_blocks("object", "object"), *goal_blocks("goal"), *handles)
-        )
+    variation_space = join(
+        placed("object"),
+        *(component(f"goal_{axis}", -_GOAL_SHIFT, _GOAL_SHIFT) for axis in "xy"),
+        component("goal_height", *_GOAL_HEIGHT),
+    )
+    """The pot's shift and turn; the goal relative to the start, metres."""
+    blocks = (
+        *object_blocks("object", "object"),
+        *goal_blocks("goal"),
+        point_block("right_handle_position", "object/right_handle_position", "beside the grip at +y"),
+        point_block("left_handle_position", "object/left_handle_position", "beside the grip at -y"),
+    )
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
-        """The pot on its table."""
         add_table(scene, (0.3, 0.3, 0.4), (0.0, -0.6, 0.2), friction=3.0)
         self.own.add_to(scene)
 
@@ -90,11 +81,9 @@ class LiftUnderarm(OwnObjectClass):
         return {"object": placement, **frozen_goal(goal)}
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        """The pot at the task's place, jittered."""
         place(qpos["object"], frozen["object"], draws)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """The goal blocks."""
         return observe_goal(state, "object/quaternion")
 
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
@@ -108,12 +97,10 @@ class LiftUnderarm(OwnObjectClass):
         }
 
     def success(self, state: TaskState) -> Tensor:
-        """The pot within 5 cm of its goal and within 30 degrees of upright."""
         upright = uprightness(state.quaternion("object/quaternion")) > math.cos(_SUCCESS_TILT)
         return (self._distance(state) < _SUCCESS_DISTANCE) & upright
 
     def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
-        """The goal, as large as the pot's wall."""
         return [(frozen["goal"], _SEMI_AXES)]
 
     def _distance(self, state: TaskState) -> Tensor:

@@ -12,12 +12,11 @@ from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
 from bidex_meta.maths import rotate, xyzw
 from bidex_meta.tasks.base import THIN, TaskClass
 from bidex_meta.tasks.goals import frozen_goal, observe_goal
-from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
+from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, place, placed
 from bidex_meta.tasks.reach import apart, reach
 from bidex_meta.tasks.scene import SceneObject, add_table
 from bidex_meta.tasks.state import TaskState
-from bidex_meta.tasks.variation import VariationSpace
 
 _PEN = SceneObject("pen", "pen", (0.0, 0.0, 0.612), (0.5 * math.pi, 0.5 * math.pi, 0.0))
 _OPEN = 0.3
@@ -29,10 +28,9 @@ _GHOST = (0.012, 0.012, 0.012)
 class OpenPenCap(TaskClass):
     """Pull the cap off a pen that lies on a table: the left hand at its body, the right hand at its cap.
 
-    Observation: Table 34 (428). Reward: equation 16, d_target the distance of the points on body and cap. Success: they
-    are more than 0.3 m apart, that is the cap pulled 13 cm, its own length.
-    Goal position is the cap's point at 0.3 m with the body at the task's start place, goal orientation the pen's there;
-    reward and success do not read them. The pen lies on flats: the original rolls.
+    Observation: Table 34 (428). Reward: equation 16. Success is a cap pulled 13 cm, its own length. Goal position is
+    the cap's point at 0.3 m with the body at the task's start, goal orientation the pen's there; reward and success do
+    not read them.
     """
 
     needs = Capacity(56, 0, 121)
@@ -50,24 +48,17 @@ class OpenPenCap(TaskClass):
     solver = replace(THIN, integrator=mujoco.mjtIntegrator.mjINT_IMPLICIT)
     camera_target = (0.12, 0.0, 0.66)
 
-    @property
-    def variation_space(self) -> VariationSpace:
-        """The pen's place."""
-        return placed("pen")
+    variation_space = placed("pen")
+    """The pen's place."""
 
-    @property
-    def layout(self) -> Layout:
-        """Table 34."""
-        tail = (
-            *object_blocks("pen", "pen"),
-            *goal_blocks("goal"),
-            point_block("pen_body_position", "pen/body_position", "point on the pen's body for the left hand"),
-            point_block("pen_cap_position", "pen/cap_position", "point on the pen's cap for the right hand"),
-        )
-        return Layout((*both_hands(self.moving_base), *tail))
+    blocks = (
+        *object_blocks("pen", "pen"),
+        *goal_blocks("goal"),
+        point_block("pen_body_position", "pen/body_position", "point on the pen's body for the left hand"),
+        point_block("pen_cap_position", "pen/cap_position", "point on the pen's cap for the right hand"),
+    )
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
-        """The table and the pen along y, cap to +y."""
         add_table(scene, (0.5, 1.0, 0.6), (0.0, 0.0, 0.3))
         _PEN.add_to(scene)
 
@@ -80,11 +71,9 @@ class OpenPenCap(TaskClass):
         return {"pen": variation, **frozen_goal(torch.cat((cap, rotation), dim=1))}
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        """The pen on the table, cap on."""
         place(qpos["pen"], frozen["pen"], draws)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """The goal blocks."""
         return observe_goal(state, "pen/quaternion")
 
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
@@ -94,11 +83,9 @@ class OpenPenCap(TaskClass):
         return {"left": left, "right": right, "target": 5.0 * _gap(state), "constant": torch.full_like(left, -0.8)}
 
     def success(self, state: TaskState) -> Tensor:
-        """The points on body and cap more than 0.3 m apart."""
         return _gap(state) > _OPEN
 
     def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
-        """Where the cap's point shall be."""
         return [(frozen["goal"], _GHOST)]
 
 

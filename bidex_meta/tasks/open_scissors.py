@@ -10,12 +10,12 @@ from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
 from bidex_meta.maths import conjugate, constant, multiply, rotate, xyzw
 from bidex_meta.tasks.base import THIN, TaskClass
-from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
+from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, place, placed, yaw_quaternion
 from bidex_meta.tasks.reach import reach
 from bidex_meta.tasks.scene import SceneObject, add_table
 from bidex_meta.tasks.state import TaskState
-from bidex_meta.tasks.variation import VariationSpace, component, join
+from bidex_meta.tasks.variation import component, join
 
 _SCISSORS = SceneObject("scissors", "scissors", (0.0, 0.0, 0.608), (0.0, 0.0, 0.5 * math.pi))
 _SHUT = -0.59
@@ -30,12 +30,11 @@ _GHOST = (0.02, 0.02, 0.01)
 class OpenScissors(TaskClass):
     """Open shears that lie on a table by a task's angle, each hand at its loop.
 
-    Observation: Table 30 (428). Reward: equation 14. Success: the hinge within 0.1 rad of the target angle.
-    The formula leaves the target angle open: a task freezes it (0 is 34 degrees open; shut, where episodes start, is
-    -0.59). The object pose is that of the left hand's half. The goal block is of the half that moves: its handle's
-    point and its orientation at the target angle, with the other half where it is now; the rotation difference is
-    that half's too, so that it shows the missing angle. Were the other half taken at the task's start place, tasks
-    with different angles would share a block. Loops are hollow, so that fingers enter them; the original's are filled.
+    Observation: Table 30 (428). Reward: equation 14. The formula leaves the target angle open: a task freezes it (0 is
+    34 degrees open; shut, where episodes start, is -0.59). The object pose is that of the left hand's half. The goal
+    block is of the half that moves: its handle's point and its orientation at the target angle, with the other half
+    where it is now; the rotation difference is that half's too, so that it shows the missing angle. Were the other half
+    taken at the task's start, tasks with different angles would share a block.
     """
 
     needs = Capacity(57, 0, 131)
@@ -56,24 +55,17 @@ class OpenScissors(TaskClass):
     solver = THIN
     camera_target = (0.08, 0.0, 0.66)
 
-    @property
-    def variation_space(self) -> VariationSpace:
-        """The scissors' place and ``target_angle`` of the hinge, radians."""
-        return join(placed("scissors"), component("target_angle", -0.15, 0.3))
+    variation_space = join(placed("scissors"), component("target_angle", -0.15, 0.3))
+    """The scissors' place and ``target_angle`` of the hinge, radians."""
 
-    @property
-    def layout(self) -> Layout:
-        """Table 30."""
-        tail = (
-            *object_blocks("scissors", "scissors"),
-            *goal_blocks("goal"),
-            point_block("right_handle_position", "scissors/right_handle_position", "in the right hand's loop"),
-            point_block("left_handle_position", "scissors/left_handle_position", "in the left hand's loop"),
-        )
-        return Layout((*both_hands(self.moving_base), *tail))
+    blocks = (
+        *object_blocks("scissors", "scissors"),
+        *goal_blocks("goal"),
+        point_block("right_handle_position", "scissors/right_handle_position", "in the right hand's loop"),
+        point_block("left_handle_position", "scissors/left_handle_position", "in the left hand's loop"),
+    )
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
-        """The table and the scissors flat on it, loops towards the hands."""
         add_table(scene, (0.5, 1.0, 0.6), (0.0, 0.0, 0.3))
         _SCISSORS.add_to(scene)
 
@@ -86,12 +78,10 @@ class OpenScissors(TaskClass):
         return {"scissors": variation[:, :3], "target": variation[:, 3:], "turn": turn, "ghost": ghost}
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        """The scissors on the table, shut."""
         place(qpos["scissors"], frozen["scissors"], draws)
         qpos["scissors/hinge"].fill_(_SHUT)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """The goal blocks."""
         rotation = state.quaternion("scissors/quaternion")
         goal = _opened(state["scissors/position"], rotation, state.frozen["turn"])
         missing = multiply(state.quaternion("scissors/half_quaternion"), conjugate(goal[:, 3:]))
@@ -105,22 +95,14 @@ class OpenScissors(TaskClass):
         return {"left": -left, "right": -right, "target": target, "constant": torch.full_like(left, 2.0)}
 
     def success(self, state: TaskState) -> Tensor:
-        """The hinge within 0.1 rad of the target angle."""
         return _missing(state) < _TOLERANCE
 
     def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
-        """Where the right handle's point shall be."""
         return [(frozen["ghost"], _GHOST)]
 
 
 def _opened(position: Tensor, rotation: Tensor, turn: Tensor) -> Tensor:
-    """Pose (n, 7) of the right handle's point on the half that moves, opened by ``turn`` from the other half.
-
-    Args:
-        position: Of the left hand's half (n, 3), metres.
-        rotation: Of that half (n, 4), (x, y, z, w).
-        turn: Rotation of the hinge (n, 4), (x, y, z, w).
-    """
+    """Pose (n, 7) of the right handle's point on the half that is opened by ``turn`` (n, 4) from the other half."""
     opened = multiply(rotation, turn)
     pivot = position + rotate(rotation, constant(_PIVOT, position))
     return torch.cat((pivot + rotate(opened, constant(_RIGHT_HANDLE, position)), opened), dim=1)

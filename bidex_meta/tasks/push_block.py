@@ -8,12 +8,12 @@ from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
 from bidex_meta.maths import norm
 from bidex_meta.tasks.base import FAST, TaskClass
-from bidex_meta.tasks.layout import Layout, both_hands, object_blocks, point_block
+from bidex_meta.tasks.layout import object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, place_all, placed
 from bidex_meta.tasks.reach import reach
 from bidex_meta.tasks.scene import SceneObject, add_table
 from bidex_meta.tasks.state import TaskState
-from bidex_meta.tasks.variation import VariationSpace, join
+from bidex_meta.tasks.variation import join
 
 _STARTS = {"block1": (0.0, -0.2, 0.625), "block2": (0.0, 0.2, 0.625)}
 _GOALS = {"block1": (-0.2, -0.2, 0.625), "block2": (-0.2, 0.2, 0.625)}
@@ -26,12 +26,8 @@ _TABLE_FRICTION = 0.75
 class PushBlock(TaskClass):
     """Push two blocks on a table, one with each hand, 20 cm away to their goals.
 
-    Table 1 x 1 m, 60 cm high. Observation: Table 26 (417), which does not tell the goals; so these are fixed and the
-    starts vary: a task shifts and turns each block. Reward: equation 12 with d_target the sum of both blocks'
-    distances. Success: both blocks within 10 cm of their goals.
-
-    Block 1 is the one on the left hand's side (-y). The original's blocks start inside the table; here they lie on
-    it. Its half success for the left block alone is left out.
+    Table 1 x 1 m, 60 cm high. Observation: Table 26 (417), without the goals; so these are fixed and the starts vary: a
+    task shifts and turns each block. Reward: equation 12. Block 1 is the one on the left hand's side (-y).
     """
 
     needs = Capacity(38, 0, 103)
@@ -50,25 +46,16 @@ class PushBlock(TaskClass):
     camera_target = (0.1, 0.0, 0.68)
     camera_distance = 1.7
 
-    @property
-    def variation_space(self) -> VariationSpace:
-        """Shift and turn of both blocks."""
-        return join(placed("block1"), placed("block2"))
+    variation_space = join(placed("block1"), placed("block2"))
+    """Shift and turn of both blocks."""
 
-    @property
-    def layout(self) -> Layout:
-        """Table 26."""
-        return Layout(
-            (
-                *both_hands(self.moving_base),
-                *object_blocks("block1", "block1"),
-                point_block("block1_position", "block1/position", "centre of block 1"),
-                point_block("block2_position", "block2/position", "centre of block 2"),
-            )
-        )
+    blocks = (
+        *object_blocks("block1", "block1"),
+        point_block("block1_position", "block1/position", "centre of block 1"),
+        point_block("block2_position", "block2/position", "centre of block 2"),
+    )
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
-        """A table with two blocks of different colour."""
         add_table(scene, (1.0, 1.0, 0.6), (0.0, 0.0, 0.3), friction=_TABLE_FRICTION, priority=1)
         SceneObject("block1", "cube", _STARTS["block1"], colour=(0.85, 0.43, 0.30, 1.0)).add_to(scene)
         SceneObject("block2", "cube", _STARTS["block2"]).add_to(scene)
@@ -79,12 +66,7 @@ class PushBlock(TaskClass):
         return {"block1": variation[:, :3], "block2": variation[:, 3:], "goal1": goals[0], "goal2": goals[1]}
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        """Places both blocks."""
         place_all(_STARTS, qpos, frozen, draws)
-
-    def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """Nothing: every block of the layout is read from sensors."""
-        return {}
 
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
         """``constant`` 2, ``left`` -d_left, ``right`` -d_right, ``target`` 5 (0.8 - d_target)."""
@@ -98,7 +80,6 @@ class PushBlock(TaskClass):
         }
 
     def success(self, state: TaskState) -> Tensor:
-        """Both blocks within 10 cm of their goals."""
         first, second = self._distances(state)
         return (first <= _SUCCESS_DISTANCE) & (second <= _SUCCESS_DISTANCE)
 
@@ -108,7 +89,6 @@ class PushBlock(TaskClass):
         return norm(first), norm(second)
 
     def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
-        """Both goals."""
         goals = [frozen["goal1"], frozen["goal2"]]
         turn = goals[0].new_tensor((0.0, 0.0, 0.0, 1.0)).expand(len(goals[0]), 4)
         return [(torch.cat((goal, turn), dim=1), (0.025, 0.025, 0.025)) for goal in goals]

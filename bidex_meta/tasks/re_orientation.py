@@ -10,10 +10,10 @@ from bidex_meta.maths import constant, multiply, rotation_angle, wxyz, xyzw
 from bidex_meta.tasks import eggs
 from bidex_meta.tasks.base import FIRM, TaskClass
 from bidex_meta.tasks.goals import frozen_goal, observe_goal
-from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks
+from bidex_meta.tasks.layout import goal_blocks, object_blocks
 from bidex_meta.tasks.scene import SceneObject
 from bidex_meta.tasks.state import TaskState
-from bidex_meta.tasks.variation import VariationSpace, orientation
+from bidex_meta.tasks.variation import orientation
 
 _BOUNDING_RADIUS = 0.0434
 """Half the space diagonal of a cube with an edge of 5 cm, metres."""
@@ -31,17 +31,12 @@ _SUCCESS_DISTANCE = 0.1
 class ReOrientation(TaskClass):
     """Turn the two cubes that lie on the hands to one common orientation.
 
-    No table. Observation: Table 32 (446). Success: both cubes within 0.2 rad of the goal's orientation
-    and within 10 cm of their places, so that dropped ones are none.
-
-    Reward: -10 (d_1 + d_2) - 1.5 (r_1 + r_2). The paper adds the rotations, which would reward larger ones; here they
-    are subtracted. Object 1 lies on the left hand (-y), as the formula's pairing asks; the original's lies on the
-    right. Bases move as the appendix says (52 actions); its scales are those of CatchUnderarm. The goal is one for an
-    episode: nothing is drawn anew when it is reached, and no episode ends early, since the reward is negative.
+    No table. Observation: Table 32 (446). Object 1 lies on the left hand (-y), as the formula's pairing asks; the
+    original's lies on the right. Bases move as the appendix says (52 actions), with the scales of CatchUnderarm. No
+    episode ends early, since the reward is negative.
 
     Both cubes start with the same random orientation 10 cm above the mounts and drop onto the palms; fingers that the
-    start noise would push into a cube's bounding sphere are opened. A start within 0.5 rad of the goal is turned by
-    half a turn, so that none is a success.
+    start noise would push into a cube's bounding sphere are opened.
     """
 
     needs = Capacity(26, 0, 67)
@@ -63,19 +58,17 @@ class ReOrientation(TaskClass):
     start_draws = eggs.JOINT_DRAWS + 5
     solver = FIRM
 
-    @property
-    def variation_space(self) -> VariationSpace:
-        """The two draws of the goals' common orientation."""
-        return orientation("goal")
+    variation_space = orientation("goal")
+    """The two draws of the goals' common orientation."""
 
-    @property
-    def layout(self) -> Layout:
-        """Table 32."""
-        tail = [(*object_blocks(f"object{i}", f"object{i}"), *goal_blocks(f"goal{i}")) for i in (1, 2)]
-        return Layout((*both_hands(self.moving_base), *tail[0], *tail[1]))
+    blocks = (
+        *object_blocks("object1", "object1"),
+        *goal_blocks("goal1"),
+        *object_blocks("object2", "object2"),
+        *goal_blocks("goal2"),
+    )
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
-        """Two cubes of different colour: the first above the left hand, the second above the right."""
         SceneObject("object1", "cube", (0.0, -0.76, 0.60), colour=(0.85, 0.43, 0.30, 1.0)).add_to(scene)
         SceneObject("object2", "cube", (0.0, -0.39, 0.60)).add_to(scene)
 
@@ -88,7 +81,6 @@ class ReOrientation(TaskClass):
         return frozen
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        """Noisy hands, a cube above each."""
         eggs.start_hands(draws[:, : eggs.JOINT_DRAWS], _JOINT_NOISE, qpos)
         for name, side, pose in (("object1", "left", self.left), ("object2", "right", self.right)):
             eggs.start_egg(qpos[name], draws[:, eggs.JOINT_DRAWS :], _POSITION_NOISE)
@@ -96,7 +88,6 @@ class ReOrientation(TaskClass):
             eggs.lay_egg_on_hand(qpos[name], qpos[f"{side}/joints"], pose, _BOUNDING_RADIUS, _BOUNDING_RADIUS)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """The goal blocks of both cubes."""
         first = observe_goal(state, "object1/quaternion", "goal1")
         return first | observe_goal(state, "object2/quaternion", "goal2")
 
@@ -106,7 +97,6 @@ class ReOrientation(TaskClass):
         return {"left": -10.0 * first, "right": -10.0 * second, "target": -1.5 * (first_angle + second_angle)}
 
     def success(self, state: TaskState) -> Tensor:
-        """Both cubes within 0.2 rad of their goal's orientation and within 10 cm of its place."""
         (first, first_angle), (second, second_angle) = self._distances(state)
         turned = (first_angle < _SUCCESS_ANGLE) & (second_angle < _SUCCESS_ANGLE)
         return turned & (first < _SUCCESS_DISTANCE) & (second < _SUCCESS_DISTANCE)
@@ -116,17 +106,11 @@ class ReOrientation(TaskClass):
         return [eggs.distances(state, f"object{i}", f"goal{i}") for i in (1, 2)]
 
     def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
-        """Both goals."""
         return [(frozen[name], (0.025, 0.025, 0.025)) for name in ("goal1", "goal2")]
 
 
 def _turn_away(cube: Tensor, goal_inverse: Tensor) -> None:
-    """Turns cubes that start near their goal's orientation by half a turn about the world's x axis.
-
-    Args:
-        cube: The cubes' positions (n, 7), quaternion (w, x, y, z), written in place.
-        goal_inverse: Inverse of the goals' rotations, (x, y, z, w), (n, 4).
-    """
+    """Turns cubes (n, 7) near their goal's orientation by half a turn about the world's x axis, in place."""
     now = xyzw(cube[:, 3:])
     near = rotation_angle(multiply(now, goal_inverse)) < _START_ANGLE
     turned = multiply(constant((1.0, 0.0, 0.0, 0.0), now).expand_as(now), now)

@@ -41,14 +41,10 @@ def names() -> list[str]:
 
 
 def resolve(name: str, kind: str = "task class") -> str:
-    """The name by which ``get`` knows a class: any case will do; ``package.module:Class`` stays as it is.
-
-    Args:
-        name: A name, as the user gave it.
-        kind: What is looked up, for messages.
+    """The name by which ``get`` knows a class, in any case; ``package.module:Class`` stays as it is.
 
     Raises:
-        BidexError: There is no such class.
+        BidexError: There is no such class; the message calls it a ``kind``.
     """
     if not is_outside(name):
         return known_name(kind, name, names())
@@ -56,9 +52,9 @@ def resolve(name: str, kind: str = "task class") -> str:
     return name
 
 
-def with_object(thing: str | None) -> dict[str, str]:
+def with_object(name: str | None) -> dict[str, str]:
     """The option of ``get`` that chooses an object; none for None."""
-    return {} if thing is None else {"object": thing}
+    return {} if name is None else {"object": name}
 
 
 def get(name: str, moving_base: bool | None = None, **options: float | str) -> "TaskClass":

@@ -8,8 +8,7 @@ import mujoco
 import numpy as np
 
 from bidex_meta import paths
-from bidex_meta.hands.hand import hand
-from bidex_meta.hands.pair import FIXTURE, OBJECT, SIDES, add_hands, damp_bases, set_contact_bits
+from bidex_meta.hands.hand import FIXTURE, OBJECT, SIDES, add_hands, damp_bases, hand, set_contact_bits
 from bidex_meta.maths import quaternion_from_rpy
 from bidex_meta.tasks.state import unknown_sensor
 
@@ -203,11 +202,9 @@ def build_spec(task: "TaskClass") -> mujoco.MjSpec:
 
 
 def _let_objects_fall(spec: mujoco.MjSpec) -> None:
-    """Gives weight to objects alone.
-
-    The hands float (the original switches their gravity off). Gravity with compensation of their 52 bodies costs 8 %
-    of a step, hardly any gravity with a compensation a million times as large on a few objects costs nothing.
-    """
+    """Gives weight to objects alone; the hands float, as in the original."""
+    # Compensating gravity on the hands' 52 bodies costs 8 % of a step. Hardly any gravity, with a compensation a
+    # million times as large on a few objects, costs nothing.
     for body in spec.bodies:
         if body.name != "world" and not body.name.startswith(tuple(f"{side}/" for side in SIDES)):
             body.gravcomp = _FALL

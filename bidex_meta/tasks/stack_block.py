@@ -8,12 +8,12 @@ from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_DOWN_AWAY, PALM_DOWN_BACK, HandPose
 from bidex_meta.maths import norm
 from bidex_meta.tasks.base import FIRM, TaskClass
-from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
+from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, place_all, placed
 from bidex_meta.tasks.reach import reach
 from bidex_meta.tasks.scene import SceneObject, add_table
 from bidex_meta.tasks.state import TaskState
-from bidex_meta.tasks.variation import VariationSpace, component, join
+from bidex_meta.tasks.variation import component, join
 
 _EDGE = 0.05
 """Edge of a block, metres."""
@@ -34,13 +34,9 @@ class StackBlock(TaskClass):
     """Stack two blocks: the left hand's block 1 on the right hand's block 2.
 
     Table 0.5 x 1 m, 60 cm high. Observation: Table 38 (428); its goal is the top block's: target 1, upright and
-    unturned (the reward asks for no turn). Reward: equation 18, with each block's distance to its own target (the paper
-    prints target 1 twice). Success: each block within 3 cm of its target and block 1 on block 2: one edge higher within
-    1 cm, and within 3 cm above its middle.
-
-    A task shifts and turns both blocks and shifts the targets by up to 3 cm along x and y. Frictions are the means of
-    the original's figures; of four kinds of contact, two differ from them: block on block has 0.375 instead of 0.25,
-    hand on table 0.225 instead of 0.35.
+    unturned (the reward asks for no turn). Reward: equation 18. Success: each block within 3 cm of its target and block
+    1 on block 2: one edge higher within 1 cm, and within 3 cm above its middle. A task shifts and turns both blocks and
+    shifts the targets by up to 3 cm along x and y. Frictions are the means of the original's figures.
     """
 
     needs = Capacity(43, 0, 115)
@@ -62,27 +58,21 @@ class StackBlock(TaskClass):
     camera_target = (0.0, 0.0, 0.66)
     camera_distance = 1.5
 
-    @property
-    def variation_space(self) -> VariationSpace:
-        """Shift and turn of both blocks, shift of the targets."""
-        target = [component(f"target_{axis}", -_TARGET_RANGE, _TARGET_RANGE) for axis in "xy"]
-        return join(placed("block1"), placed("block2"), *target)
+    variation_space = join(
+        placed("block1"),
+        placed("block2"),
+        *(component(f"target_{axis}", -_TARGET_RANGE, _TARGET_RANGE) for axis in "xy"),
+    )
+    """Shift and turn of both blocks, shift of the targets."""
 
-    @property
-    def layout(self) -> Layout:
-        """Table 38."""
-        return Layout(
-            (
-                *both_hands(self.moving_base),
-                *object_blocks("block1", "block1"),
-                *goal_blocks("goal"),
-                point_block("block1_position", "block1/position", "centre of block 1"),
-                point_block("block2_position", "block2/position", "centre of block 2"),
-            )
-        )
+    blocks = (
+        *object_blocks("block1", "block1"),
+        *goal_blocks("goal"),
+        point_block("block1_position", "block1/position", "centre of block 1"),
+        point_block("block2_position", "block2/position", "centre of block 2"),
+    )
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
-        """A slippery table with two slippery blocks of different colour."""
         add_table(scene, (0.5, 1.0, 0.6), (0.0, 0.0, 0.3), friction=_TABLE_FRICTION, priority=2)
         SceneObject("block1", "cube", _STARTS["block1"], colour=(0.85, 0.43, 0.30, 1.0)).add_to(scene)
         SceneObject("block2", "cube", _STARTS["block2"]).add_to(scene)
@@ -104,11 +94,9 @@ class StackBlock(TaskClass):
         }
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        """Places both blocks."""
         place_all(_STARTS, qpos, frozen, draws)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """The goal blocks; the goal is unturned, so block 1's own orientation is the difference."""
         return {"goal_pose": state.frozen["goal"], "goal_rotation_difference": state.quaternion("block1/quaternion")}
 
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
@@ -123,7 +111,6 @@ class StackBlock(TaskClass):
         }
 
     def success(self, state: TaskState) -> Tensor:
-        """Both blocks within 3 cm of their targets, block 1 on block 2."""
         first, second = self._distances(state)
         x, y, z = (state["block1/position"] - state["block2/position"]).unbind(1)
         stacked = ((z - _EDGE).abs() < _SUCCESS_HEIGHT) & ((x * x + y * y).sqrt() < _SUCCESS_DISTANCE)
@@ -135,6 +122,5 @@ class StackBlock(TaskClass):
         return norm(first), norm(state["block2/position"] - state.frozen["target2"])
 
     def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
-        """Both targets."""
         bottom = torch.cat((frozen["target2"], frozen["goal"][:, 3:]), dim=1)
         return [(frozen["goal"], (0.025, 0.025, 0.025)), (bottom, (0.025, 0.025, 0.025))]

@@ -30,11 +30,7 @@ class TaskState:
         self.frozen = frozen
 
     def __getitem__(self, name: str) -> Tensor:
-        """Values of the named sensor, shape (n, k).
-
-        Raises:
-            BidexError: The scene has no such sensor.
-        """
+        """Values of the named sensor, shape (n, k); BidexError for an unknown one."""
         try:
             return self._sensors[:, self._addresses[name]]
         except KeyError:

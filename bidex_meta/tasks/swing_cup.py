@@ -11,13 +11,13 @@ from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
 from bidex_meta.maths import multiply, norm, rotation_angle, xyzw
 from bidex_meta.tasks.base import FIRM
 from bidex_meta.tasks.goals import frozen_goal, observe_goal, rotation_difference
-from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
+from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.objects.pointed import OwnObjectClass
 from bidex_meta.tasks.placement import DRAWS, place, placed, yaw_quaternion
 from bidex_meta.tasks.reach import reach
 from bidex_meta.tasks.scene import SceneObject, add_table
 from bidex_meta.tasks.state import TaskState
-from bidex_meta.tasks.variation import VariationSpace, component, join
+from bidex_meta.tasks.variation import component, join
 
 _CUP = SceneObject("cup", "cup", (0.0, 0.0, 0.6845), (0.0, 0.0, 0.5 * math.pi))
 _SUCCESS_ANGLE = 0.25 * math.pi
@@ -29,11 +29,10 @@ _GHOST = (0.1, 0.012, 0.012)
 class SwingCup(OwnObjectClass):
     """Turn a two-handled cup about the vertical, each hand at its ear.
 
-    Observation: Table 28 (428). Reward: equation 13. Success: the cup within 45 degrees of its goal and within
-    20 cm of where the task puts it, so that one on the floor is none.
-    The goal's turn is counted from the nominal start (yaw 90 degrees), without the task's own start turn: it lies at
-    least 72 degrees away, so no start is a success. The original's goal, half a turn away, is one end of the range.
-    Goal position is the task's start position; the reward does not read it.
+    Observation: Table 28 (428). Reward: equation 13. The goal's turn is counted from the nominal start (yaw 90
+    degrees), without the task's own start turn: it lies at least 72 degrees away, so no start is a success. The
+    original's goal, half a turn away, is one end of the range. Goal position is the task's start position; the reward
+    does not read it.
     """
 
     needs = Capacity(34, 4, 87)
@@ -55,24 +54,17 @@ class SwingCup(OwnObjectClass):
     usual = _CUP
     camera_target = (0.08, 0.0, 0.68)
 
-    @property
-    def variation_space(self) -> VariationSpace:
-        """The cup's place and ``yaw_change``, the goal's turn from the nominal start, radians."""
-        return join(placed("cup"), component("yaw_change", 0.5 * math.pi, math.pi))
+    variation_space = join(placed("cup"), component("yaw_change", 0.5 * math.pi, math.pi))
+    """The cup's place and ``yaw_change``, the goal's turn from the nominal start, radians."""
 
-    @property
-    def layout(self) -> Layout:
-        """Table 28."""
-        tail = (
-            *object_blocks("cup", "cup"),
-            *goal_blocks("goal"),
-            point_block("right_handle_position", "cup/right_handle_position", "middle of the right hand's ear"),
-            point_block("left_handle_position", "cup/left_handle_position", "middle of the left hand's ear"),
-        )
-        return Layout((*both_hands(self.moving_base), *tail))
+    blocks = (
+        *object_blocks("cup", "cup"),
+        *goal_blocks("goal"),
+        point_block("right_handle_position", "cup/right_handle_position", "middle of the right hand's ear"),
+        point_block("left_handle_position", "cup/left_handle_position", "middle of the left hand's ear"),
+    )
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
-        """The table and the cup, ears towards the hands."""
         add_table(scene, (0.3, 0.3, 0.6), (0.0, 0.0, 0.3))
         self.own.add_to(scene)
 
@@ -85,11 +77,9 @@ class SwingCup(OwnObjectClass):
         return {"cup": variation[:, :3], **frozen_goal(goal)}
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        """The cup on the table, lid shut."""
         place(qpos["cup"], frozen["cup"], draws)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """The goal blocks."""
         return observe_goal(state, "cup/quaternion")
 
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
@@ -100,12 +90,10 @@ class SwingCup(OwnObjectClass):
         return {"left": -left, "right": -right, "target": target, "constant": torch.full_like(left, -1.0)}
 
     def success(self, state: TaskState) -> Tensor:
-        """The cup within 45 degrees of its goal and within 20 cm of where the task puts it."""
         moved = norm(state["cup/position"] - state.frozen["goal"][:, :3])
         return (_angle(state) < _SUCCESS_ANGLE) & (moved < _SUCCESS_DISTANCE)
 
     def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
-        """The line of the ears at the goal."""
         return [(frozen["goal"], _GHOST)]
 
 

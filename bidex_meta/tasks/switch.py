@@ -11,12 +11,12 @@ from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
 from bidex_meta.maths import norm, quaternion_from_rpy, quaternion_product, xyzw
 from bidex_meta.tasks.base import FAST, TaskClass
 from bidex_meta.tasks.goals import frozen_goal, observe_goal
-from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks, point_block
+from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import SHIFT
 from bidex_meta.tasks.reach import reach
 from bidex_meta.tasks.scene import SceneObject, add_table
 from bidex_meta.tasks.state import TaskState
-from bidex_meta.tasks.variation import VariationSpace, component, join
+from bidex_meta.tasks.variation import component, join
 
 _BASES = {"switch1": (0.0, -0.2, 0.65), "switch2": (0.0, 0.2, 0.65)}
 _FACE_UP = (math.pi, 0.5 * math.pi, 0.0)
@@ -31,15 +31,11 @@ _SUCCESS_ANGLE = 0.8 * _TRAVEL
 class Switch(TaskClass):
     """Press the buttons of two rocker switches.
 
-    Observation: Table 36 (428). Reward: equation 17. Table 0.5 x 1 x 0.55 m. Success: both rockers past 80 % of their
-    travel.
-
-    Decided here: the half of each rocker that stands proud is the button, its point 3.5 cm from the hinge on the
-    surface, its target the same point at full travel. The published test asks for a height that its own point cannot
-    reach, since pressing raises it. Switch 1 is the one at -y, the left hand's. The entries of switch 1's pose
-    and velocity are its rocker's, since the housing does not move. The goal block holds switch 1's target and its
-    rocker's orientation there. A task freezes where the housings stand, 3 cm around the nominal place, unturned; an
-    episode draws nothing.
+    Table 0.5 x 1 x 0.55 m. Observation: Table 36 (428). Reward: equation 17. The half of each rocker that stands proud
+    is the button, its point 3.5 cm from the hinge on the surface, its target the same point at full travel. Switch 1 is
+    the one at -y, the left hand's. The entries of switch 1's pose and velocity are its rocker's, since the housing does
+    not move. The goal block holds switch 1's target and its rocker's orientation there. A task freezes where the
+    housings stand, 3 cm around the nominal place, unturned; an episode draws nothing.
     """
 
     needs = Capacity(36, 0, 90)
@@ -61,24 +57,19 @@ class Switch(TaskClass):
     camera_target = (0.08, 0.0, 0.70)
     camera_distance = 1.1
 
-    @property
-    def variation_space(self) -> VariationSpace:
-        """Both housings' shifts along x and y, metres."""
-        return join(*(component(f"{name}_{axis}", -SHIFT, SHIFT) for name in _BASES for axis in "xy"))
+    variation_space = join(*(component(f"{name}_{axis}", -SHIFT, SHIFT) for name in _BASES for axis in "xy"))
+    """Both housings' shifts along x and y, metres."""
 
-    @property
-    def layout(self) -> Layout:
-        """Table 36."""
-        points = [
+    blocks = (
+        *object_blocks("switch1", "switch1"),
+        *goal_blocks("goal"),
+        *(
             point_block(f"{name}_position", f"{name}/button_position", "point on the rocker's proud half")
             for name in _BASES
-        ]
-        return Layout(
-            (*both_hands(self.moving_base), *object_blocks("switch1", "switch1"), *goal_blocks("goal"), *points)
-        )
+        ),
+    )
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
-        """Two switches, face up, on a table."""
         add_table(scene, (0.5, 1.0, 0.55), (0.0, 0.0, 0.275))
         for name, base in _BASES.items():
             SceneObject(name, "switch", base, _FACE_UP).add_to(scene)
@@ -99,12 +90,10 @@ class Switch(TaskClass):
         return frozen | frozen_goal(torch.cat((frozen["goal1"], turn), dim=1))
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        """Both housings at the task's places, buttons unpressed."""
         for name in _BASES:
             qpos[name][:, :3] = frozen[name]
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """The goal blocks of switch 1."""
         return observe_goal(state, "switch1/quaternion")
 
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
@@ -118,6 +107,5 @@ class Switch(TaskClass):
         }
 
     def success(self, state: TaskState) -> Tensor:
-        """Both rockers past 80 % of their travel."""
         first, second = (state[f"{name}/angle"][:, 0] for name in _BASES)
         return (first > _SUCCESS_ANGLE) & (second > _SUCCESS_ANGLE)

@@ -10,11 +10,11 @@ from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
 from bidex_meta.tasks import eggs
 from bidex_meta.tasks.base import LIGHT, TaskClass
 from bidex_meta.tasks.goals import frozen_goal, observe_goal
-from bidex_meta.tasks.layout import Layout, both_hands, goal_blocks, object_blocks
+from bidex_meta.tasks.layout import goal_blocks, object_blocks
 from bidex_meta.tasks.objects.held import EGG, held_object
 from bidex_meta.tasks.scene import SceneObject
 from bidex_meta.tasks.state import TaskState
-from bidex_meta.tasks.variation import VariationSpace, box, join, orientation
+from bidex_meta.tasks.variation import box, join, orientation
 
 _ALPHA = 50.0
 _NOISE = 0.01
@@ -26,7 +26,7 @@ class TwoCatchUnderarm(TaskClass):
     """Throw two eggs at once, each to the other hand.
 
     Observation: Table 14 (446). Reward: equation 4. Both goals share one orientation, both eggs one start noise and
-    orientation (docs/figures.md, start noise). Success: each egg within 3 cm of its goal, both in the same step.
+    orientation (docs/figures.md, start noise).
     """
 
     needs = Capacity(42, 8, 57)
@@ -44,15 +44,7 @@ class TwoCatchUnderarm(TaskClass):
     solver = LIGHT
 
     def __init__(self, moving_base: bool | None = None, object: str = EGG) -> None:
-        """Chooses base and object, of which there are two.
-
-        Args:
-            moving_base: Drive the bases or fix them; None takes the class's own.
-            object: What is thrown: ``"egg"``, a name of the shelf, or the path of an MJCF file (docs/objects.md).
-
-        Raises:
-            BidexError: There is no such object, or its file holds none for a hand.
-        """
+        """As of ``OneEgg``; there are two of the object."""
         super().__init__(moving_base)
         self.held = held_object(object)
         if self.held is not None:
@@ -60,23 +52,21 @@ class TwoCatchUnderarm(TaskClass):
 
     @property
     def scene_key(self) -> tuple[Hashable, ...]:
-        """As in ``TaskClass``, and the object."""
         return (*super().scene_key, self.held)
 
-    @property
-    def variation_space(self) -> VariationSpace:
-        """Both goal positions (world, metres) and the two draws of their common orientation."""
-        goals = [box(f"goal{i}", centre, eggs.GOAL_RANGE) for i, centre in enumerate(_GOALS.values(), start=1)]
-        return join(*goals, orientation("goal"))
-
-    @property
-    def layout(self) -> Layout:
-        """Table 14."""
-        tail = [(*object_blocks(f"object{i}", f"object{i}"), *goal_blocks(f"goal{i}")) for i in (1, 2)]
-        return Layout((*both_hands(self.moving_base), *tail[0], *tail[1]))
+    variation_space = join(
+        *(box(f"goal{i}", centre, eggs.GOAL_RANGE) for i, centre in enumerate(_GOALS.values(), start=1)),
+        orientation("goal"),
+    )
+    """Both goal positions (world, metres) and the two draws of their common orientation."""
+    blocks = (
+        *object_blocks("object1", "object1"),
+        *goal_blocks("goal1"),
+        *object_blocks("object2", "object2"),
+        *goal_blocks("goal2"),
+    )
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
-        """Two eggs: the first on the right hand, the second, of another colour, on the left."""
         first, second, green = (0.0, -0.39, 0.54), (0.0, -0.78, 0.54), (0.45, 0.62, 0.30, 1.0)
         if self.held is None:
             SceneObject("object1", "egg", first).add_to(scene)
@@ -91,13 +81,11 @@ class TwoCatchUnderarm(TaskClass):
         return first | frozen_goal(eggs.goal_pose(variation[:, 3:6], variation[:, 6:]), "goal2")
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        """Noisy hands with an egg on each."""
         eggs.start_hands(draws[:, : eggs.JOINT_DRAWS], 0.2, qpos)
         for name, side, pose in (("object1", "right", self.right), ("object2", "left", self.left)):
             eggs.put_down(qpos[name], self.held, draws[:, eggs.JOINT_DRAWS :], _NOISE, qpos[f"{side}/joints"], pose)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """The goal blocks of both eggs."""
         first = observe_goal(state, "object1/quaternion", "goal1")
         return first | observe_goal(state, "object2/quaternion", "goal2")
 
@@ -106,7 +94,6 @@ class TwoCatchUnderarm(TaskClass):
         return {f"pose{i}": eggs.pose_reward(state, f"object{i}", f"goal{i}", _ALPHA) for i in (1, 2)}
 
     def success(self, state: TaskState) -> Tensor:
-        """Each egg within 3 cm of its goal."""
         first, second = (eggs.distances(state, f"object{i}", f"goal{i}")[0] for i in (1, 2))
         return (first < eggs.SUCCESS_DISTANCE) & (second < eggs.SUCCESS_DISTANCE)
 
@@ -115,6 +102,5 @@ class TwoCatchUnderarm(TaskClass):
         return (state["object1/position"][:, 2] <= _FLOOR) | (state["object2/position"][:, 2] <= _FLOOR)
 
     def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
-        """Both goals."""
         size = eggs.SEMI_AXES if self.held is None else self.held.half_extents
         return [(frozen["goal1"], size), (frozen["goal2"], size)]

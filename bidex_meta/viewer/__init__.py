@@ -1,1 +1,1 @@
-"""A policy at work, live: on a screen in MuJoCo's own viewer, without one in the browser."""
+"""A policy live: in MuJoCo's viewer on a screen, in the browser without one."""

@@ -1,4 +1,4 @@
-"""The same in the browser, by viser: for machines without a screen. Needs the extra ``viewer``."""
+"""A viewer in the browser, by viser, for machines without a screen. Needs the extra ``viewer``."""
 
 from importlib import import_module
 from typing import Any
@@ -8,25 +8,80 @@ import numpy as np
 
 from bidex_meta.errors import BidexError
 from bidex_meta.viewer.playback import Stage
-from bidex_meta.viewer.shapes import colour, shape, visible
 from bidex_meta.world.rendering import CAMERAS, GHOST
+
+_TYPE = mujoco.mjtGeom
+_SHOWN_GROUPS = 3
+"""Groups from here on are hidden, as in MuJoCo's own viewer."""
+
+
+def visible(model: mujoco.MjModel) -> list[int]:
+    """Geoms that a viewer shows, without planes."""
+    return [
+        geom
+        for geom in range(model.ngeom)
+        if model.geom_group[geom] < _SHOWN_GROUPS
+        and model.geom_type[geom] != _TYPE.mjGEOM_PLANE
+        and colour(model, geom)[3] > 0.0
+    ]
+
+
+def colour(model: mujoco.MjModel, geom: int) -> tuple[float, float, float, float]:
+    """Red, green, blue, alpha in [0, 1]: the geom's, or its material's."""
+    material = int(model.geom_matid[geom])
+    red, green, blue, alpha = (model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]).tolist()
+    return red, green, blue, alpha
+
+
+def shape(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3), metres, in the geom's frame, and triangles (m, 3) of a geom.
+
+    Raises:
+        BidexError: A height field or the like.
+    """
+    make = import_module("trimesh.creation")  # of viser's packages
+    kind, size = model.geom_type[geom], model.geom_size[geom]
+    if kind == _TYPE.mjGEOM_MESH:
+        mesh = int(model.geom_dataid[geom])
+        points, faces = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
+        return (
+            model.mesh_vert[points : points + model.mesh_vertnum[mesh]].astype(float),
+            model.mesh_face[faces : faces + model.mesh_facenum[mesh]].astype(int),
+        )
+    if kind == _TYPE.mjGEOM_SPHERE:
+        made = make.icosphere(subdivisions=3, radius=size[0])
+    elif kind == _TYPE.mjGEOM_ELLIPSOID:
+        made = make.icosphere(subdivisions=3, radius=1.0)
+        made.apply_scale(size)
+    elif kind == _TYPE.mjGEOM_CAPSULE:
+        made = make.capsule(height=2.0 * size[1], radius=size[0], count=(16, 16))
+        made.apply_translation((0.0, 0.0, -made.bounds.mean(axis=0)[2]))  # from one end on in some versions
+    elif kind == _TYPE.mjGEOM_CYLINDER:
+        made = make.cylinder(radius=size[0], height=2.0 * size[1], sections=32)
+    elif kind == _TYPE.mjGEOM_BOX:
+        made = make.box(extents=2.0 * size)
+    else:
+        raise BidexError(
+            f"Expected geoms that the browser can show (primitives, meshes), got {model.geom(geom).name!r} of type "
+            f"{_TYPE(int(kind)).name}. Make a film of it: bidex-meta render."
+        )
+    return np.asarray(made.vertices), np.asarray(made.faces)
 
 
 class Browser:
-    """A server that shows the stage to whoever opens its page. A ``loop.Screen``."""
+    """A ``Screen`` as a web server.
+
+    Args:
+        stage: The episodes.
+        host: Address it listens at; 0.0.0.0 lets other machines in.
+        port: Port; if it is in use, the next free one.
+        speed: Of the clock.
+
+    Raises:
+        BidexError: viser is missing.
+    """
 
     def __init__(self, stage: Stage, host: str = "127.0.0.1", port: int = 8080, speed: float = 1.0) -> None:
-        """Starts it.
-
-        Args:
-            stage: What is shown.
-            host: Address it listens at; 0.0.0.0 lets other machines in.
-            port: Port; where it is taken, the next free one.
-            speed: Of the clock.
-
-        Raises:
-            BidexError: viser is missing.
-        """
         try:
             viser = import_module("viser")
         except ImportError:
@@ -50,7 +105,7 @@ class Browser:
         self._pause = gui.add_checkbox("Pause", False)
         self._pace = gui.add_slider("Speed", min=0.1, max=2.0, step=0.1, initial_value=min(2.0, max(0.1, self.speed)))
         for label in ("Another episode", "Next task"):
-            # Called in a thread of the server's: the stage is played in another one, which looks there.
+            # Called in the server's thread; the stage runs in another one.
             gui.add_button(label).on_click(lambda event, label=label: self._asked.append(label))
 
     def is_open(self) -> bool:
@@ -68,7 +123,7 @@ class Browser:
             stage.restart() if self._asked.pop(0) == "Another episode" else stage.next_task()
 
     def _set_the_scene(self, stage: Stage) -> None:
-        """Shapes and camera of the class that is looked at."""
+        """Shapes and camera of the shown class."""
         scene, self._model = self._server.scene, stage.model()
         for handle in (*self._shapes.values(), *self._ghosts):
             handle.remove()
@@ -89,14 +144,14 @@ class Browser:
             client.camera.position, client.camera.look_at = camera.position, camera.look_at
 
     def show(self, stage: Stage) -> None:
-        """Places of all shapes, goals, and the numbers."""
+        """Poses of all shapes and goals, and the status."""
         data, turned = stage.data(), np.empty(4)
         with self._server.atomic():
             for geom, handle in self._shapes.items():
                 mujoco.mju_mat2Quat(turned, data.geom_xmat[geom])
                 handle.position, handle.wxyz = data.geom_xpos[geom], turned.copy()
             self._show_ghosts(stage)
-        self._text.content = "\n".join(["| | |", "|-|-|", *(f"| {k} | {v} |" for k, v in stage.told().items())])
+        self._text.content = "\n".join(["| | |", "|-|-|", *(f"| {k} | {v} |" for k, v in stage.status().items())])
         self._server.flush()
 
     def _show_ghosts(self, stage: Stage) -> None:

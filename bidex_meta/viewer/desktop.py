@@ -14,7 +14,7 @@ KEYS = "Space pauses, Enter begins another episode, Right goes to the next task,
 
 
 class Desktop:
-    """A window; its keys are ``KEYS``. A ``loop.Screen``."""
+    """A ``Screen`` as a window; its keys are ``KEYS``."""
 
     def __init__(self, stage: Stage, speed: float = 1.0) -> None:
         """Opens it.
@@ -59,21 +59,19 @@ class Desktop:
                 self.speed = min(4.0, max(1.0 / 16.0, self.speed * (2.0 if key == _EQUAL else 0.5)))
 
     def show(self, stage: Stage) -> None:
-        """State, goals, and a few words."""
+        """State, goals and status."""
         now = stage.data()
         with self._viewer.lock():
-            for name in ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat", "time"):
-                if name == "time":
-                    self._data.time = now.time
-                else:
-                    getattr(self._data, name)[:] = getattr(now, name)
+            self._data.time = now.time
+            for name in ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat"):
+                getattr(self._data, name)[:] = getattr(now, name)
             mujoco.mj_forward(self._model, self._data)
             scene = self._viewer.user_scn
             scene.ngeom = 0
             add_ghosts(stage.ghosts(), scene)
-        told = stage.told()
+        status = stage.status()
         corner = mujoco.mjtGridPos.mjGRID_TOPLEFT
-        self._viewer.set_texts((None, corner, "\n".join(told), "\n".join(told.values())))
+        self._viewer.set_texts((None, corner, "\n".join(status), "\n".join(status.values())))
         self._viewer.sync()
 
     def close(self) -> None:

@@ -1,33 +1,38 @@
-"""What is played: a world with a row of each class, a policy, and the row that is looked at."""
+"""The episodes that a viewer shows, and their clock."""
 
-from typing import Any
+import time
+from typing import Protocol
 
 import mujoco
 import numpy as np
 import torch
 
 from bidex_meta.agents import Agent
+from bidex_meta.tasks.base import CONTROL_RATE
+from bidex_meta.world import World
 from bidex_meta.world.rendering import Ghost, ghosts, simulation
 
 
 class Stage:
-    """Episodes one after the other, in all rows.
+    """Episodes one after the other, in all environments.
 
     Args:
-        world: A world of ours in autoreset mode DISABLED, a row of each slot.
+        world: In autoreset mode DISABLED, one environment of each slot.
         agent: The policy.
-        row: Which row is looked at first.
+        row: The environment that is shown first.
         seed: Of the starts.
 
     Attributes:
-        names: Class of each row.
-        row: Which row is looked at; may be set.
+        names: Class of each environment.
+        row: The environment that is shown; may be set.
     """
 
-    def __init__(self, world: Any, agent: Agent, row: int = 0, seed: int = 0) -> None:
+    def __init__(self, world: World, agent: Agent, row: int = 0, seed: int = 0) -> None:
         self.names: list[str] = [world.task_names[int(slot)] for slot in world.task_id]
         self.row, self._world, self._agent, self._seed = row, world, agent, seed
-        self._episodes, self._solved = np.zeros(len(self.names), int), np.zeros(len(self.names), int)
+        size = len(self.names)
+        self._episodes, self._solved, self._steps = np.zeros((3, size), int)
+        self._returns, self._success = np.zeros(size), np.zeros(size, bool)
         self._begin()
 
     def _begin(self) -> None:
@@ -37,14 +42,11 @@ class Stage:
     def _start(self, mask: torch.Tensor) -> None:
         self._agent.reset(mask)
         chosen = mask.cpu().numpy()
-        if not hasattr(self, "_steps"):
-            size = len(self.names)
-            self._steps, self._returns, self._success = np.zeros(size, int), np.zeros(size), np.zeros(size, bool)
         self._steps[chosen], self._returns[chosen], self._success[chosen] = 0, 0.0, False
 
     @torch.no_grad()
     def step(self) -> None:
-        """One control step of all rows; those whose episodes ended begin the next."""
+        """One control step of all environments; those whose episodes ended begin the next."""
         self._obs, _, terminated, truncated, info = self._world.step(self._agent.eval_action(self._obs))
         self._steps += 1
         self._returns += info["reward_unscaled"].double().cpu().numpy()
@@ -57,7 +59,7 @@ class Stage:
             self._restart(ended)
 
     def restart(self) -> None:
-        """The row that is looked at begins another episode; the unfinished one does not count."""
+        """The shown environment begins another episode; the unfinished one does not count."""
         mask = torch.zeros(len(self.names), dtype=torch.bool, device=self._obs.device)
         mask[self.row] = True
         self._restart(mask)
@@ -67,14 +69,14 @@ class Stage:
         self._start(mask)
 
     def next_task(self) -> None:
-        """Every class goes on to the next task of its pool."""
+        """Each class goes on to the next task of its pool."""
         pools = zip(self._world.task_names, self._world.pools, strict=True)
         self._world.set_tasks({name: np.roll(pool, -1, axis=0) for name, pool in pools})
         self._seed += 1
         self._begin()
 
     def model(self) -> mujoco.MjModel:
-        """The model of the row that is looked at."""
+        """The model of the shown environment."""
         engine, row = simulation(self._world, self.row)
         return engine.model(row)
 
@@ -88,12 +90,12 @@ class Stage:
         return ghosts(self._world, self.row)
 
     def camera(self) -> tuple[tuple[float, float, float], float]:
-        """The point that pictures of it look at, world, metres, and the camera's distance from it."""
+        """The camera's target, world, metres, and its distance from it."""
         task = self._world.slots[int(self._world.task_id[self.row])].task_class
         return task.camera_target, task.camera_distance
 
-    def told(self) -> dict[str, str]:
-        """What to write beside it."""
+    def status(self) -> dict[str, str]:
+        """Labels and values to show beside it."""
         row = self.row
         most = int(self._world.max_episode_steps[row])
         return {
@@ -103,3 +105,55 @@ class Stage:
             "success": "yes" if self._success[row] else "not yet",
             "episodes": f"{self._solved[row]} of {self._episodes[row]} solved",
         }
+
+
+_PICTURES = 30
+"""Pictures a second at most: more would only delay the browser."""
+
+
+class Screen(Protocol):
+    """A viewer.
+
+    Attributes:
+        paused: Whether time stands still.
+        speed: Of the clock, 1 in real time.
+    """
+
+    paused: bool
+    speed: float
+
+    def is_open(self) -> bool:
+        """Whether it has not been closed."""
+        ...
+
+    def obey(self, stage: Stage) -> None:
+        """Applies the user's requests since the last call to the stage."""
+        ...
+
+    def show(self, stage: Stage) -> None:
+        """Shows its present state."""
+        ...
+
+    def close(self) -> None:
+        """Ends the view."""
+        ...
+
+
+def play(stage: Stage, screen: Screen, seconds: float | None = None) -> None:
+    """Plays until the viewer is closed, or for so many seconds, in real time or slower."""
+    began = shown = due = time.monotonic()
+    screen.show(stage)
+    try:
+        while screen.is_open() and (seconds is None or time.monotonic() - began < seconds):
+            screen.obey(stage)
+            if not screen.paused:
+                stage.step()
+            now = time.monotonic()
+            if now - shown >= 0.9 / _PICTURES:  # a step that comes a little early counts
+                shown = now
+                screen.show(stage)
+            # Delays are not caught up with: the view would race after each pause.
+            due = max(due + 1.0 / (CONTROL_RATE * screen.speed), now)
+            time.sleep(due - now)
+    finally:
+        screen.close()

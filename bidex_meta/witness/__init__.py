@@ -1,6 +1,6 @@
-"""Witnesses: recorded actions that solve a task, their replay, and scripts that solve one in closed loop.
+"""Witnesses: stored reference solutions, one recorded action sequence a class, and what replays them.
 
 They prove that a scene, its reward and its success test fit together, as Meta-World's scripted policies do. A witness
-belongs to task 0 of ``Benchmark("MT20", seed=0)``. Most were searched on the printed reward alone; where such a search
-stays in a local optimum, a script controls the hands (``scripts``). The search is no part of the package.
+solves task 0 of ``Benchmark("MT20", seed=0)``. Most were found by a search on the printed reward alone
+(``tools/witness_search``); where it stays in a local optimum, a scripted policy controls the hands (``scripts``).
 """

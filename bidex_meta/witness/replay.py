@@ -1,23 +1,158 @@
-"""Plays a witness again: from its start, and from starts that are shifted by a tenth of a millimetre."""
+"""Replays of witnesses: from their start, and from starts shifted by a tenth of a millimetre."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from bidex_meta.witness.simulator import Simulator
+from bidex_meta.benchmark import Benchmark
+from bidex_meta.errors import unknown_name
 from bidex_meta.witness.store import Witness
+from bidex_meta.world import Slot, World
+from bidex_meta.world.part import judge
 
+SUITE, SEED = "MT20", 0
+"""Witnesses are about task 0 of each class of this suite and seed."""
+SHIFT = 1e-4
+"""How far the objects' start is shifted to see whether a witness succeeds by more than luck, metres."""
 SHIFTED = 10
-"""Shifted starts that a witness is tried from."""
+"""Shifted starts of a replay."""
 NEEDED = 8
 """Of these so many must succeed."""
+
+State = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Trace:
+    """Results of T steps of N environments."""
+
+    rewards: Tensor
+    """Unscaled reward (T, N), float64; 0 from the step after an end on."""
+    least: Tensor
+    """The least of the reward's terms, times their number; else as ``rewards``."""
+    success: Tensor
+    """Bool (T, N), counted until the end of the episode."""
+    alive: Tensor
+    """Bool (N,): the episode has not failed nor its physics broken."""
+
+
+def task_slot(name: str) -> Slot:
+    """The slot of a class with the one task that witnesses are about.
+
+    Raises:
+        BidexError: The suite has no such class.
+    """
+    benchmark = Benchmark(SUITE, seed=SEED)
+    classes = benchmark.task_classes()
+    if name not in classes:
+        raise unknown_name("task", name, classes)
+    task = next(t for t in benchmark.train_tasks if t.env_name == name)
+    return Slot(name, classes[name], task.variation[None])
+
+
+class Simulator:
+    """N environments in a class's task 0, all at the same start: the world's physics and reward without its episodes.
+
+    Args:
+        name: The class.
+        num: Environments, N.
+        threads: Engine threads; None takes all CPUs.
+
+    Attributes:
+        action_size: Actions of an environment.
+        episode_steps: Time limit, control steps.
+    """
+
+    def __init__(self, name: str, num: int, threads: int | None = None):
+        slot = task_slot(name)
+        self._name, self.num, self.task = name, num, slot.task_class
+        self.action_size, self.episode_steps = slot.task_class.action_size, slot.task_class.episode_steps
+        self._world = World([slot], num, autoreset_mode="DISABLED", seed=SEED, threads=threads)
+        self._world.reset(seed=SEED)
+        self._part = self._world.parts[0]
+        self._engine = self._part.group.engine
+        self._start = self._engine.placement()[0]
+        self._everyone = torch.ones(num, dtype=torch.bool)
+        self._engine.reset(self._everyone, self._start.expand(num, -1))
+
+    def starts(self, shifted: int, seed: int = SEED) -> list[State]:
+        """The start state, and so many with every object or fixture shifted by 0.1 mm in the plane."""
+        generator = torch.Generator().manual_seed(seed)
+        places = self._part.group.members[0].scene.qpos
+        objects = [where for part, where in places.items() if "/" not in part]
+        states = []
+        for i in range(shifted + 1):
+            start = self._start.clone()
+            for where in objects if i else []:
+                angle = 2.0 * torch.pi * torch.rand(1, generator=generator, dtype=start.dtype)
+                start[where.start : where.start + 2] += SHIFT * torch.cat((angle.cos(), angle.sin()))
+            self._engine.reset(self._everyone, start.expand(self.num, -1))
+            states.append(self.save(0))
+        return states
+
+    def save(self, row: int) -> State:
+        """The state of an environment, copied."""
+        return {name: value[row].clone() for name, value in self._engine.state_dict().items()}
+
+    def load(self, states: list[State]) -> None:
+        """Puts equal consecutive shares of the environments into these states; their number must divide N."""
+        share = self.num // len(states)
+        names = states[0]
+        self._engine.load_state_dict(
+            {name: torch.stack([s[name] for s in states]).repeat_interleave(share, dim=0) for name in names}
+        )
+
+    def take(self, task: np.ndarray, start: State) -> None:
+        """Puts all environments into another task of the class, variation (variation_space.size,), and its start."""
+        self._world.set_tasks({self._name: task[None]})
+        self._world.reset(seed=SEED)
+        self.load([start])
+
+    def play(self, actions: Tensor, each_step: Callable[[], None] | None = None) -> Trace:
+        """Plays actions (T, N, action_size) in [-1, 1] from the present state, and calls back after each step."""
+        alive = torch.ones(self.num, dtype=torch.bool)
+        rewards, least, success = [], [], []
+        for action in actions:
+            self._part.step(action, None)
+            (_, _, state), *_ = self._part.states(self._world.task_index)
+            transition = judge(self._part.group.members[0].scene.task, state)
+            alive &= ~self._part.unstable()
+            terms = torch.stack(list(transition.terms.values()))
+            rewards.append(torch.where(alive, transition.reward, 0.0))
+            least.append(torch.where(alive, len(terms) * terms.amin(0), 0.0))
+            success.append(alive & transition.success)
+            alive &= ~transition.failed
+            if each_step is not None:
+                each_step()
+        return Trace(torch.stack(rewards), torch.stack(least), torch.stack(success), alive)
+
+    def sensor(self, name: str) -> Tensor:
+        """A sensor's values, (N, k), a copy."""
+        return self._engine.sensordata[:, self._part.group.members[0].scene.sensors[name]].clone()
+
+    def frozen(self, name: str) -> Tensor:
+        """A frozen number of the task, (N, k)."""
+        return self._part.frozen(0, self._world.task_index)[name]
+
+    def contact_depth(self, row: int) -> float:
+        """Deepest penetration among an environment's contacts, metres."""
+        return self._engine.contact_depth(row)
+
+    def picture(self, width: int = 640, height: int = 480, camera: str | None = None) -> np.ndarray:
+        """Picture of the first environment, (height, width, 3) uint8."""
+        return self._world.render(row=0, width=width, height=height, camera=camera)
+
+    def close(self) -> None:
+        """Ends the engine."""
+        self._world.close()
 
 
 @dataclass(frozen=True)
 class Replay:
-    """What a replay showed."""
+    """Result of a replay."""
 
     total: float
     """Return from the unshifted start."""
@@ -42,10 +177,7 @@ class Replay:
 def frames(
     name: str, witness: Witness, at: Collection[int] | None = None, camera: str | None = None, **size: int
 ) -> Iterator[np.ndarray]:
-    """Pictures of a witness, (height, width, 3) uint8: after as many steps as ``at`` says (0: the start).
-
-    None: after every step.
-    """
+    """Pictures of a witness, (height, width, 3) uint8, after these numbers of steps, from 0 on; None: after each."""
     simulator = Simulator(name, 1, threads=1)
     for played in range(len(witness.actions) + 1):
         if at is None or played in at:

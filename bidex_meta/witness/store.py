@@ -1,39 +1,42 @@
-"""Witnesses on disk: one small file a class under ``assets/witnesses/``."""
+"""Witnesses, stored reference solutions, on disk: one file a class under ``assets/witnesses/``."""
 
 import io
 import json
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
-from torch import Tensor
 
 from bidex_meta import paths
 from bidex_meta.errors import BidexError, one_line
-from bidex_meta.reading import bounded, check, number, read_bytes, whole
+from bidex_meta.reading import bounded, read_bytes
 from bidex_meta.record.atomic import write_atomic
 from bidex_meta.tasks import registry
+from bidex_meta.validation import Finite, Whole, parse
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 LEVELS = 127
 """Actions are whole multiples of 1/127, so that a byte holds one exactly."""
 _MOST_BYTES, _MOST_STEPS = 50_000_000, 100_000
-_MADE = {"return": number(), "first_success": whole(0).or_none(), "rival": number().or_none()}
-"""What is read again of how a witness was made."""
+_Made = TypedDict("_Made", {"return": Finite, "first_success": Whole | None, "rival": Finite | None}, total=False)
+"""What is read again of how a witness was found."""
 
 
 @dataclass(frozen=True)
 class Witness:
-    """Recorded actions and what they were made with."""
+    """Recorded actions that solve a task, and how they were found."""
 
     actions: np.ndarray
     """Actions (T, action_size), float32, multiples of 1/127."""
     made: dict[str, Any]
-    """Return, step of the first success, the best unsuccessful episode seen (``rival``), how it was found, versions."""
+    """Return, step of the first success, return of the best unsuccessful episode (``rival``), settings, versions."""
 
 
-def quantised(actions: Tensor) -> Tensor:
+def quantised(actions: "Tensor") -> "Tensor":
     """Actions rounded to multiples of 1/127, float32."""
     return (actions.clamp(-1.0, 1.0) * LEVELS).round() / LEVELS
 
@@ -58,8 +61,10 @@ def load_witness(name: str, path: Path | None = None) -> Witness:
         raise BidexError(f"Expected a witness file such as {witness_path(name)}, got {path}, which is no file.")
     witness, size = _read(path), registry.get(name, moving_base=True).action_size
     if witness.actions.shape[1] != size:
-        told = f"expected actions of shape (steps, {size}), as {name} has, got {witness.actions.shape}"
-        raise BidexError(f"{path}: {told}. Give a witness of {name}, or leave --file out.")
+        raise BidexError(
+            f"{path}: expected actions of shape (steps, {size}), as {name} has, got {witness.actions.shape}. Give a "
+            f"witness of {name}, or leave --file out."
+        )
     return witness
 
 
@@ -88,5 +93,5 @@ def _read(path: Path) -> Witness:
         raise BidexError(
             f"{path}: expected actions as bytes, (steps, actions), got {levels.dtype} of shape {levels.shape}."
         )
-    check(made, _MADE, path)
+    parse(made, _Made, str(path))
     return Witness(levels.astype(np.float32) / LEVELS, made)

@@ -10,8 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from bidex_meta.errors import BidexError, unknown_name
-from bidex_meta.hands.hand import hand
-from bidex_meta.hands.pair import SIDES
+from bidex_meta.hands.hand import SIDES, hand
 from bidex_meta.hands.units import UNITS, Agents, partition_line, units_by_agent
 from bidex_meta.tasks.layout import hand_blocks
 from bidex_meta.world.contract import ObservationGroup

@@ -11,7 +11,7 @@ from bidex_meta.engine.capacity import room_for
 from bidex_meta.engine.models import same_structure
 from bidex_meta.engine.protocol import Engine, EngineMaker
 from bidex_meta.errors import BidexError
-from bidex_meta.points.sight import PointsRule, Sight
+from bidex_meta.points.depth_sensor import DepthSensor, PointsRule
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.scene import Scene, compile_scene
 
@@ -134,7 +134,7 @@ def build_groups(slots: list[Slot], rows: list[slice], make_engine: EngineMaker)
     return [_build_group([(i, by_slot[i], rows[i]) for i in pool], make_engine) for pool in pools]
 
 
-def sights(groups: list[Group], rule: PointsRule, first: int) -> list[Sight]:
+def sights(groups: list[Group], rule: PointsRule, first: int) -> list[DepthSensor]:
     """What rows of each slot see, in the slots' order; slots of one scene share it.
 
     Args:
@@ -142,13 +142,13 @@ def sights(groups: list[Group], rule: PointsRule, first: int) -> list[Sight]:
         rule: What is seen.
         first: Where in an observation the clouds begin.
     """
-    made: dict[int, Sight] = {}
-    by_slot: dict[int, Sight] = {}
+    made: dict[int, DepthSensor] = {}
+    by_slot: dict[int, DepthSensor] = {}
     for group in groups:
         for member in group.members:
             key = id(member.scene)
             if key not in made:
-                made[key] = Sight(member.scene, rule, first, group.engine.device)
+                made[key] = DepthSensor(member.scene, rule, first, group.engine.device)
             by_slot[member.slot] = made[key]
     return [by_slot[slot] for slot in sorted(by_slot)]
 

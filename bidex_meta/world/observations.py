@@ -7,8 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from bidex_meta.hands.hand import hand
-from bidex_meta.hands.pair import SIDES
+from bidex_meta.hands.hand import SIDES, hand
 from bidex_meta.maths import conjugate, multiply, roll_pitch_yaw, xyzw
 from bidex_meta.tasks.layout import CLIP, Layout, hand_blocks
 from bidex_meta.tasks.scene import Scene

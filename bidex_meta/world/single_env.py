@@ -14,7 +14,7 @@ import torch
 from gymnasium.spaces import Box
 
 from bidex_meta.errors import BidexError
-from bidex_meta.points.sight import PointsRule
+from bidex_meta.points.depth_sensor import PointsRule
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import CONTROL_RATE, TaskClass
 from bidex_meta.world.contract import Info, Options

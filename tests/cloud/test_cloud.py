@@ -6,10 +6,8 @@ import pytest
 import torch
 
 from bidex_meta.errors import BidexError
-from bidex_meta.points.camera import camera_of
-from bidex_meta.points.cloud import Cloud
-from bidex_meta.points.solids import area, inside, surface
-from bidex_meta.points.surfaces import sample
+from bidex_meta.points.cloud import Camera, Cloud, beside, camera_of, draw
+from bidex_meta.points.surfaces import FIXTURE, HAND, OBJECT, area, inside, sample, surface
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import compile_scene
 
@@ -117,8 +115,6 @@ def test_a_wall_hides_and_without_it_nothing_does() -> None:
         )
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
-        from bidex_meta.points.camera import Camera
-
         cloud = Cloud(sample(model, 3072), Camera((1.0, 0.0, 0.0), (0.0, 0.0, 0.0)), 256)
         return model, cloud(torch.tensor(data.xpos)[None], torch.tensor(data.xmat).view(1, -1, 3, 3))[0]
 
@@ -128,3 +124,37 @@ def test_a_wall_hides_and_without_it_nothing_does() -> None:
     assert (hidden[:, 0] > 0.28).all()
     _, behind = scene('<body pos="-0.3 0 0"><geom type="box" size="0.01 0.05 0.05"/></body>')
     assert (behind[:, 0] > 0.0).all()
+
+
+_CAMERA = Camera((1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+
+def middle(*points: tuple[float, float, float, float]) -> list[int]:
+    return draw(np.array(points), _CAMERA, 41, 41)[20, 20].tolist()
+
+
+def test_a_point_is_drawn_where_the_camera_sees_it() -> None:
+    picture = draw(np.array([[0.0, 0.2, 0.1, HAND]]), _CAMERA, 200, 100)
+    rows, columns = (picture != picture[0, 0]).any(axis=2).nonzero()
+    # A width of the image is 2 tan 30 deg at a distance of 1: 100 pixels, the smaller side.
+    assert abs(columns.mean() - (100 + 0.2 * _CAMERA.focal * 100)) < 1.0
+    assert abs(rows.mean() - (50 - 0.1 * _CAMERA.focal * 100)) < 1.0
+
+
+def test_the_nearer_point_is_in_front_whatever_the_order() -> None:
+    near, far = (0.2, 0.0, 0.0, OBJECT), (-0.2, 0.0, 0.0, HAND)
+    assert middle(near, far) == middle(far, near)
+    alone = middle((0.2, 0.0, 0.0, OBJECT))
+    assert alone == middle(near, far) != middle(far)
+
+
+def test_nothing_seen_is_an_empty_picture() -> None:
+    behind = draw(np.array([[2.0, 0.0, 0.0, FIXTURE], [np.nan, 0.0, 0.0, HAND]]), _CAMERA, 20, 10)
+    assert behind.shape == (10, 20, 3) and (behind == behind[0, 0]).all()
+
+
+def test_from_the_side_it_looks_at_the_same_place_from_as_far() -> None:
+    side = beside(_CAMERA)
+    assert side.target == _CAMERA.target
+    assert abs(float(np.linalg.norm(np.subtract(side.eye, side.target))) - 1.0) < 0.01
+    assert abs(side.axes[2] @ _CAMERA.axes[2]) < 0.01

@@ -8,14 +8,27 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 from gymnasium.spaces import Box
 from torch import Tensor
 
+from bidex_meta.cli import main
 from bidex_meta.data import Dataset, Episode, open_dataset, part_files, seals
 from bidex_meta.data.writer import DatasetWriter, finish
 from tests.fake_world import FakeWorld
 from tests.points import PointWorld, ring
+
+
+def printed(capsys: pytest.CaptureFixture[str], *words: object, code: int = 0) -> str:
+    """What a command line prints; it must end with this exit code."""
+    capsys.readouterr()
+    try:
+        assert main([str(word) for word in words]) == code
+    except SystemExit as end:
+        assert end.code == code
+    out = capsys.readouterr()
+    return out.out + out.err
 
 
 class Rough(PointWorld):

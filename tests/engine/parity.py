@@ -9,7 +9,7 @@ from torch import Tensor
 from bidex_meta.engine.capacity import room_for
 from bidex_meta.engine.cpu import CpuEngine
 from bidex_meta.engine.warp import WarpEngine
-from bidex_meta.hands.pair import SIDES
+from bidex_meta.hands.hand import SIDES
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.world import World

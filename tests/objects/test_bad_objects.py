@@ -7,7 +7,7 @@ from pathlib import Path
 import mujoco
 import pytest
 
-from bidex_meta import Benchmark, BidexError, make_task_world
+from bidex_meta import Benchmark, BidexError
 from bidex_meta.cli import main
 from bidex_meta.tasks import registry
 
@@ -117,11 +117,6 @@ def test_a_bad_name_is_one_line(name: object) -> None:
         registry.get("CatchUnderarm", True, object=name)  # type: ignore[arg-type]
 
 
-def test_the_nearest_name_of_the_shelf_is_told() -> None:
-    with pytest.raises(BidexError, match="Did you mean 'hammer'"):
-        registry.get("HandOver", object="hamer")
-
-
 def test_a_pipe_a_folder_and_a_link_that_leads_away(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.xml")
     (tmp_path / "folder.xml").mkdir()
@@ -189,8 +184,3 @@ def test_a_bad_suite_is_one_line(line: str, told: str, tmp_path: Path) -> None:
     with pytest.raises(BidexError, match=r"things\.toml") as raised:
         Benchmark(tmp_path / "things.toml")
     assert told in str(raised.value)
-
-
-def test_a_world_of_one_class_refuses_it_too() -> None:
-    with pytest.raises(BidexError, match="Unknown object"):
-        make_task_world("HandOver", 2, "cpu", threads=1, object="crate")

@@ -7,31 +7,20 @@ import numpy as np
 import pytest
 import torch
 
-from bidex_meta.cli import main
-from bidex_meta.commands import record_demonstrations
-from bidex_meta.data import open_dataset, place
+from bidex_meta.data import collect, open_dataset, writer
 from bidex_meta.record import RunFolder
+from bidex_meta.witness.demonstrators import ShiftedStarts
+from bidex_meta.witness.replay import Simulator
 from bidex_meta.witness.scripts import SCRIPTS
-from bidex_meta.witness.shifted import ShiftedStarts
-from bidex_meta.witness.simulator import Simulator
 from bidex_meta.witness.store import load_witness
 from bidex_meta.worlds.own import SingleClass
+from tests.data.worlds import printed
 
 pytest.importorskip("h5py", reason="needs the extra data")
 
 RECORD = ["record", "demonstrations", "--task", "HandOver", "--num-envs", "3", "--threads", "1", "--noise", "0.02"]
 RUN = ["run", "--task", "HandOver", "--base", "moving", "--algo", "ppo", "--num-envs", "50", "--steps", "800"]
 RUN += ["--threads", "1", "--device", "cpu", "--logger", "none", "--learner.hidden", "8", "--no-evaluate"]
-
-
-def told(capsys: pytest.CaptureFixture[str], *words: object, code: int = 0) -> str:
-    capsys.readouterr()
-    try:
-        assert main([str(word) for word in words]) == code
-    except SystemExit as end:
-        assert end.code == code
-    out = capsys.readouterr()
-    return out.out + out.err
 
 
 @pytest.fixture
@@ -68,14 +57,14 @@ def test_the_world_begins_and_goes_as_the_witness_does() -> None:
 def test_only_what_succeeds_is_kept_and_a_recording_goes_on(
     sets: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert "0.00 GB" in told(capsys, *RECORD, "--size", "300", "--estimate")
+    assert "0.00 GB" in printed(capsys, *RECORD, "--size", "300", "--estimate")
     assert not (sets / "sets").exists()
-    told(capsys, *RECORD, "--size", "300")
+    printed(capsys, *RECORD, "--size", "300")
     whole = open_dataset("HandOver/demonstrations-v0")
     assert whole.num_steps >= 300 and bool(whole.table["success"].all())
     assert (whole.metadata["kind"], whole.metadata["base"]) == ("demonstrations", "moving")
     torn = [*RECORD, "--size", "300", "--out", sets / "sets" / "torn-v0"]
-    play, rounds = record_demonstrations._round, []
+    play, rounds = collect.collect_successes, []
 
     def once(*given: Any) -> None:
         if rounds:
@@ -83,19 +72,19 @@ def test_only_what_succeeds_is_kept_and_a_recording_goes_on(
         rounds.append(play(*given))
 
     with monkeypatch.context() as patch:
-        patch.setattr(record_demonstrations, "_round", once)
-        told(capsys, *torn, code=130)
-    asked, room = [], place.check_room
+        patch.setattr(collect, "collect_successes", once)
+        printed(capsys, *torn, code=130)
+    asked, room = [], writer.check_room
     with monkeypatch.context() as patch:
-        patch.setattr(place, "check_room", lambda *given: (asked.append(given[1]), room(*given)))
-        told(capsys, *torn)
-        told(capsys, *RECORD, "--size", "300", "--out", sets / "sets" / "fresh-v0")
+        patch.setattr(writer, "check_room", lambda *given: (asked.append(given[1]), room(*given)))
+        printed(capsys, *torn)
+        printed(capsys, *RECORD, "--size", "300", "--out", sets / "sets" / "fresh-v0")
     assert 0 <= asked[0] < asked[1]  # less what the killed one left
     again = open_dataset("torn-v0").transitions()
     assert all(np.array_equal(a, again[name]) for name, a in whole.transitions().items())
-    assert "rewards computed again" in told(capsys, "data", "check", whole.name)
+    assert "rewards computed again" in printed(capsys, "data", "check", whole.name)
     # A witness that is shaken hard succeeds no more.
-    told_of = told(capsys, *RECORD, "--noise", "3", "--out", sets / "sets" / "wild-v0", code=2)
+    told_of = printed(capsys, *RECORD, "--noise", "3", "--out", sets / "sets" / "wild-v0", code=2)
     assert "None of 9 replays of HandOver's witness succeeds" in told_of
 
 
@@ -106,10 +95,10 @@ def test_on_all_tasks_they_show_more(
     played = load_witness("CatchAbreast")
     monkeypatch.setattr("bidex_meta.witness.store.load_witness", lambda name: played)
     words = ["record", "demonstrations", "--task", "Switch", "--threads", "1", "--starts", "tasks"]
-    assert "None of 12 replays" in told(capsys, *words, "--num-envs", "4", "--size", "10", code=2)
+    assert "None of 12 replays" in printed(capsys, *words, "--num-envs", "4", "--size", "10", code=2)
     monkeypatch.undo()
     monkeypatch.setenv("BIDEX_DATA", str(sets / "sets"))
-    told(capsys, *words, "--num-envs", "8", "--size", "1", "--out", sets / "sets" / "own-v0")
+    printed(capsys, *words, "--num-envs", "8", "--size", "1", "--out", sets / "sets" / "own-v0")
     kept = open_dataset("own-v0")
     (policy,) = kept.metadata["policies"]
     assert policy == {"algo": None, "actions": "witness", "noise": 0.0, "starts": "tasks"}
@@ -121,28 +110,28 @@ def test_a_script_shows_tasks_in_closed_loop(
 ) -> None:
     monkeypatch.setenv("BIDEX_DATA", str(sets / "sets"))
     words = ["record", "demonstrations", "--threads", "1", "--script"]
-    assert "--starts tasks" in told(capsys, *words, "--task", "PourWater", code=2)
+    assert "--starts tasks" in printed(capsys, *words, "--task", "PourWater", code=2)
     words += ["--starts", "tasks", "--num-envs", "2", "--size", "1"]
-    assert "Expected a class with a script" in told(capsys, *words, "--task", "Switch", code=2)
-    told(capsys, *words, "--task", "PourWater", "--out", sets / "sets" / "led-v0")
+    assert "Expected a class with a script" in printed(capsys, *words, "--task", "Switch", code=2)
+    printed(capsys, *words, "--task", "PourWater", "--out", sets / "sets" / "led-v0")
     kept = open_dataset("led-v0")
     (policy,) = kept.metadata["policies"]
     assert policy == {"algo": None, "actions": "script", "noise": 0.0, "starts": "tasks"}
     assert bool(kept.table["success"].all())
     monkeypatch.setitem(SCRIPTS, "PourWater", lambda hands: hands.lead((0.0, 0.0, 1.0), (0.0, 0.0, 1.0)))
-    told_of = told(capsys, *words, "--task", "PourWater", "--out", sets / "sets" / "idle-v0", code=2)
-    assert "None of 6 episodes that PourWater's script leads succeeds" in told_of
+    told_of = printed(capsys, *words, "--task", "PourWater", "--out", sets / "sets" / "idle-v0", code=2)
+    assert "None of 6 episodes of PourWater's scripted policy succeeds" in told_of
 
 
 def test_a_run_imitates_them_and_is_resumed(
     sets: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told(capsys, *RECORD, "--size", "200")
+    printed(capsys, *RECORD, "--size", "200")
     shown = ["--demonstrations", "HandOver/demonstrations-v0"]
-    assert "Demonstrations: 2" in told(capsys, *RUN, *shown, "--run-dir", sets / "whole")
-    told(capsys, *RUN, *shown, "--steps", "400", "--run-dir", sets / "torn")
-    told(capsys, "run", "--resume", sets / "torn", "--steps", "800", "--no-evaluate")
-    told(capsys, *RUN, "--run-dir", sets / "plain")
+    assert "Demonstrations: 2" in printed(capsys, *RUN, *shown, "--run-dir", sets / "whole")
+    printed(capsys, *RUN, *shown, "--steps", "400", "--run-dir", sets / "torn")
+    printed(capsys, "run", "--resume", sets / "torn", "--steps", "800", "--no-evaluate")
+    printed(capsys, *RUN, "--run-dir", sets / "plain")
     weights = []
     for name in ("whole", "torn", "plain"):
         found = RunFolder.open(sets / name).checkpoints.load()
@@ -163,21 +152,21 @@ def test_a_run_imitates_them_and_is_resumed(
         ([*shown, "--algo", "td3"], "td3 imitates nothing; --demonstrations goes with mtppo, ppo"),
     ]
     for flags, text in wrong:
-        assert text in told(capsys, *RUN, *flags, "--run-dir", sets / "bad", code=2)
-    assert "Name the class" in told(capsys, "record", "demonstrations", code=2)
-    assert "--shift must lie in" in told(capsys, *RECORD, "--shift", "1", code=2)
+        assert text in printed(capsys, *RUN, *flags, "--run-dir", sets / "bad", code=2)
+    assert "Name the class" in printed(capsys, "record", "demonstrations", code=2)
+    assert "shift" in printed(capsys, *RECORD, "--shift", "1", code=2)
     assert not (sets / "bad").exists()
 
 
 def test_a_run_imitates_several_sets_and_is_resumed(sets: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    told(capsys, *RECORD, "--size", "200")
-    told(capsys, *RECORD, "--size", "200", "--seed", "1", "--out", sets / "other")
+    printed(capsys, *RECORD, "--size", "200")
+    printed(capsys, *RECORD, "--size", "200", "--seed", "1", "--out", sets / "other")
     counts = [open_dataset(name).num_steps for name in ("HandOver/demonstrations-v0", sets / "other")]
     shown = ["--demonstrations", "HandOver/demonstrations-v0", "--demonstrations", sets / "other"]
     suite = ["--suite", "MT4", *RUN[7:], "--num-envs", "200", *shown]
-    assert f"Demonstrations: {sum(counts)} transitions" in told(capsys, "run", *suite, "--run-dir", sets / "many")
+    assert f"Demonstrations: {sum(counts)} transitions" in printed(capsys, "run", *suite, "--run-dir", sets / "many")
     kept = ["HandOver/demonstrations-v0", str((sets / "other").resolve())]
-    assert list(RunFolder.open(sets / "many").config().demonstrations) == kept
-    told(capsys, "run", "--resume", sets / "many", "--steps", "1600", "--no-evaluate")
-    assert list(RunFolder.open(sets / "many").config().demonstrations) == kept
-    assert "Switch" in told(capsys, "run", "--task", "Switch", *RUN[5:], *shown, "--run-dir", sets / "bad", code=2)
+    assert RunFolder.open(sets / "many").config()["demonstrations"] == kept
+    printed(capsys, "run", "--resume", sets / "many", "--steps", "1600", "--no-evaluate")
+    assert RunFolder.open(sets / "many").config()["demonstrations"] == kept
+    assert "Switch" in printed(capsys, "run", "--task", "Switch", *RUN[5:], *shown, "--run-dir", sets / "bad", code=2)

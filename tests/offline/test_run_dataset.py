@@ -10,21 +10,20 @@ import pytest
 import torch
 from gymnasium.spaces import Box
 
-from bidex_meta.cli import main
-from bidex_meta.commands.run_offline import implied
+from bidex_meta.commands.run_data import implied
 from bidex_meta.data import Dataset, open_dataset
-from bidex_meta.data.episode_recorder import EpisodeRecorder
+from bidex_meta.data.collector import EpisodeCollector
 from bidex_meta.data.joined import join
 from bidex_meta.data.writer import DatasetWriter, begin, finish
 from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder
-from bidex_meta.witness.simulator import task_slot
+from bidex_meta.witness.replay import task_slot
 from bidex_meta.world import World
 from bidex_meta.world.contract import ObservationGroup
 from bidex_meta.worlds.external import HUMANOID
 from bidex_meta.worlds.own import OwnSuite
 from tests.algos.problems import opposite_bandits
-from tests.data.worlds import rough
+from tests.data.worlds import printed, rough
 from tests.offline.stored import noisy, played
 
 pytest.importorskip("h5py", reason="needs the extra data")
@@ -42,29 +41,19 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def told(capsys: pytest.CaptureFixture[str], *words: object, code: int = 0) -> str:
-    capsys.readouterr()
-    try:
-        assert main([str(word) for word in words]) == code
-    except SystemExit as end:
-        assert end.code == code
-    out = capsys.readouterr()
-    return out.out + out.err
-
-
 def test_a_run_on_data_sets_is_evaluated_resumed_and_reported(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for kind, seed in (("a", 0), ("b", 5)):
         more = ["--size", "150", "--seed", seed, "--out", folder / "sets" / f"{kind}-v0"]
-        told(capsys, "record", "random", "--suite", "mt4", *FEW, *more)
+        printed(capsys, "record", "random", "--suite", "mt4", *FEW, *more)
     run = ["run", "--dataset", "a-v0", "--dataset", folder / "sets" / "b-v0", "--algo", "iql", "--seed", "3", *SMALL]
     whole, halves = folder / "whole", folder / "halves"
-    said = told(capsys, *run, "--steps", "40", "--evaluate-every", "2", "--run-dir", whole, "--episodes", "1")
+    said = printed(capsys, *run, "--steps", "40", "--evaluate-every", "2", "--run-dir", whole, "--episodes", "1")
     assert "Reading 3" in said and "Evaluating" in said
-    assert "--dataset is ['a-v0'," in told(
+    assert "--dataset is ['a-v0'," in printed(
         capsys, "run", "--algo", "iql", "--resume", whole, "--dataset", "a-v0", code=2
     )
-    told(capsys, *run, "--steps", "20", "--run-dir", halves, "--no-evaluate")
-    told(capsys, "run", "--resume", halves, "--steps", "40", "--no-evaluate")
+    printed(capsys, *run, "--steps", "20", "--run-dir", halves, "--no-evaluate")
+    printed(capsys, "run", "--resume", halves, "--steps", "40", "--no-evaluate")
     config = RunFolder.open(whole).config()
     assert (config.suite, config.task, config.task_seed, config.num_envs) == ("MT4", None, 0, 4)
     assert list(config.dataset) == ["a-v0", str((folder / "sets" / "b-v0").resolve())]
@@ -74,22 +63,22 @@ def test_a_run_on_data_sets_is_evaluated_resumed_and_reported(folder: Path, caps
     lines = [json.loads(line) for line in (whole / "metrics.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [10, 20, 30, 40]
     assert ["Eval/mean_return" in line for line in lines] == [False, True, False, True]
-    assert "iql" in told(capsys, "compare", whole)
-    told(capsys, "plot", whole, "--out", folder / "curves.png")
+    assert "iql" in printed(capsys, "compare", whole)
+    printed(capsys, "plot", whole, "--out", folder / "curves.png")
     assert (folder / "curves.png").stat().st_size > 5000
-    told(capsys, "report", whole, "--out", folder / "report.html")
+    printed(capsys, "report", whole, "--out", folder / "report.html")
 
 
 def test_a_policy_from_data_is_recorded_on_the_tasks_of_its_data(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Whatever the seeds of the runs are, so that two of them make one data set."""
-    told(capsys, "record", "random", "--suite", "MT4", *FEW, "--size", "60", "--seed", "4")
+    printed(capsys, "record", "random", "--suite", "MT4", *FEW, "--size", "60", "--seed", "4")
     runs = [folder / name for name in ("a", "b")]
     for seed, run in enumerate(runs, 1):
         flags = ["--dataset", "MT4/random-v0", "--algo", "bc", "--seed", seed, "--steps", "10", "--run-dir", run]
-        told(capsys, "run", *flags, *SMALL, "--no-evaluate")
-    told(capsys, "record", "medium-expert", *runs, *FEW, "--size", "60", "--seed", "9")
+        printed(capsys, "run", *flags, *SMALL, "--no-evaluate")
+    printed(capsys, "record", "medium-expert", *runs, *FEW, "--size", "60", "--seed", "9")
     about = open_dataset("MT4/medium-expert-v0").metadata
     assert (about["seed"], about["starts"]) == (4, 9)
 
@@ -97,11 +86,11 @@ def test_a_policy_from_data_is_recorded_on_the_tasks_of_its_data(
 def test_gymnasiums_humanoid_is_learned_without_being_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Its data set tells the task, and no suite."""
     few = ["--size", "60", "--num-envs", "4", "--threads", "1", "--device", "cpu"]
-    told(capsys, "record", "random", "--task", HUMANOID, *few)
+    printed(capsys, "record", "random", "--task", HUMANOID, *few)
     name = f"{HUMANOID}/random-v0"
     about = open_dataset(name).metadata
     assert (about["suite"], about["task"], about["base"]) == (None, HUMANOID, "own")
-    told(
+    printed(
         capsys,
         "run",
         "--dataset",
@@ -119,20 +108,20 @@ def test_gymnasiums_humanoid_is_learned_without_being_named(folder: Path, capsys
 
 
 def test_what_does_not_go_together_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    told(capsys, "record", "random", "--suite", "MT4", *FEW, "--size", "60")
+    printed(capsys, "record", "random", "--suite", "MT4", *FEW, "--size", "60")
     data = ["--dataset", "MT4/random-v0"]
-    assert "Add --dataset NAME" in told(capsys, "run", "--suite", "MT4", "--algo", "bc", code=2)
-    assert "goes with bc, bcq, td3bc, iql" in told(capsys, "run", *data, "--algo", "mtppo", code=2)
-    assert "nothing to record" in told(capsys, "run", *data, "--algo", "bc", "--record", "10", code=2)
-    assert "Unknown data set 'MT4/rand-v0'. Did you mean" in told(
+    assert "Add --dataset NAME" in printed(capsys, "run", "--suite", "MT4", "--algo", "bc", code=2)
+    assert "goes with bc, bcq, td3bc, iql" in printed(capsys, "run", *data, "--algo", "mtppo", code=2)
+    assert "nothing to record" in printed(capsys, "run", *data, "--algo", "bc", "--record", "10", code=2)
+    assert "Unknown data set 'MT4/rand-v0'. Did you mean" in printed(
         capsys, "run", "--dataset", "MT4/rand-v0", "--algo", "bc", code=2
     )
-    told(capsys, "record", "random", "--suite", "ML4", *FEW, "--size", "60")
+    printed(capsys, "record", "random", "--suite", "ML4", *FEW, "--size", "60")
     hidden = ["--dataset", "ML4/random-v0"]
-    assert "ML4/random-v0 hides goals, MT4 shows" in told(
+    assert "ML4/random-v0 hides goals, MT4 shows" in printed(
         capsys, "run", *hidden, "--suite", "MT4", "--algo", "bc", code=2
     )
-    assert "--dataset" in told(capsys, "run", "--algo", "bc", "--help")
+    assert "--dataset" in printed(capsys, "run", "--algo", "bc", "--help")
     assert not (folder / "runs").exists()
 
 
@@ -196,7 +185,7 @@ def test_goals_that_the_world_hides_are_zero_as_it_shows_them(tmp_path: Path) ->
         for rule, pad in (("plain", None), ("masked", 450))
     )
     episodes: list[Any] = []
-    recorder = EpisodeRecorder(plain, episodes.append)
+    recorder = EpisodeCollector(plain, episodes.append)
     seen, action = [masked.reset(seed=3)[0]], torch.full((1, 52), 0.1)
     recorder.reset(seed=3)
     for _ in range(slot.task_class.episode_steps):

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from bidex_meta.hands.pair import SIDES
+from bidex_meta.hands.hand import SIDES
 from bidex_meta.world import World
 from tests.hands import figures
 from tests.tasks.worlds import (

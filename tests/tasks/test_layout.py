@@ -6,7 +6,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidex_meta.hands.pair import SIDES
+from bidex_meta.hands.hand import SIDES
 from bidex_meta.tasks import registry
 from bidex_meta.world import World
 from tests.hands import figures
@@ -16,7 +16,6 @@ from tests.tasks.tables import SIZES, TABLES, block_name
 from tests.tasks.worlds import (
     CASES,
     Lens,
-    dofs_of,
     each_case,
     engine_of,
     objects_of,
@@ -78,71 +77,7 @@ def test_a_wrong_block_name_is_answered_with_the_names_there_are() -> None:
         registry.get("HandOver").layout.range("joint_positions")
 
 
-def test_every_block_says_what_it_is() -> None:
-    for name, moving in CASES:
-        assert all(block.description for block, _ in registry.get(name, moving).layout), name
-
-
 # ----------------------------------------------------------------------------------------- values by hand
-
-
-@each_case
-def test_a_joint_at_its_limit_reads_one(worlds: dict[tuple[str, bool], World], name: str, moving: bool) -> None:
-    world, where = started(worlds, name, moving), places(name, moving)
-    engine, scene = engine_of(world), scene_of(world)
-    for side in SIDES:
-        for row, angles in enumerate((figures.LOW, figures.HIGH, 0.5 * (figures.LOW + figures.HIGH))):
-            engine.qpos[row, scene.qpos[f"{side}/joints"]] = torch.from_numpy(angles)
-    obs = observe(world)
-    for side in SIDES:
-        found = obs[:, where[f"{side} dof position"]]
-        np.testing.assert_allclose(found, np.array([[-1.0], [1.0], [0.0]]) * np.ones(24), atol=1e-6)
-
-
-@each_case
-def test_one_joint_moves_one_entry(worlds: dict[tuple[str, bool], World], name: str, moving: bool) -> None:
-    world, where = started(worlds, name, moving), places(name, moving)
-    engine, scene = engine_of(world), scene_of(world)
-    start = torch.from_numpy(scene.start_qpos[: scene.model.nq])
-    engine.qpos[:] = start
-    nominal = observe(world)
-    for i, side in ((0, "right"), (5, "left"), (14, "right"), (23, "left")):
-        engine.qpos[:] = start
-        engine.qpos[0, scene.qpos[f"{side}/joints"].start + i] = figures.HIGH[i] or figures.LOW[i]
-        obs = observe(world)
-        entries = np.concatenate(
-            [np.arange(p.start, p.stop) for what, p in where.items() if what.endswith("dof position")]
-        )
-        changed = entries[obs[0, entries] != nominal[0, entries]]
-        assert changed.tolist() == [where[f"{side} dof position"].start + i]
-        np.testing.assert_array_equal(obs[1], nominal[1])
-
-
-@each_case
-def test_an_object_pose_set_by_hand_stands_at_its_indices(
-    worlds: dict[tuple[str, bool], World], name: str, moving: bool
-) -> None:
-    world, where = started(worlds, name, moving), places(name, moving)
-    engine, scene = engine_of(world), scene_of(world)
-    xyzw = np.array((0.1, -0.5, 0.7, 0.5)) / np.linalg.norm((0.1, -0.5, 0.7, 0.5))
-    for i, body in enumerate(objects_of(scene)):
-        set_pose(world, 1, body, np.array([0.3 + i, -0.2, 1.7, *np.roll(xyzw, 1)]))
-        first, _ = dofs_of(scene, body)
-        engine.qvel[1, first : first + 6] = torch.tensor([0.4, -0.5, 0.6 + i, 1.0, 2.0, -3.0])
-    before = observe(world)
-    for i, body in enumerate(objects_of(scene)):
-        position = (0.3 + i, -0.2, 1.7)
-        # MuJoCo's free joint holds the angular velocity in the body's frame; the table's is the world's, times 0.2.
-        wanted = {
-            f"{body} pose": (*position, *xyzw),
-            f"{body} position": position,
-            f"{body} quaternion": xyzw,
-            f"{body} link quaternion": xyzw,
-            f"{body} linear velocity": (0.4, -0.5, 0.6 + i),
-            f"{body} angle velocity": 0.2 * Rotation.from_quat(xyzw).apply((1.0, 2.0, -3.0)),
-        }
-        for what in wanted.keys() & where.keys():
-            np.testing.assert_allclose(before[1, where[what]], wanted[what], atol=1e-6, err_msg=what)
 
 
 def same_turn(found: np.ndarray, turn: Rotation, what: str) -> None:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidex_meta.hands.pair import SIDES
+from bidex_meta.hands.hand import SIDES
 from bidex_meta.tasks import registry
 from tests.hands import figures
 from tests.tasks.formulas import FORMULAS
@@ -260,14 +260,6 @@ def test_starts_differ_and_depend_on_the_seed_alone(qpos: np.ndarray, name: str,
 def world_tasks(name: str, moving: bool) -> np.ndarray:
     """The pool that the thousand rows have."""
     return registry.get(name, moving).variation_space.sample(np.random.default_rng(5), RESETS)
-
-
-@each_case
-def test_bases_start_at_their_places(qpos: np.ndarray, name: str, moving: bool) -> None:
-    places = scene(name, moving)
-    for side in SIDES if moving else ():
-        start = places.start_qpos[places.qpos[f"{side}/base"]]
-        np.testing.assert_array_equal(qpos[:, places.qpos[f"{side}/base"]], np.tile(start, (RESETS, 1)))
 
 
 @each_case

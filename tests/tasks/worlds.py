@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.engine.cpu import CpuEngine
-from bidex_meta.hands.pair import SIDES
+from bidex_meta.hands.hand import SIDES
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.scene import Scene

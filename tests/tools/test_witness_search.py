@@ -8,10 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bidex_meta.errors import BidexError
-from bidex_meta.witness.puppets import Puppets
-from bidex_meta.witness.replay import replay
+from bidex_meta.witness.controller import HandController
+from bidex_meta.witness.replay import Simulator, replay
 from bidex_meta.witness.scripts import SCRIPTS
-from bidex_meta.witness.simulator import Simulator
 from bidex_meta.witness.store import LEVELS, Witness, load_witness, witness_path
 from tools.witness_search import steady, whole
 from tools.witness_search.__main__ import main
@@ -156,7 +155,7 @@ def test_what_holds_goes_into_the_working_folder(tmp_path: Path, monkeypatch: py
 def test_an_episode_of_a_script_that_does_not_hold_is_kept_in_a_named_file_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def stay(hands: Puppets) -> None:
+    def stay(hands: HandController) -> None:
         hands.lead(tuple(hands.at("right").tolist()), tuple(hands.at("left").tolist()), steps=3)
 
     monkeypatch.setitem(SCRIPTS, "StackBlock", stay)

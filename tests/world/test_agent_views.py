@@ -126,11 +126,11 @@ def test_a_file_a_line_and_a_dict_are_the_same(tmp_path: Path) -> None:
         ({"a": [*ALL, "left/palm"]}, "left/palm is of a and of a"),
         ({"a": ALL[:-1]}, "left/thumb is of no agent"),
         ({"a": [*ALL[:-1], "left/thum"]}, "Did you mean 'left/thumb'"),
-        ({}, "at least one agent"),
-        ({"a": "right/palm"}, "a list of units"),
+        ({}, "agents: expected"),
+        ({"a": "right/palm"}, "agents.*expected a list"),
         ("hand", "expected single, hands, fingers"),
         ("a=right/palm;a=left/palm", "a twice"),
-        ("none.toml", "expected a file at none.toml"),
+        ("none.toml", "none.toml"),
     ],
 )
 def test_bad_partitions_are_one_line(agents, message: str) -> None:

@@ -11,10 +11,9 @@ import tyro
 
 from bidex_meta.errors import BidexError
 from bidex_meta.record.versions import collect_versions
-from bidex_meta.witness.puppets import Puppets
-from bidex_meta.witness.replay import SHIFTED, Replay, replay
+from bidex_meta.witness.controller import HandController
+from bidex_meta.witness.replay import SHIFTED, Replay, Simulator, replay
 from bidex_meta.witness.scripts import script_of
-from bidex_meta.witness.simulator import Simulator
 from bidex_meta.witness.store import Witness, load_witness, save_witness
 from tools.witness_search.planner import Planner, PlannerConfig
 from tools.witness_search.steady import steadied
@@ -129,7 +128,7 @@ class Script(Search):
         """Plays the script once."""
         play, simulator = script_of(self.task), Simulator(self.task, 16, self.threads)
         simulator.load(simulator.starts(15, seed=7))
-        hands = Puppets(simulator)
+        hands = HandController(simulator)
         play(hands)
         self.keep(np.stack([action.numpy() for action in hands.actions]), {"script": play.__name__, "rival": None})
 

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from bidex_meta.errors import BidexError
-from bidex_meta.witness.puppets import rest_action
-from bidex_meta.witness.simulator import Simulator, State, Trace
+from bidex_meta.witness.controller import rest_action
+from bidex_meta.witness.replay import Simulator, State, Trace
 from bidex_meta.witness.store import quantised
 from tools.witness_search.mutants import FINEST, mutants, parts_of_the_hands
 

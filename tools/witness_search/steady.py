@@ -9,7 +9,7 @@ the replay.
 import numpy as np
 import torch
 
-from bidex_meta.witness.simulator import Simulator
+from bidex_meta.witness.replay import Simulator
 from bidex_meta.witness.store import quantised
 from tools.witness_search.mutants import mutants
 from tools.witness_search.planner import interpolation

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bidex_meta.hands.pair import SIDES
-from bidex_meta.witness.simulator import SEED, Simulator, Trace
+from bidex_meta.hands.hand import SIDES
+from bidex_meta.witness.replay import SEED, Simulator, Trace
 from bidex_meta.witness.store import quantised
 from tools.witness_search.planner import interpolation
 

@@ -1,4 +1,4 @@
-"""What the throwing classes throw, if it is no egg: a thing of the shelf, or an MJCF file of the user's."""
+"""Objects of the throwing classes in place of the egg: of the shelf, or from an MJCF file of the user's."""
 
 import math
 import os
@@ -18,8 +18,7 @@ from bidex_meta.hands.poses import PALM_UP_AWAY, HandPose
 from bidex_meta.hands.starts import make_room_for
 from bidex_meta.maths import conjugate, constant, multiply, rotate, wxyz, xyzw
 from bidex_meta.reading import expanded
-from bidex_meta.tasks.objects.outline import extents, outline
-from bidex_meta.tasks.objects.own_file import compiled, read_own, set_contacts
+from bidex_meta.tasks.objects.mjcf import check_collisions, compiled, extents, outline, read_own, set_contacts
 from bidex_meta.tasks.scene import attach
 
 EGG = "egg"
@@ -28,7 +27,6 @@ _MASS = (0.002, 2.0)
 _LONGEST, _SHORTEST = 0.25, 0.01
 """The longest edge of the box around an object, metres: a hand is 20 cm long from the wrist to the middle fingertip."""
 _MOST_GEOMS = 32
-_MOST_FRICTION = 5.0
 _PALM_UP = HandPose((0.0, 0.0, 0.0), PALM_UP_AWAY)
 
 
@@ -37,12 +35,12 @@ class HeldObject:
     """An object that lies on a hand.
 
     Attributes:
-        name: As the user called it: of the shelf, or the file's name without its ending.
+        name: Of the shelf, or the file's name without its ending.
         file: Its MJCF file.
         mass: kg.
         low: Lower corner of the box around its colliding geoms, its own frame, metres.
         high: Upper corner.
-        geoms: How many geoms of it collide.
+        geoms: Number of its geoms that collide.
         centres: Balls whose convex hull holds these geoms: their centres, its own frame, metres, shape (k, 3).
         radii: Their radii, shape (k,).
     """
@@ -58,7 +56,7 @@ class HeldObject:
 
     @property
     def half_extents(self) -> tuple[float, float, float]:
-        """How far it reaches from its origin along its axes, metres."""
+        """Extent from its origin along its axes, metres."""
         x, y, z = (max(-low, high) for low, high in zip(self.low, self.high, strict=True))
         return x, y, z
 
@@ -91,10 +89,8 @@ class HeldObject:
         attach(scene, part, name, position, (1.0, 0.0, 0.0, 0.0), colour)
 
     def needs(self, egg: Capacity, count: int = 1) -> Capacity:
-        """Room for contacts of a class with so many of it, from what the class needs with eggs.
-
-        A flat face meets what it lies on in four points, and every geom may meet palm and fingers at once.
-        """
+        """Room for contacts of a class with so many of it, from the class's need with eggs."""
+        # A flat face meets its support in four points, and each geom may meet palm and fingers at once.
         more = count * (8 + 4 * self.geoms)
         return Capacity(egg.contacts + 2 * more, egg.convex + more, egg.rows + 6 * more)
 
@@ -201,12 +197,8 @@ def _loaded(file: Path, _state: tuple[int, int]) -> HeldObject:
     if (spec.body("object") or bodies[0]) is not bodies[0] or not list(bodies[0].geoms):
         raise BidexError(f"{file}: expected a <body> with geoms, got none. Add its shape.")
     model = compiled(file, spec)
+    collide = check_collisions(file, model, _MOST_GEOMS)
     centres, radii = outline(model, 1)
-    collide = int(((model.geom_contype != 0) | (model.geom_conaffinity != 0)).sum())
-    if not len(centres):
-        raise BidexError(f"{file}: expected geoms that collide, got contype 0 in all. Leave contype out.")
-    if collide > _MOST_GEOMS:
-        raise BidexError(f"{file}: expected at most {_MOST_GEOMS} geoms that collide, got {collide}. Simplify it.")
     low, high = extents(model, 1)
     _check_figures(file, model, low, high)
     corners = tuple(map(float, low)), tuple(map(float, high))
@@ -220,15 +212,14 @@ def _check_figures(file: Path, model: mujoco.MjModel, low: np.ndarray, high: np.
             f"{file}: expected a mass of {_MASS[0]:g} to {_MASS[1]:g} kg, got {mass:.4g}. Mend mass or density."
         )
     if not _SHORTEST <= longest <= _LONGEST:
-        told = f"{100 * _SHORTEST:g} to {100 * _LONGEST:g} cm on its longest side, which fits a hand"
         raise BidexError(
-            f"{file}: expected an object of {told}, got {100 * longest:.4g} cm. Scale it (MJCF is in metres)."
+            f"{file}: expected an object of {100 * _SHORTEST:g} to {100 * _LONGEST:g} cm on its longest side, which "
+            f"fits a hand, got {100 * longest:.4g} cm. Scale it (MJCF is in metres)."
         )
     if (low > 0.0).any() or (high < 0.0).any():
         raise BidexError(f"{file}: expected the body's origin inside its shape, got it outside. Shift the geoms.")
-    if max(-low.min(), high.max()) > 0.5 * _LONGEST:
-        told = f"the body's origin in the middle, at most {50 * _LONGEST:g} cm from its ends"
-        raise BidexError(f"{file}: expected {told}, got {100 * max(-low.min(), high.max()):.4g}. Shift the geoms.")
-    if not (model.geom_friction[:, 0] <= _MOST_FRICTION).all():
-        worst = float(model.geom_friction[:, 0].max())
-        raise BidexError(f"{file}: expected friction of at most {_MOST_FRICTION:g}, got {worst:.4g}. Lower it.")
+    if (far := max(-low.min(), high.max())) > 0.5 * _LONGEST:
+        raise BidexError(
+            f"{file}: expected the body's origin at most {50 * _LONGEST:g} cm from its ends, got {100 * far:.4g}. "
+            "Shift the geoms."
+        )

@@ -1,4 +1,4 @@
-"""Own objects for classes that reach for points of theirs, handles or a cap: the file names them as the usual one."""
+"""User's objects for classes that reach for points such as handles: the file names them as the usual one does."""
 
 import hashlib
 from collections.abc import Hashable
@@ -16,12 +16,11 @@ from bidex_meta.engine.capacity import Capacity
 from bidex_meta.errors import BidexError, shortened
 from bidex_meta.reading import absolute
 from bidex_meta.tasks.base import TaskClass
-from bidex_meta.tasks.objects.outline import outline
-from bidex_meta.tasks.objects.own_file import compiled, read_own, set_contacts
+from bidex_meta.tasks.objects.mjcf import check_collisions, compiled, outline, read_own, set_contacts
 from bidex_meta.tasks.scene import SceneObject, attach, compile_scene
 
-_MOST_MASS, _LARGEST, _MOST_GEOMS, _MOST_FRICTION = 10.0, 0.6, 64, 5.0
-"""kg, and metres of the box around it: what stands on a table between two hands; geoms that collide; their friction."""
+_MOST_MASS, _LARGEST, _MOST_GEOMS = 10.0, 0.6, 64
+"""kg; metres of the box around it; geoms that collide."""
 _LEVEL = 0.003
 """How far its foot may lie from the usual one's, metres: it starts at rest on the table."""
 _DEEPEST = 0.005
@@ -30,7 +29,7 @@ _DEEPEST = 0.005
 
 @dataclass(frozen=True)
 class PointedObject(SceneObject):
-    """An object of the user's in the place of a usual one; ``asset`` is the path of its file.
+    """An object of the user's; ``asset`` is the path of its file.
 
     Attributes:
         digest: Of its model, so that a changed file is another object.
@@ -57,11 +56,7 @@ class OwnObjectClass(TaskClass):
     usual_stands: ClassVar[bool] = True
 
     def __init__(self, moving_base: bool | None = None, object: str | None = None) -> None:
-        """Chooses base and object.
-
-        Args:
-            moving_base: Drive the bases or fix them; None takes the class's own.
-            object: Path of an MJCF file (docs/objects.md); None takes the class's own.
+        """Chooses the base and the object: the path of an MJCF file (docs/objects.md), or None for the class's own.
 
         Raises:
             BidexError: The file holds no such object, or one that starts inside hands or table.
@@ -71,8 +66,10 @@ class OwnObjectClass(TaskClass):
         if object is None:
             return
         if not isinstance(object, str) or not object.endswith(".xml") or not object.isprintable():
-            told = f"the path of an MJCF file that takes the place of the {self.usual.asset}"
-            raise BidexError(f"object: expected {told}, which ends in .xml; got {shortened(object)}.")
+            raise BidexError(
+                f"object: expected the path of an MJCF file (.xml) that takes the place of the {self.usual.asset}, got "
+                f"{shortened(object)}."
+            )
         file = absolute(object)
         model, like = _checked(self.usual, file, self.usual_stands), _usual_model(self.usual)
         self.own = PointedObject(
@@ -82,8 +79,10 @@ class OwnObjectClass(TaskClass):
         self.needs = Capacity(self.needs.contacts + more, self.needs.convex + more, self.needs.rows + 3 * more)
         depth, other = _depth_at_start(self)
         if depth > _DEEPEST:
-            told = f"an object that starts clear of hands and table, got one {1000 * depth:.0f} mm deep in {other}"
-            raise BidexError(f"{file}: expected {told}. Make it smaller, or shift what is in the body.")
+            raise BidexError(
+                f"{file}: expected an object that starts clear of hands and table, got one {1000 * depth:.0f} mm deep "
+                f"in {other}. Make it smaller, or shift the geoms."
+            )
 
     @property
     def scene_key(self) -> tuple[Hashable, ...]:
@@ -92,24 +91,20 @@ class OwnObjectClass(TaskClass):
 
 
 def _checked(usual: SceneObject, file: Path, stands: bool) -> mujoco.MjModel:
-    """The model that a file holds, once it is seen to be like the usual object."""
+    """The model in a file, which must be like the usual object."""
     spec, like = read_own(file, points=True), _usual_model(usual)
     if spec.body("object") is None:
         raise BidexError(f'{file}: expected a body called "object", got none. Name the outermost one so.')
     model = compiled(file, spec)
-    for kind, wanted, found in (
-        ("joint", _joints(like), _joints(model)),
-        ("sensor", _sensors(like), _sensors(model)),
-    ):
+    for kind, names in (("joint", _joints), ("sensor", _sensors)):
+        wanted, found = names(like), names(model)
         if wanted != found:
-            missing = sorted(set(wanted) - set(found)) or sorted(set(found) - set(wanted)) or list(wanted)
-            told = f"the {kind}s of assets/objects/{usual.asset}.xml in their order ({', '.join(wanted)})"
-            raise BidexError(f"{file}: expected {told}; look at {', '.join(missing)}. See docs/objects.md.")
-    if not 0 < _colliding(model) <= _MOST_GEOMS:
-        raise BidexError(f"{file}: expected 1 to {_MOST_GEOMS} geoms that collide, got {_colliding(model)}. Mend it.")
-    if not (model.geom_friction[:, 0] <= _MOST_FRICTION).all():
-        worst = float(model.geom_friction[:, 0].max())
-        raise BidexError(f"{file}: expected friction of at most {_MOST_FRICTION:g}, got {worst:.4g}. Lower it.")
+            missing = sorted(set(wanted) ^ set(found)) or list(wanted)
+            raise BidexError(
+                f"{file}: expected the {kind}s of assets/objects/{usual.asset}.xml in their order "
+                f"({', '.join(wanted)}); look at {', '.join(missing)}. See docs/objects.md."
+            )
+    check_collisions(file, model, _MOST_GEOMS)
     mass, (low, high) = float(model.body_mass.sum()), _box(model)
     if not 0.0 < mass <= _MOST_MASS:
         raise BidexError(f"{file}: expected at most {_MOST_MASS:g} kg, got {mass:.4g}. Mend mass or density.")
@@ -117,19 +112,15 @@ def _checked(usual: SceneObject, file: Path, stands: bool) -> mujoco.MjModel:
         raise BidexError(f"{file}: expected at most {_LARGEST:g} m, got {(high - low).max():.4g}. Scale it.")
     foot = _box(like)[0][2]
     if stands and abs(low[2] - foot) > _LEVEL:
-        told = (
-            f"its lowest point {-foot:.4f} m below its origin, as the {usual.asset}'s, so that it stands at the start"
+        raise BidexError(
+            f"{file}: expected its lowest point {-foot:.4f} m below its origin, as the {usual.asset}'s, so that it "
+            f"stands at the start; got {-low[2]:.4f}. Shift the geoms."
         )
-        raise BidexError(f"{file}: expected {told}; got {-low[2]:.4f}. Shift what is in the body.")
     return model
 
 
 def _depth_at_start(task: OwnObjectClass) -> tuple[float, str]:
-    """The deepest that the object sticks in anything else at the nominal start, metres, and the name of what that is.
-
-    Only here, of all classes, is a scene compiled before a world asks for it: the starts of hands and object are the
-    class's own, and no box tells whether a grip meets a finger.
-    """
+    """Deepest penetration of the object at the nominal start, metres, and the name of the body that it is in."""
     scene = compile_scene(task)
     start = torch.from_numpy(scene.start_qpos)[None].clone()
     space = task.variation_space

@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bidex_meta.data import open_dataset
-from bidex_meta.data.episode_recorder import BROKEN, CUT, SHORTENED, EpisodeRecorder
-from bidex_meta.data.run_recorder import RunRecorder, spread_rows
+from bidex_meta.data.collector import BROKEN, CUT, SHORTENED, EpisodeCollector, RunCollector, spread_environments
 from bidex_meta.data.writer import DatasetWriter, finish
 from bidex_meta.errors import BidexError
 from tests.data.worlds import Plain, rough, same
@@ -60,7 +59,7 @@ def test_what_is_stored_is_what_a_plain_loop_saw(
         for process in range(2):
             make = lambda number=process: rough(mode=mode, breaks_at=tuple(breaks_at), late=tuple(late), seed=number)  # noqa: E731
             plain, writer = Plain(make()), DatasetWriter(folder, process)
-            recorder = EpisodeRecorder(make(), writer.add)
+            recorder = EpisodeCollector(make(), writer.add)
             plain.reset(seed=seed + process)
             recorder.reset(seed=seed + process)
             for step in range(steps):
@@ -95,7 +94,7 @@ def test_what_is_stored_is_what_a_plain_loop_saw(
 def test_what_is_left_out_is_counted() -> None:
     world = rough(mode="SAME_STEP", breaks_at=((1, 0), (2, 3)), late=(0, 2, 0, 0, 0))
     found: list[Any] = []
-    recorder = EpisodeRecorder(world, found.append, rows=[0, 1, 3])
+    recorder = EpisodeCollector(world, found.append, rows=[0, 1, 3])
     recorder.reset(seed=0)
     for _ in range(3):
         recorder.step(torch.zeros(5, 2))
@@ -108,33 +107,33 @@ def test_what_is_left_out_is_counted() -> None:
 
 def test_rows_are_spread_over_slots_and_checked() -> None:
     world = rough(num_envs=10)
-    assert spread_rows(world, 0.4) == [0, 2, 5, 7] and spread_rows(world, 1e-9) == [0, 5]
-    assert spread_rows(world, 7.0) == list(range(10))
+    assert spread_environments(world, 0.4) == [0, 2, 5, 7] and spread_environments(world, 1e-9) == [0, 5]
+    assert spread_environments(world, 7.0) == list(range(10))
     for rows in ([0, 0], [10], [-1]):
         with pytest.raises(BidexError, match="Expected different rows of 0 to 9"):
-            EpisodeRecorder(world, lambda episode: None, rows)
+            EpisodeCollector(world, lambda episode: None, rows)
 
 
 def test_a_run_that_goes_on_stores_each_episode_once(tmp_path: Path) -> None:
     """Saved after 12 steps, ended after 20, taken up at 12: as one that was never ended."""
 
-    def drive(recorder: RunRecorder, steps: range) -> None:
+    def drive(recorder: RunCollector, steps: range) -> None:
         for step in steps:
             recorder.step(actions(3, step, 5))
 
-    whole = RunRecorder(rough(breaks_at=((9, 1),)), range(5))
+    whole = RunCollector(rough(breaks_at=((9, 1),)), range(5))
     whole.open(tmp_path / "whole")
     whole.reset(seed=1)
     drive(whole, range(30))
     whole.state_dict()
-    first = RunRecorder(rough(breaks_at=((9, 1),)), range(5))
+    first = RunCollector(rough(breaks_at=((9, 1),)), range(5))
     first.open(tmp_path / "torn")
     first.reset(seed=1)
     drive(first, range(12))
     state = first.state_dict()
     drive(first, range(12, 20))
     first.state_dict()  # a part that the checkpoint above does not know
-    second = RunRecorder(rough(breaks_at=((9, 1),)), range(5))
+    second = RunCollector(rough(breaks_at=((9, 1),)), range(5))
     second.folder = tmp_path / "torn"
     second.load_state_dict(state)
     drive(second, range(12, 30))
@@ -145,7 +144,7 @@ def test_a_run_that_goes_on_stores_each_episode_once(tmp_path: Path) -> None:
     assert len(a) == len(b) > 10 and all(map(same, a, b))
     with pytest.raises(BidexError, match="saved without a recording"):
         second.load_state_dict(rough().state_dict())
-    other = RunRecorder(rough(), [0, 1])
+    other = RunCollector(rough(), [0, 1])
     other.open(tmp_path / "other")
     with pytest.raises(BidexError, match="of other rows"):
         other.load_state_dict(state)
@@ -156,7 +155,7 @@ def _one_of_two(rank: int, folder: str) -> int:
     from bidex_meta.train import distributed
 
     distributed.init_from_environment()
-    recorder = RunRecorder(rough(seed=rank, breaks_at=((3, rank),)), [0, 2, 4], rank)
+    recorder = RunCollector(rough(seed=rank, breaks_at=((3, rank),)), [0, 2, 4], rank)
     recorder.open(Path(folder))
     recorder.reset(seed=rank)
     for step in range(20):

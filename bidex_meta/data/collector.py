@@ -1,41 +1,47 @@
-"""A wrapper around any world that hands on every whole episode of chosen rows, exactly as the world played it."""
+"""Wrappers around a world that hand on whole episodes of chosen environments exactly as they were played."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from bidex_meta.data import part_files
 from bidex_meta.data.episode import Episode
+from bidex_meta.data.writer import DatasetWriter
 from bidex_meta.errors import BidexError
-from bidex_meta.world.checking import clean
-from bidex_meta.world.contract import PooledWorld, VectorWorld
+from bidex_meta.record.atomic import write_json
+from bidex_meta.world.checked import clean
+from bidex_meta.world.contract import PooledWorld, TaskWorld, VectorWorld
 from bidex_meta.world.wrapper import PooledWorldWrapper
 
 _FIRST_ROOM = 64
-"""Steps of a row that there is room for where the world tells no time limit; doubled when an episode is longer."""
+"""Steps of an episode that there is room for where the world has no time limit; doubled when one is longer."""
 BROKEN, SHORTENED, CUT = "broken_transitions", "shortened_episodes", "cut_episodes"
-"""What is left out: transitions in which physics broke; episodes that began somewhere within, as the first ones of a
-training world may; those that a reset broke off."""
+"""What is left out: transitions in which physics broke; episodes that began after their first step, as those of a
+training world may; episodes that a reset cut."""
+_KEY = "recorder"
+"""Entry of a checkpoint's world state."""
 
 
-class EpisodeRecorder(PooledWorldWrapper):
-    """Records whole episodes; the world does what it did without.
+class EpisodeCollector(PooledWorldWrapper):
+    """Collects whole episodes; it changes nothing of what the world does.
 
-    An episode goes from a start to its end. A transition in which physics broke is left out, and the episode ends as
-    truncated before it. Only rows that are told are kept in memory: one step of a row takes 4 (d + a + 2) bytes.
+    A transition in which physics broke is left out, and its episode ends as truncated before it. Only chosen
+    environments are kept in memory: a step of one takes 4 (d + a + 2) bytes.
 
     Args:
-        world: In either autoreset mode. In DISABLED mode a frozen row records nothing until it is reset.
-        sink: Takes each episode when it has ended, those of one step by ascending row.
-        rows: Which rows to record; None: all.
+        world: In either autoreset mode. In DISABLED mode a frozen environment collects nothing until it is reset.
+        sink: Receives each episode when it has ended, those of one step by ascending environment.
+        rows: Which environments to collect from; None: all.
 
     Attributes:
-        left_out: Counts of what was not recorded, by reason.
+        left_out: Counts of what was not collected, by reason.
         policy: Number of the policy that acts, for the episodes that end.
-        active: Which of the chosen rows record the episodes that they begin, bool (rows,); all at first.
+        active: Which of the chosen environments collect the episodes that begin, bool (rows,); all at first.
     """
 
     def __init__(self, world: VectorWorld, sink: Callable[[Episode], None], rows: Sequence[int] | None = None) -> None:
@@ -54,12 +60,11 @@ class EpisodeRecorder(PooledWorldWrapper):
         self._forget()
 
     def _forget(self) -> None:
-        """No row has begun."""
+        """Drops all running episodes."""
         num, room = len(self.rows), _FIRST_ROOM
-        limits = getattr(self.world, "max_episode_steps", None)
-        if limits is not None and num:
+        if isinstance(self.world, TaskWorld) and num:
             # Pages of memory that no episode reaches are never taken.
-            room = int(limits[self._where].max())
+            room = int(self.world.max_episode_steps[self._where].max())
         d, a = (int(s.shape[0]) for s in (self.world.single_observation_space, self.world.single_action_space))
         self._observations = np.zeros((num, room + 1, d), np.float32)
         self._actions = np.zeros((num, room, a), np.float32)
@@ -67,15 +72,13 @@ class EpisodeRecorder(PooledWorldWrapper):
         self._running, self._success = np.zeros(num, bool), np.zeros(num, bool)
         self._length, self._task = np.zeros(num, np.int64), np.zeros(num, np.int64)
 
-    # What the world does, and what is noted of it.
-
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
-        """Starts episodes; those that run in these rows are broken off and left out."""
+        """Starts episodes; those that run in these environments are left out."""
         obs, info = self.world.reset(seed=seed, options=options)
         mask = (options or {}).get("reset_mask")
         begun = np.ones(len(self.rows), bool) if mask is None else self._own(torch.as_tensor(mask))
         if begun.all() or not self._pools:
-            # Other tasks hold from a reset of all rows on.
+            # Other tasks hold from a reset of all environments on.
             self._pools = list(self.world.pools) if isinstance(self.world, PooledWorld) else []
         self.left_out[CUT] += int((begun & self._running & (self._length > 0)).sum())
         self._begin(begun, self._own(obs))
@@ -111,11 +114,11 @@ class EpisodeRecorder(PooledWorldWrapper):
         return result
 
     def _own(self, of_all: Tensor) -> np.ndarray:
-        """The chosen rows of a tensor of all rows."""
+        """The chosen environments' share of a tensor of all."""
         return of_all.to(self._where.device)[self._where].detach().cpu().numpy()
 
-    def _begin_again(self, info: dict[str, Any], obs: Tensor) -> None:
-        """New episodes of rows that a world in SAME_STEP mode has started within the step."""
+    def _begin_again(self, info: dict[str, Tensor], obs: Tensor) -> None:
+        """Begins the episodes that a world in SAME_STEP mode has started within the step."""
         if self.world.metadata["autoreset_mode"].name == "SAME_STEP":
             begun = self._own(info["_final_obs"])
             if begun.any():
@@ -127,12 +130,11 @@ class EpisodeRecorder(PooledWorldWrapper):
         self._observations[mask, 0] = obs[mask]
         self._length[mask], self._success[mask] = 0, False
         self._running |= mask
-        index = getattr(self.world, "task_index", None)
-        if index is not None:
-            self._task = np.where(mask, self._own(index), self._task)
+        if isinstance(self.world, TaskWorld):
+            self._task = np.where(mask, self._own(self.world.task_index), self._task)
 
     def _end(self, row: int, terminated: bool, unstable: bool, counted: bool) -> None:
-        """Hands an episode on, unless it began within or has no good transition."""
+        """Hands an episode on, unless it was shortened or has no good transition."""
         length, slot, task = int(self._length[row]), self._slots[row], int(self._task[row])
         if not counted:
             self.left_out[SHORTENED] += 1
@@ -167,15 +169,13 @@ class EpisodeRecorder(PooledWorldWrapper):
         self._observations, self._actions = np.pad(self._observations, more), np.pad(self._actions, more)
         self._rewards = np.pad(self._rewards, [(0, 0), (0, 0), (0, room)])
 
-    # From one process to the next.
-
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Puts the world's state back; episodes that run there began unseen and are not recorded."""
+        """Restores the world's state; episodes that run there are not collected, since their beginning is unknown."""
         self.world.load_state_dict(state)
         self._forget()
 
-    def recorder_state(self) -> dict[str, Any]:
-        """The episodes that run, for the checkpoint of a run that goes on with them: tensors, copied."""
+    def collector_state(self) -> dict[str, Tensor]:
+        """The running episodes, for a checkpoint: tensors, copied."""
         most = int(self._length.max(initial=0))
         arrays = {
             "observations": self._observations[:, : most + 1],
@@ -189,11 +189,11 @@ class EpisodeRecorder(PooledWorldWrapper):
         }
         return {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
 
-    def load_recorder_state(self, state: dict[str, Any]) -> None:
-        """Goes on with the episodes of ``recorder_state``; the world must have been put back before.
+    def load_collector_state(self, state: dict[str, Tensor]) -> None:
+        """Goes on with the episodes of ``collector_state``; the world must have been restored before.
 
         Raises:
-            BidexError: Other rows were recorded, or observations and actions had other sizes.
+            BidexError: Other environments were collected from, or observations and actions had other sizes.
         """
         given = {name: value.numpy() for name, value in state.items()}
         self._forget()
@@ -211,3 +211,83 @@ class EpisodeRecorder(PooledWorldWrapper):
         self._running, self._success = given["running"].copy(), given["success"].copy()
         self._length, self._task = given["length"].copy(), given["task"].copy()
         self._pools = list(self.world.pools) if isinstance(self.world, PooledWorld) else []
+
+
+class RunCollector(EpisodeCollector):
+    """Collects from the training world of a run; killed and resumed, each episode is stored once.
+
+    ``state_dict``, which a checkpoint calls, commits what was collected as a part. Its result holds the number of
+    parts and the running episodes. A run that goes on from it deletes later parts and plays them again.
+
+    Args:
+        world: In either autoreset mode.
+        rows: Environments to collect from.
+        process: Number of this process.
+
+    Attributes:
+        folder: The data set's folder: set by ``open``, or before ``load_state_dict``, which opens it.
+    """
+
+    folder: Path
+
+    def __init__(self, world: VectorWorld, rows: Sequence[int], process: int = 0) -> None:
+        self.process, self._writer = process, None
+        super().__init__(world, lambda episode: self.writer.add(episode), rows)
+
+    @property
+    def writer(self) -> DatasetWriter:
+        """Where episodes go, once the folder is open."""
+        assert self._writer is not None, "open the folder first"
+        return self._writer
+
+    def open(self, folder: Path, parts: int = 0) -> None:
+        """Sets the folder, before the first reset, and deletes this process's parts from a number on."""
+        self.folder = folder
+        self._writer = DatasetWriter(folder, self.process, keep=parts)
+        if self.process == 0:  # no complete data set any longer
+            write_json(folder / "data" / part_files.RECORDING, {"run": folder.parent.name})
+            (folder / "data" / part_files.METADATA).unlink(missing_ok=True)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The world's state, the number of parts, and the running episodes."""
+        self.writer.left_out.update(self.left_out)
+        self.left_out.clear()
+        self.writer.commit()
+        return {**self.world.state_dict(), _KEY: {"parts": self.writer.parts, **self.collector_state()}}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes on from ``state_dict``.
+
+        Raises:
+            BidexError: Nothing was collected then.
+        """
+        if _KEY not in state:
+            raise BidexError("This checkpoint was saved without a recording. Start a new run to record one.")
+        own = dict(state[_KEY])
+        self.world.load_state_dict({name: value for name, value in state.items() if name != _KEY})
+        if self._writer is not None:
+            self._writer.close()
+        self.open(self.folder, int(own.pop("parts")))
+        self.load_collector_state(own)
+
+    def close(self) -> None:
+        """Drops what no checkpoint knows, and frees the world."""
+        if self._writer is not None:
+            self._writer.close()
+        super().close()
+
+
+def spread_environments(world: VectorWorld, share: float) -> list[int]:
+    """A share of a world's environments, evenly over its slots, at least one of each.
+
+    Args:
+        world: The world.
+        share: Above 0; 1 or more are all.
+    """
+    chosen: list[int] = []
+    slots = world.task_id.tolist()
+    for slot in range(world.num_tasks):
+        rows = [row for row, own in enumerate(slots) if own == slot]
+        count = min(len(rows), max(1, round(share * len(rows))))
+        chosen += [rows[number * len(rows) // count] for number in range(count)]
+    return chosen

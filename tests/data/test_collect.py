@@ -13,9 +13,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from bidex_meta.data import Dataset, open_dataset, part_files, rounds, writer
-from bidex_meta.data.episode_recorder import EpisodeRecorder
-from bidex_meta.data.rounds import Actor, whole_parts
+from bidex_meta.data import Dataset, collect, open_dataset, part_files, writer
+from bidex_meta.data.collect import Actor, resumed_writer
+from bidex_meta.data.collector import EpisodeCollector
 from bidex_meta.errors import BidexError
 from tests.data.worlds import rough, same
 
@@ -47,9 +47,8 @@ def record(folder: Path, actors: list[Actor] = ACTORS, size: int = SIZE, brittle
     """As the command does: goes on where it stopped."""
     world = rough(mode="DISABLED", brittle=brittle)
     writer.begin(folder, PLAN)
-    keep = whole_parts([path.name for path in part_files.parts_of(folder / "data", 0)])
-    out = writer.DatasetWriter(folder, keep=keep)
-    rounds.collect(world, actors, out, size, 5, lambda now, seconds: None)
+    out = resumed_writer(folder)
+    collect.collect(world, actors, out, size, 5, lambda now, seconds: None)
     spaces = world.single_observation_space, world.single_action_space
     writer.finish(folder, "Points/test-v0", *spaces, {"tasks": world.task_names, "kind": "test"})
     return open_dataset(folder)
@@ -57,7 +56,7 @@ def record(folder: Path, actors: list[Actor] = ACTORS, size: int = SIZE, brittle
 
 @pytest.fixture(autouse=True)
 def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rounds, "PART_BYTES", 2500)
+    monkeypatch.setattr(collect, "PART_BYTES", 2500)
 
 
 def test_sizes_and_shares(tmp_path: Path) -> None:
@@ -109,7 +108,7 @@ def _killed(work: Callable[[], object], at: int) -> bool:
             return call
 
         os.fsync, os.replace = counted(os.fsync), counted(os.replace)
-        EpisodeRecorder.step = counted(EpisodeRecorder.step)
+        EpisodeCollector.step = counted(EpisodeCollector.step)
         part_files.PartWriter.add = counted(part_files.PartWriter.add)
         try:
             work()
@@ -175,7 +174,7 @@ def test_another_recording_or_a_complete_one_is_refused(tmp_path: Path) -> None:
 def test_nothing_to_record_is_said(tmp_path: Path) -> None:
     world = rough(mode="DISABLED", breaks_at=tuple((step, row) for step in range(60) for row in range(5)))
     with pytest.raises(BidexError, match="Physics broke in the first step of all 5"):
-        rounds.collect(world, [Actor(None)], writer.DatasetWriter(tmp_path), 100, 0, lambda now, seconds: None)
+        collect.collect(world, [Actor(None)], writer.DatasetWriter(tmp_path), 100, 0, lambda now, seconds: None)
 
 
 def test_minari_opens_and_samples_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

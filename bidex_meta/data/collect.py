@@ -1,15 +1,16 @@
-"""Plays policies and records them: in rounds, each of which is one part of the data set and can be played again.
+"""Plays policies and collects their episodes in rounds, each of which is one part of a data set and can be replayed.
 
-In a round every row plays the same number of whole episodes of its task, so that no kind of episode is favoured: a
-recording that simply stopped after so many steps would lack the long ones. All that a round draws follows from the
-recording's seed and the round's number, and a part is there wholly or not at all. So a recording that was killed goes
-on with the first round whose part is missing, and ends with the same data as if it had not been.
+In a round every environment plays the same number of whole episodes of its task; a collection that stopped after so
+many steps would lack the long ones. All that a round draws follows from the collection's seed and the round's number.
+So a collection that was killed goes on with the first round whose part is missing, and ends with the same data.
 """
 
 import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -17,7 +18,8 @@ from torch import Tensor
 
 from bidex_meta.agents import Agent
 from bidex_meta.data import part_files
-from bidex_meta.data.episode_recorder import BROKEN, EpisodeRecorder
+from bidex_meta.data.collector import BROKEN, EpisodeCollector
+from bidex_meta.data.episode import Episode
 from bidex_meta.data.writer import DatasetWriter
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import RandomAgent
@@ -25,17 +27,28 @@ from bidex_meta.world.contract import PooledWorld
 
 PART_BYTES = 64_000_000
 """Bytes of a part, about: what is played again after a kill at the worst moment."""
+FAILED = "unsuccessful_episodes"
+"""What is left out of demonstrations."""
 _SLACK = 1.05
 """The last round is planned for a little more than is missing, since episodes differ in length."""
 
 
+@runtime_checkable
+class SamplingAgent(Agent, Protocol):
+    """An agent whose policy has a distribution."""
+
+    def sample_action(self, obs: Tensor, generator: torch.Generator) -> Tensor:
+        """Actions (N, a) drawn from the policy's distribution."""
+        ...
+
+
 @dataclass(frozen=True)
 class Actor:
-    """A policy as it acts in a recording.
+    """A policy as it acts in a collection.
 
     Attributes:
         policy: An agent; None: uniform actions.
-        sampled: Whether actions are drawn from the policy's distribution; else its mean action is taken.
+        sampled: Whether actions are drawn from the policy's distribution, if it has one; else its mean action is taken.
         noise: Standard deviation of Gaussian noise on the actions.
     """
 
@@ -44,7 +57,7 @@ class Actor:
     noise: float = 0.0
 
     def acting(self, world: PooledWorld, seed: int) -> Callable[[Tensor], Tensor]:
-        """What gives actions (N, a) for observations (N, d); it draws by the seed alone."""
+        """A function from observations (N, d) to actions (N, a) that draws by the seed alone."""
         if self.policy is None:
             return RandomAgent(world.action_space, seed).eval_action
         policy: Agent = self.policy
@@ -54,7 +67,10 @@ class Actor:
         outer = torch.Generator().manual_seed(int(np.random.SeedSequence(seed).generate_state(1)[0]))
 
         def act(obs: Tensor) -> Tensor:
-            action = policy.sample_action(obs, inner) if self.sampled else policy.eval_action(obs)  # type: ignore
+            if self.sampled and isinstance(policy, SamplingAgent):
+                action = policy.sample_action(obs, inner)
+            else:
+                action = policy.eval_action(obs)
             if self.noise > 0.0:
                 action = action + self.noise * torch.randn(action.shape, generator=outer).to(action)
             return action.clamp(-1.0, 1.0)
@@ -62,14 +78,9 @@ class Actor:
         return act
 
 
-def can_sample(policy: Agent) -> bool:
-    """Whether a policy offers ``sample_action(obs, generator)``: actions drawn from its distribution."""
-    return callable(getattr(policy, "sample_action", None))
-
-
 @dataclass(frozen=True)
-class Standing:
-    """How far a recording has come, by policy; all of it stands in the parts.
+class Progress:
+    """How far a collection is, by policy; computed from its parts alone.
 
     Attributes:
         rounds: Parts that are there.
@@ -86,11 +97,11 @@ class Standing:
     success: float
 
 
-def standing(writer: DatasetWriter, policies: int) -> Standing:
-    """What the parts of a recording say.
+def progress(writer: DatasetWriter, policies: int = 1) -> Progress:
+    """The progress of a collection.
 
     Raises:
-        BidexError: One is damaged.
+        BidexError: A part is damaged.
     """
     paths = part_files.parts_of(writer.folder, writer.process)
     tables = [part_files.read_table(path) for path in paths]
@@ -100,12 +111,14 @@ def standing(writer: DatasetWriter, policies: int) -> Standing:
     )
     of_policy = [owner == number for number in range(policies)]
     mean = [float(column.mean()) if len(column) else math.nan for column in (returns, success)]
-    return Standing(len(paths), [int(steps[own].sum()) for own in of_policy], [int(o.sum()) for o in of_policy], *mean)
+    return Progress(len(paths), [int(steps[own].sum()) for own in of_policy], [int(o.sum()) for o in of_policy], *mean)
 
 
-def whole_parts(folder_parts: Sequence[str]) -> int:
-    """Parts from number 0 on without a gap: those after one are of a recording that somebody damaged."""
-    return next((n for n, name in enumerate(folder_parts) if not name.endswith(f"-{n:05d}.hdf5")), len(folder_parts))
+def resumed_writer(folder: Path) -> DatasetWriter:
+    """The writer of a new collection, or of one that has begun; parts after a missing one are deleted."""
+    names = [path.name for path in part_files.parts_of(folder / "data", 0)]
+    keep = next((n for n, name in enumerate(names) if not name.endswith(f"-{n:05d}.hdf5")), len(names))
+    return DatasetWriter(folder, keep=keep)
 
 
 def collect(
@@ -114,7 +127,7 @@ def collect(
     writer: DatasetWriter,
     size: int,
     seed: int,
-    told: Callable[[Standing, float], None],
+    report: Callable[[Progress, float], None],
 ) -> None:
     """Plays rounds until each actor has its share of ``size`` transitions; goes on where the writer's parts end.
 
@@ -124,35 +137,35 @@ def collect(
         writer: Where episodes go; its parts are counted as rounds.
         size: Transitions in all; the last episodes may make it a little more.
         seed: Of all that is drawn.
-        told: Is told after each round how far it is, and the seconds since the call.
+        report: Receives the progress after each round, and the seconds since the call.
 
     Raises:
         BidexError: A part is damaged, or no transition can be recorded.
     """
     began, share = time.monotonic(), math.ceil(size / len(actors))
-    now = standing(writer, len(actors))
-    recorder = EpisodeRecorder(world, writer.add)  # pyright: ignore[reportAbstractUsage]  # the wrapped world has all
+    now = progress(writer, len(actors))
+    collector = EpisodeCollector(world, writer.add)  # pyright: ignore[reportAbstractUsage]  # the wrapped world has all
     while min(now.steps) < share:
-        # The one that has least: both are played from the start, should the recording be ended early.
+        # The one that has least, so that both have their share should the collection be ended early.
         which = int(np.argmin(now.steps))
         rows, repeats = _plan(world, share - now.steps[which], now, which)
         number = np.random.SeedSequence((seed, writer.parts)).generate_state(1, np.uint64)[0]
-        recorder.policy, recorder.active = which, rows
-        _round(recorder, actors[which], torch.from_numpy(rows), repeats, int(number >> np.uint64(1)))
+        collector.policy, collector.active = which, rows
+        _round(collector, actors[which], torch.from_numpy(rows), repeats, int(number >> np.uint64(1)))
         if writer.open_steps == 0:
             raise BidexError(
                 f"Physics broke in the first step of all {int(rows.sum())} episodes: nothing can be recorded. "
                 "Check the policy's actions."
             )
-        writer.left_out.update({name: count for name, count in recorder.left_out.items() if name == BROKEN})
-        recorder.left_out.clear()
+        writer.left_out.update({name: count for name, count in collector.left_out.items() if name == BROKEN})
+        collector.left_out.clear()
         writer.commit()
-        now = standing(writer, len(actors))
-        told(now, time.monotonic() - began)
+        now = progress(writer, len(actors))
+        report(now, time.monotonic() - began)
 
 
-def _plan(world: PooledWorld, missing: int, now: Standing, which: int) -> tuple[np.ndarray, int]:
-    """Rows that play in the next round, bool (N,), and how many episodes each."""
+def _plan(world: PooledWorld, missing: int, now: Progress, which: int) -> tuple[np.ndarray, int]:
+    """Environments that play in the next round, bool (N,), and how many episodes each."""
     known = now.episodes[which] > 0
     mean = now.steps[which] / now.episodes[which] if known else float(world.max_episode_steps.float().mean())
     step_bytes = 4 * (world.single_observation_space.shape[0] + world.single_action_space.shape[0] + 1) + 2
@@ -168,29 +181,57 @@ def _plan(world: PooledWorld, missing: int, now: Standing, which: int) -> tuple[
 
 
 @torch.no_grad()
-def _round(recorder: EpisodeRecorder, actor: Actor, rows: Tensor, repeats: int, seed: int) -> None:
-    """Every row of a mask plays so many episodes."""
-    obs, _ = recorder.reset(seed=seed)
-    act = actor.acting(recorder, seed)
-    left = torch.where(rows, repeats, 0).to(recorder.device)
+def _round(collector: EpisodeCollector, actor: Actor, rows: Tensor, repeats: int, seed: int) -> None:
+    """Each environment of a mask plays ``repeats`` episodes."""
+    obs, _ = collector.reset(seed=seed)
+    act = actor.acting(collector, seed)
+    left = torch.where(rows, repeats, 0).to(collector.device)
     everyone = torch.ones_like(left, dtype=torch.bool)
     if actor.policy is not None:
         actor.policy.reset(everyone)
     while bool((left > 0).any()):
-        obs, _, _, _, info = recorder.step(act(obs))
+        obs, _, _, _, info = collector.step(act(obs))
         ended = info["_final_obs"]
         if not bool(ended.any()):
             continue
         left = left - (ended & (left > 0)).long()
         again = ended & (left > 0)
         if bool(again.any()):
-            obs, _ = recorder.reset(options={"reset_mask": again})
+            obs, _ = collector.reset(options={"reset_mask": again})
             if actor.policy is not None:
                 actor.policy.reset(again)
 
 
+@torch.no_grad()
+def collect_successes(world: PooledWorld, agent_of: Callable[[int], Agent], writer: DatasetWriter, seed: int) -> None:
+    """Plays one round, an episode in every environment, and stores those that succeed as a part.
+
+    Args:
+        world: In autoreset mode DISABLED.
+        agent_of: Makes the agent of a round from a seed, once the world has been reset.
+        writer: Where episodes go; the round's draws follow from the seed and its number of parts.
+        seed: The collection's.
+    """
+
+    def sink(episode: Episode) -> None:
+        if episode.success and not episode.broken:
+            writer.add(episode)
+        else:
+            writer.left_out[FAILED] += 1
+
+    seeds = np.random.SeedSequence((seed, writer.parts)).generate_state(2, np.uint32).tolist()
+    collector = EpisodeCollector(world, sink)  # pyright: ignore[reportAbstractUsage]  # the wrapped world has all
+    obs, _ = collector.reset(seed=seeds[0])
+    agent, over = agent_of(seeds[1]), torch.zeros(world.num_envs, dtype=torch.bool)
+    agent.reset(~over)
+    while not bool(over.all()):
+        obs, *_, info = collector.step(agent.eval_action(obs))
+        over |= info["_final_obs"]
+    writer.commit()
+
+
 def bytes_held(world: PooledWorld, rows: Sequence[int] | None = None) -> int:
-    """Bytes that the episodes that run in some rows (None: all) take at most, while they are recorded."""
+    """Most bytes of the running episodes of some environments (None: all) while they are collected."""
     step = 4 * (world.single_observation_space.shape[0] + world.single_action_space.shape[0] + 2)
     limits = world.max_episode_steps if rows is None else world.max_episode_steps[list(rows)]
     return int(limits.sum()) * step

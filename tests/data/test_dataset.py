@@ -14,15 +14,14 @@ import pytest
 import torch
 from gymnasium.spaces import Box
 
-from bidex_meta.commands.run_offline import implied
+from bidex_meta.commands.run_data import implied
 from bidex_meta.data import Dataset, open_dataset, part_files
-from bidex_meta.data.checking import verify
+from bidex_meta.data.checking import coverage, summary, verify
 from bidex_meta.data.joined import gathered, join
-from bidex_meta.data.summary import coverage, summary
-from bidex_meta.data.writer import begin, begun
+from bidex_meta.data.writer import begin, stored_plan
 from bidex_meta.errors import BidexError
 from tests.algos.problems import one_step_bandit
-from tests.data.test_rounds import record
+from tests.data.test_collect import record
 from tests.data.worlds import ABOUT, changed, rough, same, small_set, without_digests
 from tests.robust.damage import NO_FILES, ODD, of_values, remove, replace
 from tests.robust.kills import quick_folder
@@ -67,7 +66,7 @@ def test_a_part_is_held_to_its_digest_before_its_episodes_are_read(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a set too large to be read at once when it is opened."""
-    monkeypatch.setattr("bidex_meta.data.dataset._LOOKED_AT", 8000)
+    monkeypatch.setattr("bidex_meta.data.dataset._CHECKED_AT_OPENING", 8000)
     path = part_files.parts_of(folder)[-1]
     with h5py.File(path, "r+") as file:
         file["episode_2"]["actions"][0, 0] += 0.25
@@ -84,7 +83,7 @@ def test_sets_without_digests_load_as_before(folder: Path, capsys: pytest.Captur
     without_digests(folder)
     assert not unlike(open_dataset(folder), whole)
     done = called(["data", "check", str(folder.parent)])
-    assert done.code == 0 and "Without a digest, since written elsewhere or by an older version: 4 files." in done.out
+    assert done.code == 0 and "Files without a digest, from elsewhere or older versions: 4." in done.out
     make_foreign(folder)
     assert len(verify(open_dataset(folder)).unsealed) == 2
 
@@ -280,7 +279,7 @@ def test_loops_of_links_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_an_odd_plan_of_a_recording_is_one_line(plan: Any, tmp_path: Path) -> None:
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / part_files.RECORDING).write_text(json.dumps(plan))
-    for read in (lambda: begin(tmp_path, {"kind": "test"}), lambda: begin(tmp_path, {}) and begun(tmp_path)):
+    for read in (lambda: begin(tmp_path, {"kind": "test"}), lambda: begin(tmp_path, {}) and stored_plan(tmp_path)):
         assert one_line_or(read) is None
 
 
@@ -299,7 +298,7 @@ def test_a_disk_that_fills_while_it_is_recorded_loses_no_part(
     limit: Callable[[int | None], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At whatever byte it ends; with room again the same command goes on to the same data."""
-    monkeypatch.setattr("bidex_meta.data.rounds.PART_BYTES", 20_000)
+    monkeypatch.setattr("bidex_meta.data.collect.PART_BYTES", 20_000)
     with quick_folder() as place:
         expected = list(record(place / "whole", size=200).episodes())
         most = max(path.stat().st_size for path in (place / "whole" / "data").iterdir())

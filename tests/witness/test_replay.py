@@ -10,10 +10,9 @@ from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
 from bidex_meta.record.versions import collect_versions
 from bidex_meta.tasks import registry
-from bidex_meta.witness.open_loop import OpenLoop
-from bidex_meta.witness.puppets import rest_action
-from bidex_meta.witness.replay import Replay, replay
-from bidex_meta.witness.simulator import SHIFT, Simulator, task_slot
+from bidex_meta.witness.controller import rest_action
+from bidex_meta.witness.demonstrators import OpenLoopReplay
+from bidex_meta.witness.replay import SHIFT, Replay, Simulator, replay, task_slot
 from bidex_meta.witness.store import LEVELS, Witness, load_witness, quantised, save_witness, witness_path
 from bidex_meta.world import World
 from bidex_meta.worlds.own import OwnSuite
@@ -119,7 +118,7 @@ def test_a_missing_witness_says_where_others_are_listed(monkeypatch: pytest.Monk
 def test_replay_of_what_is_missing_is_not_found(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("bidex_meta.witness.store.witness_path", lambda name: tmp_path / name)
+    monkeypatch.setattr("bidex_meta.commands.witness.witness_path", lambda name: tmp_path / name)
     assert main(["witness", "--task", "HandOver", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)[0]["found"] is False
 
@@ -146,7 +145,7 @@ def test_every_stored_witness_holds(name: str) -> None:
         f"{name}: success {result.first_success}, {result.succeeded} of 10 shifted starts, "
         f"on {here['platform']} with {here['packages']}; made on {witness.made['versions']}"
     )
-    page = (Path(__file__).parent.parent / "docs/results/mt20.md").read_text().partition("| class | return | best")[2]
+    page = (Path(__file__).parents[2] / "docs/results/mt20.md").read_text().partition("| class | return | best")[2]
     row = next(line for line in page.splitlines() if line.startswith(f"| {name} |")).split(" | ")
     assert row[1] == f"{result.total:.4g}" and row[3].startswith(f"{result.first_success} of ")
     assert row[4:6] == [f"{result.succeeded} of 10", f"{1000.0 * result.deepest:.1f} mm"]
@@ -154,7 +153,7 @@ def test_every_stored_witness_holds(name: str) -> None:
 
 def test_a_witness_is_played_in_its_order_by_every_row_of_its_class() -> None:
     known = {"A": Witness(np.arange(6, dtype=np.float32).reshape(3, 2) / 8, {})}
-    agent = OpenLoop(known, ["A", "B"], torch.tensor([0, 1, 0]), 3)
+    agent = OpenLoopReplay(known, ["A", "B"], torch.tensor([0, 1, 0]), 3)
     obs = torch.zeros(3, 5)
     played = [agent.eval_action(obs) for _ in range(2)]
     assert played[1].tolist() == [[0.25, 0.375, 0.0], [0.0, 0.0, 0.0], [0.25, 0.375, 0.0]]

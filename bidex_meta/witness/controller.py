@@ -1,45 +1,44 @@
-"""Hand controllers: a script moves both hands to points in closed loop, by what it reads from sensors.
+"""Hand controller: moves both hands to points in closed loop, for scripted policies.
 
-A script reads the mean over all copies of the start, and does the same in each of them. Where the copies are slightly
-shifted, what it does depends on none of them alone. The actions are recorded; played again they need no script.
+A script reads the mean of each sensor over all copies of the start and acts alike in each of them, so that it depends
+on no single copy. The recorded actions replay without the script.
 """
 
 import torch
 from torch import Tensor
 
-from bidex_meta.hands.hand import ANGULAR_DAMPING, FORCE_PER_SCALE, LINEAR_DAMPING, TORQUE_PER_SCALE, hand
-from bidex_meta.hands.pair import SIDES
+from bidex_meta.hands.hand import ANGULAR_DAMPING, FORCE_PER_SCALE, LINEAR_DAMPING, SIDES, TORQUE_PER_SCALE, hand
 from bidex_meta.maths import conjugate, multiply, quaternion_from_rpy, rotate, xyzw
-from bidex_meta.witness.simulator import Simulator
+from bidex_meta.witness.replay import Simulator
 from bidex_meta.witness.store import quantised
 
 GAIN = 8.0
-"""Speed of a hand over its distance to where it is led, and of its turn over its angle to how it is held, 1/s."""
+"""Speed of a hand over its distance to its target, and of its turn over its angle to its target, 1/s."""
 _KNUCKLES, _MIDDLES = ("FFJ2", "MFJ2", "RFJ2", "LFJ2"), ("FFJ1", "MFJ1", "RFJ1", "LFJ1")
 
 Point = tuple[float, float, float]
 
 
 def rest_action(size: int) -> Tensor:
-    """The action (size,) that holds zero joint angles and leaves the bases alone."""
+    """The action (size,) of zero joint angles and no force on the bases."""
     low, high = (torch.as_tensor(x).float() for x in (hand().control_low, hand().control_high))
     one = torch.zeros(size // 2)
     one[: len(low)] = (-(high + low) / (high - low)).clamp(-1.0, 1.0)
     return one.repeat(2)
 
 
-class Puppets:
-    """Both hands of a class, from where they stand.
+class HandController:
+    """Moves both hands of a class to points, from the present state of a simulator.
 
     Args:
-        simulator: Its rows are the copies that a script watches, and does the same in.
-        noise: Standard deviation of Gaussian noise on each action, which the script then makes up for.
+        simulator: Its environments are copies of one start; each gets the same actions.
+        noise: Standard deviation of Gaussian noise on each action, to which the script reacts.
         generator: Of the noise.
 
     Attributes:
-        actions: What was done so far, each (action_size,).
-        rewards: What it gave in the first copy, whose start is the unshifted one.
-        success: Which of its steps were a success there.
+        actions: Actions so far, each (action_size,).
+        rewards: Their rewards in the first copy, whose start is not shifted.
+        success: Which of them succeeded there.
         episode_steps: Time limit, control steps.
     """
 
@@ -72,11 +71,11 @@ class Puppets:
         return xyzw(mean / mean.norm())
 
     def frozen(self, name: str) -> Tensor:
-        """A number that the task has frozen, (k,)."""
+        """A frozen number of the task, (k,)."""
         return self._simulator.frozen(name)[0]
 
     def at(self, side: str) -> Tensor:
-        """Where a hand's point is, metres, (3,)."""
+        """Position of a hand's point, metres, (3,)."""
         return self.where(f"{side}/hand_point_position")
 
     def bend(self, side: str, knuckles: float, middles: float, **others: float) -> None:
@@ -90,32 +89,20 @@ class Puppets:
         self._fingers[side] = (2.0 * (angles - low) / (high - low) - 1.0).clamp(-1.0, 1.0)
 
     def hold(self, side: str, roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> None:
-        """Holds a hand from now on as it stood at the start, turned about the world's axes, rad.
-
-        A hand that was never held is turned by whatever it touches.
-        """
+        """From now on holds a hand's start orientation, turned about the world's axes, rad; a free hand may turn."""
         turn = torch.tensor(quaternion_from_rpy((roll, pitch, yaw)), dtype=torch.float64)
         self._held[side] = multiply(xyzw(turn), xyzw(self._first[side]))
 
     def turn(self, side: str, way: Tensor) -> None:
-        """Turns a hand from how it stands now.
-
-        Args:
-            side: The hand.
-            way: Axis times angle (3,), world, rad; small: a hand turns at ``GAIN`` times it a second.
-        """
+        """Turns a hand from its present orientation by a small ``way``: axis times angle (3,), world, rad."""
         angle = way.norm()
         turn = torch.cat((torch.sin(0.5 * angle) * way / (angle + 1e-9), torch.cos(0.5 * angle)[None]))
         self._held[side] = multiply(turn, self.orientation(f"{side}/mount_quaternion"))
 
     def lead(self, right: Point, left: Point, steps: int = 1, speed: float = 0.6) -> None:
-        """Leads the hands' points towards two points for some control steps.
+        """Moves the hands' points towards two points (world, metres) at most at ``speed`` (m/s).
 
-        Args:
-            right: World, metres.
-            left: World, metres.
-            steps: Control steps; none is played after the end of the episode.
-            speed: At most, m/s.
+        Takes ``steps`` control steps, but none after the end of the episode.
         """
         for _ in range(min(steps, self.episode_steps - len(self.actions))):
             action, half = self._rest.clone(), len(self._rest) // 2
@@ -134,7 +121,7 @@ class Puppets:
             self.success.append(bool(trace.success[0, 0]))
 
     def _torque(self, side: str) -> Tensor:
-        """The actions (3,) that turn a hand towards how it is held, or leave it alone if it is not."""
+        """The actions (3,) that turn a hand to the orientation it is held at; zeros for a free hand."""
         if side not in self._held:
             return torch.zeros(3)
         now = self.orientation(f"{side}/mount_quaternion")

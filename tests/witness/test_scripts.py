@@ -8,18 +8,18 @@ from bidex_meta.errors import BidexError
 from bidex_meta.hands.hand import hand
 from bidex_meta.maths import conjugate, multiply, xyzw
 from bidex_meta.tasks.base import CONTROL_RATE
-from bidex_meta.witness.puppets import GAIN, Puppets
-from bidex_meta.witness.scripted import Scripted
+from bidex_meta.witness.controller import GAIN, HandController
+from bidex_meta.witness.demonstrators import Scripted
+from bidex_meta.witness.replay import Simulator
 from bidex_meta.witness.scripts import SCRIPTS, script_of
-from bidex_meta.witness.simulator import Simulator
 
 
 @pytest.fixture(scope="module")
-def hands() -> Puppets:
-    return Puppets(Simulator("StackBlock", 1, threads=1))
+def hands() -> HandController:
+    return HandController(Simulator("StackBlock", 1, threads=1))
 
 
-def test_a_hand_goes_where_it_is_led_and_the_other_stays(hands: Puppets) -> None:
+def test_a_hand_goes_where_it_is_led_and_the_other_stays(hands: HandController) -> None:
     right, left = hands.at("right"), hands.at("left")
     goal = right + torch.tensor([0.03, -0.04, 0.05], dtype=right.dtype)
     hands.lead(tuple(goal.tolist()), tuple(left.tolist()), steps=40)
@@ -28,7 +28,7 @@ def test_a_hand_goes_where_it_is_led_and_the_other_stays(hands: Puppets) -> None
     assert len(hands.actions) == len(hands.rewards) == len(hands.success) == 40
 
 
-def test_bent_fingers_are_those_of_the_joint_table(hands: Puppets) -> None:
+def test_bent_fingers_are_those_of_the_joint_table(hands: HandController) -> None:
     hands.bend("right", 0.8, 0.4)
     here = [tuple(hands.at(side).tolist()) for side in ("right", "left")]
     hands.lead(*here, steps=20)
@@ -47,9 +47,9 @@ def test_a_class_without_a_script_is_refused() -> None:
 @pytest.mark.parametrize("noise", [0.0, 0.3])
 def test_a_script_is_led_anew_from_each_rows_start(noise: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the copy earned is what the world's row earns, whatever its task and start; then the last action holds."""
-    led: list[Puppets] = []
+    led: list[HandController] = []
 
-    def to_the_block(hands: Puppets) -> None:
+    def to_the_block(hands: HandController) -> None:
         hands.lead(tuple((hands.where("block1/position") + 0.1).tolist()), tuple(hands.at("left").tolist()), steps=6)
         led.append(hands)
 
@@ -75,7 +75,7 @@ def test_a_script_is_led_anew_from_each_rows_start(noise: float, monkeypatch: py
 
 
 def test_a_hand_turns_about_the_worlds_axes_as_fast_as_it_is_asked() -> None:
-    hands = Puppets(Simulator("ReOrientation", 1, threads=1))
+    hands = HandController(Simulator("ReOrientation", 1, threads=1))
     first, here = hands.where("right/mount_quaternion"), tuple(hands.at("left").tolist())
     for _ in range(30):
         hands.turn("right", torch.tensor([0.0, 0.0, 1.2 / GAIN], dtype=torch.float64))
@@ -90,6 +90,6 @@ def test_a_hand_turns_about_the_worlds_axes_as_fast_as_it_is_asked() -> None:
 def test_both_leaves_are_pulled_and_both_cubes_turned(name: str) -> None:
     simulator = Simulator(name, 1, threads=1)
     simulator.load(simulator.starts(0))
-    hands = Puppets(simulator)
+    hands = HandController(simulator)
     script_of(name)(hands)
     assert any(hands.success) and len(hands.actions) == hands.episode_steps

@@ -1,0 +1,116 @@
+"""The depth sensor: point clouds in place of the objects' state in observations."""
+
+from dataclasses import dataclass
+
+import mujoco
+import torch
+from torch import Tensor
+
+from bidex_meta.hands.hand import SIDES
+from bidex_meta.points.cloud import Cloud, camera_of
+from bidex_meta.points.surfaces import sample
+from bidex_meta.suite import MOST_POINTS
+from bidex_meta.tasks.scene import Scene
+from bidex_meta.tasks.state import TaskState
+from bidex_meta.validation import true_or_false, whole_number
+
+CANDIDATES = 3072
+"""Points fixed on a scene at least: fewer leave gaps through which hidden points are seen."""
+POINT_ENTRIES = {"points": 3, "kind_points": 4}
+"""Entries of a point, by the name of the clouds' observation group."""
+
+
+@dataclass(frozen=True)
+class PointsRule:
+    """Observations with a point cloud in place of the objects' state.
+
+    Attributes:
+        count: Points of a cloud; the original code takes 768.
+        kinds: Whether each has a fourth entry: 1 object, 0 hand, -1 fixture.
+    """
+
+    count: int = 768
+    kinds: bool = False
+
+    def __post_init__(self) -> None:
+        """Checks both."""
+        object.__setattr__(self, "count", whole_number("points", self.count, 1, MOST_POINTS))
+        true_or_false("kinds of points", self.kinds)
+
+    @property
+    def entries(self) -> int:
+        """Entries of an observation that a cloud takes, point after point."""
+        return self.count * POINT_ENTRIES[self.group]
+
+    @property
+    def group(self) -> str:
+        """Name of their observation group: ``points``, or ``kind_points`` where a point has four entries."""
+        return "kind_points" if self.kinds else "points"
+
+
+class DepthSensor:
+    """Puts clouds into the observations of a class.
+
+    Args:
+        scene: The class's scene.
+        rule: Form of the clouds.
+        first: Index of the cloud in an observation.
+        device: Where to compute.
+
+    Attributes:
+        hidden: Entries of the class's observation that depend on objects' states, ascending.
+    """
+
+    def __init__(self, scene: Scene, rule: PointsRule, first: int, device: torch.device) -> None:
+        surfaces = sample(scene.model, max(CANDIDATES, 2 * rule.count))
+        self._cloud = Cloud(surfaces, camera_of(scene.task), rule.count, rule.kinds, device)
+        self._columns = slice(first, first + rule.entries)
+        self.hidden = privileged_columns(scene)
+        self._hidden = torch.tensor(self.hidden, dtype=torch.int64, device=device)
+
+    def show(self, values: Tensor, position: Tensor, rotation: Tensor) -> None:
+        """Zeroes the hidden entries and fills in clouds.
+
+        Args:
+            values: Observations (n, d), written in place.
+            position: Of the bodies, metres, (n, nbody, 3).
+            rotation: Likewise, matrices (n, nbody, 3, 3).
+        """
+        values.index_fill_(1, self._hidden, 0.0)
+        values[:, self._columns] = self._cloud(position, rotation).flatten(1)
+
+
+_OF_HANDS = tuple(f"{side}/" for side in SIDES)
+
+
+def privileged_columns(scene: Scene) -> list[int]:
+    """Indices, ascending, of the observation's entries from which an object's pose or motion could be read.
+
+    They are found by replacing each sensor that is not a hand's by NaN: an entry that becomes NaN, or is read from such
+    a sensor, depends on it. A hand's own sensors stay, though its fingertips feel objects.
+    """
+    task, layout = scene.task, scene.task.layout
+    found = {
+        i
+        for block, where in layout
+        if any(not sensor.startswith(_OF_HANDS) for sensor in block.sensors)
+        for i in range(where.start, where.stop)
+    }
+    for name, values in task.observe(_without_objects(scene)).items():
+        start = layout.range(name).start
+        found |= {start + int(i) for i in values[0].isnan().nonzero()}
+    return sorted(found)
+
+
+def _without_objects(scene: Scene) -> TaskState:
+    """The nominal start of a task from the middle of the variation space, objects' sensors NaN, one row."""
+    data = mujoco.MjData(scene.model)
+    data.qpos[:] = scene.start_qpos[: scene.model.nq]
+    mujoco.mj_forward(scene.model, data)
+    sensors = torch.from_numpy(data.sensordata.copy())[None]
+    for name, where in scene.sensors.items():
+        if not name.startswith(_OF_HANDS):
+            sensors[:, where] = torch.nan
+    space = scene.task.variation_space
+    low, high = (torch.tensor(ends, dtype=torch.float64) for ends in (space.low, space.high))
+    return TaskState(sensors, scene.sensors, scene.task.freeze((0.5 * (low + high))[None]))
