@@ -11,7 +11,7 @@ from bidex_meta import drawing
 from bidex_meta.cli import main
 from bidex_meta.commands import watching
 from bidex_meta.record import RunFolder, read_metrics
-from bidex_meta.record.writers import LOGGERS, NoWriter
+from bidex_meta.record.writers import LOGGERS, Writer
 from tests.test_cli import final, run, same, toy_worlds
 
 __all__ = ["toy_worlds"]
@@ -122,7 +122,7 @@ def test_equal_success_is_settled_by_the_score_or_the_return():
 def test_films_are_of_every_class_and_go_to_the_logger(toy_worlds, tmp_path, monkeypatch):
     seen = []
 
-    class Notes(NoWriter):
+    class Notes(Writer):
         def config(self, values):
             seen.append(values["algo"])
 
