@@ -9,9 +9,9 @@ from typing import Any
 
 from bidex_meta.config import RunConfig, flat
 from bidex_meta.errors import BidexError, shortened, unknown_name
-from bidex_meta.outside import short_name
-from bidex_meta.reading import TABLE, TEXT, Rule, absolute, check, expanded, read_toml, whole
-from bidex_meta.record.folder import RunFolder
+from bidex_meta.runs.folder import RunFolder
+from bidex_meta.utils.files import TABLE, TEXT, Rule, absolute, check, expanded, read_toml, whole
+from bidex_meta.utils.plugins import short_name
 
 _OWN = ("suite", "task", "algo", "seed", "run_dir", "resume", "print_config", "evaluate", "threads", "learner")
 """Flags of a run that no override sets: other entries of the file do, or the sweep."""

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bidex_meta.errors import BidexError, one_line, shortened
-from bidex_meta.reading import exists, is_file, read_text
-from bidex_meta.record.metrics import last_rows
+from bidex_meta.runs.metrics import last_rows
 from bidex_meta.sweep.plan import PlannedRun
+from bidex_meta.utils.files import exists, is_file, read_text
 
 COMMAND = (sys.executable, "-m", "bidex_meta.cli")
 """What a run's words are given to."""

@@ -21,8 +21,8 @@ import tyro
 
 from bidex_meta.engine.cpu import default_threads
 from bidex_meta.errors import BidexError
-from bidex_meta.record.atomic import write_json
-from bidex_meta.record.versions import git_state
+from bidex_meta.runs.atomic import write_json
+from bidex_meta.runs.versions import git_state
 
 HERE = Path(__file__).resolve().parents[2]
 """The checkout that this code runs from."""
