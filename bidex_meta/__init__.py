@@ -12,9 +12,9 @@ from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
+from bidex_meta.clients.gymnasium_ids import register_ids
 from bidex_meta.drawing import set_aside_what_is_missing
 from bidex_meta.errors import BidexError
-from bidex_meta.registration import register_ids
 from bidex_meta.suite import Suite, load_suite, suite_names
 
 if TYPE_CHECKING:

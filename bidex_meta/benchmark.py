@@ -5,34 +5,28 @@ physics is made here: this module decides which numbers belong to which task and
 """
 
 import hashlib
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple, cast
+from typing import Literal, NamedTuple, cast
 
 import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode
 
 from bidex_meta.errors import BidexError, shortened, unknown_name
-from bidex_meta.memory import POINT_BYTES, ROW_BYTES, check_memory
 from bidex_meta.outside import name_with_object
 from bidex_meta.suite import MOST_POINTS, SPLITS, ListedTask, Split, Suite, SuiteClass, load_suite
 from bidex_meta.tasks import registry
+from bidex_meta.tasks.base import TaskClass
+from bidex_meta.tasks.variation import VariationSpace
 from bidex_meta.validation import whole_number
-
-if TYPE_CHECKING:
-    import torch
-    from gymnasium.vector import AutoresetMode
-
-    from bidex_meta.envs.suite_env import SuiteEnv
-    from bidex_meta.tasks.base import TaskClass
-    from bidex_meta.tasks.variation import VariationSpace
-    from bidex_meta.world import Slot, World
-from bidex_meta.world.threads import keep_freed_memory
+from bidex_meta.world import PointsRule, Slot, World
+from bidex_meta.world.episodes import checked_mode
+from bidex_meta.world.single_env import EnvRecipe, SuiteEnv
 
 TaskSampling = Literal["uniform", "fixed"]
 
 _NUMBERS = np.dtype("<f8")
 _TASKS_ALONE = 50
-_DEFAULT_ROWS = {"cpu": 1024, "accelerator": 8192}
 
 
 class Task(NamedTuple):
@@ -69,7 +63,8 @@ class Benchmark:
 
     The same name and seed give the same tasks in every process; no global random generator is read or written.
 
-    To those who ask it is a `metaworld.Benchmark`, and its classes make single environments as Meta-World's do.
+    Its classes make single environments as Meta-World's do; with `bidex_meta.metaworld` imported it is a
+    `metaworld.Benchmark`.
 
     Args:
         name_or_path: A shipped suite (`bidex_meta.suite_names()`), the path of a suite file of your own, or a `Suite`.
@@ -107,32 +102,21 @@ class Benchmark:
         return f"Benchmark({self.name!r}, seed={self.seed})"
 
     @property
-    def __class__(self) -> type:  # type: ignore[override]
-        """Its class, which is by now known to Meta-World: `isinstance(self, metaworld.Benchmark)` reads this first.
-
-        Only so can whoever has imported Meta-World at whatever time be told, without importing it here.
-        """
-        library = sys.modules.get("metaworld")
-        if library is not None and hasattr(library, "Benchmark"):
-            library.Benchmark.register(Benchmark)
-        return type(self)
-
-    @property
     def name(self) -> str:
         """The suite's name."""
         return self.suite.name
 
     @property
-    def train_classes(self) -> "dict[str, type[SuiteEnv]]":
+    def train_classes(self) -> dict[str, type[SuiteEnv]]:
         """Environment classes of the train split by name, in the order of the suite file."""
         return self._env_classes("train")
 
     @property
-    def test_classes(self) -> "dict[str, type[SuiteEnv]]":
+    def test_classes(self) -> dict[str, type[SuiteEnv]]:
         """Environment classes of the test split by name; empty in a multi-task suite."""
         return self._env_classes("test")
 
-    def task_classes(self, split: str = "train") -> "dict[str, TaskClass]":
+    def task_classes(self, split: str = "train") -> dict[str, TaskClass]:
         """What the classes of a split are (scene, observation, reward), by name."""
         return {entry.name: self._classes[entry.name] for entry in self.suite.split_classes(cast(Split, split))}
 
@@ -155,49 +139,46 @@ class Benchmark:
         self,
         split: str = "train",
         num_envs: int | None = None,
-        device: "str | torch.device" = "auto",
+        device: str | torch.device = "auto",
         seed: int | None = None,
-        autoreset_mode: "AutoresetMode | str | None" = None,
+        autoreset_mode: AutoresetMode | str | None = None,
         threads: int | None = None,
         engine: str = "auto",
         stagger: bool = True,
-    ) -> "World":
+    ) -> World:
         """A batched world of one split.
 
         In a training world (SAME_STEP) of a multi-task suite every episode draws one of its class's tasks; in a meta
-        suite, and in every evaluation world (DISABLED), row j of a class keeps task j modulo their number.
+        suite, and in every evaluation world (DISABLED), environment j of a class keeps task j modulo their number.
 
         Args:
             split: `"train"` or `"test"`.
-            num_envs: Rows over all classes, divided evenly; left out, 1024 on the CPU and 8192 on an accelerator.
+            num_envs: Environments over all classes, divided evenly; left out, 1024 on the CPU, 8192 on an accelerator.
             device: `"auto"` (CUDA where there is one), `"cpu"`, `"cuda"`, ... or a `torch.device`.
             seed: Seed of starts and task draws; left out, the benchmark's.
             autoreset_mode: SAME_STEP (the default, for training) or DISABLED (for evaluation); also as text.
             threads: Engine threads on the CPU; left out, one per core. Results do not depend on it.
             engine: `"c"` (C MuJoCo, on the CPU), `"warp"` (mujoco_warp, on either) or `"auto"`: what is fast there.
             stagger: In training worlds the first episodes begin at random elapsed steps (and do not count), so that
-                rows do not end together; False: at 0.
+                environments do not end together; False: at 0.
 
         Raises:
-            BidexError: A split without classes, too few rows, an unknown mode, device or engine.
+            BidexError: A split without classes, too few environments, an unknown mode, device or engine.
         """
-        from bidex_meta.world.autoreset import checked_mode
-
-        slots = self._slots(self._checked_split(split))
-        evaluation = checked_mode(autoreset_mode).name == "DISABLED"
-        return _make_world(
+        slots, mode = self._slots(self._checked_split(split)), checked_mode(autoreset_mode)
+        return World(
             slots,
             num_envs,
-            device,
-            self.seed if seed is None else seed,
-            autoreset_mode,
-            threads,
-            engine,
-            stagger,
+            device=device,
+            engine=engine,
+            seed=self.seed if seed is None else seed,
+            autoreset_mode=mode,
             observation=self.suite.observation,
             pad_to=self.padded_size,
-            task_sampling="fixed" if evaluation or self.suite.kind == "meta" else "uniform",
-            points=(self.suite.points, self.suite.point_kinds),
+            task_sampling="fixed" if mode.name == "DISABLED" or self.suite.kind == "meta" else "uniform",
+            threads=threads,
+            stagger=stagger,
+            points=_points_rule(self.suite.points, self.suite.point_kinds),
         )
 
     def _draw(self, entry: SuiteClass, split: Split) -> list[Task]:
@@ -208,9 +189,7 @@ class Benchmark:
             return [Task.from_variation(entry.name, _listed(space, self.seed, key, task)) for task in listed]
         return _drawn(space, self.seed, key, split, self.suite.tasks_per_class or 0, entry.name)
 
-    def _env_classes(self, split: Split) -> "dict[str, type[SuiteEnv]]":
-        from bidex_meta.envs.suite_env import EnvRecipe
-
+    def _env_classes(self, split: Split) -> dict[str, type[SuiteEnv]]:
         moving, hides = True if self.suite.base == "moving" else None, self.suite.observation == "masked"
         points, found = (self.suite.points, self.suite.point_kinds), {}
         for entry in self.suite.split_classes(split):
@@ -225,9 +204,7 @@ class Benchmark:
             )
         return cast(Split, split)
 
-    def _slots(self, split: Split) -> "list[Slot]":
-        from bidex_meta.world import Slot
-
+    def _slots(self, split: Split) -> list[Slot]:
         slots = []
         for entry in self.suite.split_classes(split):
             task_class = self._classes[entry.name]
@@ -244,9 +221,9 @@ class Benchmark:
 def make_task_world(
     task_name: str,
     num_envs: int | None = None,
-    device: "str | torch.device" = "auto",
+    device: str | torch.device = "auto",
     seed: int = 0,
-    autoreset_mode: "AutoresetMode | str | None" = None,
+    autoreset_mode: AutoresetMode | str | None = None,
     threads: int | None = None,
     task_sampling: TaskSampling | None = None,
     moving_base: bool | None = None,
@@ -254,19 +231,19 @@ def make_task_world(
     stagger: bool = True,
     points: int = 0,
     object: str | None = None,
-) -> "World":
+) -> World:
     """A world of one class as it is on its own: goal visible, no one-hot, no padding, 50 tasks drawn by the seed.
 
     Args:
         task_name: A task class, e.g. `"HandOver"` (which alone has a fixed base: 398 observations, 40 actions), or
             `"package.module:Class"` of your own (docs/own-task.md).
-        num_envs: Rows; left out, 1024 on the CPU and 8192 on an accelerator.
+        num_envs: How many; left out, 1024 on the CPU and 8192 on an accelerator.
         device: As in `Benchmark.make_world`.
         seed: Chooses the tasks, the starts and the task draws.
         autoreset_mode: As in `Benchmark.make_world`.
         threads: As in `Benchmark.make_world`.
-        task_sampling: `"uniform"`: each episode draws a task; `"fixed"`: row j keeps task j modulo 50. Left out:
-            uniform in training worlds, fixed in evaluation worlds.
+        task_sampling: `"uniform"`: each episode draws a task; `"fixed"`: environment j keeps task j modulo 50. Left
+            out: uniform in training worlds, fixed in evaluation worlds.
         moving_base: Drive the hands' bases or fix them; left out, as the class has it on its own.
         engine: As in `Benchmark.make_world`.
         stagger: As in `Benchmark.make_world`.
@@ -274,79 +251,31 @@ def make_task_world(
         object: In the place of its own: a name, or an MJCF file (docs/objects.md); in the slot's name behind a dash.
 
     Raises:
-        BidexError: Unknown class or object, too few rows, an unknown mode, device or engine.
+        BidexError: Unknown class or object, too few environments, an unknown mode, device or engine.
     """
-    from bidex_meta.world import Slot
-    from bidex_meta.world.autoreset import checked_mode
-
-    task_name = registry.resolve(task_name)
+    task_name, mode = registry.resolve(task_name), checked_mode(autoreset_mode)
     task_class = registry.get(task_name, moving_base, **registry.with_object(object))
     tasks = _drawn(task_class.variation_space, whole_number("seed", seed, 0), task_name, "train", _TASKS_ALONE)
     slot = Slot(name_with_object(task_name, object), task_class, np.stack([task.variation for task in tasks]))
-    if task_sampling is None:
-        task_sampling = "fixed" if checked_mode(autoreset_mode).name == "DISABLED" else "uniform"
-    return _make_world(
+    return World(
         [slot],
         num_envs,
-        device,
-        seed,
-        autoreset_mode,
-        threads,
-        engine,
-        stagger,
-        observation="plain",
-        pad_to=None,
-        task_sampling=task_sampling,
-        points=(whole_number("points", points, 0, MOST_POINTS), False),
-    )
-
-
-def _make_world(
-    slots: "list[Slot]",
-    num_envs: int | None,
-    device: "str | torch.device",
-    seed: int,
-    autoreset_mode: "AutoresetMode | str | None",
-    threads: int | None,
-    engine: str,
-    stagger: bool,
-    *,
-    observation: Literal["plain", "one-hot", "masked"],
-    pad_to: int | None,
-    task_sampling: TaskSampling,
-    points: tuple[int, bool],
-) -> "World":
-    from bidex_meta.world import PointsRule, World
-    from bidex_meta.world.autoreset import checked_mode
-
-    place = _checked_device(device)
-    if num_envs is None:
-        num_envs = _DEFAULT_ROWS["cpu" if place.type == "cpu" else "accelerator"]
-    if not isinstance(num_envs, int | np.integer) or isinstance(num_envs, bool) or num_envs < len(slots):
-        names = ", ".join(slot.name for slot in slots)
-        raise BidexError(
-            f"num_envs: expected at least {len(slots)}, a row each for {names}; got {shortened(num_envs)}."
-        )
-    if place.type == "cpu":
-        check_memory(int(num_envs) * (ROW_BYTES + points[0] * POINT_BYTES), f"{num_envs:,} rows", "Lower num_envs.")
-    keep_freed_memory()
-    return World(
-        slots,
-        int(num_envs),
-        device=place,
-        seed=whole_number("seed", seed, 0),
-        autoreset_mode=checked_mode(autoreset_mode),
-        observation=observation,
-        pad_to=pad_to,
-        task_sampling=task_sampling,
-        threads=threads,
+        device=device,
         engine=engine,
+        seed=seed,
+        autoreset_mode=mode,
+        task_sampling=task_sampling or ("fixed" if mode.name == "DISABLED" else "uniform"),
+        threads=threads,
         stagger=stagger,
-        points=PointsRule(*points) if points[0] else None,
+        points=_points_rule(whole_number("points", points, 0, MOST_POINTS)),
     )
 
 
-def _task_class(suite: Suite, entry: SuiteClass) -> "TaskClass":
+def _points_rule(count: int, kinds: bool = False) -> PointsRule | None:
+    return PointsRule(count, kinds) if count else None
+
+
+def _task_class(suite: Suite, entry: SuiteClass) -> TaskClass:
     try:
         task_class = registry.get(entry.class_name, True if suite.base == "moving" else None, **entry.options)
         for task in entry.tasks:
@@ -365,30 +294,14 @@ def _generator(*key: object) -> np.random.Generator:
 
 
 def _drawn(
-    space: "VariationSpace", seed: int, name: str, split: Split, count: int, called: str | None = None
+    space: VariationSpace, seed: int, name: str, split: Split, count: int, called: str | None = None
 ) -> list[Task]:
     variations = space.sample(_generator(seed, name, split), count)
     return [Task.from_variation(called or name, variation) for variation in variations]
 
 
-def _listed(space: "VariationSpace", seed: int, name: str, task: ListedTask) -> np.ndarray:
+def _listed(space: VariationSpace, seed: int, name: str, task: ListedTask) -> np.ndarray:
     variation = space.sample(_generator(seed, name, "listed", task.name), 1)[0]
     for component, value in task.fixed.items():
         variation[space.names.index(component)] = value
     return variation
-
-
-def _checked_device(device: "str | torch.device") -> "torch.device":
-    import torch
-
-    if isinstance(device, str) and device == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        place = torch.device(device)
-    except (RuntimeError, TypeError, ValueError) as error:
-        raise BidexError(f"device: expected auto, cpu, cuda or cuda:N, got {shortened(device)}.") from error
-    if place.type == "cuda" and not torch.cuda.is_available():
-        raise BidexError(
-            f"device: expected one that is here, got {shortened(device)} without a CUDA device. Use cpu or auto."
-        )
-    return place

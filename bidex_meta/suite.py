@@ -4,52 +4,41 @@ Names of task classes and of the components of their variations are checked wher
 `bidex_meta.benchmark`.
 """
 
-import math
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeVar, cast
+from typing import Annotated, Literal
+
+from msgspec import Meta
 
 from bidex_meta.errors import BidexError, known_name, shortened, unknown_name
 from bidex_meta.outside import name_with_object
 from bidex_meta.paths import suites_dir
 from bidex_meta.reading import absolute, expanded, read_toml
+from bidex_meta.validation import parse
 
 Split = Literal["train", "test"]
 SPLITS: tuple[Split, Split] = ("train", "test")
-_LARGEST = 1_000_000
-"""Of any number in a suite file: metres, radians, tasks; beyond it nothing is meant."""
 MOST_POINTS = 16_384
 """Of a cloud: more than a coarse image has pixels are no finer."""
-_LONGEST_TEXT, _MOST_TABLES = 500, 1000
-
-
-_V = TypeVar("_V")
-
-
-class ReadOnly(Mapping[str, _V]):
-    """A mapping that nobody changes and, unlike Python's own ``MappingProxyType``, everybody may pickle.
-
-    Args:
-        content: Is copied.
-    """
-
-    def __init__(self, content: Mapping[str, _V]) -> None:
-        self._content = dict(content)
-
-    def __getitem__(self, key: str) -> _V:
-        return self._content[key]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._content)
-
-    def __len__(self) -> int:
-        return len(self._content)
-
-    def __repr__(self) -> str:
-        """As the dict of its content."""
-        return repr(self._content)
+METAWORLD_SUITES: dict[str, tuple[str, ...]] = {
+    "metaworld/MT10": (
+        "reach-v3",
+        "push-v3",
+        "pick-place-v3",
+        "door-open-v3",
+        "drawer-open-v3",
+        "drawer-close-v3",
+        "button-press-topdown-v3",
+        "peg-insert-side-v3",
+        "window-open-v3",
+        "window-close-v3",
+    ),
+    # No suite of Meta-World's: three of its classes that are learned within minutes.
+    "metaworld/MT3": ("reach-v3", "drawer-close-v3", "button-press-topdown-v3"),
+}
+"""Suites of Meta-World's own environments, and their classes in its order."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +75,7 @@ class SuiteClass:
 
 @dataclass(frozen=True)
 class Suite:
-    """What a suite file says, checked."""
+    """A suite file, checked."""
 
     name: str
     """E.g. `"MT4"`."""
@@ -107,7 +96,7 @@ class Suite:
     tasks_per_class: int | None
     """Tasks drawn per class and split; None when every class lists its tasks."""
     classes: tuple[SuiteClass, ...]
-    """In the order of rows, one-hot and task lists."""
+    """In the order of environments, one-hot and task lists."""
     file: Path
     """Where it was read from."""
     points: int = 0
@@ -130,6 +119,17 @@ def suite_names() -> list[str]:
     return sorted(path.stem for path in suites_dir().glob("*.toml"))
 
 
+def metaworld_classes(suite: str) -> tuple[str, ...]:
+    """The classes of one of Meta-World's suites.
+
+    Raises:
+        BidexError: There is no such suite; with the nearest name and the list.
+    """
+    if suite not in METAWORLD_SUITES:
+        raise unknown_name("suite of Meta-World", suite, METAWORLD_SUITES)
+    return METAWORLD_SUITES[suite]
+
+
 def load_suite(name_or_path: str | Path) -> Suite:
     """Reads a shipped suite by name, or any suite file by path.
 
@@ -137,7 +137,7 @@ def load_suite(name_or_path: str | Path) -> Suite:
         name_or_path: E.g. `"MT4"`, in any case, or the path of a `.toml` file: a `Path`, or a text that ends so.
 
     Raises:
-        BidexError: No such suite or file, or the file does not say what `suites/README.md` asks for.
+        BidexError: No such suite or file, or the file is not as `suites/README.md` describes.
     """
     text = str(name_or_path)
     if isinstance(name_or_path, Path) or text.endswith(".toml"):
@@ -145,235 +145,155 @@ def load_suite(name_or_path: str | Path) -> Suite:
     return _parse(suites_dir() / f"{known_name('suite', text, suite_names())}.toml")
 
 
+# What stands in a file, as msgspec checks it. No number is larger than a million: beyond it nothing is meant.
+_Text = Annotated[str, Meta(min_length=1, max_length=500)]
+_Count = Annotated[int, Meta(ge=1, le=1_000_000)]
+_Number = Annotated[float, Meta(ge=-1_000_000, le=1_000_000)]
+_Tables = Meta(min_length=1, max_length=1000)
+
+
+@dataclass
+class _TaskEntry:
+    name: _Text
+    fixed: dict[str, _Number]
+    split: Split = "train"
+
+
+@dataclass
+class _ClassEntry:
+    name: _Text
+    split: Literal["train", "test", "both"] = "train"
+    reward_scale: Annotated[float, Meta(gt=0.0, le=1_000_000)] = 1.0
+    gamma: Annotated[float, Meta(ge=0.0, lt=1.0)] | None = None
+    tasks: Annotated[list[_TaskEntry], _Tables] = field(default_factory=list)
+    options: dict[str, _Count | _Number | _Text] = field(default_factory=dict)  # a whole number may count something
+    objects: Annotated[list[_Text], _Tables] = field(default_factory=list)
+
+
+@dataclass
+class _PointsEntry:
+    count: Annotated[int, Meta(ge=1, le=MOST_POINTS)] = 768
+    kinds: bool = False
+
+
+@dataclass
+class _File:
+    name: _Text
+    version: _Count
+    kind: Literal["multi-task", "meta"]
+    description: _Text
+    observation: Literal["plain", "one-hot", "masked"]
+    task_id: Literal["class", "task"]
+    reward: Literal["paper"]
+    base: Literal["moving", "alone"]
+    classes: Annotated[list[_ClassEntry], _Tables]
+    tasks_per_class: _Count | None = None
+    points: _PointsEntry | None = None
+
+    def texts(self) -> Iterator[tuple[str, object]]:
+        """What comes to terminals, by its place in the file."""
+        yield from (("name", self.name), ("description", self.description))
+        for i, entry in enumerate(self.classes):
+            yield f"classes[{i}].name", entry.name
+            yield from ((f"classes[{i}].tasks[{j}].name", task.name) for j, task in enumerate(entry.tasks))
+            yield from ((f"classes[{i}].objects", name) for name in entry.objects)
+            yield from ((f"classes[{i}].options.object", name) for name in [entry.options.get("object", "egg")])
+
+
 def _parse(file: Path) -> Suite:
-    content = read_toml(file, "a suite file")
-    table = _Table(file, "", content)
-    points, kinds = _parse_points(table.table("points", "{ count = 768 }")) if "points" in content else (0, False)
+    content = parse(read_toml(file, "a suite file"), _File, str(file), exact=True)
+    for place, text in content.texts():
+        # Terminals obey what is not printable.
+        if not isinstance(text, str) or not text.strip() or not text.isprintable():
+            raise _error(file, place, "printable text", shortened(text))
+    points = content.points or _PointsEntry(0)
     suite = Suite(
-        name=table.text("name"),
-        version=table.count("version"),
-        kind=table.choice("kind", "multi-task", "meta"),
-        description=table.text("description"),
-        observation=table.choice("observation", "plain", "one-hot", "masked"),
-        task_id=table.choice("task_id", "class", "task"),
-        reward=table.choice("reward", "paper"),
-        base=table.choice("base", "moving", "alone"),
-        tasks_per_class=table.count("tasks_per_class") if "tasks_per_class" in content else None,
-        classes=tuple(entry for each in table.tables("classes") for entry in _parse_classes(each)),
+        name=content.name,
+        version=content.version,
+        kind=content.kind,
+        description=content.description,
+        observation=content.observation,
+        task_id=content.task_id,
+        reward=content.reward,
+        base=content.base,
+        tasks_per_class=content.tasks_per_class,
+        classes=tuple(made for i, entry in enumerate(content.classes) for made in _classes(file, i, entry)),
         file=file,
-        points=points,
-        point_kinds=kinds,
+        points=points.count,
+        point_kinds=points.kinds,
     )
-    table.finish()
-    _check(suite, table)
+    _check(suite)
     return suite
 
 
-def _parse_points(table: "_Table") -> tuple[int, bool]:
-    count, kinds = table.count("count") if "count" in table.content else 768, table.flag("kinds", default=False)
-    table.finish()
-    if count > MOST_POINTS:
-        raise table.error("count", f"a whole number of at most {MOST_POINTS:,}", count)
-    return count, kinds
-
-
-def _parse_classes(table: "_Table") -> list[SuiteClass]:
+def _classes(file: Path, index: int, entry: _ClassEntry) -> Iterator[SuiteClass]:
     """A class, or with `objects` one for each of them."""
-    entry = _parse_class(table)
-    objects = table.things("objects") if "objects" in table.content else []
-    table.finish()
-    given = entry.options.get("object")
-    if objects and given is not None:
-        raise table.error("objects", "either objects or options.object", "both", "Leave one of them out.")
-    if not objects:
-        return [replace(entry, name=name_with_object(entry.class_name, cast(str | None, given)))]
-    return [
-        replace(
-            entry,
-            name=name_with_object(entry.class_name, thing),
-            options=ReadOnly({**entry.options, "object": thing}),
+    options: dict[str, float | str] = dict(entry.options)
+    for name, value in options.items():
+        if isinstance(value, str) != (name == "object"):
+            raise _error(file, f"classes[{index}].options.{name}", "a number", shortened(value))
+    given = options.pop("object", None)
+    if entry.objects and given is not None:
+        mend = "Leave one of them out."
+        raise _error(file, f"classes[{index}].objects", "either objects or options.object", "both", mend)
+    for name in entry.objects or [given]:
+        thing = None if name is None else _object(file, str(name))
+        yield SuiteClass(
+            name=name_with_object(entry.name, thing),
+            class_name=entry.name,
+            splits=SPLITS if entry.split == "both" else (entry.split,),
+            reward_scale=entry.reward_scale,
+            gamma=entry.gamma,
+            tasks=tuple(ListedTask(task.name, task.split, task.fixed) for task in entry.tasks),
+            options=options if thing is None else {**options, "object": thing},
         )
-        for thing in objects
-    ]
 
 
-def _parse_class(table: "_Table") -> SuiteClass:
-    split = table.choice("split", "train", "test", "both", default="train")
-    name = table.text("name")
-    entry = SuiteClass(
-        name=name,
-        class_name=name,
-        splits=SPLITS if split == "both" else (cast(Split, split),),
-        reward_scale=table.number("reward_scale", default=1.0),
-        gamma=table.number("gamma") if "gamma" in table.content else None,
-        tasks=tuple(_parse_task(task) for task in table.tables("tasks", default=())),
-        options=ReadOnly(_parse_options(table) if "options" in table.content else {}),
-    )
-    if entry.reward_scale <= 0.0:
-        raise table.error("reward_scale", "a number above 0", entry.reward_scale)
-    if entry.gamma is not None and not 0.0 <= entry.gamma < 1.0:
-        raise table.error("gamma", "a number from 0 to below 1", entry.gamma)
-    return entry
+def _object(file: Path, name: str) -> str:
+    """An object's name; of a file its path, which is relative to the suite file's folder."""
+    return str(absolute(file.parent / expanded(name))) if name.endswith(".xml") else name
 
 
-def _parse_options(table: "_Table") -> dict[str, float | str]:
-    options = table.table("options")
-
-    def parsed(key: str) -> float | str:
-        if key == "object":
-            return options.thing(key)
-        # A whole number stays one: it may count something.
-        return options.number(key) if isinstance(options.content[key], float) else options.count(key)
-
-    return {key: parsed(key) for key in options.content}
-
-
-def _parse_task(table: "_Table") -> ListedTask:
-    fixed = table.table("fixed")
-    task = ListedTask(
-        name=table.text("name"),
-        split=table.choice("split", *SPLITS, default="train"),
-        fixed=ReadOnly({key: fixed.number(key) for key in fixed.content}),
-    )
-    table.finish()
-    return task
-
-
-def _check(suite: Suite, table: "_Table") -> None:
-    _check_unique(table, "classes", [entry.name for entry in suite.classes])
+def _check(suite: Suite) -> None:
+    _check_unique(suite.file, "classes", [entry.name for entry in suite.classes])
     expected = SPLITS if suite.kind == "meta" else ("train",)
     if suite.splits != expected:
         mend = "Give each class a split." if suite.kind == "meta" else 'Leave split out, or write kind = "meta".'
-        received = ", ".join(suite.splits)
-        raise table.error("classes", f"a {suite.kind} suite with the splits {', '.join(expected)}", received, mend)
+        wanted = f"a {suite.kind} suite with the splits {', '.join(expected)}"
+        raise _error(suite.file, "classes", wanted, ", ".join(suite.splits), mend)
     all_listed = all(entry.tasks for entry in suite.classes)
     if all_listed and suite.tasks_per_class is not None:
         mend = "Leave it out: every class lists its tasks."
-        raise table.error("tasks_per_class", "nothing", suite.tasks_per_class, mend)
+        raise _error(suite.file, "tasks_per_class", "nothing", suite.tasks_per_class, mend)
     if not all_listed and suite.tasks_per_class is None:
-        raise table.error("tasks_per_class", "a whole number from 1 on", "nothing", "Add it, or list every task.")
+        mend = "Add it, or list every task."
+        raise _error(suite.file, "tasks_per_class", "a whole number from 1 on", "nothing", mend)
     if suite.task_id == "task" and not all_listed:
-        raise table.error("task_id", '"class", since not every class lists its tasks', suite.task_id)
+        raise _error(suite.file, "task_id", '"class", since not every class lists its tasks', suite.task_id)
     for index, entry in enumerate(suite.classes):
         if entry.tasks:
-            _check_listed(entry, _Table(table.file, f"classes[{index}].", {}))
+            _check_listed(suite.file, f"classes[{index}].tasks", entry)
 
 
-def _check_listed(entry: SuiteClass, table: "_Table") -> None:
-    _check_unique(table, "tasks", [task.name for task in entry.tasks])
-    listed = tuple(split for split in SPLITS if any(task.split == split for task in entry.tasks))
-    if listed != entry.splits:
+def _check_listed(file: Path, place: str, entry: SuiteClass) -> None:
+    _check_unique(file, place, [task.name for task in entry.tasks])
+    splits = tuple(split for split in SPLITS if any(task.split == split for task in entry.tasks))
+    if splits != entry.splits:
         mend = f"Make split of {entry.name} and of its tasks agree."
-        raise table.error("tasks", f"tasks in {' and '.join(entry.splits)}", f"in {' and '.join(listed)}", mend)
+        raise _error(file, place, f"tasks in {' and '.join(entry.splits)}", f"in {' and '.join(splits)}", mend)
     train, test = ([task for task in entry.tasks if task.split == split] for split in SPLITS)
     for held_out in test:
         for other in train:
             if held_out.fixed == other.fixed:
-                received = f"{other.name!r} and {held_out.name!r} with the same fixed values"
-                raise table.error("tasks", "train and test tasks that differ", received, "Change one of them.")
+                got = f"{other.name!r} and {held_out.name!r} with the same fixed values"
+                raise _error(file, place, "train and test tasks that differ", got, "Change one of them.")
 
 
-def _check_unique(table: "_Table", key: str, names: list[str]) -> None:
+def _check_unique(file: Path, place: str, names: list[str]) -> None:
     for name, times in Counter(names).items():
         if times > 1:
-            raise table.error(f"{key}.name", "each name once", f"{name!r} {times} times", "Remove one.")
+            raise _error(file, f"{place}.name", "each name once", f"{name!r} {times} times", "Remove one.")
 
 
-_REQUIRED: Any = object()
-
-
-class _Table:
-    """A TOML table that is asked for each of its keys by type, and at the end for keys nobody asked for."""
-
-    def __init__(self, file: Path, prefix: str, content: dict[str, Any]) -> None:
-        self.file = file
-        self.content = content
-        self._prefix = prefix
-        self._asked: list[str] = []
-
-    def text(self, key: str) -> str:
-        value = self._get(key, "a text in quotes", _REQUIRED)
-        if not isinstance(value, str) or not value.strip():
-            raise self.error(key, "a text in quotes", value)
-        # Names and descriptions come to terminals, which obey what is not printable.
-        if not value.isprintable() or len(value) > _LONGEST_TEXT:
-            raise self.error(key, f"printable text of at most {_LONGEST_TEXT} letters", value)
-        return value
-
-    def thing(self, key: str) -> str:
-        """An object's name; of a file its path, which is relative to the suite file's folder."""
-        return self._placed(self.text(key))
-
-    def things(self, key: str) -> list[str]:
-        values = self._get(key, "a list of objects", _REQUIRED)
-        fits = isinstance(values, list) and 0 < len(values) <= _MOST_TABLES
-        if not fits or not all(isinstance(value, str) and value.strip() and value.isprintable() for value in values):
-            raise self.error(key, 'a list of objects such as ["egg", "block"]', values)
-        return [self._placed(value) for value in values]
-
-    def _placed(self, value: str) -> str:
-        return str(absolute(self.file.parent / expanded(value))) if value.endswith(".xml") else value
-
-    def choice(self, key: str, *choices: str, default: str = _REQUIRED) -> Any:
-        expected = " or ".join(f'"{choice}"' for choice in choices)
-        value = self._get(key, expected, default)
-        if not isinstance(value, str) or value not in choices:
-            raise self.error(key, expected, value)
-        return value
-
-    def count(self, key: str) -> int:
-        value = self._get(key, "a whole number from 1 on", _REQUIRED)
-        if type(value) is not int or value < 1:
-            raise self.error(key, "a whole number from 1 on", value)
-        if value > _LARGEST:
-            raise self.error(key, f"a whole number of at most {_LARGEST:,}", value)
-        return value
-
-    def flag(self, key: str, default: bool) -> bool:
-        value = self._get(key, "true or false", default)
-        if not isinstance(value, bool):
-            raise self.error(key, "true or false", value)
-        return value
-
-    def number(self, key: str, default: float = _REQUIRED) -> float:
-        value = self._get(key, "a number", default)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise self.error(key, "a finite number", value)
-        if abs(value) > _LARGEST:
-            raise self.error(key, f"a number within +-{_LARGEST:,}", value)
-        return float(value)
-
-    def table(self, key: str, example: str = "{ goal_x = 0.0 }") -> "_Table":
-        value = self._get(key, "a table", _REQUIRED)
-        if not isinstance(value, dict):
-            raise self.error(key, f"a table such as {example}", value)
-        return _Table(self.file, f"{self._prefix}{key}.", value)
-
-    def tables(self, key: str, default: Any = _REQUIRED) -> list["_Table"]:
-        expected = f"at least one [[{key}]] table"
-        value = self._get(key, expected, default)
-        if value is default:
-            return []
-        if not isinstance(value, list) or not value or not all(isinstance(entry, dict) for entry in value):
-            raise self.error(key, expected, value)
-        if len(value) > _MOST_TABLES:
-            raise self.error(key, f"at most {_MOST_TABLES:,} tables", f"{len(value):,}", "Leave some out.")
-        return [_Table(self.file, f"{self._prefix}{key}[{index}].", entry) for index, entry in enumerate(value)]
-
-    def finish(self) -> None:
-        for key in self.content:
-            if key not in self._asked:
-                where = f"{self.file}: {self._prefix}{key}"
-                raise BidexError(f"{where}: {unknown_name('key', key, self._asked)}")
-
-    def error(self, key: str, expected: str, received: object, mend: str = "") -> BidexError:
-        shown = received if isinstance(received, str) and mend else shortened(received)
-        hint = mend or "See suites/README.md."
-        return BidexError(f"{self.file}: {self._prefix}{key}: expected {expected}, got {shown}. {hint}")
-
-    def _get(self, key: str, expected: str, default: Any) -> Any:
-        self._asked.append(key)
-        if key not in self.content and default is _REQUIRED:
-            near = [given for given in self.content if given not in self._asked]
-            raise self.error(key, expected, "nothing", f"Add {key} (keys given: {', '.join(near) or 'none'}).")
-        return self.content.get(key, default)
+def _error(file: Path, place: str, expected: str, got: object, mend: str = "See suites/README.md.") -> BidexError:
+    return BidexError(f"{file}: {place}: expected {expected}, got {got}. {mend}")

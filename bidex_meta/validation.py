@@ -55,6 +55,10 @@ NonNegative = Annotated[float, Meta(ge=0.0, le=_LARGE)]
 """A finite number, 0 or more."""
 Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
 """A number from 0 to 1."""
+Share = Annotated[float, Meta(gt=0.0, le=1.0)]
+"""A number above 0, to 1."""
+BelowOne = Annotated[float, Meta(ge=0.0, lt=1.0)]
+"""A number from 0 to below 1."""
 Text = Annotated[str, Meta(min_length=1, max_length=4096, pattern=r"^[^\0]*$")]
 """A text that is not empty."""
 

@@ -23,12 +23,15 @@ PRESETS = {"laptop": Config(), "paper": Config(8)}
 
 class Learner:
     adapts = True
-    autoreset = "DISABLED"
     per_process = ()
 
     def __init__(self, world: Any, config: Config, seed: int):
         self.mode = world.metadata["autoreset_mode"].name
         self.rows, self.env_steps = world.num_envs, 0
+
+    @classmethod
+    def autoreset_mode(cls, config: Config) -> str:
+        return "DISABLED"
 
     def iterate(self) -> dict[str, float]:
         self.env_steps += self.rows

@@ -10,13 +10,10 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from bidex_meta.errors import BidexError
-from bidex_meta.world.actions import clean
-from bidex_meta.world.autoreset import checked_mode, checked_seed, reset_mask
+from bidex_meta.world.base import make_spaces, split_rows
+from bidex_meta.world.checking import clean
 from bidex_meta.world.contract import plain_groups
-from bidex_meta.world.ends import Clock, ended_info
-from bidex_meta.world.episodes import Episodes
-from bidex_meta.world.groups import split_rows
-from bidex_meta.world.spaces import make_spaces
+from bidex_meta.world.episodes import Clock, Episodes, checked_mode, checked_seed, ended_info, reset_mask
 
 
 class FakeWorld(ABC):

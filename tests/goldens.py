@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from bidex_meta.benchmark import make_task_world
-from bidex_meta.engine.identity import model_identity
+from bidex_meta.engine.models import model_identity
 from bidex_meta.tasks import registry
 from bidex_meta.world import World
 

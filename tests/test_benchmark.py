@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode
 from hypothesis import given
 from hypothesis import strategies as st
 
-import bidex_meta.world
+import bidex_meta.benchmark
 from bidex_meta.benchmark import Benchmark, Task, make_task_world
 from bidex_meta.errors import BidexError
 from bidex_meta.metaworld import CustomML
@@ -36,7 +36,7 @@ class Asked:
 
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(bidex_meta.world, "World", lambda slots, num_envs, **options: Asked(slots, num_envs, options))
+    monkeypatch.setattr(bidex_meta.benchmark, "World", lambda slots, num, **options: Asked(slots, num, options))
     yield
 
 
@@ -76,9 +76,6 @@ def test_suites_and_benchmarks_pickle(own: str, tmp_path: Path) -> None:
         assert copied.train_tasks == benchmark.train_tasks and copied.train_classes == benchmark.train_classes
         for a, b in zip(begun(copied), begun(benchmark), strict=True):
             np.testing.assert_array_equal(a, b)
-    entry = benchmark.suite.classes[0]
-    with pytest.raises(TypeError):
-        entry.options["object"] = "egg"  # type: ignore[index]
 
 
 def test_benchmarks_go_to_other_processes() -> None:
@@ -182,7 +179,7 @@ def test_what_a_world_is_asked_for(
     world = Benchmark(name, seed=4).make_world(split, num_envs=9, device="cpu", threads=2)
     assert world.num_envs == 9
     assert world.options == {
-        "device": torch.device("cpu"),
+        "device": "cpu",
         "seed": 4,
         "autoreset_mode": AutoresetMode.SAME_STEP,
         "observation": observation,
@@ -233,22 +230,21 @@ def test_task_world_has_the_tasks_of_the_suites(asked: None) -> None:
     world = make_task_world("CatchAbreast", num_envs=3, device="cpu", seed=2)
     expected = [t.variation for t in Benchmark("MT4", seed=2).train_tasks if t.env_name == "CatchAbreast"]
     np.testing.assert_array_equal(world.slots[0].tasks, expected)
-    assert world.options["observation"] == "plain" and world.options["pad_to"] is None
-    assert world.options["task_sampling"] == "uniform"
+    assert not {"observation", "pad_to"} & world.options.keys() and world.options["task_sampling"] == "uniform"
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"num_envs": 3}, "num_envs: expected at least 4, a row each for CatchUnderarm, HandOver"),
-        ({"num_envs": 4.5}, "num_envs: expected at least 4"),
+        ({"num_envs": 3}, "num_envs: expected at least 4, one each for CatchUnderarm, HandOver"),
+        ({"num_envs": 4.5}, "num_envs: expected a whole number"),
         ({"split": "test"}, "MT4 has the splits train, got 'test'"),
         ({"autoreset_mode": "NEXT_STEP"}, "Unknown autoreset_mode 'NEXT_STEP'"),
         ({"device": "gpu"}, "device: expected auto, cpu, cuda or cuda:N, got 'gpu'"),
-        ({"seed": -1}, "seed: expected a whole number from 0 on, got -1"),
+        ({"seed": -1}, "seed: expected a whole number"),
     ],
 )
-def test_bad_worlds(asked: None, arguments: dict[str, Any], message: str) -> None:
+def test_bad_worlds(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(BidexError, match=message):
         Benchmark("MT4").make_world(**arguments)
 

@@ -12,8 +12,8 @@ import torch
 from bidex_meta.cli import main
 from bidex_meta.commands import COMMANDS
 from bidex_meta.record import RunFolder, read_metrics
-from bidex_meta.sources import Source
-from bidex_meta.sources.source import OwnSuite
+from bidex_meta.worlds import Worlds
+from bidex_meta.worlds.own import OwnSuite
 from tests.fakes import ToyWorld
 
 SMALL = ["--suite", "MT4", "--num-envs", "6", "--threads", "1", "--device", "cpu"]
@@ -321,7 +321,7 @@ import functools, sys, time
 import bidex_meta.record.progress as progress
 import bidex_meta.train.runner as runner
 from bidex_meta.cli import main
-from bidex_meta.sources.source import OwnSuite
+from bidex_meta.worlds.own import OwnSuite
 from tests.fakes import ToyWorld
 class Slow(ToyWorld):
     def step(self, action):
@@ -371,7 +371,7 @@ def test_a_single_task_can_be_played_with_moving_bases_as_in_suites(capsys):
     for flags, moving in (([], False), (["--base", "moving"], True), (["--base", "fixed"], False)):
         assert main(["run", "--task", "HandOver", "--algo", "ppo", "--print-config", *flags]) == 0
         config = json.loads(capsys.readouterr().out)
-        source = Source.open(config | {"threads": 1})
+        source = Worlds.open(config | {"threads": 1})
         assert source.moving_bases == moving
         world = source.world()
         assert world.single_action_space.shape == ((52,) if moving else (40,))

@@ -14,8 +14,8 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from bidex_meta.clients.humanoid_world import HumanoidWorld
-from bidex_meta.clients.metaworld_world import MetaWorldWorld
 from bidex_meta.errors import BidexError
+from bidex_meta.metaworld.batched import MetaWorldWorld
 from bidex_meta.world import World
 from bidex_meta.world.contract import PooledWorld, TaskWorld, VectorWorld
 from bidex_meta.world.wrapper import PooledWorldWrapper, TaskWorldWrapper, WorldWrapper

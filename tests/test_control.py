@@ -15,7 +15,7 @@ from bidex_meta.evaluation.control_arms import arms, control
 from bidex_meta.evaluation.gains import difference_over_runs
 from bidex_meta.evaluation.meta_test import meta_evaluate
 from bidex_meta.evaluation.play import play_tasks
-from bidex_meta.sources.source import OwnSuite
+from bidex_meta.worlds.own import OwnSuite
 from tests.points import Finder, PointWorld, Still, ring
 
 NORTH, EAST, WEST = np.array([[0.0, 1.0]]), np.array([[1.0, 0.0]]), np.array([[-1.0, 0.0]])

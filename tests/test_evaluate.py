@@ -7,11 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.play import evaluate
+from bidex_meta.evaluation.play import RandomAgent, ZeroAgent, evaluate
+from bidex_meta.evaluation.references import Reference
 from bidex_meta.evaluation.results import MANY_TASKS, ClassResult, Evaluation, compare
-from bidex_meta.evaluation.scores import Reference
 from bidex_meta.evaluation.statistics import aggregate, bootstrap_interval
-from bidex_meta.evaluation.untrained import RandomAgent, ZeroAgent
 from tests.fakes import STEPS_OF_TASK, Seeker, ToyWorld
 
 

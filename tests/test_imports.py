@@ -15,28 +15,27 @@ PACKAGES = {package.__name__: Path(next(iter(package.__path__))) for package in 
 
 ORDER = (
     ("errors",),
-    ("paths", "maths", "agents", "drawing", "reading", "fields", "memory", "outside", "streams", "validation"),
+    ("paths", "maths", "agents", "drawing", "reading", "memory", "outside", "streams", "validation"),
     ("engine", "hands", "suite"),
     ("config",),
     ("record",),
     ("tasks",),
     ("points",),
     ("world",),
-    ("envs",),
-    ("evaluation", "benchmark", "train"),
+    ("evaluation", "benchmark"),
     ("metaworld",),
-    ("registration",),
+    ("clients",),
     ("bidex_meta",),  # the package's own names
-    ("clients", "witness", "data"),
-    ("sources",),
+    ("witness", "data", "worlds"),
+    ("train",),
     ("speed", "viewer", "report", "sweep"),
-    ("bidex_algos.checks", "bidex_algos.choices", "bidex_algos.reports"),
-    ("bidex_algos.gradients", "bidex_algos.experience"),
+    tuple(
+        f"bidex_algos.{name}" for name in ("advantages", "balancing", "replay", "rollout", "step_size", "trust_region")
+    ),
     ("bidex_algos.nets",),
     ("bidex_algos.learner",),
     ("bidex_algos.onpolicy", "bidex_algos.offpolicy"),
     ("bidex_algos.meta", "bidex_algos.multiagent", "bidex_algos.offline"),  # RL² takes PPO's loss
-    ("bidex_algos.single_task", "bidex_algos.start_from"),
     ("bidex_algos",),
     ("commands",),
     ("cli",),
@@ -46,14 +45,14 @@ ORDER = (
 LEVEL = {room: level for level, rooms in enumerate(ORDER) for room in rooms}
 
 MUTUAL = {
-    ("bidex_meta.sources.metaworld_suite", "bidex_meta.sources.source"),  # Source.open chooses among its kinds
-    ("bidex_meta.sources.humanoid_task", "bidex_meta.sources.source"),
+    ("bidex_meta.worlds.base", "bidex_meta.worlds.own"),  # Worlds.open chooses among its kinds
+    ("bidex_meta.worlds.base", "bidex_meta.worlds.external"),
     ("bidex_meta.world.rendering", "bidex_meta.world.world"),  # rendering names World in an annotation only
 }
 """Modules that import each other all the same."""
 
-TWICE = {"base", "config", "episodes", "replay", "starts"}
-"""Names of several modules. ``base`` and ``config`` are a room's own; the others are older than this rule."""
+TWICE = {"base", "config", "learner", "replay", "starts"}
+"""Names of several modules. ``base`` is a room's own, ``learner`` contract and base; the others are older."""
 
 
 def _name(package: str, path: Path) -> str:
@@ -150,5 +149,5 @@ def test_pages_name_modules_that_are_there() -> None:
         for page in pages
         for path in re.findall(r"\b(?:bidex_meta|algos/bidex_algos)/[\w/]+\.(?:py|md)\b", page.read_text())
     }
-    assert len(named) > 30
+    assert len(named) > 25
     assert not [(page, path) for page, path in sorted(named) if not (root / path).is_file()]

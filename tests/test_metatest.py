@@ -8,10 +8,9 @@ from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.gains import paired_gains
 from bidex_meta.evaluation.meta_test import meta_evaluate
-from bidex_meta.evaluation.play import evaluate
+from bidex_meta.evaluation.play import RandomAgent, evaluate
+from bidex_meta.evaluation.references import Reference
 from bidex_meta.evaluation.results import ClassResult, Evaluation
-from bidex_meta.evaluation.scores import Reference
-from bidex_meta.evaluation.untrained import RandomAgent
 from tests.fakes import ToyWorld
 from tests.points import Finder, PointWorld, Still, ring
 

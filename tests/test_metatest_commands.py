@@ -11,8 +11,8 @@ from bidex_meta.commands import learners
 from bidex_meta.commands.metatest import rollouts_of, rows_for
 from bidex_meta.evaluation.comparison import read_groups
 from bidex_meta.record import RunFolder
-from bidex_meta.sources import Source
-from bidex_meta.sources.source import OwnSuite
+from bidex_meta.worlds import Worlds
+from bidex_meta.worlds.own import OwnSuite
 from tests.adapting_learner import Learner
 from tests.points import PointWorld, ring
 
@@ -167,9 +167,9 @@ def test_no_adaptation_where_tasks_are_shown(capsys, tmp_path, monkeypatch, show
 
 def test_where_rows_share_nothing_each_plays_one_episode_a_shot(monkeypatch):
     config = {"suite": "ML4", "algo": "finder", "num_envs": 1024, "learner": {}}
-    source = Source.open(config)
+    source = Worlds.open(config)
     assert [rollouts_of(source, config, asked, 6) for asked in (20, None)] == [20, 10]
-    monkeypatch.setattr(Learner, "adapts_by_row", True, raising=False)
+    monkeypatch.setattr(Learner, "independent_adaptation", True, raising=False)
     assert [rollouts_of(source, config, asked, 6) for asked in (20, None, 4)] == [6, 6, 4]
 
 

@@ -40,8 +40,6 @@ class Constant:
 class RandomSearch:
     """Random search over constant actions."""
 
-    per_process = ()
-
     def __init__(self, world, config, seed):
         self.world, self.config = world, config
         self.generator = torch.Generator().manual_seed(seed)
@@ -114,8 +112,8 @@ def test_a_learner_of_the_working_folder_trains_resumes_and_is_evaluated(
     [
         ("scratch_package.nowhere:Learner", "no scratch_package.nowhere"),
         ("scratch_package.search:Another", "a class Another"),
-        ("scratch_package.empty:NoLearner", "expected PRESETS"),
-        ("scratch_package.half:RandomSearch", "iterate is missing"),
+        ("scratch_package.empty:NoLearner", "expected presets"),
+        ("scratch_package.half:RandomSearch", "to have iterate"),
         ("scratch_package.raises:RandomSearch", "RuntimeError: no luck ("),
         ("scratch_package.arguments:RandomSearch", "takes 2 positional arguments but 4 were given"),
     ],
@@ -126,6 +124,6 @@ def test_what_is_no_learner_is_told_in_one_line(
     assert main([*RUN[:-1], algo, "--steps", "64"]) == 2
     error = capsys.readouterr().err
     assert told in error.splitlines()[-1] and error.count("\n") == error.count("bidex-meta: ") + 2 * (
-        "rows on" in error
+        "environments on" in error
     )
     assert not (scratch / "runs").exists()

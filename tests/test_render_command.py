@@ -4,8 +4,8 @@ import pytest
 
 from bidex_meta.cli import main
 from bidex_meta.commands import policies
-from bidex_meta.sources.source import OwnSuite, SingleClass
 from bidex_meta.tasks import registry
+from bidex_meta.worlds.own import OwnSuite, SingleClass
 from tests.test_cli import run, toy, toy_worlds
 
 __all__ = ["toy_worlds"]

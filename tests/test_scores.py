@@ -11,10 +11,9 @@ from torch import Tensor
 from bidex_meta.commands.tables import evaluation_table
 from bidex_meta.evaluation import references
 from bidex_meta.evaluation.meta_test import meta_evaluate
-from bidex_meta.evaluation.play import evaluate
+from bidex_meta.evaluation.play import RandomAgent, ZeroAgent, evaluate
+from bidex_meta.evaluation.references import Reference, counted_returns
 from bidex_meta.evaluation.results import Evaluation, results_by_class
-from bidex_meta.evaluation.scores import Reference, counted_returns
-from bidex_meta.evaluation.untrained import RandomAgent, ZeroAgent
 from bidex_meta.tasks import registry
 from tests.points import Finder, PointWorld, Still, ring
 from tests.tasks.worlds import mixed_world

@@ -14,8 +14,8 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.agreement import agreements, classes_of
 from bidex_meta.evaluation.results import ClassResult
 from bidex_meta.record import RunFolder
-from bidex_meta.sources import Source
-from bidex_meta.sources.source import OwnSuite
+from bidex_meta.worlds import Worlds
+from bidex_meta.worlds.own import OwnSuite
 from tests.fakes import ToyWorld
 from tests.test_metatest_commands import COUNTS, points
 
@@ -225,7 +225,7 @@ def test_rows_that_cannot_agree():
 
 
 def test_what_was_not_recorded_is_said_once():
-    now = conditions(Source.open({"suite": "metaworld/MT3", "device": "cpu", "threads": 1}))
+    now = conditions(Worlds.open({"suite": "metaworld/MT3", "device": "cpu", "threads": 1}))
     assert "metaworld" in now["packages"] and now["physics"] is None
     assert others(now, now) == []
     assert others(recorded_conditions({}, {}, {"device": "cpu"}), now) == [

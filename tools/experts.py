@@ -10,9 +10,9 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.references import load, store
 from bidex_meta.record.stored import open_run
 from bidex_meta.record.versions import collect_versions
-from bidex_meta.sources import Source
 from bidex_meta.witness.replay import replay
 from bidex_meta.witness.store import load_witness, witness_path
+from bidex_meta.worlds import Worlds
 
 
 def experts(runs: tyro.conf.Positional[tuple[Path, ...]], suite: str = "MT20", out: Path | None = None) -> None:
@@ -25,7 +25,7 @@ def experts(runs: tyro.conf.Positional[tuple[Path, ...]], suite: str = "MT20", o
         suite: Suite whose train classes are looked up.
         out: File of references that takes the figures, beside those it has of other classes.
     """
-    known = best_known(Source.open({"suite": suite}).task_classes(), runs)
+    known = best_known(Worlds.open({"suite": suite}).task_classes(), runs)
     for name, row in known.items():
         print(f"{name}: {row['return']:.4g} ({row['source']})")
     if out is not None:
@@ -64,7 +64,7 @@ def _of_run(path: Path) -> list[tuple[str, dict[str, Any]]]:
     """What a run's evaluation says of its classes: the mean over all tasks."""
     run = open_run(path)
     config = run.config()
-    source = Source.open(config.to_json())
+    source = Worlds.open(config.to_json())
     if not source.moving_bases:
         raise BidexError(
             f"Expected a run with moving bases, as suites have them, but {path} plays {source.name} with fixed ones."

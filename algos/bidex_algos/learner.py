@@ -5,9 +5,10 @@ algorithm its update.
 """
 
 import copy
+import math
 import time
-from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from abc import abstractmethod
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any, ClassVar
@@ -15,21 +16,44 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.experience.rollout import check_autoreset
-from bidex_algos.nets.encoders.inputs import Inputs
-from bidex_algos.nets.encoders.point_net import with_point_net
-from bidex_algos.nets.encoders.task_embedding import with_task_embedding
-from bidex_algos.nets.fitting import check_discounts, check_options
-from bidex_algos.nets.shape import Shape
-from bidex_algos.reports import check_finite
+from bidex_algos.nets.inputs import Inputs, with_task_embedding
+from bidex_algos.nets.point_net import with_point_net
+from bidex_algos.nets.policy import SquashedPolicy
+from bidex_algos.nets.shape import Shape, check_discounts, check_options
+from bidex_algos.rollout import check_autoreset
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import broadcast, own_seed
+from bidex_meta.train.learner import Learner as Contract
+from bidex_meta.train.learner import LearnerConfig, Parts, State
 from bidex_meta.world.contract import VectorWorld
 
 
-class Learner(ABC):
-    """What ``bidex_meta.train.runner`` trains.
+def as_numbers(tensors: dict[str, Tensor]) -> dict[str, float]:
+    """Scalars as numbers, in one transfer from the device."""
+    if not tensors:
+        return {}
+    values = torch.stack([value.double() for value in tensors.values()]).tolist()
+    return dict(zip(tensors, values, strict=True))
+
+
+def check_finite(metrics: dict[str, float], losses: Iterable[str], learner: str, steps: int, remedy: str) -> None:
+    """Ends a training that can no longer learn.
+
+    Raises:
+        FloatingPointError: One of the ``losses`` among the metrics is not finite.
+    """
+    if not math.isfinite(sum(metrics.get(name, 0.0) for name in losses)):
+        raise FloatingPointError(f"{learner}: the loss is not finite after {steps} steps; {remedy}.")
+
+
+# What decides, beside the shapes of the weights, what they compute.
+_WORLD = ("observations", "actions", "task_id")
+_FORM = ("hidden", "activation", "normalise_observations", "reward_unit", "task_embedding", *_WORLD)
+
+
+class Learner(Contract):
+    """Base of all learners of this package.
 
     In a run of several processes each has a world and samples of its own, and all have the same networks: statistics
     and gradients are those of the samples of all.
@@ -40,7 +64,7 @@ class Learner(ABC):
         seed: Of the initial weights, all that is drawn, and the world's first reset.
 
     Attributes:
-        env_steps: Environment steps taken so far, over all rows of all processes; a waiting row takes none.
+        env_steps: Environment steps taken so far, over all environments of all processes; a waiting one takes none.
         shape: Sizes of the world's spaces and the groups of its observation.
         inputs: How networks read the observation.
         generator: Of all that is drawn while learning, on the device; another one in each process.
@@ -52,22 +76,15 @@ class Learner(ABC):
             the task's one-hot where an option of the config needs it.
     """
 
-    name: ClassVar[str]
-    """How the learner calls itself in messages."""
     remedy: ClassVar[str]
     """What helps, mostly, when a loss is no longer finite."""
-    config_type: ClassVar[type[Any]]
+    config_type: ClassVar[type[LearnerConfig]]
     """Its config, a dataclass."""
-    autoreset: ClassVar[Any] = "SAME_STEP"
-    """Mode of the world it trains on, or a function of the config (as a dict) that gives it."""
     discounts_by_class: ClassVar[bool] = False
     """Whether it takes the discount of each class where a world has some (``world.gammas``)."""
-    per_process: tuple[str, ...] = ()
-    """Entries of ``state_dict`` that differ from process to process."""
 
     def __init__(self, world: VectorWorld, config: Any, seed: int):
-        mode = self.autoreset(asdict(config)) if callable(self.autoreset) else self.autoreset
-        check_autoreset(world, self.name, str(mode))
+        check_autoreset(world, self.name, self.autoreset_mode(config))
         self.world, self.config, self.seed = world, config, seed
         self.device = torch.device(world.device)
         self.env_steps = 0
@@ -97,29 +114,29 @@ class Learner(ABC):
     @staticmethod
     def _embedded(config: Any, shape: Shape) -> int:
         """Size of a task's embedding, 0 where there is none."""
-        return getattr(config, "task_embedding", 0) if shape.num_id_columns else 0
+        return vars(config).get("task_embedding", 0) if shape.num_id_columns else 0
 
     @abstractmethod
     def _iterate(self) -> dict[str, float]:
         """Collects, learns, adds to ``env_steps``; returns all metrics but those of time."""
 
     @abstractmethod
-    def _parts(self) -> dict[str, Any]:
+    def _parts(self) -> Parts:
         """What a checkpoint holds beside the policy, by name.
 
         Modules, optimisers, statistics, tensors that keep their shape, generators, and dicts and lists of these. The
         modules' weights are made the same in all processes when training begins.
         """
 
-    def _place(self) -> dict[str, Any]:
+    def _place(self) -> State:
         """Tensors, numbers and None from which the next iteration goes on, for the checkpoint."""
         return {"env_steps": self.env_steps}
 
-    def _go_on_from(self, state: dict[str, Any]) -> None:
+    def _go_on_from(self, state: State) -> None:
         """Puts back what :meth:`_place` gave, from a whole state."""
         self.env_steps = int(state["env_steps"])
 
-    def _check_size(self, state: dict[str, Any]) -> None:
+    def _check_size(self, state: State) -> None:
         """Refuses a state of a world of another size."""
         self._expect("", Shape.load(state["policy"]["shape"]).sizes(), self.shape.sizes())
 
@@ -171,29 +188,41 @@ class Learner(ABC):
 
     # Checkpoints.
 
-    def policy_state_dict(self) -> dict[str, Any]:
+    def policy_state_dict(self) -> State:
         """What :meth:`load_policy` needs: network, observation statistics, sizes and config."""
         return {"config": asdict(self.config), "shape": self.shape.state_dict(), "weights": self.policy.state_dict()}
 
     @classmethod
-    def load_policy(cls, state: dict[str, Any], device: str | torch.device = "cpu") -> Any:
-        """The agent of a checkpoint, for a world of any number of rows.
-
-        Args:
-            state: ``checkpoint["learner"]["policy"]``.
-            device: Where to run it.
-        """
+    def load_policy(cls, state: State, device: str | torch.device = "cpu") -> Any:
+        """The agent of a checkpoint (its entry ``learner.policy``), for a world of any number of environments."""
         init = torch.Generator().manual_seed(0)
         config, shape = cls.config_type(**state["config"]), Shape.load(state["shape"])
         policy = cls._make_policy(config, shape, init, torch.device(device))
         policy.load_state_dict(state["weights"])
         return policy
 
-    def state_dict(self) -> dict[str, Any]:
+    def start_from(self, policy: State) -> None:
+        """Takes network and statistics of another learner's policy; refuses what would not mean the same here."""
+        own = asdict(self.config) | _seen(self.shape)
+        given = policy["config"] | _seen(Shape.load(policy["shape"]))
+        _agree(own, given, _FORM)
+        network, weights = _network(self.policy.state_dict()), _network(policy["weights"])
+        if _shapes(network) != _shapes(weights):
+            raise BidexError(
+                "Expected a policy to start from of the same kind (mtppo, mttrpo, promp and maml share one; mtsac and "
+                "rl2 have their own, other architectures, policy heads and a task embedding others), got one with "
+                "other weights. Name another run."
+            )
+        if isinstance(self.policy, SquashedPolicy):
+            # Its network speaks of a place between these bounds; a Gaussian one has its deviation as a weight.
+            _agree(own, given, ("std_range",))
+        self.policy.load_state_dict(self.policy.state_dict() | weights)
+
+    def state_dict(self) -> State:
         """A copy of everything but the world, as tensors and plain values (``torch.load(weights_only=True)``)."""
         return copy.deepcopy({"policy": self.policy_state_dict(), **_saved(self._parts()), **self._place()})
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Restores what :meth:`state_dict` gave.
 
         Raises:
@@ -239,3 +268,34 @@ def _restore(part: Any, state: Any) -> None:
         part.set_state(state.cpu())
     else:
         part.load_state_dict(state)
+
+
+def _network(weights: State) -> State:
+    """Without learned sizes of inner steps, which are no part of what plays."""
+    return {name: weight for name, weight in weights.items() if not name.startswith("step_sizes.")}
+
+
+def _seen(shape: Shape) -> State:
+    """What of a world's shape a network's weights depend on."""
+    ids = [[part.start, part.stop] for group in shape.groups if group.name == "task_id" for part in group.where]
+    return dict(zip(_WORLD, (shape.observations, shape.actions, ids), strict=True))
+
+
+def _agree(own: State, given: State, names: tuple[str, ...]) -> None:
+    """Refuses what is not alike in both, where both know it."""
+    for name in names:
+        if name in own and name in given and _plain(own[name]) != _plain(given[name]):
+            flag = f"--learner.{name.replace('_', '-')}"
+            mend = "Name a run on the same observations" if name in _WORLD else f"Add {flag} as there"
+            raise BidexError(
+                f"Expected a policy to start from with {name} = {_plain(own[name])}, got {_plain(given[name])}. "
+                f"{mend}, or start afresh."
+            )
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _shapes(weights: State) -> dict[str, tuple[int, ...]]:
+    return {name: tuple(weight.shape) for name, weight in weights.items()}

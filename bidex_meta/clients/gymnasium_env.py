@@ -4,15 +4,14 @@ For trying things out and for libraries that know single environments only; for 
 and pickles go on where it was.
 """
 
-from typing import Any
-
 import gymnasium
 import numpy as np
 import torch
 
 from bidex_meta.benchmark import make_task_world
+from bidex_meta.clients.gymnasium_ids import check_render_mode
 from bidex_meta.errors import BidexError
-from bidex_meta.registration import check_render_mode
+from bidex_meta.world.contract import Info, Options
 
 
 class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -41,7 +40,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.observation_space = self.world.single_observation_space
         self.action_space = self.world.single_action_space
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+    def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
         """Starts an episode; with a seed, the same one every time.
 
         Returns:
@@ -67,7 +66,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             ``unstable`` and ``reward_terms``; at the end of an episode also ``is_success``: at any of its steps.
         """
         obs, reward, terminated, truncated, told = self.world.step(torch.as_tensor(action)[None])
-        info: dict[str, Any] = {"success": bool(told["success"][0]), "unstable": bool(told["unstable"][0])}
+        info: Info = {"success": bool(told["success"][0]), "unstable": bool(told["unstable"][0])}
         info["reward_terms"] = {name: float(term[0]) for name, term in told["reward_terms"].items()}
         if terminated[0] or truncated[0]:
             info["is_success"] = bool(told["so_far"]["success"][0])

@@ -1,13 +1,12 @@
-"""Gymnasium's Humanoid-v5 as a world: its model, observation and reward, many rows on ``mujoco.batch``.
+"""Gymnasium's Humanoid-v5 as a world: its model, observation and reward, many environments on ``mujoco.batch``.
 
-The paper's appendix C compares PPO and SAC over numbers of rows on a humanoid, since no hand shows what SAC can do.
-This is the one that everybody has (Gymnasium 1.x, ``gymnasium/envs/mujoco/humanoid_v5.py``, whose constants stand
-below); starts, actions and steps give its numbers bit for bit, to single precision (``tests/test_humanoid.py``).
+The paper's appendix C compares PPO and SAC over numbers of environments on a humanoid. This is the one that everybody
+has (Gymnasium 1.x, ``gymnasium/envs/mujoco/humanoid_v5.py``, whose constants stand below); starts, actions and steps
+give its numbers bit for bit, to single precision (``tests/clients/test_humanoid_world.py``).
 """
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -15,11 +14,13 @@ import torch
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
-from bidex_meta.clients.foreign_world import ForeignWorld, Sizes, Transition
 from bidex_meta.engine.cpu import CpuEngine
 from bidex_meta.errors import BidexError, unknown_name
 from bidex_meta.validation import whole_number
-from bidex_meta.world.checked import fits
+from bidex_meta.world.base import Transition
+from bidex_meta.world.checking import fits
+from bidex_meta.world.contract import State
+from bidex_meta.world.foreign import OWN_DRAWS, ForeignWorld, Sizes
 
 NAME = "Humanoid-v5"
 EPISODE_STEPS = 1000
@@ -29,7 +30,6 @@ _FORWARD_WEIGHT, _HEALTHY_REWARD = 1.25, 5.0
 _CONTROL_WEIGHT, _CONTACT_WEIGHT, _CONTACT_MOST = 0.1, 5e-7, 10.0
 _LOWEST, _HIGHEST = 1.0, 2.0  # metres, of the torso
 _START_NOISE = 1e-2
-_DRAWS_BEFORE = 2  # of a task and of an elapsed step, by ``ForeignWorld``
 
 
 class HumanoidWorld(ForeignWorld):
@@ -51,17 +51,17 @@ class HumanoidWorld(ForeignWorld):
         threads: int | None = None,
         stagger: bool = True,
     ) -> None:
-        """Builds the rows; none is started before ``reset``.
+        """Builds the engine; no episode is started before ``reset``.
 
         Args:
-            num_envs: Rows.
-            seed: Of starts, until ``reset(seed=...)`` says otherwise.
+            num_envs: How many.
+            seed: Of starts, until ``reset(seed=...)`` gives another.
             autoreset_mode: SAME_STEP (training) or DISABLED (evaluation), as a member or its name.
             threads: Of the engine; None takes all CPUs.
             stagger: As in ``bidex_meta.World``.
 
         Raises:
-            BidexError: Unknown mode or no row.
+            BidexError: Unknown mode or no environment.
         """
         import gymnasium.envs.mujoco as home
 
@@ -102,9 +102,9 @@ class HumanoidWorld(ForeignWorld):
         """Tasks, (n, 0)."""
         return [np.zeros((self.num_slot_tasks[0], 0))]
 
-    def _start(self, mask: Tensor) -> None:
+    def _place(self, mask: Tensor) -> None:
         model, engine = self._model, self._engine
-        draws = self._draws(_DRAWS_BEFORE + model.nq + model.nv)[mask, _DRAWS_BEFORE:]
+        draws = self._draws(OWN_DRAWS + model.nq + model.nv)[mask, OWN_DRAWS:]
         noise = (2.0 * draws - 1.0) * _START_NOISE
         engine.reset(mask, torch.from_numpy(model.qpos0) + noise[:, : model.nq])
         engine.qvel[mask] = noise[:, model.nq :]
@@ -123,25 +123,19 @@ class HumanoidWorld(ForeignWorld):
         parts = self._engine.qpos[:, 2:], self._engine.qvel, inertia[:, 1:], velocity[:, 1:], force[:, 6:]
         return torch.cat([part.flatten(1) for part in (*parts, self._contact[:, 1:])], dim=1).float()
 
-    def _advance(self, action: Tensor, active: Tensor, broken: Tensor) -> Transition:
+    def _advance(self, active: Tensor, broken: Tensor) -> Transition:
         engine, moved = self._engine, active & ~broken
         # In single precision, as Gymnasium's actions are.
-        engine.ctrl[:] = action * self._largest.float()
+        engine.ctrl[:] = self._action * self._largest.float()
         engine.step(_SUBSTEPS, moved)
         self._feel(moved)
-        broken = broken | (engine.unstable() & active)
-        good = moved & ~broken
+        unstable = broken | (engine.unstable() & active)
+        good = moved & ~unstable
         before, self._x = self._x, torch.where(good, self._centre(), self._x)
         contact = (_CONTACT_WEIGHT * self._contact.square().sum((1, 2))).clamp_max(_CONTACT_MOST)
         control = _CONTROL_WEIGHT * engine.ctrl.square().sum(1)
         reward = _FORWARD_WEIGHT * (self._x - before) / self._dt + _HEALTHY_REWARD * self._is_up() - control - contact
-        return Transition(
-            torch.where(good[:, None], self._state(), self._obs),
-            torch.where(good, reward, 0.0).float(),
-            torch.zeros_like(active),
-            ~self._is_up() & good,
-            broken,
-        )
+        return Transition(self._state(), reward.float(), torch.zeros_like(active), ~self._is_up(), unstable, {})
 
     def _is_up(self) -> Tensor:
         height = self._engine.qpos[:, 2]
@@ -154,7 +148,7 @@ class HumanoidWorld(ForeignWorld):
             mujoco.mj_rnePostConstraint(self._model, self._data)
             self._contact[row] = torch.from_numpy(self._data.cfrc_ext)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         """Everything that decides the future of the world: tensors and plain values, copied."""
         return {
             **super().state_dict(),
@@ -164,14 +158,14 @@ class HumanoidWorld(ForeignWorld):
             "contact": self._contact.clone(),
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Puts back what ``state_dict`` gave, on a world of as many rows.
+    def load_state_dict(self, state: State) -> None:
+        """Puts back what ``state_dict`` gave, on a world of the same size.
 
         Raises:
-            BidexError: The state is of another number of rows.
+            BidexError: The state is of another size.
         """
         fits(state, self.state_dict())
         self.set_tasks({NAME: np.zeros((whole_number("tasks", state["tasks"], 1), 0))})
-        super().load_state_dict(state)
+        self._restore(state)
         self._engine.load_state_dict(state["engine"])
         self._x, self._contact = state["x"].clone(), state["contact"].clone()

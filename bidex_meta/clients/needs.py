@@ -8,8 +8,8 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from bidex_meta.errors import BidexError, shortened
-from bidex_meta.world.autoreset import set_stagger
 from bidex_meta.world.contract import VectorWorld
+from bidex_meta.world.episodes import set_stagger
 
 
 @contextmanager

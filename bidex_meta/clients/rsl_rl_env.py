@@ -6,10 +6,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bidex_meta.clients.episode_log import EpisodeLog
 from bidex_meta.clients.needs import check_training, extra, whole_steps
 from bidex_meta.errors import unknown_name
-from bidex_meta.world.contract import TaskWorld
+from bidex_meta.world.contract import Info, TaskWorld, VectorWorld
 
 with extra("rsl-rl"):
     from rsl_rl.env import VecEnv
@@ -17,9 +16,9 @@ with extra("rsl-rl"):
 
 
 class RslRlVecEnv(VecEnv):
-    """All rows of one world on its device; observations in the groups `policy` and `critic`.
+    """All environments of one world on its device; observations in the groups `policy` and `critic`.
 
-    `extras`: `time_outs` (cut by the time limit or broken physics) and `log` (`EpisodeLog`; empty where no row ended).
+    `extras`: `time_outs` (cut by the time limit or broken physics) and `log` (`EpisodeLog`; empty where none ended).
 
     Args:
         world: In autoreset mode SAME_STEP.
@@ -48,7 +47,7 @@ class RslRlVecEnv(VecEnv):
 
     @property
     def episode_length_buf(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Steps since each row's start, int64 (num_envs,). Setting it shortens the running episodes, uncounted."""
+        """Steps since each environment's start, int64 (num_envs,). Setting it shortens running episodes, uncounted."""
         return self.world.episodes.elapsed.clone()
 
     @episode_length_buf.setter
@@ -60,7 +59,7 @@ class RslRlVecEnv(VecEnv):
         episodes.elapsed = steps.minimum(self.world.max_episode_steps - 1)
 
     def reset(self, seed: int | None = None) -> tuple[TensorDict, dict[str, Any]]:
-        """Starts episodes of all rows."""
+        """Starts episodes of all environments."""
         with torch.inference_mode(False):
             self._obs, self._log = self.world.reset(seed=seed)[0], EpisodeLog(self.world)
         return self.get_observations(), {}
@@ -75,6 +74,44 @@ class RslRlVecEnv(VecEnv):
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
         """Takes actions (num_envs, a): observations, rewards and dones (num_envs,), extras."""
         with torch.inference_mode(False), torch.no_grad():  # the world outlives the runner's mode
-            self._obs, reward, terminated, truncated, told = self.world.step(actions)
-            extras = {"time_outs": truncated, "log": self._log.update(told, terminated, truncated)}
+            self._obs, reward, terminated, truncated, info = self.world.step(actions)
+            extras = {"time_outs": truncated, "log": self._log.update(info, terminated, truncated)}
             return self.get_observations(), reward, terminated | truncated, extras
+
+
+class EpisodeLog:
+    """Ended episodes of a world under the tags that Isaac Lab, mjlab and rsl-rl know, from a full reset on."""
+
+    def __init__(self, world: VectorWorld) -> None:
+        self._world = world
+        self._terms: dict[str, Tensor] = {}
+
+    def update(self, info: Info, terminated: Tensor, truncated: Tensor) -> dict[str, Tensor]:
+        """What ended in a step.
+
+        Args:
+            info: The step's.
+            terminated: Shape (N,), bool.
+            truncated: Shape (N,), bool.
+
+        Returns:
+            Values of the environments that ended, (k,), float32, to be averaged; nothing where none did. Of episodes
+            that count `Metrics/success_rate`, `Metrics/return`, `Metrics/length`, `Metrics/success/<task>` and, as sums
+            over an episode, `Episode_Reward/<term>`; of all `Episode_Termination/terminated`, `time_out`, `unstable`.
+        """
+        ended, counted, world = info["_final_obs"], info["counted"], self._world
+        for name, term in info.get("reward_terms", {}).items():
+            self._terms[name] = self._terms.get(name, 0.0) + term
+        if not bool(ended.any()):
+            return {}
+        unstable = info["unstable"]
+        ends = {"terminated": terminated, "time_out": truncated & ~unstable, "unstable": unstable}
+        log = {f"Episode_Termination/{name}": value[ended].float() for name, value in ends.items()}
+        log |= {f"Episode_Reward/{name}": term[counted] for name, term in self._terms.items()}
+        success = info["so_far"]["success"].float()
+        log |= {"Metrics/success_rate": success[counted], "Metrics/return": info["so_far"]["r"][counted]}
+        log["Metrics/length"] = info["so_far"]["l"][counted].float()
+        for slot in world.task_id[counted].unique().tolist():
+            log[f"Metrics/success/{world.task_names[slot]}"] = success[counted & (world.task_id == slot)]
+        self._terms = {name: term.masked_fill(ended, 0.0) for name, term in self._terms.items()}
+        return {name: value for name, value in log.items() if len(value)}

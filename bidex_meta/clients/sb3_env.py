@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from bidex_meta.clients.needs import check_training, extra
-from bidex_meta.world.contract import VectorWorld
+from bidex_meta.world.contract import Info, VectorWorld
 
 with extra("sb3"):
     from stable_baselines3.common.monitor import Monitor
@@ -43,10 +43,10 @@ class SB3VecEnv(VecEnv):
         """Keeps the actions (num_envs, a)."""
         self._actions = torch.as_tensor(actions, dtype=torch.float32, device=self.world.device)
 
-    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Info]]:
         """Takes them: observations (num_envs, d), rewards and dones (num_envs,), infos."""
         obs, reward, _, truncated, told = self.world.step(self._actions)
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        infos: list[Info] = [{} for _ in range(self.num_envs)]
         ended = told["_final_obs"]
         rows = ended.nonzero().squeeze(1).tolist()
         if rows:

@@ -7,7 +7,7 @@ from gymnasium.spaces import Box
 from torch import Tensor
 
 from bidex_meta.clients.needs import check_training, extra
-from bidex_meta.world.contract import VectorWorld
+from bidex_meta.world.contract import Info, Step, VectorWorld
 
 with extra("skrl"):
     from skrl.envs.wrappers.torch import Wrapper
@@ -43,13 +43,13 @@ class SkrlEnv(Wrapper):
         """Of a row."""
         return self.world.single_action_space
 
-    def reset(self) -> tuple[Tensor, dict[str, Any]]:
+    def reset(self) -> tuple[Tensor, Info]:
         """Starts the rows once; later the present observations (num_envs, d), since rows start anew by themselves."""
         if self._obs is None:
             self._obs, _ = self.world.reset(seed=self._seed)
         return self._obs, {}
 
-    def step(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+    def step(self, actions: Tensor) -> Step:
         """Takes actions (num_envs, a): observations (num_envs, d); reward and both ends (num_envs, 1); infos."""
         with torch.no_grad():
             self._obs, *made, told = self.world.step(actions)

@@ -10,8 +10,8 @@ import tyro
 
 from bidex_meta.commands.parsing import Switch, parse
 from bidex_meta.errors import BidexError, known_name
-from bidex_meta.sources import Source
 from bidex_meta.validation import Few, Seed, Threads
+from bidex_meta.worlds import Worlds
 
 if TYPE_CHECKING:
     from bidex_meta.agents import Agent
@@ -64,7 +64,7 @@ def main(arguments: Sequence[str]) -> None:
 
         load_from(flags.out)
         check_writable(flags.out)
-    source = Source.open({"suite": flags.suite, "seed": flags.seed, "threads": flags.threads})
+    source = Worlds.open({"suite": flags.suite, "seed": flags.seed, "threads": flags.threads})
     if not source.moving_bases:
         raise BidexError(f'References are of moving bases, but {flags.suite} has fixed ones. Write base = "moving".')
     found = _scripted(source, flags) if what == "script" else _played(what, source, flags)
@@ -81,7 +81,7 @@ def main(arguments: Sequence[str]) -> None:
     print_table(evaluation_table(f"{_POLICIES[what]} on {flags.suite}{stored}", found, None))
 
 
-def _played(what: str, source: Source, flags: BaselineFlags) -> "Evaluation":
+def _played(what: str, source: Worlds, flags: BaselineFlags) -> "Evaluation":
     from bidex_meta.evaluation.play import EVALUATION_SEED, evaluate
 
     world = source.world()
@@ -91,7 +91,7 @@ def _played(what: str, source: Source, flags: BaselineFlags) -> "Evaluation":
     return replace(found, classes={name: found.classes[name] for name in names})
 
 
-def _scripted(source: Source, flags: BaselineFlags) -> "Evaluation":
+def _scripted(source: Worlds, flags: BaselineFlags) -> "Evaluation":
     """Each class that has a script on its own: alone it has the tasks that it has in suites."""
     from bidex_meta.evaluation.play import EVALUATION_SEED, evaluate
     from bidex_meta.evaluation.results import Evaluation
@@ -104,7 +104,7 @@ def _scripted(source: Source, flags: BaselineFlags) -> "Evaluation":
     classes = {}
     for name in names:
         config = {"task": name, "base": "moving", "seed": flags.seed, "device": "cpu", "engine": "c"}
-        world: Any = Source.open(config | {"threads": flags.threads}).world()
+        world: Any = Worlds.open(config | {"threads": flags.threads}).world()
         played = evaluate(Scripted(world), world, flags.episodes, seed=EVALUATION_SEED, references={})
         classes |= played.classes
         world.close()
@@ -113,7 +113,7 @@ def _scripted(source: Source, flags: BaselineFlags) -> "Evaluation":
 
 def _agent(what: str, world: Any, seed: int) -> tuple["Agent", list[str]]:
     """The policy, and the classes that it can play."""
-    from bidex_meta.evaluation.untrained import RandomAgent, ZeroAgent
+    from bidex_meta.evaluation.play import RandomAgent, ZeroAgent
     from bidex_meta.witness.demonstrators import OpenLoopReplay
     from bidex_meta.witness.store import load_witness, witness_path
 

@@ -49,12 +49,12 @@ def main(arguments: Sequence[str]) -> None:
 def _names() -> dict[str, list[str]]:
     """What the values of flags may be, by the flag's name."""
     from bidex_meta.commands.learners import ALGOS
-    from bidex_meta.sources import source_names
     from bidex_meta.tasks import registry
     from bidex_meta.tasks.objects.held import EGG, shelf
+    from bidex_meta.worlds import suites_to_run
 
     things = [EGG, *shelf()]
-    return {"suite": source_names(), "task": registry.names(), "algo": list(ALGOS), "object": things}
+    return {"suite": suites_to_run(), "task": registry.names(), "algo": list(ALGOS), "object": things}
 
 
 def _with_names(options: type, names: dict[str, list[str]]) -> type:

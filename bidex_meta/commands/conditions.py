@@ -4,12 +4,12 @@ from typing import Any
 
 from bidex_meta.config import RunConfig
 from bidex_meta.record.versions import package_versions
-from bidex_meta.sources import Source
+from bidex_meta.worlds import Worlds
 
 _PACKAGES = ("bidex-meta", "mujoco", "torch", "numpy")
 
 
-def conditions(source: Source, num_envs: int | None = None) -> dict[str, Any]:
+def conditions(source: Worlds, num_envs: int | None = None) -> dict[str, Any]:
     """Ready for JSON, as ``evaluation.json`` keeps it under ``conditions``.
 
     Args:

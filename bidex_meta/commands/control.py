@@ -11,8 +11,8 @@ import tyro
 
 from bidex_meta.commands.parsing import Switch, parse
 from bidex_meta.errors import BidexError
-from bidex_meta.sources import Source
 from bidex_meta.validation import Environments, Few, Seed, Shots
+from bidex_meta.worlds import Worlds
 
 if TYPE_CHECKING:
     from bidex_meta.evaluation.control_arms import Control
@@ -66,7 +66,7 @@ def main(arguments: Sequence[str]) -> None:
     metatest.check_numbers(flags, "trials", "episodes", "shots", "rollouts", "num_envs")
     folders = [RunFolder.open(path) for path in flags.runs]
     config = folders[0].config()
-    source = Source.open(config.to_json())
+    source = Worlds.open(config.to_json())
     _check(folders)
     played = [_play(folder, flags) for folder in folders]
     classes = played[0].own.classes
@@ -96,7 +96,7 @@ def _check(folders: "Sequence[RunFolder]") -> None:
         config = folder.config()
         if not learner_kind(config.algo).adapts:
             raise BidexError(f"{folder.path}: {config.algo} does not adapt to tasks. Name runs of maml, promp or rl2.")
-        metatest.check_source(Source.open(config.to_json()), config.algo)
+        metatest.check_source(Worlds.open(config.to_json()), config.algo)
         kinds.append(run_kind(config))
         if (seed := config.seed) in seeds:
             raise BidexError(f"{folder.path} and {seeds[seed]} both have seed {seed}. Name one run for each seed.")
@@ -121,8 +121,8 @@ def _play(folder: "RunFolder", flags: ControlFlags) -> "Control":
     from bidex_meta.world.threads import set_up_torch
 
     config = folder.config()
-    device = resolve_device(flags.device, Source.open(config.to_json()).on_gpu)
-    source = Source.open({**config.to_json(), "device": device, "engine": flags.engine})
+    device = resolve_device(flags.device, Worlds.open(config.to_json()).on_gpu)
+    source = Worlds.open({**config.to_json(), "device": device, "engine": flags.engine})
     set_up_torch(config.threads)
     counts = [len(pool) for pool in source.tasks("test").values()]
     rollouts = metatest.rollouts_of(source, config, flags.rollouts, max(1, flags.num_envs // len(counts)))

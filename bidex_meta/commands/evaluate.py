@@ -8,8 +8,8 @@ from typing import Any, Literal
 from bidex_meta.commands.parsing import RunPath, Switch, parse
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
-from bidex_meta.sources import Source
 from bidex_meta.validation import Environments, Few, Seed, Shots
+from bidex_meta.worlds import Worlds
 
 
 @dataclass(frozen=True)
@@ -62,17 +62,16 @@ def main(arguments: Sequence[str]) -> None:
     from bidex_meta.commands.learners import learner_kind, resolve_device
     from bidex_meta.commands.policies import load_policy
     from bidex_meta.commands.tables import evaluation_table, print_table
-    from bidex_meta.evaluation.play import EVALUATION_SEED
+    from bidex_meta.evaluation.play import EVALUATION_SEED, RandomAgent
     from bidex_meta.evaluation.results import compare
-    from bidex_meta.evaluation.untrained import RandomAgent
     from bidex_meta.record import RunFolder
     from bidex_meta.world.threads import set_up_torch
 
     folder = RunFolder.open(flags.run)
     stored = folder.config()
-    device = resolve_device(flags.device, Source.open(stored.to_json()).on_gpu)
+    device = resolve_device(flags.device, Worlds.open(stored.to_json()).on_gpu)
     config = replace(stored, device=device, engine=flags.engine)
-    source = Source.open(config.to_json())
+    source = Worlds.open(config.to_json())
     set_up_torch(config.threads)
     kind = learner_kind(stored.algo)
     if kind.adapts:
@@ -108,7 +107,7 @@ def _refuse_adaptation(flags: EvaluateFlags, algo: str) -> None:
         raise BidexError(f"{algo} does not adapt to tasks: its splits are shown one by one. Use --split train or test.")
 
 
-def _meta_test(flags: EvaluateFlags, folder: Any, config: RunConfig[Any], source: Source) -> None:
+def _meta_test(flags: EvaluateFlags, folder: Any, config: RunConfig[Any], source: Worlds) -> None:
     import sys
 
     from bidex_meta.commands import metatest

@@ -1,34 +1,15 @@
-"""The learners by name: the only place in ``bidex_meta`` that names any.
-
-An entry is ``"module:Class"``; a name of that form is one too, so that a learner from elsewhere needs no entry.
-Beside the class the module holds ``PRESETS``: a dict from preset name to an instance of the learner's config dataclass;
-``auto`` takes ``laptop`` on a CPU and ``paper`` on a GPU, or the first where one of them is missing. The class offers:
-
-* ``Class(world, config, seed)``, and what ``bidex_meta.train.runner.Learner`` names;
-* where it adapts to tasks, ``adapts = True``: then ``load_policy`` gives a MetaLearningAgent (``bidex_meta.agents``),
-  which explores by a generator of its own, seeded alike by each ``load_policy``; of its config, if they are there, the
-  meta-test reads ``max_adapt_steps`` (longest episode it adapts to) and ``tasks_per_class`` (of a meta-batch, over
-  which a class's rows are split: as many rollouts has a task); ``adapts_by_row = True`` where rows of a task share
-  nothing of what they learn;
-* where it learns from data sets, ``offline = True`` and ``learn_from(data)``, which takes a ``bidex_meta.data.joined``
-  before the first iteration; ``env_steps`` then counts updates, and the world is not stepped;
-* where it may imitate demonstrations beside what it learns by playing, ``learn_from_demonstrations(data)``, which takes
-  the same before the first iteration;
-* of its config, if it is there, `run` asks ``bytes_held(rows, width)``: about what it takes beside the world;
-* where it does not train in autoreset mode SAME_STEP, ``autoreset``: the mode, or a function of the learner's config
-  that gives it;
-* ``policy_state_dict()`` and ``load_policy(state, device)``, which gives an agent for ``bidex_meta.evaluation.play``
-  from the entry ``learner.policy`` of a checkpoint.
-"""
+"""The learners by name, and how one is loaded; :mod:`bidex_meta.train.learner` says what a learner is."""
 
 import dataclasses
 import importlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.outside import is_outside, outside_class
 from bidex_meta.train.launch import launch
+from bidex_meta.train.learner import Learner
 
 ALGOS: dict[str, str] = {
     "mtppo": "bidex_algos.onpolicy.mtppo:MTPPO",
@@ -45,10 +26,10 @@ ALGOS: dict[str, str] = {
     "happo": "bidex_algos.multiagent.happo:HAPPO",
     "hatrpo": "bidex_algos.multiagent.hatrpo:HATRPO",
     "maddpg": "bidex_algos.multiagent.maddpg:MADDPG",
-    # On a single task they are the plain ones, with presets of their own (bidex_algos.single_task).
-    "ppo": "bidex_algos.onpolicy.mtppo:MTPPO",
-    "trpo": "bidex_algos.onpolicy.mttrpo:MTTRPO",
-    "sac": "bidex_algos.offpolicy.mtsac:MTSAC",
+    # For a single task.
+    "ppo": "bidex_algos.onpolicy.mtppo:PPO",
+    "trpo": "bidex_algos.onpolicy.mttrpo:TRPO",
+    "sac": "bidex_algos.offpolicy.mtsac:SAC",
     "ddpg": "bidex_algos.offpolicy.ddpg:DDPG",
     "td3": "bidex_algos.offpolicy.td3:TD3",
     # These learn from data sets (`--dataset`), of one class or of many.
@@ -58,14 +39,8 @@ ALGOS: dict[str, str] = {
     "iql": "bidex_algos.offline.iql:IQL",
 }
 
-_NEEDED = ("iterate", "state_dict", "load_state_dict", "policy_state_dict", "load_policy", "per_process")
-
-
-def start_from(learner: Any, policy: dict[str, Any]) -> None:
-    """Gives a fresh learner the policy of another run's checkpoint (``bidex_algos.start_from``)."""
-    from bidex_algos.start_from import start_from as give
-
-    give(learner, policy)
+_RENAMED = {"autoreset": "autoreset_mode(config)", "adapts_by_row": "independent_adaptation"}
+"""Members of learners before version 0.3, and what they are now."""
 
 
 @dataclass(frozen=True)
@@ -74,35 +49,40 @@ class LearnerKind:
 
     name: str
     """Name in ``ALGOS``, or ``package.module:Class``."""
-    make: Any
+    make: type[Learner]
     """The learner's class."""
-    presets: dict[str, Any]
+    presets: Mapping[str, Any]
     """Configs by name; all of one dataclass."""
 
     @property
     def adapts(self) -> bool:
-        """Whether what it learns adapts to tasks, so that it is judged by the meta-test."""
-        return getattr(self.make, "adapts", False)
+        """See :class:`Learner`."""
+        return self.make.adapts
 
     @property
     def offline(self) -> bool:
-        """Whether it learns from data sets and counts updates as steps."""
-        return getattr(self.make, "offline", False)
+        """See :class:`Learner`."""
+        return self.make.offline
 
     @property
     def imitates(self) -> bool:
-        """Whether it takes demonstrations beside what it learns by playing."""
-        return hasattr(self.make, "learn_from_demonstrations")
+        """See :class:`Learner`."""
+        return self.make.imitates
 
     @property
     def adapts_by_row(self) -> bool:
-        """Whether each row learns from its own episodes alone, so that rows of a task share nothing."""
-        return getattr(self.make, "adapts_by_row", False)
+        """``independent_adaptation`` of :class:`Learner`."""
+        return self.make.independent_adaptation
 
     def autoreset(self, config: dict[str, Any]) -> str:
-        """Mode of the world it trains on, for a config of the learner's."""
-        mode: Any = getattr(self.make, "autoreset", "SAME_STEP")
-        return str(mode(config) if callable(mode) else mode)
+        """Mode of the world it trains on, for fields of its config."""
+        config_type = type(next(iter(self.presets.values())))
+        return self.make.autoreset_mode(config_type(**config))
+
+
+def start_from(learner: Learner, policy: dict[str, Any]) -> None:
+    """Gives a fresh learner the policy of another run's checkpoint."""
+    learner.start_from(policy)
 
 
 def learner_kind(name: str, task: str | None = None) -> LearnerKind:
@@ -116,33 +96,40 @@ def learner_kind(name: str, task: str | None = None) -> LearnerKind:
         BidexError: There is none of this name, its package is not installed, or it is no learner.
     """
     if is_outside(name):
-        return _from_elsewhere(name)
-    name = known_name("algo", name, ALGOS)
-    module_name, _, class_name = ALGOS[name].partition(":")
-    try:
-        module = importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        raise BidexError(f"The algo {name!r} needs {error.name}, which is not installed.") from error
-    single = importlib.import_module("bidex_algos.single_task")
-    presets = single.PRESETS.get(name, module.PRESETS) | single.OF_TASK.get(name, {}).get(task, {})
-    return LearnerKind(name, getattr(module, class_name), presets)
+        make = _from_elsewhere(name)
+    else:
+        name = known_name("algo", name, ALGOS)
+        module_name, _, class_name = ALGOS[name].partition(":")
+        try:
+            make = vars(importlib.import_module(module_name))[class_name]
+        except ModuleNotFoundError as error:
+            raise BidexError(f"The algo {name!r} needs {error.name}, which is not installed.") from error
+    return LearnerKind(name, make, {**make.presets, **make.task_presets.get(task or "", {})})
 
 
-def _from_elsewhere(name: str) -> LearnerKind:
-    """The learner ``package.module:Class``, of an installed package or of the working folder."""
+def _from_elsewhere(name: str) -> type[Learner]:
+    """The learner ``package.module:Class``, of an installed package or of the working folder.
+
+    A class that does not derive from :class:`Learner` gets its defaults, and the presets of a class without any are
+    its module's ``PRESETS``.
+    """
     make, module = outside_class(name, "--algo")
-    presets = getattr(module, "PRESETS", None)
+    for old, new in _RENAMED.items():
+        if old in vars(make):
+            raise BidexError(f"--algo {name}: {old} is now {new}; see docs/own-learner.md.")
+    bases = (make,) if issubclass(make, Learner) else (make, Learner)
+    members = {"__module__": make.__module__, "__doc__": make.__doc__}
+    learner: type[Learner] = type(make.__name__, bases, members)
+    learner.presets = learner.presets or vars(module).get("PRESETS", {})
+    presets = learner.presets
     if not isinstance(presets, dict) or not presets or not all(map(dataclasses.is_dataclass, presets.values())):
         raise BidexError(
-            f"--algo {name}: expected PRESETS in {module.__file__}, a dict from a preset's name to an instance of the "
-            f"learner's config dataclass, found {presets!r}."
+            f"--algo {name}: expected presets in {make.__name__}, a dict from a preset's name to an instance of the "
+            f"learner's config dataclass, got {presets!r}."
         )
-    missing = [needed for needed in _NEEDED if not hasattr(make, needed)]
-    if missing:
-        raise BidexError(
-            f"--algo {name}: expected {make.__name__} to have {', '.join(_NEEDED)}; {missing[0]} is missing."
-        )
-    return LearnerKind(name, make, presets)
+    if missing := sorted(learner.__abstractmethods__):
+        raise BidexError(f"--algo {name}: expected {make.__name__} to have {missing[0]}, see bidex_meta.train.learner.")
+    return learner
 
 
 def choose_preset(kind: LearnerKind, asked: str, device: str, first: tuple[str, str] | None = None) -> tuple[str, str]:
@@ -152,7 +139,7 @@ def choose_preset(kind: LearnerKind, asked: str, device: str, first: tuple[str, 
         kind: The learner.
         asked: A preset's name, or ``auto``.
         device: ``cpu``, ``cuda``, ``cuda:0``, ...
-        first: A preset that goes before others where the learner has it, and why; ``Source.preset``.
+        first: A preset that goes before others where the learner has it, and why; ``Worlds.preset``.
     """
     if asked.casefold() != "auto":
         return known_name("preset", asked, ["auto", *kind.presets]), "as asked"
@@ -172,7 +159,7 @@ def resolve_device(asked: str, on_gpu: bool) -> str:
 
     Args:
         asked: ``auto``, ``cpu``, ``cuda``, ``cuda:0``, ...
-        on_gpu: Whether a GPU is of use; ``Source.on_gpu``.
+        on_gpu: Whether a GPU is of use; ``Worlds.on_gpu``.
 
     Raises:
         BidexError: torch does not know the device, or it is not there (for each of several processes).

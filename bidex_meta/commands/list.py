@@ -40,9 +40,9 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _suites() -> list[dict[str, Any]]:
-    from bidex_meta.sources import metaworld_suite, source
+    from bidex_meta.worlds import listed
 
-    return source.listed() + metaworld_suite.listed()
+    return listed()
 
 
 def _tasks() -> list[dict[str, Any]]:

@@ -9,8 +9,8 @@ from bidex_meta.commands.learners import learner_kind
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import EVALUATION_SEED
-from bidex_meta.sources import Source
 from bidex_meta.validation import Environments, Few, Seed, Shots
+from bidex_meta.worlds import Worlds
 
 SHOTS = 1
 """Shots where nobody says otherwise."""
@@ -46,7 +46,7 @@ class Options:
 
 
 def meta_test(
-    source: Source,
+    source: Worlds,
     config: RunConfig[Any],
     load: Callable[[], Agent],
     options: Options,
@@ -107,7 +107,7 @@ def meta_test(
     return found
 
 
-def rollouts_of(source: Source, config: RunConfig[Any], asked: int | None, rows: int) -> int:
+def rollouts_of(source: Worlds, config: RunConfig[Any], asked: int | None, rows: int) -> int:
     """Episodes of each task in a shot.
 
     Args:
@@ -121,7 +121,7 @@ def rollouts_of(source: Source, config: RunConfig[Any], asked: int | None, rows:
     return min(rollouts, rows) if learner_kind(config.algo).adapts_by_row else rollouts
 
 
-def trained_rollouts(source: Source, config: RunConfig[Any]) -> int:
+def trained_rollouts(source: Worlds, config: RunConfig[Any]) -> int:
     """Episodes of each task that the run's learner adapted to."""
     of_batch = config.learner_values.get("tasks_per_class")
     if of_batch is None:
@@ -143,7 +143,7 @@ def check_numbers(options: Any, *names: str) -> None:
             raise BidexError(f"--{name.replace('_', '-')} must be at least 1, not {number}.")
 
 
-def check_source(source: Source, algo: str) -> None:
+def check_source(source: Worlds, algo: str) -> None:
     """Refuse a source on which there is no meta-test.
 
     Raises:
@@ -156,7 +156,7 @@ def check_source(source: Source, algo: str) -> None:
         )
 
 
-def splits_of(source: Source, asked: str) -> list[str]:
+def splits_of(source: Worlds, asked: str) -> list[str]:
     """The splits that a meta-test plays.
 
     Args:

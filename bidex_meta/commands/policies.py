@@ -11,7 +11,7 @@ from bidex_meta.commands.learners import learner_kind
 from bidex_meta.errors import BidexError, one_line
 from bidex_meta.reading import is_file
 from bidex_meta.record import RunFolder
-from bidex_meta.sources import Source
+from bidex_meta.worlds import Worlds
 
 _SMALL = 1_000_000
 """Numbers that fit anywhere."""
@@ -122,7 +122,7 @@ def acting(policy: str, world: Any, seed: int, which: str = "last") -> Agent:
     Raises:
         BidexError: The policy is of other observations or actions than the world's.
     """
-    from bidex_meta.evaluation.untrained import RandomAgent, ZeroAgent
+    from bidex_meta.evaluation.play import RandomAgent, ZeroAgent
 
     if policy == "zero":
         return ZeroAgent(world.action_space)
@@ -142,7 +142,7 @@ def acting(policy: str, world: Any, seed: int, which: str = "last") -> Agent:
     return policy_of(folder, state, "cpu")
 
 
-def looked_at(policy: str, suite: str | None, task: str | None, seed: int, thing: str | None = None) -> Source:
+def looked_at(policy: str, suite: str | None, task: str | None, seed: int, thing: str | None = None) -> Worlds:
     """The worlds in which a policy is looked at: those of its run, or of a suite or a task that is named.
 
     Args:
@@ -164,9 +164,9 @@ def looked_at(policy: str, suite: str | None, task: str | None, seed: int, thing
         config |= {"task": task or stored.task, "object": thing if task or thing else stored.object}
     if config["suite"] is None and config["task"] is None:
         raise BidexError("Name what to show: a run folder, --task TASK or --suite SUITE.")
-    return Source.open({**config, "seed": seed})
+    return Worlds.open({**config, "seed": seed})
 
 
-def slots_of(source: Source) -> list[str]:
+def slots_of(source: Worlds) -> list[str]:
     """The class of each slot of a source's worlds; a slot of listed tasks is named Class/task."""
     return [name.split("/")[0] for name in source.tasks("train")]

@@ -20,8 +20,8 @@ from bidex_meta.data import open_dataset, part_files, writer
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.reading import absolute
 from bidex_meta.record import RunFolder
-from bidex_meta.sources import Source
 from bidex_meta.validation import Environments, Seed, Threads
+from bidex_meta.worlds import Worlds
 
 if TYPE_CHECKING:
     from bidex_meta.agents import Agent
@@ -102,7 +102,7 @@ class RecordFlags:
 class _Collection:
     """A data set to collect."""
 
-    source: Source
+    source: Worlds
     name: str
     """Kind in the data set's name."""
     plan: dict[str, Any]
@@ -195,7 +195,7 @@ def _episodes(flags: RecordFlags, kind: str) -> _Collection:
     from bidex_meta.world.threads import set_up_torch
 
     config = _config(flags)
-    source = Source.open(config)
+    source = Worlds.open(config)
     # Sums depend on how torch splits them over threads: a collection keeps those that it began with.
     before = writer.stored_plan(writer.dataset_path(flags.out, source.name, kind)[0])
     config["threads"] = flags.threads or before.get("threads") or _cores()
@@ -233,7 +233,7 @@ def _config(flags: RecordFlags) -> dict[str, Any]:
         config = _OF_RUN | {"suite": flags.suite, "task": flags.task, "base": flags.base, "seed": flags.seed}
         if flags.suite is not None and flags.suite.endswith(".toml"):
             config["suite"] = str(absolute(flags.suite))
-    return config | {"device": resolve_device(flags.device, Source.open(config).on_gpu), "engine": flags.engine}
+    return config | {"device": resolve_device(flags.device, Worlds.open(config).on_gpu), "engine": flags.engine}
 
 
 def _actors(flags: RecordFlags, kind: str, device: str) -> "tuple[list[Actor], list[dict[str, Any]]]":
@@ -268,7 +268,7 @@ def _demonstrations(flags: RecordFlags) -> _Collection:
         raise BidexError(
             "Witnesses are of moving bases and of C MuJoCo on the CPU. Leave --base, --engine, --device out."
         )
-    source = Source.open({"task": flags.task, "base": "moving", "seed": 0, "threads": flags.threads})
+    source = Worlds.open({"task": flags.task, "base": "moving", "seed": 0, "threads": flags.threads})
     name, size, rows = source.name, flags.size or SIZE["demonstrations"], flags.num_envs or _DEMONSTRATORS[flags.starts]
     if name not in source.task_classes() or ":" in name:
         raise BidexError(f"{name} is none of the classes that have witnesses (bidex-meta witness --all).")
@@ -311,7 +311,7 @@ def _nothing_succeeds(played: int, name: str, flags: RecordFlags) -> BidexError:
     return BidexError(f"None of {played} replays of {name}'s witness succeeds. Lower --noise or {other}.")
 
 
-def _one_per_task(source: Source) -> int:
+def _one_per_task(source: Worlds) -> int:
     """One environment per task; where tasks are few, several."""
     pools = source.tasks("train")
     tasks = max(map(len, pools.values())) * len(pools)
@@ -352,7 +352,7 @@ def _publish_replay(flags: RecordFlags) -> None:
     if not config.record:
         raise BidexError(f"{run} kept nothing of its training. Train one that does: bidex-meta run --record 1e6 ...")
     dataset = open_dataset(folder.path / "replay")
-    out, name = writer.dataset_path(flags.out, Source.open(config.to_json()).name, "replay")
+    out, name = writer.dataset_path(flags.out, Worlds.open(config.to_json()).name, "replay")
     writer.adopt(dataset.folder, out, name)
     _say_complete(out, name)
 

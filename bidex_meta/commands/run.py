@@ -21,9 +21,8 @@ from bidex_meta.commands.run_config import RunPlan, plan_run
 from bidex_meta.commands.tables import evaluation_table, print_table
 from bidex_meta.config import RunConfig, printed
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.play import EVALUATION_SEED
+from bidex_meta.evaluation.play import EVALUATION_SEED, RandomAgent
 from bidex_meta.evaluation.results import compare
-from bidex_meta.evaluation.untrained import RandomAgent
 from bidex_meta.record import Recorder, RunFolder, mend, training_seconds
 from bidex_meta.record.atomic import write_json
 from bidex_meta.record.folder import check_new, new_folder_name

@@ -20,9 +20,9 @@ from bidex_meta.errors import BidexError, one_line
 from bidex_meta.memory import POINT_BYTES, ROW_BYTES, check_memory
 from bidex_meta.reading import absolute
 from bidex_meta.record.folder import RunFolder
-from bidex_meta.sources import Source
 from bidex_meta.train.launch import launch, resume_command
 from bidex_meta.validation import Count, Few, Shots
+from bidex_meta.worlds import Worlds
 
 _EXAMPLE = "MT4"  # a suite whose defaults `run --help` shows
 
@@ -74,9 +74,9 @@ class RunPlan:
     """Why this preset."""
 
     @cached_property
-    def source(self) -> Source:
+    def source(self) -> Worlds:
         """Where this process's worlds come from."""
-        return Source.open({**self.config.to_json(), "device": launch().own_device(self.config.device)})
+        return Worlds.open({**self.config.to_json(), "device": launch().own_device(self.config.device)})
 
 
 def plan_run(arguments: Sequence[str]) -> RunPlan:
@@ -100,7 +100,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     suite, task = (given(name) or implied.get(name) for name in ("suite", "task"))
     # Where neither is named, `run --help` still has defaults to show; without --help _resolved refuses it.
     named = {"suite": suite or (None if task else _EXAMPLE), "task": task}
-    source = Source.open({**named, "object": given("object") or implied.get("object")})
+    source = Worlds.open({**named, "object": given("object") or implied.get("object")})
     kind = learner_kind(given("algo") or "mtppo", getattr(source, "class_name", None))
     device = resolve_device(given("device") or "auto", source.on_gpu)
     preset, reason = choose_preset(kind, given("preset") or "auto", device, source.preset)
@@ -124,7 +124,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     config = replace(flags.config, dataset=dataset, demonstrations=demonstrations, algo=kind.name, preset=preset)
     config = _resolved(config, source, device, fresh=folder is None)
     _check(flags, config, kind)
-    run_data.check_demonstrations(kind, config.demonstrations, Source.open(config.to_json()))
+    run_data.check_demonstrations(kind, config.demonstrations, Worlds.open(config.to_json()))
     if folder and stored:
         _refuse_changes(default, config, folder)
     return RunPlan(flags, kind, config, folder, reason)
@@ -136,7 +136,7 @@ def _parse(arguments: Sequence[str], default: RunConfig[Any]) -> RunFlags[Any]:
     return parse(options, arguments, "run", RunFlags(replace(default, dataset=(), demonstrations=())))
 
 
-def _resolved(config: RunConfig[Any], source: Source, device: str, fresh: bool) -> RunConfig[Any]:
+def _resolved(config: RunConfig[Any], source: Worlds, device: str, fresh: bool) -> RunConfig[Any]:
     """The config with names as they are written (``MT4`` where ``--suite mt4`` was given) and whole paths.
 
     A run may be resumed from another folder.

@@ -9,8 +9,8 @@ from bidex_meta.data import Dataset, open_dataset
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.reading import absolute, expanded
 from bidex_meta.record.versions import collect_versions
-from bidex_meta.sources import Source
 from bidex_meta.train.launch import launch
+from bidex_meta.worlds import Worlds
 
 if TYPE_CHECKING:
     from bidex_meta.world.contract import VectorWorld
@@ -21,7 +21,7 @@ _FORM = ("suite", "task", "base", "object", "points")
 
 
 def dataset_metadata(
-    source: Source, world: "VectorWorld", kind: str, policies: Sequence[dict[str, Any]], **more: Any
+    source: Worlds, world: "VectorWorld", kind: str, policies: Sequence[dict[str, Any]], **more: Any
 ) -> dict[str, Any]:
     """Our entry in the metadata of a data set.
 
@@ -105,12 +105,12 @@ def task_seed(datasets: Sequence[Dataset]) -> int | None:
     return datasets[0].metadata.get("seed") if datasets else None
 
 
-def rows_and_steps(source: Source) -> tuple[int, int]:
+def rows_and_steps(source: Worlds) -> tuple[int, int]:
     """Environments of the world from which an offline learner takes sizes and names, and updates."""
     return max(1, len(source.tasks("train"))), UPDATES
 
 
-def check_offline(kind: LearnerKind, record: int, datasets: Sequence[Dataset], source: Source) -> None:
+def check_offline(kind: LearnerKind, record: int, datasets: Sequence[Dataset], source: Worlds) -> None:
     """Refuses a learner and data sets that do not go together.
 
     Raises:
@@ -131,7 +131,7 @@ def check_offline(kind: LearnerKind, record: int, datasets: Sequence[Dataset], s
         _check_goals(dataset, source)
 
 
-def check_demonstrations(kind: LearnerKind, names: Sequence[str], source: Source) -> None:
+def check_demonstrations(kind: LearnerKind, names: Sequence[str], source: Worlds) -> None:
     """Refuses, from the data sets' metadata alone, what could not be imitated.
 
     Raises:
@@ -145,7 +145,7 @@ def check_demonstrations(kind: LearnerKind, names: Sequence[str], source: Source
         _check_demonstration(dataset, source)
 
 
-def _check_demonstration(dataset: Dataset, source: Source) -> None:
+def _check_demonstration(dataset: Dataset, source: Worlds) -> None:
     classes = source.task_classes()
     for slot in dataset.metadata["tasks"]:
         known_name(f"class in {source.name} of", slot.partition("/")[0], classes)
@@ -158,7 +158,7 @@ def _check_demonstration(dataset: Dataset, source: Source) -> None:
         )
 
 
-def _check_goals(dataset: Dataset, source: Source) -> None:
+def _check_goals(dataset: Dataset, source: Worlds) -> None:
     """Refuses data without the goals that the source shows; goals that it hides may be in the data."""
     about = dataset.metadata
     if about.get("hides_goals", source.hides_goals) == source.hides_goals:

@@ -11,8 +11,8 @@ from bidex_meta.commands.parsing import RunPath, Switch, parse
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import EXIT_FAILED, BidexError, one_line
 from bidex_meta.reading import exists
-from bidex_meta.sources import Source
 from bidex_meta.validation import Environments
+from bidex_meta.worlds import Worlds
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def main(arguments: Sequence[str]) -> None:
     recorded = recorded_evaluation(folder.path, flags.evaluation)
     then = recorded_conditions(recorded, read_versions(folder.path), config)
     config = replace(config, **_place(flags, then, config))
-    source = Source.open(config.to_json())
+    source = Worlds.open(config.to_json())
     set_up_torch(config.threads)
     rows = then["num_envs"] if flags.num_envs is None else flags.num_envs
     state, step = _checkpoint(folder, recorded["steps"])
@@ -120,7 +120,7 @@ def _place(flags: VerifyFlags, then: dict[str, Any], config: RunConfig[Any]) -> 
     """Device and engine to evaluate with."""
     from bidex_meta.commands.learners import resolve_device
 
-    on_gpu = Source.open(config.to_json()).on_gpu
+    on_gpu = Worlds.open(config.to_json()).on_gpu
     try:
         device = resolve_device(then["device"] if flags.device == "auto" else flags.device, on_gpu)
     except BidexError:
@@ -156,7 +156,7 @@ def _checkpoint(folder: Any, steps: int) -> tuple[dict[str, Any], int]:
 
 
 def _again(
-    folder: Any, config: RunConfig[Any], source: Source, recorded: dict[str, Any], rows: int | None, state: Any
+    folder: Any, config: RunConfig[Any], source: Worlds, recorded: dict[str, Any], rows: int | None, state: Any
 ) -> dict[str, Any]:
     """The recorded evaluation, made again."""
     from bidex_meta.commands.learners import learner_kind

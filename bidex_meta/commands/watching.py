@@ -16,8 +16,8 @@ from bidex_meta.commands.run_config import RunPlan
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.record import Recorder, RunFolder
-from bidex_meta.sources import Source
 from bidex_meta.train.launch import launch
+from bidex_meta.worlds import Worlds
 
 TASKS = 10
 """Tasks of each class in such an evaluation, the first of its pool; one episode each."""
@@ -143,7 +143,7 @@ class Watch:
 
         try:
             if "film" not in self._worlds:
-                source = Source.open({**self._plan.config.to_json(), "device": "cpu", "engine": "auto"})
+                source = Worlds.open({**self._plan.config.to_json(), "device": "cpu", "engine": "auto"})
                 self._worlds["film"] = source.world("train", len(slots_of(source)))
             world = self._worlds["film"]
             steps = min(_MOST_FILM_STEPS, int(world.max_episode_steps.max()))

@@ -18,7 +18,7 @@ from torch import Tensor
 from bidex_meta.data.dataset import Dataset
 from bidex_meta.data.episode import Episode
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.scores import Reference
+from bidex_meta.evaluation.references import Reference
 from bidex_meta.outside import name_without_object
 from bidex_meta.points.depth_sensor import POINT_ENTRIES, privileged_columns
 from bidex_meta.tasks import registry

@@ -22,7 +22,7 @@ from bidex_meta.data.collector import BROKEN, EpisodeCollector
 from bidex_meta.data.episode import Episode
 from bidex_meta.data.writer import DatasetWriter
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.untrained import RandomAgent
+from bidex_meta.evaluation.play import RandomAgent
 from bidex_meta.world.contract import PooledWorld
 
 PART_BYTES = 64_000_000

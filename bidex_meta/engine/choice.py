@@ -2,8 +2,9 @@
 
 import torch
 
+from bidex_meta.engine.cpu import CpuEngine
 from bidex_meta.engine.protocol import EngineMaker
-from bidex_meta.errors import BidexError, shortened
+from bidex_meta.errors import BidexError, known_name, shortened
 from bidex_meta.validation import whole_number
 
 ENGINES = ("auto", "c", "warp")
@@ -16,7 +17,7 @@ def choose_engine(
     """The device and what makes engines there.
 
     Args:
-        device: "cpu" or a CUDA device.
+        device: "auto" (CUDA where there is one), "cpu" or a CUDA device.
         engine: "c", "warp" or "auto": C MuJoCo on the CPU, mujoco_warp on a GPU.
         threads: Threads of C MuJoCo; None takes all CPUs.
 
@@ -25,30 +26,30 @@ def choose_engine(
     """
     if threads is not None:
         threads = whole_number("threads", threads, 1, _MOST_THREADS)
-    place = _device(device)
-    if not isinstance(engine, str) or engine not in ENGINES:
-        raise BidexError(f"Expected an engine among {', '.join(ENGINES)}, got {shortened(engine)}.")
+    place, engine = _device(device), known_name("engine", engine, ENGINES)
     if engine == "c" and place.type != "cpu":
         raise BidexError(f"Expected device 'cpu' for the C engine, got {str(device)!r}; leave engine at 'auto'.")
     if engine == "warp" or (engine == "auto" and place.type == "cuda"):
-        from bidex_meta.engine.warp import WarpEngine
+        from bidex_meta.engine.warp import WarpEngine  # mujoco_warp takes seconds to import
 
         return place, lambda models, rows, room: WarpEngine(models, rows, room, device=str(place))
-    from bidex_meta.engine.cpu import CpuEngine
-
     return place, lambda models, rows, room: CpuEngine(models, rows, threads)
 
 
 def _device(device: str | torch.device) -> torch.device:
+    if isinstance(device, str) and device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         place = torch.device(device)
-    except (RuntimeError, TypeError):
+    except (RuntimeError, TypeError, ValueError):
         place = None
     if place is None or place.type not in ("cpu", "cuda"):
-        raise BidexError(f"Expected device 'cpu' or 'cuda:N', got {str(device)!r}.")
-    if place.type == "cuda" and (place.index or 0) >= torch.cuda.device_count():
+        raise BidexError(f"device: expected auto, cpu, cuda or cuda:N, got {shortened(device)}.")
+    if place.type == "cpu":
+        return place
+    if (place.index or 0) >= torch.cuda.device_count():
         raise BidexError(
-            f"Expected one of {torch.cuda.device_count()} CUDA devices, got {str(device)!r}; "
-            "use device 'cpu', or install a torch build with CUDA."
+            f"device: expected one of {torch.cuda.device_count()} CUDA devices, got {shortened(device)}. Use cpu or "
+            "auto, or install a torch build with CUDA."
         )
-    return torch.device("cuda", place.index or 0) if place.type == "cuda" else place
+    return torch.device("cuda", place.index or 0)

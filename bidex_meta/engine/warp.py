@@ -22,7 +22,7 @@ from torch import Tensor
 from bidex_meta.engine import kernels
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.engine.health import LARGEST, checked_state
-from bidex_meta.engine.ward import Ward
+from bidex_meta.engine.kernels import Guard
 from bidex_meta.errors import BidexError
 
 # What a simulation carries from one step to the next; the fields that a model has none of are skipped.
@@ -93,7 +93,7 @@ class WarpEngine:
         self._mask_view.fill_(True)
         with self._on_device():
             mjw.reset_data(self._m, self._d, reset=self._mask)
-            self._ward.keep(self._d)
+            self._guard.keep(self._d)
         self._failed_view.zero_()
 
     def _put(self, capacity: Capacity) -> None:
@@ -112,7 +112,7 @@ class WarpEngine:
         )
         _put_static_frames(self._d, self._models, self._rows)
         d = self._d
-        self._ward = Ward(self._models[0], d)
+        self._guard = Guard(self._models[0], d)
         self._mask = wp.zeros(self.num, dtype=bool)
         self._start = wp.zeros((self.num, d.qpos.shape[1] + 7 * d.mocap_pos.shape[1]), dtype=float)
 
@@ -123,7 +123,7 @@ class WarpEngine:
         self._state = {name: views[name] for name in _STATE if name in views}
         self.qpos, self.qvel, self.ctrl = (views[name] for name in ("qpos", "qvel", "ctrl"))
         self.xfrc_applied, self.sensordata = views["xfrc_applied"], views["sensordata"]
-        self._overflow, self._failed_view = views["overflow"], wp.to_torch(self._ward.failed)
+        self._overflow, self._failed_view = views["overflow"], wp.to_torch(self._guard.failed)
         self._stepped = [views[name] for name in _STEPPED if name in views] + [self._failed_view]
         self._mocap = [views[name] for name in ("mocap_pos", "mocap_quat") if name in views]
         self._mask_view, self._start_view = wp.to_torch(self._mask), wp.to_torch(self._start)
@@ -230,13 +230,13 @@ class WarpEngine:
         """The substeps of a control step, then position and velocity sensors of the new state."""
         m, d = self._m, self._d
         wanted = m.opt.disableflags
-        self._ward.examine(d)
+        self._guard.examine(d)
         for left in reversed(range(self._substeps)):
-            self._ward.watch(m, d)
+            self._guard.watch(m, d)
             m.opt.disableflags = wanted | _NO_SENSORS if left else wanted  # only the last substep's forces are read
             mjw.step(m, d)
         m.opt.disableflags = wanted
-        self._ward.watch(m, d)
+        self._guard.watch(m, d)
         self._refresh()
 
     def _refresh(self) -> None:
@@ -254,7 +254,7 @@ class WarpEngine:
             kernels.place,
             dim=self.num,
             inputs=[self._mask, self._start, LARGEST],
-            outputs=[d.qpos, d.mocap_pos, d.mocap_quat, self._ward.failed],
+            outputs=[d.qpos, d.mocap_pos, d.mocap_quat, self._guard.failed],
             device=self._device,
         )
         self._refresh()

@@ -24,9 +24,8 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.gains import Gains, paired_gains
 from bidex_meta.evaluation.play import EVALUATION_SEED, check_world, play_tasks, quota
 from bidex_meta.evaluation.portions import Portions, task_of_row
-from bidex_meta.evaluation.references import references_of
+from bidex_meta.evaluation.references import Reference, references_of
 from bidex_meta.evaluation.results import Evaluation, results_by_class
-from bidex_meta.evaluation.scores import Reference
 from bidex_meta.world.contract import TaskWorld
 
 MAX_ADAPT_STEPS = 150

@@ -4,7 +4,7 @@ The protocol: the world keeps each row on one task of its slot and does not rese
 task is played ``episodes_per_task`` times, whole episodes, by the mean action; a task that ends early is not played
 more often, so easy tasks cannot crowd out hard ones. An episode is a success if ``info["success"]`` was true at any
 step; its return is the sum of the unscaled reward. An episode in which the physics broke is no success and counts with
-the return of random actions, or its own if that is lower (``bidex_meta.evaluation.scores``).
+the return of random actions, or its own if that is lower (``bidex_meta.evaluation.references``).
 """
 
 from collections.abc import Mapping
@@ -15,9 +15,8 @@ from gymnasium.vector import AutoresetMode
 
 from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError, shortened
-from bidex_meta.evaluation.references import references_of
+from bidex_meta.evaluation.references import Reference, references_of
 from bidex_meta.evaluation.results import Evaluation, results_by_class
-from bidex_meta.evaluation.scores import Reference
 from bidex_meta.maths import check_precision
 from bidex_meta.validation import whole_number
 from bidex_meta.world.contract import TaskWorld

@@ -15,7 +15,7 @@ import numpy as np
 from bidex_meta import paths
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.scores import Reference
+from bidex_meta.evaluation.references import Reference
 from bidex_meta.reading import TABLE, check, exists, number, read_json
 from bidex_meta.record.atomic import write_json
 

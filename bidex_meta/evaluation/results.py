@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from bidex_meta.evaluation.scores import Reference, counted_returns
+from bidex_meta.evaluation.references import Reference, counted_returns
 from bidex_meta.evaluation.statistics import Interval, aggregate, bootstrap_interval, mean, mean_difference
 
 MANY_TASKS = 10

@@ -8,8 +8,8 @@
         env.set_task(next(task for task in ml20.train_tasks if task.env_name == name))
         obs, info = env.reset()
 
-docs/metaworld.md says what is the same, what is not, and what is faster. Importing it mends Meta-World's own
-environments in this process, which MuJoCo 4 breaks (``mending``).
+docs/metaworld.md lists what is the same, what is not, and what is faster. Importing it mends Meta-World's own
+environments in this process, which MuJoCo 4 breaks (``library.mended``), and makes `Benchmark` one of Meta-World's.
 """
 
 from contextlib import suppress
@@ -17,11 +17,11 @@ from typing import Any
 
 from bidex_meta.benchmark import Benchmark, Task
 from bidex_meta.metaworld.benchmarks import ML1, ML4, ML20, MT1, MT4, MT20, CustomML, CustomMT
-from bidex_meta.metaworld.mending import mended
+from bidex_meta.metaworld.library import mended
 from bidex_meta.metaworld.vector_envs import make_ml_envs, make_ml_envs_test, make_ml_envs_train, make_mt_envs
 
 with suppress(ModuleNotFoundError):
-    mended()
+    mended().Benchmark.register(Benchmark)
 
 __all__ = [
     "ML1",

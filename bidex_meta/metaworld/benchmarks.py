@@ -10,7 +10,7 @@ from typing import ClassVar, Literal
 
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import BidexError, known_name
-from bidex_meta.suite import ReadOnly, Split, Suite, SuiteClass
+from bidex_meta.suite import Split, Suite, SuiteClass
 from bidex_meta.tasks import registry
 
 _TASKS = 50
@@ -75,36 +75,29 @@ class CustomML(Benchmark):
         super().__init__(_suite("CustomML", "masked", {"train": train_envs, "test": test_envs}), seed or 0)
 
 
-class MT4(Benchmark):
+class _Shipped(Benchmark):
+    def __init__(self, seed: int | None = None) -> None:
+        super().__init__(type(self).__name__, seed or 0)
+
+
+class MT4(_Shipped):
     """The suite MT4; `seed` chooses the tasks, None: 0."""
 
-    def __init__(self, seed: int | None = None) -> None:
-        super().__init__("MT4", seed or 0)
 
-
-class MT20(Benchmark):
+class MT20(_Shipped):
     """The suite MT20: all classes; `seed` chooses the tasks, None: 0."""
 
-    def __init__(self, seed: int | None = None) -> None:
-        super().__init__("MT20", seed or 0)
 
-
-class ML4(Benchmark):
+class ML4(_Shipped):
     """The suite ML4: three classes, tested on a fourth; `seed` chooses the tasks, None: 0."""
 
-    def __init__(self, seed: int | None = None) -> None:
-        super().__init__("ML4", seed or 0)
 
-
-class ML20(Benchmark):
+class ML20(_Shipped):
     """The suite ML20: fifteen classes, tested on five others; `seed` chooses the tasks, None: 0."""
-
-    def __init__(self, seed: int | None = None) -> None:
-        super().__init__("ML20", seed or 0)
 
 
 def _suite(name: str, observation: Literal["plain", "one-hot", "masked"], classes: dict[Split, Sequence[str]]) -> Suite:
-    """A suite that no file says, of the given classes by split."""
+    """A suite without a file, of the given classes by split."""
     splits: dict[str, tuple[Split, ...]] = {}
     for split, given in classes.items():
         for entry in _named(given):
@@ -121,7 +114,7 @@ def _suite(name: str, observation: Literal["plain", "one-hot", "masked"], classe
         reward="paper",
         base="moving",
         tasks_per_class=_TASKS,
-        classes=tuple(SuiteClass(entry, entry, where, 1.0, None, (), ReadOnly({})) for entry, where in splits.items()),
+        classes=tuple(SuiteClass(entry, entry, where, 1.0, None, (), {}) for entry, where in splits.items()),
         file=Path(f"metaworld.{name}"),
     )
 

@@ -16,36 +16,11 @@ from typing import Any, Protocol
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import any_process, gather, is_main, rank, world_size
 from bidex_meta.train.launch import hangup
+from bidex_meta.train.learner import Learner
 from bidex_meta.world.contract import VectorWorld
 
 # The most of a run's time that may go into checkpoints.
 _SAVING_SHARE = 0.02
-
-
-class Learner(Protocol):
-    """What the loop needs of a learner."""
-
-    @property
-    def env_steps(self) -> int:
-        """Environment steps taken so far, over all rows of all processes."""
-        ...
-
-    @property
-    def per_process(self) -> tuple[str, ...]:
-        """Entries of ``state_dict`` that differ from process to process; the others are the same in all."""
-        ...
-
-    def iterate(self) -> dict[str, float]:
-        """One rollout and one update; flat metrics."""
-        ...
-
-    def state_dict(self) -> dict[str, Any]:
-        """All that is needed to continue bit for bit, beside the world's own state."""
-        ...
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`state_dict` gave."""
-        ...
 
 
 class Record(Protocol):

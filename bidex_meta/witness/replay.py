@@ -11,7 +11,7 @@ from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import unknown_name
 from bidex_meta.witness.store import Witness
 from bidex_meta.world import Slot, World
-from bidex_meta.world.transitions import judge
+from bidex_meta.world.part import judge
 
 SUITE, SEED = "MT20", 0
 """Witnesses are about task 0 of each class of this suite and seed."""

@@ -9,9 +9,6 @@ all sees the full observation.
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-import torch
-from torch import Tensor
-
 from bidex_meta.errors import BidexError, unknown_name
 from bidex_meta.hands.hand import SIDES, hand
 from bidex_meta.hands.units import UNITS, Agents, partition_line, units_by_agent
@@ -71,12 +68,6 @@ def agent_views(groups: Sequence[ObservationGroup], num_actions: int, agents: Ag
         seen = tuple(group for group in groups if group.name not in others or not _has_hands(groups))
         views.append(AgentView(name, seen, tuple(sorted(action for unit in own for action in units[unit]))))
     return tuple(views)
-
-
-def joint_action(views: Sequence[AgentView], actions: Sequence[Tensor]) -> Tensor:
-    """The world's action (..., a), put together of what the agents do, (..., a_i) each in the order of ``views``."""
-    order = torch.tensor([entry for view in views for entry in view.actions], device=actions[0].device)
-    return torch.cat(list(actions), dim=-1)[..., order.argsort()]
 
 
 def _joined(parts: Iterable[slice]) -> tuple[slice, ...]:

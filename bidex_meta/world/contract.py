@@ -45,6 +45,15 @@ import torch
 from gymnasium.spaces import Box
 from torch import Tensor
 
+Info = dict[str, Any]
+"""What a step reports; the keys are above."""
+Options = dict[str, Any]
+"""Of a reset."""
+State = dict[str, Any]
+"""Tensors and plain values, nested, as a checkpoint holds them."""
+Step = tuple[Tensor, Tensor, Tensor, Tensor, Info]
+"""Observations, rewards, terminated, truncated, info."""
+
 
 @dataclass(frozen=True)
 class ObservationGroup:
@@ -115,7 +124,7 @@ class VectorWorld(Protocol):
     observation_groups: tuple[ObservationGroup, ...]
     metadata: dict[str, Any]
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
         """Starts episodes.
 
         Args:
@@ -133,7 +142,7 @@ class VectorWorld(Protocol):
         """
         ...
 
-    def step(self, action: Tensor, /) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+    def step(self, action: Tensor, /) -> Step:
         """Takes actions (N, a), clipped to [-1, 1]; a row with a non-finite number ends as unstable.
 
         Returns:
@@ -141,11 +150,11 @@ class VectorWorld(Protocol):
         """
         ...
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         """Tensors and plain values from which it continues bit for bit, copied."""
         ...
 
-    def load_state_dict(self, state: dict[str, Any], /) -> None:
+    def load_state_dict(self, state: State, /) -> None:
         """Puts back what ``state_dict`` gave, on a world made alike; it may be stepped without a reset."""
         ...
 

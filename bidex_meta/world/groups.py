@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from bidex_meta.engine.capacity import room_for
+from bidex_meta.engine.models import same_structure
 from bidex_meta.engine.protocol import Engine, EngineMaker
-from bidex_meta.engine.structure import same_structure
 from bidex_meta.errors import BidexError
 from bidex_meta.points.depth_sensor import DepthSensor, PointsRule
 from bidex_meta.tasks.base import TaskClass
@@ -115,13 +115,6 @@ def with_pool(slot: Slot, tasks: np.ndarray) -> Slot:
             f"in row {row}."
         )
     return replace(slot, tasks=tasks)
-
-
-def split_rows(num_envs: int, slots: int) -> list[slice]:
-    """Contiguous rows for each slot, even; the first slots take the remainder."""
-    share, rest = divmod(num_envs, slots)
-    stops = [share * (i + 1) + min(i + 1, rest) for i in range(slots)]
-    return [slice(stop - share - (i < rest), stop) for i, stop in enumerate(stops)]
 
 
 def build_groups(slots: list[Slot], rows: list[slice], make_engine: EngineMaker) -> list[Group]:

@@ -1,5 +1,7 @@
-"""From sensors to observations: one gather, one scale, a few computed blocks."""
+"""From sensors to observations (one gather, one scale, a few computed blocks), and the groups of their entries."""
 
+from collections.abc import Sequence
+from itertools import groupby
 from typing import Literal
 
 import torch
@@ -7,11 +9,14 @@ from torch import Tensor
 
 from bidex_meta.hands.hand import SIDES, hand
 from bidex_meta.maths import conjugate, multiply, roll_pitch_yaw, xyzw
-from bidex_meta.tasks.layout import CLIP, Layout
+from bidex_meta.tasks.layout import CLIP, Layout, hand_blocks
 from bidex_meta.tasks.scene import Scene
+from bidex_meta.world.contract import ObservationGroup
 
 Rule = Literal["plain", "one-hot", "masked"]
 """What a suite shows: everything; everything and the task's id; everything but the goal."""
+_HAND_OF = {block.name: f"{side}_hand" for side in SIDES for block in hand_blocks(side, moving=True)}
+"""By name and not by prefix: ``right_handle_position`` is of an object."""
 
 
 class Observer:
@@ -85,3 +90,46 @@ def _indices(scene: Scene, name: str) -> Tensor:
     where = scene.sensors[name]
     indices = torch.arange(int(where.start), int(where.stop))
     return xyzw(indices) if name.endswith("quaternion") else indices
+
+
+def observation_groups(
+    layouts: Sequence[Layout],
+    width: int,
+    num_id_columns: int,
+    hidden: Sequence[Sequence[int]] | None = None,
+    points: tuple[str, int] | None = None,
+) -> tuple[ObservationGroup, ...]:
+    """Groups that hold for rows of all these classes.
+
+    Args:
+        layouts: Of the world's slots.
+        width: Entries of an observation before the task id, at least those of each layout.
+        num_id_columns: Entries of the task id.
+        hidden: Entries of each layout that are zero, as padding is.
+        points: Name and entries of the cloud between the padded observation and the task id.
+
+    Returns:
+        In the order of their first entries. An entry that is of one kind in some classes and of another one in others
+        is in ``task``.
+    """
+    hidden = [()] * len(layouts) if hidden is None else hidden
+    by_class = zip(*(_kinds(layout, width, zero) for layout, zero in zip(layouts, hidden, strict=True)), strict=True)
+    kinds = [kinds[0] if len(set(kinds)) == 1 else "task" for kinds in by_class]
+    if points is not None:
+        kinds += [points[0]] * points[1]
+    kinds += ["task_id"] * num_id_columns
+    ranges: dict[str, list[slice]] = {}
+    for kind, run in groupby(range(len(kinds)), key=kinds.__getitem__):
+        entries = list(run)
+        ranges.setdefault(kind, []).append(slice(entries[0], entries[-1] + 1))
+    return tuple(ObservationGroup(kind, tuple(where)) for kind, where in ranges.items())
+
+
+def _kinds(layout: Layout, width: int, hidden: Sequence[int]) -> list[str]:
+    """The group of each entry of one class's padded observation; hidden ones are padding."""
+    kinds = ["padding"] * width
+    for block, where in layout:
+        kinds[where] = [_HAND_OF.get(block.name, "goal" if block.goal else "object")] * block.size
+    for i in hidden:
+        kinds[i] = "padding"
+    return kinds

@@ -1,27 +1,66 @@
-"""The rows of a world that one engine carries: controls, transitions, observations, starts."""
+"""The environments that one engine carries: controls, starts, observations, rewards."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from bidex_meta.hands.hand import FORCE_PER_SCALE, SIDES, TORQUE_PER_SCALE, hand
 from bidex_meta.maths import xyzw
 from bidex_meta.points.depth_sensor import DepthSensor
-from bidex_meta.tasks.base import CONTROL_RATE
+from bidex_meta.tasks.base import CONTROL_RATE, TaskClass
 from bidex_meta.tasks.state import TaskState
-from bidex_meta.world.actions import Controls
-from bidex_meta.world.formulas import check_formulas
+from bidex_meta.world import checking
+from bidex_meta.world.base import Transition
 from bidex_meta.world.groups import Group, Member, Slot
 from bidex_meta.world.observations import Observer, Rule, clip
 
 
+class Controls:
+    """Writes actions into a group's engine: position targets and base forces.
+
+    The action order is the appendix's: per hand 20 joints, 3 base translations, 3 base rotations; the right hand first
+    (Tables 9 and 11).
+    """
+
+    def __init__(self, group: Group) -> None:
+        engine, scene = group.engine, group.members[0].scene
+        self._engine, self._moving = engine, scene.task.moving_base
+        low, high = (engine.ctrl.new_tensor(x) for x in (hand().control_low, hand().control_high))
+        self._middle, self._half = 0.5 * (high + low), 0.5 * (high - low)
+        self._joints = len(low)
+        self._bodies = scene.base_bodies
+        self._wrench = engine.ctrl.new_empty(engine.num, 6)
+        for member in group.members:
+            task = member.scene.task
+            self._wrench[member.engine_rows, :3] = FORCE_PER_SCALE * task.transition_scale
+            self._wrench[member.engine_rows, 3:] = TORQUE_PER_SCALE * task.orientation_scale
+
+    def write(self, action: Tensor) -> None:
+        """Sets targets lo + (a + 1)/2 (hi - lo), and force (N) and torque (N m) at the bases, in the world frame.
+
+        Args:
+            action: Clean actions of the group's environments, shape (num, 52 or 40).
+        """
+        action = action.to(self._engine.ctrl.dtype)
+        share = action.shape[1] // len(SIDES)
+        for side, body in enumerate(self._bodies):
+            first = side * share
+            targets = self._engine.ctrl[:, side * self._joints : (side + 1) * self._joints]
+            torch.mul(action[:, first : first + self._joints], self._half, out=targets)
+            targets += self._middle
+            if self._moving:
+                self._engine.xfrc_applied[:, body] = action[:, first + self._joints : first + share] * self._wrench
+
+
 class Part:
-    """A group of rows with everything that turns engine numbers into transitions and back.
+    """A group of environments with everything that turns engine numbers into transitions and back.
 
     Attributes:
-        group: The rows and their engine.
+        group: The environments and their engine.
         substeps: Engine steps per control step.
-        engine_rows: Engine row of each of the world's rows, -1 where it is not of this part, shape (num_envs,).
+        engine_rows: Engine row of each environment of the world, -1 where it is not of this part, shape (num_envs,).
         start_size: Numbers of a start: ``qpos`` and the poses of movable fixtures.
     """
 
@@ -37,12 +76,12 @@ class Part:
         """Prepares controls and observers.
 
         Args:
-            group: The rows and their engine.
+            group: The environments and their engine.
             slots: The world's slots.
             rule: What observations show.
             width: Entries of an observation with padding and task id.
-            num_envs: Rows of the world.
-            sights: What rows of each of the world's slots see of objects; None: their state.
+            num_envs: Environments of the world.
+            sights: What environments of each of the world's slots see of objects; None: their state.
         """
         device = group.engine.device
         self.engine_rows = torch.full((num_envs,), -1, device=device)
@@ -55,7 +94,7 @@ class Part:
         self.start_size = self._start.shape[1]
         for member in group.members:
             tasks = slots[member.slot].tasks
-            check_formulas(member.scene, tasks, self._engine.sensordata, observed=rule != "masked")
+            checking.formulas(member.scene, tasks, self._engine.sensordata, observed=rule != "masked")
         self._observer = Observer(group.members[0].scene, self._start_mounts(), width)
         self._sights = sights
         if sights is not None:
@@ -78,39 +117,39 @@ class Part:
         ]
 
     def frozen(self, member: int, task_index: Tensor) -> dict[str, Tensor]:
-        """Frozen numbers of rows of a member, by their tasks' indices in the pool."""
+        """Frozen numbers of environments of a member, by their tasks' indices in the pool."""
         return {name: values[task_index] for name, values in self._pools[member].items()}
 
     def control(self, action: Tensor) -> None:
-        """Writes the actions of the part's rows, shape (num, a), into the engine."""
+        """Writes the actions of the part's environments, shape (num, a), into the engine."""
         self._controls.write(action)
 
     def step(self, action: Tensor, active: Tensor | None) -> None:
-        """Applies actions, shape (num, a), and advances all rows, or those of the mask, by one control step."""
+        """Applies actions, shape (num, a), and advances all environments, or those of the mask, by a control step."""
         self.control(action)
         self.advance(active)
 
     def advance(self, active: Tensor | None) -> None:
-        """Advances all rows, or those of the mask, by one control step."""
+        """Advances all environments, or those of the mask, by one control step."""
         self._engine.step(self.substeps, active)
 
     def unstable(self) -> Tensor:
-        """Which rows broke since their last reset. Shape (num,), bool."""
+        """Which environments broke since their last reset. Shape (num,), bool."""
         return self._engine.unstable()
 
     def states(self, task_index: Tensor, rows: Tensor | None = None) -> Iterator[tuple[Member, slice, TaskState]]:
-        """The members that have rows here, the rows' place among the chosen ones, and their state.
+        """The members among the chosen rows, the slice of their rows, and their state.
 
         Args:
-            task_index: Task of each of the part's rows, shape (num,).
+            task_index: Task of each of the part's environments, shape (num,).
             rows: Chosen engine rows in ascending order, or None for all.
         """
-        for i, member, where, chosen in self._places(rows):
+        for i, member, where, chosen in self._members(rows):
             frozen = self.frozen(i, task_index[chosen])
             yield member, where, TaskState(self._engine.sensordata[chosen], member.scene.sensors, frozen)
 
-    def _places(self, rows: Tensor | None) -> Iterator[tuple[int, Member, slice, Tensor | slice]]:
-        """Index, member, place among the chosen rows, and engine rows of the members that have rows among them."""
+    def _members(self, rows: Tensor | None) -> Iterator[tuple[int, Member, slice, Tensor | slice]]:
+        """Index, member, slice among the chosen rows, and engine rows of the members that have rows among them."""
         for i, member in enumerate(self.group.members):
             if rows is None:
                 yield i, member, member.engine_rows, member.engine_rows
@@ -158,10 +197,60 @@ class Part:
         """
         qpos = self._engine.qpos.new_empty(len(draws), self.start_size)
         each = len(draws) // self._engine.num if rows is None else 1
-        for i, member, place, _ in self._places(rows):
+        for i, member, place, _ in self._members(rows):
             where = slice(each * place.start, each * place.stop)
             qpos[where] = self._start[i]
             views = {name: qpos[where, columns] for name, columns in member.scene.qpos.items()}
             task = member.scene.task
             task.start(draws[where, : task.start_draws], self.frozen(i, task_index[where]), views)
         return qpos
+
+
+class Judgement(NamedTuple):
+    """A step of environments of one class by its formulas; see ``Transition``."""
+
+    terms: dict[str, Tensor]
+    reward: Tensor
+    success: Tensor
+    failed: Tensor
+
+
+def judge(task: TaskClass, state: TaskState) -> Judgement:
+    """Reward, success and true ends of the step just made."""
+    terms = task.reward_terms(state)
+    values = list(terms.values())
+    reward = torch.stack(values).sum(dim=0) if len(values) > 1 else values[0]
+    return Judgement(terms, reward, task.success(state), task.failed(state))
+
+
+def collect(
+    parts: Iterable[Part], task_index: Tensor, action: Tensor, width: int, with_id: Callable[[Tensor, Tensor], Tensor]
+) -> Transition:
+    """Judges and observes all environments after a step.
+
+    Args:
+        parts: The world's parts; each is taken when its turn comes.
+        task_index: Task of each environment, shape (n,).
+        action: Actions of the step, shape (n, a).
+        width: Entries of an observation.
+        with_id: Writes the task id into observations (k, d) of environments (k,) and returns them.
+    """
+    n, device = len(action), action.device
+    reward, obs = torch.empty(n, device=device), torch.empty(n, width, device=device)
+    success, failed, unstable = torch.zeros(3, n, dtype=torch.bool, device=device).unbind()
+    terms: dict[str, Tensor] = {}
+    for part in parts:
+        group = part.group
+        states = list(part.states(group.take(task_index)))
+        out = None if group.span is None else obs[group.span]
+        values = with_id(part.observe(states, group.take(action), out=out), group.rows)
+        broke = part.unstable()
+        for member, where, state in states:
+            rows, judged = member.world_rows, judge(member.scene.task, state)
+            reward[rows], success[rows], failed[rows] = judged.reward, judged.success, judged.failed
+            unstable[rows] = broke[where]
+            for name, value in judged.terms.items():
+                terms.setdefault(name, torch.zeros(n, device=device))[rows] = value
+            if out is None:
+                obs[rows] = values[where]
+    return Transition(obs, reward, success, failed, unstable, terms)

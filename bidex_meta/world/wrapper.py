@@ -1,4 +1,4 @@
-"""A world around a world: what recorders, statistics and the like are made from.
+"""Worlds around a world: what recorders, statistics and the like are made from, and the form that Gymnasium expects.
 
 Take the class of what is wrapped, so that evaluation and learners still see what it can do, and override what shall be
 done besides::
@@ -14,16 +14,21 @@ done besides::
 from typing import Any
 
 import numpy as np
+import torch
+from gymnasium.vector import VectorEnv
 from torch import Tensor
 
-from bidex_meta.world.contract import PooledWorld, TaskWorld, VectorWorld
+from bidex_meta.world.contract import Info, Options, PooledWorld, State, Step, TaskWorld, VectorWorld
+from bidex_meta.world.episodes import ended_info, set_stagger
+
+_OF_THE_CONTRACT = ("so_far", "counted", "final_obs", "_final_obs", "episode", "_episode", "final_info", "_final_info")
 
 
 class WorldWrapper(VectorWorld):
     """A ``VectorWorld`` that passes everything on to another one.
 
     Args:
-        world: What is wrapped. Nothing of it is copied: attributes are asked of it each time, its own ones too.
+        world: What is wrapped; attributes are read from it each time, its own ones too.
     """
 
     def __init__(self, world: VectorWorld) -> None:
@@ -39,19 +44,19 @@ class WorldWrapper(VectorWorld):
         """The world within all wrappers."""
         return getattr(self.world, "unwrapped", self.world)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
         """Starts episodes; see ``VectorWorld``."""
         return self.world.reset(seed=seed, options=options)
 
-    def step(self, action: Tensor, /) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+    def step(self, action: Tensor, /) -> Step:
         """Takes actions (N, a); see ``VectorWorld``."""
         return self.world.step(action)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         """The wrapped world's state: with or without the wrapper a run continues from it."""
         return self.world.state_dict()
 
-    def load_state_dict(self, state: dict[str, Any], /) -> None:
+    def load_state_dict(self, state: State, /) -> None:
         """Puts back what ``state_dict`` gave."""
         self.world.load_state_dict(state)
 
@@ -85,3 +90,64 @@ class PooledWorldWrapper(TaskWorldWrapper, PooledWorld):
     def set_tasks(self, pools: dict[str, np.ndarray], /) -> None:
         """Gives slots other pools; see ``PooledWorld``."""
         self.world.set_tasks(pools)
+
+
+class NumpyWorld(VectorEnv):
+    """What ``world.to_numpy()`` gives: NumPy arrays, for Gymnasium's vector wrappers.
+
+    ``info`` has ``success``, ``unstable``, ... of every environment, and where one ended ``final_obs`` (an array of
+    objects: observations, None in the others) and ``final_info`` with the ``episode`` (r, l, t, success, unscaled)
+    within. ``episode`` itself is left to ``RecordEpisodeStatistics``, as Gymnasium leaves it.
+
+    Args:
+        world: The world to step.
+        stagger: Whether a training world's first episodes begin at random elapsed steps, so that wrappers which count
+            for themselves count them too short; left out, at 0.
+    """
+
+    def __init__(self, world: VectorWorld, stagger: bool = False) -> None:
+        set_stagger(world, stagger)
+        self.world, self.num_envs = world, world.num_envs
+        self.single_observation_space, self.observation_space = world.single_observation_space, world.observation_space
+        self.single_action_space, self.action_space = world.single_action_space, world.action_space
+        self.metadata, self.render_mode = world.metadata, getattr(world, "render_mode", None)
+        self.autoreset_mode, self.spec = world.metadata["autoreset_mode"], getattr(world, "spec", None)
+
+    def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
+        """Starts episodes; see ``VectorWorld.reset``."""
+        obs, info = self.world.reset(seed=seed, options=options)
+        return _arrays(obs), info
+
+    def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
+        """Takes actions (num_envs, a).
+
+        Returns:
+            Observations (num_envs, d), rewards (num_envs,), float32; terminated, truncated (num_envs,), bool; info.
+        """
+        *flags, step_info = self.world.step(torch.as_tensor(actions, dtype=torch.float32, device=self.world.device))
+        info = {name: _arrays(value) for name, value in step_info.items() if name not in _OF_THE_CONTRACT}
+        ended = _arrays(step_info["_final_obs"])
+        if ended.any():
+            step_info = ended_info(step_info) | step_info  # a world's own has the time on the clock
+            info |= {"final_obs": np.full(self.num_envs, None, dtype=object), "_final_obs": ended}
+            for row, obs in zip(np.flatnonzero(ended), _arrays(step_info["final_obs"])[ended], strict=True):
+                info["final_obs"][row] = obs
+            info |= {name: _arrays(step_info[name]) for name in ("final_info", "_final_info")}
+        obs, reward, terminated, truncated = map(_arrays, flags)
+        return obs, reward, terminated, truncated, info
+
+    def render(self) -> tuple[np.ndarray, ...]:
+        """A picture of each environment, (height, width, 3), uint8."""
+        world: Any = self.world
+        return tuple(world.render(row=row) for row in range(self.num_envs))
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Frees the world."""
+        self.world.close()
+
+
+def _arrays(value: Any) -> Any:
+    """Tensors, and those of a dict, as arrays."""
+    if isinstance(value, dict):
+        return {name: _arrays(each) for name, each in value.items()}
+    return value.cpu().numpy() if isinstance(value, torch.Tensor) else value

@@ -3,13 +3,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from bidex_algos.experience.advantages import (
-    explained_variance,
-    gae,
-    normalise_per_task,
-    successor_values,
-    task_moments,
-)
+from bidex_algos.advantages import explained_variance, gae, normalise_per_task, successor_values, task_moments
 
 
 def draws(seed: int, steps: int, rows: int):

@@ -10,13 +10,12 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.testing import assert_close
 
-from bidex_algos.experience.n_step import Stretches
-from bidex_algos.experience.replay import Replay
-from bidex_algos.nets.atoms import Atoms
-from bidex_algos.nets.encoders.task_embedding import TaskEmbedding
+from bidex_algos.nets.inputs import TaskEmbedding
 from bidex_algos.nets.networks import MLP
-from bidex_algos.nets.residual import ResidualMLP
+from bidex_algos.offpolicy.brc import ResidualMLP
+from bidex_algos.offpolicy.categorical import Atoms
 from bidex_algos.offpolicy.return_scale import ReturnBound
+from bidex_algos.replay import Replay, Stretches
 from tests.algos.toy import ToyWorld, nearness
 
 # The projection.

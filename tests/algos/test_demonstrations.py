@@ -141,18 +141,3 @@ def test_a_resumed_run_goes_on_bit_for_bit_with_its_own_data_alone(cloning: int)
     other.learn_from_demonstrations(shown(seed_rows=2))
     with pytest.raises(BidexError, match="demonstrations are others"):
         other.load_state_dict(state["learner"])
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"demonstration_weight": -0.1},
-        {"demonstration_half_life": 0.0},
-        {"demonstration_batch": 0},
-        {"demonstration_cloning": -1},
-        {"critic_first": -1},
-    ],
-)
-def test_settings_out_of_range_are_refused(wrong: dict[str, Any]) -> None:
-    with pytest.raises(BidexError, match=next(iter(wrong))):
-        replace(SMALL, **wrong)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from bidex_algos.experience.advantages import discounts
+from bidex_algos.advantages import discounts
 from bidex_algos.meta.promp import PRESETS as PROMP
 from bidex_algos.meta.promp import ProMP
 from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig

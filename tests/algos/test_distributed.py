@@ -10,13 +10,13 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from bidex_algos.experience.rollout import collect
 from bidex_algos.multiagent.happo import HAPPO, HAPPOConfig
 from bidex_algos.multiagent.hatrpo import HATRPO, HATRPOConfig
 from bidex_algos.multiagent.ippo import IPPO, IPPOConfig
 from bidex_algos.multiagent.mappo import MAPPO, MAPPOConfig
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig
+from bidex_algos.rollout import collect
 from bidex_meta.errors import BidexError
 from bidex_meta.train import attendance, distributed
 from bidex_meta.train.runner import checkpoint, resume, train

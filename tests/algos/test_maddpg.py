@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from bidex_algos.experience.replay import Transitions
 from bidex_algos.multiagent.maddpg import MADDPG, MADDPGConfig
 from bidex_algos.offpolicy.ddpg import DDPG, DDPGConfig
+from bidex_algos.replay import Transitions
 from tests.algos.problems import opposite_bandits
 from tests.algos.resume import resumed
 from tests.algos.toy import ToyWorld

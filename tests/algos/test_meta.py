@@ -9,15 +9,14 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from bidex_algos.gradients.trust_region import flatten, write
 from bidex_algos.meta.adaptation import weighted_mean
-from bidex_algos.meta.linear_baseline import features
 from bidex_algos.meta.maml import MAML, MAMLConfig
-from bidex_algos.meta.maml import PRESETS as MAML_PRESETS
 from bidex_algos.meta.meta_policy import make_meta_policy
-from bidex_algos.meta.promp import PRESETS, ProMP, ProMPConfig
-from bidex_algos.nets.encoders.inputs import Inputs
+from bidex_algos.meta.promp import ProMP, ProMPConfig
+from bidex_algos.meta.stage import features
+from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import gaussian_log_prob
+from bidex_algos.trust_region import flatten, write
 from bidex_meta.agents import Timestep
 from bidex_meta.errors import BidexError
 from bidex_meta.world.contract import plain_groups
@@ -232,7 +231,7 @@ def test_save_load_resume_is_bit_equal(kind: Any, config: Any, slice_steps: int 
         config, slice_steps=slice_steps, tasks_per_class=3, max_adapt_steps=30, normalise_observations=True,
         step_sizes=sizes,
     )  # fmt: skip
-    mode = kind.autoreset({"slice_steps": slice_steps})
+    mode = kind.autoreset_mode(replace(config, slice_steps=slice_steps))
     assert mode == ("DISABLED" if slice_steps is None else "SAME_STEP")
     resumed(lambda seed: kind(PointGoals(rows=12, autoreset_mode=mode), config, seed))
 
@@ -327,23 +326,9 @@ def test_before_any_data_an_adapting_policy_is_the_meta_policy_and_init_goes_bac
 def test_bad_input_is_one_line():
     with pytest.raises(BidexError, match=r"8 tasks.*num_envs of at least 8"):
         ProMP(PointGoals(rows=4), PROMP, seed=0)
-    for field, value in (("inner_steps", 0), ("gamma", 2.0), ("init_std", 0.0), ("std_range", (1.0, 0.5))):
-        with pytest.raises(BidexError, match=f"promp: {field}"):
-            replace(PROMP, **{field: value})
-    with pytest.raises(BidexError, match="maml: backtracks"):
-        replace(MAML_TRPO, backtracks=0)
     learner = ProMP(PointGoals(rows=8), PROMP, seed=0)
-    with pytest.raises(BidexError, match=r"8 rows.*9"):
+    with pytest.raises(BidexError, match=r"8 environments.*9"):
         ProMP(PointGoals(rows=9), PROMP, seed=0).load_state_dict(learner.state_dict())
-
-
-def test_the_paper_presets_are_table_48():
-    for paper in (PRESETS["paper"], MAML_PRESETS["paper"]):
-        assert (paper.hidden, paper.slice_steps, paper.inner_steps) == ((2048, 1024, 512), 8, 1)
-        assert (paper.inner_learning_rate, paper.gamma, paper.lam, paper.init_std) == (3e-4, 0.9, 0.95, 1.0)
-    paper = PRESETS["paper"]
-    assert (paper.outer_epochs, paper.outer_learning_rate, paper.clip, paper.max_grad_norm) == (3, 3e-4, 0.2, 1.0)
-    assert paper.desired_kl == 0.016
 
 
 @pytest.mark.parametrize(("rule", "equal"), [("masked", True), ("plain", False)])

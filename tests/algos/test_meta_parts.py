@@ -12,9 +12,7 @@ from torch.testing import assert_close
 
 from bidex_algos.meta.adaptation import Adapter, TaskBatch
 from bidex_algos.meta.config import MetaConfig
-from bidex_algos.meta.linear_baseline import features, fitted
-from bidex_algos.meta.stage import Stage, task_batch
-from bidex_algos.meta.task_rows import TaskRows
+from bidex_algos.meta.stage import Stage, TaskRows, features, fitted, task_batch
 from bidex_algos.nets.networks import GaussianActor, gaussian_log_prob
 
 

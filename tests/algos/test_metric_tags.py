@@ -16,20 +16,13 @@ from tests.pages import ROOT
 SMALL: dict[str, Any] = {"hidden": (8,), "autocast": "off"}
 VARIANTS: dict[str, list[dict[str, Any]]] = {
     "mtppo": [{}, {"gradient_surgery": "pcgrad"}, {"gradient_surgery": "famo"}, {"demonstration_weight": 0.1}],
-    "mttrpo": [{}],
-    "mtsac": [{"warmup_steps": 2, "batch_size": 16}],
-    "mttd3": [{"warmup_steps": 2, "batch_size": 16}],
-    "fasttd3": [{"warmup_steps": 2, "batch_size": 16}],
-    "brc": [{"warmup_steps": 2, "batch_size": 16}],
-    "ddpg": [{"warmup_steps": 2, "batch_size": 16}],
-    "maml": [{}, {"outer": "adam"}, {"step_sizes": "weight"}],
-    "promp": [{}, {"step_sizes": "layer"}],
-    "rl2": [{}],
-    "bc": [{"batch_size": 16, "updates_per_iteration": 4}],
+    "mttrpo": [{}], "mtsac": [{"warmup_steps": 2, "batch_size": 16}], "mttd3": [{"warmup_steps": 2, "batch_size": 16}],
+    "fasttd3": [{"warmup_steps": 2, "batch_size": 16}], "brc": [{"warmup_steps": 2, "batch_size": 16}],
+    "ddpg": [{"warmup_steps": 2, "batch_size": 16}], "maml": [{}, {"outer": "adam"}, {"step_sizes": "weight"}],
+    "promp": [{}, {"step_sizes": "layer"}], "rl2": [{}], "bc": [{"batch_size": 16, "updates_per_iteration": 4}],
     "bcq": [{"batch_size": 16, "updates_per_iteration": 4, "vae_hidden": (8,)}],
-    "td3bc": [{"batch_size": 16, "updates_per_iteration": 4}],
-    "iql": [{"batch_size": 16, "updates_per_iteration": 4}],
-}
+    "td3bc": [{"batch_size": 16, "updates_per_iteration": 4}], "iql": [{"batch_size": 16, "updates_per_iteration": 4}],
+}  # fmt: skip
 PLAYING = [algo for algo in VARIANTS if not learner_kind(algo).offline]
 TEAM = {"agents": "a=action/0;b=action/1"}
 OF_AGENTS = {"ippo": "mtppo", "mappo": "mtppo", "happo": "mtppo", "hatrpo": "mttrpo", "maddpg": "ddpg"}

@@ -5,8 +5,8 @@ import torch
 from torch.distributions import Independent, Normal, kl_divergence
 from torch.testing import assert_close
 
-from bidex_algos.experience.rollout import collect
-from bidex_algos.onpolicy.mttrpo import MTTRPO, PRESETS, MTTRPOConfig
+from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig
+from bidex_algos.rollout import collect
 from bidex_meta.errors import BidexError
 from tests.algos.resume import resumed
 from tests.algos.test_mtppo import equal, mean_errors
@@ -129,9 +129,3 @@ def test_config_errors_name_the_field():
     ):
         with pytest.raises(BidexError, match=f"mttrpo: {field}"):
             replace(SMALL, **{field: value})
-
-
-def test_the_paper_preset_has_the_networks_of_table_47_and_a_whole_fisher_matrix():
-    paper = PRESETS["paper"]
-    assert (paper.hidden, paper.rollout_steps, paper.gamma, paper.lam) == ((2048, 1024, 512), 8, 0.96, 0.95)
-    assert (paper.max_kl, paper.cg_iterations, paper.fisher_stride) == (0.01, 10, 1)

@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 from torch.distributions import Normal
 
-from bidex_algos.experience.rollout import collect
 from bidex_algos.multiagent.happo import HAPPO, HAPPOConfig
 from bidex_algos.multiagent.hatrpo import HATRPO, HATRPOConfig
 from bidex_algos.multiagent.ippo import IPPO, IPPOConfig
 from bidex_algos.multiagent.mappo import MAPPO, MAPPOConfig
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig
+from bidex_algos.rollout import collect
 from bidex_meta.errors import BidexError
 from tests.algos.problems import LQR, opposite_bandits
 from tests.algos.resume import resumed
@@ -174,7 +174,7 @@ def test_ippos_critics_see_no_more_than_their_agents() -> None:
     from bidex_algos.multiagent.team import TeamCritic
     from bidex_meta.tasks import registry
     from bidex_meta.world.agent_views import agent_views
-    from bidex_meta.world.observation_groups import observation_groups
+    from bidex_meta.world.observations import observation_groups
 
     layout = registry.get("CatchUnderarm").layout
     views = agent_views(observation_groups([layout], layout.size, 0), 52, "hands")
@@ -228,9 +228,5 @@ def test_bad_configs_are_one_line() -> None:
         MAPPO(LQR(), MAPPOConfig(agents="a=action/0", **SMALL), seed=0)
     with pytest.raises(BidexError, match="agents: expected single"):
         HAPPOConfig(agents="thumbs")
-    with pytest.raises(BidexError, match="mappo: huber_delta must be positive"):
-        MAPPOConfig(huber_delta=0.0)
-    with pytest.raises(BidexError, match="max_factor: expected 0 or at least 1"):
-        HATRPOConfig(max_factor=0.5)
     with pytest.raises(BidexError, match="200 mini-batches need as many samples"):
         HAPPO(LQR(rows=2), HAPPOConfig(agents=PAIR, num_minibatches=200, **SMALL), seed=0)

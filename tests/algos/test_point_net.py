@@ -7,11 +7,9 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from bidex_algos.nets.encoders.inputs import Inputs
-from bidex_algos.nets.encoders.point_net import PointNet, _largest_of, with_point_net
-from bidex_algos.offpolicy.mtsac import MTSACConfig
+from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.point_net import PointNet, _largest_of, with_point_net
 from bidex_algos.onpolicy.mtppo import MTPPOConfig
-from bidex_meta.errors import BidexError
 from bidex_meta.world.contract import ObservationGroup
 
 
@@ -74,10 +72,3 @@ def test_clouds_alone_are_encoded_by_the_widths_of_the_config() -> None:
     both = with_point_net(Inputs(groups), MTPPOConfig(point_widths=(6, 7)))
     made = both.encoders["kind_points"]
     assert made is not None
-
-
-@pytest.mark.parametrize("config", [MTPPOConfig, MTSACConfig])
-@pytest.mark.parametrize("bad", [{"point_widths": ()}, {"point_widths": (8, 0)}, {"points_read": -1}])
-def test_bad_options_are_one_line(config: Any, bad: dict[str, Any]) -> None:
-    with pytest.raises(BidexError, match="point"):
-        config(**bad)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from bidex_algos.experience.replay import Replay, replay_bytes, steps_within
+from bidex_algos.replay import Replay, replay_bytes, steps_within
 from bidex_meta.errors import BidexError
 from tests.algos.ranks import same
 

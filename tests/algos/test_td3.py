@@ -9,71 +9,20 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from bidex_algos.experience.replay import Transitions
 from bidex_algos.offpolicy.ddpg import DDPG, DDPGConfig, spread
 from bidex_algos.offpolicy.td3 import TD3, TD3Config
-from bidex_meta.commands.learners import learner_kind
-from bidex_meta.errors import BidexError
-from tests.algos.off_policy import errors, trained
-from tests.algos.problems import LQR, PointMass, discounted_return, one_step_bandit, opposite_bandits
-from tests.algos.resume import resumed
+from bidex_algos.replay import Transitions
+from tests.algos.off_policy import trained
+from tests.algos.problems import opposite_bandits
 from tests.algos.toy import ToyWorld, nearness
 
 SHARED: dict[str, Any] = {
-    "hidden": (32, 32),
-    "replay_steps": 200,
-    "cut_share": 0.3,
-    "warmup_steps": 4,
-    "batch_size": 128,
-    "critic_layer_norm": False,
-    "gamma": 0.8,
-    "tau": 0.05,
-    "learning_rate": 3e-3,
-    "critic_learning_rate": 5e-3,
-    "squash_price": 0.0,
-    "autocast": "off",
-}
+    "hidden": (32, 32), "replay_steps": 200, "cut_share": 0.3, "warmup_steps": 4, "batch_size": 128,
+    "critic_layer_norm": False, "gamma": 0.8, "tau": 0.05, "learning_rate": 3e-3, "critic_learning_rate": 5e-3,
+    "squash_price": 0.0, "autocast": "off",
+}  # fmt: skip
 SMALL = TD3Config(**SHARED)
 both = pytest.mark.parametrize(("kind", "config"), [(DDPG, DDPGConfig(**SHARED)), (TD3, SMALL)], ids=["ddpg", "td3"])
-
-
-# Problems with a known optimum.
-
-
-@both
-@pytest.mark.parametrize("heads", [True, False])
-def test_two_tasks_at_odds_are_learned_though_one_pays_a_thousandfold(kind: Any, config: Any, heads: bool) -> None:
-    world = opposite_bandits(0.5, scale=1000.0)
-    learner = trained(kind, world, replace(config, policy_heads=heads, value_heads=heads), 16)
-    assert max(errors(learner, 0.5, -0.5)) < 0.15
-
-
-@both
-def test_lqr_comes_close_to_the_riccati_optimum(kind: Any, config: Any) -> None:
-    learner, test = trained(kind, LQR(), config, 22), LQR(rows=256)
-    best = discounted_return(test, test.best(0.8), 0.8, 40)
-    nothing = discounted_return(test, lambda obs: torch.zeros(len(obs), 2), 0.8, 40)
-    assert nothing < 2.5 * best
-    assert discounted_return(test, learner.eval_action, 0.8, 40) > 1.35 * best
-
-
-@both
-def test_a_point_mass_is_moved_to_its_goal(kind: Any, config: Any) -> None:
-    learner, test = trained(kind, PointMass(), config, 18), PointMass(rows=256)
-    best = discounted_return(test, test.best, 0.8, 30)
-    assert discounted_return(test, learner.eval_action, 0.8, 30) > 1.15 * best
-
-
-@both
-@pytest.mark.parametrize(("terminal", "value"), [(False, 5.0), (True, 1.0)])
-def test_a_time_limit_is_bootstrapped_and_a_true_end_is_not(
-    kind: Any, config: Any, terminal: bool, value: float
-) -> None:
-    # Reward 1 at each step and gamma 0.8: worth 1 / (1 - 0.8) = 5 where only the clock stops an episode of one step.
-    world = ToyWorld([lambda action: torch.ones(len(action))], horizon=1, terminal=terminal)
-    learner = trained(kind, world, replace(config, cut_share=1.0, per_task_rewards=False, tau=0.1), 14)
-    values = learner.critic(learner.policy.observations(learner.replay.obs), torch.zeros(32, 2), world.task_id)
-    assert_close(values.detach(), torch.full_like(values, value), rtol=0.05, atol=0)
 
 
 # One update, against an independent computation.
@@ -162,47 +111,3 @@ def test_noise_goes_from_little_to_much_over_the_rows_of_each_task() -> None:
 
 
 # Checkpoints, metrics, errors.
-
-
-@both
-def test_save_load_resume_is_bit_equal(kind: Any, config: Any) -> None:
-    resumed(lambda seed: kind(opposite_bandits(rows=8), replace(config, updates_per_step=3), seed))
-
-
-@both
-def test_the_policy_alone_is_loaded(kind: Any, config: Any) -> None:
-    learner = trained(kind, opposite_bandits(), replace(config, policy_heads=True), 2)
-    policy, obs = kind.load_policy(learner.policy_state_dict()), learner.replay.obs
-    assert torch.equal(policy.eval_action(obs), learner.eval_action(obs))
-
-
-@both
-def test_metrics_and_errors_carry_its_name(kind: Any, config: Any) -> None:
-    learner = trained(kind, one_step_bandit(), config, 1)
-    assert {"Loss/critic", "Loss/actor", "Value/q/task0", "Train/weightless"} <= learner.iterate().keys()
-    with torch.no_grad():
-        next(learner.critic.parameters()).fill_(float("nan"))
-    with pytest.raises(
-        FloatingPointError, match=rf"{kind.name}: the loss is not finite after \d+ steps; lower critic_"
-    ):
-        learner.iterate()
-    for wrong in (
-        {"tau": 0.0},
-        {"exploration_std": (0.5, 0.1)},
-        {"exploration_std": (-0.1, 0.1)},
-        {"squash_price": -1.0},
-    ):
-        with pytest.raises(BidexError, match=f"{kind.name}: {next(iter(wrong))}"):
-            replace(config, **wrong)
-
-
-def test_td3_refuses_what_could_only_fail_later() -> None:
-    for wrong in ({"target_std": -0.1}, {"target_bound": float("nan")}, {"policy_delay": 0}):
-        with pytest.raises(BidexError, match=f"td3: {next(iter(wrong))}"):
-            replace(SMALL, **wrong)
-
-
-def test_they_are_found_by_name() -> None:
-    assert learner_kind("ddpg").make is DDPG
-    assert learner_kind("td3").make is learner_kind("mttd3").make is TD3
-    assert list(learner_kind("td3").presets) == ["paper", "laptop", "metaworld"]

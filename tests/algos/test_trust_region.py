@@ -5,9 +5,9 @@ from hypothesis import given, settings
 from torch import Tensor, nn
 from torch.testing import assert_close
 
-from bidex_algos.gradients.trust_region import conjugate_gradient, fisher_product, flatten, line_search, write
-from bidex_algos.nets.encoders.inputs import Inputs
+from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import GaussianActor, gaussian_kl
+from bidex_algos.trust_region import conjugate_gradient, fisher_product, flatten, line_search, write
 from bidex_meta.world.contract import plain_groups
 
 

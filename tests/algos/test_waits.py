@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bidex_algos.experience import rollout
+from bidex_algos import rollout
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_meta import Benchmark
 from tests.world.play import suite_world
@@ -17,12 +17,11 @@ CONFIG = MTPPOConfig(hidden=(16,), rollout_steps=4, num_minibatches=2, epochs=2,
 
 
 OPTIONS = {
-    "ppo": {},
-    "pcgrad": {"gradient_surgery": "pcgrad", "policy_heads": True},
+    "ppo": {}, "pcgrad": {"gradient_surgery": "pcgrad", "policy_heads": True},
     "cagrad": {"gradient_surgery": "cagrad", "architecture": "paco"},
     "famo": {"gradient_surgery": "famo", "architecture": "moore"},
     "soft_modules": {"architecture": "soft_modules", "hidden": (16, 16)},
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bidex_meta.clients.needs import extra
 from bidex_meta.errors import BidexError
-from bidex_meta.world.numpy_form import NumpyWorld
+from bidex_meta.world.wrapper import NumpyWorld
 from tests.points import PointWorld, ring
 from tests.world.play import class_world, suite_world
 

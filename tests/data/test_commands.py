@@ -20,8 +20,8 @@ from bidex_meta.data.checking import verify
 from bidex_meta.data.writer import DatasetWriter, estimated_bytes, finish
 from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder
-from bidex_meta.sources import Source
 from bidex_meta.sources.source import OwnSuite
+from bidex_meta.worlds import Worlds
 from tests.data.worlds import changed, printed, rough
 from tests.pages import ROOT
 
@@ -89,7 +89,7 @@ def test_a_real_class_its_rewards_and_a_damaged_copy(real: Dataset, capsys: pyte
 
 def recorded(folder: Path, **config: Any) -> Dataset:
     """Uniform actions in two rows of what a config names."""
-    source = Source.open({"seed": 0, "threads": 1, **config})
+    source = Worlds.open({"seed": 0, "threads": 1, **config})
     world, out = source.world("train", 2), DatasetWriter(folder)
     try:
         collect.collect(world, [collect.Actor(None)], out, 60, 0, lambda now, seconds: None)

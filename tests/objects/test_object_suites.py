@@ -8,12 +8,11 @@ import torch
 
 from bidex_meta import Benchmark, make_task_world
 from bidex_meta.cli import main
-from bidex_meta.evaluation.play import evaluate
-from bidex_meta.evaluation.untrained import RandomAgent
-from bidex_meta.sources import Source
+from bidex_meta.evaluation.play import RandomAgent, evaluate
 from bidex_meta.suite import load_suite
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import compile_scene
+from bidex_meta.worlds import Worlds
 
 FOUR = ["CatchUnderarm-egg", "CatchUnderarm-block", "CatchUnderarm-gelatin_box", "CatchUnderarm-tennis_ball"]
 
@@ -54,7 +53,7 @@ def test_a_held_out_object_is_a_test_split() -> None:
 def test_success_is_told_by_object(tmp_path: Path) -> None:
     text = load_suite("MT1-objects").file.read_text()
     (tmp_path / "one.toml").write_text(text.replace("tasks_per_class = 50", "tasks_per_class = 1"))
-    source = Source.open({"suite": str(tmp_path / "one.toml"), "threads": 1})
+    source = Worlds.open({"suite": str(tmp_path / "one.toml"), "threads": 1})
     assert list(source.tasks("train")) == FOUR
     world = source.world("train", 4)
     found = evaluate(RandomAgent(world.action_space), world, 1, seed=0, references=source.references())

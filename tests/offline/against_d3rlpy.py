@@ -26,7 +26,7 @@ from bidex_meta.commands.run_data import implied, task_seed
 from bidex_meta.data import open_dataset
 from bidex_meta.data.joined import Joined, join
 from bidex_meta.evaluation.play import EVALUATION_SEED
-from bidex_meta.sources import Source
+from bidex_meta.worlds import Worlds
 
 ALGOS = ("td3bc", "iql")
 TRAIN = Path(__file__).with_name("d3rlpy_train.py")
@@ -130,7 +130,7 @@ def main() -> None:
     flags = parser.parse_args()
     dataset = open_dataset(flags.dataset)
     config = {"suite": None, "task": None, **implied([dataset]), "task_seed": task_seed([dataset])}
-    source = Source.open(config)
+    source = Worlds.open(config)
     world, tested = source.world("train", len(source.tasks("train")), "SAME_STEP"), source.world()
 
     def judge(agent: Any) -> float:

@@ -15,7 +15,6 @@ from bidex_algos.offline.bc import BC, BCConfig
 from bidex_algos.offline.bcq import BCQ, BCQConfig, best_of
 from bidex_algos.offline.iql import IQL, IQLConfig, expectile_loss
 from bidex_algos.offline.td3bc import TD3BC, TD3BCConfig
-from bidex_meta.commands.learners import learner_kind
 from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
 from tests.algos.problems import PointMass, discounted_return, one_step_bandit, opposite_bandits
@@ -23,19 +22,11 @@ from tests.algos.resume import resumed
 from tests.offline.stored import as_data, noisy, played
 
 PLAIN: dict[str, Any] = {
-    "hidden": (32, 32),
-    "batch_size": 128,
-    "updates_per_iteration": 200,
-    "learning_rate": 3e-3,
-    "autocast": "off",
-}
+    "hidden": (32, 32), "batch_size": 128, "updates_per_iteration": 200, "learning_rate": 3e-3, "autocast": "off",
+}  # fmt: skip
 VALUED: dict[str, Any] = {
-    **PLAIN,
-    "critic_learning_rate": 5e-3,
-    "gamma": 0.8,
-    "tau": 0.02,
-    "critic_layer_norm": False,
-}
+    **PLAIN, "critic_learning_rate": 5e-3, "gamma": 0.8, "tau": 0.02, "critic_layer_norm": False,
+}  # fmt: skip
 SMALL: dict[str, tuple[Any, Any]] = {
     "bc": (BC, BCConfig(**PLAIN)),
     "td3bc": (TD3BC, TD3BCConfig(**VALUED)),
@@ -267,34 +258,3 @@ def test_a_checkpoint_of_other_data_is_refused() -> None:
         other.load_state_dict(learner.state_dict())
     with pytest.raises(BidexError, match="Call learn_from first"):
         BC(world, SMALL["bc"][1], seed=0).iterate()
-
-
-def test_presets_are_table_46() -> None:
-    paper = {name: learner_kind(name).presets["paper"] for name in SMALL}
-    table = {
-        "bcq": ((400, 300), 1e-3, 0.99, 0.005, 100),
-        "td3bc": ((256, 256), 3e-4, 0.99, 0.005, 256),
-        "iql": ((256, 256), 3e-4, 0.99, 0.005, 256),
-    }
-    for name, numbers in table.items():
-        of = paper[name]
-        assert (of.hidden, of.learning_rate, of.gamma, of.tau, of.batch_size) == numbers
-        assert of.critic_learning_rate == of.learning_rate
-    assert (paper["bcq"].perturbation, paper["bcq"].candidates) == (0.05, 10)
-    assert paper["td3bc"].alpha == 0.2 and (paper["iql"].beta, paper["iql"].expectile) == (3.0, 0.7)
-
-
-@pytest.mark.parametrize(
-    ("kind", "options", "told"),
-    [
-        (IQLConfig, {"expectile": 1.0}, r"iql: expectile must lie in \(0, 1\)"),
-        (IQLConfig, {"beta": -1.0}, "iql: beta must be at least 0"),
-        (TD3BCConfig, {"policy_delay": 0}, "td3bc: policy_delay must be at least 1"),
-        (BCQConfig, {"candidates": 0}, "bcq: candidates must be at least 1"),
-        (BCQConfig, {"gamma": 1.0}, r"bcq: gamma must lie in \[0, 1\)"),
-        (BCConfig, {"batch_size": 0}, "bc: batch_size must be at least 1"),
-    ],
-)
-def test_bad_options_are_named(kind: Any, options: dict[str, Any], told: str) -> None:
-    with pytest.raises(BidexError, match=told):
-        kind(**options)

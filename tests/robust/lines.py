@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from bidex_meta.cli import main
-from bidex_meta.clients import metaworld_world
+from bidex_meta.metaworld import batched
 from bidex_meta.world import world as world_module
 
 
@@ -34,7 +34,7 @@ def working_folder(folder: Path, patch: pytest.MonkeyPatch) -> Path:
 
     patch.chdir(folder)
     patch.setattr(world_module.World, "__init__", built)
-    patch.setattr(metaworld_world.MetaWorldWorld, "__init__", built)
+    patch.setattr(batched.MetaWorldWorld, "__init__", built)
     for what in ("draw_learning", "draw_adaptation", "missing"):  # drawing takes a second
         patch.setattr(f"bidex_meta.record.plots.{what}", built)
     return folder

@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 from bidex_meta import Benchmark
 from bidex_meta.benchmark import Task, make_task_world
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.play import evaluate
-from bidex_meta.evaluation.untrained import ZeroAgent
+from bidex_meta.evaluation.play import ZeroAgent, evaluate
 from bidex_meta.suite import load_suite
 
 ROWS = 2

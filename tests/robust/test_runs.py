@@ -14,7 +14,7 @@ import torch
 
 from bidex_meta.cli import main
 from bidex_meta.record import RunFolder
-from bidex_meta.sources.source import OwnSuite
+from bidex_meta.worlds.own import OwnSuite
 from tests.fakes import ToyWorld
 
 SMALL = ["--suite", "MT4", "--num-envs", "6", "--threads", "1", "--device", "cpu", "--learner.hidden", "8"]
@@ -169,7 +169,7 @@ def test_a_deleted_run_folder_is_one_line(run: Path, capsys: pytest.CaptureFixtu
 _WAIT = """
 import sys, time
 from bidex_meta.cli import main
-from bidex_meta.sources.source import OwnSuite
+from bidex_meta.worlds.own import OwnSuite
 def world(*_):
     print("building", flush=True)
     time.sleep(60)

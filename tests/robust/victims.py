@@ -23,8 +23,9 @@ from torch import Tensor
 
 from bidex_meta.cli import main
 from bidex_meta.commands.learners import learner_kind
-from bidex_meta.sources.source import OwnSuite, Source
 from bidex_meta.train import runner
+from bidex_meta.worlds import Worlds
+from bidex_meta.worlds.own import OwnSuite
 from tests.fake_world import FakePools
 from tests.points import ring
 from tests.robust.marks import Marks, instrument
@@ -190,7 +191,7 @@ def serve() -> None:
     for algo in FLAGS:
         learner_kind(algo)
     for suite in ("MT4", "ML4"):
-        Source.open({"suite": suite}).task_classes()
+        Worlds.open({"suite": suite}).task_classes()
     answers = os.fdopen(os.dup(1), "w")
     for line in sys.stdin:
         print(json.dumps(do(json.loads(line))), file=answers, flush=True)

@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from bidex_meta.clients import metaworld_world
 from bidex_meta.errors import BidexError
+from bidex_meta.metaworld import batched
 from bidex_meta.record.versions import git_state
 from tools.bench import against, field
 from tools.bench.__main__ import main
@@ -83,7 +83,7 @@ def test_bench_field_measures_what_is_installed(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(field, "importlib", SimpleNamespace(import_module=missing))
     monkeypatch.setattr(field, "_SUITES", ("MT1",))
     monkeypatch.setattr(metaworld, "_N_GOALS", 2)  # drawing all fifty tasks of a class takes seconds
-    monkeypatch.setattr(metaworld_world, "TASKS_PER_CLASS", 2)
+    monkeypatch.setattr(batched, "TASKS_PER_CLASS", 2)
     found = field.field(num_envs=4, steps=20, repeats=1, seed=1919)  # no other test's tasks stay cached as two
     assert list(found["skipped"]) == ["gymnasium-robotics"]
     theirs, through_ours, ours = found["table"]

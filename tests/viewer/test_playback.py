@@ -10,16 +10,16 @@ import torch
 
 from bidex_meta import drawing
 from bidex_meta.cli import main
-from bidex_meta.evaluation.untrained import ZeroAgent
-from bidex_meta.sources import Source
+from bidex_meta.evaluation.play import ZeroAgent
 from bidex_meta.viewer import playback
 from bidex_meta.viewer.browser import colour, shape, visible
 from bidex_meta.viewer.playback import Stage
+from bidex_meta.worlds import Worlds
 
 
 @pytest.fixture(scope="module")
 def world():
-    return Source.open({"suite": "MT4", "threads": 1}).world("train", 4)
+    return Worlds.open({"suite": "MT4", "threads": 1}).world("train", 4)
 
 
 @pytest.fixture

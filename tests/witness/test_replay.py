@@ -9,13 +9,13 @@ from bidex_meta import paths
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
 from bidex_meta.record.versions import collect_versions
-from bidex_meta.sources.source import OwnSuite
 from bidex_meta.tasks import registry
 from bidex_meta.witness.controller import rest_action
 from bidex_meta.witness.demonstrators import OpenLoopReplay
 from bidex_meta.witness.replay import SHIFT, Replay, Simulator, replay, task_slot
 from bidex_meta.witness.store import LEVELS, Witness, load_witness, quantised, save_witness, witness_path
 from bidex_meta.world import World
+from bidex_meta.worlds.own import OwnSuite
 
 
 def random_actions(steps: int) -> torch.Tensor:

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bidex_meta.engine.identity import model_identity
+from bidex_meta.engine.models import model_identity
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import compile_scene
 from tests import goldens

@@ -1,8 +1,6 @@
 import numpy as np
-import pytest
 import torch
 
-from bidex_meta.errors import BidexError
 from bidex_meta.world import World
 from tests.world.play import assert_same, play, random_actions, suite_world
 
@@ -65,16 +63,6 @@ def test_episodes_draw_among_the_new_tasks() -> None:
     assert seen == {0, 1}
 
 
-def test_a_reset_must_follow() -> None:
-    world = suite_world("MT4", 4)
-    world.reset(seed=0)
-    world.set_tasks({"HandOver": pool(world, "HandOver", 1)})
-    with pytest.raises(BidexError, match=r"reset\(\) before step\(\)"):
-        world.step(torch.zeros(4, 52))
-    world.reset()
-    world.step(torch.zeros(4, 52))
-
-
 def test_starts_go_on_with_the_next_episodes() -> None:
     world = suite_world("MT4", 4, "DISABLED")
     first, _ = world.reset(seed=0)
@@ -82,24 +70,3 @@ def test_starts_go_on_with_the_next_episodes() -> None:
     second, _ = world.reset()
     assert (first != second).any(dim=1).all()
     assert world.episodes.number.tolist() == [1] * 4
-
-
-@pytest.mark.parametrize(
-    ("tasks", "message"),
-    [
-        ({"HandOvr": np.zeros((1, 5))}, "Expected a slot among .*got 'HandOvr'"),
-        ({"HandOver": np.zeros((1, 4))}, r"HandOver with shape \(n, 5\), got \(1, 4\)"),
-        ({"HandOver": np.zeros(5)}, r"HandOver with shape \(n, 5\), got \(5,\)"),
-        ({"HandOver": np.zeros((0, 5))}, r"HandOver with shape \(n, 5\), got \(0, 5\)"),
-        ({"TwoCatchUnderarm": np.zeros((2, 5))}, r"TwoCatchUnderarm with shape \(n, 8\)"),
-    ],
-)
-def test_bad_tasks_are_named_and_change_nothing(tasks: dict[str, np.ndarray], message: str) -> None:
-    world = suite_world("MT4", 4)
-    world.reset(seed=0)
-    good = pool(world, "CatchUnderarm", 1)
-    with pytest.raises(BidexError, match=message):
-        world.set_tasks({"CatchUnderarm": good, **tasks})
-    assert world.num_slot_tasks == [50] * 4
-    assert [len(slot.tasks) for slot in world.slots] == [50] * 4
-    world.step(torch.zeros(4, 52))

@@ -11,8 +11,7 @@ from torch.func import functional_call
 
 from bidex_algos.meta.adaptation import Adapter, Params, TaskBatch, detached
 from bidex_algos.meta.config import MetaConfig
-from bidex_algos.meta.stage import Stage, task_batch
-from bidex_algos.meta.task_rows import TaskRows
+from bidex_algos.meta.stage import Stage, TaskRows, task_batch
 from bidex_algos.nets.networks import GaussianActor, gaussian_log_prob
 from bidex_meta.world.threads import set_up_torch
 

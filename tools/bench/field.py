@@ -13,8 +13,8 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 
 from bidex_meta.benchmark import Benchmark
-from bidex_meta.clients.metaworld_world import MetaWorldWorld
 from bidex_meta.engine.cpu import default_threads
+from bidex_meta.metaworld.batched import MetaWorldWorld
 from bidex_meta.tasks.base import CONTROL_RATE
 
 _METAWORLD_ROWS = 10

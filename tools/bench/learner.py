@@ -13,8 +13,8 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor, nn
 
 from bidex_algos.onpolicy.mtppo import MTPPO, PRESETS, MTPPOConfig
+from bidex_meta.world.base import make_spaces
 from bidex_meta.world.contract import plain_groups
-from bidex_meta.world.spaces import make_spaces
 
 _END = 0.01
 """Chance of a step to end its episode, half of it by a time limit."""

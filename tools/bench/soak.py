@@ -15,9 +15,9 @@ from bidex_meta.config import Steps
 from bidex_meta.engine.cpu import default_threads
 from bidex_meta.errors import BidexError
 from bidex_meta.record.atomic import write_json
-from bidex_meta.sources import Source
 from bidex_meta.world.contract import PooledWorld
 from bidex_meta.world.wrapper import PooledWorldWrapper
+from bidex_meta.worlds import Worlds
 from tools.bench.drift import judge
 
 _SAMPLE_SECONDS = 60.0
@@ -73,14 +73,14 @@ def soak(
         ``noise_percent``, the standard deviation of samples about that line; ``holds``, and ``verdict`` in words.
 
     Raises:
-        BidexError: No time at all, or what ``Source.world`` refuses.
+        BidexError: No time at all, or what ``Worlds.world`` refuses.
     """
     if minutes is not None and minutes <= 0:
         raise BidexError(f"--minutes must be more than 0, not {minutes:g}.")
     import scipy.stats  # noqa: F401  (judge takes it; imported after the first samples it would pass for a leak)
 
     minutes = _MINUTES if minutes is None and steps is None else minutes
-    source = Source.open({"suite": suite, "seed": seed, "threads": threads, "device": device, "engine": engine})
+    source = Worlds.open({"suite": suite, "seed": seed, "threads": threads, "device": device, "engine": engine})
     # The wrapper asks the world for what the protocol declares.
     kind, config = (None, None) if algo is None else chosen_learner(algo, device)
     mode = "SAME_STEP" if kind is None else kind.autoreset(vars(config))

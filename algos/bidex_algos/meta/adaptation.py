@@ -11,12 +11,45 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.func import grad
 
-from bidex_algos.choices import Adapted, StepSizeKind
-from bidex_algos.meta.step_sizes import StepSizes
 from bidex_algos.nets.networks import GaussianActor, gaussian_kl, gaussian_log_prob, stacked_forward
+
+Adapted = Literal["all", "head"]
+"""Which parameters an inner step moves: all, or those of the mean's output layer."""
+StepSizeKind = Literal["fixed", "layer", "weight"]
+"""Whether sizes of the inner step are learned, and of what; see :class:`StepSizes`."""
+
+
+class StepSizes(nn.Module):
+    """A factor of the inner step for each tensor (``layer``), or each entry of it (``weight``), that it moves."""
+
+    def __init__(self, actor: nn.Module, moved: list[str], kind: StepSizeKind):
+        super().__init__()
+        sizes = {name: p.shape if kind == "weight" else () for name, p in actor.named_parameters() if name in moved}
+        self.factors = nn.ParameterDict({_key(name): torch.ones(size) for name, size in sizes.items()})
+
+    def __getitem__(self, name: str) -> Tensor:
+        """Factor of a parameter: a scalar, or of the parameter's shape."""
+        return self.factors[_key(name)]
+
+    @torch.no_grad()
+    def project(self) -> None:
+        """Moves factors below 0 back to it: a step uphill would unlearn."""
+        for factor in self.parameters():
+            factor.clamp_(min=0.0)
+
+    @torch.no_grad()
+    def mean(self) -> Tensor:
+        """Mean factor over tensors and their entries, a scalar."""
+        return torch.cat([factor.flatten() for factor in self.parameters()]).mean()
+
+
+def _key(name: str) -> str:
+    """Names of parameters must not hold dots."""
+    return name.replace(".", "/")
+
 
 Params = dict[str, Tensor]
 """Parameters of an actor by name; stacked ones have a first axis of tasks."""
@@ -33,18 +66,12 @@ that all take."""
 class TaskBatch:
     """What was sampled in one stage of adaptation, by task: B transitions of each of M tasks."""
 
-    obs: Tensor
-    """Normalised observations (M, B, d)."""
-    actions: Tensor
-    """Sampled actions (M, B, a)."""
-    old_means: Tensor
-    """Means of the policies that sampled (M, B, a)."""
-    old_log_stds: Tensor
-    """Logarithms of their standard deviations (M, a)."""
-    advantages: Tensor
-    """Normalised within each task (M, B)."""
-    weights: Tensor
-    """1, or 0 for what teaches nothing: after an episode's end, or where physics broke (M, B)."""
+    obs: Tensor  # normalised observations (M, B, d)
+    actions: Tensor  # sampled actions (M, B, a)
+    old_means: Tensor  # means of the policies that sampled (M, B, a)
+    old_log_stds: Tensor  # logarithms of their standard deviations (M, a)
+    advantages: Tensor  # normalised within each task (M, B)
+    weights: Tensor  # 1, or 0 for what teaches nothing: after an episode's end, or where physics broke (M, B)
 
     def tensors(self) -> tuple[Tensor, ...]:
         """The fields, in order."""

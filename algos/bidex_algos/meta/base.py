@@ -4,44 +4,41 @@ They differ in the outer step alone. An iteration::
 
     draw tasks; every task starts from the meta-parameters
     for each stage k = 0 ... inner_steps:
-        every row plays one episode by its task's parameters          D_k
+        every environment plays one episode by its task's parameters          D_k
         theta_k+1 = theta_k + inner_learning_rate * gradient on D_k   (not after the last)
     outer step of the meta-parameters on D_0 ... D_K
 """
 
 from abc import abstractmethod
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.experience.rollout import may_look
-from bidex_algos.learner import Learner
+from bidex_algos.learner import Learner, as_numbers
 from bidex_algos.meta.adaptation import Objective, TaskBatch, detached
 from bidex_algos.meta.config import MetaConfig, OuterConfig
 from bidex_algos.meta.meta_policy import MetaPolicy, make_meta_policy
-from bidex_algos.meta.stage import Outcome, Stage, moments, task_batch
-from bidex_algos.meta.task_rows import TaskRows
+from bidex_algos.meta.stage import Outcome, Stage, TaskRows, moments, task_batch
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.shape import Shape
-from bidex_algos.reports import as_numbers
+from bidex_algos.rollout import may_look
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import world_size
+from bidex_meta.train.learner import AutoresetMode, Parts, State
 from bidex_meta.world.contract import PooledWorld
 
 
 class MetaLearner(Learner):
     """Learns parameters from which one gradient step on a task's own data goes far.
 
-    Arguments and attributes are those of :class:`~bidex_algos.learner.Learner`; the world hides its goals.
-
     Attributes:
         policy: The adapting agent that evaluation uses; the learner itself never adapts it.
         pools: The tasks of each class that meta-batches are drawn from.
-        rows: Which rows play the same task of the present meta-batch.
+        rows: Which environments play the same task of the present meta-batch.
 
     Raises:
-        BidexError: Several processes, or a class with fewer rows than it has tasks in a meta-batch.
+        BidexError: Several processes, or a class with fewer environments than it has tasks in a meta-batch.
     """
 
     world: PooledWorld
@@ -50,8 +47,7 @@ class MetaLearner(Learner):
     remedy = "lower inner_learning_rate or the outer step"
     objective: ClassVar[Objective]
     """What its inner step follows."""
-    adapts: ClassVar[bool] = True
-    """Its policy adapts to a task: evaluation measures before and after."""
+    adapts = True
 
     def __init__(self, world: PooledWorld, config: OuterConfig, seed: int):
         if world_size() > 1:
@@ -71,10 +67,10 @@ class MetaLearner(Learner):
             sizes = list(self.policy.step_sizes.parameters())
             self.adam.add_param_group({"params": sizes, "lr": config.step_size_rate})
 
-    @staticmethod
-    def autoreset(config: dict[str, Any]) -> str:
-        """The world's mode: whole episodes wait for each other, slices of them go on."""
-        return "DISABLED" if config["slice_steps"] is None else "SAME_STEP"
+    @classmethod
+    def autoreset_mode(cls, config: OuterConfig) -> AutoresetMode:
+        """Whole episodes wait for each other, slices of them go on."""
+        return "DISABLED" if config.slice_steps is None else "SAME_STEP"
 
     def _check_rows(self) -> None:
         rows = torch.bincount(self.world.task_id, minlength=self.world.num_tasks).tolist()
@@ -82,8 +78,8 @@ class MetaLearner(Learner):
             tasks = min(self.config.tasks_per_class, len(pool))
             if count < tasks:
                 raise BidexError(
-                    f"{self.name}: {name} has {count} rows for {tasks} tasks of a meta-batch. Use num_envs of at least "
-                    f"{tasks * self.world.num_tasks}, or lower tasks_per_class."
+                    f"{self.name}: {name} has {count} environments for {tasks} tasks of a meta-batch. Use num_envs of "
+                    f"at least {tasks * self.world.num_tasks}, or lower tasks_per_class."
                 )
 
     # What a learner adds.
@@ -148,7 +144,7 @@ class MetaLearner(Learner):
 
     @torch.no_grad()
     def _sample(self, params: dict[str, Tensor], seen: RunningStats) -> tuple[Stage, Outcome]:
-        """A whole episode, or a slice, in every row. Raw observations go into ``seen``: the stage's are clipped."""
+        """A whole episode, or a slice, in every environment; raw observations go into ``seen``, clipped ones on."""
         policy, rows, stage = self.policy, self.rows, Stage()
         if self.config.slice_steps is None:
             horizon = min(int(self.world.max_episode_steps.max()), self.config.max_adapt_steps)
@@ -219,26 +215,21 @@ class MetaLearner(Learner):
     def _make_policy(cls, config: MetaConfig, shape: Shape, init: torch.Generator, device: torch.device) -> MetaPolicy:
         return make_meta_policy(config, cls.objective, cls._inputs(config, shape), shape.actions, init).to(device)
 
-    def policy_state_dict(self) -> dict[str, Any]:
+    def policy_state_dict(self) -> State:
         """What :meth:`load_policy` needs: network, statistics, sizes, config, and the seed that it explores by."""
         return super().policy_state_dict() | {"seed": self.seed}
 
     @classmethod
-    def load_policy(cls, state: dict[str, Any], device: str | torch.device = "cpu") -> MetaPolicy:
-        """The adapting agent of a checkpoint, for a world of any number of rows.
-
-        Args:
-            state: ``checkpoint["learner"]["policy"]``.
-            device: Where to run it.
-        """
+    def load_policy(cls, state: State, device: str | torch.device = "cpu") -> MetaPolicy:
+        """The adapting agent of a checkpoint (``learner.policy``), for a world of any number of environments."""
         policy = super().load_policy(state, device)
         policy.seed = state["seed"]
         return policy
 
-    def _parts(self) -> dict[str, Any]:
+    def _parts(self) -> Parts:
         return {**self._optimisers(), "generator": self.generator, "tasks_generator": self.tasks_generator}
 
-    def _place(self) -> dict[str, Any]:
+    def _place(self) -> State:
         return {
             "rows": self.rows.task_of_row,
             "obs": self.obs,
@@ -247,12 +238,12 @@ class MetaLearner(Learner):
             **super()._place(),
         }
 
-    def _go_on_from(self, state: dict[str, Any]) -> None:
+    def _go_on_from(self, state: State) -> None:
         super()._go_on_from(state)
         self.rows = TaskRows(state["rows"].to(self.device))
         self.obs = None if state["obs"] is None else state["obs"].to(self.device, copy=True)
         self.elapsed = state["elapsed"].to(self.device, copy=True)
         self.steps_with_tasks = int(state["steps_with_tasks"])
 
-    def _check_size(self, state: dict[str, Any]) -> None:
-        self._expect("", f"{len(state['elapsed'])} rows", f"{self.world.num_envs} rows")
+    def _check_size(self, state: State) -> None:
+        self._expect("", f"{len(state['elapsed'])} environments", f"{self.world.num_envs} environments")

@@ -1,118 +1,92 @@
 """What can be set about every gradient-based meta-learner; imports no torch, so that a command line can show it."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
-from bidex_algos.checks import at_least, between, network_bytes, positive, rising, types
-from bidex_algos.choices import Activation, Adapted, StepSizeKind
+from bidex_algos.meta.adaptation import Adapted, StepSizeKind
+from bidex_algos.nets.architecture import network_bytes
+from bidex_algos.nets.networks import Activation, Layers
+from bidex_meta.train.learner import LearnerConfig
+from bidex_meta.validation import Count, Fraction, Positive, check_rising
 
 
 @dataclass(frozen=True)
-class MetaConfig:
+class MetaConfig(LearnerConfig):
     """Policy, sampling and inner steps; the defaults are the preset ``laptop``."""
 
-    algo: ClassVar[str] = "meta"
-    """How the learner calls itself in messages."""
-
-    hidden: tuple[int, ...] = (128, 128)
+    hidden: Layers = (128, 128)
     """Widths of the policy's hidden layers."""
     activation: Activation = "tanh"
     """Non-linearity of the hidden layers."""
-    init_std: float = 0.8
+    init_std: Positive = 0.8
     """Standard deviation of the actions at the start; part of what is adapted."""
-    std_range: tuple[float, float] = (0.1, 1.5)
+    std_range: tuple[Positive, Positive] = (0.1, 1.5)
     """Bounds of the standard deviation of the actions."""
-    tasks_per_class: int = 3
+    tasks_per_class: Count = 3
     """Tasks of each class in a meta-batch, drawn anew for each; fewer where a class has fewer. The class's rows are
     split over them: that many rollouts has each."""
-    max_adapt_steps: int = 150
+    max_adapt_steps: Count = 150
     """Longest episode that is played to adapt."""
-    slice_steps: int | None = None
+    slice_steps: Count | None = None
     """Adapt on so many steps of running episodes, as Bi-DexHands did, instead of whole ones; None: whole ones."""
-    inner_steps: int = 1
+    inner_steps: Count = 1
     """Adaptation steps before the outer objective is measured."""
-    inner_learning_rate: float = 0.1
+    inner_learning_rate: Positive = 0.1
     """Size of an adaptation step."""
     adapted: Adapted = "all"
     """What an adaptation step moves: all parameters, or the mean's output layer alone (ANIL, Raghu et al. 2020)."""
     step_sizes: StepSizeKind = "fixed"
     """Whether the outer step learns sizes of the inner one, from inner_learning_rate on: of each tensor (layer,
     MAML++), of each weight (Meta-SGD), or of none (fixed)."""
-    step_size_rate: float = 0.01
+    step_size_rate: Positive = 0.01
     """Adam's step size for these, as shares of inner_learning_rate. A trust region moves them with all else."""
     advantage_scale: Literal["std", "variance"] = "std"
     """What advantages are divided by in each task. With the variance, as in garage and Meta-World's baselines, the
     inner step depends on the scale of the rewards."""
     first_order: bool = False
     """Leave out the second derivatives of the inner step."""
-    gamma: float = 0.95
+    gamma: Fraction = 0.95
     """Discount per step."""
-    lam: float = 1.0
+    lam: Fraction = 1.0
     """Trace decay of the advantage estimate."""
     normalise_observations: bool = True
     """Give observations zero mean and unit variance by running statistics."""
 
     def __post_init__(self) -> None:
-        """Rejects values that could only fail later.
+        """Checks what annotations cannot say."""
+        super().__post_init__()
+        check_rising(self, self.algo, "std_range")
 
-        Raises:
-            BidexError: A field is out of its range.
-        """
-        types(self)
-        at_least(self, 1, "tasks_per_class", "max_adapt_steps", "inner_steps")
-        if self.slice_steps is not None:
-            at_least(self, 1, "slice_steps")
-        between(self, 0.0, 1.0, "gamma", "lam")
-        positive(self, "inner_learning_rate", "step_size_rate", "init_std")
-        rising(self, "std_range")
-
-    def bytes_held(self, rows: int, width: int) -> int:
-        """About how much memory a learner takes on so many rows.
-
-        Args:
-            rows: Rows of its world.
-            width: Numbers that are kept of a step of a row.
-        """
+    def bytes_held(self, num_envs: int, width: int) -> int:
+        """As in the base."""
         steps = (self.slice_steps or self.max_adapt_steps) * (1 + self.inner_steps)
-        return 4 * rows * width * steps + network_bytes(self.hidden, width, 2)
+        return 4 * num_envs * width * steps + network_bytes(self.hidden, width, 2)
 
 
 class OuterConfig(MetaConfig):
     """What the outer steps share. The learners' configs hold these as fields, each in its own place among the flags."""
 
-    outer_learning_rate: float
+    outer_learning_rate: Positive
     """Adam's step size for the meta-parameters."""
-    max_grad_norm: float
+    max_grad_norm: Positive
     """Meta-gradients longer than this are shortened to it."""
 
 
 # Table 48 of the Bi-DexHands appendix (ProMP), but for its outer step: eight steps of running episodes, and an inner
 # step which moves the weights too little to matter.
 TABLE_48: dict[str, Any] = {
-    "hidden": (2048, 1024, 512),
-    "activation": "elu",
-    "init_std": 1.0,
-    "slice_steps": 8,
-    "inner_steps": 1,
-    "inner_learning_rate": 3e-4,
-    "gamma": 0.9,
-    "lam": 0.95,
-    "normalise_observations": False,
-}
+    "hidden": (2048, 1024, 512), "activation": "elu", "init_std": 1.0, "slice_steps": 8, "inner_steps": 1,
+    "inner_learning_rate": 3e-4, "gamma": 0.9, "lam": 0.95, "normalise_observations": False,
+}  # fmt: skip
 
 # For what MT-PPO's preset laptop has learned on the same tasks (--start-from): its network and discount. Inner steps of
 # 0.1 lost more than they gained. Before any meta-training (seed 0) five shots of 100 episodes moved the return on
 # ML1-wide's held-out task, 8, by +2.2 with inner steps of 0.05, whether all layers move or the head alone, by +0.8 with
 # 0.02; a trace of 0.95 by +1.7, of 0.7 by 0.0, of 0.5 by -1.7 (4 to 6 trials, intervals of about 1.2 to either side).
 TUNED: dict[str, Any] = {
-    "hidden": (256, 256, 128),
-    "activation": "elu",
-    "std_range": (0.05, 1.5),
-    "adapted": "head",
-    "inner_learning_rate": 0.05,
-    "gamma": 0.93,
-    "lam": 0.9,
-}
+    "hidden": (256, 256, 128), "activation": "elu", "std_range": (0.05, 1.5), "adapted": "head",
+    "inner_learning_rate": 0.05, "gamma": 0.93, "lam": 0.9,
+}  # fmt: skip
 
 # The same where the test tasks are of classes that nobody has trained on (ML4, ML20): smaller steps and whole episodes.
 # docs/results/ml20.md: adapted to the first 150 of its 500 steps LiftUnderarm lost 317 of return, to all it gained 352.

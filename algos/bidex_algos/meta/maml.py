@@ -10,25 +10,55 @@ The outer step on one meta-batch with stages D_0 ... D_K::
 theta_K depends on theta through the inner steps; ``first_order`` leaves their derivative out.
 """
 
+from dataclasses import dataclass
+from typing import Literal
+
 import torch
 from torch import Tensor
 
-from bidex_algos.gradients.trust_region import trust_region_step
 from bidex_algos.meta.adaptation import TaskBatch, weighted_mean
 from bidex_algos.meta.base import MetaLearner
-from bidex_algos.meta.maml_config import PRESETS, MAMLConfig
+from bidex_algos.meta.config import TABLE_48, TUNED, UNSEEN, OuterConfig
+from bidex_algos.trust_region import trust_region_step
+from bidex_meta.validation import Count, Fraction, NonNegative, Positive
 
-__all__ = ["MAML", "PRESETS", "MAMLConfig"]
+
+@dataclass(frozen=True)
+class MAMLConfig(OuterConfig):
+    """Everything that can be set about MAML; the defaults are the preset ``laptop``."""
+
+    outer: Literal["trpo", "adam"] = "trpo"
+    """How the meta-parameters move: a trust-region step, as in the paper, or one step of Adam."""
+    outer_learning_rate: Positive = 1e-3
+    """Adam's step size for the meta-parameters."""
+    max_grad_norm: Positive = 1.0
+    """Before a step of Adam, meta-gradients longer than this are shortened to it."""
+    max_kl: Positive = 0.01
+    """Mean KL of the adapted policies from those that sampled that a trust-region step may not exceed."""
+    damping: NonNegative = 1e-2
+    """Added to the diagonal of the Fisher matrix."""
+    cg_iterations: Count = 10
+    """Conjugate-gradient iterations."""
+    backtracks: Count = 15
+    """Points that the line search tries."""
+    backtrack_factor: Fraction = 0.8
+    """By which the line search shortens the step."""
+
+
+PRESETS: dict[str, MAMLConfig] = {
+    # The Bi-DexHands appendix has no table for MAML: all but the trust region, MAML's own, is as in ProMP's.
+    "paper": MAMLConfig(**TABLE_48, max_kl=0.01, damping=1e-5),
+    "tuned": MAMLConfig(**TUNED),
+    "unseen": MAMLConfig(**UNSEEN),
+    "laptop": MAMLConfig(),
+}
 
 
 class MAML(MetaLearner):
-    """MAML (Finn et al. 2017, arXiv 1703.03400) with a trust region.
-
-    Arguments and attributes are those of its base.
-    """
+    """MAML (Finn et al. 2017, arXiv 1703.03400) with a trust region."""
 
     name, objective = "maml", "likelihood"
-    config_type = MAMLConfig
+    config_type, presets = MAMLConfig, PRESETS
     config: MAMLConfig
 
     def _optimisers(self) -> dict[str, torch.optim.Optimizer]:

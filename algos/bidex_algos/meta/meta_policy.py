@@ -5,9 +5,8 @@ from torch import Tensor, nn
 
 from bidex_algos.meta.adaptation import Adapter, Objective, Params, detached
 from bidex_algos.meta.config import MetaConfig
-from bidex_algos.meta.stage import Stage, task_batch
-from bidex_algos.meta.task_rows import TaskRows
-from bidex_algos.nets.encoders.inputs import Inputs
+from bidex_algos.meta.stage import Stage, TaskRows, task_batch
+from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import GaussianActor
 from bidex_algos.nets.normalise import ObservationNormaliser
 from bidex_meta.agents import Timestep
@@ -16,14 +15,8 @@ from bidex_meta.agents import Timestep
 class MetaPolicy(nn.Module):
     """A Gaussian actor with adapted copies, one a task; follows the protocol of adapting agents (bidex_meta.agents).
 
-    Its own parameters are the meta-parameters. Before the first ``adapt`` every task plays by them.
-
-    Args:
-        observations: Normaliser of raw observations.
-        actor: Network on normalised observations.
-        config: Of the learner.
-        objective: What an inner step follows.
-        seed: Of the exploring actions.
+    Its own parameters are the meta-parameters. Before the first ``adapt`` every task plays by them. ``seed`` is that of
+    the exploring actions.
     """
 
     def __init__(
@@ -54,7 +47,7 @@ class MetaPolicy(nn.Module):
         self.elapsed: Tensor | None = None
 
     def assign(self, task_of_row: Tensor | None) -> None:
-        """Which rows play the same task and share what they learn (N,); None: each row a task of its own."""
+        """The task (N,) of each environment; those of one task share what they learn. None: each has its own."""
         self.rows = None if task_of_row is None else TaskRows(task_of_row)
         self.init()
 
@@ -73,7 +66,7 @@ class MetaPolicy(nn.Module):
 
     @torch.no_grad()
     def step(self, timestep: Timestep) -> None:
-        """Takes in one transition of every row."""
+        """Takes in one transition of every environment."""
         terminated, truncated = timestep.terminated.bool(), timestep.truncated.bool()
         valid = getattr(timestep, "valid", None)
         valid = torch.ones_like(terminated) if valid is None else valid
@@ -130,15 +123,6 @@ class MetaPolicy(nn.Module):
 def make_meta_policy(
     config: MetaConfig, objective: Objective, inputs: Inputs, actions: int, init: torch.Generator, seed: int = 0
 ) -> MetaPolicy:
-    """A policy with fresh weights.
-
-    Args:
-        config: Of the learner.
-        objective: What an inner step follows.
-        inputs: How the network reads an observation. Encoders are meta-learned: no inner step moves them.
-        actions: Number of actions.
-        init: CPU generator of the weights.
-        seed: Of the exploring actions.
-    """
+    """A policy with fresh weights of ``init``, a CPU generator; no inner step moves the encoders of ``inputs``."""
     actor = GaussianActor(inputs, config.hidden, actions, config.init_std, init, config.activation)
     return MetaPolicy(ObservationNormaliser(inputs, config.normalise_observations), actor, config, objective, seed)

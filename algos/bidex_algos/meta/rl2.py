@@ -2,41 +2,84 @@
 
 A trial is a few episodes of one task. The policy reads, beside the observation, its last action, the last reward and
 whether an episode ended, and keeps its memory from one episode of the trial to the next: what it finds out about the
-task in the first it may use in the next. An iteration plays one trial in every row, makes ``epochs`` passes over it in
-shuffled mini-batches of chunks, through which gradients flow back, and starts the next trial without memory. The very
-first trial only measures what statistics are made of.
-``docs/learners/rl2.md`` says what is done otherwise, and why.
+task in the first it may use in the next. An iteration plays one trial in every environment, makes ``epochs`` passes
+over it in shuffled mini-batches of chunks, through which gradients flow back, and starts the next trial without memory.
+The very first trial only measures what statistics are made of. ``docs/learners/rl2.md`` says what is done otherwise,
+and why.
 """
 
 import math
-from typing import Any, ClassVar
+from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from bidex_algos.experience.episodes import EpisodeStatistics
-from bidex_algos.gradients.step_size import AdaptiveAdams
-from bidex_algos.learner import Learner
+from bidex_algos.learner import Learner, as_numbers
 from bidex_algos.meta.rl2_agent import RL2Agent
-from bidex_algos.meta.rl2_config import PRESETS, RL2Config
-from bidex_algos.meta.trial_batch import Batch, make_batch, of_task
-from bidex_algos.meta.trials import Trials, play
+from bidex_algos.meta.trials import Batch, TrialConfig, Trials, make_batch, of_task, play
+from bidex_algos.nets.architecture import network_bytes
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.recurrent import RecurrentNet, RecurrentPolicy
 from bidex_algos.nets.shape import Shape
-from bidex_algos.onpolicy.ppo_loss import NAMES, ppo_loss
-from bidex_algos.reports import as_numbers
+from bidex_algos.onpolicy.ppo import NAMES, PPOConfig, mini_batches, policy_loss
+from bidex_algos.rollout import EpisodeStatistics
+from bidex_algos.step_size import AdaptiveAdams
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import all_sum, own_seed, rank, sum_gradients, world_size
+from bidex_meta.train.learner import AutoresetMode, Parts, State
+from bidex_meta.validation import Finite, Positive, check_rising
 from bidex_meta.world.contract import PooledWorld
 
-__all__ = ["PRESETS", "RL2", "RL2Config"]
+
+@dataclass(frozen=True)
+class RL2Config(PPOConfig, TrialConfig):
+    """Everything that can be set about RL²; the defaults are the preset ``laptop``."""
+
+    learning_rate_range: tuple[Positive, Positive] = (1e-5, 3e-3)
+    """Bounds of the adaptive step size."""
+    entropy_weight: Finite = 0.0
+    """Factor of the entropy bonus."""
+    max_grad_norm: Positive = 1.0
+    """Gradients longer than this are shortened to it, actor and critic apart."""
+    normalise_observations: bool = True
+    """Give observations zero mean and unit variance by running statistics."""
+    value_horizon: Positive = 100.0
+    """Iterations after which returns fade from the statistics that the critic's targets are normalised by."""
+
+    def __post_init__(self) -> None:
+        """Checks what annotations cannot say."""
+        super().__post_init__()
+        check_rising(self, self.algo, "std_range")
+
+    @property
+    def trial_steps(self) -> int:
+        """Most steps of a trial."""
+        return self.episodes_per_trial * self.max_adapt_steps
+
+    def bytes_held(self, num_envs: int, width: int) -> int:
+        """As in the base."""
+        memory = 4 * 4 * 2 * 3 * self.memory * (self.memory + self.hidden[-1])
+        return 4 * num_envs * width * self.trial_steps + network_bytes(self.hidden, width, 2) + memory
+
+
+PRESETS: dict[str, RL2Config] = {
+    # The appendix has no table for RL². Layers, epochs, mini-batches, clip, gradient norm, step size, discount, trace,
+    # starting noise and KL are Table 48's, ProMP's: its outer loop is PPO too. Its 8 steps a rollout have no
+    # counterpart, since a trial is made of whole episodes. Memory, ten episodes a trial and 250 steps of
+    # backpropagation are those of RL² in Meta-World's baselines (metaworld-algorithms).
+    "paper": RL2Config(
+        hidden=(2048, 1024, 512), memory=256, value_heads=False, init_std=1.0, episodes_per_trial=10, gamma=0.9,
+        lam=0.95, chunk=250, num_minibatches=1, epochs=3, clip=0.2, learning_rate=3e-4, desired_kl=0.016,
+        critic_learning_rate=None, entropy_weight=0.0, max_grad_norm=1.0, normalise_observations=False,
+    ),
+    # Discount and KL are MT-PPO's. With 0.97, so that what an episode finds out is paid in the next, and a KL of 0.02
+    # the egg of ML1-wide was carried and not thrown after 5 M steps (docs/results/ml1.md).
+    "laptop": RL2Config(),
+}  # fmt: skip
 
 
 class RL2(Learner):
     """RL² (Duan et al. 2016, arXiv 1611.02779): a policy with a memory that adapts to a task while it plays it.
-
-    Arguments and attributes are those of :class:`~bidex_algos.learner.Learner`.
 
     Attributes:
         policy: Network and statistics.
@@ -44,27 +87,23 @@ class RL2(Learner):
         trials: The last trial.
 
     Raises:
-        BidexError: A world that resets by itself, or fewer rows than mini-batches.
+        BidexError: A world that resets by itself, or fewer environments than mini-batches.
     """
 
     name, remedy = "rl2", "lower learning_rate"
-    config_type = RL2Config
+    config_type, presets = RL2Config, PRESETS
     world: PooledWorld
     config: RL2Config
     policy: RecurrentPolicy
-    autoreset = "DISABLED"
     per_process = ("generator", "episodes")
-    adapts: ClassVar[bool] = True
-    """Its agent is a ``MetaLearningAgent``: evaluation measures before and after."""
-    adapts_by_row: ClassVar[bool] = True
-    """A row learns from its own episodes alone."""
+    adapts = independent_adaptation = True
 
     def __init__(self, world: PooledWorld, config: RL2Config, seed: int):
         super().__init__(world, config, seed)
         if world.num_envs < config.num_minibatches:
             raise BidexError(
-                f"rl2: {config.num_minibatches} mini-batches need as many rows, got {world.num_envs}. Raise num_envs "
-                "or lower num_minibatches."
+                f"rl2: {config.num_minibatches} mini-batches need as many environments, got {world.num_envs}. Raise "
+                "num_envs or lower num_minibatches."
             )
         self.agent = RL2Agent(self.policy, own_seed(seed))
         heads = world.num_tasks if config.value_heads else 1
@@ -90,8 +129,13 @@ class RL2(Learner):
         # The tasks that the world was made with: of them each trial takes as many as there are rows.
         self.pools = _larger_pools(world)
 
+    @classmethod
+    def autoreset_mode(cls, config: RL2Config) -> AutoresetMode:
+        """Episodes of a trial begin together."""
+        return "DISABLED"
+
     def _iterate(self) -> dict[str, float]:
-        """Plays one trial in every row and learns from it."""
+        """Plays one trial in every environment and learns from it."""
         counts = [[self.episodes] for _ in range(self.config.episodes_per_trial)]
         counts[0].append(self.firsts)
         counts[-1].append(self.lasts)
@@ -137,39 +181,26 @@ class RL2(Learner):
         cfg, policy = self.config, self.policy
         old_log_std = policy.log_std.detach().clone()
         low, high = (math.log(std) for std in cfg.std_range)
-        chunk_weights = b.chunk_weights()
         measured: list[Tensor] = []
-        for epoch in range(cfg.epochs):
-            order = torch.randperm(len(b.row), generator=self.generator, device=self.device)
-            # The same number of parts in every process, whatever the number of its chunks.
-            parts = order.tensor_split(cfg.num_minibatches)
-            # Divided by the samples of all processes, losses and gradients become means by being summed over them.
-            counts = all_sum(torch.stack([chunk_weights[index].sum() for index in parts])).clamp_min(1.0)
-            for number, (index, count) in enumerate(zip(parts, counts, strict=True)):
-                measured.append(self._gradients(b, index, count, old_log_std))
-                # The first mini-batch compares the sampling policy with itself and says nothing about the step.
-                if (epoch, number) != (0, 0):
-                    self.adams.follow(measured[-1][2])
-                for weights in (policy.parameters(), self.critic.parameters()):
-                    nn.utils.clip_grad_norm_(weights, cfg.max_grad_norm)
-                self.adams.step()
-                with torch.no_grad():
-                    policy.log_std.clamp_(low, high)
+        # The same number of parts in every process, whatever the number of its chunks.
+        batches = mini_batches(b.chunk_weights(), cfg.epochs, cfg.num_minibatches, self.generator, Tensor.tensor_split)
+        for first, index, count in batches:
+            measured.append(self._gradients(b, index, count, old_log_std))
+            self.adams.descend(None if first else measured[-1][2], cfg.max_grad_norm)
+            with torch.no_grad():
+                policy.log_std.clamp_(low, high)
         return {**dict(zip(NAMES, torch.stack(measured).mean(0), strict=True)), "Policy/lr": self.adams.rate}
 
     def _gradients(self, b: Batch, chosen: Tensor, count: Tensor, old_log_std: Tensor) -> Tensor:
-        """Puts the gradients of some chunks, int64 (B,), into the parameters.
-
-        ``count`` samples are in the mini-batch, over all processes.
-
-        Returns:
-            Surrogate loss, value loss, KL and share of clipped ratios: (4,).
-        """
+        """Puts the gradients of some chunks, int64 (B,), into the parameters."""
         policy, chunk, row = self.policy, b.chunk[chosen], b.row[chosen]
         x = policy.see(b.take(b.obs, chosen), *(b.take(p, chosen) for p in b.previous))
         means, _ = policy.actor(x, b.actor_states[chunk, row])
         out, _ = self.critic(x, b.critic_states[chunk, row])
-        loss = ppo_loss(
+        weights = b.take(b.weights, chosen) / count
+        values, targets = of_task(out, self.world.task_id[row]), b.take(b.targets, chosen)
+        value = (weights * (values - targets).square()).sum()
+        loss = policy_loss(
             b.take(b.actions, chosen),
             means,
             policy.log_std,
@@ -177,14 +208,12 @@ class RL2(Learner):
             old_log_std,
             b.take(b.old_log_probs, chosen),
             b.take(b.advantages, chosen),
-            of_task(out, self.world.task_id[row]),
-            b.take(b.targets, chosen),
-            weights=b.take(b.weights, chosen) / count,
+            weights=weights,
             clip=self.config.clip,
         )
         self.adams.zero_grad()
-        (loss.surrogate + loss.value - self.config.entropy_weight * loss.entropy).backward()
-        return sum_gradients([*policy.parameters(), *self.critic.parameters()], torch.stack(loss.numbers()))
+        (loss.surrogate + value - self.config.entropy_weight * loss.entropy).backward()
+        return sum_gradients([*policy.parameters(), *self.critic.parameters()], torch.stack(loss.numbers(value)))
 
     def _metrics(self, losses: dict[str, Tensor], explained: Tensor, broken: Tensor) -> dict[str, float]:
         tensors = dict(losses)
@@ -220,11 +249,11 @@ class RL2(Learner):
         ).to(device)
 
     @classmethod
-    def load_policy(cls, state: dict[str, Any], device: str | torch.device = "cpu") -> RL2Agent:
-        """The agent of a checkpoint, for a world of any number of rows; see ``Learner.load_policy``."""
+    def load_policy(cls, state: State, device: str | torch.device = "cpu") -> RL2Agent:
+        """The agent of a checkpoint, for a world of any number of environments; see ``Learner.load_policy``."""
         return RL2Agent(super().load_policy(state, device))
 
-    def _parts(self) -> dict[str, Any]:
+    def _parts(self) -> Parts:
         return {
             "critic": self.critic,
             "return_stats": self.return_stats,
@@ -233,16 +262,16 @@ class RL2(Learner):
             "episodes": [self.episodes, self.firsts, self.lasts],
         }
 
-    def _place(self) -> dict[str, Any]:
+    def _place(self) -> State:
         return {"trials_played": self.trials_played, **super()._place()}
 
-    def _go_on_from(self, state: dict[str, Any]) -> None:
+    def _go_on_from(self, state: State) -> None:
         super()._go_on_from(state)
         self.trials_played = int(state["trials_played"])
 
 
 def _larger_pools(world: PooledWorld) -> dict[str, tuple[Tensor, int]]:
-    """Pool of tasks (n, ...) and number of rows of each class that has fewer rows than tasks."""
+    """Pool of tasks (n, ...) and number of rows of each class that has fewer environments than tasks."""
     pools = {}
     for i, (name, pool) in enumerate(zip(world.task_names, world.pools, strict=True)):
         rows = int((world.task_id == i).sum())

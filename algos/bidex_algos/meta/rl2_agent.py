@@ -1,4 +1,4 @@
-"""RL²'s agent: it adapts by what its memory has taken in, each row by its own; no weight changes.
+"""RL²'s agent: it adapts by what its memory has taken in, each environment by its own; no weight changes.
 
 Episodes that adapt write the memory; evaluation episodes play on a copy. So every evaluation episode after k shots
 starts from what k shots have taught, however many came before it.
@@ -15,7 +15,7 @@ from bidex_meta.agents import Timestep
 
 
 class RL2Agent:
-    """A ``bidex_meta.agents.MetaLearningAgent`` made of a policy with a memory, for any number of rows.
+    """A ``bidex_meta.agents.MetaLearningAgent`` made of a policy with a memory, for any number of environments.
 
     Args:
         policy: The policy.
@@ -29,7 +29,7 @@ class RL2Agent:
         self.init()
 
     def assign(self, task_of_row: Tensor | None) -> None:
-        """Nothing: each row learns from its own episodes, rows of one task do not share what they learn."""
+        """Nothing: each environment learns from its own episodes, rows of one task do not share what they learn."""
 
     def init(self) -> None:
         """Every memory is as at the start of a trial."""
@@ -58,7 +58,7 @@ class RL2Agent:
         return (mean + std * noise).clamp(-1.0, 1.0), {"mean": mean, "std": std}
 
     def step(self, timestep: Timestep) -> None:
-        """Remembers one transition of every row, but of those whose episode is over: they wait for ``reset``."""
+        """Remembers one transition of every environment but those whose episode is over: they wait for ``reset``."""
         if self._learned is None or self._next_state is None:
             return
         valid, ended = timestep.valid, timestep.terminated | timestep.truncated
@@ -86,7 +86,7 @@ class RL2Agent:
         return action
 
     def _memory(self, memory: Memory | None, rows: int) -> Memory:
-        """``memory``, or a fresh one if there is none of so many rows."""
+        """``memory``, or a fresh one if there is none of so many environments."""
         if memory is not None and len(memory.state) == rows:
             return memory
         if self._learned is None or len(self._learned.state) != rows:
@@ -94,6 +94,6 @@ class RL2Agent:
         return self.policy.fresh_memory(rows)
 
     def _wait(self, rows: int) -> None:
-        """No row has played yet; each waits for its ``reset``."""
+        """No environment has played yet; each waits for its ``reset``."""
         self._begun = torch.zeros(rows, dtype=torch.bool, device=self.device)
         self._over = ~self._begun

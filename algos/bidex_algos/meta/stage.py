@@ -1,4 +1,4 @@
-"""One stage of adaptation: what all rows did and got, and the batch by task that is made of it."""
+"""One stage of adaptation: what all environments did and got, and the batch by task that is made of it."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -6,49 +6,139 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from bidex_algos.experience.advantages import gae, normalise_per_task, successor_values, task_moments
+from bidex_algos.advantages import gae, normalise_per_task, successor_values, task_moments
 from bidex_algos.meta.adaptation import TaskBatch
 from bidex_algos.meta.config import MetaConfig
-from bidex_algos.meta.linear_baseline import fitted
-from bidex_algos.meta.task_rows import TaskRows
+
+
+class TaskRows:
+    """Rows by task, as a rectangle: tasks with fewer environments than others repeat one, without weight.
+
+    Args:
+        task_of_row: Task of each environment, numbers from 0 on without gaps, int64 (N,).
+
+    Attributes:
+        count: Number of tasks M.
+        task_of_row: As given.
+        weight: 1, or 0 where a row is repeated to fill the rectangle, (M, R) float32.
+    """
+
+    def __init__(self, task_of_row: Tensor):
+        self.task_of_row = task_of_row
+        self.count = int(task_of_row.max()) + 1
+        counts = torch.bincount(task_of_row, minlength=self.count)
+        width = int(counts.max())
+        order = torch.argsort(task_of_row, stable=True)
+        first = counts.cumsum(0) - counts
+        column = torch.arange(width, device=task_of_row.device)
+        self._table = order[first[:, None] + torch.minimum(column, counts[:, None] - 1)]
+        self.weight = (column < counts[:, None]).float()
+        # Where each environment stands in the flattened rectangle.
+        place = torch.empty_like(order)
+        rank = torch.arange(len(order), device=order.device) - first[task_of_row[order]]
+        place[order] = task_of_row[order] * width + rank
+        self._place = place
+
+    def by_task(self, x: Tensor) -> Tensor:
+        """(N, ...) to (M, R, ...)."""
+        return x[self._table]
+
+    def by_row(self, x: Tensor) -> Tensor:
+        """(M, R, ...) back to (N, ...)."""
+        return x.flatten(0, 1)[self._place]
+
+    def steps_by_task(self, x: Tensor) -> Tensor:
+        """(T, N, ...) to (M, T * R, ...)."""
+        return x[:, self._table].transpose(0, 1).flatten(1, 2)
+
+    def steps_by_row(self, x: Tensor, steps: int) -> Tensor:
+        """(M, T * R, ...) back to (T, N, ...)."""
+        return x.unflatten(1, (steps, -1)).transpose(0, 1).flatten(1, 2)[:, self._place]
+
+
+_BOUND = 10.0
+
+_OF_TIME = 4
+"""Features at the end that tell of time alone."""
+
+_SOLVABLE = 1e-5
+"""What every diagonal entry gets, relative to their mean, so that features may depend on each other."""
+
+
+def features(obs: Tensor, elapsed: Tensor) -> Tensor:
+    """Observation, its square, three powers of time, and 1: of (..., d) and (...) to (..., 2 d + 4), float32."""
+    bounded = obs.clamp(-_BOUND, _BOUND)
+    t = elapsed[..., None].to(obs.dtype) / 100.0
+    return torch.cat([bounded, bounded.square(), t, t.square(), t**3, torch.ones_like(t)], dim=-1)
+
+
+def fitted(obs: Tensor, elapsed: Tensor, returns: Tensor, weights: Tensor, ridge: float = 1.0) -> Tensor:
+    """Predictions of the returns they are fitted to, by ridge regression in each task.
+
+    Coefficients of observations are held back by ``ridge`` times features per sample, relative to the mean of the
+    Gram matrix's diagonal; the four of time hardly. With 1 that is the best linear prediction if features and noise
+    explain as much of the returns. A fit that is free (1e-5) remembers the returns where there are hundreds of
+    features and as many samples, and leaves advantages that are noise: of 7, 20 and 50 rollouts on ML1-wide they
+    correlated by 0.19, 0.18 and 0.47 with those of a baseline fitted to other rollouts, without any baseline by 0.71,
+    0.63 and 0.62, and with 1 by 0.78, 0.76 and 0.77.
+
+    Args:
+        obs: Normalised observations (tasks, B, d).
+        elapsed: Steps since the episode began (tasks, B).
+        returns: What to predict (tasks, B).
+        weights: 1, or 0 for what does not count (tasks, B).
+        ridge: How strongly coefficients are held back.
+
+    Returns:
+        (tasks, B), in the type of ``returns``.
+    """
+    # Task by task: the features of all tasks at once, and their Gram matrices, take more memory and more time.
+    tasks = zip(obs, elapsed, returns, weights, strict=True)
+    predicted = [_one(features(o, t), r, w, ridge) for o, t, r, w in tasks]
+    return torch.stack(predicted).to(returns.dtype)
+
+
+def _one(x: Tensor, returns: Tensor, weights: Tensor, ridge: float) -> Tensor:
+    """Predictions (B,) of one task from its features (B, f), float64."""
+    weighted = x * weights[:, None]
+    gram = (weighted.T @ x).double()
+    diagonal = gram.diagonal()
+    penalty = torch.full_like(diagonal, _SOLVABLE)
+    penalty[:-_OF_TIME] += ridge * x.shape[1] / weights.sum().clamp_min(1.0)
+    diagonal += penalty * diagonal.mean().clamp_min(1.0)
+    coefficients = torch.linalg.solve(gram, (weighted.T @ returns).double())
+    return x.double() @ coefficients
 
 
 @dataclass
 class Stage:
-    """Transitions of T steps in N rows, in the order they were made; one entry of a list a step."""
+    """Transitions of T steps in N environments, in the order they were made; one entry of a list a step."""
 
-    obs: list[Tensor] = field(default_factory=list)
-    """Normalised observations before the step (N, d)."""
-    actions: list[Tensor] = field(default_factory=list)
-    """Sampled actions, not clamped (N, a)."""
-    means: list[Tensor] = field(default_factory=list)
-    """Means of the sampling policies (N, a)."""
-    rewards: list[Tensor] = field(default_factory=list)
-    """(N,); 0 where not valid."""
-    terminated: list[Tensor] = field(default_factory=list)
-    """Bool (N,), the episode came to a true end."""
-    ended: list[Tensor] = field(default_factory=list)
-    """Bool (N,), the episode is over, for whatever reason."""
+    obs: list[Tensor] = field(default_factory=list)  # normalised observations before the step (N, d)
+    actions: list[Tensor] = field(default_factory=list)  # sampled actions, not clamped (N, a)
+    means: list[Tensor] = field(default_factory=list)  # means of the sampling policies (N, a)
+    rewards: list[Tensor] = field(default_factory=list)  # (N,); 0 where not valid
+    terminated: list[Tensor] = field(default_factory=list)  # bool (N,), the episode came to a true end
+    ended: list[Tensor] = field(default_factory=list)  # bool (N,), the episode is over, for whatever reason
+    # Bool (N,), False where the row was frozen or its physics broke: such a transition teaches nothing.
     valid: list[Tensor] = field(default_factory=list)
-    """Bool (N,), False where the row was frozen or its physics broke: such a transition teaches nothing."""
-    elapsed: list[Tensor] = field(default_factory=list)
-    """Steps since the row's episode began, before the step (N,)."""
+    elapsed: list[Tensor] = field(default_factory=list)  # steps of the episode before this one (N,)
 
     def add(self, **step: Tensor) -> None:
         """Takes a step, with every field by name."""
         for name, value in step.items():
-            getattr(self, name).append(value)
+            vars(self)[name].append(value)
 
     def __len__(self) -> int:
         return len(self.obs)
 
     def stacked(self, name: str) -> Tensor:
         """A field of all steps (T, N, ...)."""
-        return torch.stack(getattr(self, name))
+        return torch.stack(vars(self)[name])
 
     def by_task(self, name: str, rows: TaskRows) -> Tensor:
         """A field of all steps by task (M, T * R, ...); rearranged step by step, so that nothing large is copied."""
-        return torch.stack([rows.by_task(x) for x in getattr(self, name)], dim=1).flatten(1, 2)
+        return torch.stack([rows.by_task(x) for x in vars(self)[name]], dim=1).flatten(1, 2)
 
 
 @torch.no_grad()
@@ -60,7 +150,7 @@ def task_batch(stage: Stage, rows: TaskRows, log_std: Tensor, config: MetaConfig
 
     Args:
         stage: What was sampled.
-        rows: Which rows play the same task.
+        rows: Which environments play the same task.
         log_std: Logarithms of the standard deviations of the policies that sampled (M, a).
         config: Discount, trace, scale.
     """
@@ -93,12 +183,9 @@ def task_batch(stage: Stage, rows: TaskRows, log_std: Tensor, config: MetaConfig
 class Outcome(NamedTuple):
     """What a stage came to."""
 
-    earned: Tensor
-    """Undiscounted, unscaled return of each row (N,)."""
-    success: Tensor
-    """Whether each row succeeded, bool (N,)."""
-    steps: Tensor
-    """Environment steps, int64 (); a row that waits for the others takes none."""
+    earned: Tensor  # undiscounted, unscaled return of each environment (N,)
+    success: Tensor  # whether each environment succeeded, bool (N,)
+    steps: Tensor  # environment steps, int64 (); a row that waits for the others takes none
 
 
 def moments(x: Tensor, counted: Tensor) -> tuple[Tensor, Tensor, Tensor]:

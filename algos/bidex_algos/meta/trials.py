@@ -1,17 +1,55 @@
-"""Trials: a few whole episodes of one task in each row, played with one memory; shared by learners that remember.
+"""Trials: a few whole episodes of one task in each environment, played with one memory.
 
-Rows' episodes differ in length, and all rows start the next one together: a row whose episode is over waits, its memory
-untouched. Waiting is not recorded, so that the transitions of a row follow each other without gaps: slot t holds what
-the memory saw at its t-th step.
+Episodes differ in length, and all environments start the next one together: an environment whose episode is over waits,
+its memory untouched. Waiting is not recorded, so that the transitions of a row follow each other without gaps: slot t
+holds what the memory saw at its t-th step.
 """
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from bidex_algos.experience.episodes import EpisodeStatistics
-from bidex_algos.experience.rollout import may_look
-from bidex_algos.nets.recurrent import Memory, RecurrentPolicy
+from bidex_algos.advantages import explained_variance, gae, normalise_per_task, task_moments
+from bidex_algos.nets.networks import Activation, gaussian_log_prob
+from bidex_algos.nets.normalise import RunningStats
+from bidex_algos.nets.recurrent import Memory, RecurrentNet, RecurrentPolicy
+from bidex_algos.rollout import EpisodeStatistics, may_look
+from bidex_meta.train.learner import LearnerConfig
+from bidex_meta.validation import Count, Fraction, Positive, Widths
 from bidex_meta.world.contract import VectorWorld
+
+
+@dataclass(frozen=True)
+class TrialConfig(LearnerConfig):
+    """Networks and trials of RL²."""
+
+    hidden: Widths = (256, 128)
+    """Widths of the encoder's layers, before the memory; of actor and critic alike."""
+    activation: Activation = "elu"
+    """Non-linearity of the encoder."""
+    memory: Count = 128
+    """Numbers that an environment's memory (GRU) holds; actor and critic have one each."""
+    value_heads: bool = True
+    """Give the critic one output per task class instead of one for all."""
+    init_std: Positive = 0.8
+    """Standard deviation of the actions at the start."""
+    std_range: tuple[Positive, Positive] = (0.05, 1.5)
+    """Bounds of the standard deviation of the actions."""
+    episodes_per_trial: Count = 3
+    """Episodes of one task that the memory lasts for: those an evaluation plays to adapt, and one more."""
+    max_adapt_steps: Count = 150
+    """Steps after which an episode of a trial is cut, if its class's time limit has not ended it."""
+    blind_share: Fraction = 0.3
+    """Share of the episodes whose rewards the policy is not shown, as it is not in an evaluation."""
+    reward_unit: Positive = 0.01
+    """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
+    gamma: Fraction = 0.93
+    """Discount per step, over all episodes of a trial."""
+    lam: Fraction = 0.95
+    """Trace decay of the advantage estimate."""
+    chunk: Count | None = None
+    """Steps that gradients flow back through the memory; None, or no fewer than a trial has: the whole trial."""
 
 
 def in_chunks(steps: int, chunk: int | None) -> tuple[int, int]:
@@ -29,10 +67,10 @@ def in_chunks(steps: int, chunk: int | None) -> tuple[int, int]:
 
 
 class Trials:
-    """One trial of N rows, preallocated on the device and overwritten by each :func:`play`.
+    """One trial of N environments, preallocated on the device and overwritten by each :func:`play`.
 
     Attributes:
-        obs: Raw observations before each step; in the slot after a row's last step, what that step led to; (S, N, d).
+        obs: Raw observations before each step; in the slot after the last step, what that step led to; (S, N, d).
         actions: Sampled actions, not clamped, (S, N, a).
         rewards: 0 where not valid, (S, N).
         shown: Whether the policy was shown the reward, bool (S, N).
@@ -40,8 +78,8 @@ class Trials:
         ended: Whether it ended an episode, bool (S, N).
         terminated: Whether it ended an episode truly, not by a time limit, bool (S, N).
         left: Steps that the time limit would still have allowed, int64 (S, N).
-        lengths: Slots that each row has filled, int64 (N,); what lies beyond is void.
-        limits: Most steps of an episode of each row, int64 (N,).
+        lengths: Slots that each environment has filled, int64 (N,); what lies beyond is void.
+        limits: Most steps of an episode of each environment, int64 (N,).
 
     Args:
         episodes: Episodes in a trial.
@@ -157,3 +195,121 @@ def play(
         for each in statistics[episode]:
             each.update({"so_far": found, "counted": whole})
     trials.obs[trials.lengths, rows] = obs
+
+
+@dataclass
+class Batch:
+    """A trial made ready for the update: T slots (a multiple of the chunk C) of N rows, and its S chunks."""
+
+    obs: Tensor  # raw observations (T, N, d)
+    actions: Tensor  # sampled actions (T, N, a)
+    # What the memory is fed beside the observation; see Trials.previous.
+    previous: tuple[Tensor, Tensor, Tensor, Tensor]
+    old_means: Tensor  # means of the sampling policy (T, N, a)
+    old_log_probs: Tensor  # log-density of the actions under it (T, N)
+    advantages: Tensor  # normalised advantages (T, N)
+    targets: Tensor  # what the critic shall predict, in its own units (T, N)
+    weights: Tensor  # 1, or 0 for slots that teach nothing (T, N)
+    actor_states: Tensor  # the actor's memory before each chunk (T / C, N, memory)
+    critic_states: Tensor  # the critic's (T / C, N, memory)
+    chunk: Tensor  # number of each chunk that holds a step, int64 (S,)
+    row: Tensor  # its row, int64 (S,)
+
+    @property
+    def size(self) -> int:
+        """Steps of a chunk, C."""
+        return len(self.weights) // len(self.actor_states)
+
+    def chunk_weights(self) -> Tensor:
+        """Sum of the weights of each chunk (S,)."""
+        return self.weights.unflatten(0, (-1, self.size)).sum(1)[self.chunk, self.row]
+
+    def take(self, x: Tensor, chosen: Tensor) -> Tensor:
+        """The chosen chunks, int64 (B,), of a tensor (T, N, ...): (C, B, ...)."""
+        chunks = x.unflatten(0, (-1, self.size)).transpose(1, 2)
+        return chunks[self.chunk[chosen], self.row[chosen]].transpose(0, 1)
+
+
+def of_task(outputs: Tensor, task_id: Tensor) -> Tensor:
+    """A critic's outputs (T, B, heads) as one value (T, B): the only one, or that of each environment's task (B,)."""
+    if outputs.shape[-1] == 1:
+        return outputs.squeeze(-1)
+    return outputs.gather(2, task_id.expand(len(outputs), -1)[..., None]).squeeze(-1)
+
+
+@torch.no_grad()
+def make_batch(
+    t: Trials,
+    policy: RecurrentPolicy,
+    critic: RecurrentNet,
+    return_stats: RunningStats,
+    task_id: Tensor,
+    config: TrialConfig,
+) -> tuple[Batch, Tensor]:
+    """Passes a trial through the networks, chunk by chunk from empty memories, and estimates advantages.
+
+    Args:
+        t: The trial.
+        policy: The policy that played it.
+        critic: Sees what the policy sees; speaks in units of its task's running mean and deviation of returns.
+        return_stats: These (num_tasks,); they take in the trial's returns.
+        task_id: Task of each environment, int64 (N,).
+        config: Chunk, discount and trace.
+
+    Returns:
+        The batch and the explained variance per task (num_tasks,).
+    """
+    num_tasks = len(return_stats.mean)
+    # The only wait for the device: how many steps the longest trial has.
+    slots, size = in_chunks(int(t.lengths.max()), config.chunk)
+    previous = t.previous(slots)
+    means, values = [], []
+    actor_states, critic_states = [], []
+    actor_state = critic_state = policy.fresh_memory(len(task_id)).state
+    for begin in range(0, slots, size):
+        part = slice(begin, begin + size)
+        x = policy.see(t.obs[part], *(p[part] for p in previous))
+        actor_states.append(actor_state)
+        critic_states.append(critic_state)
+        mean, actor_state = policy.actor(x, actor_state)
+        value, critic_state = critic(x, critic_state)
+        means.append(mean)
+        values.append(of_task(value, task_id))
+    old_means = torch.cat(means)
+
+    values = return_stats.restore(torch.cat(values), task_id)
+    filled, last = t.filled(slots), t.last(slots)
+    valid = t.valid[:slots] & filled
+    # What follows the trial's last slot is never asked for.
+    next_values = torch.cat([values[1:], values[-1:]])
+    # The end of an episode is none of the trial: the next one follows, and the memory with it.
+    advantages = gae(
+        t.rewards[:slots],
+        values,
+        next_values,
+        terminated=t.terminated[:slots] & last,
+        ended=last,
+        gamma=t.discounts(slots, config.gamma),
+        lam=config.lam,
+        valid=valid,
+    )
+    returns = advantages + values
+    explained = explained_variance(values, returns, task_id, num_tasks, valid)
+    return_stats.merge(*task_moments(returns, task_id, num_tasks, valid))
+    actions = t.actions[:slots]
+    chunk, row = filled[::size].nonzero(as_tuple=True)
+    batch = Batch(
+        obs=t.obs[:slots],
+        actions=actions,
+        previous=previous,
+        old_means=old_means,
+        old_log_probs=gaussian_log_prob(actions, old_means, policy.log_std),
+        advantages=normalise_per_task(advantages, task_id, num_tasks, valid),
+        targets=return_stats.normalise(returns, task_id),
+        weights=valid.float(),
+        actor_states=torch.stack(actor_states),
+        critic_states=torch.stack(critic_states),
+        chunk=chunk,
+        row=row,
+    )
+    return batch, explained

@@ -5,26 +5,154 @@ To the base below it the agents are one policy, whose action is put together of 
 
 import math
 from collections.abc import Iterator
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import torch
+import tyro
 from torch import Tensor, nn
 
-from bidex_algos.multiagent.agent_batch import AgentBatch
-from bidex_algos.multiagent.config import MultiAgentConfig
-from bidex_algos.multiagent.popart import keep_values
 from bidex_algos.multiagent.team import TeamActor
-from bidex_algos.nets.encoders.inputs import Inputs
-from bidex_algos.nets.networks import gaussian_log_prob
+from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.networks import MLP, autocast, gaussian_log_prob, use_bfloat16
 from bidex_algos.nets.normalise import ObservationNormaliser
 from bidex_algos.nets.policy import GaussianPolicy
-from bidex_algos.nets.precision import autocast, use_bfloat16
 from bidex_algos.nets.shape import Shape
-from bidex_algos.onpolicy.base import Batch, OnPolicy
+from bidex_algos.onpolicy.base import Batch, OnPolicy, OnPolicyConfig, check_samples
+from bidex_algos.onpolicy.ppo import PPOConfig
 from bidex_meta.errors import BidexError
+from bidex_meta.hands.units import partition_line
 from bidex_meta.train.distributed import sum_gradients
+from bidex_meta.train.learner import LearnerConfig, Parts
+from bidex_meta.validation import Count, Finite, NonNegative, Positive
 from bidex_meta.world.agent_views import agent_views
 from bidex_meta.world.contract import VectorWorld
+
+Partition = Annotated[str, tyro.conf.arg(aliases=("--agents",))]
+"""A partition of the hands' units, on the command line by a short name too."""
+
+
+def keep_partition(config: Any) -> None:
+    """Puts a file's partition itself in the place of its path: a checkpoint shall know it without the file.
+
+    Raises:
+        BidexError: ``agents`` is no partition, or the agents' networks would be none of their own.
+    """
+    if config.architecture != "shared":
+        raise BidexError(f"{config.algo}: each agent has a plain network; architecture must be shared.")
+    object.__setattr__(config, "agents", partition_line(config.agents))
+
+
+@dataclass(frozen=True)
+class MultiAgentConfig(OnPolicyConfig):
+    """Agents and the critic's loss."""
+
+    agents: Partition = "hands"
+    """Who acts: hands (two agents), fingers (twelve: five fingers and the palm of each hand), single, a TOML file with
+    a table [agents], or name=unit+unit;name=unit (docs/learners/multiagent.md)."""
+    huber_delta: Positive = 10.0
+    """Error of the critic, in its own units, beyond which its loss grows no faster than the error."""
+    value_clip: NonNegative = 0.0
+    """How far a value may leave the old one before it earns nothing more; 0: as far as it likes."""
+    popart: bool = False
+    """When the statistics of returns change, move the critic's output layer so that its values stay as they were."""
+    max_grad_norm: Positive = 1.0
+    """Gradients longer than this are shortened to it: each agent's, and the critic's."""
+    critic_learning_rate: Positive = 1e-3
+    """Adam's step size of the critic."""
+    num_minibatches: Count = 4
+    """Mini-batches per epoch; each holds shuffled samples of all environments."""
+    adam_eps: NonNegative = 1e-8
+    """What Adam adds to its denominators."""
+
+    def __post_init__(self) -> None:
+        """Checks what annotations cannot say."""
+        super().__post_init__()
+        keep_partition(self)
+        if self.popart and not (self.per_task_values and self.value_heads):
+            raise BidexError(
+                f"{self.algo}: popart moves the critic's output of each task; leave per_task_values and value_heads on."
+            )
+
+
+@dataclass(frozen=True)
+class MultiAgentPPOConfig(PPOConfig, MultiAgentConfig):
+    """What IPPO, MAPPO and HAPPO share; the defaults are the preset ``laptop``."""
+
+    critic_learning_rate: Positive = 1e-3
+    """Adam's step size of the critic."""
+    value_loss_weight: Finite = 1.0
+    """Factor of the value loss. Adam undoes it; it matters only beside max_grad_norm."""
+    entropy_weight: Finite = 0.0
+    """Factor of the entropy bonus."""
+    desired_kl: Positive = 0.03
+    """KL of the sampling policy from the current one, of all agents together, that the adaptive step sizes aim at; each
+    agent's has an even share."""
+
+
+@dataclass(frozen=True)
+class InTurnConfig(LearnerConfig):
+    """What HAPPO and HATRPO share. A config that is made of this and others puts its fields behind theirs."""
+
+    max_factor: NonNegative = 4.0
+    """The most that the ratios of the agents before it, new policy over old, may multiply an agent's advantage with; 0:
+    as much as it comes to."""
+
+    def __post_init__(self) -> None:
+        """Checks what its annotation cannot say."""
+        super().__post_init__()
+        if 0 < self.max_factor < 1:
+            raise BidexError(
+                f"{self.algo}: max_factor: expected 0 or at least 1, which is no change at all, got {self.max_factor}."
+            )
+
+
+PAPER: dict[str, Any] = {
+    "hidden": (1024, 1024, 512), "popart": True, "rollout_steps": 8, "gamma": 0.96, "lam": 0.95,
+    "normalise_observations": False, "huber_delta": 10.0, "value_clip": 0.2,
+}  # fmt: skip
+"""What Tables 44 (HAPPO) and 45 (MAPPO) of the Bi-DexHands appendix agree on, in their columns for other tasks than
+LiftUnderarm; B.2.1 and B.2.4 have the clipped value."""
+
+PAPER_PPO: dict[str, Any] = PAPER | {
+    "num_minibatches": 1, "epochs": 5, "clip": 0.2, "adaptive_learning_rate": False, "entropy_weight": 0.0,
+}  # fmt: skip
+"""The same with the two tables' passes and clip."""
+
+LIFT: dict[str, Any] = {"rollout_steps": 20, "epochs": 10}
+"""Both tables' column for LiftUnderarm, where it differs."""
+
+
+@torch.no_grad()
+def keep_values(critics: list[MLP], before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> None:
+    """Moves the output layers of critics so that std V + mean stays: PopArt (van Hasselt 2016, Hessel et al. 2019).
+
+    Each critic has an output for each task. ``before`` and ``after`` are mean and standard deviation of the returns
+    that define the critics' units, each (critics * tasks,).
+    """
+    given = [x.view(len(critics), -1) for x in (*before, *after)]
+    for critic, old_mean, old_std, mean, std in zip(critics, *given, strict=True):
+        weight, bias = critic.head.weight, critic.head.bias
+        weight.copy_(weight * (old_std / std)[:, None])
+        bias.copy_((old_std * bias + old_mean - mean) / std)
+
+
+@dataclass
+class AgentBatch:
+    """Samples (B,) of one agent with a_i actions. Cut out of the batch once, so that mini-batches take rows alone."""
+
+    seen: Tensor  # what its network is fed (B, d_i)
+    task: Tensor  # the tasks' one-hot (B, heads); without columns where the agent has one head
+    actions: Tensor  # its part of the sampled actions (B, a_i)
+    old_means: Tensor  # of the sampling policy (B, a_i)
+    old_log_std: Tensor  # of the sampling policy (B, a_i)
+    old_log_probs: Tensor  # log-density of its part under the sampling policy (B,)
+    gain: Tensor  # the advantages it shall climb (B,)
+    weights: Tensor  # as in the batch (B,)
+
+    def select(self, index: Tensor) -> "AgentBatch":
+        """The samples at ``index``."""
+        return AgentBatch(**{name: torch.index_select(value, 0, index) for name, value in vars(self).items()})
 
 
 class TeamPolicy(GaussianPolicy):
@@ -35,8 +163,6 @@ class TeamPolicy(GaussianPolicy):
 
 class MultiAgent(OnPolicy):
     """Agents that share a reward, each with a policy on what it sees.
-
-    Arguments and attributes are those of :class:`~bidex_algos.onpolicy.base.OnPolicy`.
 
     Attributes:
         views: The agents.
@@ -54,12 +180,7 @@ class MultiAgent(OnPolicy):
     def __init__(self, world: VectorWorld, config: MultiAgentConfig, seed: int):
         self.views = agent_views(world.observation_groups, int(world.single_action_space.shape[0]), config.agents)
         self.kl_share = 1.0 / len(self.views)
-        samples = config.rollout_steps * world.num_envs
-        if samples < config.num_minibatches:
-            raise BidexError(
-                f"{self.name}: {config.num_minibatches} mini-batches need as many samples, but {world.num_envs} rows x "
-                f"{config.rollout_steps} steps give {samples}. Raise num_envs or lower num_minibatches."
-            )
+        check_samples(self.name, config, world.num_envs)
         super().__init__(world, config, seed)
         rate, eps = config.critic_learning_rate, config.adam_eps
         self.critic_adam = torch.optim.Adam(self.critic.parameters(), lr=rate, eps=eps, fused=True)
@@ -69,7 +190,7 @@ class MultiAgent(OnPolicy):
         cls, config: MultiAgentConfig, shape: Shape, init: torch.Generator, device: torch.device
     ) -> TeamPolicy:
         views, inputs = agent_views(shape.groups, shape.actions, config.agents), Inputs(shape.groups)
-        heads, share = shape.num_id_columns if config.policy_heads else 1, getattr(config, "share_parameters", False)
+        heads, share = shape.num_id_columns if config.policy_heads else 1, vars(config).get("share_parameters", False)
         actor = TeamActor(views, config, inputs, init, heads, share)
         observations = ObservationNormaliser(inputs, config.normalise_observations)
         policy: Any = TeamPolicy(observations, actor, use_bfloat16(config.autocast, device))  # type: ignore[arg-type]
@@ -124,7 +245,7 @@ class MultiAgent(OnPolicy):
         """Fits the critic to its targets; the mean loss over all mini-batches, a scalar."""
         old_values, losses = self._old_values(batch), list[Tensor]()
         parameters = list(self.critic.parameters())
-        for _, index, count in self._mini_batches(batch, epochs, num_minibatches):
+        for _, index, count in self._mini_batches(batch.weights, epochs, num_minibatches):
             b = batch.select(index)
             loss = self._value_loss(b, old_values.index_select(0, index), b.weights / count)
             self.critic_adam.zero_grad()
@@ -133,7 +254,7 @@ class MultiAgent(OnPolicy):
             self._critic_step()
         return torch.stack(losses).mean()
 
-    def _optimisers(self) -> dict[str, Any]:
+    def _optimisers(self) -> Parts:
         return {"critic_adam": self.critic_adam}
 
 
@@ -183,5 +304,5 @@ class Sequential(MultiAgent):
         with autocast(self.device, self.low_precision):
             return self.policy.actor.distribution_of(agent, share.seen, share.task)
 
-    def _parts(self) -> dict[str, Any]:
+    def _parts(self) -> Parts:
         return super()._parts() | {"order": self.order}

@@ -8,34 +8,45 @@ For each agent, in an order drawn anew in each iteration::
 Then the critic of all. Each agent's step is to the gain of all, whatever the others did before it.
 """
 
-from typing import Any
+from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from bidex_algos.gradients.step_size import AdaptiveAdam
-from bidex_algos.multiagent.agent_batch import AgentBatch
-from bidex_algos.multiagent.base import Sequential
-from bidex_algos.multiagent.happo_config import PRESETS, HAPPOConfig
+from bidex_algos.multiagent.base import LIFT, PAPER_PPO, AgentBatch, InTurnConfig, MultiAgentPPOConfig, Sequential
 from bidex_algos.onpolicy.base import Batch
-from bidex_algos.onpolicy.ppo_loss import policy_loss
+from bidex_algos.onpolicy.ppo import policy_loss
+from bidex_algos.step_size import AdaptiveAdam
 from bidex_meta.train.distributed import sum_gradients
+from bidex_meta.train.learner import Parts
 from bidex_meta.world.contract import VectorWorld
 
-__all__ = ["HAPPO", "PRESETS", "HAPPOConfig"]
+
+@dataclass(frozen=True)
+class HAPPOConfig(InTurnConfig, MultiAgentPPOConfig):
+    """Everything that can be set about HAPPO; the defaults are the preset ``laptop``."""
+
+
+PRESETS: dict[str, HAPPOConfig] = {
+    # Table 44; its replay, Polyak factor and reward scale are of no use to an on-policy learner.
+    "paper": HAPPOConfig(
+        **PAPER_PPO, learning_rate=1e-4, critic_learning_rate=1e-4, max_grad_norm=1.0, init_std=1.0,
+        max_factor=0.0,
+    ),
+    "laptop": HAPPOConfig(),
+}  # fmt: skip
+TASK_PRESETS = {"LiftUnderarm": {"paper": replace(PRESETS["paper"], **LIFT)}}
 
 
 class HAPPO(Sequential):
     """HAPPO, agents in turn (Kuba et al. 2022, arXiv 2109.11251).
-
-    Arguments, attributes and errors are those of its base.
 
     Attributes:
         adams: An optimiser of each agent.
     """
 
     name, remedy = "happo", "lower learning_rate"
-    config_type = HAPPOConfig
+    config_type, presets, task_presets = HAPPOConfig, PRESETS, TASK_PRESETS
     config: HAPPOConfig
 
     def __init__(self, world: VectorWorld, config: HAPPOConfig, seed: int):
@@ -46,7 +57,7 @@ class HAPPO(Sequential):
             for i in range(len(self.views))
         ]
 
-    def _optimisers(self) -> dict[str, Any]:
+    def _optimisers(self) -> Parts:
         return super()._optimisers() | {"agents": [adam.parts() for adam in self.adams]}
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
@@ -63,7 +74,7 @@ class HAPPO(Sequential):
         """Some passes over the batch by one agent; the means of surrogate loss, KL and share of clipped ratios (3,)."""
         cfg, adam, parameters = self.config, self.adams[agent], self.policy.actor.parameters_of(agent)
         measured: list[Tensor] = []
-        for first, index, count in self._mini_batches(share, cfg.epochs, cfg.num_minibatches):
+        for first, index, count in self._mini_batches(share.weights, cfg.epochs, cfg.num_minibatches):
             part = share.select(index)
             loss = policy_loss(
                 part.actions,
@@ -79,9 +90,6 @@ class HAPPO(Sequential):
             (loss.surrogate - cfg.entropy_weight * loss.entropy).backward(inputs=parameters)
             numbers = torch.stack([loss.surrogate.detach(), loss.kl, loss.outside])
             measured.append(sum_gradients(parameters, numbers))
-            if not first:
-                adam.follow(measured[-1][1])
-            nn.utils.clip_grad_norm_(parameters, cfg.max_grad_norm)
-            adam.step()
+            adam.descend(None if first else measured[-1][1], cfg.max_grad_norm)
             self.policy.actor.clamp_std(*cfg.std_range)
         return torch.stack(measured).mean(0)

@@ -4,35 +4,54 @@ For each agent, in an order drawn anew in each iteration, MT-TRPO's step on its 
 trust region, with the advantage times the ratios of the agents before it. Then the critic of all.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from bidex_algos.gradients.trust_region import trust_region_step
-from bidex_algos.multiagent.agent_batch import AgentBatch
-from bidex_algos.multiagent.base import Sequential
-from bidex_algos.multiagent.hatrpo_config import PRESETS, HATRPOConfig
+from bidex_algos.multiagent.base import LIFT, PAPER, AgentBatch, InTurnConfig, MultiAgentConfig, Sequential
 from bidex_algos.nets.networks import gaussian_kl, gaussian_log_prob
 from bidex_algos.onpolicy.base import Batch
+from bidex_algos.onpolicy.mttrpo import MTTRPOConfig
+from bidex_algos.trust_region import trust_region_step
 from bidex_meta.train.distributed import all_sum
+from bidex_meta.validation import Positive
 from bidex_meta.world.contract import VectorWorld
 
-__all__ = ["HATRPO", "PRESETS", "HATRPOConfig"]
+
+@dataclass(frozen=True)
+class HATRPOConfig(InTurnConfig, MTTRPOConfig, MultiAgentConfig):
+    """Everything that can be set about HATRPO; the defaults are the preset ``laptop``."""
+
+    max_kl: Positive = 0.05
+    """Mean KL of the new policy from the sampling one, of all agents together, that an update may not exceed; each
+    agent's has an even share."""
+
+
+PRESETS: dict[str, HATRPOConfig] = {
+    # There is no table for HATRPO: HAPPO's (44), with the trust region of our TRPO's preset of this name.
+    "paper": HATRPOConfig(
+        **PAPER, max_kl=0.01, damping=0.1, cg_iterations=10, fisher_stride=1, backtracks=10, backtrack_factor=0.5,
+        accept_ratio=0.1, critic_learning_rate=1e-4, critic_epochs=5, num_minibatches=1, max_grad_norm=1.0,
+        init_std=1.0, max_factor=0.0,
+    ),
+    "laptop": HATRPOConfig(),
+}  # fmt: skip
+TASK_PRESETS = {
+    "LiftUnderarm": {"paper": replace(PRESETS["paper"], rollout_steps=LIFT["rollout_steps"], critic_epochs=10)}
+}
 
 
 class HATRPO(Sequential):
     """HATRPO, agents in turn (Kuba et al. 2022, arXiv 2109.11251).
-
-    Arguments, attributes and errors are those of its base.
 
     Attributes:
         region: The config with an agent's share of ``max_kl``.
     """
 
     name, remedy = "hatrpo", "lower max_kl or critic_learning_rate"
-    config_type = HATRPOConfig
+    config_type, presets, task_presets = HATRPOConfig, PRESETS, TASK_PRESETS
     config: HATRPOConfig  # type: ignore[assignment]
 
     def __init__(self, world: VectorWorld, config: Any, seed: int):

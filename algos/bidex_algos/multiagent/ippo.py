@@ -3,28 +3,47 @@
 MAPPO but for the critics: each agent has its own values, returns and advantages, normalised per task.
 """
 
+from dataclasses import dataclass, replace
 from typing import Any
 
 from torch import Tensor, nn
 
-from bidex_algos.multiagent.ippo_config import PRESETS, IPPOConfig
-from bidex_algos.multiagent.mappo import MAPPO
+from bidex_algos.multiagent import mappo as mappo_config
+from bidex_algos.multiagent.base import LIFT
+from bidex_algos.multiagent.mappo import MAPPO, MAPPOConfig
 from bidex_algos.multiagent.team import TeamCritic
-from bidex_algos.nets.precision import autocast
+from bidex_algos.nets.networks import autocast
+from bidex_meta.errors import BidexError
 from bidex_meta.world.agent_views import agent_views
 from bidex_meta.world.contract import VectorWorld
 
-__all__ = ["IPPO", "PRESETS", "IPPOConfig"]
+
+@dataclass(frozen=True)
+class IPPOConfig(MAPPOConfig):
+    """Everything that can be set about IPPO; the defaults are the preset ``laptop``."""
+
+    def __post_init__(self) -> None:
+        """Checks what annotations cannot say."""
+        super().__post_init__()
+        if self.popart and self.share_parameters:
+            raise BidexError("ippo: popart needs a critic for each agent; leave popart or share_parameters off.")
+
+
+_MAPPO = mappo_config.PRESETS["paper"]
+
+PRESETS: dict[str, IPPOConfig] = {
+    # There is no table for IPPO: MAPPO's. B.2.1 has a policy and a critic for each agent.
+    "paper": IPPOConfig(**{**vars(_MAPPO), "share_parameters": False}),
+    "laptop": IPPOConfig(),
+}
+TASK_PRESETS = {"LiftUnderarm": {"paper": replace(PRESETS["paper"], **LIFT)}}
 
 
 class IPPO(MAPPO):
-    """IPPO, independent PPO (de Witt et al. 2020, arXiv 2011.09533).
-
-    Arguments, attributes and errors are those of its base.
-    """
+    """IPPO, independent PPO (de Witt et al. 2020, arXiv 2011.09533)."""
 
     name = "ippo"
-    config_type = IPPOConfig
+    config_type, presets, task_presets = IPPOConfig, PRESETS, TASK_PRESETS
     config: IPPOConfig
     critic: TeamCritic  # type: ignore[assignment]
 

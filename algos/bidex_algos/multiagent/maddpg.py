@@ -10,36 +10,45 @@ The original has a critic for each agent, since rewards may differ. Here they ar
 the same targets: there is one.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from bidex_algos.experience.replay import Transitions
-from bidex_algos.multiagent.maddpg_config import PRESETS, MADDPGConfig
+from bidex_algos.multiagent.base import Partition, keep_partition
 from bidex_algos.multiagent.team import Team
-from bidex_algos.nets.deterministic import DeterministicPolicy
-from bidex_algos.nets.encoders.inputs import Inputs
+from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.networks import use_bfloat16
 from bidex_algos.nets.normalise import ObservationNormaliser
-from bidex_algos.nets.precision import use_bfloat16
+from bidex_algos.nets.policy import DeterministicPolicy
 from bidex_algos.nets.shape import Shape
-from bidex_algos.offpolicy.ddpg import DDPG
+from bidex_algos.offpolicy.ddpg import DDPG, DDPGConfig, of_paper
+from bidex_algos.replay import Transitions
 from bidex_meta.world.agent_views import AgentView, agent_views
 from bidex_meta.world.contract import VectorWorld
 
-__all__ = ["MADDPG", "PRESETS", "MADDPGConfig"]
+
+@dataclass(frozen=True)
+class MADDPGConfig(DDPGConfig):
+    """Everything that can be set about MADDPG; the defaults are the preset ``laptop``."""
+
+    agents: Partition = "hands"
+    """Who acts: hands (two agents), fingers (twelve: five fingers and the palm of each hand), single, a TOML file with
+    a table [agents], or name=unit+unit;name=unit (docs/learners/multiagent.md)."""
+
+    def __post_init__(self) -> None:
+        """Checks what annotations cannot say."""
+        super().__post_init__()
+        keep_partition(self)
+
+
+# There is no table for MADDPG (B.2.5 describes it): DDPG's preset of this name.
+PRESETS: dict[str, MADDPGConfig] = {"paper": MADDPGConfig(**of_paper()), "laptop": MADDPGConfig()}
 
 
 class DeterministicTeam(Team):
-    """All agents as one actor without a distribution: in the place of a ``DeterministicActor``.
-
-    Args:
-        views: The agents.
-        config: As for :class:`Team`.
-        groups: The groups of the world's observation.
-        generator: CPU generator of the initial weights.
-        heads: Output layers of each agent; the group ``task_id`` chooses.
-    """
+    """All agents as one actor without a distribution, in the place of a ``DeterministicActor``."""
 
     def __init__(
         self, views: tuple[AgentView, ...], config: Any, groups: Inputs, generator: torch.Generator, heads: int
@@ -67,15 +76,13 @@ class DeterministicTeam(Team):
 class MADDPG(DDPG):
     """MADDPG, multi-agent DDPG (Lowe et al. 2017, arXiv 1706.02275).
 
-    Arguments, attributes and errors are those of its base.
-
     Attributes:
         views: The agents.
         owner: The agent of each action, int64 (a,).
     """
 
     name = "maddpg"
-    config_type = MADDPGConfig
+    config_type, presets = MADDPGConfig, PRESETS
     config: MADDPGConfig
 
     def __init__(self, world: VectorWorld, config: MADDPGConfig, seed: int):

@@ -4,35 +4,49 @@ An iteration is MT-PPO's, and with one agent the update is too: in each mini-bat
 surrogate, the critic its targets. The advantage is of all agents together, normalised per task like the returns.
 """
 
-from typing import Any
+from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from bidex_algos.gradients.step_size import AdaptiveAdam
-from bidex_algos.multiagent.base import MultiAgent
-from bidex_algos.multiagent.mappo_config import PRESETS, MAPPOConfig
-from bidex_algos.nets.networks import gaussian_log_prob
-from bidex_algos.nets.precision import autocast
+from bidex_algos.multiagent.base import LIFT, PAPER_PPO, MultiAgent, MultiAgentPPOConfig
+from bidex_algos.nets.networks import autocast, gaussian_log_prob
 from bidex_algos.onpolicy.base import Batch
-from bidex_algos.onpolicy.ppo_loss import NAMES, PolicyLoss, policy_loss
+from bidex_algos.onpolicy.ppo import NAMES, PolicyLoss, policy_loss
+from bidex_algos.step_size import AdaptiveAdam
 from bidex_meta.train.distributed import sum_gradients
+from bidex_meta.train.learner import Parts
 from bidex_meta.world.contract import VectorWorld
 
-__all__ = ["MAPPO", "PRESETS", "MAPPOConfig"]
+
+@dataclass(frozen=True)
+class MAPPOConfig(MultiAgentPPOConfig):
+    """Everything that can be set about MAPPO; the defaults are the preset ``laptop``."""
+
+    share_parameters: bool = False
+    """Give agents whose observations and actions are of one form a network together, which is told who acts."""
+
+
+PRESETS: dict[str, MAPPOConfig] = {
+    # Table 45. Its deviation is 0.5 sigmoid(s), s = 1 at first (std y and x coef); B.2.4 has one policy for all agents.
+    "paper": MAPPOConfig(
+        **PAPER_PPO, learning_rate=5e-4, critic_learning_rate=5e-4, max_grad_norm=10.0, adam_eps=5e-4,
+        init_std=0.3655, std_range=(0.01, 0.5), share_parameters=True,
+    ),
+    "laptop": MAPPOConfig(),
+}  # fmt: skip
+TASK_PRESETS = {"LiftUnderarm": {"paper": replace(PRESETS["paper"], **LIFT)}}
 
 
 class MAPPO(MultiAgent):
     """MAPPO, multi-agent PPO (Yu et al. 2022, arXiv 2103.01955).
-
-    Arguments, attributes and errors are those of its base.
 
     Attributes:
         adams: An optimiser of each network of the actors.
     """
 
     name, remedy = "mappo", "lower learning_rate"
-    config_type = MAPPOConfig
+    config_type, presets, task_presets = MAPPOConfig, PRESETS, TASK_PRESETS
     config: MAPPOConfig
 
     def __init__(self, world: VectorWorld, config: MAPPOConfig, seed: int):
@@ -43,7 +57,7 @@ class MAPPO(MultiAgent):
             for k in range(len(actor.nets))
         ]
 
-    def _optimisers(self) -> dict[str, Any]:
+    def _optimisers(self) -> Parts:
         return super()._optimisers() | {"agents": [adam.parts() for adam in self.adams]}
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
@@ -54,29 +68,20 @@ class MAPPO(MultiAgent):
         given = zip(*(actor.parts(x) for x in (batch.actions, batch.old_means, old_log_std)), strict=True)
         old_log_probs = torch.stack([gaussian_log_prob(*each) for each in given], dim=1)  # of each agent
         measured: list[Tensor] = []
-        for first, index, count in self._mini_batches(batch, cfg.epochs, cfg.num_minibatches):
+        for first, index, count in self._mini_batches(batch.weights, cfg.epochs, cfg.num_minibatches):
             part = batch.select(index)
             part.old_log_probs = old_log_probs.index_select(0, index)
             told = self._gradients(part, count, old_log_std.index_select(0, index), old_values.index_select(0, index))
             measured.append(told[:4])
             for k, adam in enumerate(self.adams):
-                # The first mini-batch compares the sampling policy with itself and says nothing about the step.
-                if not first:
-                    adam.follow(told[4 + k])
-                nn.utils.clip_grad_norm_(actor.parameters_of(k), cfg.max_grad_norm)
-                adam.step()
+                adam.descend(None if first else told[4 + k], cfg.max_grad_norm)
             self._critic_step()
             actor.clamp_std(*cfg.std_range)
         rate = torch.stack([adam.rate for adam in self.adams]).mean()
         return {**dict(zip(NAMES, torch.stack(measured).mean(0), strict=True)), "Policy/lr": rate}
 
     def _gradients(self, b: Batch, count: Tensor, old_log_std: Tensor, old_values: Tensor) -> Tensor:
-        """Puts the gradients of a mini-batch into the parameters; ``count`` samples are in it, over all processes.
-
-        Returns:
-            Surrogate loss, value loss, KL, share of clipped ratios, each the mean over agents, and the KL of the
-            agents of each network (4 + networks,).
-        """
+        """Puts the gradients of a mini-batch into the parameters; ``count`` samples are in it, over all processes."""
         cfg, actor = self.config, self.policy.actor
         weights = b.weights / count
         losses = self._agent_losses(b, weights, old_log_std)

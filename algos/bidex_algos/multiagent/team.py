@@ -7,11 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.nets.encoders.columns import Columns
-from bidex_algos.nets.encoders.inputs import Inputs
-from bidex_algos.nets.encoders.point_net import with_point_net
-from bidex_algos.nets.encoders.task_embedding import with_task_embedding
+from bidex_algos.nets.inputs import Columns, Inputs, with_task_embedding
 from bidex_algos.nets.networks import MLP, stacked_forward
+from bidex_algos.nets.point_net import with_point_net
 from bidex_meta.world.agent_views import AgentView
 
 
@@ -99,13 +97,8 @@ class Team(nn.Module):
 class TeamActor(Team):
     """Diagonal Gaussians of all agents, together one of the world's action: in the place of a ``GaussianActor``.
 
-    Args:
-        views: The agents.
-        config: Of a learner: as for :class:`Team`, and ``init_std``.
-        groups: The groups of the world's observation.
-        generator: CPU generator of the initial weights.
-        heads: Output layers and rows of standard deviations of each agent; the group ``task_id`` chooses.
-        share: As for :class:`Team`.
+    ``groups`` are those of the world's observation; ``heads`` output layers and deviations of each agent, which the
+    group ``task_id`` chooses.
 
     Attributes:
         own: The world's actions that are each agent's, int64 (a_i,).
@@ -154,15 +147,9 @@ class TeamActor(Team):
         return [self._chosen(task, out) for out in self.outputs(x)]
 
     def distribution_of(self, agent: int, seen: Tensor, task: Tensor) -> tuple[Tensor, Tensor]:
-        """One agent's Gaussian.
+        """One agent's Gaussian: mean (B, a_i) and logarithm of the deviation, (a_i,) with one head, else (B, a_i).
 
-        Args:
-            agent: Its number.
-            seen: What its network is fed (B, d_i): :meth:`seen`.
-            task: The tasks' one-hot (B, heads): ``one_hot``.
-
-        Returns:
-            Mean (B, a_i) and logarithm of the standard deviation, (a_i,) with one head, else (B, a_i).
+        ``seen`` is what its network is fed (B, d_i), ``task`` the tasks' one-hot (B, heads).
         """
         return self._chosen(task, self.nets[self.net_of[agent]](seen)), self.own_log_std(agent, task)
 
@@ -204,15 +191,7 @@ class TeamActor(Team):
 
 
 class TeamCritic(Team):
-    """A critic for each agent, on what it sees.
-
-    Args:
-        views: The agents.
-        config: As for :class:`Team`.
-        heads: Outputs of each: one per task, or 1 for all.
-        generator: CPU generator of the initial weights.
-        share: As for :class:`Team`.
-    """
+    """A critic for each agent, on what it sees, with ``heads`` outputs; other arguments as for :class:`Team`."""
 
     def __init__(
         self, views: Sequence[AgentView], config: Any, heads: int, generator: torch.Generator, share: bool = False

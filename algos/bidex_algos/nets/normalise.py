@@ -1,11 +1,12 @@
 """Running statistics: of observations, and of returns per task."""
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.nets.encoders.inputs import Inputs
+from bidex_algos.nets.inputs import Inputs
 from bidex_meta.train.distributed import pool_moments
 
 
@@ -110,3 +111,38 @@ class ObservationNormaliser(nn.Module):
         self.measured.write(self.shift, self.stats.mean.float())
         # The floor keeps a column that has been constant so far from blowing up noise a thousandfold.
         self.measured.write(self.scale, self.stats.std(floor=3e-3).reciprocal().float())
+
+
+def observation_normaliser(config: Any, inputs: Inputs, tasks: int) -> ObservationNormaliser:
+    """What a config asks for by ``normalise_observations`` and ``normalise_per_task``, of so many tasks."""
+    if config.normalise_per_task and config.normalise_observations and tasks > 1:
+        return TaskNormaliser(inputs, tasks)
+    return ObservationNormaliser(inputs, config.normalise_observations)
+
+
+class TaskNormaliser(ObservationNormaliser):
+    """Normalises by the statistics of each of ``tasks`` tasks, which the group ``task_id`` names."""
+
+    def __init__(self, inputs: Inputs, tasks: int, clip: float = 10.0):
+        super().__init__(inputs, True, clip)
+        self.tasks, self.one_hot = tasks, inputs.columns("task_id")
+        self.stats = RunningStats((tasks, self.measured.size))
+        self.shift, self.scale = torch.zeros(tasks, inputs.width), torch.ones(tasks, inputs.width)
+
+    def forward(self, obs: Tensor) -> Tensor:
+        """Normalises (..., columns), float32."""
+        task = self.one_hot(obs).argmax(-1)
+        return ((obs - self.shift[task]) * self.scale[task]).clamp_(-self.clip, self.clip)
+
+    @torch.no_grad()
+    def update(self, obs: Tensor) -> None:
+        """Takes (..., columns) raw observations, of all processes, into the statistics of their tasks."""
+        if self.settled or self.measured.size == 0:
+            return
+        flat = obs.reshape(-1, obs.shape[-1])
+        task = self.one_hot(flat).argmax(-1)
+        var, mean = torch.zeros(2, self.tasks, self.measured.size, device=obs.device).unbind()
+        for seen in task.unique():
+            var[seen], mean[seen] = torch.var_mean(self.measured(flat[task == seen]), dim=0, correction=0)
+        count = torch.bincount(task, minlength=self.tasks).double()[:, None]
+        self.merge(mean, var, count.expand_as(mean).contiguous())

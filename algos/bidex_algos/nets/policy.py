@@ -1,11 +1,16 @@
 """The agents that evaluation and sampling use: observation statistics, actor and precision in one module."""
 
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import softplus
 
-from bidex_algos.nets.networks import GaussianActor
+from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.networks import MLP, Activation, GaussianActor, autocast, gaussian_log_prob
 from bidex_algos.nets.normalise import ObservationNormaliser
-from bidex_algos.nets.precision import autocast
 
 
 class ActorPolicy(nn.Module):
@@ -53,3 +58,135 @@ class GaussianPolicy(ActorPolicy):
         mean, log_std = self.distribution(obs)
         noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype)
         return (mean + log_std.exp() * noise).clamp(-1.0, 1.0)
+
+
+class DeterministicActor(nn.Module):
+    """One action for each observation, squashed by tanh; arguments are those of :class:`GaussianActor`."""
+
+    def __init__(
+        self,
+        inputs: int | Inputs,
+        hidden: Sequence[int],
+        actions: int,
+        heads: int,
+        generator: torch.Generator,
+        activation: Activation,
+        network: Callable[..., Any] = MLP,
+    ):
+        super().__init__()
+        self.heads = heads
+        self.one_hot = Inputs.of(inputs).columns(*["task_id"] * (heads > 1))
+        self.net = network(inputs, hidden, heads * actions, 0.01, generator, activation)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Actions of normalised observations (batch, d): float32 (batch, a) in [-1, 1]."""
+        return torch.tanh(self.raw(x))
+
+    def raw(self, x: Tensor) -> Tensor:
+        """The same before the squashing: float32 (batch, a)."""
+        out = self.net(x)
+        if self.heads > 1:
+            head = self.one_hot(x).argmax(1).view(-1, 1, 1)
+            out = out.unflatten(1, (self.heads, -1))
+            out = out.gather(1, head.expand(-1, 1, out.shape[2]))[:, 0]
+        return out
+
+
+class DeterministicPolicy(ActorPolicy):
+    """A deterministic actor on raw observations."""
+
+    actor: DeterministicActor
+
+    def raw(self, obs: Tensor) -> Tensor:
+        """What tanh makes the actions of (N, a), for normalised observations (N, d), with their slopes."""
+        with autocast(obs.device, self.low_precision):
+            return self.actor.raw(obs)
+
+    @torch.no_grad()
+    def eval_action(self, obs: Tensor) -> Tensor:
+        """The action for raw observations (N, d): (N, a) in [-1, 1]."""
+        return torch.tanh(self.raw(self.observations(obs)))
+
+
+def squashed_log_prob(raw: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
+    """Log-density of the action tanh(raw), where raw is drawn from N(mean, exp(log_std)^2).
+
+    It takes what was squashed: in float32 tanh rounds to 1 from 9 on, and the way back from an action of 1 is infinite.
+    All are (..., a); the result is summed over the last axis, (...).
+    """
+    # log(1 - tanh(u)^2), written so that no difference of almost equal numbers occurs.
+    log_slope = 2.0 * (math.log(2.0) - raw - softplus(-2.0 * raw))
+    return gaussian_log_prob(raw, mean, log_std) - log_slope.sum(-1)
+
+
+def sample_squashed(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Actions (..., a) in [-1, 1] and their log-densities (...), from standard normal ``noise`` (..., a)."""
+    raw = mean + log_std.exp() * noise
+    return torch.tanh(raw), squashed_log_prob(raw, mean, log_std)
+
+
+class SquashedActor(nn.Module):
+    """Mean and log standard deviation, before the squashing, from one network.
+
+    The log standard deviation moves between its bounds on a tanh: a hard clamp would have no gradient beyond them, so
+    that an output that went there would never return.
+
+    Arguments are those of :class:`GaussianActor`, and ``std_range``, the bounds.
+    """
+
+    def __init__(
+        self,
+        inputs: int | Inputs,
+        hidden: Sequence[int],
+        actions: int,
+        heads: int,
+        init_std: float,
+        std_range: tuple[float, float],
+        generator: torch.Generator,
+        activation: Activation,
+        network: Callable[..., Any] = MLP,
+    ):
+        super().__init__()
+        self.heads = heads
+        self.one_hot = Inputs.of(inputs).columns(*["task_id"] * (heads > 1))
+        low, high = (math.log(std) for std in std_range)
+        self.middle, self.reach = 0.5 * (low + high), 0.5 * (high - low)
+        self.net = network(inputs, hidden, heads * 2 * actions, 0.01, generator, activation)
+        with torch.no_grad():
+            start = math.atanh((math.log(init_std) - self.middle) / self.reach)
+            self.net.output_bias.view(heads, 2, actions)[:, 1] = start
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and log standard deviation of normalised observations (batch, d): float32 (batch, a) each."""
+        out = self.net(x).unflatten(1, (self.heads, 2, -1))
+        if self.heads == 1:
+            mean, log_std = out[:, 0].unbind(1)
+        else:
+            head = self.one_hot(x).argmax(1).view(-1, 1, 1, 1).expand(-1, 1, *out.shape[2:])
+            mean, log_std = out.gather(1, head)[:, 0].unbind(1)
+        return mean, self.middle + self.reach * torch.tanh(log_std)
+
+
+class SquashedPolicy(ActorPolicy):
+    """A squashed actor on raw observations; arguments are those of its base."""
+
+    actor: SquashedActor
+
+    def sample(self, obs: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Actions (N, a) and their log-densities (N,) for normalised observations (N, d)."""
+        with autocast(obs.device, self.low_precision):
+            mean, log_std = self.actor(obs)
+        noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype)
+        return sample_squashed(mean, log_std, noise)
+
+    @torch.no_grad()
+    def eval_action(self, obs: Tensor) -> Tensor:
+        """The squashed mean for raw observations (N, d): (N, a) in [-1, 1]."""
+        with autocast(obs.device, self.low_precision):
+            mean, _ = self.actor(self.observations(obs))
+        return torch.tanh(mean)
+
+    @torch.no_grad()
+    def sample_action(self, obs: Tensor, generator: torch.Generator) -> Tensor:
+        """Actions drawn from the distribution for raw observations (N, d): (N, a) in [-1, 1]."""
+        return self.sample(self.observations(obs), generator)[0]

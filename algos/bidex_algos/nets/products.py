@@ -18,16 +18,7 @@ _LEAST = 1 << 21
 
 
 def affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """What ``torch.nn.functional.linear`` gives, to rounding: ``x @ weight.T + bias``; differentiable as often as that.
-
-    Args:
-        x: (..., inputs).
-        weight: (outputs, inputs).
-        bias: (outputs,).
-
-    Returns:
-        (..., outputs).
-    """
+    """``x @ weight.T + bias``, differentiable: (..., inputs), (outputs, inputs), (outputs,) to (..., outputs)."""
     if not _pays(x, weight):
         return nn.functional.linear(x, weight, bias)
     rows = x.reshape(-1, x.shape[-1])
@@ -36,16 +27,7 @@ def affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
 
 
 def stacked_affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """Products of several layers of one form with a batch each.
-
-    Args:
-        x: (K, batch, inputs).
-        weight: (K, outputs, inputs).
-        bias: (K, outputs).
-
-    Returns:
-        (K, batch, outputs).
-    """
+    """Layers of one form with a batch each: (K, batch, in), (K, out, in), (K, out) to (K, batch, out)."""
     if _pays(x[0], weight[0]):
         biases = [None] * len(x) if bias is None else bias.unbind()
         return torch.stack([affine(*each) for each in zip(x.unbind(), weight.unbind(), biases, strict=True)])

@@ -2,14 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.choices import Activation
-from bidex_algos.nets.encoders.inputs import Inputs
-from bidex_algos.nets.networks import ACTIVATIONS, MLP
+from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.networks import ACTIVATIONS, MLP, Activation
 from bidex_algos.nets.normalise import ObservationNormaliser
 
 
@@ -74,7 +73,7 @@ class RecurrentNet(nn.Module):
 
 @dataclass
 class Memory:
-    """What each row brings along from the step before. A fresh one is all zeros: nothing has happened yet.
+    """What each environment brings along from the step before. A fresh one is all zeros: nothing has happened yet.
 
     Attributes:
         state: The GRU's state, (N, memory).
@@ -99,7 +98,7 @@ class Memory:
 
     def replaced(self, mask: Tensor, other: "Memory") -> "Memory":
         """The same with the rows of ``mask``, bool (N,), from another one."""
-        pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
         return Memory(*(torch.where(mask if a.dim() == 1 else mask[:, None], b, a) for a, b in pairs))
 
 
@@ -107,20 +106,9 @@ class RecurrentPolicy(nn.Module):
     """A Gaussian policy whose memory is fed with observation, last action, last reward and end of episode.
 
     Rewards of task classes differ by orders of magnitude, and a class met in a meta-test has never been seen: no scale
-    of its own is known, nor which class a row plays. One rule serves all: asinh(reward / unit), which is linear below
-    the unit and tells ratios apart above it, normalised by the mean and deviation it had in training.
-
-    Args:
-        inputs: The groups of the raw observation.
-        actions: Number of actions.
-        hidden: Widths of the encoder's layers.
-        memory: Width of the memory.
-        init_std: Standard deviation of the actions at the start.
-        reward_unit: The unit.
-        normalise_observations: Whether observations are normalised.
-        generator: CPU generator of the initial weights.
-        activation: Name of the encoder's non-linearity.
-        lasting: Steps that the memory shall last for.
+    of its own is known, nor which class is played. One rule serves all: asinh(reward / ``reward_unit``), linear below
+    the unit and showing ratios above it, normalised by the mean and deviation it had in training. Other arguments are
+    those of :class:`RecurrentNet`.
 
     Attributes:
         inputs: What the networks see: these groups, normalised, and ``last_step``, what the memory is fed beside them.
@@ -149,17 +137,9 @@ class RecurrentPolicy(nn.Module):
         self.log_std = nn.Parameter(torch.full((actions,), math.log(init_std)))
 
     def see(self, obs: Tensor, action: Tensor, reward: Tensor, known: Tensor, done: Tensor) -> Tensor:
-        """What the networks see: normalised observation, last action, last reward or 0, whether it is known, end.
+        """What the networks see (..., width of ``inputs``): normalised observation, last action, last reward or 0.
 
-        Args:
-            obs: Raw observations (..., d).
-            action: Last actions (..., a).
-            reward: Last rewards (...).
-            known: Whether the rewards are shown, bool (...).
-            done: Whether the last step ended an episode, bool (...).
-
-        Returns:
-            Shape (..., width of ``inputs``).
+        ``obs`` are raw (..., d), ``action`` (..., a); ``known`` and ``done`` as in :class:`Memory`, (...); both go in.
         """
         earned = torch.where(known, self.rewards(self._compressed(reward)).squeeze(-1), 0.0)
         last = torch.stack([earned, known.float(), done.float()], dim=-1)
@@ -173,7 +153,7 @@ class RecurrentPolicy(nn.Module):
         return mean[0], state
 
     def fresh_memory(self, rows: int) -> Memory:
-        """The memory at the start of a trial of so many rows."""
+        """The memory at the start of a trial of so many environments."""
         return Memory.fresh(rows, self.memory, self.num_actions, self.log_std.device)
 
     @torch.no_grad()

@@ -3,6 +3,9 @@
 from dataclasses import dataclass
 from typing import Any
 
+from bidex_algos.nets.architecture import ArchitectureConfig
+from bidex_meta.errors import BidexError
+from bidex_meta.train.learner import State
 from bidex_meta.world.contract import ObservationGroup, VectorWorld, plain_groups
 
 
@@ -38,16 +41,56 @@ class Shape:
 
     def sizes(self) -> dict[str, int]:
         """The numbers without the places of the groups."""
-        return {name: getattr(self, name) for name in ("observations", "actions", "num_id_columns")}
+        return {
+            "observations": self.observations,
+            "actions": self.actions,
+            "num_id_columns": self.num_id_columns,
+        }
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         """Plain values for a checkpoint."""
         return self.sizes() | {"groups": {g.name: [[w.start, w.stop] for w in g.where] for g in self.groups}}
 
     @classmethod
-    def load(cls, state: dict[str, Any]) -> "Shape":
+    def load(cls, state: State) -> "Shape":
         """What :meth:`state_dict` gave; earlier versions kept the sizes alone, and the one-hot was last."""
         if "groups" not in state:
             return cls.plain(**state)
         groups = ((name, tuple(slice(*part) for part in where)) for name, where in state["groups"].items())
         return cls(state["observations"], state["actions"], tuple(ObservationGroup(*group) for group in groups))
+
+
+_OF_SEVERAL = ("task_embedding", "normalise_per_task")
+
+
+def check_options(name: str, config: Any, world: VectorWorld, shape: Shape) -> None:
+    """Options that tell tasks apart need the one-hot of the tasks.
+
+    Raises:
+        BidexError: The world does not show one.
+    """
+    wanted = [option for option in (*_OF_SEVERAL, "policy_heads") if vars(config).get(option)]
+    if world.num_tasks == 1:
+        wanted = [option for option in wanted if option not in _OF_SEVERAL]  # one task needs none; heads it cannot have
+    if isinstance(config, ArchitectureConfig) and not config.shares_a_trunk:
+        wanted.append(f"architecture {config.architecture}")
+    for option in wanted:
+        if shape.num_id_columns != world.num_tasks:
+            raise BidexError(
+                f"{name}: {option} needs the one-hot of {world.num_tasks} tasks in the observation (an MT "
+                f"suite), this world shows {shape.num_id_columns} such entries. Leave {option} off."
+            )
+
+
+def check_discounts(name: str, world: VectorWorld, by_class: bool) -> None:
+    """A suite's own discounts need a learner that takes them.
+
+    Raises:
+        BidexError: This one does not.
+    """
+    own = [task for task, gamma in zip(world.task_names, world.gammas, strict=True) if gamma is not None]
+    if own and not by_class:
+        raise BidexError(
+            f"{name}: has one discount for all classes, but the suite gives {', '.join(own)} one of its own. "
+            "Leave gamma out of the suite's file."
+        )

@@ -8,28 +8,85 @@ import copy
 import math
 from abc import abstractmethod
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.experience.advantages import discounts
-from bidex_algos.experience.replay import Transitions
-from bidex_algos.learner import Learner
-from bidex_algos.nets.encoders.inputs import Inputs
-from bidex_algos.nets.precision import autocast, use_bfloat16
+from bidex_algos.advantages import discounts
+from bidex_algos.learner import Learner, as_numbers
+from bidex_algos.nets.architecture import NetworkConfig, network_bytes
+from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.networks import Autocast, autocast, use_bfloat16
 from bidex_algos.offline.batches import Batches, return_deviation
 from bidex_algos.offpolicy.critics import Critics
-from bidex_algos.reports import as_numbers
+from bidex_algos.replay import Transitions
 from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
+from bidex_meta.train.learner import Parts, State
+from bidex_meta.validation import BelowOne, Count, NonNegative, Positive, Share
 from bidex_meta.world.contract import VectorWorld
+
+
+@dataclass(frozen=True)
+class OfflineConfig(NetworkConfig):
+    """Networks, batches, statistics; the defaults are the preset ``laptop``."""
+
+    updates_per_iteration: Count = 1000
+    """Updates between two reports; --evaluate-every and --video-every count reports."""
+    batch_size: Count = 256
+    """Transitions of an update, split evenly over the tasks."""
+    batch_per_task: Count | None = None
+    """Take this many of each task instead."""
+    learning_rate: Positive = 3e-4
+    """Adam's step size for the actor."""
+    adam_eps: NonNegative = 1e-8
+    """What Adam adds to its denominators."""
+    max_grad_norm: Positive | None = None
+    """Gradients longer than this are shortened to it, those of each network apart; None: none is."""
+    normalise_observations: bool = True
+    """Give observations zero mean and unit variance by the data's statistics; the task's one-hot stays as it is."""
+    normalise_per_task: bool = False
+    """By the statistics of each task's data apart; the world must show the task's one-hot."""
+    autocast: Autocast = "auto"
+    """Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX."""
+
+    def bytes_held(self, num_envs: int, width: int) -> int:
+        """Of the networks; the data are counted when they are read."""
+        return network_bytes(self.hidden, width, 4)
+
+
+@dataclass(frozen=True)
+class CriticConfig(OfflineConfig):
+    """What learners with critics add."""
+
+    value_heads: bool = True
+    """Give each critic one output per task instead of one for all."""
+    critic_layer_norm: bool = True
+    """Normalise the hidden layers of the critics, which keeps values of actions that no data show from growing."""
+    critic_learning_rate: Positive = 3e-4
+    """Adam's step size for the critics."""
+    gamma: BelowOne = 0.99
+    """Discount per step."""
+    tau: Share = 0.005
+    """Share of the networks that enters their targets in each update (1 - Polyak's factor)."""
+    per_task_rewards: bool = True
+    """Divide rewards by the standard deviation of their task's discounted returns in the data."""
+
+    def __post_init__(self) -> None:
+        """Checks what annotations cannot say."""
+        super().__post_init__()
+        if not 0.0 <= self.gamma < 1.0:
+            raise BidexError(f"{self.algo}: gamma must lie in [0, 1), got {self.gamma}.")
+
+
+PAPER: dict[str, Any] = {"value_heads": False, "critic_layer_norm": False, "per_task_rewards": False}
+"""What the preset ``paper`` leaves out of all learners with critics: Table 46 and the methods' papers know none."""
 
 
 class Offline(Learner):
     """A learner from data. ``learn_from`` comes before the first iteration and before a checkpoint is loaded.
-
-    Arguments, attributes and errors are those of :class:`~bidex_algos.learner.Learner`.
 
     Attributes:
         env_steps: Updates so far.
@@ -42,8 +99,7 @@ class Offline(Learner):
         reward_scale: What rewards of each task are divided by (num_tasks,).
     """
 
-    offline: ClassVar[bool] = True
-    """Whether it learns from data sets."""
+    offline = True
     num_critics: ClassVar[int] = 2
     discounts_by_class = True
 
@@ -93,7 +149,7 @@ class Offline(Learner):
     def _critics(self, inputs: Inputs, heads: int, count: int) -> Critics:
         return Critics(inputs, heads, self.config, self.initial, count).to(self.device)
 
-    def _own_parts(self) -> dict[str, Any]:
+    def _own_parts(self) -> Parts:
         """Networks of its own, beside those of the base, by their names in a checkpoint."""
         return {}
 
@@ -120,10 +176,7 @@ class Offline(Learner):
             return critic(obs, actions, self.task_of_draw)
 
     def _bootstrapped(self, draw: Transitions, following: Tensor) -> Tensor:
-        """Targets (B,): scaled reward + gamma * ``following`` (B,), the value of the next state.
-
-        Nothing follows a true end. After a time limit the episode could have gone on.
-        """
+        """Targets (B,): scaled reward + gamma * ``following`` (B,), the value of the next state."""
         rewards = draw.rewards / self.reward_scale[self.task_of_draw]
         return rewards + self.gamma_of_draw * following.masked_fill(draw.terminated, 0.0)
 
@@ -153,15 +206,15 @@ class Offline(Learner):
 
     # Checkpoints.
 
-    def _parts(self) -> dict[str, Any]:
+    def _parts(self) -> Parts:
         critics = {} if self.critic is None else {"critic": self.critic, "target_critic": self.target_critic}
         generators = {"generator": self.generator, "noise": self.noise}
         return {**critics, **self._own_parts(), "adams": self.adams, **generators, "reward_scale": self.reward_scale}
 
-    def _place(self) -> dict[str, Any]:
+    def _place(self) -> State:
         return super()._place() | {"data": self._batches and dict(self._batches.fingerprint)}
 
-    def _check_size(self, state: dict[str, Any]) -> None:
+    def _check_size(self, state: State) -> None:
         super()._check_size(state)
         here = self._batches and self._batches.fingerprint
         if here and state["data"] and here != state["data"]:

@@ -3,21 +3,14 @@
 import torch
 from torch import Tensor
 
-from bidex_algos.experience.replay import Transitions
+from bidex_algos.replay import Transitions
 from bidex_meta.data.joined import Joined
 
 _CHUNK = 65_536
 
 
 class Batches:
-    """Transitions on a device.
-
-    Args:
-        data: The transitions.
-        num_tasks: Slots; each has transitions.
-        per_task: Transitions of each in a batch.
-        device: Where they lie.
-    """
+    """Transitions on a device, in batches of ``per_task`` of each of ``num_tasks`` tasks."""
 
     def __init__(self, data: Joined, num_tasks: int, per_task: int, device: torch.device):
         self._per_task, self._device = per_task, device
@@ -56,12 +49,7 @@ def return_deviation(data: Joined, num_tasks: int, gamma: Tensor | float) -> Ten
     """Standard deviation of each task's discounted returns, from every state to the end of its episode: (num_tasks,).
 
     It doubles the steps that a sum spans until it spans the longest episode. An episode that was cut by time counts up
-    to there. 1 where all returns are equal.
-
-    Args:
-        data: The transitions.
-        num_tasks: Slots; each has transitions.
-        gamma: Discount, one for all or of each slot (num_tasks,).
+    to there. 1 where all returns are equal. ``gamma`` is one for all, or (num_tasks,).
     """
     returns = data.rewards.double()
     factor = torch.as_tensor(gamma, dtype=torch.float64).cpu().expand(num_tasks)[data.task]

@@ -1,28 +1,33 @@
 """BC: an actor that does in each state what the data did (behaviour cloning), by the mean squared distance."""
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
-from bidex_algos.experience.replay import Transitions
-from bidex_algos.nets.deterministic import DeterministicActor, DeterministicPolicy
-from bidex_algos.nets.multitask.architecture import network_of
-from bidex_algos.nets.normalise_tasks import observation_normaliser
-from bidex_algos.nets.precision import autocast, use_bfloat16
+from bidex_algos.nets.architecture import network_of
+from bidex_algos.nets.networks import autocast, use_bfloat16
+from bidex_algos.nets.normalise import observation_normaliser
+from bidex_algos.nets.policy import DeterministicActor, DeterministicPolicy
 from bidex_algos.nets.shape import Shape
-from bidex_algos.offline.base import Offline
-from bidex_algos.offline.bc_config import PRESETS, BCConfig
+from bidex_algos.offline.base import Offline, OfflineConfig
+from bidex_algos.replay import Transitions
 
-__all__ = ["BC", "PRESETS", "BCConfig"]
+
+@dataclass(frozen=True)
+class BCConfig(OfflineConfig):
+    """Everything that can be set about BC; the defaults are the preset ``laptop``."""
+
+
+# Bi-DexHands compares with BC and has no table for it: layers, step size and batch are TD3+BC's of Table 46.
+PRESETS: dict[str, BCConfig] = {"paper": BCConfig(), "laptop": BCConfig()}
 
 
 class BC(Offline):
-    """Behaviour cloning on data sets (Pomerleau 1988): TD3+BC (arXiv 2106.06860) without its critics.
-
-    Arguments, errors and attributes are those of :class:`~bidex_algos.offline.base.Offline`.
-    """
+    """Behaviour cloning on data sets (Pomerleau 1988): TD3+BC (arXiv 2106.06860) without its critics."""
 
     name, remedy = "bc", "lower learning_rate"
-    config_type = BCConfig
+    config_type, presets = BCConfig, PRESETS
     config: BCConfig
     policy: DeterministicPolicy
     num_critics = 0

@@ -9,34 +9,165 @@ Q', xi'  a small step towards Q, xi
 """
 
 import copy
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import torch
-from torch import Tensor
+from msgspec import Meta
+from torch import Tensor, nn
 
-from bidex_algos.experience.replay import Transitions
-from bidex_algos.nets.precision import autocast, use_bfloat16
+from bidex_algos.nets.architecture import network_bytes, network_of
+from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.networks import MLP, Layers, autocast, use_bfloat16
+from bidex_algos.nets.normalise import observation_normaliser
+from bidex_algos.nets.policy import DeterministicActor
 from bidex_algos.nets.shape import Shape
-from bidex_algos.offline.base import Offline
-from bidex_algos.offline.bcq_config import PRESETS, BCQConfig
-from bidex_algos.offline.bcq_policy import BCQPolicy, bounded
-from bidex_algos.offpolicy.critics import follow
+from bidex_algos.offline.base import PAPER, CriticConfig, Offline
+from bidex_algos.offpolicy.critics import Critics, follow
+from bidex_algos.replay import Transitions
+from bidex_meta.train.learner import Parts
+from bidex_meta.validation import Count, Fraction, NonNegative, Positive
 from bidex_meta.world.contract import VectorWorld
 
-__all__ = ["BCQ", "PRESETS", "BCQConfig"]
+_FARTHEST = 0.5
+"""Codes are cut to this when actions are proposed: near the middle the model has seen most."""
+_LOG_STD = (-4.0, 15.0)
+
+
+@dataclass(frozen=True)
+class BCQConfig(CriticConfig):
+    """Everything that can be set about BCQ; the defaults are the preset ``laptop``."""
+
+    vae_hidden: Layers = (256, 256)
+    """Widths of the hidden layers of the model of the data's actions, a variational autoencoder."""
+    vae_learning_rate: Positive = 1e-3
+    """Adam's step size for it."""
+    latent: Count = 2
+    """Entries of its code, for each action."""
+    kl_weight: NonNegative = 0.5
+    """Weight of the codes' divergence from a standard normal beside the squared error of an action."""
+    candidates: Count = 10
+    """Actions that are drawn for a state; the best one is taken."""
+    perturbation: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.05
+    """The most by which a candidate is changed (Phi)."""
+    lower_weight: Fraction = 0.75
+    """Weight of the lower of both critics in a target; the higher one has the rest."""
+
+    def bytes_held(self, num_envs: int, width: int) -> int:
+        """As of its base, with the autoencoder."""
+        return super().bytes_held(num_envs, width) + network_bytes(self.vae_hidden, width, 2)
+
+
+# "paper": layers, step size, batch, Phi and the number of actions are Table 46's; the autoencoder's layers, its weight
+# and lower_weight, which it leaves out, those of Fujimoto et al. (2019, their code).
+PRESETS: dict[str, BCQConfig] = {
+    "paper": BCQConfig(
+        hidden=(400, 300), vae_hidden=(750, 750), learning_rate=1e-3, critic_learning_rate=1e-3, batch_size=100,
+        normalise_observations=False, **PAPER,
+    ),
+    "laptop": BCQConfig(),
+}  # fmt: skip
+
+
+class ActionModel(nn.Module):
+    """A conditional variational autoencoder: which actions the data hold in a state.
+
+    Attributes:
+        codes: Entries of a code, z.
+    """
+
+    def __init__(self, inputs: Inputs, config: BCQConfig, actions: int, generator: torch.Generator):
+        super().__init__()
+        self.codes = config.latent * actions
+        seen, told = inputs.extended("action", actions), inputs.extended("code", self.codes)
+        self.encoder = MLP(seen, config.vae_hidden, 2 * self.codes, 1.0, generator, config.activation)
+        self.decoder = MLP(told, config.vae_hidden, actions, 1.0, generator, config.activation)
+
+    def encode(self, obs: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and logarithm of the standard deviation of the codes of actions (B, a): (B, z) each."""
+        mean, log_std = self.encoder(torch.cat([obs, actions], 1)).chunk(2, 1)
+        return mean, log_std.clamp(*_LOG_STD)
+
+    def decode(self, obs: Tensor, codes: Tensor) -> Tensor:
+        """Actions (B, a) in [-1, 1] of codes (B, z)."""
+        return torch.tanh(self.decoder(torch.cat([obs, codes], 1)))
+
+
+def bounded(codes: Tensor) -> Tensor:
+    """Standard normal codes, cut to where the model is sure."""
+    return codes.clamp(-_FARTHEST, _FARTHEST)
+
+
+class BCQPolicy(nn.Module):
+    """The best, by the first critic, of some proposals on raw observations.
+
+    The codes of the proposals are the same in every state, drawn when the policy is created: the policy is a function
+    of the observation.
+
+    Attributes:
+        model: Proposes.
+        actor: Changes: a network of observation and action.
+        critic: Two networks; chooses by its first.
+    """
+
+    def __init__(
+        self, config: BCQConfig, inputs: Inputs, shape: Shape, generator: torch.Generator, low_precision: bool
+    ):
+        super().__init__()
+        self.perturbation, self.low_precision = config.perturbation, low_precision
+        self.observations = observation_normaliser(config, inputs, shape.num_id_columns)
+        judged, heads = inputs.extended("action", shape.actions), shape.num_id_columns
+        self.actor = DeterministicActor(
+            judged,
+            config.hidden,
+            shape.actions,
+            heads if config.policy_heads else 1,
+            generator,
+            config.activation,
+            network_of(config),
+        )
+        # A policy knows its task by the one-hot alone: without it, one value serves all.
+        self.critic = Critics(judged, heads if config.value_heads and heads else 1, config, generator)  # pyright: ignore[reportArgumentType]
+        self.model = ActionModel(inputs, config, shape.actions, generator)
+        self.task = inputs.columns(*["task_id"] * (self.critic.heads > 1))
+        self.codes: Tensor
+        codes = bounded(torch.randn(config.candidates, self.model.codes, generator=generator))
+        self.register_buffer("codes", codes)
+
+    def propose(self, actor: nn.Module, obs: Tensor, codes: Tensor) -> Tensor:
+        """Actions (B, a) of codes (B, z), changed by ``actor``, for normalised observations (B, d)."""
+        return self.changed(actor, obs, self.model.decode(obs, codes))
+
+    def changed(self, actor: nn.Module, obs: Tensor, actions: Tensor) -> Tensor:
+        """Actions (B, a), each moved by no more than ``perturbation``, within [-1, 1]."""
+        moved = actions + self.perturbation * actor(torch.cat([obs, actions], 1))
+        return moved.clamp(-1.0, 1.0)
+
+    def reset(self, env_mask: Tensor) -> None:
+        """Nothing to forget between episodes; the argument is part of the Agent protocol."""
+
+    @torch.no_grad()
+    def eval_action(self, obs: Tensor) -> Tensor:
+        """The action for raw observations (N, d): (N, a) in [-1, 1]."""
+        count, rows = len(self.codes), len(obs)
+        many = self.observations(obs).repeat_interleave(count, 0)
+        with autocast(obs.device, self.low_precision):
+            actions = self.propose(self.actor, many, self.codes.repeat(rows, 1))
+            task = self.task(many).argmax(1) if self.critic.heads > 1 else many.new_zeros(len(many), dtype=torch.int64)
+            values = self.critic(many, actions, task)[0]
+        best = values.view(rows, count).argmax(1)
+        return actions.view(rows, count, -1)[torch.arange(rows, device=obs.device), best]
 
 
 class BCQ(Offline):
     """Batch-constrained deep Q-learning on data sets (Fujimoto et al. 2019, arXiv 1812.02900).
-
-    Arguments, errors and attributes are those of :class:`~bidex_algos.offline.base.Offline`.
 
     Attributes:
         target_actor: Follows the network that changes proposals.
     """
 
     name, remedy = "bcq", "lower critic_learning_rate"
-    config_type = BCQConfig
+    config_type, presets = BCQConfig, PRESETS
     config: BCQConfig
     policy: BCQPolicy
 
@@ -94,22 +225,16 @@ class BCQ(Offline):
         low_precision = use_bfloat16(config.autocast, device)
         return BCQPolicy(config, cls._inputs(config, shape), shape, init, low_precision).to(device)
 
-    def _parts(self) -> dict[str, Any]:
+    def _parts(self) -> Parts:
         parts = super()._parts()
         del parts["critic"]  # the policy's
         return parts
 
-    def _own_parts(self) -> dict[str, Any]:
+    def _own_parts(self) -> Parts:
         return {"target_actor": self.target_actor}
 
 
 def best_of(values: Tensor, count: int, lower_weight: float) -> Tensor:
-    """The best proposal's value of each state (B,).
-
-    Args:
-        values: Of both critics, ``count`` proposals of each state behind one another, (2, B * count).
-        count: Proposals of a state.
-        lower_weight: Weight of the lower critic; the higher one has the rest.
-    """
+    """The best proposal's value of each state (B,), of both critics' values (2, B * count), state after state."""
     mixed = lower_weight * values.amin(0) + (1.0 - lower_weight) * values.amax(0)
     return mixed.view(-1, count).amax(1)

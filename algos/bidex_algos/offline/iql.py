@@ -6,24 +6,49 @@ Q_i towards r + gamma (1 - terminated) V(s')
 Q'  a small step towards Q
 """
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+from msgspec import Meta
 from torch import Tensor
 
-from bidex_algos.experience.replay import Transitions
-from bidex_algos.nets.multitask.architecture import network_of
-from bidex_algos.nets.networks import GaussianActor, gaussian_log_prob
-from bidex_algos.nets.normalise_tasks import observation_normaliser
+from bidex_algos.nets.architecture import network_of
+from bidex_algos.nets.networks import GaussianActor, autocast, gaussian_log_prob, use_bfloat16
+from bidex_algos.nets.normalise import observation_normaliser
 from bidex_algos.nets.policy import GaussianPolicy
-from bidex_algos.nets.precision import autocast, use_bfloat16
 from bidex_algos.nets.shape import Shape
-from bidex_algos.offline.base import Offline
-from bidex_algos.offline.iql_config import PRESETS, IQLConfig
+from bidex_algos.offline.base import PAPER, CriticConfig, Offline
 from bidex_algos.offpolicy.critics import follow
+from bidex_algos.replay import Transitions
+from bidex_meta.train.learner import Parts
+from bidex_meta.validation import NonNegative, Positive, check_rising
 from bidex_meta.world.contract import VectorWorld
 
-__all__ = ["IQL", "PRESETS", "IQLConfig"]
+
+@dataclass(frozen=True)
+class IQLConfig(CriticConfig):
+    """Everything that can be set about IQL; the defaults are the preset ``laptop``."""
+
+    expectile: Annotated[float, Meta(gt=0.0, lt=1.0)] = 0.7
+    """Which expectile of the values of the data's actions a state is worth: 0.5 their mean, towards 1 the best one."""
+    beta: NonNegative = 3.0
+    """Weight of an action in the actor's update: exp(beta * advantage); 0: BC."""
+    max_weight: Positive = 100.0
+    """That weight is cut to this."""
+    init_std: Positive = 1.0
+    """Standard deviation of the actor at the start."""
+    std_range: tuple[Positive, Positive] = (0.0067, 7.4)
+    """Its bounds, exp(-5) and exp(2)."""
+
+    def __post_init__(self) -> None:
+        """Checks what annotations cannot say."""
+        super().__post_init__()
+        check_rising(self, self.algo, "std_range")
+
+
+# Table 46's numbers are the defaults. The bound of the weight is that of Kostrikov et al. (2022, their code).
+PRESETS: dict[str, IQLConfig] = {"paper": IQLConfig(normalise_observations=False, **PAPER), "laptop": IQLConfig()}
 
 
 class BoundedMean(GaussianActor):
@@ -37,14 +62,12 @@ class BoundedMean(GaussianActor):
 class IQL(Offline):
     """Implicit Q-learning on data sets (Kostrikov et al. 2022, arXiv 2110.06169).
 
-    Arguments, errors and attributes are those of :class:`~bidex_algos.offline.base.Offline`.
-
     Attributes:
         value: Network of the state's value.
     """
 
     name, remedy = "iql", "lower beta"
-    config_type = IQLConfig
+    config_type, presets = IQLConfig, PRESETS
     config: IQLConfig
     policy: GaussianPolicy
 
@@ -96,7 +119,7 @@ class IQL(Offline):
         observations = observation_normaliser(config, inputs, shape.num_id_columns)
         return GaussianPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
 
-    def _own_parts(self) -> dict[str, Any]:
+    def _own_parts(self) -> Parts:
         return {"value": self.value}
 
 

@@ -7,32 +7,49 @@ mu', Q'  a small step towards mu, Q                    mu and the targets at eve
 """
 
 import copy
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from bidex_algos.experience.replay import Transitions
-from bidex_algos.nets.precision import autocast
+from bidex_algos.nets.networks import autocast
+from bidex_algos.offline.base import PAPER, CriticConfig
 from bidex_algos.offline.bc import BC
-from bidex_algos.offline.td3bc_config import PRESETS, TD3BCConfig
 from bidex_algos.offpolicy.critics import follow
+from bidex_algos.replay import Transitions
+from bidex_meta.train.learner import Parts
+from bidex_meta.validation import Count, NonNegative
 from bidex_meta.world.contract import VectorWorld
 
-__all__ = ["PRESETS", "TD3BC", "TD3BCConfig"]
+
+@dataclass(frozen=True)
+class TD3BCConfig(CriticConfig):
+    """Everything that can be set about TD3+BC; the defaults are the preset ``laptop``."""
+
+    alpha: NonNegative = 2.5
+    """Weight of the value, divided by the mean absolute value of the batch, beside the distance to the data; 0: BC."""
+    target_std: NonNegative = 0.2
+    """Standard deviation of the noise on the target actor's actions."""
+    target_bound: NonNegative = 0.5
+    """That noise is cut to plus and minus this."""
+    policy_delay: Count = 2
+    """Updates of the critics for each of the actor and the targets."""
+
+
+# "paper": alpha is Table 46's, whose other numbers are the defaults; noise, its bound and the delay, which it leaves
+# out, and alpha of "laptop" are those of Fujimoto and Gu (2021, table 3), who also normalise observations.
+PRESETS: dict[str, TD3BCConfig] = {"paper": TD3BCConfig(alpha=0.2, **PAPER), "laptop": TD3BCConfig()}
 
 
 class TD3BC(BC):
     """TD3+BC on data sets (Fujimoto and Gu 2021, arXiv 2106.06860).
-
-    Arguments, errors and attributes are those of :class:`~bidex_algos.offline.base.Offline`.
 
     Attributes:
         target_actor: Follows the actor.
     """
 
     name, remedy = "td3bc", "lower critic_learning_rate"
-    config_type = TD3BCConfig
+    config_type, presets = TD3BCConfig, PRESETS
     config: TD3BCConfig  # pyright: ignore[reportIncompatibleVariableOverride]
     num_critics = 2
 
@@ -65,5 +82,5 @@ class TD3BC(BC):
         loss = imitation - weight * value.mean()
         return loss, {"Loss/actor": loss.detach()}
 
-    def _own_parts(self) -> dict[str, Any]:
+    def _own_parts(self) -> Parts:
         return {"target_actor": self.target_actor}

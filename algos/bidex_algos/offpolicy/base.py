@@ -3,7 +3,7 @@
 They differ in how the actor explores, in what the critics shall say, and in the actor's update. An iteration is
 ``steps_per_iteration`` times::
 
-    one step in every row, with exploration (uniform actions at first); into the replay
+    one step in every environment, with exploration (uniform actions at first); into the replay
     updates_per_step times: draw equally many transitions of each task; the learner's update
 
 Rewards are divided by the running deviation of their task's discounted return, so that no task outweighs another.
@@ -13,25 +13,82 @@ import copy
 import math
 from abc import abstractmethod
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.experience.advantages import discounts
-from bidex_algos.experience.episodes import EpisodeStatistics
-from bidex_algos.experience.n_step import Stretches
-from bidex_algos.experience.replay import Transitions
-from bidex_algos.learner import Learner
-from bidex_algos.nets.encoders.inputs import Inputs
-from bidex_algos.nets.precision import autocast, use_bfloat16
-from bidex_algos.offpolicy.config import OffPolicyConfig
+from bidex_algos.advantages import discounts
+from bidex_algos.learner import Learner, as_numbers
+from bidex_algos.nets.architecture import NetworkConfig, network_bytes
+from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.networks import Autocast, autocast, use_bfloat16
 from bidex_algos.offpolicy.critics import Critics
-from bidex_algos.offpolicy.replay_within import replay_within
 from bidex_algos.offpolicy.return_scale import ReturnScale
-from bidex_algos.reports import as_numbers
+from bidex_algos.replay import Stretches, Transitions, replay_within
+from bidex_algos.rollout import EpisodeStatistics
 from bidex_meta.train.distributed import all_sum, sum_gradients, world_size
+from bidex_meta.train.learner import Parts, State
+from bidex_meta.validation import BelowOne, Count, NonNegative, Positive, Share, Whole
 from bidex_meta.world.contract import VectorWorld
+
+
+@dataclass(frozen=True)
+class OffPolicyConfig(NetworkConfig):
+    """Networks, replay, updates, statistics; the defaults are the preset ``laptop``.
+
+    A vector step is one step in every environment of the world.
+    """
+
+    value_heads: bool = True
+    """Give each critic one output per task instead of one for all."""
+    critic_layer_norm: bool = True
+    """Normalise the hidden layers of the critics, which keeps many updates per step from blowing values up."""
+    replay_steps: Count = 500
+    """Vector steps that the replay keeps, if replay_memory allows."""
+    replay_memory: Positive = 2.0
+    """The most that the replay of each process may take, in GB (10^9 bytes)."""
+    cut_share: Share = 0.0625
+    """Room in it for last observations before time limits, as a share of all transitions. Too small where episodes are
+    shorter than 1 / cut_share; Train/weightless shows it."""
+    warmup_steps: Whole = 20
+    """Vector steps of uniform actions before the first update."""
+    steps_per_iteration: Count = 8
+    """Vector steps between two reports."""
+    updates_per_step: Count = 4
+    """Updates of all networks after each vector step."""
+    batch_size: Count = 1024
+    """Transitions of an update, split evenly over the tasks."""
+    batch_per_task: Count | None = None
+    """Take this many of each task instead."""
+    gamma: BelowOne = 0.93
+    """Discount per step."""
+    n_steps: Count = 1
+    """Steps whose rewards a target takes as they came, before it asks for the value of what follows."""
+    tau: Share = 0.02
+    """Share of the critics that enters the target critics in each update (1 - Polyak's factor)."""
+    learning_rate: Positive = 3e-4
+    """Adam's step size for the actor."""
+    critic_learning_rate: Positive = 1e-3
+    """Adam's step size for the critics."""
+    weight_decay: NonNegative = 0.0
+    """Share of its step size by which each step shortens all weights of actor and critics (AdamW)."""
+    adam_eps: NonNegative = 1e-8
+    """What Adam adds to its denominators."""
+    max_grad_norm: Positive = 1.0
+    """Gradients longer than this are shortened to it, those of actor and critics apart."""
+    normalise_observations: bool = True
+    """Give observations zero mean and unit variance by running statistics; the task's one-hot stays as it is."""
+    per_task_rewards: bool = True
+    """Divide rewards, when they are drawn, by the running standard deviation of their task's discounted return."""
+    autocast: Autocast = "auto"
+    """Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX or AVX-512's BF16."""
+
+    def bytes_held(self, num_envs: int, width: int) -> int:
+        """As in the base."""
+        replay = min(self.replay_memory * 1e9, 4 * num_envs * width * self.replay_steps)
+        return int(replay) + network_bytes(self.hidden, width, 3)
 
 
 class OffPolicy(Learner):
@@ -47,7 +104,7 @@ class OffPolicy(Learner):
         adams: Optimisers by name; an algorithm may add some.
         batch_per_task: Transitions of each task in an update; B is ``num_tasks`` times as many, task after task:
             ``task_of_draw``, int64 (B,).
-        gamma_of_rows: Discount of all rows, or of each (N,); ``gamma_of_draw``: of the transitions of an update (B,).
+        gamma_of_rows: Discount of all environments, or of each (N,); ``gamma_of_draw``: of a draw (B,).
 
     Raises:
         BidexError: A task without rows, or no room for a replay.
@@ -69,7 +126,15 @@ class OffPolicy(Learner):
             "actor": self._adam(self.policy.actor.parameters(), config.learning_rate),
             "critic": self._adam(self.critic.parameters(), config.critic_learning_rate),
         }
-        self.replay = replay_within(self.name, world, config, self.shape.observations, self.shape.actions)
+        self.replay = replay_within(
+            self.name,
+            world,
+            self.shape.observations,
+            self.shape.actions,
+            config.replay_steps,
+            config.replay_memory,
+            config.cut_share,
+        )
         self.batch_per_task = config.batch_per_task or math.ceil(config.batch_size / world.num_tasks)
         self.task_of_draw = torch.arange(world.num_tasks, device=self.device).repeat_interleave(self.batch_per_task)
         self.gamma_of_rows = discounts(world, config.gamma, world.task_id)
@@ -107,7 +172,7 @@ class OffPolicy(Learner):
             Scalars to be logged, the same ones each time; an iteration tells their means.
         """
 
-    def _own_parts(self) -> dict[str, Any]:
+    def _own_parts(self) -> Parts:
         """Networks and parameters of its own, beside those of the base, by their names in a checkpoint."""
         return {}
 
@@ -138,7 +203,7 @@ class OffPolicy(Learner):
 
     @torch.no_grad()
     def _step(self) -> Tensor:
-        """One step in every row; returns how many broke physics."""
+        """One step in every environment; returns how many broke physics."""
         actions = self._act(self.replay.obs)
         obs, reward, terminated, truncated, info = self.world.step(actions)
         self.replay.add(actions, reward, terminated, truncated, obs, info)
@@ -228,7 +293,7 @@ class OffPolicy(Learner):
 
     # Checkpoints.
 
-    def _parts(self) -> dict[str, Any]:
+    def _parts(self) -> Parts:
         return {
             "critic": self.critic,
             "target_critic": self.target_critic,
@@ -239,12 +304,12 @@ class OffPolicy(Learner):
             "episodes": self.episodes,
         }
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         """A copy of everything but the world, as tensors and plain values (``torch.load(weights_only=True)``)."""
         # The replay makes its own copy: two of it at once may not fit.
         return super().state_dict() | {"replay": self.replay.state_dict()}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Restores what :meth:`state_dict` gave; a ``BidexError`` where world or replay had another size."""
         self.replay.load_state_dict(state["replay"])
         super().load_state_dict(state)

@@ -10,31 +10,125 @@ The task enters by a learned vector of length 1. The critic has the capacity, th
 pessimistic. All else is as in ``mtsac.py`` and ``categorical.py``; deviations stand in ``docs/learners/brc.md``.
 """
 
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from bidex_algos.experience.advantages import discounts
-from bidex_algos.experience.replay import Transitions
-from bidex_algos.nets.encoders.inputs import Inputs
-from bidex_algos.nets.encoders.point_net import with_point_net
-from bidex_algos.nets.encoders.task_embedding import with_task_embedding
-from bidex_algos.nets.residual import ResidualMLP
+from bidex_algos.advantages import discounts
+from bidex_algos.nets.inputs import Inputs, with_task_embedding
+from bidex_algos.nets.networks import ACTIVATIONS, MLP, Activation, Layers, linear
+from bidex_algos.nets.point_net import with_point_net
 from bidex_algos.nets.shape import Shape
-from bidex_algos.offpolicy.brc_config import PRESETS, BRCConfig
-from bidex_algos.offpolicy.categorical import Categorical
-from bidex_algos.offpolicy.mtsac import MTSAC
+from bidex_algos.offpolicy.categorical import Categorical, CategoricalConfig
+from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
+from bidex_algos.replay import Transitions
+from bidex_meta.errors import BidexError
+from bidex_meta.validation import Count, Finite, NonNegative, Share, Whole
 
-__all__ = ["BRC", "PRESETS", "BRCConfig"]
+
+class ResidualBlock(nn.Module):
+    """x plus two normalised layers of it, with the non-linearity between them; sizes stay as they are."""
+
+    def __init__(self, width: int, generator: torch.Generator, activation: Activation):
+        super().__init__()
+        self.layers = nn.Sequential(
+            linear(width, width, math.sqrt(2.0), generator),
+            nn.LayerNorm(width),
+            ACTIVATIONS[activation](),
+            linear(width, width, math.sqrt(2.0), generator),
+            nn.LayerNorm(width),
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Maps (batch, width) to (batch, width)."""
+        return x + self.layers(x)
+
+
+class ResidualMLP(MLP):
+    """One normalised layer, then residual blocks: stands in the place of :class:`MLP`, whose arguments it takes.
+
+    ``hidden`` is the width as often as there are blocks, and once more for the first layer. The layer norm is part of
+    it: ``layer_norm`` changes nothing.
+    """
+
+    def __init__(
+        self,
+        inputs: int | Inputs,
+        hidden: Sequence[int],
+        outputs: int,
+        output_gain: float,
+        generator: torch.Generator,
+        activation: Activation = "elu",
+        layer_norm: bool = True,
+    ):
+        super().__init__(inputs, hidden[:1], outputs, output_gain, generator, activation, layer_norm=True)
+        self.body.extend(ResidualBlock(width, generator, activation) for width in hidden[1:])
+
+
+@dataclass(frozen=True)
+class BRCConfig(CategoricalConfig, MTSACConfig):
+    """Everything that can be set about BRC; the defaults are the preset ``laptop``."""
+
+    critic_hidden: Layers = (256, 256, 256)
+    """Width of the critics as often as there are residual blocks of two layers, and once more for the first layer."""
+    hidden: Layers = (256, 256)
+    """The same of the actor."""
+    value_heads: bool = False
+    """Give each critic one distribution per task instead of one for all."""
+    task_embedding: Whole = 32
+    """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
+    updates_per_step: Count = 4
+    """Updates of all networks after each vector step."""
+    n_steps: Count = 3
+    """Steps whose rewards a target takes as they came, before it asks for the value of what follows."""
+    tau: Share = 0.05
+    """Share of the critics that enters the target critics in each update (1 - Polyak's factor)."""
+    clipped_double_q: bool = False
+    """Targets and actor take the critic that says less; off: the mean of both."""
+    weight_decay: NonNegative = 1e-4
+    """Share of its step size by which each step shortens all weights of actor and critics (AdamW)."""
+    target_entropy_per_action: Finite = -0.5
+    """Entropy of the squashed policy that each temperature aims at, for each action; uniform actions have 0.69."""
+    one_temperature: bool = False
+    """One temperature for all tasks, led by their mean entropy."""
+
+    def __post_init__(self) -> None:
+        """Checks what annotations cannot say."""
+        super().__post_init__()
+        if not self.shares_a_trunk:
+            raise BidexError(f"{self.algo}: its networks are residual; architecture must be shared or multi_head.")
+        for name in ("hidden", "critic_hidden"):
+            widths = vars(self)[name]
+            if len(set(widths)) != 1:
+                raise BidexError(f"{self.algo}: {name} must be one width, once or more often, got {widths}.")
+
+
+PRESETS: dict[str, BRCConfig] = {
+    # The authors' code (github.com/naumix/BiggerRegularizedCategorical, 2025). train.py: batches of 1,024 in all, 2
+    # updates a vector step, critics 4,096 wide; there each task has one environment, 5,000 transitions of it come first
+    # and 1,000,000 are kept: here as many at 256 environments of each task. jaxrl/agent/brc_learner.py: 2 blocks, the
+    # actor 256 with 1, embedding of 32, steps of 3e-4, discount 0.99, tau 0.005, entropy -1/2 per action, one
+    # temperature from 0.1, 101 atoms to 10. jaxrl/networks.py: ReLU, log standard deviations from -10 to 2, which begin
+    # in the middle. Decay: AdamW's default there, 1e-4. No limit of the gradient (here a huge one), observations as
+    # they are.
+    "paper": BRCConfig(
+        hidden=(256, 256), critic_hidden=(4096, 4096, 4096), replay_steps=4000, warmup_steps=20, updates_per_step=2,
+        batch_size=1024, gamma=0.99, n_steps=1, tau=0.005, learning_rate=3e-4, critic_learning_rate=3e-4,
+        alpha_learning_rate=3e-4, init_alpha=0.1, one_temperature=True, std_range=(4.54e-5, 7.39), init_std=0.0183,
+        weight_decay=1e-4, max_grad_norm=1e9, normalise_observations=False, atoms=101, value_bound=10.0,
+    ),
+    "laptop": BRCConfig(),
+}  # fmt: skip
 
 
 class BRC(Categorical, MTSAC):
-    """BRC (Nauman et al. 2025, arXiv 2505.23150) on a batched world.
-
-    Arguments, errors and attributes are those of :class:`~bidex_algos.offpolicy.mtsac.MTSAC`.
-    """
+    """BRC (Nauman et al. 2025, arXiv 2505.23150) on a batched world."""
 
     name = "brc"
-    config_type = BRCConfig
+    config_type, presets = BRCConfig, PRESETS
     config: BRCConfig
     actor_network = critic_network = ResidualMLP
 

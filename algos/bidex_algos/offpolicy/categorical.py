@@ -9,20 +9,69 @@ errors, a classification's does not. The price: the atoms span a fixed range, so
 what each task's rewards are divided by follows its largest return so far (``ReturnBound``).
 """
 
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
 
 import torch
+from msgspec import Meta
 from torch import Tensor, nn
 
-from bidex_algos.experience.replay import Transitions
-from bidex_algos.nets.atoms import Atoms
-from bidex_algos.nets.encoders.inputs import Inputs
-from bidex_algos.nets.multitask.architecture import MakeNetwork, network_of
-from bidex_algos.nets.networks import MLP
-from bidex_algos.nets.precision import autocast
-from bidex_algos.offpolicy.base import OffPolicy
-from bidex_algos.offpolicy.categorical_config import CategoricalConfig
+from bidex_algos.nets.architecture import MakeNetwork, network_bytes, network_of
+from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.networks import MLP, Layers, autocast
+from bidex_algos.offpolicy.base import OffPolicy, OffPolicyConfig
 from bidex_algos.offpolicy.return_scale import ReturnBound
+from bidex_algos.replay import Transitions
+from bidex_meta.train.learner import State
+from bidex_meta.validation import MOST, Positive
+
+
+class Atoms(nn.Module):
+    """``count`` values (A >= 2), evenly spaced, that a distribution gives probabilities to; it has no weights."""
+
+    def __init__(self, low: float, high: float, count: int):
+        super().__init__()
+        self.low, self.high, self.count = low, high, count
+        self.values: Tensor
+        self.register_buffer("values", torch.linspace(low, high, count), persistent=False)
+
+    def mean(self, probs: Tensor) -> Tensor:
+        """Expected values (...) of distributions (..., A)."""
+        return (probs * self.values).sum(-1)
+
+    def projected(self, probs: Tensor, shift: Tensor, factor: Tensor) -> Tensor:
+        """The distribution (B, A) of shift + factor * Z on the atoms, where Z is distributed as ``probs`` (B, A).
+
+        What falls between two atoms is split between them so that its mean stays; what falls beyond the range goes to
+        the atom at its end. ``shift`` and ``factor`` are (B,).
+        """
+        moved = shift[:, None] + factor[:, None] * self.values
+        # In units of the distance of two atoms, from the lowest.
+        place = (moved.clamp(self.low, self.high) - self.low) * ((self.count - 1) / (self.high - self.low))
+        share = place - place.floor()
+        # What is not a number shall stay so and not become a place in memory.
+        index = place.long().clamp(0, self.count - 1)
+        out = torch.zeros_like(probs).scatter_add_(1, index, probs * (1.0 - share))
+        return out.scatter_add_(1, (index + 1).clamp_max(self.count - 1), probs * share)
+
+
+@dataclass(frozen=True)
+class CategoricalConfig(OffPolicyConfig):
+    """The critics' distributions and layers, beside what all off-policy learners have."""
+
+    critic_hidden: Layers = (256, 256)
+    """Widths of the hidden layers of the critics; ``hidden`` is then the actor's alone."""
+    atoms: Annotated[int, Meta(ge=2, le=MOST)] = 101
+    """Values that a distribution of the return gives probabilities to."""
+    value_bound: Positive = 10.0
+    """They lie evenly from minus this to this, in scaled rewards."""
+    clipped_double_q: bool = True
+    """Targets and actor take the critic that says less; off: the mean of both."""
+
+    def bytes_held(self, num_envs: int, width: int) -> int:
+        """As in the base, where ``hidden`` is of all networks, and the critics'."""
+        return super().bytes_held(num_envs, width) + network_bytes((*self.critic_hidden, self.atoms), width, 2)
+
 
 FIRST_DEVIATION = 0.1
 """Of the distributions before the first update, as a share of the values' bound; their mean is 0. From an even
@@ -30,16 +79,7 @@ distribution, which is much wider, means move slowly: a cross-entropy pulls at t
 
 
 class CategoricalCritics(nn.Module):
-    """Networks of observation and action that give distributions, alike but for their initial weights.
-
-    Args:
-        inputs: The groups of observation and action together, or their width.
-        heads: Distributions of each network: one per task, or 1 for all.
-        config: Layers and atoms.
-        generator: CPU generator of the initial weights.
-        count: How many networks.
-        network: What makes each, by the arguments of ``MLP``.
-    """
+    """Networks of observation and action that give distributions; arguments as those of ``Critics``."""
 
     def __init__(
         self,
@@ -87,7 +127,7 @@ class Categorical(OffPolicy):
     returns_type = ReturnBound
     returns: ReturnBound
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """As in the base; older checkpoints have no recent rewards, of which the episodes that go on then lack some."""
         super().load_state_dict({"recent": torch.zeros_like(self.returns.recent)} | state)
 
@@ -111,13 +151,7 @@ class Categorical(OffPolicy):
         return probs.gather(0, lower.view(1, -1, 1).expand(1, -1, probs.shape[2]))[0]
 
     def _projected(self, draw: Transitions, following: Tensor, bonus: Tensor) -> Tensor:
-        """Targets (B, atoms): the distribution of scaled reward + gamma^steps * (bonus + Z), Z as ``following``.
-
-        Args:
-            draw: Transitions; after a true end nothing follows.
-            following: Shape (B, atoms).
-            bonus: What is added to the value of the state after the transition, (B,).
-        """
+        """Targets (B, atoms): the distribution of scaled reward + gamma^steps * (bonus + Z), Z as ``following``."""
         shift = self._bootstrapped(draw, bonus)
         factor = (self.gamma_of_draw**draw.steps) * (~draw.terminated).to(shift.dtype)
         return self.critic.atoms.projected(following, shift, factor)

@@ -1,27 +1,22 @@
 """The critics of the off-policy learners, values of actions, and how target networks follow."""
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.nets.encoders.inputs import Inputs
-from bidex_algos.nets.multitask.architecture import network_of
-from bidex_algos.offpolicy.config import OffPolicyConfig
+from bidex_algos.nets.architecture import network_of
+from bidex_algos.nets.inputs import Inputs
 
 
 class Critics(nn.Module):
-    """Networks of observation and action, alike but for their initial weights.
+    """``count`` networks of observation and action, alike but for their initial weights.
 
-    Args:
-        inputs: The groups of observation and action together, or their width.
-        heads: Outputs of each network: one per task, or 1 for all.
-        config: Layers.
-        generator: CPU generator of the initial weights.
-        count: How many: 2 against overestimation (Fujimoto et al. 2018), or 1.
+    ``inputs`` are the groups of both together, ``heads`` the outputs of each, one per task or 1; ``config`` is a
+    learner's (layers). Two against overestimation (Fujimoto et al. 2018), or one.
     """
 
-    def __init__(
-        self, inputs: int | Inputs, heads: int, config: OffPolicyConfig, generator: torch.Generator, count: int = 2
-    ):
+    def __init__(self, inputs: int | Inputs, heads: int, config: Any, generator: torch.Generator, count: int = 2):
         super().__init__()
         self.heads = heads
         network = network_of(config)

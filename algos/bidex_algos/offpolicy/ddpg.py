@@ -2,7 +2,7 @@
 
 For each vector step of the world::
 
-    a = mu(s) + noise                            one step in every row; into the replay
+    a = mu(s) + noise                            one step in every environment; into the replay
     y = r + gamma (1 - terminated) Q'(s', mu'(s'))
     Q   towards y                                on equally many transitions of each task
     mu  up on Q(s, mu(s))
@@ -12,42 +12,75 @@ A critic's slope drives actions into the corners of their box, where tanh has no
 two hands 86 % of all actions were beyond 0.99 after 0.4 M steps, and the policy stood still. ``squash_price`` on the
 square of what goes into tanh keeps them from there; 0 gives the original.
 
-The noise is normal and without memory. Its size differs from row to row of a task, so that some rows show what the
-policy does and others what lies far from it (the spread of Horgan et al. 2018); two equal numbers give the original.
+The noise is normal and without memory. Its size differs from environment to environment of a task, so that some show
+what the policy does and others what lies far from it (the spread of Horgan et al. 2018); two equal numbers give the
+original.
 """
 
 import copy
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from bidex_algos.experience.replay import Transitions
-from bidex_algos.nets.deterministic import DeterministicActor, DeterministicPolicy
-from bidex_algos.nets.multitask.architecture import network_of
+from bidex_algos.nets.architecture import network_of
+from bidex_algos.nets.networks import autocast, use_bfloat16
 from bidex_algos.nets.normalise import ObservationNormaliser
-from bidex_algos.nets.precision import autocast, use_bfloat16
+from bidex_algos.nets.policy import DeterministicActor, DeterministicPolicy
 from bidex_algos.nets.shape import Shape
-from bidex_algos.offpolicy.base import OffPolicy
+from bidex_algos.offpolicy.base import OffPolicy, OffPolicyConfig
 from bidex_algos.offpolicy.critics import follow
-from bidex_algos.offpolicy.ddpg_config import PRESETS, DDPGConfig
+from bidex_algos.replay import Transitions
+from bidex_meta.train.learner import Parts
+from bidex_meta.validation import NonNegative, check_rising
 from bidex_meta.world.contract import VectorWorld
 
-__all__ = ["DDPG", "PRESETS", "DDPGConfig"]
+
+@dataclass(frozen=True)
+class DDPGConfig(OffPolicyConfig):
+    """Everything that can be set about DDPG; the defaults are the preset ``laptop``."""
+
+    exploration_std: tuple[NonNegative, NonNegative] = (0.05, 0.5)
+    """Standard deviation of the noise on actions: of each task's first environment, of its last; evenly between."""
+    squash_price: NonNegative = 1.0
+    """Price, in the actor's loss, on the mean square of what tanh makes the actions of; 0: none."""
+
+    def __post_init__(self) -> None:
+        """Checks what annotations cannot say."""
+        super().__post_init__()
+        check_rising(self, self.algo, "exploration_std")
+
+
+def of_paper() -> dict[str, Any]:
+    """What DDPG and TD3 share of the preset ``paper``, by field.
+
+    The Bi-DexHands appendix describes both (B.1.3, B.1.4) and has no table for either. Table 43 (SAC, "other tasks")
+    has layers, step size, discount, Polyak 0.99, gradient norm, 5000 steps of replay and 1 epoch of 4 mini-batches of
+    32 (here of each task); Table 49 32 steps between two reports. The noise of 0.1 is Fujimoto et al.'s (2018, section
+    6.1).
+    """
+    return {
+        "hidden": (1024, 1024, 1024), "value_heads": False, "critic_layer_norm": False, "replay_steps": 5000,
+        "warmup_steps": 32, "steps_per_iteration": 32, "updates_per_step": 4, "batch_per_task": 32, "gamma": 0.96,
+        "tau": 0.01, "learning_rate": 3e-4, "critic_learning_rate": 3e-4, "max_grad_norm": 1.0,
+        "normalise_observations": False, "per_task_rewards": False, "exploration_std": (0.1, 0.1), "squash_price": 0.0,
+    }  # fmt: skip
+
+
+PRESETS: dict[str, DDPGConfig] = {"paper": DDPGConfig(**of_paper()), "laptop": DDPGConfig()}
 
 
 class DDPG(OffPolicy):
     """Multi-task DDPG (Lillicrap et al. 2016, arXiv 1509.02971) on a batched world.
 
-    Arguments and errors are those of :class:`~bidex_algos.offpolicy.base.OffPolicy`, so are the attributes.
-
     Attributes:
         target_actor: Follows the actor; only with ``delayed_targets``.
-        noise_std: Of each row (N, 1).
+        noise_std: Of each environment (N, 1).
     """
 
     name, remedy = "ddpg", "lower critic_learning_rate"
-    config_type = DDPGConfig
+    config_type, presets = DDPGConfig, PRESETS
     config: DDPGConfig
     policy: DeterministicPolicy
     num_critics = 1
@@ -124,20 +157,13 @@ class DDPG(OffPolicy):
         observations = ObservationNormaliser(inputs, config.normalise_observations)
         return DeterministicPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
 
-    def _own_parts(self) -> dict[str, Any]:
+    def _own_parts(self) -> Parts:
         follows = {"target_actor": self.target_actor} if self.delayed_targets else {}
         return {**follows, "actor_loss": self.actor_loss}
 
 
 def spread(low: float, high: float, task_id: Tensor, num_tasks: int) -> Tensor:
-    """Numbers (N,) that go evenly from ``low`` in the first row of each task to ``high`` in its last.
-
-    Args:
-        low: The least.
-        high: The greatest; of a task with one row the only one.
-        task_id: Task of each row, int64 (N,).
-        num_tasks: How many tasks there are.
-    """
+    """Numbers (N,) that go evenly from ``low`` in each task's first environment to ``high`` in its last, or only."""
     numbers = torch.empty(len(task_id), device=task_id.device)
     for task in range(num_tasks):
         rows = (task_id == task).nonzero().squeeze(1)

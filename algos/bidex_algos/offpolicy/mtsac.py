@@ -2,7 +2,7 @@
 
 For each vector step of the world::
 
-    a = tanh(u), u ~ N(mean, std)(s)             one step in every row; into the replay
+    a = tanh(u), u ~ N(mean, std)(s)             one step in every environment; into the replay
     y = r + gamma (1 - terminated) (min_i Q'_i(s', a') - alpha_k log pi(a'|s'))
     Q_i  towards y                               i = 1, 2; on equally many transitions of each task k
     pi   down on alpha_k log pi(a|s) - min_i Q_i(s, a)
@@ -16,30 +16,95 @@ gradient is the gap in entropy whatever alpha is. Deviations stand in ``docs/lea
 """
 
 import math
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.experience.replay import Transitions
-from bidex_algos.nets.multitask.architecture import network_of
-from bidex_algos.nets.networks import MLP
+from bidex_algos.nets.architecture import network_of
+from bidex_algos.nets.networks import MLP, use_bfloat16
 from bidex_algos.nets.normalise import ObservationNormaliser
-from bidex_algos.nets.precision import use_bfloat16
+from bidex_algos.nets.policy import SquashedActor, SquashedPolicy
 from bidex_algos.nets.shape import Shape
-from bidex_algos.nets.squashed import SquashedActor, SquashedPolicy
-from bidex_algos.offpolicy.base import OffPolicy
+from bidex_algos.offpolicy.base import OffPolicy, OffPolicyConfig
 from bidex_algos.offpolicy.critics import follow
-from bidex_algos.offpolicy.mtsac_config import PRESETS, MTSACConfig
+from bidex_algos.replay import Transitions
+from bidex_meta.errors import BidexError
+from bidex_meta.train.learner import Parts
+from bidex_meta.validation import Finite, Positive
 from bidex_meta.world.contract import VectorWorld
 
-__all__ = ["MTSAC", "PRESETS", "MTSACConfig"]
+
+@dataclass(frozen=True)
+class MTSACConfig(OffPolicyConfig):
+    """Everything that can be set about MT-SAC; the defaults are the preset ``laptop``."""
+
+    init_std: Positive = 0.5
+    """Standard deviation of the actions at the start, before the squashing."""
+    std_range: tuple[Positive, Positive] = (0.02, 2.0)
+    """Its bounds."""
+    alpha_learning_rate: Positive = 3e-3
+    """Adam's step size for the logarithms of the temperatures."""
+    init_alpha: Positive = 0.001
+    """Temperature of every task at the start."""
+    target_entropy_per_action: Finite = -1.0
+    """Entropy of the squashed policy that each temperature aims at, for each action; uniform actions have 0.69."""
+
+    def __post_init__(self) -> None:
+        """Checks what annotations cannot say."""
+        super().__post_init__()
+        low, high = self.std_range
+        if not 0.0 < low < self.init_std < high:
+            raise BidexError(
+                f"mtsac: std_range must be two positive numbers with init_std between them, got {low} {high} and "
+                f"{self.init_std}."
+            )
+
+
+# What the published settings have in common: log standard deviations from -20 to 2, one step size for all, nothing
+# normalised.
+_PLAIN = MTSACConfig(
+    value_heads=False, critic_layer_norm=False, init_std=1.0, std_range=(2e-9, 7.4), learning_rate=3e-4,
+    critic_learning_rate=3e-4, alpha_learning_rate=3e-4, max_grad_norm=1.0, normalise_observations=False,
+    per_task_rewards=False,
+)  # fmt: skip
+
+PRESETS: dict[str, MTSACConfig] = {
+    # Table 43 of the Bi-DexHands appendix (SAC, "other tasks"; it has none for MT-SAC): layers, step size, discount,
+    # Polyak 0.99, gradient norm, entropy coefficient 0.2 (here where each temperature starts), reward scale 1, 5000
+    # steps of replay, 1 epoch of 4 mini-batches of 32 (here after every vector step, and of each task). From Table 49
+    # (SAC on Humanoid) only what Table 43 leaves out: 32 steps, here between two reports. Both are silent on
+    # non-linearity, bounds of the standard deviation, target entropy and warm-up, and learn no temperature.
+    "paper": replace(
+        _PLAIN, hidden=(1024, 1024, 1024), replay_steps=5000, warmup_steps=32, steps_per_iteration=32,
+        updates_per_step=4, batch_per_task=32, gamma=0.96, tau=0.01, init_alpha=0.2,
+    ),
+    "laptop": MTSACConfig(),
+    # MT-SAC as Meta-World's baselines run it, with one environment of each task: 128 transitions of each task in an
+    # update, one update a vector step, 100,000 transitions of each task.
+    "metaworld": replace(
+        _PLAIN, hidden=(400, 400, 400), replay_steps=100_000, warmup_steps=4000, steps_per_iteration=500,
+        updates_per_step=1, batch_per_task=128, gamma=0.99, tau=0.005, adam_eps=1e-5, init_alpha=1.0,
+    ),
+}  # fmt: skip
+
+# Table 49; its 2 epochs of one mini-batch are made after every vector step, as in ``paper``. Its replay of 40,000
+# counts vector steps, as everywhere here, and ends where ``replay_memory`` does.
+_TABLE_49: dict[str, Any] = {
+    "replay_steps": 40_000, "steps_per_iteration": 32, "updates_per_step": 2, "batch_per_task": 64, "gamma": 0.99,
+    "tau": 0.005, "learning_rate": 3e-4, "critic_learning_rate": 3e-4, "init_alpha": 0.2, "max_grad_norm": 1.0,
+}  # fmt: skip
+TASK_PRESETS: dict[str, dict[str, MTSACConfig]] = {
+    "gymnasium/Humanoid-v5": {
+        "paper": replace(PRESETS["paper"], hidden=(1024, 1024, 1024), **_TABLE_49),
+        "laptop": replace(PRESETS["laptop"], hidden=(256, 256, 256), **_TABLE_49),
+    }
+}
 
 
 class MTSAC(OffPolicy):
     """Multi-task SAC (Haarnoja et al. 2018, arXiv 1812.05905) on a batched world.
-
-    Arguments and errors are those of :class:`~bidex_algos.offpolicy.base.OffPolicy`, so are the attributes.
 
     Attributes:
         policy: The agent that evaluation uses: squashed mean.
@@ -47,7 +112,7 @@ class MTSAC(OffPolicy):
     """
 
     name, remedy = "mtsac", "lower critic_learning_rate"
-    config_type = MTSACConfig
+    config_type, presets = MTSACConfig, PRESETS
     config: MTSACConfig
     policy: SquashedPolicy
     actor_network: ClassVar[type[MLP] | None] = None
@@ -108,5 +173,15 @@ class MTSAC(OffPolicy):
         observations = ObservationNormaliser(inputs, config.normalise_observations)
         return SquashedPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
 
-    def _own_parts(self) -> dict[str, Any]:
+    def _own_parts(self) -> Parts:
         return {"log_alpha": self.log_alpha}
+
+
+class SAC(MTSAC):
+    """Multi-task SAC (Haarnoja et al. 2018, arXiv 1812.05905) on a batched world.
+
+    The same learner with the presets of a single task; those of MT-SAC are made of Table 43, SAC's own, which has the
+    same numbers in all of its columns.
+    """
+
+    task_presets = TASK_PRESETS

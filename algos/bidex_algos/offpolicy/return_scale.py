@@ -1,13 +1,12 @@
 """How large returns are, task by task, so that no task outweighs another."""
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
-from bidex_algos.experience.advantages import task_moments
+from bidex_algos.advantages import task_moments
 from bidex_algos.nets.normalise import RunningStats
 from bidex_meta.train.distributed import all_max
+from bidex_meta.train.learner import Parts
 from bidex_meta.world.contract import VectorWorld
 
 RECENT = 0.9
@@ -17,14 +16,11 @@ RECENT = 0.9
 class ReturnScale:
     """Running statistics of the discounted sum of rewards since an episode began.
 
-    Args:
-        world: Whose rewards they are.
-        gamma: Discount per step, of all rows or of each (N,).
-        horizon: Returns of a task after which older ones fade.
+    Returns of a task fade after ``horizon`` newer ones; ``gamma`` is a discount for all, or of each environment (N,).
 
     Attributes:
         stats: Mean and variance of each task (num_tasks,).
-        discounted: The sum in each row so far (N,).
+        discounted: The sum in each environment so far (N,).
     """
 
     def __init__(self, world: VectorWorld, gamma: float | Tensor, horizon: float):
@@ -33,7 +29,7 @@ class ReturnScale:
         self.discounted = torch.zeros(world.num_envs, device=world.device)
 
     def note(self, reward: Tensor, terminated: Tensor, truncated: Tensor, broken: Tensor) -> None:
-        """Takes one step of all rows: rewards (N,) and how it ended, bool (N,); broken ones do not count."""
+        """Takes one step of all environments: rewards (N,) and how it ended, bool (N,); broken ones do not count."""
         self.discounted = self.gamma * self.discounted + reward
         self._take(truncated & ~terminated, ~broken)
         self.discounted = self.discounted.masked_fill(terminated | truncated | broken, 0.0)
@@ -46,7 +42,7 @@ class ReturnScale:
         # Where all returns are about the same, their deviation alone would blow them up.
         return (self.stats.std().square() + (0.1 * self.stats.mean).square()).sqrt().float()
 
-    def parts(self) -> dict[str, Any]:
+    def parts(self) -> Parts:
         """What a checkpoint holds, by name."""
         return {"return_stats": self.stats, "discounted": self.discounted}
 
@@ -61,7 +57,7 @@ class ReturnBound(ReturnScale):
 
     Attributes:
         bound: Of each task (num_tasks,); it never falls.
-        mass: The sum in each row, had all rewards been 1 (N,).
+        mass: The sum in each environment, had all rewards been 1 (N,).
         recent: Sum and mass with a discount of :data:`RECENT` at most (2, N).
     """
 
@@ -87,6 +83,6 @@ class ReturnBound(ReturnScale):
         size = size.masked_fill(~valid, 0.0)
         self.bound = all_max(self.bound.scatter_reduce(0, self.task_id, size, "amax"))
 
-    def parts(self) -> dict[str, Any]:
+    def parts(self) -> Parts:
         """As in the base."""
         return super().parts() | {"return_bound": self.bound, "discounted_ones": self.mass, "recent": self.recent}

@@ -7,28 +7,50 @@
 All else is as in ``ddpg.py``.
 """
 
-from typing import Any
+from dataclasses import dataclass
 
 from torch import Tensor
 
-from bidex_algos.offpolicy.ddpg import DDPG
-from bidex_algos.offpolicy.td3_config import PRESETS, TD3Config
+from bidex_algos.offpolicy.ddpg import DDPG, DDPGConfig, of_paper
+from bidex_meta.train.learner import State
+from bidex_meta.validation import Count, NonNegative
 from bidex_meta.world.contract import VectorWorld
 
-__all__ = ["PRESETS", "TD3", "TD3Config"]
+
+@dataclass(frozen=True)
+class TD3Config(DDPGConfig):
+    """Everything that can be set about TD3; the defaults are the preset ``laptop``."""
+
+    target_std: NonNegative = 0.2
+    """Standard deviation of the noise on the actions that targets assume."""
+    target_bound: NonNegative = 0.5
+    """That noise is cut to plus and minus this."""
+    policy_delay: Count = 2
+    """Updates of the critics for each of the actor and of what follows them (FastTD3's target critics: at each)."""
+
+
+# Smoothing and delay of "paper" are those of Fujimoto et al. (2018, section 6.1), as are the defaults.
+PRESETS: dict[str, TD3Config] = {
+    "paper": TD3Config(**of_paper()),
+    "laptop": TD3Config(),
+    # Meta-World's suites: discount, Polyak, layers, replay and batches are those of MT-SAC's preset of that name.
+    "metaworld": TD3Config(
+        hidden=(400, 400, 400), replay_steps=100_000, warmup_steps=500, steps_per_iteration=500, updates_per_step=1,
+        batch_per_task=128, gamma=0.99, tau=0.005, learning_rate=3e-4, critic_learning_rate=3e-4,
+        exploration_std=(0.1, 0.4), squash_price=0.1,
+    ),
+}  # fmt: skip
 
 
 class TD3(DDPG):
     """Multi-task TD3 (Fujimoto et al. 2018, arXiv 1802.09477) on a batched world.
-
-    Arguments, errors and attributes are those of :class:`~bidex_algos.offpolicy.ddpg.DDPG`.
 
     Attributes:
         updates: Of the critics so far.
     """
 
     name = "td3"
-    config_type = TD3Config
+    config_type, presets = TD3Config, PRESETS
     config: TD3Config
     num_critics = 2
 
@@ -45,9 +67,9 @@ class TD3(DDPG):
         noise = self.config.target_std * self._normal(action)
         return (action + noise.clamp(-bound, bound)).clamp(-1.0, 1.0)
 
-    def _place(self) -> dict[str, Any]:
+    def _place(self) -> State:
         return {"updates": self.updates, **super()._place()}
 
-    def _go_on_from(self, state: dict[str, Any]) -> None:
+    def _go_on_from(self, state: State) -> None:
         super()._go_on_from(state)
         self.updates = int(state["updates"])

@@ -1,6 +1,7 @@
 """What the on-policy learners share: rollouts, a critic per task, statistics, checkpoints. They differ in the update.
 
-An iteration collects ``rollout_steps`` steps in every row, makes them a :class:`Batch`, and hands it to the learner.
+An iteration collects ``rollout_steps`` steps in every environment, makes them a :class:`Batch`, and hands it to the
+learner.
 """
 
 from abc import abstractmethod
@@ -11,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.experience.advantages import (
+from bidex_algos.advantages import (
     discounts,
     explained_variance,
     gae,
@@ -19,56 +20,121 @@ from bidex_algos.experience.advantages import (
     successor_values,
     task_moments,
 )
-from bidex_algos.experience.episodes import EpisodeStatistics
-from bidex_algos.experience.rollout import Rollout, collect
-from bidex_algos.learner import Learner
-from bidex_algos.nets.multitask.architecture import network_of
-from bidex_algos.nets.networks import GaussianActor, gaussian_log_prob
+from bidex_algos.learner import Learner, as_numbers
+from bidex_algos.nets.architecture import ArchitectureConfig, network_bytes, network_of
+from bidex_algos.nets.networks import (
+    Activation,
+    Autocast,
+    GaussianActor,
+    Layers,
+    autocast,
+    gaussian_log_prob,
+    use_bfloat16,
+)
 from bidex_algos.nets.normalise import ObservationNormaliser, RunningStats
 from bidex_algos.nets.policy import GaussianPolicy
-from bidex_algos.nets.precision import autocast, use_bfloat16
 from bidex_algos.nets.shape import Shape
-from bidex_algos.onpolicy.config import OnPolicyConfig
-from bidex_algos.reports import as_numbers
+from bidex_algos.onpolicy.ppo import mini_batches
+from bidex_algos.rollout import EpisodeStatistics, Rollout, collect
+from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import all_sum, world_size
+from bidex_meta.train.learner import Parts, State
+from bidex_meta.validation import Count, Fraction, Positive, Whole, Widths, check_rising
 from bidex_meta.world.contract import VectorWorld
+
+
+@dataclass(frozen=True)
+class OnPolicyConfig(ArchitectureConfig):
+    """Networks, rollouts, statistics; the defaults are the preset ``laptop``."""
+
+    hidden: Layers = (256, 256, 128)
+    """Widths of the hidden layers, of actor and critic alike."""
+    activation: Activation = "elu"
+    """Non-linearity of the hidden layers."""
+    value_heads: bool = True
+    """Give the critic one output per task instead of one for all."""
+    policy_heads: bool = False
+    """Give the actor an output layer and standard deviations per task instead of one for all; for MT suites, whose
+    observations show the task."""
+    task_embedding: Whole = 0
+    """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
+    point_widths: Widths = (32, 64)
+    """Widths of the layers that all points of a point cloud share (PointNet), where the world shows one."""
+    points_read: Whole = 0
+    """Points of a cloud that they read, evenly out of all; 0: all."""
+    init_std: Positive = 0.8
+    """Standard deviation of the actions at the start."""
+    std_range: tuple[Positive, Positive] = (0.05, 1.5)
+    """Bounds of the standard deviation of the actions."""
+    rollout_steps: Count = 8
+    """Steps taken in every environment between two updates."""
+    gamma: Fraction = 0.93
+    """Discount per step."""
+    lam: Fraction = 0.95
+    """Trace decay of the advantage estimate."""
+    normalise_observations: bool = True
+    """Give observations zero mean and unit variance by running statistics; the task's one-hot stays as it is."""
+    per_task_values: bool = True
+    """Let the critic predict returns normalised per task by running statistics."""
+    value_horizon: Positive = 100.0
+    """Iterations after which returns fade from those statistics."""
+    per_task_advantages: bool = True
+    """Normalise advantages within each task instead of over the whole batch."""
+    autocast: Autocast = "auto"
+    """Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX or AVX-512's BF16."""
+
+    def __post_init__(self) -> None:
+        """Checks what annotations cannot say."""
+        super().__post_init__()
+        check_rising(self, self.algo, "std_range")
+
+    def bytes_held(self, num_envs: int, width: int) -> int:
+        """As in the base."""
+        return 4 * num_envs * width * self.rollout_steps + network_bytes(self.hidden, width, 2)
+
+
+TABLE_47: dict[str, Any] = {
+    "hidden": (2048, 1024, 512), "value_heads": False, "init_std": 0.8, "rollout_steps": 8, "num_minibatches": 4,
+    "gamma": 0.96, "lam": 0.95, "max_grad_norm": 1.0, "normalise_observations": False,
+}  # fmt: skip
+"""Networks, rollouts and returns of MT-PPO in the Bi-DexHands appendix."""
 
 
 @dataclass
 class Batch:
     """A rollout made ready for the update, steps and rows flattened into B samples."""
 
-    obs: Tensor
-    """Normalised observations (B, d), in the precision the hidden layers run in."""
-    task_id: Tensor
-    """Task of each sample (B,)."""
-    actions: Tensor
-    """Sampled actions (B, a)."""
-    old_means: Tensor
-    """Means of the sampling policy (B, a)."""
-    old_log_probs: Tensor
-    """Log-density of the actions under the sampling policy (B,)."""
-    advantages: Tensor
-    """Normalised advantages (B,); of several critics (B, critics)."""
-    targets: Tensor
-    """What the critic shall predict, in its own units (B,); of several (B, critics)."""
-    weights: Tensor
-    """1, or 0 for a transition where physics broke (B,)."""
+    obs: Tensor  # normalised observations (B, d), in the precision the hidden layers run in
+    task_id: Tensor  # task of each sample (B,)
+    actions: Tensor  # sampled actions (B, a)
+    old_means: Tensor  # means of the sampling policy (B, a)
+    old_log_probs: Tensor  # log-density of the actions under the sampling policy (B,)
+    advantages: Tensor  # normalised advantages (B,); of several critics (B, critics)
+    targets: Tensor  # what the critic shall predict, in its own units (B,); of several (B, critics)
+    weights: Tensor  # 1, or 0 for a transition where physics broke (B,)
 
     def select(self, index: Tensor) -> "Batch":
         """The samples at ``index``."""
         return Batch(**{name: value.index_select(0, index) for name, value in vars(self).items()})
 
 
+def check_samples(name: str, config: Any, num_envs: int) -> None:
+    """Refuses a rollout of fewer samples than mini-batches."""
+    samples = config.rollout_steps * num_envs
+    if samples < config.num_minibatches:
+        raise BidexError(
+            f"{name}: {config.num_minibatches} mini-batches need as many samples, but {num_envs} environments x "
+            f"{config.rollout_steps} steps give {samples}. Raise num_envs or lower num_minibatches."
+        )
+
+
 class OnPolicy(Learner):
     """A Gaussian policy and a critic that learn from what the policy has just done.
-
-    Arguments, attributes and errors are those of :class:`~bidex_algos.learner.Learner`.
 
     Attributes:
         policy: The agent that evaluation uses: mean action, clamped.
         critic: Values of normalised observations, in units of the task's returns.
-        gamma: Discount of all rows, or of each (N,).
+        gamma: Discount of all environments, or of each (N,).
         num_critics: How many values a state has: more than one where each of several agents has a critic of its own.
     """
 
@@ -102,7 +168,7 @@ class OnPolicy(Learner):
         """Learns from a batch; returns scalars to be logged."""
 
     @abstractmethod
-    def _optimisers(self) -> dict[str, Any]:
+    def _optimisers(self) -> Parts:
         """The optimisers by their names in a checkpoint."""
 
     def _iterate(self) -> dict[str, float]:
@@ -153,18 +219,9 @@ class OnPolicy(Learner):
         """Takes a rollout's moments of returns into the statistics, which are the critic's units from now on."""
         self.return_stats.merge(mean, var, count)
 
-    def _mini_batches(self, batch: Any, epochs: int, number: int) -> Iterator[tuple[bool, Tensor, Tensor]]:
-        """Some passes over a batch, shuffled anew in each: whether it is the very first, samples (b,), and their count.
-
-        Of ``batch`` the weights (B,) are read alone.
-        Divided by that count, of all processes, losses and gradients become means by being summed over them.
-        """
-        for epoch in range(epochs):
-            order = torch.randperm(len(batch.weights), generator=self.generator, device=self.device)
-            parts = order.chunk(number)
-            counts = all_sum(torch.stack([batch.weights[index].sum() for index in parts])).clamp_min(1.0)
-            for place, (index, count) in enumerate(zip(parts, counts, strict=True)):
-                yield (epoch, place) == (0, 0), index, count
+    def _mini_batches(self, weights: Tensor, epochs: int, number: int) -> Iterator[tuple[bool, Tensor, Tensor]]:
+        """:func:`~bidex_algos.onpolicy.ppo.mini_batches` in the learner's own order."""
+        return mini_batches(weights, epochs, number, self.generator)
 
     @torch.no_grad()
     def _prepare(self) -> tuple[Batch, Tensor]:
@@ -228,7 +285,7 @@ class OnPolicy(Learner):
         observations = ObservationNormaliser(inputs, config.normalise_observations)
         return GaussianPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
 
-    def _parts(self) -> dict[str, Any]:
+    def _parts(self) -> Parts:
         return {
             "critic": self.critic,
             "return_stats": self.return_stats,
@@ -237,14 +294,14 @@ class OnPolicy(Learner):
             "episodes": self.episodes,
         }
 
-    def _place(self) -> dict[str, Any]:
+    def _place(self) -> State:
         return {"obs": self.obs, **super()._place()}
 
-    def _go_on_from(self, state: dict[str, Any]) -> None:
+    def _go_on_from(self, state: State) -> None:
         super()._go_on_from(state)
         self.obs = None if state["obs"] is None else state["obs"].to(self.device, copy=True)
 
-    def _check_size(self, state: dict[str, Any]) -> None:
+    def _check_size(self, state: State) -> None:
         if state["obs"] is not None:
             expected = tuple(self.rollout.last_obs.shape)
             self._expect("(num_envs, observations) = ", tuple(state["obs"].shape), expected)

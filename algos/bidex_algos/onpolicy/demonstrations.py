@@ -10,11 +10,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bidex_algos.nets.networks import autocast
 from bidex_algos.nets.policy import GaussianPolicy
-from bidex_algos.nets.precision import autocast
 from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import own_seed, sum_gradients, world_size
+from bidex_meta.train.learner import State
 
 _OWN = 0xDE30
 """Told apart from the learner's other draws, which are the same with and without demonstrations."""
@@ -23,14 +24,7 @@ _CLONING_RATE = 1e-3
 
 
 class Demonstrations:
-    """Transitions to be imitated, and how much they count.
-
-    Args:
-        data: In the form of the learner's world; some of its tasks may have none.
-        config: Its ``demonstration_weight``, ``demonstration_half_life``, ``demonstration_batch`` and
-            ``demonstration_cloning``.
-        seed: Of the draws.
-        device: Where they lie.
+    """Transitions to be imitated, and how much they count; some tasks may have none.
 
     Attributes:
         generator: Of the draws alone, another one in each process.
@@ -84,7 +78,7 @@ class Demonstrations:
             sum_gradients(weights, loss.detach()[None])
             adam.step()
 
-    def check(self, name: str, stored: dict[str, Any] | None) -> None:
+    def check(self, name: str, stored: State | None) -> None:
         """Refuses a checkpoint of other demonstrations.
 
         Raises:

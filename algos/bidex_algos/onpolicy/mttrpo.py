@@ -10,40 +10,80 @@ One policy reads the task's one-hot in its observation. An update, in the order 
 """
 
 import math
-from typing import Any
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.gradients.trust_region import trust_region_step
-from bidex_algos.nets.networks import gaussian_kl, gaussian_log_prob
-from bidex_algos.nets.precision import autocast
-from bidex_algos.onpolicy.base import Batch, OnPolicy
-from bidex_algos.onpolicy.mttrpo_config import PRESETS, MTTRPOConfig
+from bidex_algos.nets.networks import Autocast, autocast, gaussian_kl, gaussian_log_prob
+from bidex_algos.onpolicy.base import TABLE_47, Batch, OnPolicy, OnPolicyConfig
+from bidex_algos.trust_region import trust_region_step
 from bidex_meta.train.distributed import all_sum, sum_gradients
+from bidex_meta.train.learner import Parts
+from bidex_meta.validation import Count, Fraction, NonNegative, Positive
 from bidex_meta.world.contract import VectorWorld
 
-__all__ = ["MTTRPO", "PRESETS", "MTTRPOConfig"]
+
+@dataclass(frozen=True)
+class MTTRPOConfig(OnPolicyConfig):
+    """Everything that can be set about MT-TRPO; the defaults are the preset ``laptop``."""
+
+    max_kl: Positive = 0.1
+    """Mean KL of the new policy from the sampling one that an update may not exceed."""
+    damping: NonNegative = 0.1
+    """Added to the diagonal of the Fisher matrix, so that the step stays short along directions that the samples tell
+    nothing about."""
+    cg_iterations: Count = 10
+    """Conjugate-gradient iterations."""
+    fisher_stride: Count = 4
+    """Every so many-th sample goes into the Fisher matrix; it needs fewer than the gradient, and is multiplied once an
+    iteration."""
+    backtracks: Count = 10
+    """Points that the line search tries."""
+    backtrack_factor: Fraction = 0.8
+    """By which the line search shortens the step."""
+    accept_ratio: Fraction = 0.1
+    """Share of the improvement promised by the gradient that must come true where the line search stops; more keeps to
+    steps along which the surrogate is almost straight."""
+    critic_learning_rate: Positive = 1e-3
+    """Adam's step size of the critic."""
+    critic_epochs: Count = 4
+    """The critic's passes over the rollout per update."""
+    num_minibatches: Count = 4
+    """The critic's mini-batches per epoch."""
+    max_grad_norm: Positive = 1.0
+    """Gradients of the critic longer than this are shortened to it."""
+    autocast: Autocast = "off"
+    """Hidden layers in bfloat16: too coarse for the Fisher matrix, so off by default."""
+
+
+PRESETS: dict[str, MTTRPOConfig] = {
+    # The Bi-DexHands appendix has no table for TRPO. Networks, rollouts and returns are those of the nearest one, Table
+    # 47 (MT-PPO); trust region and line search are the defaults of Bi-DexHands' MTTRPO class.
+    "paper": MTTRPOConfig(
+        **TABLE_47, max_kl=0.01, damping=0.1, cg_iterations=10, fisher_stride=1, backtracks=10, backtrack_factor=0.5,
+        accept_ratio=0.1, critic_learning_rate=3e-4, critic_epochs=5,
+    ),
+    "laptop": MTTRPOConfig(),
+}  # fmt: skip
 
 
 class MTTRPO(OnPolicy):
     """Multi-task TRPO (Schulman et al. 2015, arXiv 1502.05477) on a batched world.
-
-    Arguments and attributes are those of :class:`~bidex_algos.onpolicy.base.OnPolicy`.
 
     Attributes:
         critic_adam: Moves the critic; the actor has no optimiser.
     """
 
     name, remedy = "mttrpo", "lower max_kl or critic_learning_rate"
-    config_type = MTTRPOConfig
+    config_type, presets = MTTRPOConfig, PRESETS
     config: MTTRPOConfig
 
     def __init__(self, world: VectorWorld, config: MTTRPOConfig, seed: int):
         super().__init__(world, config, seed)
         self.critic_adam = torch.optim.Adam(self.critic.parameters(), lr=config.critic_learning_rate, fused=True)
 
-    def _optimisers(self) -> dict[str, Any]:
+    def _optimisers(self) -> Parts:
         return {"critic_adam": self.critic_adam}
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
@@ -97,15 +137,22 @@ class MTTRPO(OnPolicy):
         """Fits the critic to its targets; the mean loss over all mini-batches, a scalar."""
         cfg, parameters = self.config, list(self.critic.parameters())
         losses: list[Tensor] = []
-        for _ in range(cfg.critic_epochs):
-            order = torch.randperm(len(batch.obs), generator=self.generator, device=self.device)
-            for index in order.chunk(cfg.num_minibatches):
-                b = batch.select(index)
-                count = all_sum(b.weights.sum()).clamp_min(1.0)
-                loss = (b.weights / count * (self._critic(b.obs, b.task_id) - b.targets).square()).sum()
-                self.critic_adam.zero_grad()
-                loss.backward()
-                losses.append(sum_gradients(parameters, loss.detach()[None])[0])
-                nn.utils.clip_grad_norm_(parameters, cfg.max_grad_norm)
-                self.critic_adam.step()
+        for _, index, count in self._mini_batches(batch.weights, cfg.critic_epochs, cfg.num_minibatches):
+            b = batch.select(index)
+            loss = (b.weights / count * (self._critic(b.obs, b.task_id) - b.targets).square()).sum()
+            self.critic_adam.zero_grad()
+            loss.backward()
+            losses.append(sum_gradients(parameters, loss.detach()[None])[0])
+            nn.utils.clip_grad_norm_(parameters, cfg.max_grad_norm)
+            self.critic_adam.step()
         return torch.stack(losses).mean()
+
+
+class TRPO(MTTRPO):
+    """Multi-task TRPO (Schulman et al. 2015, arXiv 1502.05477) on a batched world.
+
+    The same learner with the presets of a single task. There is no table for TRPO: networks of Table 42, the rest as
+    for MT-TRPO.
+    """
+
+    presets = PRESETS | {"paper": replace(PRESETS["paper"], hidden=(1024, 1024, 512))}

@@ -1,0 +1,93 @@
+"""Generalised advantage estimation and statistics per task, as plain functions of (steps, rows) tensors."""
+
+import torch
+from torch import Tensor
+
+from bidex_meta.train.distributed import pool_moments
+from bidex_meta.world.contract import VectorWorld
+
+
+def discounts(world: VectorWorld, gamma: float, task_id: Tensor) -> float | Tensor:
+    """A learner's ``gamma``; where classes of the world have their own, that of each entry of ``task_id`` (n,)."""
+    if all(own is None for own in world.gammas):
+        return gamma
+    return torch.tensor([gamma if own is None else own for own in world.gammas], device=task_id.device)[task_id]
+
+
+def successor_values(values: Tensor, last_values: Tensor, ended: Tensor, final_values: Tensor) -> Tensor:
+    """Value of the state each transition led to, in a world that resets within the step.
+
+    Args:
+        values: V(s_t), shape (T, N).
+        last_values: V of the state after the last transition, shape (N,).
+        ended: Transitions that ended an episode, bool (T, N); what follows belongs to another episode.
+        final_values: V of the last observation of the episodes that ended, (T, N); read only where ``ended``.
+    """
+    following = torch.cat([values[1:], last_values[None]])
+    return torch.where(ended, final_values, following)
+
+
+def gae(
+    rewards: Tensor,
+    values: Tensor,
+    next_values: Tensor,
+    terminated: Tensor,
+    ended: Tensor,
+    gamma: float | Tensor,
+    lam: float,
+    valid: Tensor | None = None,
+) -> Tensor:
+    """Advantages A_t = sum_k (gamma lam)^k delta_{t+k} within an episode, delta_t = r_t + gamma V(s'_t) - V(s_t).
+
+    Args:
+        rewards: Shape (T, N).
+        values: V(s_t), shape (T, N).
+        next_values: V(s'_t) of the true successor (see :func:`successor_values`), shape (T, N).
+        terminated: Bool (T, N): nothing follows, V(s') counts as 0. A time limit is not such an end.
+        ended: Bool (T, N): the episode ended here, by either flag.
+        gamma: Discount, one for all, one for each environment, (N,), or one for each transition, (T, N).
+        lam: Trace decay.
+        valid: Bool (T, N); the advantage of an invalid transition is 0 and nothing flows through it. Default: all.
+
+    Returns:
+        Advantages, shape (T, N).
+    """
+    delta = rewards + gamma * next_values.masked_fill(terminated, 0.0) - values
+    keep = gamma * lam * (~ended).to(delta.dtype)
+    advantages = torch.empty_like(delta)
+    running = torch.zeros_like(delta[0])
+    for t in range(delta.shape[0] - 1, -1, -1):
+        running = delta[t] + keep[t] * running
+        if valid is not None:
+            running = running.masked_fill(~valid[t], 0.0)
+        advantages[t] = running
+    return advantages
+
+
+def task_moments(x: Tensor, task_id: Tensor, num_tasks: int, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean, biased variance and count (num_tasks,) of ``x`` (T, N) per task, over the valid entries of all processes.
+
+    ``task_id`` is int64 (N,), ``valid`` bool (T, N). An empty task has mean, variance and count 0.
+    """
+
+    def total(values: Tensor) -> Tensor:
+        sums = torch.zeros(num_tasks, dtype=values.dtype, device=values.device)
+        return sums.index_add_(0, task_id, values.masked_fill(~valid, 0.0).sum(0))
+
+    count = total(torch.ones_like(x))
+    mean = total(x) / count.clamp_min(1.0)
+    var = total((x - mean[task_id]).square()) / count.clamp_min(1.0)
+    return pool_moments(mean, var, count)
+
+
+def normalise_per_task(x: Tensor, task_id: Tensor, num_tasks: int, valid: Tensor) -> Tensor:
+    """``x`` (T, N) to zero mean and unit variance within each task; invalid entries become 0."""
+    mean, var, _ = task_moments(x, task_id, num_tasks, valid)
+    return ((x - mean[task_id]) / (var.sqrt()[task_id] + 1e-8)).masked_fill(~valid, 0.0)
+
+
+def explained_variance(values: Tensor, returns: Tensor, task_id: Tensor, num_tasks: int, valid: Tensor) -> Tensor:
+    """1 - Var(return - value) / Var(return) per task, shape (num_tasks,): 1 is perfect, 0 no better than a constant."""
+    _, rest, _ = task_moments(returns - values, task_id, num_tasks, valid)
+    _, whole, _ = task_moments(returns, task_id, num_tasks, valid)
+    return 1.0 - rest / whole.clamp_min(1e-12)

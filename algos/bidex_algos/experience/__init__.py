@@ -1,1 +1,0 @@
-"""What worlds gave: rollouts, a replay, episodes in numbers, advantages."""

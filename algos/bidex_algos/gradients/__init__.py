@@ -1,1 +1,0 @@
-"""What is done to gradients and steps; knows no world and no learner."""

@@ -1,0 +1,159 @@
+"""What a network is fed: the named groups of an observation, each as it is or by an encoder of its own."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from bidex_meta.errors import unknown_name
+from bidex_meta.world.contract import ObservationGroup, plain_groups
+
+
+class Columns(nn.Module):
+    """Reads and writes some columns of tensors (..., d). It has no weights and leaves nothing in a checkpoint.
+
+    Args:
+        ranges: The columns; they are taken in ascending order.
+
+    Attributes:
+        size: How many they are.
+    """
+
+    def __init__(self, ranges: Iterable[slice]):
+        super().__init__()
+        index = sorted(column for part in ranges for column in range(part.start, part.stop))
+        self.size = len(index)
+        first = index[0] if index else 0
+        # A slice is a view; columns with gaps have to be copied.
+        self.range = slice(first, first + self.size) if index == list(range(first, first + self.size)) else None
+        self.index: Tensor
+        self.register_buffer("index", torch.tensor(index, dtype=torch.int64), persistent=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """The columns (..., size) of ``x`` (..., d); a view where they stand side by side."""
+        return x.index_select(-1, self.index) if self.range is None else x[..., self.range]
+
+    def write(self, x: Tensor, values: Tensor) -> None:
+        """Puts ``values`` (..., size) into the columns of ``x`` (..., d)."""
+        x[..., self.index if self.range is None else self.range] = values
+
+
+MakeEncoder = Callable[[int, torch.Generator], nn.Module]
+"""Makes an encoder for a group of so many entries, its weights drawn from a CPU generator: a module that maps
+(..., entries) to (..., ``size``) and has the attribute ``size``."""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """How a network reads an observation, before it has weights. A ``BidexError`` names a group that is not there.
+
+    Attributes:
+        groups: The parts of the observation; each column is in one. A network reads the task from ``task_id``.
+        encoders: What makes the encoder of a group, by its name; a group without one enters as it is.
+        hidden: Names of groups that do not enter at all.
+        unscaled: Names of groups that running statistics leave as they are, but for the clip.
+    """
+
+    groups: tuple[ObservationGroup, ...]
+    encoders: Mapping[str, MakeEncoder] = field(default_factory=dict)
+    hidden: frozenset[str] = frozenset()
+    unscaled: frozenset[str] = frozenset({"task_id"})
+
+    def __post_init__(self) -> None:
+        """Refuses encoders of no group."""
+        self.columns(*self.encoders)
+
+    @classmethod
+    def of(cls, inputs: "int | Inputs") -> "Inputs":
+        """Itself, or of a width: so many columns of one kind."""
+        return cls(plain_groups(inputs, 0)) if isinstance(inputs, int) else inputs
+
+    @property
+    def width(self) -> int:
+        """Columns of the observation, d."""
+        return sum(group.size for group in self.groups)
+
+    def columns(self, *names: str) -> Columns:
+        """The columns of some groups."""
+        ranges = {group.name: group.where for group in self.groups}
+        for name in names:
+            if name not in ranges:
+                raise unknown_name("observation group", name, ranges)
+        return Columns(part for name in names for part in ranges[name])
+
+    def extended(self, name: str, size: int) -> "Inputs":
+        """With one more group behind the others, for example the actions that a critic judges."""
+        end = slice(self.width, self.width + size)
+        return replace(self, groups=(*self.groups, ObservationGroup(name, (end,))))
+
+    def encoded(self, name: str, make: MakeEncoder, scaled: bool = True) -> "Inputs":
+        """With an encoder for a group; not ``scaled``: running statistics leave its columns as they are."""
+        unscaled = self.unscaled if scaled else self.unscaled | {name}
+        return replace(self, encoders={**self.encoders, name: make}, unscaled=unscaled)
+
+    def without(self, *names: str) -> "Inputs":
+        """With some groups hidden besides."""
+        self.columns(*names)
+        return replace(self, hidden=self.hidden | {*names})
+
+    def only(self, *names: str) -> "Inputs":
+        """With all other groups hidden: what an agent sees that has a view of its own."""
+        self.columns(*names)
+        return replace(self, hidden=frozenset(group.name for group in self.groups) - {*names})
+
+
+class GroupEncoder(nn.Module):
+    """Makes of observations (..., d) what the layers of a network compute with (..., size).
+
+    Groups without an encoder come first, in the order of their columns, then what the encoders give, in the order of
+    the groups. Without any encoder it is the identity and has no weights.
+
+    Args:
+        inputs: The groups and what makes their encoders; or a width.
+        generator: CPU generator of the initial weights.
+
+    Attributes:
+        groups: The encoders by the name of their group.
+        size: Width of what comes out.
+    """
+
+    def __init__(self, inputs: int | Inputs, generator: torch.Generator):
+        super().__init__()
+        inputs = Inputs.of(inputs)
+        names = [group.name for group in inputs.groups if group.name not in inputs.hidden]
+        encoded = {name: inputs.columns(name) for name in names if name in inputs.encoders}
+        self.columns = nn.ModuleDict(encoded)
+        made: dict[str, Any] = {n: inputs.encoders[n](columns.size, generator) for n, columns in encoded.items()}
+        self.groups = nn.ModuleDict(made)
+        self.plain = inputs.columns(*(name for name in names if name not in encoded))
+        self.size = self.plain.size + sum(encoder.size for encoder in made.values())
+        self.identity = self.plain.size == inputs.width
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Encodes (..., d)."""
+        if self.identity:
+            return x
+        encoded = [encoder(self.columns[name](x)) for name, encoder in self.groups.items()]
+        return torch.cat([self.plain(x), *encoded], dim=-1)
+
+
+class TaskEmbedding(nn.Module):
+    """Maps the one-hot of a task (..., tasks) to its vector (..., size), drawn from N(0, 1); ``unit``: of length 1."""
+
+    def __init__(self, tasks: int, generator: torch.Generator, size: int, unit: bool = False):
+        super().__init__()
+        self.size, self.unit = size, unit
+        self.vectors = nn.Parameter(torch.randn(tasks, size, generator=generator))
+
+    def forward(self, one_hot: Tensor) -> Tensor:
+        """The vectors of the tasks."""
+        vectors = nn.functional.normalize(self.vectors, dim=1) if self.unit else self.vectors
+        return one_hot @ vectors
+
+
+def with_task_embedding(inputs: Inputs, size: int, unit: bool = False) -> Inputs:
+    """The same with the task read by an embedding of so many entries, of length 1 if ``unit``; 0: as it was."""
+    return inputs.encoded("task_id", partial(TaskEmbedding, size=size, unit=unit)) if size else inputs

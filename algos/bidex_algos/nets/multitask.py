@@ -1,0 +1,255 @@
+"""Trunks that share weights between tasks: MOORE, PaCo and soft modules, in the place of an ``MLP``."""
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+from bidex_algos.nets.inputs import GroupEncoder, Inputs
+from bidex_algos.nets.networks import ACTIVATIONS, Activation, linear
+from bidex_algos.nets.products import affine, stacked_affine
+
+
+class StackedLinear(nn.Module):
+    """``count`` (K) linear layers of one form side by side, orthogonal weights of a ``gain`` and zero biases."""
+
+    def __init__(
+        self, count: int, inputs: int, outputs: int, gain: float, generator: torch.Generator, bias: bool = True
+    ):
+        super().__init__()
+        self.weight = nn.Parameter(torch.empty(count, outputs, inputs))
+        self.bias = nn.Parameter(torch.zeros(count, outputs)) if bias else None
+        for layer in self.weight.detach():
+            nn.init.orthogonal_(layer, gain, generator=generator)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Maps (batch, inputs), the same for all, or (K, batch, inputs), one for each, to (K, batch, outputs)."""
+        if x.dim() == 2:
+            bias = None if self.bias is None else self.bias.flatten()
+            out = affine(x, self.weight.flatten(0, 1), bias)
+            return out.unflatten(-1, self.weight.shape[:2]).transpose(0, 1)
+        return stacked_affine(x, self.weight, self.bias)
+
+
+class TaskWeights(nn.Module):
+    """Some numbers for each task, chosen by the one-hot in the group ``task_id``; drawn as directions of length 1.
+
+    Of that length, since what they mix keeps its size then: the mixed parts are independent at first. ``count``: K.
+    """
+
+    def __init__(self, inputs: Inputs, count: int, generator: torch.Generator):
+        super().__init__()
+        self.one_hot = inputs.columns("task_id")
+        drawn = torch.randn(self.one_hot.size, count, generator=generator)
+        self.rows = nn.Parameter(drawn / drawn.norm(dim=1, keepdim=True))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """The numbers (batch, K), float32, of the tasks of observations (batch, d)."""
+        with torch.autocast(x.device.type, enabled=False):  # a bfloat16 weight would round means by 0.4 %
+            return self.one_hot(x).to(self.rows.dtype) @ self.rows
+
+
+def mixed(weights: Tensor, parts: Tensor) -> Tensor:
+    """Sums of parts (K, batch, n) with the weights (batch, K) of each environment: (batch, n)."""
+    return torch.einsum("bk,kbn->bn", weights, parts)
+
+
+class PlainNorm(nn.Module):
+    """Layer normalisation without weights of its own, so that it may stand behind stacked layers; or nothing."""
+
+    def __init__(self, enabled: bool):
+        super().__init__()
+        self.enabled = enabled
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Normalises the last axis."""
+        return nn.functional.layer_norm(x, x.shape[-1:]) if self.enabled else x
+
+
+def gram_schmidt(vectors: Tensor) -> Tensor:
+    """Makes vectors (K, batch, n) orthonormal, each environment of the batch for itself; the first keeps its direction.
+
+    Each is freed of those before it twice: where two are almost parallel the first time leaves rounding errors that are
+    large beside what remains.
+    """
+    found: list[Tensor] = []
+    for vector in vectors:
+        for other in found * 2:
+            vector = vector - (vector * other).sum(-1, keepdim=True) * other
+        found.append(vector * (vector.square().sum(-1, keepdim=True) + 1e-20).rsqrt())
+    return torch.stack(found)
+
+
+class Moore(nn.Module):
+    """MOORE: a mixture of orthogonal experts (Hendawy et al. 2024).
+
+        U = [h_1(s), ..., h_K(s)]        K experts' representations of a state
+        V = Gram-Schmidt(U)              orthonormal, state by state, so that they span K directions
+        v = V w_k                        what task k takes of each
+        y = head(v)
+
+    The task's one-hot chooses w_k and is not fed to the experts. Heads of tasks are the paper's multi-head variant.
+    Ours: the mixture is multiplied by the root of its width, so that its entries are as large as those of another
+    layer, and goes through the config's non-linearity; w starts as a random direction of length 1.
+    """
+
+    def __init__(
+        self,
+        inputs: int | Inputs,
+        hidden: Sequence[int],
+        outputs: int,
+        output_gain: float,
+        generator: torch.Generator,
+        activation: Activation = "elu",
+        layer_norm: bool = False,
+        *,
+        modules: int,
+    ):
+        super().__init__()
+        inputs = Inputs.of(inputs)
+        self.encoder = GroupEncoder(inputs.without("task_id"), generator)
+        self.weights = TaskWeights(inputs, modules, generator)
+        layers: list[nn.Module] = []
+        for before, width in pairwise([self.encoder.size, *hidden]):
+            layers += [StackedLinear(modules, before, width, math.sqrt(2.0), generator)]
+            layers += [PlainNorm(layer_norm), ACTIVATIONS[activation]()]
+        self.body = nn.Sequential(*layers[:-2])  # what is made orthogonal has not been through a non-linearity
+        self.activation, self.scale = ACTIVATIONS[activation](), math.sqrt(hidden[-1])
+        self.head = linear(hidden[-1], outputs, output_gain, generator)
+
+    @property
+    def output_bias(self) -> Tensor:
+        """Biases of the output (outputs,)."""
+        return self.head.bias
+
+    def experts(self, x: Tensor) -> Tensor:
+        """Orthonormal representations (K, batch, width), float32, of observations (batch, inputs)."""
+        raw = self.body(self.encoder(x))
+        with torch.autocast(x.device.type, enabled=False):
+            return gram_schmidt(raw.to(self.head.weight.dtype))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Maps (batch, inputs) to float32 (batch, outputs)."""
+        experts = self.experts(x)
+        with torch.autocast(x.device.type, enabled=False):
+            return self.head(self.activation(self.scale * mixed(self.weights(x), experts)))
+
+
+class PaCo(nn.Module):
+    """PaCo: a task's parameters are a mixture of a few parameter sets (Sun et al. 2022).
+
+        theta_k = Phi w_k        Phi: K parameter sets, shared by all tasks; w_k: K numbers of task k
+
+    A layer is linear in its parameters, so that the composed layer's output is the mixture of the K layers' outputs;
+    the non-linearity comes after. The task's one-hot chooses w_k and is not fed to the layers.
+    Ours: actor and each critic have their own w, which starts as a random direction of length 1; biases of the output
+    are not composed, since the actor's hold its initial standard deviation. Of the paper's training, the masking and
+    fresh start of tasks whose loss explodes is left out.
+    """
+
+    def __init__(
+        self,
+        inputs: int | Inputs,
+        hidden: Sequence[int],
+        outputs: int,
+        output_gain: float,
+        generator: torch.Generator,
+        activation: Activation = "elu",
+        layer_norm: bool = False,
+        *,
+        modules: int,
+    ):
+        super().__init__()
+        inputs = Inputs.of(inputs)
+        self.encoder = GroupEncoder(inputs.without("task_id"), generator)
+        self.weights = TaskWeights(inputs, modules, generator)
+        widths = [self.encoder.size, *hidden]
+        self.layers = nn.ModuleList(
+            StackedLinear(modules, a, b, math.sqrt(2.0), generator) for a, b in pairwise(widths)
+        )
+        self.between = nn.Sequential(PlainNorm(layer_norm), ACTIVATIONS[activation]())
+        self.head = StackedLinear(modules, widths[-1], outputs, output_gain, generator, bias=False)
+        self.output_bias = nn.Parameter(torch.zeros(outputs))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Maps (batch, inputs) to float32 (batch, outputs)."""
+        weights, features = self.weights(x), self.encoder(x)
+        for layer in self.layers:
+            features = self.between(mixed(weights, layer(features)))
+        with torch.autocast(x.device.type, enabled=False):
+            return mixed(weights, self.head(features.to(weights.dtype))) + self.output_bias
+
+
+class SoftModules(nn.Module):
+    """Soft modularisation: layers of modules, and for each task soft routes between them (Yang et al. 2020).
+
+        e     = f(s) * h(k)                          embeddings of state and task, entry by entry
+        p^1   = D^1 relu(e)                          logits of the routes from the first layer to the second
+        p^l+1 = D^l+1 relu(U^l p^l * e)              each further layer of routes depends on the one before
+        g_i   = sum_j softmax_j(p_ij) relu(W_j g_j)  module i takes its shares of the modules before it
+
+    The first of ``hidden`` is the width of f(s), which feeds the first layer; each further one is that of a layer of
+    modules. The task's one-hot enters by h alone. Ours: the head takes shares of the last layer, where the paper adds
+    its modules up; f is one layer; modules have the config's non-linearity. The paper's loss weights by temperature are
+    left out.
+    """
+
+    def __init__(
+        self,
+        inputs: int | Inputs,
+        hidden: Sequence[int],
+        outputs: int,
+        output_gain: float,
+        generator: torch.Generator,
+        activation: Activation = "elu",
+        layer_norm: bool = False,
+        *,
+        modules: int,
+    ):
+        super().__init__()
+        inputs, gain, embedding = Inputs.of(inputs), math.sqrt(2.0), hidden[0]
+        self.modules_of_layer = modules
+        self.one_hot = inputs.columns("task_id")
+        self.encoder = GroupEncoder(inputs.without("task_id"), generator)
+        self.between = nn.Sequential(PlainNorm(layer_norm), ACTIVATIONS[activation]())
+        self.state = linear(self.encoder.size, embedding, gain, generator)
+        self.task = linear(self.one_hot.size, embedding, gain, generator)
+        self.layers = nn.ModuleList(StackedLinear(modules, a, b, gain, generator) for a, b in pairwise(hidden))
+        routes = [modules**2] * (len(hidden) - 2) + [modules]
+        self.down = nn.ModuleList(linear(embedding, size, 1.0, generator) for size in routes)
+        self.up = nn.ModuleList(linear(size, embedding, gain, generator) for size in routes[:-1])
+        self.head = linear(hidden[-1], outputs, output_gain, generator)
+
+    @property
+    def output_bias(self) -> Tensor:
+        """Biases of the output (outputs,)."""
+        return self.head.bias
+
+    def routes(self, x: Tensor, state: Tensor) -> list[Tensor]:
+        """Shares (batch, modules that take, modules that give) between one layer and the next; they sum to 1.
+
+        Args:
+            x: Observations (batch, inputs).
+            state: Their embeddings (batch, width).
+        """
+        both = state * self.task(self.one_hot(x).to(state.dtype))
+        logits = self.down[0](both.relu())
+        found = [logits]
+        for up, down in zip(self.up, self.down[1:], strict=True):
+            logits = down((up(logits) * both).relu())
+            found.append(logits)
+        return [each.unflatten(1, (-1, self.modules_of_layer)).softmax(-1) for each in found]
+
+    def embedded(self, x: Tensor) -> Tensor:
+        """Embeddings of the states of observations (batch, inputs): (batch, width)."""
+        return self.between(self.state(self.encoder(x)))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Maps (batch, inputs) to float32 (batch, outputs)."""
+        features = state = self.embedded(x)
+        for layer, shares in zip(self.layers, self.routes(x, state), strict=True):
+            features = torch.einsum("bij,jbn->ibn", shares, self.between(layer(features)))
+        with torch.autocast(x.device.type, enabled=False):
+            return self.head(features[0].to(self.head.weight.dtype))

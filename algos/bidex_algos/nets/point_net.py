@@ -1,0 +1,110 @@
+"""PointNet (Qi et al. 2017, arXiv 1612.00593) without its transforms: a shared network on each point, then the largest.
+
+What it gives does not depend on the order of the points, nor on how often one of them stands there.
+"""
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, cast
+
+import torch
+from torch import Tensor, nn
+
+from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.products import Linear
+from bidex_meta.errors import BidexError
+
+POINT_GROUPS = {"points": 3, "kind_points": 4}
+"""Observation groups that are clouds, and the numbers of a point."""
+_SPREAD = 0.2
+"""What distances from a cloud's centre are divided by, metres: about a hand's length."""
+_CACHED = 1 << 19
+"""Numbers of a layer that a CPU computes at once."""
+
+
+class PointNet(nn.Module):
+    """Maps clouds (..., entries) to features (..., size): the largest of each over all points, and the centre.
+
+    Points enter as what they are away from the centre of their cloud, so that the first layers see shapes rather than
+    where in the room the hands are; the centre itself (metres) stands behind the features.
+
+    Args:
+        entries: Numbers of a cloud, point after point.
+        generator: CPU generator of the initial weights.
+        widths: Of the layers that all points share.
+        channels: Numbers of a point: three of position, then others.
+        read: Read so many points alone, evenly out of the cloud; 0: all of them.
+    """
+
+    def __init__(
+        self, entries: int, generator: torch.Generator, widths: Sequence[int], channels: int = 3, read: int = 0
+    ):
+        super().__init__()
+        self.channels, self.size = channels, widths[-1] + 3
+        points = entries // channels
+        self.step = 1 if read == 0 else max(1, points // read)
+        layers: list[nn.Module] = []
+        for before, after in zip((channels, *widths[:-1]), widths, strict=True):
+            layer = Linear(before, after)
+            nn.init.orthogonal_(layer.weight, math.sqrt(2.0), generator=generator)
+            nn.init.zeros_(layer.bias)
+            layers += [layer, nn.ReLU()]
+        self.shared = nn.Sequential(*layers[:-1])  # the largest is a non-linearity of its own
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Encodes clouds."""
+        cloud = x.unflatten(-1, (-1, self.channels))[..., :: self.step, :]
+        place, rest = cloud[..., :3], cloud[..., 3:]
+        centre = place.mean(dim=-2, keepdim=True)
+        points = torch.cat(((place - centre) / _SPREAD, rest), dim=-1)
+        return torch.cat((self._largest(points.flatten(0, -3)).view(*x.shape[:-1], -1), centre[..., 0, :]), dim=-1)
+
+    def _largest(self, points: Tensor) -> Tensor:
+        """The largest of each feature, (n, features), over points (n, points, channels)."""
+        last = cast(nn.Linear, self.shared[-1])
+        if not torch.is_grad_enabled() or last.out_features >= points.shape[1]:
+            return torch.cat([self.shared(part).amax(dim=1) for part in self._parts(points)])
+        # Only the point that is largest in a feature has a gradient: find these without, then go through them alone.
+        with torch.no_grad():
+            found = torch.cat([_largest_of(self.shared(part)) for part in self._parts(points)])
+        chosen = points.gather(1, found[..., None].expand(-1, -1, points.shape[2]))
+        return (self.shared[:-1](chosen) * last.weight).sum(dim=2) + last.bias
+
+    def _parts(self, points: Tensor) -> tuple[Tensor, ...]:
+        """On a CPU so many clouds at once that what is computed of them fits its cache."""
+        if points.device.type != "cpu":
+            return (points,)
+        return points.split(max(1, _CACHED // (points.shape[1] * (self.size - 3))))
+
+
+def _largest_of(values: Tensor) -> Tensor:
+    """``values.argmax(dim=1)`` of (n, points, features), faster on a CPU, where argmax and max are no vector code."""
+    points = values.shape[1]
+    step = next(d for d in range(min(16, points), 0, -1) if points % d == 0)
+    blocks = values.unflatten(1, (-1, step))
+    block = blocks.amax(dim=2).max(dim=1).indices
+    within = blocks.gather(1, block[:, None, None].expand(-1, 1, step, -1))[:, 0].max(dim=1).indices
+    return block * step + within
+
+
+def with_point_net(inputs: Inputs, config: Any) -> Inputs:
+    """The same with clouds, where there are some, read by a PointNet.
+
+    Running statistics leave clouds as they are: each of their columns may be any point.
+
+    Raises:
+        BidexError: The learner's config has no ``point_widths``: it reads no clouds.
+    """
+    for group in inputs.groups:
+        channels = POINT_GROUPS.get(group.name)
+        if channels is not None:
+            if "point_widths" not in vars(config):
+                raise BidexError(
+                    f"{config.algo} does not read point clouds. Take another learner, such as mtppo or mtsac, or leave "
+                    "--points (a suite's table [points]) out."
+                )
+            widths, read = tuple(config.point_widths), config.points_read
+            make = partial(PointNet, widths=widths, channels=channels, read=read)
+            inputs = inputs.encoded(group.name, make, scaled=False)
+    return inputs

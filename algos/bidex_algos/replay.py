@@ -1,0 +1,293 @@
+"""A replay with a part of its own for each task: the last vector steps of all environments, in a ring on the device.
+
+An observation is kept once, since it is both where one transition leads and where the next begins. Only where a time
+limit cut an episode does the world show another one; those last observations lie in a ring of their own. Nothing here
+has a shape that depends on data, and nothing makes the host wait for the device.
+"""
+
+import math
+import sys
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bidex_meta.errors import BidexError
+from bidex_meta.train.distributed import is_main
+from bidex_meta.train.learner import State
+from bidex_meta.world.contract import VectorWorld
+
+
+@dataclass
+class Transitions:
+    """B transitions as they were stored: raw observations, raw rewards."""
+
+    obs: Tensor  # observations before the step (B, d)
+    actions: Tensor  # actions (B, a)
+    rewards: Tensor  # rewards (B,)
+    next_obs: Tensor  # observations after the step, of the same episode (B, d); read only where not terminated
+    terminated: Tensor  # whether nothing follows, bool (B,). A time limit is not such an end
+    steps: Tensor | int = 1  # steps from obs to next_obs, one for all or (B,); rewards is then their discounted sum
+
+
+class Replay:
+    """The last ``steps`` vector steps of all environments.
+
+    Environments of one task are its part of the replay: draws are made per task, and no task can crowd out another.
+
+    Args:
+        steps: Vector steps kept.
+        task_id: Task of each environment, int64 (N,).
+        num_tasks: Number of tasks; each has rows.
+        observations: Width of the observation.
+        actions: Number of actions.
+        device: Where it lies.
+        cut_share: Room for last observations of episodes cut by a time limit, as a share of all transitions (but for
+            at least one vector step). Where they do not fit, the oldest lose their weight.
+
+    Attributes:
+        added: Vector steps taken in so far.
+    """
+
+    def __init__(
+        self,
+        steps: int,
+        task_id: Tensor,
+        num_tasks: int,
+        observations: int,
+        actions: int,
+        device: torch.device,
+        cut_share: float = 1 / 16,
+    ):
+        rows = len(task_id)
+        self.steps, self.rows, self.num_tasks, self.device = steps, rows, num_tasks, device
+        self.added = 0
+        # One slot more than transitions: the newest observation has no transition yet.
+        self.slots = steps + 1
+        self.cuts_kept = _cuts_kept(steps, rows, cut_share)
+
+        # Not filled: an operating system gives memory when it is first written, and nothing is read before that.
+        def ring(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+            return torch.empty(shape, dtype=dtype, device=device)
+
+        self._obs = ring(self.slots, rows, observations)
+        self._steps = {
+            "actions": ring(self.slots, rows, actions),
+            "rewards": ring(self.slots, rows),
+            "terminated": ring(self.slots, rows, dtype=torch.bool),
+            "valid": ring(self.slots, rows, dtype=torch.bool),
+            # Running number, from 1, of the time limit that cut the episode here; 0 where none did.
+            "cut": ring(self.slots, rows, dtype=torch.int64),
+        }
+        # The cell behind the last takes what nobody will read.
+        self._final_obs = ring(self.cuts_kept + 1, observations)
+        self._cuts = torch.zeros((), dtype=torch.int64, device=device)
+
+        self._rows_of_task = torch.argsort(task_id, stable=True)
+        self._count = torch.bincount(task_id, minlength=num_tasks)
+        self._first = self._count.cumsum(0) - self._count
+
+    @property
+    def filled(self) -> int:
+        """Vector steps that can be drawn from."""
+        return min(self.added, self.steps)
+
+    @property
+    def obs(self) -> Tensor:
+        """Newest observations, raw (N, d)."""
+        return self._obs[self.added % self.slots]
+
+    def begin(self, obs: Tensor) -> None:
+        """Takes the observations (N, d) that the first step starts from."""
+        self.obs.copy_(obs)
+
+    def add(
+        self, actions: Tensor, reward: Tensor, terminated: Tensor, truncated: Tensor, obs: Tensor, info: dict[str, Any]
+    ) -> None:
+        """Takes one vector step from ``self.obs``: ``actions`` (N, a) and what a world's ``step`` returned for them."""
+        valid = ~info["unstable"]
+        cut = truncated & ~terminated & valid
+        number = self._cuts + cut.cumsum(0)
+        # All rows write, those whose episode goes on into the last cell: to pick rows the host would have to wait.
+        cell = torch.where(cut, (number - 1) % self.cuts_kept, self.cuts_kept)
+        self._final_obs.index_copy_(0, cell, info["final_obs"])
+        self._cuts += cut.sum()
+        step = {
+            "actions": actions,
+            # A weight of 0 does not undo a reward that is not a number.
+            "rewards": reward.masked_fill(~valid, 0.0),
+            "terminated": terminated,
+            "valid": valid,
+            "cut": number.masked_fill(~cut, 0),
+        }
+        slot = self.added % self.slots
+        for name, value in step.items():
+            self._steps[name][slot] = value
+        self.added += 1
+        self.obs.copy_(obs)
+
+    def draw(self, batches: int, per_task: int, generator: torch.Generator) -> Tensor:
+        """Places of transitions, uniform within each task: int64 (batches, num_tasks * per_task), task after task."""
+        shape = (batches, self.num_tasks, per_task)
+
+        def uniform(high: int) -> Tensor:
+            return torch.randint(high, shape, generator=generator, device=self.device)
+
+        # The remainder of a number this large favours no row by more than 1 in 2^40 / rows.
+        row = self._rows_of_task[self._first[:, None] + uniform(2**40) % self._count[:, None]]
+        slot = (self.added - 1 - uniform(self.filled)) % self.slots
+        return (slot * self.rows + row).flatten(1)
+
+    def weights(self, places: Tensor) -> Tensor:
+        """1, or 0 where physics broke or the last observation is no longer kept. Shape of ``places``, float32."""
+        cut = self.at("cut", places)
+        kept = (cut == 0) | (cut > self._cuts - self.cuts_kept)
+        return (self.at("valid", places) & kept).float()
+
+    def after(self, places: Tensor) -> Tensor:
+        """Where the environment's next transition lies, in the shape of ``places``."""
+        return (places + self.rows) % (self.slots * self.rows)
+
+    def take(self, places: Tensor, last: Tensor | None = None) -> Transitions:
+        """The transitions at ``places`` (B,); with ``last`` they begin there and end as the ones at ``last``."""
+        last = places if last is None else last
+        everything = self._obs.flatten(0, 1)
+        following = everything.index_select(0, self.after(last))
+        cut = self.at("cut", last)
+        final = self._final_obs.index_select(0, (cut - 1) % self.cuts_kept)
+        return Transitions(
+            obs=everything.index_select(0, places),
+            actions=self.at("actions", places),
+            rewards=self.at("rewards", places),
+            next_obs=torch.where((cut > 0)[:, None], final, following),
+            terminated=self.at("terminated", last),
+        )
+
+    def at(self, name: str, places: Tensor) -> Tensor:
+        """What was stored under a name at ``places``, in their shape: rewards, terminated, valid, cut."""
+        return self._steps[name].flatten(0, 1)[places]
+
+    # Checkpoints hold what is filled and no more.
+
+    def state_dict(self) -> State:
+        """A copy of all that was taken in."""
+        cuts = min(int(self._cuts), self.cuts_kept)
+        return {
+            "added": self.added,
+            "steps": self.steps,
+            "obs": self._obs[: self.added + 1].clone(),
+            **{name: ring[: self.added].clone() for name, ring in self._steps.items()},
+            "final_obs": self._final_obs[:cuts].clone(),
+            "cuts": self._cuts.clone(),
+        }
+
+    def load_state_dict(self, state: State) -> None:
+        """Restores what :meth:`state_dict` gave.
+
+        Raises:
+            BidexError: It comes from a replay of another size.
+        """
+        here, there = (self.steps, *self._obs.shape[1:]), (state["steps"], *state["obs"].shape[1:])
+        if here != there:
+            raise BidexError(
+                f"The checkpoint's replay had (steps, num_envs, observations) = {there}, this one has {here}. Resume "
+                "with the run's own suite, num_envs and replay."
+            )
+        self.added = int(state["added"])
+        self._obs[: self.added + 1] = state["obs"].to(self.device)
+        for name, ring in self._steps.items():
+            ring[: self.added] = state[name].to(self.device)
+        self._final_obs[: len(state["final_obs"])] = state["final_obs"].to(self.device)
+        self._cuts.copy_(state["cuts"])
+
+
+def replay_bytes(steps: int, rows: int, observations: int, actions: int, cut_share: float = 1 / 16) -> int:
+    """Bytes that a :class:`Replay` of this size takes."""
+    transition = 4 * (observations + actions + 1) + 2 + 8
+    return (steps + 1) * rows * transition + (_cuts_kept(steps, rows, cut_share) + 1) * 4 * observations
+
+
+def steps_within(
+    memory: float, steps: int, rows: int, observations: int, actions: int, cut_share: float = 1 / 16
+) -> int:
+    """The most vector steps, up to ``steps``, that take no more than ``memory`` bytes; 0 if not even one does."""
+    if replay_bytes(steps, rows, observations, actions, cut_share) <= memory:
+        return steps
+    low, high = 0, steps  # low fits (or is 0), high does not
+    while high - low > 1:
+        middle = (low + high) // 2
+        if replay_bytes(middle, rows, observations, actions, cut_share) <= memory:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def _cuts_kept(steps: int, rows: int, cut_share: float) -> int:
+    # A vector step's worth at least: all may end together, and no cell may be written twice in a step.
+    return max(rows, math.ceil(cut_share * steps * rows))
+
+
+class Stretches:
+    """Up to ``n`` steps in a row from each of ``places``, int64 (batches, B).
+
+    Attributes:
+        last: Places of the last steps, (batches, B).
+    """
+
+    def __init__(self, replay: Replay, places: Tensor, n: int, gamma: float | Tensor):
+        self.replay, self.first, self.last = replay, places, places
+        self.rewards: Tensor | None = None
+        if n > 1:
+            self._walk(n, gamma)
+
+    def _walk(self, n: int, gamma: float | Tensor) -> None:
+        replay = self.replay
+        newest = replay.added % replay.slots  # the slot of an observation that no step has left yet
+        self.rewards, self.steps = replay.at("rewards", self.first), torch.ones_like(self.first)
+        going = replay.at("valid", self.first) & ~self._ended(self.first)
+        for _ in range(1, n):
+            following = replay.after(self.last)
+            going = going & (following // replay.rows != newest) & replay.at("valid", following)
+            reward = replay.at("rewards", following) * gamma**self.steps
+            self.rewards = self.rewards + reward.masked_fill(~going, 0.0)
+            self.steps = self.steps + going
+            self.last = torch.where(going, following, self.last)
+            going = going & ~self._ended(self.last)
+
+    def _ended(self, places: Tensor) -> Tensor:
+        return self.replay.at("terminated", places) | (self.replay.at("cut", places) > 0)
+
+    def take(self, batch: int) -> Transitions:
+        """One batch of them, as transitions (B,)."""
+        taken = self.replay.take(self.first[batch], self.last[batch])
+        if self.rewards is None:
+            return taken
+        return replace(taken, rewards=self.rewards[batch], steps=self.steps[batch])
+
+
+def replay_within(
+    learner: str, world: VectorWorld, observations: int, actions: int, asked: int, memory: float, share: float
+) -> Replay:
+    """The replay of ``asked`` vector steps, or as much of it as ``memory`` (GB, 10^9 bytes) holds.
+
+    Raises:
+        BidexError: A task has no environments, or not one vector step fits.
+    """
+    rows = world.num_envs
+    present = torch.bincount(world.task_id, minlength=world.num_tasks).tolist()
+    if 0 in present:
+        raise BidexError(f"{learner}: task {world.task_names[present.index(0)]} has no environments. Raise num_envs.")
+    steps = steps_within(memory * 1e9, asked, rows, observations, actions, share)
+    needed = replay_bytes(asked, rows, observations, actions, share) / 1e9
+    if steps == 0:
+        raise BidexError(f"{learner}: replay_memory {memory:g} GB holds not one step of {rows} environments. Raise it.")
+    if steps < asked and is_main():
+        print(
+            f"{learner}: a replay of {asked:,} vector steps ({asked * rows:,} transitions) needs {needed:.1f} GB; "
+            f"replay_memory is {memory:g} GB: it keeps {steps:,} ({steps * rows:,} transitions).",
+            file=sys.stderr,
+            flush=True,
+        )
+    return Replay(steps, world.task_id, world.num_tasks, observations, actions, world.device, share)

@@ -1,0 +1,158 @@
+"""A stretch of transitions of all environments, and the loop that collects it; shared by the on-policy learners."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bidex_meta.errors import BidexError
+from bidex_meta.maths import check_precision
+from bidex_meta.train.distributed import all_sum
+from bidex_meta.world.contract import VectorWorld
+
+
+class EpisodeStatistics:
+    """Fading sums over about the last ``window`` finished episodes of each task, in each process.
+
+    A rollout is shorter than an episode, so the episodes that happen to end in one are few and, for a slow task, often
+    none: an average over one rollout would jump. ``task_id`` is that of each environment, int64 (N,).
+    """
+
+    def __init__(self, task_id: Tensor, task_names: list[str], window: float = 100.0):
+        self.task_id = task_id
+        self.task_names = task_names
+        self.window = window
+        # Rows: return, length, success, count.
+        self.sums = torch.zeros(4, len(task_names), device=task_id.device)
+
+    def update(self, info: dict[str, Any]) -> None:
+        """Takes in the episodes that ``info["counted"]`` says ended in this step."""
+        episode, ended = info["so_far"], info["counted"]
+        values = torch.stack([episode["r"].float(), episode["l"].float(), episode["success"].float(), ended.float()])
+        new = torch.zeros_like(self.sums).index_add_(1, self.task_id, values.masked_fill(~ended, 0.0))
+        self.sums = self.sums * (1.0 - 1.0 / self.window) ** new[3] + new
+
+    def metrics(self) -> dict[str, float]:
+        """Means per task, and means over the tasks that have finished an episode; a task without one is left out.
+
+        The episodes of all processes count.
+        """
+        returns, lengths, successes, counts = all_sum(self.sums).tolist()
+        seen = [i for i, count in enumerate(counts) if count > 0]
+        out: dict[str, float] = {}
+        for i in seen:
+            out[f"Train/return/{self.task_names[i]}"] = returns[i] / counts[i]
+            out[f"Train/success/{self.task_names[i]}"] = successes[i] / counts[i]
+        if seen:
+            out["Train/mean_return"] = sum(returns[i] / counts[i] for i in seen) / len(seen)
+            out["Train/success_rate"] = sum(successes[i] / counts[i] for i in seen) / len(seen)
+            out["Train/mean_episode_length"] = sum(lengths[i] / counts[i] for i in seen) / len(seen)
+        return out
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The sums."""
+        return {"sums": self.sums.clone()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Restores what :meth:`state_dict` gave."""
+        self.sums.copy_(state["sums"])
+
+
+Sampler = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""Raw observations (N, d) to a sampled action and the mean action, both (N, a) and not clamped."""
+
+FinalValue = Callable[[Tensor, Tensor], Tensor]
+"""Raw observations (n, d) and task ids (n,) to values (n,), in units of reward; of several critics (n, critics)."""
+
+
+class Rollout:
+    """Transitions of T steps in N environments, preallocated on the device and overwritten by each :func:`collect`.
+
+    Attributes:
+        obs: Raw observations before each step, (T, N, d).
+        actions: Sampled actions, not clamped, (T, N, a).
+        means: Mean actions of the sampling policy, (T, N, a).
+        rewards: (T, N); 0 where not valid.
+        terminated: Bool (T, N), the episode came to a true end.
+        ended: Bool (T, N), terminated, truncated or not valid.
+        valid: Bool (T, N), False where physics broke: such a transition teaches nothing.
+        final_values: Value of the last observation of episodes cut by a time limit, 0 elsewhere, (T, N); of several
+            critics (T, N, critics).
+        last_obs: Raw observations after the last step, (N, d).
+    """
+
+    def __init__(
+        self, steps: int, num_envs: int, observations: int, actions: int, device: torch.device, critics: int = 1
+    ):
+        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+            return torch.zeros(*shape, dtype=dtype, device=device)
+
+        self.steps = steps
+        self.obs = zeros(steps, num_envs, observations)
+        self.actions = zeros(steps, num_envs, actions)
+        self.means = zeros(steps, num_envs, actions)
+        self.rewards = zeros(steps, num_envs)
+        self.terminated = zeros(steps, num_envs, dtype=torch.bool)
+        self.ended = zeros(steps, num_envs, dtype=torch.bool)
+        self.valid = zeros(steps, num_envs, dtype=torch.bool)
+        self.final_values = zeros(steps, num_envs, *([critics] if critics > 1 else []))
+        self.last_obs = zeros(num_envs, observations)
+
+
+@torch.no_grad()
+def collect(
+    world: VectorWorld,
+    rollout: Rollout,
+    obs: Tensor,
+    sample: Sampler,
+    final_value: FinalValue,
+    episodes: EpisodeStatistics,
+) -> Tensor:
+    """Fills ``rollout`` from ``world``, starting at the observations ``obs``; returns those to continue from."""
+    for t in range(rollout.steps):
+        action, mean = sample(obs)
+        rollout.obs[t], rollout.actions[t], rollout.means[t] = obs, action, mean
+        obs, reward, terminated, truncated, info = world.step(action)
+        valid = ~info["unstable"]
+        rollout.rewards[t] = reward.masked_fill(~valid, 0.0)
+        rollout.terminated[t], rollout.ended[t], rollout.valid[t] = terminated, terminated | truncated | ~valid, valid
+        cut = truncated & ~terminated & valid
+        rollout.final_values[t] = _values_where(
+            cut, info["final_obs"], world.task_id, final_value, rollout.final_values[t]
+        )
+        episodes.update(info)
+    rollout.last_obs.copy_(obs)
+    return obs
+
+
+def check_autoreset(world: VectorWorld, learner: str, expected: str) -> None:
+    """Refuses a world that resets in another way than the learner needs.
+
+    Raises:
+        BidexError: It is in another autoreset mode, or torch's default precision is not single.
+    """
+    check_precision()
+    name = world.metadata["autoreset_mode"].name
+    if name != expected:
+        raise BidexError(
+            f"{learner}: needs a world in autoreset mode {expected}, but this one is in {name}. Make it with "
+            f'autoreset_mode="{expected}".'
+        )
+
+
+def may_look(device: torch.device) -> bool:
+    """Whether asking a tensor for its values costs nothing: elsewhere the host would wait for the device."""
+    return device.type == "cpu"
+
+
+def _values_where(cut: Tensor, final_obs: Tensor, task_id: Tensor, final_value: FinalValue, like: Tensor) -> Tensor:
+    """Values of ``final_obs`` in the rows ``cut``, 0 elsewhere; of the shape of ``like``."""
+    values = torch.zeros_like(like)
+    if not may_look(cut.device):
+        # A forward of all environments is cheaper than the wait for which rows there are.
+        return torch.where(cut.view(-1, *[1] * (like.dim() - 1)), final_value(final_obs, task_id), values)
+    rows = cut.nonzero().squeeze(-1)
+    if len(rows):
+        values[rows] = final_value(final_obs[rows], task_id[rows])
+    return values

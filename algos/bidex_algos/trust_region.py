@@ -1,0 +1,171 @@
+"""A step as far as the KL allows: conjugate gradients, Fisher-vector products and line search, on flat vectors."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from bidex_meta.train.distributed import all_sum
+
+Product = Callable[[Tensor], Tensor]
+"""A symmetric positive matrix as the function that multiplies it with a vector (P,)."""
+
+
+def flatten(tensors: Sequence[Tensor]) -> Tensor:
+    """All entries in one vector (P,)."""
+    return torch.cat([t.reshape(-1) for t in tensors])
+
+
+@torch.no_grad()
+def write(parameters: Sequence[nn.Parameter], vector: Tensor) -> None:
+    """Overwrites parameters with the entries of a vector (P,)."""
+    for parameter, part in zip(parameters, vector.split([p.numel() for p in parameters]), strict=True):
+        parameter.copy_(part.view_as(parameter))
+
+
+def conjugate_gradient(product: Product, b: Tensor, iterations: int, tolerance: float = 1e-10) -> Tensor:
+    """Solves ``product(x) = b`` for x (P,) from 0 (Hestenes and Stiefel 1952).
+
+    With as many iterations as P the solution is exact but for rounding. Once the squared residual is below
+    ``tolerance`` of the first one, x no longer changes.
+    """
+    x, residual, direction = torch.zeros_like(b), b.clone(), b.clone()
+    square = first = residual.dot(residual)
+    for _ in range(iterations):
+        along = product(direction)
+        # Masked instead of stopped: whether to stop would be a question to the device.
+        going = square > tolerance * first
+        length = torch.where(going, square / direction.dot(along), 0.0)
+        x = x + length * direction
+        residual = residual - length * along
+        following = residual.dot(residual)
+        direction = residual + torch.where(going, following / square, 0.0) * direction
+        square = following
+    return x
+
+
+def fisher_product(kl: Tensor, parameters: Sequence[nn.Parameter], damping: float) -> Product:
+    """Fisher-vector products F v + damping v by differentiating the KL twice.
+
+    Args:
+        kl: This process's part of the mean KL of the policy from itself, a scalar whose graph reaches the parameters;
+            its Hessian is the Fisher matrix.
+        parameters: The policy's.
+        damping: Added to the diagonal.
+    """
+    slope = flatten(torch.autograd.grad(kl, parameters, create_graph=True))
+
+    def product(v: Tensor) -> Tensor:
+        curved = torch.autograd.grad(slope.dot(v), parameters, retain_graph=True)
+        return all_sum(flatten(curved)) + damping * v
+
+    return product
+
+
+def natural_step(
+    objective: Tensor, kl: Tensor, parameters: Sequence[nn.Parameter], *, max_kl: float, damping: float, iterations: int
+) -> tuple[Tensor, float]:
+    """The step (P,) along F^-1 g that has the KL ``max_kl`` to second order, and the rise it promises.
+
+    Args:
+        objective: This process's part of what shall rise, a scalar with a graph.
+        kl: As for :func:`fisher_product`.
+        parameters: The policy's.
+        max_kl: The KL to use.
+        damping: Added to the diagonal of the Fisher matrix.
+        iterations: Of conjugate gradients.
+    """
+    gradient = all_sum(flatten(torch.autograd.grad(objective, parameters, retain_graph=True)))
+    product = fisher_product(kl, parameters, damping)
+    direction = conjugate_gradient(product, gradient, iterations)
+    curvature = direction.dot(product(direction)).clamp_min(1e-12)
+    step = torch.sqrt(2.0 * max_kl / curvature) * direction
+    return step, float(gradient.dot(step))
+
+
+def line_search(
+    parameters: Sequence[nn.Parameter],
+    step: Tensor,
+    measure: Callable[[], tuple[float, float]],
+    *,
+    expected: float,
+    max_kl: float,
+    accept_ratio: float,
+    factor: float,
+    tries: int,
+) -> float:
+    """Goes back along ``step`` until the objective has risen and the KL is kept; else nothing changes.
+
+    Args:
+        parameters: Overwritten with the accepted point.
+        step: The full step (P,).
+        measure: Objective and KL from the sampling policy at the parameters' present values.
+        expected: Rise of the objective that its gradient promises for the full step.
+        max_kl: The KL to keep.
+        accept_ratio: Share of the promised rise that must come true.
+        factor: By which the step is shortened from try to try.
+        tries: How many points are tried.
+
+    Returns:
+        The accepted share of the step, 0 if there was none.
+    """
+    start = flatten(parameters).detach().clone()
+    before, _ = measure()
+    share = 1.0
+    for _ in range(tries):
+        write(parameters, start + share * step)
+        objective, kl = measure()
+        # Comparisons with NaN are false, so that a broken point is never taken.
+        if objective - before > max(accept_ratio * share * expected, 0.0) and kl <= max_kl:
+            return share
+        share *= factor
+    write(parameters, start)
+    return 0.0
+
+
+class Stepped(NamedTuple):
+    """What a trust-region step has come to."""
+
+    objective: float  # the objective where it ended
+    kl: float  # KL from the sampling policy there
+    share: float  # share of the natural step that was taken; 0: the parameters are as before
+
+    def told(self, kl_tag: str, device: torch.device) -> dict[str, Tensor]:
+        """Scalars to be logged."""
+        found = {"Loss/surrogate": -self.objective, kl_tag: self.kl, "Policy/step_share": self.share}
+        return {name: torch.tensor(value, device=device) for name, value in found.items()}
+
+
+def trust_region_step(
+    parameters: Sequence[nn.Parameter],
+    objective: Tensor,
+    kl: Tensor,
+    measure: Callable[[], tuple[float, float]],
+    config: Any,
+    accept_ratio: float = 0.0,
+) -> Stepped:
+    """Moves parameters along the natural gradient, back along it until objective and KL are what was asked for.
+
+    Args:
+        parameters: The policy's.
+        objective: As for :func:`natural_step`.
+        kl: As for :func:`fisher_product`.
+        measure: As for :func:`line_search`.
+        config: Of a learner. It has ``max_kl``, ``damping``, ``cg_iterations``, ``backtracks`` (points tried) and
+            ``backtrack_factor`` (by which the step is shortened from one to the next).
+        accept_ratio: Share of the promised rise that must come true.
+    """
+    size = {"max_kl": config.max_kl, "damping": config.damping, "iterations": config.cg_iterations}
+    step, promised = natural_step(objective, kl, parameters, **size)
+    share = line_search(
+        parameters,
+        step,
+        measure,
+        expected=promised,
+        max_kl=config.max_kl,
+        accept_ratio=accept_ratio,
+        factor=config.backtrack_factor,
+        tries=config.backtracks,
+    )
+    return Stepped(*measure(), share)

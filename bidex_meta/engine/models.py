@@ -1,0 +1,96 @@
+"""Compiled models beside each other: which may share one batch, and whose trajectories are comparable."""
+
+import hashlib
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+
+_PARTS = tuple(
+    ["qpos", "body_", "jnt_", "dof_", "geom_", "site_", "actuator_", "eq_", "tendon_", "pair_", "exclude_", "sensor_"]
+)
+_LOOKS = ("rgba", "matid", "group", "user", "plugin", "castshadow")
+_DIGITS = 6
+
+
+def model_identity(model: mujoco.MjModel) -> str:
+    """Twelve hexadecimal digits of all options of the solver and all numbers of bodies, joints, geoms and actuators.
+
+    Names and looks do not enter, nor does MuJoCo's version. Numbers enter with six digits, so that a processor that
+    rounds the compiler's sums otherwise gives the same.
+
+    Args:
+        model: A compiled scene.
+    """
+    digest = hashlib.sha256()
+    for owner, names in ((model.opt, dir(model.opt)), (model, _names(model))):
+        for name in names:
+            value = None if name.startswith("_") else getattr(owner, name)
+            if isinstance(value, int | float | np.ndarray | np.number):
+                digest.update(name.encode() + _rounded(np.atleast_1d(np.asarray(value, np.float64))))
+    return digest.hexdigest()[:12]
+
+
+def common_identity(models: Mapping[str, mujoco.MjModel]) -> str:
+    """The same of several models, by name."""
+    texts = [f"{name} {model_identity(models[name])}" for name in sorted(models)]
+    return hashlib.sha256("\n".join(texts).encode()).hexdigest()[:12]
+
+
+def _names(model: mujoco.MjModel) -> list[str]:
+    return [name for name in dir(model) if name.startswith(_PARTS) and not name.endswith(_LOOKS)]
+
+
+def _rounded(values: np.ndarray) -> bytes:
+    """The numbers with six digits, what is smaller than 1e-12 as zero."""
+    size = np.floor(np.log10(np.maximum(np.abs(values), 1e-12)))
+    unit = 10.0 ** (size - _DIGITS + 1)
+    return (np.where(np.abs(values) < 1e-12, 0.0, np.round(values / unit)) + 0.0).tobytes() + size.tobytes()
+
+
+# Numbers that mujoco_warp 4.0 keeps per world (arrays of its Model with a first dimension "*"); the C engine takes a
+# whole model per simulation and is freer, but both engines shall group alike.
+_PER_WORLD_FIELDS = """
+    qpos0 qpos_spring
+    body_pos body_quat body_ipos body_iquat body_mass body_subtreemass body_inertia body_invweight0 body_gravcomp
+    jnt_solref jnt_solimp jnt_pos jnt_axis jnt_stiffness jnt_range jnt_actfrcrange jnt_margin
+    dof_solref dof_solimp dof_frictionloss dof_armature dof_damping dof_invweight0
+    geom_matid geom_solmix geom_solref geom_solimp geom_size geom_aabb geom_rbound geom_pos geom_quat geom_friction
+    geom_margin geom_gap geom_rgba site_pos site_quat
+    pair_solref pair_solreffriction pair_solimp pair_margin pair_gap pair_friction
+    eq_solref eq_solimp eq_data
+    tendon_solref_lim tendon_solimp_lim tendon_solref_fri tendon_solimp_fri tendon_range tendon_margin tendon_stiffness
+    tendon_damping tendon_armature tendon_frictionloss tendon_lengthspring tendon_length0 tendon_invweight0
+    actuator_gainprm actuator_biasprm actuator_dynprm actuator_forcerange actuator_ctrlrange actuator_gear actuator_acc0
+    actuator_lengthrange
+"""
+_PER_WORLD = frozenset(_PER_WORLD_FIELDS.split())
+# Names, pictures, and numbers that follow from those above.
+_FREE_PREFIXES = ("name", "light_", "cam_", "mat_", "tex_", "vis", "bvh_", "site_rgba")
+_FREE = frozenset(["names", "paths", "dof_M0", "dof_length", "stat"])
+
+
+def differing_fields(a: mujoco.MjModel, b: mujoco.MjModel) -> list[str]:
+    """Names of the array fields in which two models differ."""
+    found = []
+    for name in dir(a):
+        x = None if name.startswith("_") else getattr(a, name, None)
+        if isinstance(x, np.ndarray) and not np.array_equal(x, getattr(b, name), equal_nan=x.dtype.kind == "f"):
+            found.append(name)
+    return found
+
+
+def same_structure(a: mujoco.MjModel, b: mujoco.MjModel) -> bool:
+    """Whether two models differ only in numbers that may differ from row to row of one batch."""
+    return _sizes(a) == _sizes(b) and all(
+        name in _PER_WORLD or name in _FREE or name.startswith(_FREE_PREFIXES) for name in differing_fields(a, b)
+    )
+
+
+def _sizes(model: mujoco.MjModel) -> dict[str, object]:
+    counts = {n: getattr(model, n) for n in dir(model) if n.startswith("n") and isinstance(getattr(model, n), int)}
+    # Lengths of text and of picture assets are no part of the dynamics.
+    for name in [n for n in counts if n.startswith(("nname", "ntex", "npath", "nmat", "nlight", "ncam", "nbuffer"))]:
+        del counts[name]
+    options = {n: getattr(model.opt, n) for n in dir(model.opt) if not n.startswith("_")}
+    return counts | {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in options.items() if not callable(v)}

@@ -1,0 +1,247 @@
+"""Between here and Meta-World's evaluation: our agents and worlds play in it, agents written for it in ours.
+
+    from bidex_meta.metaworld.evaluation import metalearning_evaluation
+    envs = MetaWorldEnvs(Benchmark("ML1").make_world("test", 4, autoreset_mode="DISABLED"))
+    metalearning_evaluation(ForMetaWorld(agent), envs, num_evals=1, adaptation_episodes=10)
+
+The agents' protocols have the same names and order of calls (``bidex_meta/agents.py``); Meta-World uses NumPy arrays,
+does not say which environments share a task, and calls ``reset`` before and during evaluation alone. Its score is not
+ours: with several environments of a class it counts the first episodes that finish, and success ends them, so easy
+tasks crowd out hard ones. ``bidex_meta.evaluation.meta_test`` plays each task equally often.
+"""
+
+from collections import namedtuple
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode, VectorEnv
+from torch import Tensor
+
+from bidex_meta.agents import Agent, Timestep
+from bidex_meta.errors import BidexError
+from bidex_meta.world.contract import Info, Options, PooledWorld
+
+MetaWorldTimestep = namedtuple("MetaWorldTimestep", Timestep._fields[:6])
+"""The six entries of Meta-World's own, for agents that unpack them."""
+
+
+class ForMetaWorld:
+    """One of our agents as ``metaworld.evaluation`` takes it: NumPy arrays in and out.
+
+    Args:
+        agent: An Agent, for ``evaluation``; a MetaLearningAgent, for ``metalearning_evaluation``.
+        device: Where the agent is.
+        task_of_row: Which environments play the same task, numbers from 0 on; None: each has one of its own.
+    """
+
+    def __init__(self, agent: Agent, device: str | torch.device = "cpu", task_of_row: Any = None):
+        self._agent: Any = agent
+        self._device = torch.device(device)
+        self._task_of_row = None if task_of_row is None else self._tensor(np.asarray(task_of_row, np.int64))
+        self._begins = True
+
+    def eval_action(self, observations: np.ndarray) -> np.ndarray:
+        """Actions (num_envs, a), float32, for observations (num_envs, d); no exploration."""
+        return _array(self._agent.eval_action(self._tensor(observations)))
+
+    def reset(self, env_mask: np.ndarray) -> None:
+        """New episodes in the environments of a bool mask (num_envs,), which may be empty."""
+        if np.any(env_mask):
+            self._agent.reset(self._tensor(env_mask))
+
+    def init(self) -> None:
+        """Back to what was meta-learned."""
+        if hasattr(self._agent, "assign"):
+            self._agent.assign(self._task_of_row)
+        self._agent.init()
+        self._begins = True
+
+    def adapt_action(self, observations: np.ndarray) -> tuple[np.ndarray, Info]:
+        """Exploring actions (num_envs, a), float32, and the policy's other outputs as arrays."""
+        obs = self._tensor(observations)
+        if self._begins:  # Meta-World resets the environments here, and does not say so
+            self._agent.reset(torch.ones(len(obs), dtype=torch.bool, device=self._device))
+            self._begins = False
+        action, outputs = self._agent.adapt_action(obs)
+        return _array(action), {name: _array(value) for name, value in outputs.items()}
+
+    def step(self, timestep: Any) -> None:
+        """Takes in one transition of every environment: Meta-World's Timestep, or its first six entries."""
+        obs, action, reward, terminated, truncated, outputs = timestep[:6]
+        tensors = [self._tensor(value) for value in (obs, action, reward, terminated, truncated)]
+        self._agent.step(Timestep._make([*tensors, {k: self._tensor(v) for k, v in outputs.items()}, None, None]))
+        self.reset(np.logical_or(terminated, truncated))  # these go on with their next episodes
+
+    def adapt(self) -> None:
+        """Learns from the transitions since the last ``adapt`` or ``init``."""
+        self._agent.adapt()
+        self._begins = True
+
+    def _tensor(self, value: Any) -> Any:
+        """An array as a tensor, numbers with a fraction as float32; anything else as it is."""
+        if not isinstance(value, np.ndarray):
+            return value
+        tensor = torch.from_numpy(value.copy())  # an environment may write into its array again
+        return tensor.to(self._device, torch.float32 if tensor.is_floating_point() else tensor.dtype)
+
+
+class FromMetaWorld:
+    """An agent written for Meta-World's ``metalearning_evaluation`` as ``meta_evaluate`` takes it.
+
+    Where Meta-World starts an environment's next episode, ours leaves it frozen until all have ended. The agent sees it
+    go on without reward and without an end.
+
+    Args:
+        agent: Takes and returns NumPy arrays.
+    """
+
+    def __init__(self, agent: Any):
+        self._agent = agent
+        self._begun: Tensor | None = None
+        self._over: Tensor | None = None
+
+    def eval_action(self, obs: Tensor) -> Tensor:
+        """Actions (num_envs, a) for observations (num_envs, d)."""
+        if self._begun is not None:
+            self._agent.reset(_array(self._begun))
+            self._begun = None
+        return torch.as_tensor(self._agent.eval_action(_array(obs)), device=obs.device)
+
+    def reset(self, env_mask: Tensor) -> None:
+        """New episodes in the environments of a bool mask (num_envs,); passed on to the agent in evaluation alone."""
+        self._begun = env_mask
+        self._over = ~env_mask
+
+    def init(self) -> None:
+        """Back to what was meta-learned."""
+        self._agent.init()
+
+    def adapt_action(self, obs: Tensor) -> tuple[Tensor, Info]:
+        """Exploring actions (num_envs, a), and the agent's other outputs as it gave them."""
+        self._begun = None
+        action, outputs = self._agent.adapt_action(_array(obs))
+        return torch.as_tensor(action, device=obs.device), outputs
+
+    def step(self, timestep: Timestep) -> None:
+        """Takes in one transition of every environment."""
+        assert self._over is not None  # reset comes first
+        running = ~self._over
+        ended = (timestep.terminated | timestep.truncated) & running
+        reward = torch.where(running, timestep.reward, torch.zeros_like(timestep.reward))
+        flags = (_array(timestep.terminated & running), _array(timestep.truncated & running))
+        arrays = (_array(timestep.observation), _array(timestep.action), _array(reward), *flags)
+        self._agent.step(MetaWorldTimestep(*arrays, timestep.aux_policy_outputs))
+        self._over = self._over | ended
+
+    def adapt(self) -> None:
+        """Learns from the transitions since the last ``adapt`` or ``init``."""
+        self._agent.adapt()
+
+
+class MetaWorldEnvs(VectorEnv):
+    """A world in NumPy arrays, with resets in the same step and the attributes and methods that Meta-World calls.
+
+    Args:
+        world: In autoreset mode DISABLED: episodes are started here, since success may end them, and a SAME_STEP world
+            would begin with shortened ones.
+
+    Raises:
+        BidexError: A world that resets by itself.
+    """
+
+    def __init__(self, world: PooledWorld):
+        if world.metadata["autoreset_mode"] != AutoresetMode.DISABLED:
+            raise BidexError("Expected a world that does not reset by itself. Make it with autoreset_mode='DISABLED'.")
+        self.world, self.num_envs = world, world.num_envs
+        self.metadata = {**world.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}
+        self.single_observation_space, self.observation_space = world.single_observation_space, world.observation_space
+        self.single_action_space, self.action_space = world.single_action_space, world.action_space
+        self.terminate_on_success = False
+        self.task_name = [world.task_names[slot] for slot in world.task_id.tolist()]
+        self._pools = world.pools
+        self._samples = 0
+        self._returns = torch.zeros(self.num_envs, dtype=torch.float64, device=world.task_id.device)
+        self._lengths = torch.zeros_like(world.task_id)
+
+    def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
+        """Starts an episode in every environment: observations (num_envs, d)."""
+        obs, _ = self.world.reset(seed=seed)
+        self._returns.zero_()
+        self._lengths.zero_()
+        return obs.cpu().numpy(), {}
+
+    def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
+        """Advances every environment.
+
+        Args:
+            actions: Shape (num_envs, a), in [-1, 1].
+
+        Returns:
+            Observations (num_envs, d), of ended ones those of the next episode; rewards, terminated, truncated, and
+            info with ``success``, ``final_obs`` and ``final_info`` (``episode``: r, l; ``success``).
+        """
+        obs, reward, terminated, truncated, info = self.world.step(torch.as_tensor(np.asarray(actions)))
+        success = info["success"]
+        if self.terminate_on_success:
+            terminated = terminated | success
+            truncated = truncated & ~success
+        ended = terminated | truncated
+        self._returns += reward.double()
+        self._lengths += 1
+        final = {
+            "episode": {"r": self._returns.cpu().numpy().copy(), "l": self._lengths.cpu().numpy().copy()},
+            "success": success.cpu().numpy(),
+        }
+        ended_info: dict[str, Any] = {"success": final["success"], "final_obs": obs.cpu().numpy().copy()}
+        ended_info |= {"final_info": final, "_final_info": ended.cpu().numpy(), "_final_obs": ended.cpu().numpy()}
+        if bool(ended.any()):
+            obs, _ = self.world.reset(options={"reset_mask": ended})
+            self._returns.masked_fill_(ended, 0.0)
+            self._lengths.masked_fill_(ended, 0)
+        arrays = (value.cpu().numpy() for value in (obs, reward, terminated, truncated))
+        return (*arrays, ended_info)  # type: ignore[return-value]
+
+    def toggle_terminate_on_success(self, on: bool) -> None:
+        """Whether an episode ends at its first success."""
+        self.terminate_on_success = bool(on)
+
+    def toggle_sample_tasks_on_reset(self, on: bool) -> None:
+        """Environments keep their tasks until ``sample_tasks``.
+
+        Raises:
+            BidexError: Asked to draw tasks at each reset.
+        """
+        if on:
+            raise BidexError("Environments keep their tasks until sample_tasks(), as Meta-World's evaluation has it.")
+
+    def sample_tasks(self) -> None:
+        """The next tasks of each pool, one for each environment, round and round; they hold from the next reset on."""
+        chosen = {}
+        for name, pool, rows in zip(self.world.task_names, self._pools, self.world.slot_rows, strict=True):
+            count = rows.stop - rows.start
+            chosen[name] = pool[(self._samples * count + np.arange(count)) % len(pool)]
+        self.world.set_tasks(chosen)
+        self._samples += 1
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """An attribute for each environment."""
+        value = getattr(self, name)
+        return tuple(value) if name == "task_name" else (value,) * self.num_envs
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Calls a method (or reads an attribute) once, and returns the result for each environment."""
+        value = getattr(self, name)
+        return (value(*args, **kwargs),) * self.num_envs if callable(value) else self.get_attr(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Sets an attribute."""
+        setattr(self, name, values)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Frees the world."""
+        self.world.close()
+
+
+def _array(value: Any) -> Any:
+    return value.detach().cpu().numpy() if isinstance(value, Tensor) else value

@@ -1,0 +1,186 @@
+"""Meta-World's MT suites as a world: single environments of another library behind ``BatchedWorld``.
+
+Our learners, evaluation and checkpoints run on it unchanged: a cross-check on tasks, rewards and physics that no one
+here wrote. Environments are stepped one after the other; it is not fast.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode
+from torch import Tensor
+
+from bidex_meta.agents import Agent
+from bidex_meta.errors import BidexError, unknown_name
+from bidex_meta.evaluation.play import check_world, play_tasks
+from bidex_meta.evaluation.results import Evaluation, results_by_class
+from bidex_meta.metaworld.library import (
+    ACTION_SIZE,
+    EPISODE_STEPS,
+    OBSERVATION_SIZE,
+    TASKS_PER_CLASS,
+    Single,
+    make_tasks,
+)
+from bidex_meta.suite import metaworld_classes
+from bidex_meta.world.base import Transition
+from bidex_meta.world.checking import fits
+from bidex_meta.world.contract import PooledWorld, State
+from bidex_meta.world.foreign import ForeignWorld, Sizes
+
+
+class MetaWorldWorld(ForeignWorld):
+    """A suite of Meta-World's on the CPU: a ``contract.PooledWorld`` whose slots are the classes.
+
+    Observations are Meta-World's 39 numbers (goal visible) with the class's one-hot behind them; rewards its "v2" in
+    [0, 10]; an episode is 500 steps, ended by the time limit alone. Starts are part of Meta-World's tasks: an episode
+    depends on its task and actions alone. A task's variation is its number among the class's fifty.
+    """
+
+    def __init__(
+        self,
+        suite: str,
+        num_envs: int,
+        *,
+        seed: int = 0,
+        autoreset_mode: str | AutoresetMode | None = None,
+        stagger: bool = True,
+    ) -> None:
+        """Makes the environments; none is started before ``reset``.
+
+        Args:
+            suite: A key of ``suite.METAWORLD_SUITES``.
+            num_envs: Environments over all classes, at least one for each.
+            seed: Chooses Meta-World's tasks, and the draws of tasks until ``reset(seed=...)`` gives another.
+            autoreset_mode: SAME_STEP (training) or DISABLED (evaluation), as a member or its name.
+            stagger: As in ``bidex_meta.World``.
+
+        Raises:
+            BidexError: Unknown suite or mode, too few environments, or Meta-World is not installed.
+        """
+        self.suite = suite
+        sizes = Sizes(OBSERVATION_SIZE, ACTION_SIZE, EPISODE_STEPS)
+        super().__init__(metaworld_classes(suite), num_envs, sizes, seed, autoreset_mode, stagger)
+        self._task_seed, self._tasks = seed, make_tasks(suite, seed)
+        self._singles = [Single(self.task_names[i]) for i in self.task_id.tolist()]
+        self._actions = torch.zeros(num_envs, EPISODE_STEPS, ACTION_SIZE)  # of the running episodes, for checkpoints
+        self._pools: dict[str, list[int]] = {}
+        self.set_tasks({name: range(TASKS_PER_CLASS) for name in self.task_names})
+
+    def set_tasks(self, pools: Mapping[str, Sequence[int] | np.ndarray]) -> None:
+        """Replaces the pools of tasks of some classes; they hold from the next full reset on.
+
+        Args:
+            pools: Class name to numbers of tasks among its fifty, shape (n,) or (n, 1).
+
+        Raises:
+            BidexError: Unknown class, an empty pool, a wrong shape or a number out of range.
+        """
+        chosen = dict(self._pools)
+        for name, pool in pools.items():
+            if name not in self.task_names:
+                raise unknown_name(f"class of {self.suite}", name, self.task_names)
+            numbers = np.asarray(pool)
+            flat = numbers.size > 0 and numbers.shape in ((len(pool),), (len(pool), 1))
+            if not flat or not (numbers.min() >= 0 and numbers.max() < TASKS_PER_CLASS):  # false for NaN
+                raise BidexError(
+                    f"Expected tasks of {name} from 0 to {TASKS_PER_CLASS - 1}, (n,) or (n, 1), got {numbers.tolist()}."
+                )
+            chosen[name] = [int(number) for number in numbers.flatten()]
+        self._pools = chosen
+        self._set_pool_sizes([len(chosen[name]) for name in self.task_names])
+
+    @property
+    def pools(self) -> list[np.ndarray]:
+        """Numbers of the tasks of each class, each (n, 1), int64."""
+        return [np.array(self._pools[name])[:, None] for name in self.task_names]
+
+    def _place(self, mask: Tensor) -> None:
+        for row in mask.nonzero().squeeze(1).tolist():
+            self._obs[row, :OBSERVATION_SIZE] = torch.from_numpy(self._singles[row].start(self._task(row)))
+
+    def _task(self, row: int) -> Any:
+        name = self.task_names[self.task_id[row]]
+        return self._tasks[name][self._pools[name][self.task_index[row]]]
+
+    def _advance(self, active: Tensor, broken: Tensor) -> Transition:
+        action = self._action
+        self._actions[active, self.episodes.length[active]] = action[active]
+        obs, reward, success, unstable = self._obs.clone(), torch.zeros(self.num_envs), self._success & ~active, broken
+        numbers = action.numpy()
+        for row in (active & ~broken).nonzero().squeeze(1).tolist():
+            new, gained, reached, fell = self._singles[row].step(numbers[row])
+            if fell:
+                unstable[row] = True  # its last finite observation stays
+                continue
+            obs[row, :OBSERVATION_SIZE] = torch.from_numpy(new)
+            reward[row], success[row] = gained, reached
+        return Transition(obs, reward, success, torch.zeros_like(unstable), unstable, {})
+
+    def state_dict(self) -> State:
+        """Everything that decides the future of the world: tensors and plain values, copied."""
+        return {
+            **super().state_dict(),
+            "suite": self.suite,
+            "task_seed": self._task_seed,
+            "pools": {name: list(pool) for name, pool in self._pools.items()},
+            "actions": self._actions.clone(),
+        }
+
+    def load_state_dict(self, state: State) -> None:
+        """Puts back what ``state_dict`` gave, on a world of the same suite, seed and size.
+
+        Meta-World's environments keep part of their state in Python attributes and in the model, so each running
+        episode is played again from its start: exact, and a fraction of a second for each.
+
+        Raises:
+            BidexError: The state is of another suite, seed or size.
+        """
+        fits(state, self.state_dict())
+        here, there = (self.suite, self._task_seed), (state["suite"], state["task_seed"])
+        if here != there:
+            raise BidexError(
+                f"Expected the state of a world of (suite, seed) = {here}, got {there}; build the world with the same."
+            )
+        self.set_tasks(state["pools"])
+        self._restore(state)
+        self._actions = state["actions"].clone()
+        # What waits for a reset, or was never started, is not looked at before its next start.
+        running = ~self.episodes.finished & (self.episodes.number >= 0)
+        for row in running.nonzero().squeeze(1).tolist():
+            self._singles[row].start(self._task(row))
+            for action in self._actions[row, : int(self.episodes.length[row])].numpy():
+                self._singles[row].step(action)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Frees the environments."""
+        for single in self._singles:
+            single.close()
+
+
+def evaluate_all_tasks(
+    agent: Agent, world: PooledWorld, episodes_per_task: int = 1, *, seed: int | None = None
+) -> Evaluation:
+    """``evaluate`` over all tasks of all classes, as many at a time as the world has environments.
+
+    An environment takes some 10 MB: one for each of MT10's five hundred tasks would fill a laptop. Starts are
+    part of the tasks: a policy without noise plays every episode of a task alike, and one is enough.
+
+    Args:
+        agent: The policy.
+        world: A ``MetaWorldWorld`` in autoreset mode DISABLED; it is left with other pools of tasks.
+        episodes_per_task: Episodes of each task.
+        seed: Passed to the world's resets.
+    """
+    check_world(world, episodes_per_task)
+    at_once = min(rows.stop - rows.start for rows in world.slot_rows)
+    parts: list[dict[str, np.ndarray]] = []
+    for first in range(0, TASKS_PER_CLASS, at_once):
+        pool = np.arange(first, min(first + at_once, TASKS_PER_CLASS))
+        world.set_tasks({name: pool for name in world.task_names})
+        played = play_tasks(agent, world, episodes_per_task, seed)
+        parts.append(played | {"task": played["task"] + first})
+    episodes = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    return Evaluation(results_by_class(world.task_names, episodes), episodes_per_task)

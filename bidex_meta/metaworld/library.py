@@ -1,0 +1,109 @@
+"""Meta-World's library, mended for MuJoCo 4: its tasks and its environments, one at a time."""
+
+import functools
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from bidex_meta.errors import BidexError
+from bidex_meta.suite import metaworld_classes
+
+TASKS_PER_CLASS = 50
+OBSERVATION_SIZE = 39
+ACTION_SIZE = 4
+EPISODE_STEPS = 500
+
+_WELD = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 5.0)
+_BROKEN = [
+    int(getattr(mujoco.mjtWarning, f"mjWARN_{kind}"))
+    for kind in ("BADQPOS", "BADQVEL", "BADQACC", "CONTACTFULL", "CNSTRFULL")
+]
+
+
+def mended() -> Any:
+    """Meta-World's module, its environments mended in this process.
+
+    Meta-World 3.0.0 (its newest release without an upper bound on MuJoCo) sets the hand's weld by eleven numbers for
+    the whole row of ``eq_data``; since MuJoCo 3.17 that row is twelve wide, so no environment could be made. Here the
+    eleven go to the first eleven entries, as they were meant; the twelfth keeps what the model was compiled with.
+
+    Raises:
+        ModuleNotFoundError: It, or what it needs, is not installed.
+    """
+    import metaworld
+    from metaworld.sawyer_xyz_env import SawyerMocapBase
+
+    SawyerMocapBase.reset_mocap_welds = _reset_mocap_welds
+    return metaworld
+
+
+def _reset_mocap_welds(self: Any) -> None:
+    welds = np.flatnonzero(self.model.eq_type == mujoco.mjtEq.mjEQ_WELD)
+    self.model.eq_data[welds, : len(_WELD)] = _WELD
+
+
+@functools.cache
+def _library() -> Any:
+    try:
+        library = mended()
+    except ModuleNotFoundError as error:
+        raise BidexError(
+            f"Expected Meta-World for a suite metaworld/..., but {error.name} is not installed. "
+            "Mend: pip install metaworld==3.0.0"
+        ) from None
+    # MuJoCo would print each broken environment to stderr and a log file; Single.step reports it.
+    mujoco.set_mju_user_warning(lambda message: None)
+    return library
+
+
+@functools.lru_cache(maxsize=8)  # drawing them resets each class fifty times: seconds
+def make_tasks(suite: str, seed: int) -> dict[str, tuple[Any, ...]]:
+    """Meta-World's own fifty tasks of each class of a suite, goal visible.
+
+    Those of MT10 are ``metaworld.MT10(seed)``'s, those of MT3 ``metaworld.MT1(name, seed)``'s. Meta-World puts NumPy's
+    global generator back to where it was.
+
+    Args:
+        suite: E.g. ``"metaworld/MT3"``.
+        seed: A whole number from 0 on.
+
+    Raises:
+        BidexError: Unknown suite, or Meta-World is not installed.
+    """
+    names, library, seed = metaworld_classes(suite), _library(), seed % 2**32  # the range of NumPy's old generator
+    whole = suite == "metaworld/MT10"
+    benchmarks = [library.MT10(seed=seed)] if whole else [library.MT1(name, seed=seed) for name in names]
+    tasks = [task for benchmark in benchmarks for task in benchmark.train_tasks]
+    return {name: tuple(task for task in tasks if task.env_name == name) for name in names}
+
+
+class Single:
+    """One environment of Meta-World's class ``name``; an episode is a function of its task and actions alone."""
+
+    def __init__(self, name: str) -> None:
+        self._env = _library().ALL_V3_ENVIRONMENTS[name]()
+
+    def start(self, task: Any) -> np.ndarray:
+        """Begins an episode of a task; the observation, shape (39,), float64: the goal in the last three entries."""
+        self._env.set_task(task)
+        return self._env.reset()[0]
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
+        """One control step of 1/80 s.
+
+        Args:
+            action: Shape (4,), float32, in [-1, 1]: displacement of the hand (× 0.01 m), gripper.
+
+        Returns:
+            Observation (39,), reward in [0, 10] by the formula "v2", success, and whether the physics broke.
+        """
+        obs, reward, _, _, info = self._env.step(action)
+        # MuJoCo goes on from its default state after a bad number; only its counters tell.
+        broken = bool(np.any(self._env.data.warning.number[_BROKEN]))
+        broken = broken or not (np.isfinite(obs).all() and np.isfinite(reward))
+        return obs, float(reward), bool(info["success"]), broken
+
+    def close(self) -> None:
+        """Frees the environment."""
+        self._env.close()

@@ -1,0 +1,122 @@
+"""What a learner is to the commands and to the training loop; knows no particular one."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from bidex_meta.errors import BidexError
+from bidex_meta.validation import Checked
+
+if TYPE_CHECKING:
+    import torch
+
+    from bidex_meta.agents import Agent
+    from bidex_meta.data.joined import Joined
+    from bidex_meta.world.contract import VectorWorld
+
+AutoresetMode = Literal["SAME_STEP", "DISABLED"]
+State = dict[str, Any]
+"""Tensors, numbers, texts, None, and dicts and lists of these: a part of a checkpoint."""
+Parts = dict[str, Any]
+"""What goes into a checkpoint, by name: modules, optimisers, generators, tensors, and dicts and lists of these."""
+
+
+@dataclass(frozen=True)
+class LearnerConfig(Checked):
+    """Base of the learners' configs: fields are checked by their annotations, their docstrings are the flags' help."""
+
+    @property
+    def algo(self) -> str:
+        """The learner's name in messages: that of the class, ``PPO`` of ``PPOConfig``."""
+        return type(self).__name__.removesuffix("Config").lower()
+
+    def bytes_held(self, num_envs: int, width: int) -> int:
+        """About how much memory a learner takes.
+
+        Args:
+            num_envs: Environments of its world.
+            width: Numbers stored of a step of an environment.
+        """
+        return 0
+
+
+class Learner(ABC):
+    """Base of all learners.
+
+    Args:
+        world: A world in the mode that :meth:`autoreset_mode` returns.
+        config: An instance of the dataclass of its presets.
+        seed: Of all that is random, the world's first reset among it.
+
+    Attributes:
+        env_steps: Environment steps so far, over all environments of all processes; offline: updates.
+    """
+
+    name: ClassVar[str] = "learner"
+    """Its name in messages."""
+    presets: ClassVar[Mapping[str, Any]] = {}
+    """Configs by name, all of one dataclass. ``auto`` takes ``laptop`` on a CPU and ``paper`` on a GPU, or the first
+    where one of them is missing."""
+    task_presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
+    """More presets where it learns a single task class, by that class; they go before those of the same name."""
+    adapts: ClassVar[bool] = False
+    """Whether its policy adapts to tasks: ``load_policy`` returns a :class:`bidex_meta.agents.MetaLearningAgent`, which
+    explores by a generator of its own, seeded alike by each call. The meta-test reads ``max_adapt_steps`` (longest
+    episode of adaptation) and ``tasks_per_class`` (tasks of a meta-batch) of its config, where they are there."""
+    independent_adaptation: ClassVar[bool] = False
+    """Whether each environment adapts from its own episodes alone, also where several play the same task."""
+    offline: ClassVar[bool] = False
+    """Whether it learns from data sets (:meth:`learn_from`) and never steps the world."""
+    imitates: ClassVar[bool] = False
+    """Whether it takes demonstrations beside what it learns by playing (:meth:`learn_from_demonstrations`)."""
+    per_process: tuple[str, ...] = ()
+    """Entries of ``state_dict`` that differ from process to process; the others are equal in all."""
+    env_steps: int
+
+    @abstractmethod
+    def __init__(self, world: "VectorWorld", config: Any, seed: int):
+        pass
+
+    @classmethod
+    def autoreset_mode(cls, config: Any) -> AutoresetMode:
+        """Mode of the world that it trains on."""
+        return "SAME_STEP"
+
+    @classmethod
+    def bytes_held(cls, config: Any, num_envs: int, width: int) -> int:
+        """About how much memory it takes; see :meth:`LearnerConfig.bytes_held`."""
+        return config.bytes_held(num_envs, width) if isinstance(config, LearnerConfig) else 0
+
+    @abstractmethod
+    def iterate(self) -> dict[str, float]:
+        """Collects experience and learns from it; returns metrics by tag (``docs/metrics.md``)."""
+
+    @abstractmethod
+    def state_dict(self) -> State:
+        """What is needed to continue bit for bit, beside the world's state; ``policy`` is :meth:`policy_state_dict`."""
+
+    @abstractmethod
+    def load_state_dict(self, state: State) -> None:
+        """Restores what :meth:`state_dict` returned."""
+
+    @abstractmethod
+    def policy_state_dict(self) -> State:
+        """What :meth:`load_policy` needs."""
+
+    @classmethod
+    @abstractmethod
+    def load_policy(cls, state: State, device: "str | torch.device" = "cpu") -> "Agent":
+        """The agent of a checkpoint (its entry ``learner.policy``), for a world of any number of environments."""
+
+    def learn_from(self, data: "Joined") -> None:
+        """Takes the transitions to learn from, before the first iteration and before a checkpoint is loaded."""
+        raise BidexError(f"{self.name}: learns by playing, not from data sets.")
+
+    def learn_from_demonstrations(self, data: "Joined") -> None:
+        """Takes transitions to imitate, before the first iteration and before a checkpoint is loaded."""
+        raise BidexError(f"{self.name}: imitates no demonstrations.")
+
+    def start_from(self, policy: State) -> None:
+        """Takes the policy of another run's checkpoint in the place of fresh weights."""
+        raise BidexError(f"{self.name}: cannot start from another run's policy.")

@@ -1,0 +1,331 @@
+"""What all batched worlds share: reset, step, autoreset, episodes and ``info``; subclasses fill in the physics.
+
+``world.World`` is the one of hands; Meta-World's and Gymnasium's Humanoid are ``foreign.ForeignWorld``.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Self, cast
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from torch import Tensor
+
+from bidex_meta.errors import BidexError
+from bidex_meta.validation import true_or_false
+from bidex_meta.world import checking
+from bidex_meta.world.contract import Info, ObservationGroup, Options, State, Step
+from bidex_meta.world.episodes import Clock, Episodes, checked_mode, checked_seed, ended_info, reset_mask
+from bidex_meta.world.random import row_keys
+from bidex_meta.world.threads import one_torch_thread
+from bidex_meta.world.wrapper import NumpyWorld
+
+
+class Slots(NamedTuple):
+    """The slots of a world: one entry of each list for each."""
+
+    names: list[str]
+    episode_steps: list[int]
+    reward_scales: list[float]
+    gammas: list[float | None]
+
+
+class Transition(NamedTuple):
+    """A step of all environments, before rewards are scaled and broken environments cleaned."""
+
+    obs: Tensor
+    """Shape (n, d)."""
+    reward: Tensor
+    """Shape (n,)."""
+    success: Tensor
+    """Shape (n,), bool."""
+    failed: Tensor
+    """The episode came to a true end. Shape (n,), bool."""
+    unstable: Tensor
+    """The physics broke. Shape (n,), bool."""
+    terms: dict[str, Tensor]
+    """Reward terms by name, each (n,), 0 in environments of classes without the term."""
+
+
+class BatchedWorld(VectorEnv, ABC):
+    """Environments of some slots, split evenly and contiguously over them: a ``contract.TaskWorld``.
+
+    Worlds pickle and copy: a copy is built anew and goes on bit for bit. Attributes set from outside stay behind,
+    ``stagger`` alone does not.
+    """
+
+    single_observation_space: Box
+    single_action_space: Box
+    observation_space: Box
+    action_space: Box
+    num_id_columns: int
+    observation_groups: tuple[ObservationGroup, ...]
+    _masked = False
+    """Whether nothing in a step may look at a number (accelerators)."""
+    _arguments: tuple[tuple[Any, ...], dict[str, Any]]
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        """Keeps the constructor's arguments for copies."""
+        world = super().__new__(cls)
+        world._arguments = args, kwargs
+        return world
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _recreate, (type(self), *self._arguments, self.state_dict(), self._ready, self.stagger)
+
+    def __init__(
+        self,
+        slots: Slots,
+        num_envs: int,
+        device: torch.device,
+        autoreset_mode: str | AutoresetMode | None,
+        stagger: bool,
+    ) -> None:
+        """Splits the environments over the slots; a subclass sets spaces, pools and the seed.
+
+        Args:
+            slots: Name, time limit, reward scale and discount of each.
+            num_envs: Environments over all slots; the first slots take the remainder.
+            device: Of all tensors.
+            autoreset_mode: SAME_STEP (training) or DISABLED (evaluation), as a member or its name.
+            stagger: Whether first episodes begin at a random elapsed step (SAME_STEP only).
+
+        Raises:
+            BidexError: Fewer environments than slots, or an unknown mode.
+        """
+        self.num_envs, self.device = checking.num_envs(num_envs, slots.names), device
+        self.autoreset_mode = checked_mode(autoreset_mode)
+        self.stagger = true_or_false("stagger", stagger)
+        self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
+        self.task_names, self.gammas = list(slots.names), tuple(slots.gammas)
+        self.num_tasks = len(self.task_names)
+        self.slot_rows = split_rows(self.num_envs, self.num_tasks)
+        counts = [rows.stop - rows.start for rows in self.slot_rows]
+        self.task_id = torch.arange(self.num_tasks).repeat_interleave(torch.tensor(counts)).to(device)
+        self._index_in_slot = torch.cat([torch.arange(count, device=device) for count in counts])
+        self.max_episode_steps = self._by_slot(slots.episode_steps)
+        self._scale = self._by_slot(slots.reward_scales).float()
+        self._clock = Clock(self.num_envs, device)
+        self._ready = False
+
+    def _by_slot(self, values: Sequence[float]) -> Tensor:
+        """A number of each slot as one of each environment, shape (num_envs,)."""
+        return torch.tensor(values, device=self.device)[self.task_id]
+
+    def _set_spaces(self, single_observation: Box, action_size: int) -> None:
+        spaces = make_spaces(single_observation, action_size, self.num_envs)
+        self.single_observation_space, self.single_action_space = spaces.single_observation, spaces.single_action
+        self.observation_space, self.action_space = spaces.observation, spaces.action
+        self.observation_size, self.action_size = int(np.prod(single_observation.shape)), action_size
+        self._obs = torch.zeros(self.num_envs, self.observation_size, device=self.device)
+        self._action = torch.zeros(self.num_envs, action_size, device=self.device)
+
+    def _set_pool_sizes(self, sizes: list[int]) -> None:
+        """Each slot has so many tasks now; the next reset must be of all environments."""
+        self.num_slot_tasks = sizes
+        self._pool_size = self._by_slot(sizes)
+        self.task_index = self._index_in_slot % self._pool_size
+        self._ready = False
+
+    def _set_seed(self, seed: object) -> None:
+        """Starts all draws anew."""
+        self.seed = checking.seed(seed)
+        pairs = zip(self.task_names, self.slot_rows, strict=True)
+        self._keys = torch.cat([row_keys(self.seed, name, r.stop - r.start, self.device) for name, r in pairs])
+        self.episodes = Episodes.fresh(self.num_envs, self.device)
+
+    def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
+        """Starts episodes of all environments, or those of ``options["reset_mask"]``; see ``VectorWorld.reset``."""
+        mask = reset_mask(options, self.num_envs, self.device, self._ready)
+        if seed is not None:
+            self._set_seed(checked_seed(seed, mask))
+        first = not self._ready or seed is not None
+        stagger = self.stagger and first and self.autoreset_mode == AutoresetMode.SAME_STEP
+        self._ready = True
+        with one_torch_thread():
+            self._begin(mask, stagger)
+        return self._obs.clone(), {}
+
+    def step(self, action: Tensor | np.ndarray) -> Step:
+        """Advances every environment by one control step.
+
+        Args:
+            action: Shape (num_envs, a), clipped to [-1, 1]; an environment with a non-finite number ends as unstable.
+
+        Returns:
+            Observations (num_envs, d), rewards, terminated and truncated (num_envs,), and info as in the contract,
+            with Gymnasium's ``episode`` and ``final_info`` where an environment ended.
+
+        Raises:
+            BidexError: No real numbers, a wrong shape, or no reset since the world was made or got other tasks.
+        """
+        if not self._ready:
+            raise BidexError("Expected reset() before step(): the environments have no episode yet.")
+        action = checking.action(action, (self.num_envs, self.action_size), self.device)
+        with one_torch_thread():
+            active, broken = self._run("control", self._control, action)
+            reward, terminated, truncated, info = self._move(active, broken)
+            self._clock.stamp(info)
+            ended = info["_final_obs"]
+            if self.autoreset_mode == AutoresetMode.SAME_STEP and (self._masked or ended.any()):
+                self._begin(ended, stagger=False)
+            return self._obs.clone(), reward, terminated, truncated, info
+
+    def _run(self, name: str, work: Callable[..., Any], *inputs: Tensor) -> Any:
+        """A stretch of a step that looks at no number; where a graph of it is kept, that is replayed."""
+        return work(*inputs)
+
+    def _begin(self, mask: Tensor, stagger: bool) -> None:
+        self._clock.begin(mask)
+        self._start(mask, stagger)
+
+    @abstractmethod
+    def _start(self, mask: Tensor, stagger: bool) -> None:
+        """Starts the environments of a mask (``_count_episodes``) and writes their observations into ``_obs``."""
+
+    def _count_episodes(self, mask: Tensor, task_index: Tensor, share: Tensor, stagger: bool) -> None:
+        """New episodes in the environments of a mask, of these tasks, at a share of the time limit if staggered."""
+        self.episodes.number = self.episodes.number + mask
+        self.task_index = torch.where(mask, task_index, self.task_index)
+        elapsed = (share * self.max_episode_steps).long() if stagger else torch.zeros_like(self.episodes.elapsed)
+        self.episodes.begin(mask, elapsed)
+
+    def _control(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Passes actions on; which environments are active, and which of them got a non-finite number."""
+        action, broken = checking.clean(action)
+        active = ~self.episodes.finished
+        self._write_action(action, active)
+        return active, broken & active
+
+    def _write_action(self, action: Tensor, active: Tensor) -> None:
+        self._action = action
+
+    def _move(self, active: Tensor, broken: Tensor) -> tuple[Tensor, Tensor, Tensor, Info]:
+        """Physics, then rewards, terminated, truncated and info, before new episodes start."""
+        return self._finish(active, broken, self._advance(active, broken))
+
+    @abstractmethod
+    def _advance(self, active: Tensor, broken: Tensor) -> Transition:
+        """Steps the active environments under ``_action``.
+
+        Args:
+            active: Environments whose episode runs; of others success alone is read.
+            broken: Those of them whose action was not finite; of these nothing is read.
+        """
+
+    def _finish(self, active: Tensor, broken: Tensor, made: Transition) -> tuple[Tensor, Tensor, Tensor, Info]:
+        obs, unstable = made.obs, made.unstable | broken
+        valid = active & ~unstable
+        success = made.success & ~unstable
+        unscaled = torch.where(valid, made.reward, 0.0)
+        reward = unscaled * self._scale
+        episodes = self.episodes
+        episodes.add(active, reward, unscaled, success)
+        terminated = made.failed & valid | episodes.terminated
+        late = (episodes.elapsed >= self.max_episode_steps) & ~terminated
+        truncated = (late | unstable) & active | episodes.truncated
+        ended = (terminated | truncated) & active
+        if self._masked or not valid.all():  # on the CPU looking costs less than a pass over all observations
+            obs = torch.where(valid[:, None], obs, self._obs)
+        info: Info = {
+            "success": success,
+            "unstable": unstable & active,
+            "reward_unscaled": unscaled,
+            "final_obs": obs,
+            "_final_obs": ended,
+            "so_far": episodes.statistics(),
+            "counted": ended & episodes.counts,
+        }
+        if made.terms:
+            info["reward_terms"] = {name: torch.where(valid, term, 0.0) for name, term in made.terms.items()}
+        if self._masked or ended.any():
+            info |= ended_info(info)
+        self._obs = obs.clone()
+        if self.autoreset_mode == AutoresetMode.DISABLED:
+            episodes.terminated, episodes.truncated = terminated.clone(), truncated.clone()
+            episodes.finished = episodes.finished | ended
+        return reward, terminated, truncated, info
+
+    def state_dict(self) -> State:
+        """Everything that decides the future of the world: tensors and plain values, copied."""
+        return {
+            "seed": self.seed,
+            "episodes": self.episodes.state_dict(),
+            "task_index": self.task_index.clone(),
+            "observation": self._obs.clone(),
+        }
+
+    @abstractmethod
+    def load_state_dict(self, state: State) -> None:
+        """Puts back what ``state_dict`` gave, on a world made alike; all of it or nothing."""
+
+    def _restore(self, state: State) -> None:
+        """Puts back what every world has, from a state that was checked."""
+        self._set_seed(int(state["seed"]))
+        self.episodes.load_state_dict(state["episodes"])
+        # Checkpoints are loaded to the CPU, wherever the world lives.
+        self.task_index, self._obs = (state[n].to(self.device, copy=True) for n in ("task_index", "observation"))
+        self._ready = True
+
+    @property
+    def task_name(self) -> list[str]:
+        """Slot name of each environment."""
+        return [self.task_names[i] for i in self.task_id.tolist()]
+
+    def to_numpy(self, stagger: bool = False) -> NumpyWorld:
+        """This world in NumPy arrays, as Gymnasium's vector wrappers expect one; ``stagger`` as there."""
+        return NumpyWorld(self, stagger)
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """An attribute for each environment: its own entry where there is one for each, else the world's value."""
+        value = getattr(self, name)
+        each = name == "task_name" or (isinstance(value, Tensor) and value.shape[:1] == (self.num_envs,))
+        return tuple(value) if each else (value,) * self.num_envs
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Sets an attribute of the world."""
+        setattr(self, name, values)
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Calls a method of the world (or reads an attribute) and returns the result for each environment."""
+        value = getattr(self, name)
+        return (value(*args, **kwargs),) * self.num_envs if callable(value) else self.get_attr(name)
+
+
+class Spaces(NamedTuple):
+    """The four of a Gymnasium vector environment."""
+
+    single_observation: Box
+    single_action: Box
+    observation: Box
+    action: Box
+
+
+def make_spaces(single_observation: Box, action_size: int, num_envs: int) -> Spaces:
+    """The spaces of environments with these observations and ``action_size`` actions within [-1, 1]."""
+    single = single_observation, Box(-1.0, 1.0, (action_size,), np.float32)
+    return Spaces(*single, *(cast(Box, batch_space(space, num_envs)) for space in single))
+
+
+def split_rows(num_envs: int, slots: int) -> list[slice]:
+    """Contiguous environments for each slot, even; the first slots take the remainder."""
+    share, rest = divmod(num_envs, slots)
+    stops = [share * (i + 1) + min(i + 1, rest) for i in range(slots)]
+    return [slice(stop - share - (i < rest), stop) for i, stop in enumerate(stops)]
+
+
+def _recreate(
+    kind: type[BatchedWorld],
+    args: tuple[Any, ...],
+    kwargs: dict[str, Any],
+    state: State,
+    ready: bool,
+    stagger: bool,
+) -> BatchedWorld:
+    world = kind(*args, **kwargs)
+    world.load_state_dict(state)
+    world._ready, world.stagger = ready, stagger
+    return world

@@ -1,0 +1,220 @@
+"""What a world is given, checked before anything changes: arguments, actions, saved states, formulas of classes."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bidex_meta.engine.health import checked_state, dense
+from bidex_meta.errors import BidexError, shortened, unknown_name
+from bidex_meta.maths import check_precision
+from bidex_meta.points.depth_sensor import PointsRule
+from bidex_meta.tasks.scene import Scene
+from bidex_meta.tasks.state import TaskState
+from bidex_meta.validation import whole_number
+from bidex_meta.world.groups import Slot, with_pool
+from bidex_meta.world.observations import Rule
+
+_MOST_ENVIRONMENTS = 10_000_000
+"""Beyond any memory; less than what an engine's library could not count."""
+_LARGEST_SEED = 2**128
+_LEAST = {"episodes/number": -1}
+"""Of whole numbers in a state; the number of an environment's episode before its first is -1."""
+_AGAIN = "build the world with the same suite, split and num_envs."
+_ROWS = 11
+"""Rows that formulas are tried with: as many as no sensor and no block has numbers."""
+
+
+def num_envs(given: object, slots: Sequence[str]) -> int:
+    """The number of environments of a world with these slots.
+
+    Raises:
+        BidexError: No whole number, or fewer than slots.
+    """
+    number = whole_number("num_envs", given, 1, _MOST_ENVIRONMENTS)
+    if number < len(slots):
+        raise BidexError(f"num_envs: expected at least {len(slots)}, one each for {', '.join(slots)}; got {number}.")
+    return number
+
+
+def seed(given: object) -> int:
+    """The seed of a world.
+
+    Raises:
+        BidexError: No whole number from 0 on.
+    """
+    return whole_number("seed", given, 0, _LARGEST_SEED)
+
+
+def choices(task_sampling: object, observation: object, points: object) -> None:
+    """Refuses what is none of the names, and points that are no rule of them.
+
+    Raises:
+        BidexError: An unknown name, or something else than a ``PointsRule`` or None.
+    """
+    for name, given, known in (
+        ("task_sampling", task_sampling, ("uniform", "fixed")),
+        ("observation", observation, get_args(Rule)),
+    ):
+        if not isinstance(given, str) or given not in known:
+            raise unknown_name(name, str(given), known)
+    if points is not None and not isinstance(points, PointsRule):
+        raise BidexError(f"points: expected a PointsRule or None, got {shortened(points)}. Write PointsRule(768).")
+
+
+def action(given: Tensor | np.ndarray, shape: tuple[int, int], device: torch.device) -> Tensor:
+    """Actions as a tensor on the device, float32, without a gradient; non-finite ones are left to :func:`clean`.
+
+    Raises:
+        BidexError: No real numbers, or another shape; or torch's default precision is not single.
+    """
+    check_precision()
+    wanted = f"Expected actions of shape {shape}"
+    tensor = dense(given, device, torch.float32)
+    if tensor is None:
+        raise BidexError(f"{wanted}, got {type(given).__name__} that is no dense array of real numbers.")
+    if tensor.shape != shape:
+        raise BidexError(f"{wanted}, got {tuple(tensor.shape)}.")
+    return tensor
+
+
+def clean(action: Tensor) -> tuple[Tensor, Tensor]:
+    """Clips actions to [-1, 1].
+
+    Returns:
+        The actions with non-finite numbers replaced by 0, shape (n, a), and which rows held one, shape (n,), bool.
+    """
+    # Zero times a number is zero unless it is infinite or none.
+    broken = (0.0 * action).sum(dim=1) != 0.0
+    return action.nan_to_num(0.0, 0.0, 0.0).clamp_(-1.0, 1.0), broken
+
+
+def state(given: Any, own: Mapping[str, Any], slots: Sequence[Slot], task_id: Tensor) -> list[Slot]:
+    """The slots with a saved state's pools of tasks.
+
+    Args:
+        given: The saved state of a world made alike.
+        own: The state of the world that takes it.
+        slots: Its slots.
+        task_id: Slot of each of its environments, shape (n,).
+
+    Raises:
+        BidexError: Another world's state, or a damaged one.
+    """
+    fits(given, own)
+    if given["slots"] != own["slots"]:
+        raise BidexError(f"Expected the state of a world of {own['slots']}, got {shortened(given['slots'])}; {_AGAIN}")
+    for name in ("tasks", "engines"):
+        if len(given[name]) != len(own[name]):
+            raise BidexError(f"Expected {len(own[name])} {name} in a world's state, got others; {_AGAIN}")
+    for mine, engine in zip(own["engines"], given["engines"], strict=True):
+        checked_state(engine, mine)
+    filled = [with_pool(slot, tasks) for slot, tasks in zip(slots, given["tasks"], strict=True)]
+    sizes = torch.tensor([len(slot.tasks) for slot in filled])[task_id.cpu()]
+    index = given["task_index"].cpu()
+    if not bool(((index >= 0) & (index < sizes)).all()):
+        raise BidexError(f"Expected each task_index within its pool of tasks, got one outside; {_AGAIN}")
+    return filled
+
+
+def fits(given: Any, own: Mapping[str, Any], inside: str = "") -> None:
+    """Refuses a saved state with other names, types or shapes than a world's own, or numbers that are not finite.
+
+    Args:
+        given: The saved state.
+        own: That of the world that takes it: tensors, plain values, and mappings of such.
+        inside: Where in a larger state both stand.
+
+    Raises:
+        BidexError: The first difference.
+    """
+    if not isinstance(given, Mapping) or not own.keys() <= given.keys():
+        got = sorted(map(str, given)) if isinstance(given, Mapping) else type(given).__name__
+        where = inside or "it"
+        raise BidexError(f"Expected the state of a world with {sorted(own)} in {where}, got {shortened(got)}; {_AGAIN}")
+    for name, value in own.items():
+        if isinstance(value, Mapping):
+            fits(given[name], value, f"{inside}{name}/")
+        elif isinstance(value, Tensor):
+            _check_tensor(f"{inside}{name}", given[name], value)
+        elif not isinstance(given[name], type(value)):
+            got = f"{type(value).__name__}, got {shortened(given[name])}"
+            raise BidexError(f"Expected {inside}{name} of a world's state as {got}; {_AGAIN}")
+    if "seed" in own:
+        seed(given["seed"])
+
+
+def _check_tensor(name: str, given: object, own: Tensor) -> None:
+    what = f"{name} of a world's state"
+    usable = isinstance(given, Tensor) and given.layout == torch.strided and not given.is_meta
+    if not isinstance(given, Tensor) or not usable or given.shape != own.shape or given.dtype != own.dtype:
+        got = f"{given.dtype} {tuple(given.shape)}" if isinstance(given, Tensor) else type(given).__name__
+        raise BidexError(f"Expected {what} as {own.dtype} {tuple(own.shape)}, got {got}; {_AGAIN}")
+    if given.requires_grad:
+        raise BidexError(f"Expected {what} without gradients; detach it.")
+    if not bool(given.isfinite().all()):
+        raise BidexError(f"Expected finite numbers in {what}, got others; take an older state.")
+    if given.dtype == torch.int64 and bool((given < _LEAST.get(name, 0)).any()):
+        raise BidexError(f"Expected counts in {what}, got some below zero; take an older state.")
+
+
+def formulas(scene: Scene, tasks: np.ndarray, sensors: Tensor, observed: bool) -> None:
+    """Calls a class's methods once, for a few rows of its first task and sensors that all read 0.
+
+    Args:
+        scene: Its scene.
+        tasks: Its pool of variations, shape (n, variation_space.size).
+        sensors: Any tensor of the engine's precision and device.
+        observed: Whether ``observe`` is called too.
+
+    Raises:
+        BidexError: A method gives something else than it shall; it names class, method, the expected and the received.
+    """
+    task = scene.task
+    name = type(task).__name__
+    for block, _ in task.layout:
+        size = sum(scene.sensor(sensor).stop - scene.sensor(sensor).start for sensor in block.sensors)
+        if block.sensors and size != block.size:
+            raise BidexError(f"{name}.layout: block {block.name!r} has size {block.size}, its sensors give {size}.")
+    variations = torch.as_tensor(tasks[:1]).to(sensors).repeat(_ROWS, 1)
+    frozen = _named(f"{name}.freeze", task.freeze(variations))
+    for key, value in frozen.items():
+        _check_shape(f"{name}.freeze: {key!r}", value, None)
+    state = TaskState(sensors.new_zeros(_ROWS, scene.model.nsensordata), scene.sensors, frozen)
+    for key, value in _named(f"{name}.reward_terms", task.reward_terms(state)).items():
+        _check_shape(f"{name}.reward_terms: {key!r}", value)
+    _check_shape(f"{name}.success", task.success(state), kind=torch.bool)
+    _check_shape(f"{name}.failed", task.failed(state), kind=torch.bool)
+    sizes = {block.name: block.size for block, _ in task.layout}
+    for key, value in task.observe(state).items() if observed else ():
+        if key not in sizes:
+            raise BidexError(f"{name}.observe: expected blocks of the layout ({', '.join(sizes)}), got {key!r}.")
+        _check_shape(f"{name}.observe: {key!r}", value, sizes[key])
+
+
+def _named(where: str, given: object) -> dict[str, Tensor]:
+    if not isinstance(given, dict) or not given:
+        raise BidexError(f"{where}: expected a dict from names to tensors, got {shortened(given)}.")
+    return given
+
+
+def _check_shape(where: str, value: object, *sizes: int | None, kind: torch.dtype | None = None) -> None:
+    """Refuses what is no tensor of ``_ROWS`` times ``sizes`` (None: any); ``kind`` None: of any numbers."""
+    expected = (_ROWS, *sizes)
+    if isinstance(value, Tensor):
+        pairs = zip(expected, value.shape, strict=False)
+        fitting = value.dim() == len(expected) and all(size in (None, own) for size, own in pairs)
+        if fitting and kind in (None, value.dtype):
+            return
+        got = f"{_shown(tuple(value.shape))} of {str(value.dtype).removeprefix('torch.')}"
+    else:
+        got = shortened(value)
+    kinds = "" if kind is None else f" of {str(kind).removeprefix('torch.')}"
+    raise BidexError(f"{where}: expected a tensor of shape {_shown(expected)}{kinds}, where n counts rows, got {got}.")
+
+
+def _shown(shape: tuple[int | None, ...]) -> str:
+    words = ["n" if size == _ROWS else "k" if size is None else str(size) for size in shape]
+    return f"({', '.join(words)}{',' * (len(words) == 1)})"

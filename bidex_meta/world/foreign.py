@@ -1,0 +1,103 @@
+"""Worlds of other libraries' environments, on the CPU: what is the same whoever steps them.
+
+Our learners, evaluation and checkpoints run on them unchanged; a subclass places environments and advances them.
+"""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode
+from torch import Tensor
+
+from bidex_meta.world.base import BatchedWorld, Slots, Transition
+from bidex_meta.world.contract import Info, State, plain_groups
+from bidex_meta.world.random import uniform
+
+_TASK_DRAW, _ELAPSED_DRAW, OWN_DRAWS = 0, 1, 2
+
+
+class Sizes(NamedTuple):
+    """Of each environment: entries of its state as observed (no one-hot) and of its action; its time limit in steps."""
+
+    state: int
+    action: int
+    episode: int
+
+
+class ForeignWorld(BatchedWorld):
+    """Environments of foreign classes.
+
+    Observations are the class's own numbers, with its one-hot behind them where there are several. In SAME_STEP mode
+    each episode draws one of its class's tasks; in DISABLED mode environment j of a class keeps task j modulo their
+    number.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        num_envs: int,
+        sizes: Sizes,
+        seed: int = 0,
+        autoreset_mode: str | AutoresetMode | None = None,
+        stagger: bool = True,
+    ) -> None:
+        """Sets up spaces and episodes; a subclass makes what it steps.
+
+        Args:
+            names: Of the classes, its slots.
+            num_envs: Environments over all classes, at least one for each.
+            sizes: Of states, actions and episodes.
+            seed: Of the draws until ``reset(seed=...)`` gives another.
+            autoreset_mode: SAME_STEP (training) or DISABLED (evaluation), as a member or its name.
+            stagger: As in ``BatchedWorld``.
+
+        Raises:
+            BidexError: Unknown mode, or too few environments.
+        """
+        count = len(names)
+        slots = Slots(list(names), [sizes.episode] * count, [1.0] * count, [None] * count)
+        super().__init__(slots, num_envs, torch.device("cpu"), autoreset_mode, stagger)
+        self.num_id_columns = count if count > 1 else 0
+        self.observation_groups = plain_groups(sizes.state + self.num_id_columns, self.num_id_columns)
+        low, high = (
+            np.concatenate([np.full(sizes.state, far), np.full(self.num_id_columns, one_hot)]).astype(np.float32)
+            for far, one_hot in ((-np.inf, 0.0), (np.inf, 1.0))
+        )
+        self._set_spaces(Box(low, high, dtype=np.float32), sizes.action)
+        if self.num_id_columns:
+            self._obs[:, sizes.state :] = torch.eye(count)[self.task_id]
+        self._success = torch.zeros(self.num_envs, dtype=torch.bool)  # of the last transition: a frozen one keeps it
+        self._set_seed(seed)
+        self._set_pool_sizes([1] * count)
+
+    def _draws(self, num: int) -> Tensor:
+        """Uniform numbers of the running episodes, (n, num), a function of seed, environment and episode."""
+        return uniform(self._keys, self.episodes.number, num)
+
+    def _start(self, mask: Tensor, stagger: bool) -> None:
+        draws, tasks = uniform(self._keys, self.episodes.number + mask, OWN_DRAWS), self.task_index
+        if self.autoreset_mode == AutoresetMode.SAME_STEP:
+            tasks = (draws[:, _TASK_DRAW] * self._pool_size).long()
+        self._count_episodes(mask, tasks, draws[:, _ELAPSED_DRAW], stagger)
+        self._place(mask)
+
+    @abstractmethod
+    def _place(self, mask: Tensor) -> None:
+        """Puts the environments of a mask at the start of ``task_index`` and writes their states into ``_obs``."""
+
+    def _finish(self, active: Tensor, broken: Tensor, made: Transition) -> tuple[Tensor, Tensor, Tensor, Info]:
+        step = super()._finish(active, broken, made)
+        self._success = step[3]["success"].clone()
+        return step
+
+    def state_dict(self) -> State:
+        """Everything that decides the future of the world: tensors and plain values, copied."""
+        return super().state_dict() | {"success": self._success.clone()}
+
+    def _restore(self, state: State) -> None:
+        super()._restore(state)
+        self._success = state["success"].clone()

@@ -1,0 +1,143 @@
+"""How a step keeps an accelerator busy: engines side by side on streams, torch's work as CUDA graphs.
+
+Launched one by one, torch's kernels would take longer than the physics. The state that a stretch of work reads and
+leaves behind lives in tensors at fixed addresses; so does what it returns, which its next replay overwrites.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._pytree import tree_map_only
+
+Work = Callable[..., Any]
+"""Tensors in, any nest of tensors out; on the way it may read and rebind the state."""
+
+Record = Callable[[Callable[[], Any]], tuple[Callable[[], None], Any]]
+"""Takes work without inputs; gives how to do it again in the same memory, and the tensors that it then leaves there."""
+
+_BEFORE = 3
+"""Plain runs of a stretch before it is recorded: libraries allocate and compile in the first ones, and a world that is
+stepped a few times only, or whose tasks change as often, never pays for a recording."""
+
+
+def cuda_graph(work: Callable[[], Any]) -> tuple[Callable[[], None], Any]:
+    """Records work as one CUDA graph."""
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+        result = work()
+    return graph.replay, result
+
+
+class GraphCache:
+    """Stretches of a step by name, over one state.
+
+    A stretch is recorded with the tensors that its closures hold at that time: ``forget`` after changing any but the
+    state and the inputs.
+    """
+
+    def __init__(
+        self, get: Callable[[], dict[str, Tensor]], put: Callable[[dict[str, Tensor]], None], record: Record
+    ) -> None:
+        """Nothing is recorded yet.
+
+        Args:
+            get: The state's tensors by name, as they are bound now.
+            put: Binds the state to given tensors.
+            record: How to record, e.g. ``cuda_graph``.
+        """
+        self._get, self._put, self._record = get, put, record
+        self._state: dict[str, Tensor] = {}
+        self._runs: dict[str, int] = {}
+        self._recorded: dict[str, tuple[list[Tensor], Callable[[], None], Any]] = {}
+
+    def forget(self) -> None:
+        """Drops all recordings; stretches run plainly again for a while."""
+        self._state, self._runs, self._recorded = {}, {}, {}
+
+    def run(self, name: str, work: Work, *inputs: Tensor) -> Any:
+        """What the work gives for the inputs, plainly run or replayed.
+
+        Args:
+            name: The stretch; it must always come with the same work and inputs of the same shapes.
+            work: Done with the inputs.
+            inputs: Tensors that change from run to run.
+
+        Returns:
+            What the work returned; overwritten by the next replay of this stretch.
+        """
+        self._runs[name] = self._runs.get(name, 0) + 1
+        if self._runs[name] <= _BEFORE:
+            return work(*inputs)
+        self._settle()
+        if name not in self._recorded:
+            own = [value.clone() for value in inputs]
+
+            def settled() -> Any:
+                result = work(*own)
+                self._settle()
+                return result
+
+            self._recorded[name] = (own, *self._record(settled))
+        own, replay, result = self._recorded[name]
+        for place, value in zip(own, inputs, strict=True):
+            place.copy_(value)
+        replay()
+        return result
+
+    def _settle(self) -> None:
+        """Brings the state into its fixed place."""
+        now = self._get()
+        if not self._state:
+            self._state = {name: value.clone() for name, value in now.items()}
+        for name, value in now.items():
+            if value is not self._state[name]:
+                self._state[name].copy_(value)
+        self._put(self._state)
+
+
+def fresh(result: Any) -> Any:
+    """A nest of tensors in memory of its own; a tensor that occurs twice is copied once."""
+    copies: dict[int, Tensor] = {}
+
+    def copy(value: Tensor) -> Tensor:
+        if id(value) not in copies:
+            copies[id(value)] = value.clone()
+        return copies[id(value)]
+
+    return tree_map_only(Tensor, copy, result)
+
+
+class SideBySide:
+    """Runs jobs one after the other on a CPU, at the same time on a GPU."""
+
+    def __init__(self, jobs: int, device: torch.device) -> None:
+        """Makes the streams.
+
+        Args:
+            jobs: The most jobs at a time.
+            device: Where they run.
+        """
+        several = device.type == "cuda" and jobs > 1
+        self._streams = [torch.cuda.Stream(device) for _ in range(jobs)] if several else []
+
+    def run(self, jobs: Sequence[Callable[[], None]]) -> Iterator[int]:
+        """Does the jobs; gives their numbers, in order, as each is done. To be used up.
+
+        On CUDA what comes after in the caller's stream waits for them all, and they for what came before. What they
+        read must live until this ends.
+        """
+        if not self._streams:
+            for number, job in enumerate(jobs):
+                job()
+                yield number
+            return
+        caller = torch.cuda.current_stream()
+        for stream, job in zip(self._streams, jobs, strict=True):
+            stream.wait_stream(caller)
+            with torch.cuda.stream(stream):
+                job()
+        for stream in self._streams:
+            caller.wait_stream(stream)
+        yield from range(len(jobs))

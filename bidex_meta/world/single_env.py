@@ -1,0 +1,251 @@
+"""One environment of a task class as a suite has it: `env = cls()`, `env.set_task(task)`, as with Meta-World's classes.
+
+For code that is written so; all environments of a suite at once are `Benchmark.make_world`.
+"""
+
+import copyreg
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, ClassVar, Protocol
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+
+from bidex_meta.errors import BidexError
+from bidex_meta.points.depth_sensor import PointsRule
+from bidex_meta.tasks import registry
+from bidex_meta.tasks.base import CONTROL_RATE, TaskClass
+from bidex_meta.world.contract import Info, Options
+from bidex_meta.world.groups import Slot
+from bidex_meta.world.rendering import CAMERAS
+from bidex_meta.world.world import World
+
+_FAR = 2**31
+
+
+class AnyTask(Protocol):
+    """What `set_task` needs to know of a task (`bidex_meta.Task`)."""
+
+    @property
+    def env_name(self) -> str:
+        """Name of its class."""
+        ...
+
+    @property
+    def variation(self) -> np.ndarray:
+        """Its variation, shape (size,)."""
+        ...
+
+
+@dataclass(frozen=True)
+class EnvRecipe:
+    """A task class as a suite has it: what decides observations and rewards."""
+
+    name: str
+    """What it is called in the suite."""
+    moving_base: bool | None
+    """Whether the hands' bases are driven; None: as the class has it alone."""
+    options: tuple[tuple[str, float | str], ...]
+    """What else the suite chose of the class."""
+    padded_size: int
+    """Entries of an observation, without a point cloud."""
+    hides_goal: bool
+    """Whether the goal entries are zero."""
+    reward_scale: float
+    """Factor on the reward."""
+    class_name: str | None = None
+    """The task class, where it is called otherwise: with an object."""
+    points: tuple[int, bool] = (0, False)
+    """Points of the cloud in the place of objects' states, and whether each tells of what it is; 0: the states."""
+
+    def make_class(self) -> type["SuiteEnv"]:
+        """The environment's class: the same object for equal recipes."""
+        return _make_class(self)
+
+
+class _Remade(type):
+    """Of classes that no module holds: they are pickled as their recipes."""
+
+
+def _reduced(made: Any) -> str | tuple[Any, ...]:
+    return (_make_class, (made.recipe,)) if "recipe" in vars(made) else made.__qualname__  # one of a module's own
+
+
+copyreg.pickle(_Remade, _reduced)
+
+
+class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
+    """A task class as an environment that plays the task it is given; its subclasses stand in `train_classes`.
+
+    Classes and environments pickle and copy: a copy has the same task and goes on bit for bit.
+
+    Observations are those of the suite's worlds before a one-hot: padded to the suite's widest class, goal entries zero
+    where the suite hides goals; where it shows point clouds, one behind them in the place of objects' states. `info`
+    has `success` (1.0 or 0.0 in this state), `unscaled_reward` and `unstable` (physics broke: the episode is
+    truncated).
+
+    Args:
+        render_mode: None or `"rgb_array"`.
+        camera_name: `"front"`, `"side"`, `"top"` or `"back"`; the first by default.
+        camera_id: Its place in that list, instead.
+        width: Of pictures, pixels.
+        height: Of pictures, pixels.
+        reward_function_version: There is one reward, the paper's; `"v2"`, Meta-World's default, is taken for it.
+
+    Raises:
+        BidexError: Another render mode, camera or reward.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_RATE}  # noqa: RUF012  (Gymnasium's own convention)
+    recipe: ClassVar[EnvRecipe]
+    task_class: ClassVar[TaskClass]
+    """What the class is: scene, variations, observation, reward, success."""
+
+    def __init__(
+        self,
+        render_mode: str | None = None,
+        camera_name: str | None = None,
+        camera_id: int | None = None,
+        width: int = 480,
+        height: int = 480,
+        reward_function_version: str = "v2",
+    ) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise BidexError(f"render_mode: expected None or 'rgb_array', got {render_mode!r}.")
+        if reward_function_version != "v2":
+            raise BidexError(
+                f"reward_function_version: expected 'v2', which stands for the paper's reward, the only one here; got "
+                f"{reward_function_version!r}."
+            )
+        self.render_mode = render_mode
+        self._picture = (width, height, _camera(camera_name, camera_id))
+        recipe, space = self.recipe, self.task_class.variation_space
+        slot = Slot(recipe.name, self.task_class, np.array([space.low]), recipe.reward_scale)
+        self._world = World(
+            [slot],
+            1,
+            engine="c",
+            threads=1,
+            autoreset_mode="DISABLED",
+            observation="masked" if recipe.hides_goal else "plain",
+            pad_to=recipe.padded_size,
+            points=PointsRule(*recipe.points) if recipe.points[0] else None,
+        )
+        self.observation_space = self._world.single_observation_space
+        self.action_space = self._world.single_action_space
+        self.goal_space = Box(np.array(space.low), np.array(space.high), dtype=np.float64)
+        self.terminate_on_success = False
+        self._task: AnyTask | None = None
+        self._given: AnyTask | None = None  # waits for the next reset
+        self._over = True
+
+    @property
+    def task_name(self) -> str:
+        """The task class's name."""
+        return self.recipe.name
+
+    @property
+    def max_path_length(self) -> int:
+        """Time limit of an episode, steps of 1/60 s."""
+        return self.task_class.episode_steps
+
+    def seed(self, seed: int) -> list[int]:
+        """Starts the random numbers anew, as `reset(seed=...)` does: of starts, of the spaces and of wrappers."""
+        super().reset(seed=seed)
+        for space in (self.action_space, self.observation_space, self.goal_space):
+            space.seed(seed)
+        return [seed]
+
+    def set_task(self, task: AnyTask) -> None:
+        """Plays this task from the next reset on.
+
+        Args:
+            task: One of the benchmark's, of this class.
+
+        Raises:
+            BidexError: A task of another class, or with a variation of another size.
+        """
+        if task.env_name != self.recipe.name:
+            raise BidexError(f"Expected a task of {self.recipe.name}, got one of {task.env_name}.")
+        size = self.task_class.variation_space.size
+        if task.variation.shape != (size,):
+            raise BidexError(f"Expected a task of {size} numbers, got {task.variation.shape}.")
+        self._given = task
+
+    def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
+        """Starts an episode; with a seed, the same one every time.
+
+        Returns:
+            The observation, shape (d,), float32, and an empty info.
+
+        Raises:
+            BidexError: No task was set, or there are options, of which there are none.
+        """
+        super().reset(seed=seed)
+        if options:
+            raise BidexError(f"Expected no options, got {', '.join(options)}.")
+        if self._given is not None:
+            self._world.set_tasks({self.recipe.name: self._given.variation[None]})
+            self._task, self._given = self._given, None
+        if self._task is None:
+            raise BidexError(f"{self.recipe.name}: expected set_task(task) before reset().")
+        obs, _ = self._world.reset(seed=int(self.np_random.integers(_FAR)))
+        self._over = False
+        return _array(obs), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
+        """One control step of 1/60 s.
+
+        Args:
+            action: Shape (a,), in [-1, 1].
+
+        Returns:
+            Observation (d,) float32, reward, terminated (what was to be held is lost; with `terminate_on_success` also
+            success), truncated (time is up, or physics broke), and info.
+
+        Raises:
+            BidexError: No episode runs, or a wrong shape.
+        """
+        if self._over:
+            raise BidexError(f"{self.recipe.name}: expected set_task(task) and reset() before step().")
+        obs, reward, terminated, truncated, info = self._world.step(torch.as_tensor(np.asarray(action))[None])
+        success = bool(info["success"])
+        lost = bool(terminated) or (self.terminate_on_success and success)
+        self._over = lost or bool(truncated)
+        step_info = {"success": float(success), "unscaled_reward": float(info["reward_unscaled"])}
+        step_info["unstable"] = bool(info["unstable"])
+        return _array(obs), float(reward), lost, bool(truncated) and not lost, step_info
+
+    def toggle_terminate_on_success(self, on: bool) -> None:
+        """Whether an episode ends at its first success."""
+        self.terminate_on_success = bool(on)
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """A picture, shape (height, width, 3), uint8; None without a render mode."""
+        width, height, camera = self._picture
+        return None if self.render_mode is None else self._world.render(0, width, height, camera)
+
+    def close(self) -> None:
+        """Frees the world."""
+        self._world.close()
+
+
+@cache
+def _make_class(recipe: EnvRecipe) -> type[SuiteEnv]:
+    task_class = registry.get(recipe.class_name or recipe.name, recipe.moving_base, **dict(recipe.options))
+    text = f"{task_class.summary}."
+    return _Remade(recipe.name, (SuiteEnv,), {"recipe": recipe, "task_class": task_class, "__doc__": text})
+
+
+def _camera(name: str | None, number: int | None) -> str:
+    names = list(CAMERAS)
+    chosen = name or names[0] if number is None else next(iter(names[number : number + 1]), None)
+    if chosen not in names:
+        raise BidexError(f"Expected a camera among {', '.join(names)}, got {name if number is None else number!r}.")
+    return chosen
+
+
+def _array(batch: torch.Tensor) -> np.ndarray:
+    return batch[0].cpu().numpy()

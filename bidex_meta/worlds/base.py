@@ -1,0 +1,218 @@
+"""What a config names, resolved once: `Worlds.open(config)`, whichever kind it is.
+
+Opening reads a suite file at most; torch and physics are imported when a world is made or evaluated in.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from bidex_meta.errors import known_name
+from bidex_meta.suite import METAWORLD_SUITES, Suite, load_suite, suite_names
+from bidex_meta.tasks import registry
+
+if TYPE_CHECKING:
+    from bidex_meta.agents import Agent
+    from bidex_meta.evaluation.references import Reference
+    from bidex_meta.evaluation.results import Evaluation
+    from bidex_meta.tasks.base import TaskClass
+    from bidex_meta.world.contract import PooledWorld
+
+Base = Literal["own", "moving", "fixed"]
+_SIZES_AND_STEPS = {"cpu": (1024, 20_000_000), "gpu": (8192, 200_000_000)}
+# Whole episodes of all environments make one meta-batch: with fewer environments there are more of them.
+_ADAPTING_SIZE_AND_STEPS = (300, 20_000_000)
+
+
+@dataclass(frozen=True)
+class WorldConfig:
+    """Which worlds, and how they are made. One of ``suite`` and ``task`` names them."""
+
+    suite: str | None = None
+    """Name or path of a suite."""
+    task: str | None = None
+    """A task class on its own, where there is no suite."""
+    base: Base = "own"
+    """Whether the bases of a single class move."""
+    points: int = 0
+    """Points of the cloud in place of objects' states; 0: as the suite has it."""
+    object: str | None = None
+    """The object of a single class; None: its own."""
+    seed: int = 0
+    """Of starts, and of tasks without ``task_seed``."""
+    task_seed: int | None = None
+    """Of tasks and starts instead."""
+    device: str = "cpu"
+    """Of this process."""
+    threads: int | None = None
+    """Of the engine; None: one per core."""
+    engine: str = "auto"
+    """auto, c or warp."""
+
+    @staticmethod
+    def of(config: "Mapping[str, Any] | WorldConfig") -> "WorldConfig":
+        """The entries of a run's config that are of worlds; others are left out."""
+        if isinstance(config, WorldConfig):
+            return config
+        return WorldConfig(**{field.name: config[field.name] for field in fields(WorldConfig) if field.name in config})
+
+
+class Worlds(ABC):
+    """The worlds that a config names, and what holds for all of them.
+
+    Args:
+        name: How the user calls it: a suite's name or path, or a task class.
+        config: How they are made.
+    """
+
+    hides_goals: bool = False
+    """Whether it is a meta suite, whose goals have to be found out."""
+    suite: Suite | None = None
+    """The suite's file, where there is one."""
+    class_name: str | None = None
+    """The class, where it is a single one."""
+    object: str | None = None
+    """The object of a single class, where it is not its own."""
+    moving_base: bool | None = None
+    """Whether the bases of a single class move; None: as it has them."""
+    on_gpu: ClassVar[bool] = True
+    """Whether a GPU is of use to its worlds."""
+    preset: ClassVar[tuple[str, str] | None] = None
+    """A preset for such worlds alone, which goes before others where a learner has it; and, in words, why."""
+    default_episodes: ClassVar[int] = 4
+    """Episodes of each task in an evaluation where none are given."""
+
+    def __init__(self, name: str, config: WorldConfig) -> None:
+        self.name, self.config = name, config
+        self.seed = config.seed if config.task_seed is None else config.task_seed
+        self.device, self.threads, self.engine = config.device, config.threads, config.engine
+        self.points = config.points
+
+    @staticmethod
+    def open(config: Mapping[str, Any] | WorldConfig) -> "Worlds":
+        """Those of a config: its ``suite``, or without one the class ``task`` on its own, in any case.
+
+        Raises:
+            BidexError: Unknown suite or task, with the nearest name; or a faulty suite file.
+        """
+        from bidex_meta.worlds import external, own
+
+        config = WorldConfig.of(config)
+        if config.suite is None:
+            task = config.task or ""
+            if task.casefold() == external.HUMANOID.casefold():
+                return external.HumanoidTask(external.HUMANOID, config)
+            return own.SingleClass(registry.resolve(task, "task"), config)
+        suite = config.suite
+        if not suite.endswith(".toml"):
+            suite = known_name("suite", suite, suites_to_run())
+        return (external.MetaWorldSuite if suite in METAWORLD_SUITES else own.OwnSuite)(suite, config)
+
+    @abstractmethod
+    def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> "PooledWorld":
+        """A fresh world of one split.
+
+        Args:
+            split: ``train`` or ``test``.
+            rows: Environments over all tasks; one per task by default (a few per class where it is Meta-World's).
+            mode: Autoreset mode: SAME_STEP to train in, DISABLED to evaluate in.
+
+        Raises:
+            BidexError: There is no such split, too few environments, or a device or an engine that it does not run on.
+        """
+
+    @abstractmethod
+    def tasks(self, split: str) -> dict[str, list[str]]:
+        """Names of the tasks in the pool of each slot of a split's worlds, by the slot's name; empty without any."""
+
+    @abstractmethod
+    def task_classes(self) -> "dict[str, TaskClass]":
+        """The classes of its train split by name.
+
+        Raises:
+            BidexError: They are of another library; nothing is drawn or measured of them here.
+        """
+
+    @property
+    def splits(self) -> list[str]:
+        """The splits there are: ``train``, and ``test`` for a meta suite."""
+        return [split for split in ("train", "test") if self.tasks(split)]
+
+    def rows_and_steps(self, device: str, adapts: bool) -> tuple[int, int]:
+        """Environments of a training world, and steps of a run over all of them, where none are given.
+
+        Args:
+            device: ``cpu``, ``cuda``, ``cuda:0``, ...
+            adapts: Whether the learner adapts to tasks.
+        """
+        if not device.startswith("cpu"):
+            return _SIZES_AND_STEPS["gpu"]
+        return _ADAPTING_SIZE_AND_STEPS if adapts else _SIZES_AND_STEPS["cpu"]
+
+    @property
+    def moving_bases(self) -> bool:
+        """Whether the hands move as in the shipped suites, and as where references were measured."""
+        return all(task_class.moving_base for task_class in self.task_classes().values())
+
+    def identity(self) -> dict[str, Any]:
+        """What tells its worlds from others of the same name, ready for JSON.
+
+        Returns:
+            ``physics``: twelve letters of the classes' physics (``bidex_meta.engine.models``), None where they are
+            not ours; ``suite_version``: of the suite's file, None without one.
+        """
+        return {"physics": physics_of(self.task_classes()), "suite_version": None}
+
+    def references(self) -> "dict[str, Reference]":
+        """References of the normalised score and of broken episodes; none where the bases do not move as there."""
+        from bidex_meta.evaluation.references import references
+
+        return references() if self.moving_bases else {}
+
+    def judge(self, agent: "Agent", world: "PooledWorld", episodes: int | None, seed: int) -> "Evaluation":
+        """Evaluates a policy on all tasks of a split, beside the references.
+
+        Args:
+            agent: The policy.
+            world: What ``world`` made in mode DISABLED.
+            episodes: Episodes of each task; None takes ``default_episodes``.
+            seed: Of the starts.
+        """
+        from bidex_meta.evaluation.play import evaluate
+
+        episodes = self.default_episodes if episodes is None else episodes
+        return evaluate(agent, world, episodes, seed=seed, references=self.references())
+
+
+def physics_of(classes: "Mapping[str, TaskClass]") -> str:
+    """Twelve letters of the physics of some classes."""
+    from bidex_meta.engine.models import common_identity
+    from bidex_meta.tasks.scene import compile_scene
+
+    return common_identity({name: compile_scene(task_class).model for name, task_class in classes.items()})
+
+
+def suites_to_run() -> list[str]:
+    """Every suite that a config may name: the shipped ones and Meta-World's."""
+    return [*suite_names(), *METAWORLD_SUITES]
+
+
+def listed() -> list[dict[str, Any]]:
+    """A row of ``bidex-meta list suites`` for each suite, shipped or Meta-World's."""
+    suites = [load_suite(name) for name in suite_names()]
+    rows = [
+        {
+            "name": suite.name,
+            "kind": suite.kind,
+            "train_classes": [entry.name for entry in suite.split_classes("train")],
+            "test_classes": [entry.name for entry in suite.split_classes("test")],
+            "summary": suite.description,
+        }
+        for suite in suites
+    ]
+    summary = "Meta-World's own environments, to run our learners on (only run and evaluate know them)"
+    return rows + [
+        {"name": name, "kind": "multi-task", "train_classes": list(classes), "test_classes": [], "summary": summary}
+        for name, classes in METAWORLD_SUITES.items()
+    ]

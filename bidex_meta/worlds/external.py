@@ -1,0 +1,115 @@
+"""Worlds of other libraries' environments, on the CPU in C MuJoCo: Meta-World's suites, Gymnasium's humanoid."""
+
+from typing import TYPE_CHECKING, Any
+
+from bidex_meta.errors import BidexError
+from bidex_meta.memory import check_memory
+from bidex_meta.suite import metaworld_classes
+from bidex_meta.worlds.base import WorldConfig, Worlds
+
+if TYPE_CHECKING:
+    from bidex_meta.agents import Agent
+    from bidex_meta.evaluation.references import Reference
+    from bidex_meta.evaluation.results import Evaluation
+    from bidex_meta.tasks.base import TaskClass
+    from bidex_meta.world.contract import PooledWorld
+
+HUMANOID = "gymnasium/Humanoid-v5"
+"""How a run names it (``--task``)."""
+
+# Of each of Meta-World's classes; 2 M steps are the budget of published results.
+_TRAINING_SIZE, _TRAINING_STEPS = 4, 2_000_000
+_TASKS, _EVALUATION_SIZE = 50, 5  # of a class, and how many are played at a time
+_HUMANOIDS = 50
+
+
+class Foreign(Worlds):
+    """Classes of another library: the split train alone, without references or pictures."""
+
+    on_gpu = False
+    bytes_per_environment: int
+
+    def _check(self, split: str, rows: int) -> None:
+        """Refuses another split than train, engines but C MuJoCo on the CPU, and more than fits into memory."""
+        if split != "train":
+            raise BidexError(f"{self.name} has the split train alone, got {split!r}. Leave --split out.")
+        if not self.device.startswith("cpu") or self.engine == "warp":
+            wrong = "--engine warp" if self.engine == "warp" else f"--device {self.device}"
+            raise BidexError(f"{self.name} runs on the CPU in C MuJoCo, got {wrong}. Add --device cpu.")
+        check_memory(rows * self.bytes_per_environment, f"{rows:,} environments", "Lower --num-envs.")
+
+    def task_classes(self) -> "dict[str, TaskClass]":
+        """As in ``Worlds``: refused."""
+        raise BidexError(f"Pictures and references are made of classes of our own, got {self.name}. Name another.")
+
+    def identity(self) -> dict[str, Any]:
+        """As in ``Worlds``: the physics is the library's, known by its package's version."""
+        return {"physics": None, "suite_version": None}
+
+    def references(self) -> "dict[str, Reference]":
+        """As in ``Worlds``: none."""
+        return {}
+
+
+class MetaWorldSuite(Foreign):
+    """A suite of Meta-World's."""
+
+    preset = ("metaworld", "the suite is Meta-World's")
+    default_episodes = 1  # its tasks fix their start, so that a policy would only repeat itself
+    bytes_per_environment = 10_000_000
+
+    def __init__(self, name: str, config: WorldConfig) -> None:
+        super().__init__(name, config)
+        self.class_names = metaworld_classes(name)
+        if self.points:
+            raise BidexError(f"Point clouds are made of scenes of our own, got the suite {name}. Leave --points out.")
+
+    def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> "PooledWorld":
+        """As in ``Worlds``."""
+        rows = rows or _EVALUATION_SIZE * len(self.class_names)
+        self._check(split, rows)
+        from bidex_meta.metaworld.batched import MetaWorldWorld
+
+        return MetaWorldWorld(self.name, rows, seed=self.seed, autoreset_mode=mode)
+
+    def tasks(self, split: str) -> dict[str, list[str]]:
+        """As in ``Worlds``."""
+        numbers = [str(number) for number in range(_TASKS)]
+        return dict.fromkeys(self.class_names, numbers) if split == "train" else {}
+
+    def rows_and_steps(self, device: str, adapts: bool) -> tuple[int, int]:
+        """As in ``Worlds``."""
+        return _TRAINING_SIZE * len(self.class_names), _TRAINING_STEPS * len(self.class_names)
+
+    def judge(self, agent: "Agent", world: "PooledWorld", episodes: int | None, seed: int) -> "Evaluation":
+        """As in ``Worlds``: the fifty tasks of each class a few at a time, as many as the world has environments."""
+        from bidex_meta.metaworld.batched import evaluate_all_tasks
+
+        return evaluate_all_tasks(agent, world, self.default_episodes if episodes is None else episodes, seed=seed)
+
+
+class HumanoidTask(Foreign):
+    """``clients/humanoid_world.py``, a single class with one task."""
+
+    default_episodes = _HUMANOIDS
+    class_name = HUMANOID
+    bytes_per_environment = 2_000_000
+
+    def __init__(self, name: str, config: WorldConfig) -> None:
+        super().__init__(name, config)
+        given = {"points": config.points or None, "object": config.object, "base": config.base.replace("own", "")}
+        for flag, value in given.items():
+            if value:
+                raise BidexError(f"--{flag} is of the classes with hands, got {value} with {HUMANOID}. Leave it out.")
+
+    def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> "PooledWorld":
+        """As in ``Worlds``."""
+        rows = rows or _HUMANOIDS
+        self._check(split, rows)
+        from bidex_meta.clients.humanoid_world import HumanoidWorld
+
+        return HumanoidWorld(rows, seed=self.seed, autoreset_mode=mode, threads=self.threads)
+
+    def tasks(self, split: str) -> dict[str, list[str]]:
+        """As in ``Worlds``."""
+        return {"Humanoid-v5": ["0"]} if split == "train" else {}

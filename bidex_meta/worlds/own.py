@@ -1,0 +1,106 @@
+"""Worlds of our own classes: a suite, or a class on its own."""
+
+from dataclasses import replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, cast
+
+from bidex_meta.errors import BidexError
+from bidex_meta.outside import name_with_object
+from bidex_meta.suite import Split, Suite, load_suite
+from bidex_meta.tasks import registry
+from bidex_meta.worlds.base import WorldConfig, Worlds, physics_of
+
+if TYPE_CHECKING:
+    from bidex_meta.benchmark import Benchmark
+    from bidex_meta.tasks.base import TaskClass
+    from bidex_meta.world.contract import PooledWorld
+
+_TASKS_ALONE = 50
+"""Tasks that ``make_task_world`` draws for a class on its own."""
+
+
+class OwnSuite(Worlds):
+    """A suite file, shipped or the user's own."""
+
+    suite: Suite
+
+    def __init__(self, name: str, config: WorldConfig) -> None:
+        super().__init__(name, config)
+        suite = load_suite(name)
+        self.suite = replace(suite, points=self.points) if self.points else suite
+        self.hides_goals = self.suite.kind == "meta"
+
+    @cached_property
+    def benchmark(self) -> "Benchmark":
+        """The suite with its classes and the tasks that the config's seed draws."""
+        from bidex_meta.benchmark import Benchmark
+
+        return Benchmark(self.suite, seed=self.seed)
+
+    def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> "PooledWorld":
+        """As in ``Worlds``."""
+        if rows is None:
+            # They are split evenly over slots, so that all need as many as the slot with the most tasks.
+            pools = self.tasks(split).values()
+            rows = max(map(len, pools), default=1) * max(len(pools), 1)
+        return self.benchmark.make_world(split, rows, self.device, self.seed, mode, self.threads, self.engine)
+
+    def tasks(self, split: str) -> dict[str, list[str]]:
+        """As in ``Worlds``: the names that the file lists, else numbers."""
+        pools = {}
+        for entry in self.suite.split_classes(cast(Split, split)):
+            names = [task.name for task in entry.tasks if task.split == split]
+            pools[entry.name] = names or [str(number) for number in range(self.suite.tasks_per_class or 0)]
+        if self.suite.task_id == "class":
+            return pools
+        return {f"{name}/{task}": [task] for name, pool in pools.items() for task in pool}
+
+    def task_classes(self) -> "dict[str, TaskClass]":
+        """As in ``Worlds``."""
+        return self.benchmark.task_classes()
+
+    def identity(self) -> dict[str, Any]:
+        """As in ``Worlds``; of the classes of both splits."""
+        classes = self.benchmark.task_classes("train") | self.benchmark.task_classes("test")
+        return {"physics": physics_of(classes), "suite_version": self.suite.version}
+
+
+class SingleClass(Worlds):
+    """A class on its own: goal visible, no one-hot, no padding."""
+
+    class_name: str
+
+    def __init__(self, name: str, config: WorldConfig) -> None:
+        super().__init__(name, config)
+        self.moving_base = {"own": None, "moving": True, "fixed": False}[config.base]
+        self.class_name, self.object = name, config.object
+        self.name = name_with_object(name, self.object)
+        if self.object is not None:
+            self.task_classes()  # refuses an unknown one now
+
+    def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> "PooledWorld":
+        """As in ``Worlds``."""
+        from bidex_meta.benchmark import make_task_world
+
+        if split != "train":
+            raise BidexError(f"A run on the task {self.name} alone has no {split} split. Leave --split out.")
+        return make_task_world(
+            self.class_name,
+            rows or _TASKS_ALONE,
+            self.device,
+            self.seed,
+            mode,
+            self.threads,
+            moving_base=self.moving_base,
+            engine=self.engine,
+            points=self.points,
+            object=self.object,
+        )
+
+    def tasks(self, split: str) -> dict[str, list[str]]:
+        """As in ``Worlds``."""
+        return {self.name: [str(number) for number in range(_TASKS_ALONE)]} if split == "train" else {}
+
+    def task_classes(self) -> "dict[str, TaskClass]":
+        """As in ``Worlds``."""
+        return {self.name: registry.get(self.class_name, self.moving_base, **registry.with_object(self.object))}

@@ -1,0 +1,55 @@
+"""The learners' configs: what out of bounds is refused by the field's name, and that hostile values are too."""
+
+from typing import Any
+
+import pytest
+
+from bidex_meta.commands.learners import ALGOS, learner_kind
+from bidex_meta.errors import BidexError
+
+WRONG: dict[str, dict[str, Any]] = {
+    "mtppo": {
+        "epochs": 0, "gamma": 1.5, "std_range": (1.0, 0.5), "clip": -0.2, "max_grad_norm": -1.0, "cagrad_radius": 1.0,
+        "demonstration_weight": -0.1, "demonstration_half_life": 0.0, "demonstration_batch": 0, "modules": 0,
+        "demonstration_cloning": -1, "critic_first": -1, "points_read": -1, "task_embedding": -1,
+        "point_widths": (8, 0),
+    },
+    "mttrpo": {"max_kl": 0.0, "backtrack_factor": 1.5, "fisher_stride": 0},
+    "mtsac": {
+        "updates_per_step": 0, "batch_per_task": 0, "warmup_steps": -1, "gamma": 1.0, "tau": 0.0, "cut_share": 2.0,
+        "replay_memory": 0.0, "init_alpha": 0.0, "std_range": (1.0, 0.5), "init_std": 3.0, "point_widths": (),
+    },
+    "ddpg": {"tau": 0.0, "exploration_std": (0.5, 0.1), "squash_price": -1.0},
+    "td3": {"target_std": -0.1, "target_bound": float("nan"), "policy_delay": 0, "exploration_std": (-0.1, 0.1)},
+    "fasttd3": {"atoms": 1, "value_bound": 0.0, "n_steps": 0, "weight_decay": -0.1},
+    "brc": {"critic_hidden": (8, 16), "hidden": (), "atoms": 1},
+    "promp": {"inner_steps": 0, "gamma": 2.0, "init_std": 0.0, "std_range": (1.0, 0.5), "outer_epochs": 0},
+    "maml": {"backtracks": 0, "slice_steps": 0},
+    "rl2": {"chunk": 0, "gamma": 1.5, "blind_share": -0.1, "reward_unit": 0.0, "hidden": ()},
+    "mappo": {"huber_delta": 0.0, "value_clip": -1.0},
+    "hatrpo": {"max_factor": 0.5},
+    "iql": {"expectile": 1.0, "beta": -1.0, "std_range": (2.0, 1.0)},
+    "bcq": {"perturbation": 2.5, "lower_weight": -0.1, "latent": 0},
+    "td3bc": {"alpha": -1.0, "policy_delay": 0},
+}  # fmt: skip
+HOSTILE: tuple[Any, ...] = ("1e3", None, True, [1], {}, float("inf"))
+
+
+@pytest.mark.parametrize(("algo", "field"), [(algo, field) for algo, wrong in WRONG.items() for field in wrong])
+def test_a_value_out_of_bounds_is_refused_by_its_field(algo: str, field: str) -> None:
+    config = type(learner_kind(algo).presets["laptop"])
+    with pytest.raises(BidexError, match=f"{algo}: .*{field}"):
+        config(**{field: WRONG[algo][field]})
+
+
+@pytest.mark.parametrize("algo", ALGOS)
+def test_values_of_another_type_are_refused(algo: str) -> None:
+    config = type(learner_kind(algo).presets["laptop"])
+    rate = "inner_learning_rate" if "inner_learning_rate" in vars(config()) else "learning_rate"
+    rate = "critic_learning_rate" if algo in ("mttrpo", "trpo", "hatrpo") else rate
+    for value in HOSTILE:
+        if value is not None:
+            with pytest.raises(BidexError, match=f": {rate}: "):
+                config(**{rate: value})
+        with pytest.raises(BidexError, match=r": hidden\S*: "):
+            config(hidden=(value,))

@@ -1,0 +1,104 @@
+"""Beginning with another run's policy: it acts as that one did, and what does not fit is refused."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bidex_algos.learner import as_numbers, check_finite
+from bidex_algos.meta.maml import PRESETS as MAML_PRESETS
+from bidex_algos.meta.promp import PRESETS as PROMP_PRESETS
+from bidex_algos.meta.promp import ProMP, ProMPConfig
+from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
+from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
+from bidex_algos.onpolicy.mtppo import PRESETS as PPO_PRESETS
+from bidex_meta.errors import BidexError
+from tests.algos.families import PointGoals
+
+PPO = MTPPOConfig(hidden=(8,), rollout_steps=4, activation="tanh", autocast="off")
+PROMP = ProMPConfig(hidden=(8,), activation="tanh", tasks_per_class=4)
+
+
+def trained():
+    learner = MTPPO(PointGoals(rows=16, autoreset_mode="SAME_STEP"), PPO, seed=3)
+    for _ in range(3):
+        learner.iterate()
+    return learner
+
+
+def test_a_meta_learner_acts_as_the_policy_it_starts_from_and_learns_on():
+    given = trained()
+    learner = ProMP(PointGoals(rows=16), PROMP, seed=0)
+    obs, _ = learner.world.reset(seed=9)
+    assert not torch.allclose(learner.eval_action(obs), given.eval_action(obs))
+    learner.start_from(given.policy_state_dict())
+    assert torch.equal(learner.eval_action(obs), given.eval_action(obs))
+    assert torch.equal(learner.policy.actor.log_std, given.policy.actor.log_std)
+    before = learner.eval_action(obs)
+    learner.iterate()
+    assert not torch.equal(learner.eval_action(obs), before)
+
+
+def test_learned_step_sizes_are_no_part_of_what_another_run_begins_with():
+    sizing = ProMP(PointGoals(rows=16), replace(PROMP, step_sizes="layer"), seed=0)
+    sizing.start_from(trained().policy_state_dict())
+    sizing.iterate()
+    assert float(sizing.policy.step_sizes.mean()) != 1.0
+    for again in (PROMP, replace(PROMP, step_sizes="weight")):
+        learner = ProMP(PointGoals(rows=16), again, seed=0)
+        learner.start_from(sizing.policy_state_dict())
+        assert torch.equal(learner.policy.actor.log_std, sizing.policy.actor.log_std)
+        assert learner.policy.step_sizes is None or float(learner.policy.step_sizes.mean()) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"hidden": (9,)}, r"hidden = \[9\], got \[8\]\. Add --learner\.hidden"),
+        ({"activation": "elu"}, "activation = elu, got tanh"),
+        ({"normalise_observations": False}, "normalise_observations = False, got True"),
+    ],
+)
+def test_another_form_is_refused(change, expected):
+    learner = ProMP(PointGoals(rows=16), replace(PROMP, **change), seed=0)
+    with pytest.raises(BidexError, match=expected):
+        learner.start_from(trained().policy_state_dict())
+
+
+@pytest.mark.parametrize("preset", ["tuned", "unseen"])
+@pytest.mark.parametrize("presets", [PROMP_PRESETS, MAML_PRESETS])
+def test_presets_that_go_on_fit_what_mtppo_learns_on_a_laptop(presets, preset):
+    tuned, given = presets[preset], PPO_PRESETS["laptop"]
+    for name in ("hidden", "activation", "normalise_observations", "gamma"):
+        assert getattr(tuned, name) == getattr(given, name)
+
+
+def test_a_squashed_policy_must_have_the_same_bounds():
+    config = MTSACConfig(hidden=(8,), activation="tanh", normalise_observations=True, replay_steps=8)
+    world = PointGoals(rows=16, autoreset_mode="SAME_STEP")
+    state = MTSAC(world, config, seed=0).policy_state_dict()
+    MTSAC(world, config, seed=1).start_from(state)
+    with pytest.raises(BidexError, match=r"std_range = \[0.01, 3.0\], got \[0.02, 2.0\]"):
+        MTSAC(world, replace(config, std_range=(0.01, 3.0)), seed=1).start_from(state)
+
+
+def test_another_kind_of_policy_is_refused():
+    config = MTSACConfig(hidden=(8,), activation="tanh", normalise_observations=True, replay_steps=8)
+    learner = MTSAC(PointGoals(rows=16, autoreset_mode="SAME_STEP"), config, seed=0)
+    with pytest.raises(BidexError, match="of the same kind"):
+        learner.start_from(trained().policy_state_dict())
+
+
+def test_scalars_of_any_type_become_numbers():
+    assert as_numbers({"a": torch.tensor(3), "b": torch.tensor(0.5), "c": torch.tensor(True)}) == {
+        "a": 3.0, "b": 0.5, "c": 1.0
+    }  # fmt: skip
+    assert as_numbers({}) == {}
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_loss_that_is_not_finite_ends_the_training_with_a_remedy(bad: float):
+    metrics = {"Loss/a": 1.0, "Loss/b": bad}
+    check_finite(metrics, ["Loss/a", "Loss/missing"], "mtppo", 5, "rest")
+    with pytest.raises(FloatingPointError, match="mtppo: the loss is not finite after 5 steps; lower the rate"):
+        check_finite(metrics, ["Loss/a", "Loss/b"], "mtppo", 5, "lower the rate")

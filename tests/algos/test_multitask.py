@@ -1,0 +1,255 @@
+"""Networks that share weights between tasks: soft modules, PaCo, MOORE, heads; alone and in the learners."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.testing import assert_close
+
+from bidex_algos.nets.architecture import network_of
+from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.multitask import Moore, PaCo, SoftModules, gram_schmidt
+from bidex_algos.nets.networks import MLP
+from bidex_algos.offpolicy.fasttd3 import FastTD3Config
+from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
+from bidex_algos.offpolicy.td3 import TD3, TD3Config
+from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
+from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig
+from bidex_meta.errors import BidexError
+from bidex_meta.world.contract import ObservationGroup, plain_groups
+from tests.algos.problems import opposite_bandits
+from tests.algos.resume import resumed
+from tests.algos.toy import ToyWorld, nearness
+
+TRUNKS = {"soft_modules": SoftModules, "paco": PaCo, "moore": Moore}
+# The task id stands in the middle: nothing may assume that it is last.
+GROUPS = (
+    ObservationGroup("state", (slice(0, 3), slice(6, 9))),
+    ObservationGroup("task_id", (slice(3, 6),)),
+)
+TASKS = torch.arange(8) % 3
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def made(name: str, hidden: tuple[int, ...] = (16, 12, 10), modules: int = 4, **options: Any) -> Any:
+    return TRUNKS[name](Inputs(GROUPS), hidden, 5, 1.0, generator(), modules=modules, **options)
+
+
+def observations(seed: int = 1) -> torch.Tensor:
+    x = torch.randn(8, 9, generator=generator(seed))
+    x[:, 3:6] = torch.eye(3)[TASKS]
+    return x
+
+
+@pytest.mark.parametrize("name", TRUNKS)
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_gradients_reach_every_weight_and_the_task_decides(name: str, layer_norm: bool):
+    network, x = made(name, layer_norm=layer_norm), observations()
+    out = network(x)
+    assert out.shape == (8, 5) and out.dtype == torch.float32
+    out.square().sum().backward()
+    for weight_name, weight in network.named_parameters():
+        gradient = weight.grad
+        assert gradient is not None and gradient.abs().sum() > 0, weight_name
+        if weight.dim() == 3:  # each of the modules
+            assert (gradient.abs().sum((1, 2)) > 0).all(), weight_name
+    other = x.clone()
+    other[:, 3:6] = torch.eye(3)[(TASKS + 1) % 3]
+    assert not torch.isclose(network(other), out).all(1).any()
+
+
+@pytest.mark.parametrize("name", TRUNKS)
+def test_the_output_is_float32_and_near_in_low_precision(name: str):
+    network, x = made(name), observations()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        low = network(x.bfloat16())
+    assert low.dtype == torch.float32
+    assert_close(low, network(x), rtol=0.1, atol=0.1)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**31), st.integers(1, 6), st.sampled_from([1.0, 1e-2, 1e-4]))
+def test_gram_schmidt_is_orthonormal_and_spans_the_same(seed: int, count: int, apart: float):
+    common = torch.randn(1, 7, 16, generator=generator(seed))
+    vectors = common + apart * torch.randn(count, 7, 16, generator=generator(seed + 1))  # nearly parallel
+    found = gram_schmidt(vectors)
+    products = torch.einsum("ibn,jbn->bij", found, found)
+    assert_close(products, torch.eye(count).expand(7, -1, -1), rtol=0, atol=1e-5)
+    rest = vectors - torch.einsum("ibn,jbn,jbm->ibm", vectors, found, found)
+    assert rest.abs().max() < 1e-5
+    assert_close(found[0], vectors[0] / vectors[0].norm(dim=-1, keepdim=True))
+
+
+def test_moores_experts_are_orthogonal_and_mixed_by_the_tasks_weights():
+    network, x = made("moore"), observations()
+    experts = network.experts(x)
+    assert_close(torch.einsum("ibn,jbn->bij", experts, experts), torch.eye(4).expand(8, -1, -1), rtol=0, atol=1e-5)
+    weights = network.weights.rows[TASKS]
+    together = sum((weights[:, k, None] * experts[k] for k in range(4)), torch.zeros(8, 10))
+    hidden = torch.nn.functional.elu(10**0.5 * together)
+    assert_close(network(x), network.head(hidden))
+
+
+@pytest.mark.parametrize("hidden", [(16, 12), (16, 12, 10), (16, 12, 10, 8)])
+def test_soft_routes_sum_to_one_and_follow_the_paper(hidden: tuple[int, ...]):
+    network, x = made("soft_modules", hidden, modules=3), observations()
+    state = network.embedded(x)
+    routes = network.routes(x, state)
+    assert [tuple(r.shape) for r in routes] == [(8, 3, 3)] * (len(hidden) - 2) + [(8, 1, 3)]
+    for shares in routes:
+        assert_close(shares.sum(-1), torch.ones(shares.shape[:2]))
+    # One row by hand, module by module.
+    row, both = 4, state[4] * network.task(torch.eye(3)[TASKS[4]])
+    logits, given = network.down[0](both.relu()), [state[row]] * 3
+    for number, layer in enumerate(network.layers):
+        given = [torch.nn.functional.elu(w @ g + b) for w, b, g in zip(layer.weight, layer.bias, given, strict=True)]
+        table = logits.view(-1, 3)
+        given = [sum(p * g for p, g in zip(shares.softmax(0), given, strict=True)) for shares in table]
+        if number < len(network.up):
+            logits = network.down[number + 1]((network.up[number](logits) * both).relu())
+    assert_close(network.head(given[0]), network(x)[row])
+
+
+def test_paco_with_one_hot_weights_is_a_network_of_its_own_for_each_task():
+    network, x = made("paco", modules=3), observations()
+    with torch.no_grad():
+        network.weights.rows.copy_(torch.eye(3))
+        network.output_bias.normal_(generator=generator(3))
+        for layer in network.layers:
+            layer.bias.normal_(generator=generator(4))
+    out = network(x)
+    for task in range(3):
+        plain = MLP(6, (16, 12, 10), 5, 1.0, generator())
+        layers = [layer for layer in plain.body if isinstance(layer, torch.nn.Linear)]
+        with torch.no_grad():
+            for layer, stacked in zip(layers, network.layers, strict=True):
+                layer.weight.copy_(stacked.weight[task])
+                layer.bias.copy_(stacked.bias[task])
+            plain.head.weight.copy_(network.head.weight[task])
+            plain.head.bias.copy_(network.output_bias)
+        rows = task == TASKS
+        assert_close(out[rows], plain(x[rows][:, [0, 1, 2, 6, 7, 8]]))
+
+
+def test_pacos_layers_are_those_of_the_composed_parameters():
+    network, x = made("paco", (16,), modules=5), observations()
+    for task in range(3):
+        weights = network.weights.rows[task]
+        [layer] = network.layers
+        first, bias = torch.einsum("k,koi->oi", weights, layer.weight), weights @ layer.bias
+        last = torch.einsum("k,koi->oi", weights, network.head.weight)
+        state = x[task == TASKS][:, [0, 1, 2, 6, 7, 8]]
+        expected = torch.nn.functional.elu(state @ first.T + bias) @ last.T + network.output_bias
+        assert_close(network(x)[task == TASKS], expected)
+
+
+# In the learners.
+
+PPO = MTPPOConfig(
+    hidden=(32, 32), rollout_steps=8, learning_rate=1e-3, learning_rate_range=(1e-4, 4e-3), std_range=(0.05, 1.0),
+    autocast="off",
+)  # fmt: skip
+TRPO = MTTRPOConfig(
+    hidden=(32, 32), rollout_steps=16, gamma=0.8, init_std=0.5, fisher_stride=1, max_kl=0.03, damping=0.01,
+    critic_learning_rate=3e-3,
+)  # fmt: skip
+OFF: dict[str, Any] = {
+    "hidden": (32, 32), "replay_steps": 200, "cut_share": 0.3, "warmup_steps": 4, "batch_size": 128, "gamma": 0.8,
+    "tau": 0.05, "learning_rate": 3e-3, "critic_learning_rate": 5e-3, "autocast": "off",
+}  # fmt: skip
+KINDS: dict[str, tuple[Any, Any]] = {
+    "ppo": (MTPPO, PPO),
+    "trpo": (MTTRPO, TRPO),
+    "sac": (MTSAC, MTSACConfig(**OFF, init_alpha=0.01)),
+    "td3": (TD3, TD3Config(**OFF)),
+}
+ITERATIONS = {"ppo": 30, "sac": 9}
+learners = pytest.mark.parametrize("kind", KINDS)
+
+
+@pytest.mark.parametrize("kind", ["ppo", "sac"])
+@pytest.mark.parametrize("architecture", TRUNKS)
+def test_two_tasks_at_odds_are_learned(kind: str, architecture: str):
+    make, config = KINDS[kind]
+    world = opposite_bandits(0.5, rows=16)
+    learner = make(world, replace(config, architecture=architecture, modules=2), seed=0)
+    for _ in range(ITERATIONS[kind]):
+        learner.iterate()
+    obs, _ = world.reset(seed=1)
+    action = learner.eval_action(obs)
+    means = [float(action[world.task_id == k].mean()) for k in range(2)]
+    assert means == pytest.approx([0.5, -0.5], abs=0.2)
+    policy = make.load_policy(learner.state_dict()["policy"])
+    assert torch.equal(policy.eval_action(obs), action)
+
+
+@learners
+@pytest.mark.parametrize("architecture", TRUNKS)
+def test_save_load_resume_is_bit_equal(kind: str, architecture: str):
+    make, config = KINDS[kind]
+    if kind in ("sac", "td3"):
+        config = replace(config, steps_per_iteration=3, warmup_steps=2, updates_per_step=2, batch_size=32)
+    config = replace(config, architecture=architecture, policy_heads=True, modules=2)
+    resumed(lambda seed: make(opposite_bandits(rows=4), config, seed), iterations=1)
+
+
+@pytest.mark.parametrize("architecture", TRUNKS)
+def test_the_squashed_actor_starts_with_its_deviation_in_every_task(architecture: str):
+    learner = MTSAC(opposite_bandits(), replace(KINDS["sac"][1], architecture=architecture, init_std=0.3), seed=0)
+    obs, _ = learner.world.reset(seed=0)
+    _, log_std = learner.policy.actor(obs)
+    assert_close(log_std.exp(), torch.full_like(log_std, 0.3), rtol=0.05, atol=0)
+
+
+def test_multi_head_is_the_shared_trunk_with_both_heads():
+    heads = MTPPO(opposite_bandits(), replace(PPO, architecture="multi_head", value_heads=False), seed=0)
+    plain = MTPPO(opposite_bandits(), replace(PPO, policy_heads=True, value_heads=True), seed=0)
+    for a, b in zip(heads.policy.parameters(), plain.policy.parameters(), strict=True):
+        assert torch.equal(a, b)
+    assert heads.critic.head.weight.shape == plain.critic.head.weight.shape == (2, 32)
+
+
+def test_a_checkpoint_from_before_there_were_architectures_loads():
+    learner = MTPPO(opposite_bandits(), PPO, seed=0)
+    learner.iterate()
+    state = learner.state_dict()
+    for name in ("architecture", "modules", "cagrad_radius", "famo_rate", "famo_decay"):
+        del state["policy"]["config"][name]
+    policy = MTPPO.load_policy(state["policy"])
+    obs, _ = learner.world.reset(seed=1)
+    assert torch.equal(policy.eval_action(obs), learner.eval_action(obs))
+    assert isinstance(network_of(PPO)(4, (8,), 1, 1.0, generator()), MLP)
+
+
+@learners
+def test_an_architecture_needs_the_one_hot(kind: str):
+    make, config = KINDS[kind]
+    world = ToyWorld([nearness(0.4), nearness(-0.4)])
+    world.num_id_columns, world.observation_groups = 0, plain_groups(3, 0)
+    with pytest.raises(BidexError, match="architecture paco needs the one-hot of 2 tasks"):
+        make(world, replace(config, architecture="paco"), seed=0)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"architecture": "paco", "task_embedding": 4}, "task_embedding goes with architecture shared"),
+        ({"architecture": "soft_modules", "hidden": (32,)}, "at least two widths"),
+        ({"architecture": "moore", "hidden": (32, 3)}, "no more modules than the last width"),
+        ({"architecture": "moore", "hidden": ()}, "no more modules than the last width"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(options: dict[str, Any], message: str):
+    with pytest.raises(BidexError, match=message):
+        replace(PPO, **options)
+
+
+def test_the_critics_own_widths_are_checked_too():
+    with pytest.raises(BidexError, match="two widths in critic_hidden"):
+        FastTD3Config(architecture="soft_modules", critic_hidden=(64,))

@@ -1,0 +1,103 @@
+"""Gymnasium's own Humanoid-v5 beside the batched one."""
+
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+from bidex_meta.cli import main
+from bidex_meta.clients.humanoid_world import NAME, HumanoidWorld
+from bidex_meta.commands import watching
+from bidex_meta.errors import BidexError
+from bidex_meta.record import RunFolder
+from bidex_meta.worlds import Worlds
+from bidex_meta.worlds.external import HUMANOID
+
+
+def test_as_gymnasiums() -> None:
+    """Equal starts and actions: observations, rewards and falls are equal, to single precision."""
+    rows, steps = 3, 40
+    world = HumanoidWorld(rows, autoreset_mode="DISABLED", threads=1)
+    obs, _ = world.reset(seed=1)
+    start = world.state_dict()["engine"]
+    actions = 2 * torch.rand(steps, rows, 17, generator=torch.Generator().manual_seed(0)) - 1
+    made = [world.step(action) for action in actions]
+    lengths = made[-1][-1]["so_far"]["l"].tolist()
+    assert made[-1][2].all() and min(lengths) > 5  # all have fallen
+    for row, length in enumerate(lengths):
+        env = gymnasium.make("Humanoid-v5").unwrapped
+        env.reset(seed=0)
+        env.set_state(start["qpos"][row].numpy(), start["qvel"][row].numpy())
+        assert np.array_equal(env._get_obs().astype(np.float32), obs[row].numpy())
+        for step, (after, reward, terminated, _, _) in enumerate(made[:length], 1):
+            theirs, gained, fell, _, _ = env.step(actions[step - 1, row].numpy() * np.float32(0.4))
+            assert np.array_equal(theirs.astype(np.float32), after[row].numpy())
+            assert np.isclose(gained, reward[row].item(), rtol=1e-6)
+            assert fell == terminated[row].item() == (step == length)
+
+
+@pytest.mark.parametrize("algo", ["ppo", "sac"])
+def test_a_run_on_it(algo: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """In any case of the name, with the appendix's numbers for it; evaluated without references."""
+    flags = ["--task", "gymnasium/humanoid-v5", "--algo", algo, "--num-envs", "4", "--steps", "140", "--threads", "1"]
+    flags += ["--device", "cpu", "--logger", "none", "--learner.hidden", "8", "--episodes", "2"]
+    assert main(["run", *flags, "--run-dir", str(tmp_path / "run")]) == 0
+    folder = RunFolder.open(tmp_path / "run")
+    config = folder.config()
+    assert config["task"] == HUMANOID and config["learner"]["gamma"] == 0.99
+    found = folder.evaluation()["policy"]["classes"]["Humanoid-v5"]
+    assert found["score"] is None and found["success"] == 0.0
+    capsys.readouterr()
+
+
+def test_an_evaluation_while_training_is_of_ten_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[np.ndarray] = []
+    monkeypatch.setattr(watching, "_metrics", lambda found: {"Eval/mean_return": note(found.classes[NAME].returns)})
+
+    def note(returns: np.ndarray) -> float:
+        seen.append(returns)
+        return 0.0
+
+    flags = ["--task", HUMANOID, "--algo", "ppo", "--num-envs", "4", "--steps", "8", "--learner.rollout-steps", "2"]
+    flags += ["--threads", "1", "--device", "cpu", "--logger", "none", "--learner.hidden", "8", "--no-evaluate"]
+    assert main(["run", *flags, "--evaluate-every", "1", "--run-dir", str(tmp_path / "run")]) == 0
+    assert len(seen) == 1 and len(set(seen[0].tolist())) == 10, "ten starts, not one ten times"
+
+
+@pytest.mark.parametrize(
+    ("flags", "told"),
+    [
+        (["--points", "8"], "--points"),
+        (["--object", "mug"], "--object"),
+        (["--base", "moving"], "--base"),
+        (["--engine", "warp"], "runs on the CPU"),
+    ],
+)
+def test_what_is_of_hands_is_refused(
+    flags: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    known = ["--task", HUMANOID, "--num-envs", "4", "--device", "cpu", "--algo", "ppo"]
+    assert main(["run", *known, *flags, "--run-dir", str(tmp_path / "run")]) == 2
+    error = capsys.readouterr().err
+    last = error.splitlines()[-1]
+    assert told in last and HUMANOID in last and "Traceback" not in error
+
+
+@pytest.mark.parametrize("more", [["--tiled"], []])
+@pytest.mark.parametrize("named", [["--task", HUMANOID], ["--suite", "metaworld/MT10"]])
+def test_there_are_no_pictures_of_it(
+    named: list[str], more: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["render", *named, *more, "--out", str(tmp_path / "a.png")]) == 2
+    error = capsys.readouterr().err
+    assert f"got {named[1]}. Name another." in error and error.count("\n") == 1
+
+
+def test_no_other_split() -> None:
+    source = Worlds.open({"task": HUMANOID})
+    assert source.splits == ["train"] and source.references() == {}
+    for ask in (lambda: source.world("test"), source.task_classes):
+        with pytest.raises(BidexError, match=HUMANOID):
+            ask()

@@ -1,0 +1,293 @@
+"""Meta-World as a foreign world: its contract, and oracles that no one here wrote: its environments, its scripts."""
+
+import io
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import metaworld as library
+import numpy as np
+import pytest
+import torch
+from metaworld.env_dict import MT10_V3
+from metaworld.policies import ENV_POLICY_MAP
+from torch import Tensor
+
+from bidex_algos.onpolicy.mtppo import MTPPO, PRESETS, MTPPOConfig
+from bidex_meta.cli import main
+from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.play import RandomAgent, evaluate
+from bidex_meta.metaworld import batched
+from bidex_meta.metaworld import library as client
+from bidex_meta.metaworld.batched import MetaWorldWorld, evaluate_all_tasks
+from bidex_meta.record import RunFolder
+from bidex_meta.suite import METAWORLD_SUITES
+from tests.world.play import assert_same, number_of_ends, play
+
+ROWS = 6
+SHORT = 40
+"""Steps of an episode where a test is about its end."""
+
+
+def make(rows: int = ROWS, mode: str = "SAME_STEP", seed: int = 0, suite: str = "metaworld/MT3") -> MetaWorldWorld:
+    return MetaWorldWorld(suite, rows, seed=seed, autoreset_mode=mode)
+
+
+def actions(world: MetaWorldWorld, steps: int, seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return 2.0 * torch.rand(steps, world.num_envs, 4, generator=generator) - 1.0
+
+
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Worlds with episodes of ``SHORT`` steps."""
+    monkeypatch.setattr(batched, "EPISODE_STEPS", SHORT)
+
+
+@pytest.fixture
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Worlds with three tasks a class."""
+    monkeypatch.setattr(batched, "TASKS_PER_CLASS", 3)
+
+
+class Scripts:
+    """Meta-World's own scripted policies."""
+
+    def __init__(self, world: MetaWorldWorld) -> None:
+        self.policies = [ENV_POLICY_MAP[world.task_names[i]]() for i in world.task_id.tolist()]
+
+    def eval_action(self, obs: Tensor) -> Tensor:
+        numbers = [p.get_action(o) for p, o in zip(self.policies, obs[:, :39].double().numpy(), strict=True)]
+        return torch.tensor(np.clip(numbers, -1, 1), dtype=torch.float32)
+
+    def reset(self, env_mask: Tensor) -> None:
+        """Nothing is remembered."""
+
+
+def test_suites_are_those_of_the_library() -> None:
+    assert METAWORLD_SUITES["metaworld/MT10"] == tuple(MT10_V3)
+    assert set(METAWORLD_SUITES["metaworld/MT3"]) < set(MT10_V3)
+    tasks = client.make_tasks("metaworld/MT3", 0)
+    assert all(len(set(pool)) == client.TASKS_PER_CLASS for pool in tasks.values())
+    assert client.make_tasks("metaworld/MT3", 1) != tasks
+
+
+def test_a_row_is_the_library_s_environment() -> None:
+    world = make(3, "DISABLED")
+    world.set_tasks({name: [7] for name in world.task_names})
+    obs, _ = world.reset(seed=0)
+    for row, (name, pool) in enumerate(client.make_tasks("metaworld/MT3", 0).items()):
+        env: Any = library.ALL_V3_ENVIRONMENTS[name]()
+        env.set_task(pool[7])
+        expected = [env.reset()[0]]
+        steps = [env.step(action) for action in actions(world, 40)[:, row].numpy()]
+        expected += [step[0] for step in steps]
+        world.reset()
+        found = [obs[row, :39]]
+        for action, step in zip(actions(world, 40), steps, strict=True):
+            new, reward, _, _, info = world.step(action)
+            found.append(new[row, :39])
+            assert (float(reward[row]), bool(info["success"][row])) == (np.float32(step[1]), bool(step[4]["success"]))
+        assert torch.equal(torch.stack(found), torch.tensor(np.array(expected), dtype=torch.float32))
+
+
+def test_the_library_s_scripts_solve_its_tasks_here() -> None:
+    world = make(ROWS, "DISABLED")
+    scripts, solved = Scripts(world), torch.zeros(ROWS, dtype=torch.bool)
+    obs, _ = world.reset(seed=0)
+    for _ in range(500):
+        obs, _, _, _, info = world.step(scripts.eval_action(obs))
+        solved |= info["success"]
+        if solved.all():
+            break
+    assert solved.all()
+
+
+def test_episodes_draw_tasks_and_first_ones_are_shortened(short: None) -> None:
+    world = make(30)
+    world.reset(seed=0)
+    first = world.task_index.clone()
+    assert len(first.unique()) > 10
+    world.reset()
+    assert (world.task_index != first).sum() > 20 and (world.episodes.elapsed == 0).all()
+    fixed = make(ROWS, "DISABLED")
+    fixed.reset(seed=0)
+    assert fixed.task_index.tolist() == [0, 1] * 3 and (fixed.episodes.elapsed == 0).all()
+
+
+def test_same_seed_same_run_and_seeds_differ() -> None:
+    a, b = make(seed=0), make(seed=0)
+    before = np.random.get_state()
+    runs = []
+    for world, seed in ((a, 5), (b, 5), (b, 6)):
+        obs, _ = world.reset(seed=seed)
+        runs.append((obs, play(world, actions(world, 30))))
+    after = np.random.get_state()
+    assert torch.equal(runs[0][0], runs[1][0]) and not torch.equal(runs[0][0], runs[2][0])
+    assert_same(runs[0][1], runs[1][1])
+    assert all(np.array_equal(x, y) for x, y in zip(before, after, strict=True))
+    client.make_tasks.__wrapped__("metaworld/MT3", 0)  # Meta-World seeds NumPy's generator to draw tasks
+    assert all(np.array_equal(x, y) for x, y in zip(before, np.random.get_state(), strict=True))
+
+
+def test_rows_do_not_affect_each_other(short: None) -> None:
+    many, single = make(12), make(3)
+    many.reset(seed=0), single.reset(seed=0)
+    rows = [0, 4, 8]
+    wide = actions(many, 60)
+    assert_same(play(many, wide), play(single, wide[:, rows]), rows, slice(None))
+
+
+@pytest.mark.parametrize("mode", ["SAME_STEP", "DISABLED"])
+def test_state_resumes_bit_for_bit_within_episodes(mode: str, short: None) -> None:
+    world, other = make(mode=mode), make(mode=mode)
+    world.reset(seed=3)
+    play(world, actions(world, 50 if mode == "SAME_STEP" else 20))
+    file = io.BytesIO()
+    torch.save(world.state_dict(), file)
+    file.seek(0)
+    other.reset(seed=9)
+    play(other, actions(other, 7, seed=1))
+    other.load_state_dict(torch.load(file, weights_only=True))
+    after = actions(world, 60, seed=2)
+    steps = play(world, after)
+    assert number_of_ends(steps) >= ROWS
+    assert_same(steps, play(other, after))
+
+
+def test_mt10_steps_and_resumes() -> None:
+    world = make(10, suite="metaworld/MT10")
+    obs, _ = world.reset(seed=0)
+    assert obs.shape == (10, 49)
+    play(world, actions(world, 40))
+    state, after = world.state_dict(), actions(world, 60, seed=1)
+    steps = play(world, after)
+    assert all(step["obs"].isfinite().all() and step["reward"].isfinite().all() for step in steps)
+    world.load_state_dict(state)
+    assert_same(steps, play(world, after))
+
+
+def test_broken_physics_and_broken_actions_end_their_row_alone() -> None:
+    world, other = make(), make()
+    world.reset(seed=0), other.reset(seed=0)
+    first = actions(world, 10)
+    assert_same(play(world, first), play(other, first))
+    before = world.state_dict()["observation"]
+    world._singles[0]._env.data.qvel[0] = np.nan
+    action = actions(world, 1, seed=1)[0]
+    bad = action.clone()
+    bad[2, 1] = torch.inf
+    broken, sound = play(world, [bad])[0], play(other, [action])[0]
+    rows = [0, 2]
+    assert broken["info/unstable"].nonzero().squeeze(1).tolist() == rows
+    assert broken["truncated"][rows].all() and broken["info/_final_obs"][rows].all()
+    assert torch.equal(broken["info/final_obs"][rows], before[rows]) and broken["obs"].isfinite().all()
+    assert_same([broken], [sound], [1, 3, 4, 5])
+    after = actions(world, 10, seed=2)
+    steps = play(world, after)
+    assert not any(step["info/unstable"].any() for step in steps)
+    assert_same(steps, play(other, after), [1, 3, 4, 5])
+
+
+def test_evaluate_plays_each_task_once(short: None, few: None) -> None:
+    world = make(ROWS, "DISABLED")
+    found = evaluate_all_tasks(Scripts(world), world, 1, seed=4)
+    assert list(found.classes) == world.task_names
+    for result in found.classes.values():
+        assert result.tasks.tolist() == [0, 1, 2] and result.lengths.tolist() == [SHORT] * 3
+        assert result.reference is None and result.unstable == 0
+    world.set_tasks({name: [0, 1] for name in world.task_names})
+    two = evaluate(Scripts(world), world, 2, seed=4).classes["reach-v3"]
+    assert two.returns.tolist() == [*found.classes["reach-v3"].returns[:2]] * 2  # a task fixes its start
+    random = evaluate_all_tasks(RandomAgent(world.action_space), world, 1).classes["reach-v3"]
+    assert random.mean_return < found.classes["reach-v3"].mean_return
+
+
+def test_mtppo_learns_from_it(short: None) -> None:
+    world = make()
+    learner = MTPPO(world, MTPPOConfig(hidden=(16,), rollout_steps=50, num_minibatches=2), seed=0)
+    for _ in range(2):
+        metrics = learner.iterate()
+    assert "Train/return/reach-v3" in metrics and metrics["Train/unstable"] == 0
+    assert learner.env_steps == 100 * ROWS
+
+
+RUN = ["run", "--suite", "metaworld/MT3", "--num-envs", "6", "--threads", "1", "--device", "cpu"]
+RUN += ["--learner.hidden", "16", "--learner.rollout-steps", "20"]
+
+
+def test_a_run_trains_evaluates_and_resumes(
+    short: None, few: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole, part = str(tmp_path / "whole"), str(tmp_path / "part")
+    assert main([*RUN, "--steps", "480", "--run-dir", whole]) == 0
+    assert "Preset metaworld: the suite is Meta-World's." in capsys.readouterr().err
+    report = json.loads((tmp_path / "whole" / "evaluation.json").read_text())
+    assert report["policy"]["classes"]["reach-v3"]["episodes"] == 3 and report["policy"]["aggregate"]["score"] is None
+    assert main([*RUN, "--steps", "240", "--run-dir", part, "--no-evaluate"]) == 0
+    assert main(["run", "--resume", part, "--steps", "480", "--no-evaluate"]) == 0
+    ends = [RunFolder.open(Path(path)).checkpoints.load() for path in (whole, part)]
+    assert ends[0] is not None and ends[1] is not None and ends[0][1] == ends[1][1] == 480
+    weights = [end[0]["learner"]["policy"]["weights"] for end in ends if end]
+    assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
+    capsys.readouterr()
+    assert main(["evaluate", part, "--json", "--device", "cpu"]) == 0
+    assert json.loads(capsys.readouterr().out)["policy"] == report["policy"]
+    assert main(["evaluate", part, "--split", "test"]) == 2
+    assert "split train alone" in capsys.readouterr().err
+
+
+def test_defaults_follow_the_suite(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "--suite", "metaworld/MT10", "--print-config"]) == 0
+    config = json.loads(capsys.readouterr().out)
+    assert (config["num_envs"], config["preset"], config["device"]) == (40, "metaworld", "cpu")
+    assert config["learner"]["gamma"] == PRESETS["metaworld"].gamma
+    assert main(["list", "suites", "--json"]) == 0
+    listed = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
+    assert listed["metaworld/MT3"]["train_classes"] == list(METAWORLD_SUITES["metaworld/MT3"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ("run --suite metaworld/MT4", "Unknown suite 'metaworld/MT4'. Did you mean 'metaworld/MT3'?"),
+        ("run --suite metaworld/MT10 --num-envs 9", "num_envs: expected at least 10"),
+        ("run --suite metaworld/MT3 --engine warp", "--device cpu"),
+        ("run --suite metaworld/MT3 --preset metaworl", "Did you mean 'metaworld'?"),
+        ("baseline random --suite metaworld/MT3", "classes of our own"),
+        ("render --suite metaworld/MT3 --task reach-v3 --out a.png", "classes of our own"),
+    ],
+)
+def test_bad_input_is_one_line(
+    arguments: str, expected: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments.split()) == 2
+    error = capsys.readouterr().err
+    # A run says what it is about to do before it makes the world.
+    lines = [line for line in error.splitlines() if line.startswith("bidex-meta: ")]
+    assert len(lines) == 1 and expected in lines[0] and error.splitlines()[-1] == lines[0]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_misuse_is_refused() -> None:
+    world = make()
+    with pytest.raises(BidexError, match="reset\\(\\) before step"):
+        world.step(torch.zeros(ROWS, 4))
+    with pytest.raises(BidexError, match="Did you mean 'reach-v3'"):
+        world.set_tasks({"reach": [0]})
+    with pytest.raises(BidexError, match="from 0 to 49"):
+        world.set_tasks({"reach-v3": [50]})
+    world.reset(seed=0)
+    with pytest.raises(BidexError, match="shape \\(6, 4\\)"):
+        world.step(torch.zeros(ROWS, 5))
+    with pytest.raises(BidexError, match="build the world with the same"):
+        make(seed=1).load_state_dict(world.state_dict())
+
+
+def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "metaworld", None)
+    client._library.cache_clear()
+    with pytest.raises(BidexError, match="pip install metaworld"):
+        client.Single("reach-v3")

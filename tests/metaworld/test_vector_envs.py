@@ -1,0 +1,417 @@
+"""Code written for Meta-World runs here by changing the import: the same functions on its module and on ours."""
+# ruff: noqa: RUF059  (the examples are as they were written)
+
+import copy
+import pickle
+import random
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import cloudpickle
+import gymnasium
+import metaworld as original
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils import seeding
+from gymnasium.utils.env_checker import check_env
+from metaworld import evaluation as original_evaluation
+
+import bidex_meta.metaworld as ours
+from bidex_meta import Benchmark, Task
+from bidex_meta.errors import BidexError
+from bidex_meta.metaworld import evaluation as our_evaluation
+from bidex_meta.world.single_env import SuiteEnv
+
+BOTH = pytest.mark.parametrize(
+    ("metaworld", "name"), [(original, "reach-v3"), (ours, "HandOver")], ids=["metaworld", "bidex-meta"]
+)
+SHORT: dict[str, Any] = {"max_episode_steps": 8}
+"""Of episodes where a test is about their ends."""
+
+
+ITS_OWN_CODE = """
+import metaworld
+env = metaworld.make_mt_envs("reach-v3", seed=0)
+env.reset()
+assert env.step(env.action_space.sample())[0].shape == (39,)
+"""
+
+
+@pytest.mark.parametrize("ours", ["", "import bidex_meta.metaworld", "import metaworld, bidex_meta.metaworld"])
+def test_meta_worlds_own_code_runs_beside_ours(ours: str) -> None:
+    """Meta-World 3.0.0 makes no environment on MuJoCo 4 by itself."""
+    command = [sys.executable, "-W", "ignore", "-c", ours + ITS_OWN_CODE]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    assert (done.returncode == 0) == bool(ours), done.stderr
+    assert ours or "could not broadcast input array from shape (11,) into shape (12,)" in done.stderr
+
+
+# Meta-World's examples, word for word but for the benchmark, which is an argument.
+
+
+def single_task(metaworld: Any, name: str) -> None:
+    """Its README: a benchmark with a single environment."""
+    assert name in metaworld.ML1.ENV_NAMES
+    ml1 = metaworld.ML1(name, 42)  # Construct the benchmark, sampling tasks
+
+    env = ml1.train_classes[name]()  # Create an environment with task
+    task = random.choice(ml1.train_tasks)
+    env.set_task(task)  # Set task
+
+    obs, info = env.reset()  # Reset environment
+    a = env.action_space.sample()  # Sample an action
+    obs, reward, terminate, truncate, info = env.step(a)  # Step the environment with the sampled random action
+    assert obs.shape == env.observation_space.shape and info["success"] in (0.0, 1.0)
+    env.close()
+
+
+def many_tasks(ml10: Any) -> None:
+    """Its README: a benchmark with several environments."""
+    training_envs = []
+    for name, env_cls in ml10.train_classes.items():
+        env = env_cls()
+        task = random.choice([task for task in ml10.train_tasks if task.env_name == name])
+        env.set_task(task)
+        training_envs.append(env)
+
+    for env in training_envs:
+        obs, info = env.reset()
+        a = env.action_space.sample()
+        obs, reward, terminate, truncate, info = env.step(a)
+
+    testing_envs = []
+    for name, env_cls in ml10.test_classes.items():
+        env = env_cls()
+        task = random.choice([task for task in ml10.test_tasks if task.env_name == name])
+        env.set_task(task)
+        testing_envs.append(env)
+
+    for env in testing_envs:
+        obs, info = env.reset()
+        for _ in range(3):
+            obs, reward, terminate, truncate, info = env.step(env.action_space.sample())
+
+
+def whole_episode(metaworld: Any, name: str) -> int:
+    """Its documentation: a scripted policy until the time is up."""
+    mt1 = metaworld.MT1(name, seed=1)
+    env = mt1.train_classes[name](render_mode=None)
+    env.set_task(mt1.train_tasks[0])
+    env.reset()
+    steps, done = 0, False
+    while not done:
+        _, _, terminated, truncated, _ = env.step(np.zeros(env.action_space.shape, np.float32))
+        done, steps = terminated or truncated, steps + 1
+    assert steps <= env.max_path_length
+    with pytest.raises(ValueError):
+        env.step(np.zeros(env.action_space.shape, np.float32))
+    return steps
+
+
+class Agent:
+    """Both protocols of its evaluation; counts the calls."""
+
+    def __init__(self, envs: Any) -> None:
+        self.space, self.calls = envs.action_space, {"init": 0, "step": 0, "adapt": 0, "reset": 0}
+
+    def eval_action(self, observations: np.ndarray) -> np.ndarray:
+        return np.zeros(self.space.shape, np.float32)
+
+    def adapt_action(self, observations: np.ndarray) -> tuple[np.ndarray, dict]:
+        return self.eval_action(observations), {}
+
+    def reset(self, env_mask: np.ndarray) -> None:
+        self.calls["reset"] += 1
+
+    def init(self) -> None:
+        self.calls["init"] += 1
+
+    def step(self, timestep: Any) -> None:
+        assert timestep.observation.shape[:1] == timestep.reward.shape == timestep.truncated.shape
+        self.calls["step"] += 1
+
+    def adapt(self) -> None:
+        self.calls["adapt"] += 1
+
+
+@BOTH
+def test_a_single_task(metaworld: Any, name: str) -> None:
+    single_task(metaworld, name)
+
+
+@pytest.mark.parametrize("make", [ours.ML4, ours.ML20, lambda: Benchmark("ML4", 1), lambda: ours.ML1("Switch")])
+def test_many_tasks(make: Callable[[], Any]) -> None:
+    many_tasks(make())
+
+
+def test_the_example_is_meta_worlds() -> None:
+    many_tasks(original.CustomML(["reach-v3"], ["drawer-close-v3"], seed=1))
+    many_tasks(ours.CustomML(["HandOver"], ["Switch"], seed=1))
+
+
+@BOTH
+def test_an_episode_to_its_end(metaworld: Any, name: str) -> None:
+    steps = whole_episode(metaworld, name)
+    assert steps == (500 if metaworld is original else steps)
+
+
+@BOTH
+def test_evaluation_of_multi_task_environments(metaworld: Any, name: str) -> None:
+    module: Any = original_evaluation if metaworld is original else our_evaluation
+    envs = metaworld.make_ml_envs(name, seed=1, meta_batch_size=2, vector_strategy="sync", **SHORT)
+    agent = Agent(envs)
+    success, mean_return, by_name, returns = module.evaluation(agent, envs, num_episodes=4)
+    assert success == by_name[name] == 0.0 and mean_return == pytest.approx(np.mean(returns[name]))
+    assert len(returns[name]) == 4 and agent.calls["reset"] == 17
+    envs.close()
+
+
+@BOTH
+def test_evaluation_of_an_agent_that_adapts(metaworld: Any, name: str) -> None:
+    module: Any = original_evaluation if metaworld is original else our_evaluation
+    envs = metaworld.make_ml_envs_test(name, seed=1, meta_batch_size=2, **SHORT)
+    agent = Agent(envs)
+    success, _, by_name = module.metalearning_evaluation(
+        agent, envs, num_evals=2, adaptation_steps=1, adaptation_episodes=2, evaluation_episodes=1
+    )
+    assert success == by_name[name] == 0.0
+    assert agent.calls == {"init": 2, "step": 2 * 2 * 8, "adapt": 2, "reset": 2 * 9}
+    envs.close()
+
+
+@BOTH
+def test_wrappers_keep_their_meaning(metaworld: Any, name: str) -> None:
+    plain = metaworld.make_mt_envs(name, seed=1, **SHORT)
+    size, actions = plain.observation_space.shape[0], plain.action_space.shape[0]
+    options = {"use_one_hot": True, "env_id": 1, "num_tasks": 3, "recurrent_info_in_obs": True}
+    env = metaworld.make_mt_envs(name, seed=1, **options, reward_normalization_method="exponential", **SHORT)
+    obs, _ = env.reset()
+    assert obs[size : size + 3].tolist() == [0.0, 1.0, 0.0] and len(obs) == size + 3 + actions + 2
+    action = np.full(actions, 0.25, np.float32)
+    for _ in range(8):
+        obs, _, terminated, truncated, info = env.step(action)
+    np.testing.assert_array_equal(obs[size + 3 : -2], action)
+    assert truncated and obs[-1] == 1.0 and info["episode"]["l"] == 8
+    env_id, state = env.get_checkpoint()
+    assert len(state["tasks"]) == 50 and isinstance(env_id, str)
+
+
+# What is ours.
+
+
+@pytest.mark.parametrize("suite", ["MT4", "ML4", "MT20"])
+def test_an_environment_plays_what_a_row_of_the_world_plays(suite: str) -> None:
+    benchmark, seed = Benchmark(suite, 3), 5
+    drawn = int(seeding.np_random(seed)[0].integers(2**31))
+    classes = list(benchmark.train_classes.items())
+    world = benchmark.make_world(num_envs=len(classes), device="cpu", autoreset_mode="DISABLED", threads=1)
+    world_obs, _ = world.reset(seed=drawn)
+    envs = []
+    for i, (name, env_cls) in enumerate(classes):
+        env = env_cls()
+        env.set_task(next(task for task in benchmark.train_tasks if task.env_name == name))
+        obs, _ = env.reset(seed=seed)
+        np.testing.assert_array_equal(obs, world_obs[i, : len(obs)].numpy(), err_msg=name)
+        envs.append(env)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(6):
+        actions = 2.0 * torch.rand(len(envs), 52, generator=generator) - 1.0
+        world_obs, reward, terminated, truncated, info = world.step(actions)
+        for i, env in enumerate(envs):
+            if env._over:
+                continue
+            obs, *rest, told = env.step(actions[i].numpy())
+            np.testing.assert_array_equal(obs, world_obs[i, : len(obs)].numpy(), err_msg=env.task_name)
+            assert rest == [float(reward[i]), bool(terminated[i]), bool(truncated[i])]
+            assert told["success"] == float(info["success"][i])
+            assert told["unscaled_reward"] == float(info["reward_unscaled"][i])
+
+
+@pytest.mark.parametrize("strategy", ["sync", "async"])
+def test_strategies_play_alike_and_the_seed_decides(strategy: str) -> None:
+    def play(vector_strategy: str, seed: int) -> list[np.ndarray]:
+        keywords: dict[str, Any] = {"vector_strategy": vector_strategy, "seed": seed, "use_one_hot": True}
+        envs: Any = gymnasium.make_vec("bidex-meta/MT4-v1", **keywords, **SHORT)
+        obs, _ = envs.reset()
+        seen = [obs.copy()]
+        for _ in range(10):
+            obs, _, _, truncated, _ = envs.step(np.full(envs.action_space.shape, 0.1, np.float32))
+            seen.append(obs.copy())
+        envs.close()
+        return seen
+
+    expected = play("sync", 1)
+    np.testing.assert_array_equal(play(strategy, 1), expected)
+    assert expected[0].shape == (4, 450) and not np.array_equal(play("sync", 2)[0], expected[0])
+    np.testing.assert_array_equal(expected[0][:, 446:], np.eye(4))
+
+
+def test_the_seed_of_make_vec_chooses_the_tasks() -> None:
+    def pools(**keywords: Any) -> list[np.ndarray]:
+        world: Any = gymnasium.make_vec("bidex-meta/ML4-train-v1", num_envs=3, device="cpu", threads=1, **keywords)
+        return world.unwrapped.pools
+
+    by_seed, expected = pools(seed=4), Benchmark("ML4", 4).make_world(num_envs=3, device="cpu", threads=1).pools
+    assert all(map(np.array_equal, by_seed, expected))
+    assert all(map(np.array_equal, pools(seed=9, benchmark_seed=4), expected))
+    assert all(map(np.array_equal, pools(benchmark_seed=4), expected))
+    assert not np.array_equal(pools()[0], expected[0])
+    keywords: dict[str, Any] = {"vector_strategy": "sync", "meta_batch_size": 6, "seed": 4}
+    envs: Any = gymnasium.make_vec("bidex-meta/ML4-train-v1", **keywords)
+    tasks = envs.get_attr("tasks")
+    assert [len(share) for share in tasks] == [25] * 6
+    assert {task for share in tasks for task in share} == set(Benchmark("ML4", 4).train_tasks)
+    envs.close()
+
+
+def test_ids_of_custom_benchmarks_and_of_one_class() -> None:
+    keywords: dict[str, Any] = {"vector_strategy": "sync", "seed": 1}
+    envs: Any = gymnasium.make_vec("bidex-meta/custom-mt-envs", envs_list=["Switch", "HandOver"], **keywords)
+    assert envs.get_attr("task_name") == ("Switch", "HandOver")
+    lists = {"train_envs": ["Switch"], "test_envs": ["HandOver"]}
+    hidden: Any = gymnasium.make_vec("bidex-meta/custom-ml-envs", **lists, **keywords)
+    assert hidden.get_attr("task_name") == ("Switch",) and hidden.get_attr("recipe")[0].hides_goal
+    split: Any = gymnasium.make_vec("bidex-meta/ML1-test-v1", env_name="Switch", meta_batch_size=5, **keywords)
+    assert {task for share in split.get_attr("tasks") for task in share} == set(ours.ML1("Switch", 1).test_tasks)
+
+
+def test_sampled_tasks_go_round_without_one_twice() -> None:
+    envs: Any = ours.make_ml_envs_train("HandOver", seed=0, total_tasks_per_cls=4)
+    seen = []
+    for _ in range(4):
+        envs.call("sample_tasks")
+        seen.append(envs.envs[0].unwrapped._task)
+    assert set(seen) == set(ours.ML1("HandOver", 0).train_tasks[:4])
+
+
+def test_an_environment_ends_as_its_class_says_and_at_success_if_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = ours.MT1("CatchUnderarm", 0).train_classes["CatchUnderarm"]()
+    env.set_task(ours.MT1("CatchUnderarm", 0).train_tasks[0])
+    env.toggle_terminate_on_success(True)
+    for _ in range(2):
+        env.reset(seed=0)
+        terminated = False
+        while not terminated:  # it falls long before the time is up
+            _, _, terminated, truncated, info = env.step(np.full(52, -1.0, np.float32))
+            assert not truncated
+        assert info["success"] == 0.0
+    env.reset(seed=0)
+    monkeypatch.setattr(type(env.task_class), "success", lambda self, state: torch.ones(1, dtype=torch.bool))
+    assert env.step(np.zeros(52, np.float32))[2:4] == (True, False)
+    env.toggle_terminate_on_success(False)
+    env.reset(seed=0)
+    assert env.step(np.zeros(52, np.float32))[2:4] == (False, False)
+
+
+def test_seeds_repeat_an_episode_and_tasks_hold_from_the_next_reset() -> None:
+    ml1 = ours.ML1("HandOver", 0)
+    env = ml1.train_classes["HandOver"]()
+    with pytest.raises(BidexError, match="set_task"):
+        env.reset()
+    env.set_task(ml1.train_tasks[0])
+    first, again, other = (env.reset(seed=seed)[0] for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other) and not np.array_equal(env.reset()[0], env.reset()[0])
+    env.set_task(ml1.train_tasks[1])
+    env.step(np.zeros(52, np.float32))
+    assert env._task == ml1.train_tasks[0]
+    env.reset()
+    assert env._task == ml1.train_tasks[1]
+    assert env.seed(1) == [1]
+    env.set_task(ml1.train_tasks[0])
+    np.testing.assert_array_equal(env.reset()[0], first)
+
+
+@pytest.mark.filterwarnings("ignore:.*infinity")
+def test_an_environment_passes_gymnasiums_checker() -> None:
+    env = ours.MT1("Switch").train_classes["Switch"]()
+    env.set_task(ours.MT1("Switch").train_tasks[0])
+    check_env(env, skip_render_check=True)
+
+
+def test_classes_are_the_same_objects_and_travel() -> None:
+    env_cls = Benchmark("MT4").train_classes["HandOver"]
+    assert env_cls is Benchmark("MT4", 1).train_classes["HandOver"]
+    assert env_cls is not Benchmark("ML4").train_classes["HandOver"]
+    assert (env_cls.__name__, env_cls.task_class.name) == ("HandOver", "HandOver")
+    assert pickle.loads(pickle.dumps(env_cls.recipe)).make_class() is env_cls
+    assert pickle.loads(pickle.dumps(env_cls)) is copy.deepcopy(env_cls) is env_cls
+    assert pickle.loads(pickle.dumps(SuiteEnv)) is SuiteEnv
+    assert cloudpickle.loads(cloudpickle.dumps(env_cls))().task_name == "HandOver"
+    assert set(ours.ALL_V3_ENVIRONMENTS) == set(ours.MT1.ENV_NAMES)
+
+
+@pytest.mark.parametrize("begun", [False, True])
+def test_environments_pickle_and_go_on_alike(begun: bool) -> None:
+    benchmark = ours.ML1("CatchUnderarm", seed=2)
+    env = benchmark.train_classes["CatchUnderarm"]()
+    env.seed(3)
+    env.set_task(benchmark.train_tasks[4])
+    if begun:
+        env.reset()
+        env.step(np.ones(52, np.float32))
+    vector = ours.make_ml_envs("CatchUnderarm", seed=0)
+    assert pickle.loads(pickle.dumps(vector)).num_envs == 1
+    action = np.linspace(-1, 1, 52, dtype=np.float32)
+    seen = []
+    for each in (pickle.loads(pickle.dumps(env)), copy.deepcopy(env), env):
+        obs = [] if begun else [each.reset()[0]]
+        seen.append([*obs, *(each.step(action)[0] for _ in range(3)), each.reset()[0], each.step(action)[0]])
+        assert type(each) is type(env) and each._task == benchmark.train_tasks[4]
+    np.testing.assert_array_equal(seen[0], seen[2])
+    np.testing.assert_array_equal(seen[1], seen[2])
+
+
+@pytest.mark.parametrize("first", ["metaworld", "bidex_meta.metaworld"])
+def test_a_benchmark_is_one_of_meta_worlds(first: str) -> None:
+    made = Benchmark("ML4"), ours.MT20(1), ours.ML1("Switch", 2)
+    assert all(isinstance(one, original.Benchmark) and isinstance(one, ours.Benchmark) for one in made)
+    assert not isinstance("ML4", original.Benchmark) and type(made[0]) is made[0].__class__ is Benchmark
+    code = (
+        f"import sys; from bidex_meta import Benchmark; b = Benchmark('ML4', 3); assert 'metaworld' not in sys.modules;"
+        f"import {first}, metaworld, bidex_meta.metaworld; assert isinstance(b, metaworld.Benchmark)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_constructors_take_what_meta_worlds_take() -> None:
+    assert ours.MT1("handover", 1).train_tasks == ours.MT1("HandOver", seed=1).train_tasks
+    assert len(ours.ML1("HandOver").train_tasks) == len(ours.ML1("HandOver").test_tasks) == 50
+    assert ours.ML20(7).train_tasks == Benchmark("ML20", 7).train_tasks == Benchmark("ML20", seed=7).train_tasks
+    assert isinstance(ours.ML4().train_tasks[0], ours.Task) and ours.Task is Task
+    assert ours.MT1("HandOver").make_world(num_envs=2, device="cpu").observation_size == 422
+    assert ours.OneHotWrapper is original.OneHotWrapper
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        (lambda: ours.make_ml_envs("ML20", meta_batch_size=20), "a multiple of 15"),
+        (lambda: ours.make_ml_envs("ML4", meta_batch_size=12), "total_tasks_per_cls=48"),
+        (lambda: ours.make_ml_envs("MT4"), "make_mt_envs('MT4')"),
+        (lambda: ours.make_mt_envs("ML4"), "make_ml_envs('ML4')"),
+        (lambda: ours.make_mt_envs("MT4", meta_batch_size=4), "of meta suites"),
+        (lambda: ours.make_mt_envs("MT5"), "Did you mean 'MT4'?"),
+        (lambda: ours.make_mt_envs("MT4", vector_strategy="threads"), "Known: async, sync"),
+        (lambda: ours.make_mt_envs("HandOver", reward_function_version="v1"), "the paper's reward"),
+        (lambda: ours.make_mt_envs("HandOver", render_mode="human"), "rgb_array"),
+        (lambda: ours.CustomML(["HandOver"], ["handover"]), "HandOver in both"),
+        (lambda: gymnasium.make_vec("bidex-meta/custom-ml-envs", envs_list=[]), "at least one class"),
+        (lambda: gymnasium.make_vec("bidex-meta/MT4-v1", env_name="HandOver"), "make_mt_envs(name)"),
+        (lambda: ours.ML4().train_classes["HandOver"]().set_task(ours.MT1("Switch").train_tasks[0]), "one of Switch"),
+    ],
+)
+def test_what_cannot_be_had_says_so_in_a_line(call: Callable[[], Any], told: str) -> None:
+    with pytest.raises(BidexError) as error:
+        call()
+    assert told in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("name", "told"), [("MT10", "MT4 or MT20"), ("nothing", "docs/metaworld.md")])
+def test_names_that_are_not_here_say_what_is(name: str, told: str) -> None:
+    with pytest.raises(AttributeError, match=told):
+        getattr(ours, name)
+    assert not hasattr(ours, "ALL_V3_ENVIRONMENTS_GOAL_HIDDEN")

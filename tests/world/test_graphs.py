@@ -1,0 +1,156 @@
+"""Recorded stretches of a step: a tape of operations in fixed memory, as a CUDA graph is one, against plain runs."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from bidex_meta.engine.cpu import CpuEngine
+from bidex_meta.world import World, world
+from bidex_meta.world.graphs import GraphCache, fresh
+from tests.world.play import assert_same, number_of_ends, play, random_actions, suite_world
+from tests.world.test_masked import MaskedEngine, at_work
+
+
+class Tape(TorchDispatchMode):
+    """Remembers operations with the very tensors that they read and made."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.done: list[tuple[Any, Any, Any, Any]] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        self.done.append((func, args, kwargs or {}, result))
+        return result
+
+    def replay(self) -> None:
+        for func, args, kwargs, result in self.done:
+            for old, new in zip(tree_leaves(result), tree_leaves(func(*args, **kwargs)), strict=True):
+                if isinstance(old, Tensor) and old.data_ptr() != new.data_ptr():
+                    old.copy_(new)
+
+
+class StillEngine(MaskedEngine):
+    """As an accelerator's engine: trouble is told in a tensor of fixed place."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._told = torch.zeros(self.num, dtype=torch.bool)
+
+    def step(self, substeps: int, active: Tensor | None = None) -> None:
+        super().step(substeps, active)
+        self._tell()
+
+    def reset(self, mask: Tensor, start: Tensor) -> None:
+        super().reset(mask, start)
+        self._tell()
+
+    def _tell(self) -> None:
+        with at_work():
+            self._told.copy_(CpuEngine.unstable(self))
+
+    def unstable(self) -> Tensor:
+        return self._told.clone()
+
+
+def taped(
+    recorder: list[GraphCache], count: list[int]
+) -> Callable[[Callable[[], Any]], tuple[Callable[[], None], Any]]:
+    """Records as CUDA does: the work is written down and not done."""
+
+    def record(work: Callable[[], Any]) -> tuple[Callable[[], None], Any]:
+        state = recorder[0]._state
+        before = fresh(state)
+        with Tape() as tape:
+            result = work()
+        for name, value in before.items():
+            state[name].copy_(value)
+        count.append(1)
+        return tape.replay, result
+
+    return record
+
+
+@pytest.fixture
+def recorded(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str, int], tuple[World, list[int]]]]:
+    def make(suite: str, rows: int) -> tuple[World, list[int]]:
+        with monkeypatch.context() as patch:
+            maker = lambda models, of, room: StillEngine(models, of, threads=1)  # noqa: E731
+            patch.setattr(world, "choose_engine", lambda *_: (torch.device("cpu"), maker))
+            made = suite_world(suite, rows)
+        holder: list[GraphCache] = []
+        count: list[int] = []
+        made._graphs = GraphCache(made._state, made._put_state, taped(holder, count))
+        holder.append(made._graphs)
+        return made, count
+
+    yield make
+
+
+@pytest.mark.parametrize("suite", ["MT4", "ML4"])
+def test_replayed_steps_are_plain_steps(suite: str, recorded: Callable[..., tuple[World, list[int]]]) -> None:
+    plain, (taped_world, count) = suite_world(suite, 9), recorded(suite, 9)
+    actions = random_actions(plain, 120)
+    actions[40, 3] = torch.nan
+    for one in (plain, taped_world):
+        one.reset(seed=3)
+    a, b = play(plain, actions), play(taped_world, actions)
+    assert_same(a, b)
+    assert number_of_ends(a) >= 9 and a[40]["info/unstable"][3]
+    assert len(count) == 4  # controls, transitions, starts, first observations
+
+
+def test_what_a_step_returned_stays(recorded: Callable[..., tuple[World, list[int]]]) -> None:
+    made, count = recorded("MT4", 8)
+    made.reset(seed=0)
+    actions = random_actions(made, 12)
+    play(made, actions[:6])
+    assert count
+    kept = play(made, actions[6:7])
+    copies = [{name: value.clone() for name, value in kept[0].items()}]
+    play(made, actions[7:])
+    assert_same(kept, copies)
+
+
+def test_a_reset_other_tasks_and_a_loaded_state_are_seen(recorded: Callable[..., tuple[World, list[int]]]) -> None:
+    plain, (made, count) = suite_world("MT4", 8), recorded("MT4", 8)
+    actions = random_actions(plain, 40)
+    for one in (plain, made):
+        one.reset(seed=0)
+        play(one, actions[:10])
+    saved = plain.state_dict()
+    for one in (plain, made):
+        one.reset(options={"reset_mask": torch.arange(8) % 2 == 0})
+    assert_same(play(plain, actions[10:20]), play(made, actions[10:20]))
+    before = len(count)
+    for one in (plain, made):
+        one.set_tasks({"CatchUnderarm": one.pools[one.task_names.index("CatchUnderarm")][5:7]})
+        one.reset()
+    assert_same(play(plain, actions[20:30]), play(made, actions[20:30]))
+    assert len(count) == 2 * before
+    for one in (plain, made):
+        one.load_state_dict(saved)
+    assert_same(play(plain, actions[30:]), play(made, actions[30:]))
+
+
+@pytest.mark.gpu
+def test_graphs_on_cuda_are_plain_steps() -> None:
+    """Nearly everywhere: sums are made in any order there, and what touches something grows apart from then on."""
+    from bidex_meta import Benchmark
+
+    plain, graphs = (Benchmark("MT4").make_world("train", num_envs=64, device="cuda:0") for _ in range(2))
+    plain._graphs = None
+    actions = random_actions(plain, 12)
+    for one in (plain, graphs):
+        one.reset(seed=0)
+    a, b = play(plain, actions.cuda()), play(graphs, actions.cuda())
+    for x, y in zip(a, b, strict=True):
+        for name in ("obs", "reward", "terminated", "truncated", "info/final_obs", "info/so_far/l"):
+            apart = (x[name].float() - y[name].float()).abs().flatten()
+            assert apart.quantile(0.95) < 1e-2, name
+    assert graphs._graphs is not None and len(graphs._recorder._recorded) == 4

@@ -1,0 +1,131 @@
+"""``Worlds.open``: own suites, single classes and Meta-World's suites answer the same questions."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bidex_meta import paths
+from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.play import ZeroAgent
+from bidex_meta.worlds import WorldConfig, Worlds
+
+CORE = Path(paths.__file__).parent
+
+
+@pytest.fixture
+def named(request: pytest.FixtureRequest, tmp_path: Path) -> dict[str, Any]:
+    """A config; the suite ``mine.toml`` is a file of the user's, with the tasks of MT1."""
+    if request.param.get("suite") != "mine.toml":
+        return {"threads": 1, **request.param}
+    file = tmp_path / "mine.toml"
+    file.write_text((paths.suites_dir() / "MT1.toml").read_text())
+    return {"threads": 1, "suite": str(file)}
+
+
+# Of each split: slots, tasks of each, rows of an evaluation world, observations, actions.
+WORLDS: list[Any] = [
+    ({"suite": "MT4"}, {"train": (4, 50, 200, 450, 52)}),
+    ({"suite": "ML1"}, {"train": (1, 3, 3, 422, 52), "test": (1, 1, 1, 422, 52)}),
+    ({"suite": "mine.toml"}, {"train": (4, 1, 4, 426, 52)}),
+    ({"task": "HandOver"}, {"train": (1, 50, 50, 398, 40)}),
+    ({"task": "HandOver", "base": "moving"}, {"train": (1, 50, 50, 422, 52)}),
+    ({"suite": "metaworld/MT3"}, {"train": (3, 50, 15, 42, 4)}),
+]
+
+
+@pytest.mark.parametrize(("named", "expected"), WORLDS, indirect=["named"])
+def test_worlds_of_each_split(named: dict[str, Any], expected: dict[str, tuple[int, ...]]) -> None:
+    source = Worlds.open(named)
+    assert source.name == (named.get("suite") or named["task"])
+    assert source.splits == list(expected)
+    for split, (slots, tasks, rows, observations, actions) in expected.items():
+        world = source.world(split)
+        assert list(source.tasks(split)) == list(world.task_names) and world.num_tasks == slots
+        assert [len(pool) for pool in source.tasks(split).values()] == [tasks] * slots
+        assert world.num_envs == rows and world.autoreset_mode.name == "DISABLED"
+        assert world.single_observation_space.shape == (observations,)
+        assert world.single_action_space.shape == (actions,)
+        world.close()
+    training = source.world("train", 12, "SAME_STEP")
+    assert training.num_envs == 12 and training.autoreset_mode.name == "SAME_STEP"
+    training.close()
+
+
+def test_tasks_are_called_as_the_suite_file_calls_them() -> None:
+    ml1 = Worlds.open({"suite": "ML1"})
+    assert ml1.tasks("train") == {"CatchUnderarm": ["original", "left", "right"]}
+    assert ml1.tasks("test") == {"CatchUnderarm": ["back"]} and Worlds.open({"suite": "MT4"}).tasks("test") == {}
+
+
+def test_defaults_follow_the_source() -> None:
+    own, alone, foreign = (
+        Worlds.open(config) for config in ({"suite": "ML1"}, {"task": "HandOver"}, {"suite": "metaworld/MT10"})
+    )
+    assert [s.hides_goals for s in (own, alone, foreign)] == [True, False, False]
+    assert [s.on_gpu for s in (own, alone, foreign)] == [True, True, False]
+    assert [s.default_episodes for s in (own, alone, foreign)] == [4, 4, 1]
+    assert [s.preset and s.preset[0] for s in (own, alone, foreign)] == [None, None, "metaworld"]
+    assert own.rows_and_steps("cpu", adapts=True) == (300, 20_000_000)
+    assert alone.rows_and_steps("cuda:0", adapts=False) == (8192, 200_000_000)
+    assert foreign.rows_and_steps("cpu", adapts=False) == (40, 20_000_000)
+
+
+def test_references_are_of_moving_bases() -> None:
+    assert Worlds.open({"suite": "MT4"}).references().keys() >= {"CatchUnderarm"}
+    assert Worlds.open({"task": "HandOver"}).references() == {} == Worlds.open({"suite": "metaworld/MT3"}).references()
+    assert Worlds.open({"task": "HandOver", "base": "moving"}).references()
+
+
+def test_a_policy_is_judged_on_every_task_of_its_slots() -> None:
+    source = Worlds.open({"task": "Switch", "threads": 1})
+    world = source.world()
+    found = source.judge(ZeroAgent(world.action_space), world, 1, seed=3)
+    world.close()
+    assert len(found.classes["Switch"].returns) == 50 and found.classes["Switch"].reference is not None
+
+
+@pytest.mark.parametrize(
+    ("config", "told"),
+    [
+        ({"suite": "MT5"}, "Unknown suite 'MT5'. Did you mean"),
+        ({"suite": "none.toml"}, "Expected a suite file at none.toml"),
+        ({"task": "HandOvr"}, "Unknown task 'HandOvr'. Did you mean 'HandOver'?"),
+        ({"suite": "metaworld/MT4"}, "Unknown suite 'metaworld/MT4'. Did you mean 'metaworld/MT3'?"),
+    ],
+)
+def test_an_unknown_name_is_one_line(config: dict[str, Any], told: str) -> None:
+    with pytest.raises(BidexError) as error:
+        Worlds.open(config)
+    assert str(error.value).startswith(told) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("config", "split", "told"),
+    [
+        ({"suite": "MT4"}, "test", "MT4 has the splits train, got 'test'"),
+        ({"task": "HandOver"}, "test", "HandOver alone has no test split. Leave --split out."),
+        ({"suite": "metaworld/MT3"}, "test", "metaworld/MT3 has the split train alone, got 'test'."),
+        ({"suite": "metaworld/MT3", "device": "cuda"}, "train", "got --device cuda. Add --device cpu."),
+        ({"suite": "metaworld/MT3", "engine": "warp"}, "train", "got --engine warp. Add --device cpu."),
+    ],
+)
+def test_a_world_that_cannot_be_is_refused(config: dict[str, Any], split: str, told: str) -> None:
+    with pytest.raises(BidexError) as error:
+        Worlds.open(config).world(split)
+    assert told in str(error.value) and "\n" not in str(error.value)
+
+
+def test_nobody_else_asks_whose_suite_it_is() -> None:
+    asked = re.compile(r"METAWORLD_SUITES|metaworld_classes|metaworld\.(batched|library)")
+    others = [path for path in CORE.rglob("*.py") if path.parent.name not in ("worlds", "metaworld")]
+    asking = [path.name for path in others if asked.search(path.read_text())]
+    assert len(others) > 50 and asking == ["suite.py"]
+
+
+def test_a_config_is_taken_as_it_is_or_from_a_run() -> None:
+    config = WorldConfig(task="HandOver", seed=1, task_seed=5)
+    of_run = {"task": "HandOver", "suite": None, "algo": "ppo", "seed": 1, "task_seed": 5}
+    assert WorldConfig.of(of_run) == config == Worlds.open(config).config
+    assert Worlds.open(of_run).seed == 5
