@@ -213,7 +213,7 @@ def config_of(content: object, where: str) -> RunConfig[dict[str, Any]]:
     config = parse(content, RunConfig[dict[str, Any]], where)
     if (config.suite is None) == (config.task is None):
         raise BidexError(f"{where}: expected either a suite or a task, the other null. Name a run.")
-    return config
+    return dataclasses.replace(config)  # msgspec leaves defaults to the class, and does not write those
 
 
 def _brought_up(content: dict[str, Any]) -> dict[str, Any]:

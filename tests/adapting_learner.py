@@ -5,6 +5,8 @@ from typing import Any
 
 import torch
 
+from bidex_meta.train.learner import AutoresetMode
+from bidex_meta.train.learner import Learner as Contract
 from tests.points import Finder
 
 
@@ -21,16 +23,17 @@ class Config:
 PRESETS = {"laptop": Config(), "paper": Config(8)}
 
 
-class Learner:
+class Learner(Contract):
+    name = "finder"
+    presets = PRESETS
     adapts = True
-    per_process = ()
 
     def __init__(self, world: Any, config: Config, seed: int):
         self.mode = world.metadata["autoreset_mode"].name
         self.rows, self.env_steps = world.num_envs, 0
 
     @classmethod
-    def autoreset_mode(cls, config: Config) -> str:
+    def autoreset_mode(cls, config: Config) -> AutoresetMode:
         return "DISABLED"
 
     def iterate(self) -> dict[str, float]:

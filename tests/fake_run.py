@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+from bidex_meta.config import config_of
 from bidex_meta.record import RunFolder
 
 STEPS = 6
@@ -24,17 +25,17 @@ def main(words: list[str]) -> int:
         config |= {"num_envs": 8, "minutes": None, "learner": {}}
         config |= {"stop_at_return": float(given["stop-at-return"])} if "stop-at-return" in given else {}
         config |= {"start_from": str(Path(given["start-from"]).resolve())} if "start-from" in given else {}
-        folder = RunFolder.create(config, Path(given["run-dir"]))
+        folder = RunFolder.create(config_of(config, "fake"), Path(given["run-dir"]))
     with folder.locked():
         with (folder.path / "starts").open("a") as starts:
             cores = sorted(os.sched_getaffinity(0)) if sys.platform == "linux" else []
             starts.write(json.dumps({"at": time.time(), "cores": cores, "resumed": "resume" in given}) + "\n")
-        if folder.config()["seed"] == 13:
+        if folder.config().seed == 13:
             print("some warning\nbidex-meta: the physics broke.\n", file=sys.stderr)
             return 2
         saved = folder.checkpoints_path / "step"
         done = int(saved.read_text()) if saved.is_file() else 0
-        last = int(folder.config().get("stop_at_return", STEPS))
+        last = int(folder.config().stop_at_return or STEPS)
         for step in range(done + 1, last + 1):
             time.sleep(float(os.environ.get("FAKE_SECONDS", "0.01")))
             with folder.metrics_path.open("a") as metrics:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bidex_meta.errors import BidexError
 from bidex_meta.world.base import make_spaces, split_rows
-from bidex_meta.world.checking import clean
+from bidex_meta.world.checked import clean
 from bidex_meta.world.contract import plain_groups
 from bidex_meta.world.episodes import Clock, Episodes, checked_mode, checked_seed, ended_info, reset_mask
 

@@ -1,14 +1,32 @@
 """A small world that keeps the contract of ``bidex_meta.world.World``, without physics."""
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
 
+from bidex_meta.config import RunConfig, config_of
+from bidex_meta.record import RunFolder
 from tests.fake_world import FakeWorld
 
 SLOT_TASKS = [3, 2]
 SLOT_NAMES = ["Near", "Far"]
 STEPS_OF_TASK = [4, 9, 6]
+
+
+def run_config(**entries: Any) -> RunConfig[dict[str, Any]]:
+    """A run's config; on MT4 where no suite or task is named."""
+    usual = {"suite": None if entries.get("task") else "MT4", "task": None, "algo": "mtppo", "learner": {}}
+    return config_of({**usual, "num_envs": 8, "steps": 1000, "seed": 0, **entries}, "a test's config")
+
+
+def change(path: Path, **entries: Any) -> Path:
+    """Other entries in a run's ``config.json``."""
+    folder = RunFolder.open(path)
+    folder.change_config(run_config(**{**folder.config().to_json(), **entries}))
+    return path
 
 
 class ToyWorld(FakeWorld):

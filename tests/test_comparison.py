@@ -9,15 +9,14 @@ from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import iqm, iqm_difference, read_groups
 from bidex_meta.record import RunFolder
+from tests.fakes import change, run_config
 
 
 def run(
     root: Path, seed: int, successes: dict[str, float], algo: str = "mtppo", task: str | None = None, **learner: Any
 ) -> Path:
-    config = {"suite": None if task else "MT4", "task": task, "algo": algo, "seed": seed, "steps": 1000}
-    config |= {"num_envs": 8, "learner": learner}
     path = root / f"{algo}_{task}_{seed}_{learner}"
-    folder = RunFolder.create(config, path)
+    folder = RunFolder.create(run_config(task=task, algo=algo, seed=seed, learner=learner), path)
     metrics = [{"step": 500, "Perf/collection_time": 1700.0, "Perf/learning_time": 100.0}, {"step": 1000}]
     folder.metrics_path.write_text("".join(json.dumps(row) + "\n" for row in metrics))
     classes = {name: {"success": s, "return": 10 * s, "score": 100 * s} for name, s in successes.items()}
@@ -41,17 +40,10 @@ def test_runs_that_differ_in_the_seed_alone_are_one_group(tmp_path: Path):
 def test_runs_that_start_from_runs_of_their_own_seed_are_one_group(tmp_path: Path):
     paths = [run(tmp_path, seed, {"A": 0.5}) for seed in (0, 1, 2)]
     for number, path in enumerate(paths[:2]):
-        folder = RunFolder.open(path)
-        folder.change_config({**folder.config(), "start_from": f"/runs/{number}"})
+        change(path, start_from=f"/runs/{number}")
     started, fresh = groups(*paths)
     assert (started.label, started.seeds) == ("mtppo, started from another run", [0, 1])
     assert (fresh.label, fresh.seeds) == ("mtppo, started afresh", [2])
-
-
-def change(path: Path, **entries: Any) -> Path:
-    folder = RunFolder.open(path)
-    folder.change_config({**folder.config(), **entries})
-    return path
 
 
 @pytest.mark.parametrize(
@@ -59,7 +51,7 @@ def change(path: Path, **entries: Any) -> Path:
     [
         ("dataset", [], ["HandOver/medium-v0"], "medium-v0"),
         ("dataset", ["HandOver/medium-v0"], ["HandOver/medium-v0", "/data/mine"], "medium-v0 + /data/mine"),
-        ("demonstrations", None, "HandOver/demonstrations-v0", "demonstrations-v0"),
+        ("demonstrations", [], ["HandOver/demonstrations-v0"], "demonstrations-v0"),
         ("points", 0, 256, "256"),
         ("object", None, "mug", "mug"),
         ("base", "own", "moving", "moving"),
@@ -78,7 +70,7 @@ def test_runs_of_other_data_or_worlds_are_other_groups(
 
 def test_data_sets_called_as_their_class_leave_classes_one_group(tmp_path: Path):
     paths = [
-        change(run(tmp_path, 0, {c: 0.5}, "bc", task=c), dataset=[f"{c}/medium-v0"], demonstrations=f"{c}/d")
+        change(run(tmp_path, 0, {c: 0.5}, "bc", task=c), dataset=[f"{c}/medium-v0"], demonstrations=[f"{c}/d"])
         for c in ("A", "B")
     ]
     assert [(group.label, group.classes) for group in groups(*paths)] == [("bc", ["A", "B"])]
@@ -145,8 +137,7 @@ def test_an_evaluation_that_is_torn_or_of_fewer_steps_is_refused(tmp_path: Path)
 
 def test_a_run_that_time_ended_is_of_the_steps_it_made(tmp_path: Path):
     path = run(tmp_path, 0, {"A": 0.5})
-    folder = RunFolder.open(path)
-    folder.change_config({**folder.config(), "steps": 10**9, "minutes": 4.0})
+    change(path, steps=10**9, minutes=4.0)
     found = json.loads((path / "evaluation.json").read_text())
     (path / "evaluation.json").write_text(json.dumps({"steps": 1000, **found}))
     [group] = groups(path)

@@ -8,7 +8,7 @@ import pytest
 
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.histories import over_runs, read_histories
+from bidex_meta.evaluation.comparison import over_runs, read_histories
 from bidex_meta.evaluation.statistics import bootstrap_band, bootstrap_interval, mean
 from bidex_meta.record import RunFolder
 from tests.test_comparison import run
@@ -51,7 +51,7 @@ def test_runs_are_grouped_whether_evaluated_or_not(tmp_path: Path):
     folders = [log(path, *rows) for path in (*paths, other)]
     first, second = read_histories(folders)
     assert (first.label, second.label) == ("mtppo, gamma 0.9", "mtppo, gamma 0.8")
-    assert [len(each.folders) for each in (first, second)] == [2, 1]
+    assert [len(each.runs) for each in (first, second)] == [2, 1]
     assert list(first.curves) == ["Train/success/A"]
     with pytest.raises(BidexError, match="holds nothing yet"):
         read_histories([log(paths[0])])

@@ -32,7 +32,7 @@ def test_a_run_reads_clouds_and_is_evaluated_on_them(
     flags += ["--learner.warmup-steps", "2"] if algo == "sac" else []
     assert main(["run", *flags, "--steps", "64", "--episodes", "1", "--run-dir", str(tmp_path / "a")]) == 0
     folder = RunFolder.open(tmp_path / "a")
-    assert folder.config()["points"] == 24 and read_metrics(folder.metrics_path)[-1]["step"] >= 64
+    assert folder.config().points == 24 and read_metrics(folder.metrics_path)[-1]["step"] >= 64
     assert folder.evaluation()["policy"]["classes"].keys() == {"HandOver"}
     state, _ = checkpoint(folder, "last")
     shapes = [each.shape for name, each in state["learner"]["policy"]["weights"].items() if "shared.0.weight" in name]
@@ -52,7 +52,7 @@ def test_a_data_set_of_clouds_is_learned_from(tmp_path: Path) -> None:
     flags = ["--algo", "bc", "--steps", "2", "--threads", "1", "--device", "cpu", "--logger", "none", *small]
     assert main(["run", "--dataset", str(seen / "replay"), *flags, "--run-dir", str(learned)]) == 0
     config = RunFolder.open(learned).config()
-    assert (config["task"], config["points"], config["learner"]["point_widths"]) == ("HandOver", 24, [32, 64])
+    assert (config.task, config.points, config.learner["point_widths"]) == ("HandOver", 24, [32, 64])
 
 
 def test_a_suite_file_asks_for_points(tmp_path: Path) -> None:

@@ -11,13 +11,13 @@ from bidex_meta.evaluation.references import Reference
 from bidex_meta.tasks import registry
 from bidex_meta.worlds import Worlds
 from bidex_meta.worlds.own import OwnSuite
-from tests.fakes import ToyWorld
+from tests.fakes import ToyWorld, run_config
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(references, "reference_path", lambda kind: tmp_path / f"{kind}.json")
-    return tmp_path
+    monkeypatch.setattr(paths, "assets_dir", lambda: tmp_path)
+    return tmp_path / "references"
 
 
 def test_without_a_file_nothing_is_known(folder: Path) -> None:
@@ -30,13 +30,13 @@ def test_scores_of_another_day_are_told_by_todays_references(folder: Path, base:
         references.store(folder / f"{kind}.json", {name: {"return": value} for name in ("A", "B")}, {})
     rows = {name: {"return": 2.0, "success": 0.5, "score": score} for name, score in (("A", 90.0), ("B", None))}
     foreign = {"Lamp": {"return": 2.0, "score": 7.0}}
-    assert references.rescored(rows | foreign, {"base": base}) == {
+    assert references.rescored(rows | foreign, run_config(base=base)) == {
         "A": {"return": 2.0, "success": 0.5, "score": 25.0},
         "B": {"return": 2.0, "success": 0.5, "score": 25.0},
         **foreign,
     }
     unscored = {"B": rows["B"]}  # nobody could say of what base, but where the run says so itself
-    assert references.rescored(unscored, {"base": base})["B"]["score"] == (25.0 if base == "moving" else None)
+    assert references.rescored(unscored, run_config(base=base))["B"]["score"] == (25.0 if base == "moving" else None)
 
 
 def test_storing_keeps_the_other_classes_and_how_each_was_made(folder: Path) -> None:

@@ -7,16 +7,18 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
 from bidex_meta.cli import main
+from bidex_meta.config import config_of
 from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder, read_metrics
+from bidex_meta.train import distributed
 from bidex_meta.train.distributed import TIMEOUT
 from tests.algos.ranks import same
 
@@ -176,7 +178,7 @@ def test_a_run_of_two_processes_is_not_resumed_by_one(tmp_path: Path, capsys: py
     assert main(["run", *SMALL, "--print-config"]) == 0
     config = json.loads(capsys.readouterr().out)
     assert config["processes"] == 1
-    RunFolder.create({**config, "processes": 2}, path)
+    RunFolder.create(config_of({**config, "processes": 2}, "a test"), path)
     assert main(["run", "--resume", str(path)]) == 2
     message = capsys.readouterr().err
     assert f"Continue: torchrun --nproc-per-node 2 -m bidex_meta.cli run --resume {path}" in message
@@ -192,7 +194,7 @@ def test_each_process_takes_its_share_of_threads_and_a_gpu_of_its_own(monkeypatc
         monkeypatch.setenv(name, str(value))
     monkeypatch.setattr(run_config, "_cores", lambda: 10)
     config = run_config.plan_run(["--suite", "MT4", "--device", "cpu"]).config
-    assert (config["threads"], config["processes"], config["device"]) == (2, 8, "cpu")
+    assert (config.threads, config.processes, config.device) == (2, 8, "cpu")
     assert launch().own_device("cuda") == "cuda:1"
     assert resume_command(Path("r"), 8).startswith("torchrun --nnodes 2 --nproc-per-node 4 -m bidex_meta.cli")
     monkeypatch.delenv("MASTER_ADDR")
@@ -202,24 +204,25 @@ def test_each_process_takes_its_share_of_threads_and_a_gpu_of_its_own(monkeypatc
 def test_a_run_from_before_several_processes_is_one_of_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from bidex_meta.commands.run_config import plan_run
 
-    config = plan_run(SMALL).config
+    folder = RunFolder.create(plan_run(SMALL).config, tmp_path / "r")
+    config = folder.config().to_json()
     del config["processes"]
-    RunFolder.create(config, tmp_path / "r")
-    assert plan_run(["--resume", str(tmp_path / "r")]).config["processes"] == 1
+    folder.config_path.write_text(json.dumps(config))
+    assert plan_run(["--resume", str(tmp_path / "r")]).config.processes == 1
 
 
-def test_processes_that_disagree_are_refused(tmp_path: Path) -> None:
+def test_processes_that_disagree_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     from bidex_meta.commands.run import _agree
     from bidex_meta.commands.run_config import plan_run
 
     plan = plan_run(SMALL)
 
-    def agree(other: dict[str, Any], step: int | None = None) -> Any:
-        group = SimpleNamespace(share=lambda mine: [mine, (plan.config | other, step)], together=lambda check: check())
-        return _agree(plan, None, group)
+    def agree(step: int | None = None, **other: Any) -> Any:
+        monkeypatch.setattr(distributed, "share", lambda mine: [mine, (replace(plan.config, **other), step)])
+        return _agree(plan, None)
 
-    assert agree({"threads": 99}).config["threads"] == 1
+    assert agree(threads=99).config.threads == 1
     with pytest.raises(BidexError, match=r"Process 1 has steps = 5, not .* Start all with the same flags"):
-        agree({"steps": 5})
+        agree(steps=5)
     with pytest.raises(BidexError, match="Process 1 finds a checkpoint at 64 steps, process 0 at None"):
-        agree({}, 64)
+        agree(64)

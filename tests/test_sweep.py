@@ -13,11 +13,13 @@ from typing import Any
 import pytest
 
 from bidex_meta.cli import main
+from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder
 from bidex_meta.sweep import queue
 from bidex_meta.sweep.plan import PlannedRun, read_sweep
 from bidex_meta.sweep.queue import State, state_of
+from tests.fakes import run_config
 from tests.pages import ROOT
 from tools import collect
 
@@ -30,7 +32,7 @@ overrides = { steps = 6, num_envs = 8 }
 """
 FAKE = (sys.executable, str(Path(__file__).with_name("fake_run.py")))
 CORES = os.sched_getaffinity(0) if sys.platform == "linux" else {0}
-CONFIG = {"steps": 6, "minutes": None, "num_envs": 8}
+CONFIG = run_config(task="HandOver", algo="ppo", steps=6)
 
 
 @pytest.fixture
@@ -51,7 +53,7 @@ def starts(root: Path) -> dict[str, list[dict[str, Any]]]:
     return {path.parent.name: [json.loads(line) for line in path.read_text().splitlines()] for path in found}
 
 
-def state(run: PlannedRun, config: dict[str, Any] = CONFIG) -> State:
+def state(run: PlannedRun, config: RunConfig[Any] = CONFIG) -> State:
     return state_of(replace(run, config=config))
 
 
@@ -83,7 +85,7 @@ def test_a_run_that_its_return_ended_is_done_at_the_steps_it_made(
     file: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:
     file.write_text(FILE.replace("steps = 6", "steps = 6, stop_at_return = 4"))
-    config = {**CONFIG, "stop_at_return": 4.0}
+    config = replace(CONFIG, stop_at_return=4.0)
     monkeypatch.setattr("bidex_meta.commands.sweep._configs", lambda sweep, _: {r.words: config for r in sweep.runs})
     assert main(["sweep", str(file)]) == 0
     assert "2 done, 0 runs, 0 failed, 0 left" in capsys.readouterr().out
@@ -221,8 +223,8 @@ def test_one_sweep_works_in_a_folder_and_a_changed_file_is_noticed(file: Path, t
         assert "Another sweep works in" in capsys.readouterr().err
     assert main(["sweep", str(file)]) == 0
     with pytest.raises(BidexError, match="num_envs is 8 there, not 16"):
-        state(read_sweep(file).runs[0], {**CONFIG, "num_envs": 16})
-    more = state(read_sweep(file).runs[0], {**CONFIG, "steps": 12})
+        state(read_sweep(file).runs[0], replace(CONFIG, num_envs=16))
+    more = state(read_sweep(file).runs[0], replace(CONFIG, steps=12))
     assert (more.state, more.step, more.speed) == ("left", 6, 2.0), "more steps: the run goes on"
 
 
@@ -241,11 +243,11 @@ def test_how_long_the_rest_takes(file: Path, tmp_path: Path, monkeypatch, capsys
     file.write_text(FILE.replace("[0, 1]", "[0, 1, 2]"))
     run = read_sweep(file).runs[0]
     run.path.mkdir(parents=True)
-    (run.path / "config.json").write_text(json.dumps({"suite": None, "task": "HandOver", "algo": "ppo", "seed": 0}))
+    (run.path / "config.json").write_text(json.dumps(CONFIG.to_json()))
     (run.path / "metrics.jsonl").write_text('{"step": 3, "Perf/training_time": 3600}\n')
     assert main(["sweep", str(file), "--status"]) == 0
     assert "0 done, 0 runs, 0 failed, 3 left; about 5.00 core-hours" in capsys.readouterr().out, "1 h of 2, and 2 · 2 h"
-    timed = {**CONFIG, "minutes": 90.0}
+    timed = replace(CONFIG, minutes=90.0)
     monkeypatch.setattr("bidex_meta.commands.sweep._configs", lambda sweep, _: {r.words: timed for r in sweep.runs})
     assert main(["sweep", str(file), "--status"]) == 0
     assert "about 3.50 core-hours" in capsys.readouterr().out, "0.5 h, and 2 · 1.5 h"

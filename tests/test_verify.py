@@ -16,7 +16,7 @@ from bidex_meta.evaluation.results import ClassResult
 from bidex_meta.record import RunFolder
 from bidex_meta.worlds import Worlds
 from bidex_meta.worlds.own import OwnSuite
-from tests.fakes import ToyWorld
+from tests.fakes import ToyWorld, run_config
 from tests.test_metatest_commands import COUNTS, points
 
 SMALL = ["--suite", "MT4", "--num-envs", "6", "--threads", "1", "--device", "cpu", "--learner.hidden", "8"]
@@ -228,6 +228,6 @@ def test_what_was_not_recorded_is_said_once():
     now = conditions(Worlds.open({"suite": "metaworld/MT3", "device": "cpu", "threads": 1}))
     assert "metaworld" in now["packages"] and now["physics"] is None
     assert others(now, now) == []
-    assert others(recorded_conditions({}, {}, {"device": "cpu"}), now) == [
+    assert others(recorded_conditions({}, {}, run_config(device="cpu")), now) == [
         "not recorded: " + ", ".join(now["packages"])
     ]

@@ -18,9 +18,9 @@ from bidex_meta.engine.cpu import CpuEngine
 from bidex_meta.errors import BidexError, unknown_name
 from bidex_meta.validation import whole_number
 from bidex_meta.world.base import Transition
-from bidex_meta.world.checking import fits
+from bidex_meta.world.checked import fits
 from bidex_meta.world.contract import State
-from bidex_meta.world.foreign import OWN_DRAWS, ForeignWorld, Sizes
+from bidex_meta.world.foreign_world import OWN_DRAWS, ForeignWorld, Sizes
 
 NAME = "Humanoid-v5"
 EPISODE_STEPS = 1000

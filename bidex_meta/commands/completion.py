@@ -1,16 +1,16 @@
 """``bidex-meta completion``: a script that completes commands, flags and names in a shell."""
 
 import contextlib
-import dataclasses
 import importlib
 import io
-from collections.abc import Sequence
-from dataclasses import MISSING, dataclass, field
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from bidex_meta.commands.parsing import flags_of, parse
+from bidex_meta.commands.parsing import FlagsFound, flags_of, parse
 
 
 @dataclass(frozen=True)
@@ -32,48 +32,41 @@ def main(arguments: Sequence[str]) -> None:
     from bidex_meta.commands import COMMANDS
 
     app = tyro.extras.SubcommandApp()
-    names = _names()
     for name, command in COMMANDS.items():
         found = flags_of(importlib.import_module(command.module).main)
-        app.command(name=name, help=command.summary)(_takes(_with_names(found.options, names)))
+        app.command(name=name, help=command.summary)(_takes(found))
     script = io.StringIO()
     # tyro prints and exits.
     with contextlib.redirect_stdout(script), contextlib.suppress(SystemExit):
         app.cli(prog="bidex-meta", args=["--tyro-print-completion", shell])
-    # tyro's script gives a line to each completion, but keeps the line breaks of help texts.
-    lines = script.getvalue().splitlines()
-    lines = [line.replace("\\n", " ") if line.startswith("COMPLETION_SPEC = ") else line for line in lines]
-    print("\n".join(lines))
+    for line in script.getvalue().splitlines():
+        if line.startswith("COMPLETION_SPEC = "):
+            # tyro's script gives a line to each completion, but keeps the line breaks of help texts.
+            line = re.sub(r"\\+n", " ", line)
+            for flag, names in _names().items():
+                line = re.sub(
+                    rf"({{'flags': \['{flag}'\].*?)'type': '\w+'", rf"\1'type': 'choice', 'choices': {names}", line
+                )
+        print(line)
 
 
 def _names() -> dict[str, list[str]]:
-    """What the values of flags may be, by the flag's name."""
+    """What the values of flags may be."""
     from bidex_meta.commands.learners import ALGOS
     from bidex_meta.tasks import registry
     from bidex_meta.tasks.objects.held import EGG, shelf
     from bidex_meta.worlds import suites_to_run
 
-    things = [EGG, *shelf()]
-    return {"suite": suites_to_run(), "task": registry.names(), "algo": list(ALGOS), "object": things}
+    names = {"--suite": suites_to_run(), "--task": registry.names(), "--algo": list(ALGOS)}
+    return {**names, "--object": [EGG, *shelf()]}
 
 
-def _with_names(options: type, names: dict[str, list[str]]) -> type:
-    """A dataclass of flags in which some are a choice of names."""
-    fields = [entry for entry in dataclasses.fields(options) if entry.name in names]
-    # Any of the names serves as a default, which a completion does not show.
-    chosen = [
-        (entry.name, Literal[tuple(known)], field() if entry.default is MISSING else field(default=known[0]))
-        for entry in fields
-        for known in [names[entry.name]]
-    ]
-    return dataclasses.make_dataclass(options.__name__, chosen, bases=(options,), frozen=True)
-
-
-def _takes(options: type) -> Any:
-    """A function of the flags, which is how tyro is told of a subcommand."""
+def _takes(found: FlagsFound) -> Callable[..., None]:
+    """A function of a command's flags, from which tyro reads them."""
 
     def command(flags: Any) -> None: ...
 
     # A name of its own would stand before every flag.
-    command.__annotations__["flags"] = Annotated[options, tyro.conf.arg(name="")]
+    command.__annotations__["flags"] = Annotated[found.options, tyro.conf.arg(name="")]
+    command.__defaults__ = None if found.default is None else (found.default,)
     return command

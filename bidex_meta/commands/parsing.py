@@ -14,6 +14,9 @@ from typing import Annotated, Any, NoReturn, TypeVar
 import tyro
 
 from bidex_meta.errors import BidexError
+from bidex_meta.record.atomic import check_writable, refuse_links
+from bidex_meta.record.folder import RunFolder
+from bidex_meta.record.stored import StoredRun, open_run
 from bidex_meta.validation import check_fields
 
 Options = TypeVar("Options")
@@ -53,6 +56,34 @@ Switch = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
 RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
 """A run folder, as the first word."""
+
+
+RunPaths = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
+"""Run folders, or files of ``results/data/``."""
+
+
+def named_runs(paths: Sequence[Path], command: str) -> list[RunFolder | StoredRun]:
+    """The runs that a command was given.
+
+    Raises:
+        BidexError: None, or one that is no run.
+    """
+    if not paths:
+        raise BidexError(f"Name the run folders: bidex-meta {command} RUN...")
+    return [open_run(path) for path in paths]
+
+
+def output(asked: Path | None, runs: Sequence[RunFolder | StoredRun], name: str) -> Path:
+    """Where a command writes: as asked, else of this name into the run's folder or, of several runs, here.
+
+    Raises:
+        BidexError: The file cannot be written.
+    """
+    out = asked or (runs[0].path if len(runs) == 1 and runs[0].path.is_dir() else Path()) / name
+    if asked is None:
+        refuse_links(out)
+    check_writable(out)
+    return out
 
 
 def parse(options: type[Options], arguments: Sequence[str], command: str, default: Options | None = None) -> Options:

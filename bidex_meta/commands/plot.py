@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
-import tyro
-
-from bidex_meta.commands.parsing import Switch, parse
+from bidex_meta.commands.parsing import RunPaths, Switch, named_runs, output, parse
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.comparison import read_histories
+from bidex_meta.record import plots
+from bidex_meta.record.stored import StoredRun
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class PlotFlags:
     Runs that differ in the seed alone are one line, with the 95 % bootstrap interval over runs.
     """
 
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
+    runs: RunPaths
     """Run folders, or files of results/data/."""
     adaptation: Switch = False
     """Against shots of adaptation, from the meta-test in the run's evaluation.json; of one run."""
@@ -37,31 +37,18 @@ def main(arguments: Sequence[str]) -> None:
         BidexError: No run is named, or there is nothing to draw.
     """
     flags = parse(PlotFlags, arguments, "plot")
-    if not flags.runs:
-        raise BidexError("Name the run folders to draw: bidex-meta plot RUN...")
-
-    from bidex_meta.record import plots
-    from bidex_meta.record.atomic import check_writable, refuse_links
-    from bidex_meta.record.stored import StoredRun, open_run
-
-    runs = [open_run(path) for path in flags.runs]
-    home = runs[0].path if len(runs) == 1 and runs[0].path.is_dir() else Path()
-    if flags.out is None:
-        refuse_links(home / "curves.png", home / "adaptation.png")
+    runs = named_runs(flags.runs, "plot")
+    if not (flags.adaptation or flags.evaluation):
+        out = output(flags.out, runs, "curves.png")
+        figure = plots.draw_learning([(history.label, history.curves) for history in read_histories(runs)])
+    elif len(runs) > 1:
+        raise BidexError(f"--adaptation draws one run, got {len(runs)}. bidex-meta report shows all.")
     else:
-        check_writable(flags.out)
-    if flags.adaptation or flags.evaluation:
-        if len(runs) > 1:
-            raise BidexError(f"--adaptation draws one run, got {len(runs)}. bidex-meta report shows all.")
-        out, source = flags.out or home / "adaptation.png", flags.evaluation or home / "evaluation.json"
+        out = output(flags.out, runs, "adaptation.png")
         if isinstance(runs[0], StoredRun) and flags.evaluation is None:
             figure = plots.draw_adaptation(runs[0].evaluation(), runs[0].path)
         else:
+            source = flags.evaluation or runs[0].path / "evaluation.json"
             figure = plots.draw_adaptation(plots.read_evaluation(source), source)
-    else:
-        from bidex_meta.evaluation.histories import read_histories
-
-        out = flags.out or home / "curves.png"
-        figure = plots.draw_learning([(history.label, history.curves) for history in read_histories(runs)])
     plots.save(figure, out)
     print(out)

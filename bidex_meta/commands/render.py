@@ -102,7 +102,7 @@ def main(arguments: Sequence[str]) -> None:
 
 def _with_clouds(world: Any) -> Any:
     """The world with clouds in its pictures."""
-    from bidex_meta.evaluation.seen import SeenWorld
+    from bidex_meta.evaluation.filming import SeenWorld
     from bidex_meta.points.depth_sensor import PointsRule
     from bidex_meta.world import World
 

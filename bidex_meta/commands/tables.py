@@ -9,6 +9,7 @@ from rich.table import Table
 
 from bidex_meta.errors import one_line
 from bidex_meta.evaluation.agreement import DIFFERS, Agreement
+from bidex_meta.evaluation.comparison import Group, iqm, score_over, success_over
 from bidex_meta.evaluation.gains import Gains
 from bidex_meta.evaluation.results import Difference, Evaluation, compare
 from bidex_meta.evaluation.statistics import Interval
@@ -32,21 +33,16 @@ def evaluation_table(
         random: The same of a random policy on the same tasks.
         gains: What adaptation gained.
     """
-    table = Table(title=escape(title), title_justify="left", caption_justify="left")
-    table.caption = "[..] 95 % bootstrap interval over tasks (of few: episodes); success: at any step of the episode"
-    table.add_column("task")
+    caption = "[..] 95 % bootstrap interval over tasks (of few: episodes); success: at any step of the episode"
     headers = ["episodes", "length", "success", "return [95 %]", "score"]
     if random is not None:
         headers += ["random success", "random return [95 %]", "return above random [95 %]"]
     if gains is not None:
         headers += ["success gained [95 %]", "return gained [95 %]", "score gained [95 %]"]
-        table.caption += (
-            "\ngained: above the same episodes before adaptation; resampled: adaptations, and their episodes"
-        )
-    for header in headers:
-        table.add_column(header, justify="right")
+        caption += "\ngained: above the same episodes before adaptation; resampled: adaptations, and their episodes"
     if any(result.unstable for result in policy.classes.values()):
-        table.caption += f"\n{_BROKEN}"
+        caption += f"\n{_BROKEN}"
+    table = _titled(title, caption, ["task"], headers)
     differences = compare(policy, random) if random is not None else {}
     rows, others = policy.to_json(), random.to_json() if random is not None else None
     for name, row in rows["classes"].items():
@@ -85,14 +81,12 @@ def _gained(measures: Mapping[str, Difference | None]) -> list[str]:
 
 
 def control_table(title: str, by_arm: Mapping[str, Mapping[str, Any]]) -> Table:
-    """What ``bidex_meta.evaluation.control_arms.arms`` found: an arm a row."""
-    table = Table(title=escape(title), title_justify="left", caption_justify="left")
-    table.caption = (
+    """What ``bidex_meta.evaluation.control_arms.arms`` gives: an arm a row."""
+    caption = (
         "gains: own data above this arm, same starts; [..] 95 % bootstrap interval over runs, adaptations, episodes"
     )
-    table.add_column("adapted to")
-    for header in ("return", "return of each run", "success", "success gained", "return gained", "score gained"):
-        table.add_column(header, justify="right")
+    headers = ("return", "return of each run", "success", "success gained", "return gained", "score gained")
+    table = _titled(title, caption, ["adapted to"], headers)
     labels = {"before": "nothing", "own": "its own data", "foreign": "train tasks' data, mean"}
     for arm, values in by_arm.items():
         of_runs = " ".join(f"{value:.4g}" for value in values["runs"])
@@ -108,18 +102,46 @@ def control_table(title: str, by_arm: Mapping[str, Mapping[str, Any]]) -> Table:
 
 def agreement_table(title: str, found: Sequence[Agreement]) -> Table:
     """A recorded evaluation and the same made again, a class a row."""
-    table = Table(title=escape(title), title_justify="left", caption_justify="left")
-    table.caption = "within: apart by no more than both 95 % intervals allow, over all classes together"
-    for header in ("task", "outcome"):
-        table.add_column(header)
-    for header in ("success", "again", "return [95 %]", "again"):
-        table.add_column(header, justify="right")
+    caption = "within: apart by no more than both 95 % intervals allow, over all classes together"
+    headers = ("success", "again", "return [95 %]", "again")
+    table = _titled(title, caption, ["task", "outcome"], headers)
     for each in found:
         was, now = each.recorded, each.again
         cells = [_name(each.name), each.outcome, _percent(was["success"]), _percent(now["success"])]
         cells += [_ranged(row["return"], row.get("return_interval")) for row in (was, now)]
         table.add_row(*cells, style="bold red" if each.outcome == DIFFERS else None)
     return table
+
+
+def group_table(groups: Sequence[Group]) -> tuple[list[str], list[list[str]]]:
+    """Columns and rows of groups of runs beside each other, each measured against the first."""
+    columns = ["group", "seeds", "steps", "hours", "success, IQM (%)", "score, IQM"]
+    rows = []
+    for group in groups:
+        score = None if group.scores is None else iqm(group.scores)
+        measures = (iqm(group.success), 100.0, ".1f"), (score, 1.0, ".1f")
+        over = (success_over(group, groups[0]), 100.0, "+.1f"), (score_over(group, groups[0]), 1.0, "+.1f")
+        cells = [_NONE if each is None else each.text(factor, form=form) for each, factor, form in (*measures, *over)]
+        seeds = ", ".join(map(str, group.seeds))
+        rows.append([group.label, seeds, group.steps_text(), f"{group.hours:.2f}", *cells])
+    return [*columns, "success over the first", "score over the first"], rows
+
+
+def class_table(groups: Sequence[Group]) -> tuple[list[str], list[list[str]]]:
+    """Columns and rows of each class by name: mean over seeds, and the seeds' range."""
+    names = list(dict.fromkeys(name for group in groups for name in group.classes))
+    rows = []
+    for group in groups:
+        for measure, values, factor, unit in (
+            ("success", group.success, 100.0, " %"),
+            ("return", group.returns, 1.0, ""),
+        ):
+            cells = {
+                name: f"{factor * of.mean():.4g}{unit} ({factor * of.min():.4g} to {factor * of.max():.4g})"
+                for name, of in zip(group.classes, values.T, strict=True)
+            }
+            rows.append([group.label, measure, *(cells.get(name, _NONE) for name in names)])
+    return ["group", "measure", *names], rows
 
 
 def plain_table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> Table:
@@ -130,6 +152,15 @@ def plain_table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> Tab
         table.add_column(_name(column), justify="right" if numbers else "left")
     for row in rows:
         table.add_row(*(f"{cell:,.4g}" if isinstance(cell, float) else _name(str(cell)) for cell in row))
+    return table
+
+
+def _titled(title: str, caption: str, left: Sequence[str], right: Sequence[str]) -> Table:
+    table = Table(title=escape(title), title_justify="left", caption=caption, caption_justify="left")
+    for header in left:
+        table.add_column(header)
+    for header in right:
+        table.add_column(header, justify="right")
     return table
 
 

@@ -11,10 +11,14 @@ import numpy as np
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.references import rescored
-from bidex_meta.evaluation.statistics import Interval, bootstrap_interval
+from bidex_meta.evaluation.statistics import Interval, bootstrap_band, bootstrap_interval
 from bidex_meta.outside import name_with_object, short_name
 from bidex_meta.record.metrics import training_seconds
+from bidex_meta.record.plots import Curve
 from bidex_meta.record.stored import Run
+
+_POINTS = 200
+"""Of a curve over several runs."""
 
 
 @dataclass(frozen=True)
@@ -135,6 +139,20 @@ def iqm_difference(a: np.ndarray, b: np.ndarray) -> Estimate:
     return Estimate(value, interval)
 
 
+def success_over(group: Group, first: Group) -> Estimate | None:
+    """Success above the first group's; None of the first itself, and of other classes than its own."""
+    known = group is not first and set(group.classes) == set(first.classes)
+    return iqm_difference(group.success, first.success) if known else None
+
+
+def score_over(group: Group, first: Group) -> Estimate | None:
+    """Normalised score above the first group's; None too where either is unknown."""
+    known = group is not first and set(group.classes) == set(first.classes)
+    if not known or group.scores is None or first.scores is None:
+        return None
+    return iqm_difference(group.scores, first.scores)
+
+
 def _iqm(values: np.ndarray) -> float:
     from scipy.stats import trim_mean
 
@@ -241,3 +259,65 @@ def _group(label: str, members: list[dict[str, Any]]) -> Group:
         hours=float(np.mean([rows[seed]["seconds"] for seed in seeds])) / 3600.0,
         paths=[run["path"] for run in members],
     )
+
+
+@dataclass(frozen=True)
+class History:
+    """Runs that differ in the seed alone."""
+
+    label: str
+    """The algo, and what tells the group from others of that algo."""
+    runs: list[Run]
+    """Its runs."""
+    curves: dict[str, Curve]
+    """Of each tag that a run has logged."""
+
+
+def read_histories(runs: Sequence[Run]) -> list[History]:
+    """Runs, evaluated or not, by group, in the order they are named.
+
+    Raises:
+        BidexError: None of them has logged anything.
+    """
+    kinds = [{"kind": run_kind(run.config()), "run": run} for run in runs]
+    groups = [(label, [member["run"] for member in members]) for label, members in by_kind(kinds)]
+    histories = [History(label, members, curves_of(members)) for label, members in groups]
+    if not any(history.curves for history in histories):
+        raise BidexError(f"{runs[0].path} holds nothing yet: nothing to draw. Let the run go on.")
+    return histories
+
+
+def curves_of(runs: Sequence[Run]) -> dict[str, Curve]:
+    """Of each tag that one of the runs has logged: see :func:`over_runs`."""
+    logged = [run.metrics() for run in runs]
+    tags = dict.fromkeys(tag for rows in logged for row in rows for tag in row if tag not in ("step", "time"))
+    curves = {tag: over_runs([_series(rows, tag) for rows in logged]) for tag in tags}
+    return {tag: curve for tag, curve in curves.items() if curve is not None}
+
+
+def over_runs(series: Sequence[tuple[np.ndarray, np.ndarray]]) -> Curve | None:
+    """Mean and 95 % bootstrap interval over runs; None where no run has a point.
+
+    Args:
+        series: Steps and values of each run, each (points,). Several are interpolated to 200 steps between the last of
+            their first points and the first of their last ones, so that each point is of all runs; a run without a
+            point is left out.
+    """
+    known = [(steps, values) for steps, values in series if len(steps)]
+    if not known:
+        return None
+    if len(known) == 1:
+        return Curve(*known[0], None, None)
+    first, last = max(steps[0] for steps, _ in known), min(steps[-1] for steps, _ in known)
+    if first > last:  # they have no step in common
+        first = last
+    grid = np.unique(np.linspace(first, last, _POINTS))
+    table = np.array([np.interp(grid, steps, values) for steps, values in known])
+    low, high = bootstrap_band(table)
+    return Curve(grid, table.mean(axis=0), low, high)
+
+
+def _series(rows: list[dict[str, Any]], tag: str) -> tuple[np.ndarray, np.ndarray]:
+    points = [(row["step"], row[tag]) for row in rows if row.get(tag) is not None]
+    steps, values = zip(*points, strict=True) if points else ((), ())
+    return np.array(steps, float), np.array(values, float)

@@ -1,36 +1,78 @@
-"""The two ends of the normalised score: per class what a policy that has learned nothing gets, and the best known one.
+"""What a return is measured against: the normalised score's two ends, and what an episode of broken physics counts for.
 
-They hold for classes with moving bases, as every suite has them. Files under ``assets/references/``: ``random.json``
-and ``zero.json``, the returns of random actions and of doing nothing, the better of which is the score's zero, and
-``expert.json``; ``witness.json`` and ``script.json`` hold what witnesses get open loop and scripts in closed loop.
-``bidex-meta baseline`` measures all but ``expert.json``, which ``python -m tools.experts`` of the repository writes.
+The references hold for classes with moving bases, as every suite has them. Files under ``assets/references/``:
+``random.json`` and ``zero.json``, the returns of random actions and of doing nothing, the better of which is the
+score's zero, and ``expert.json``; ``witness.json`` and ``script.json`` hold what witnesses get in open-loop replay and
+scripted policies in closed loop. ``bidex-meta baseline`` measures all but ``expert.json``, which ``python -m
+tools.experts`` of the repository writes.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict
 
 import numpy as np
 
 from bidex_meta import paths
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.references import Reference
-from bidex_meta.reading import TABLE, check, exists, number, read_json
+from bidex_meta.reading import exists, read_json
 from bidex_meta.record.atomic import write_json
+from bidex_meta.validation import Finite, parse
 
 Kind = Literal["random", "zero", "expert", "witness", "script"]
+_Row = TypedDict("_Row", {"return": Finite})
 
 
-def reference_path(kind: Kind) -> Path:
-    """Where the references of a kind lie."""
-    return paths.assets_dir() / "references" / f"{kind}.json"
+class _File(TypedDict):
+    classes: dict[str, _Row]
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What a class's return is measured against."""
+
+    random: float
+    """Mean return of uniform actions."""
+    expert: float | None = None
+    """Mean return of the best known policy; None where none is known that is above the floor."""
+    zero: float | None = None
+    """Mean return of zero actions, where it is known."""
+
+    @property
+    def floor(self) -> float:
+        """The score's zero: what a policy that has learned nothing gets, by doing anything or nothing."""
+        return self.random if self.zero is None else max(self.random, self.zero)
+
+    def scores(self, returns: np.ndarray) -> np.ndarray | None:
+        """100 · (R − R_floor) / (R_expert − R_floor) of every return R; None without an expert above the floor."""
+        if self.expert is None or self.expert <= self.floor:
+            return None
+        return 100 * (returns - self.floor) / (self.expert - self.floor)
+
+
+def counted_returns(
+    returns: np.ndarray, broken: np.ndarray, reference: Reference | None, finished: np.ndarray
+) -> np.ndarray:
+    """Returns of a class's episodes, such that nothing is gained by breaking physics.
+
+    A broken episode ends early, which would pay where rewards are negative. So it counts with the return of random
+    actions or, where that is unknown, of the worst finished episode; with its own if that is lower, or without either.
+
+    Args:
+        returns: Sums of the unscaled reward, shape (episodes,).
+        broken: Which of them ended because the physics broke, shape (episodes,), bool.
+        reference: The class's, where there is one.
+        finished: Returns of the class's finished episodes, of this policy and of those it is compared with, shape (n,).
+    """
+    others = finished if reference is None else np.array([reference.random])
+    bound = others.min() if len(others) else np.inf
+    return np.where(broken, np.minimum(returns, bound), returns)
 
 
 def load(kind: Kind) -> dict[str, dict[str, Any]]:
-    """What is known of each class by its name, e.g. ``{"return": 0.49, "source": ...}``; empty without a file."""
-    path = reference_path(kind)
-    return _read(path) if exists(path) else {}
+    """The installation's references by class, such as ``{"return": 0.49, "source": ...}``; empty without a file."""
+    return load_from(paths.assets_dir() / "references" / f"{kind}.json")
 
 
 def store(path: Path, classes: dict[str, dict[str, Any]], made: dict[str, Any]) -> None:
@@ -51,7 +93,7 @@ def store(path: Path, classes: dict[str, dict[str, Any]], made: dict[str, Any]) 
 
 
 def load_from(path: Path) -> dict[str, dict[str, Any]]:
-    """What a file of references knows of each class; empty without a file.
+    """The references in a file, by class; empty without a file.
 
     Raises:
         BidexError: The file holds something else.
@@ -59,16 +101,10 @@ def load_from(path: Path) -> dict[str, dict[str, Any]]:
     if not exists(path):
         return {}
     try:
-        return _read(path)
+        content = read_json(path, "references")
+        parse(content, _File, str(path))
     except BidexError as error:
         raise BidexError(f"{error} Expected a file of references or none: name another file.") from None
-
-
-def _read(path: Path) -> dict[str, dict[str, Any]]:
-    content = read_json(path, "references")
-    check(content, {"classes": TABLE}, path, ("classes",))
-    for name, row in content["classes"].items():
-        check(row, {"return": number()}, path, ("return",), f"classes.{name}.")
     return content["classes"]
 
 
@@ -79,11 +115,11 @@ def references() -> dict[str, Reference]:
     """
     kinds: tuple[Kind, ...] = ("random", "zero", "expert")
     random, zero, expert = ({name: row["return"] for name, row in load(kind).items()} for kind in kinds)
-    found = {}
-    for name in random:
-        known = Reference(random[name], expert.get(name), zero.get(name))
-        found[name] = known if known.expert is not None and known.expert > known.floor else replace(known, expert=None)
-    return found
+    known = {name: Reference(random[name], expert.get(name), zero.get(name)) for name in random}
+    return {
+        name: each if each.expert is not None and each.expert > each.floor else replace(each, expert=None)
+        for name, each in known.items()
+    }
 
 
 def references_of(world: Any) -> dict[str, Reference]:
@@ -107,14 +143,8 @@ def rescored(classes: dict[str, Any], config: RunConfig[Any]) -> dict[str, Any]:
     """
     if config.base != "moving" and all(row["score"] is None for row in classes.values()):
         return classes
-    known = references()
-    return {
-        name: {**row, "score": _score(known[name], row["return"])} if name in known else row
-        for name, row in classes.items()
-    }
-
-
-def _score(reference: Reference, value: float) -> float | None:
-    """The mean score of episodes of a mean return."""
-    found = reference.scores(np.array([value]))
-    return None if found is None else float(found[0])
+    known, rows = references(), dict(classes)
+    for name in known.keys() & classes.keys():
+        scores = known[name].scores(np.array([classes[name]["return"]]))
+        rows[name] = {**classes[name], "score": None if scores is None else float(scores[0])}
+    return rows

@@ -26,9 +26,9 @@ from bidex_meta.metaworld.library import (
 )
 from bidex_meta.suite import metaworld_classes
 from bidex_meta.world.base import Transition
-from bidex_meta.world.checking import fits
+from bidex_meta.world.checked import fits
 from bidex_meta.world.contract import PooledWorld, State
-from bidex_meta.world.foreign import ForeignWorld, Sizes
+from bidex_meta.world.foreign_world import ForeignWorld, Sizes
 
 
 class MetaWorldWorld(ForeignWorld):

@@ -1,6 +1,6 @@
 """What all batched worlds share: reset, step, autoreset, episodes and ``info``; subclasses fill in the physics.
 
-``world.World`` is the one of hands; Meta-World's and Gymnasium's Humanoid are ``foreign.ForeignWorld``.
+``world.World`` is the one of hands; Meta-World's and Gymnasium's Humanoid are ``foreign_world.ForeignWorld``.
 """
 
 from abc import ABC, abstractmethod
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from bidex_meta.errors import BidexError
 from bidex_meta.validation import true_or_false
-from bidex_meta.world import checking
+from bidex_meta.world import checked
 from bidex_meta.world.contract import Info, ObservationGroup, Options, State, Step
 from bidex_meta.world.episodes import Clock, Episodes, checked_mode, checked_seed, ended_info, reset_mask
 from bidex_meta.world.random import row_keys
@@ -96,7 +96,7 @@ class BatchedWorld(VectorEnv, ABC):
         Raises:
             BidexError: Fewer environments than slots, or an unknown mode.
         """
-        self.num_envs, self.device = checking.num_envs(num_envs, slots.names), device
+        self.num_envs, self.device = checked.num_envs(num_envs, slots.names), device
         self.autoreset_mode = checked_mode(autoreset_mode)
         self.stagger = true_or_false("stagger", stagger)
         self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
@@ -132,7 +132,7 @@ class BatchedWorld(VectorEnv, ABC):
 
     def _set_seed(self, seed: object) -> None:
         """Starts all draws anew."""
-        self.seed = checking.seed(seed)
+        self.seed = checked.seed(seed)
         pairs = zip(self.task_names, self.slot_rows, strict=True)
         self._keys = torch.cat([row_keys(self.seed, name, r.stop - r.start, self.device) for name, r in pairs])
         self.episodes = Episodes.fresh(self.num_envs, self.device)
@@ -164,7 +164,7 @@ class BatchedWorld(VectorEnv, ABC):
         """
         if not self._ready:
             raise BidexError("Expected reset() before step(): the environments have no episode yet.")
-        action = checking.action(action, (self.num_envs, self.action_size), self.device)
+        action = checked.action(action, (self.num_envs, self.action_size), self.device)
         with one_torch_thread():
             active, broken = self._run("control", self._control, action)
             reward, terminated, truncated, info = self._move(active, broken)
@@ -195,7 +195,7 @@ class BatchedWorld(VectorEnv, ABC):
 
     def _control(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """Passes actions on; which environments are active, and which of them got a non-finite number."""
-        action, broken = checking.clean(action)
+        action, broken = checked.clean(action)
         active = ~self.episodes.finished
         self._write_action(action, active)
         return active, broken & active

@@ -11,7 +11,7 @@ from bidex_meta.maths import xyzw
 from bidex_meta.points.depth_sensor import DepthSensor
 from bidex_meta.tasks.base import CONTROL_RATE, TaskClass
 from bidex_meta.tasks.state import TaskState
-from bidex_meta.world import checking
+from bidex_meta.world import checked
 from bidex_meta.world.base import Transition
 from bidex_meta.world.groups import Group, Member, Slot
 from bidex_meta.world.observations import Observer, Rule, clip
@@ -94,7 +94,7 @@ class Part:
         self.start_size = self._start.shape[1]
         for member in group.members:
             tasks = slots[member.slot].tasks
-            checking.formulas(member.scene, tasks, self._engine.sensordata, observed=rule != "masked")
+            checked.formulas(member.scene, tasks, self._engine.sensordata, observed=rule != "masked")
         self._observer = Observer(group.members[0].scene, self._start_mounts(), width)
         self._sights = sights
         if sights is not None:

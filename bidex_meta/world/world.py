@@ -22,7 +22,7 @@ from bidex_meta.points.depth_sensor import PointsRule
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.layout import CLIP
 from bidex_meta.validation import whole_number
-from bidex_meta.world import checking
+from bidex_meta.world import checked
 from bidex_meta.world.base import BatchedWorld, Slots, Transition
 from bidex_meta.world.contract import Info, State
 from bidex_meta.world.graphs import GraphCache, SideBySide, Work, cuda_graph, fresh
@@ -87,12 +87,12 @@ class World(BatchedWorld):
             BidexError: Fewer environments than slots, unknown device, engine, mode or sampling, too narrow a padding.
         """
         place, make_engine = choose_engine(device, engine, threads)
-        checking.choices(task_sampling, observation, points)
-        checking.seed(seed)
+        checked.choices(task_sampling, observation, points)
+        checked.seed(seed)
         if num_envs is None:
             num_envs = _DEFAULT_SIZES[place.type]
         names = [slot.name for slot in slots]
-        num_envs = checking.num_envs(num_envs, names)
+        num_envs = checked.num_envs(num_envs, names)
         if place.type == "cpu":
             needed = num_envs * (ROW_BYTES + (points.count if points else 0) * POINT_BYTES)
             check_memory(needed, f"{num_envs:,} environments", "Lower num_envs.")
@@ -262,7 +262,7 @@ class World(BatchedWorld):
 
     def load_state_dict(self, state: State) -> None:
         """Puts back what ``state_dict`` gave, on a world of the same suite and size; all of it or nothing."""
-        self._set_pools(checking.state(state, self.state_dict(), self.slots, self.task_id))
+        self._set_pools(checked.state(state, self.state_dict(), self.slots, self.task_id))
         self._restore(state)
         self._action = state["action"].to(self.device, copy=True)
         for part, engine in zip(self.parts, state["engines"], strict=True):

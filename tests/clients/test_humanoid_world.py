@@ -46,7 +46,7 @@ def test_a_run_on_it(algo: str, tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert main(["run", *flags, "--run-dir", str(tmp_path / "run")]) == 0
     folder = RunFolder.open(tmp_path / "run")
     config = folder.config()
-    assert config["task"] == HUMANOID and config["learner"]["gamma"] == 0.99
+    assert config.task == HUMANOID and config.learner["gamma"] == 0.99
     found = folder.evaluation()["policy"]["classes"]["Humanoid-v5"]
     assert found["score"] is None and found["success"] == 0.0
     capsys.readouterr()

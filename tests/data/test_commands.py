@@ -20,8 +20,8 @@ from bidex_meta.data.checking import verify
 from bidex_meta.data.writer import DatasetWriter, estimated_bytes, finish
 from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder
-from bidex_meta.sources.source import OwnSuite
 from bidex_meta.worlds import Worlds
+from bidex_meta.worlds.own import OwnSuite
 from tests.data.worlds import changed, printed, rough
 from tests.pages import ROOT
 

@@ -17,11 +17,11 @@ from bidex_meta.data.joined import join
 from bidex_meta.data.writer import DatasetWriter, begin, finish
 from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder
-from bidex_meta.sources.humanoid_task import HUMANOID
-from bidex_meta.sources.source import OwnSuite
 from bidex_meta.witness.replay import task_slot
 from bidex_meta.world import World
 from bidex_meta.world.contract import ObservationGroup
+from bidex_meta.worlds.external import HUMANOID
+from bidex_meta.worlds.own import OwnSuite
 from tests.algos.problems import opposite_bandits
 from tests.data.worlds import printed, rough
 from tests.offline.stored import noisy, played

@@ -23,6 +23,7 @@ from bidex_meta.paths import assets_dir, suites_dir
 from bidex_meta.record import Checkpoints, RunFolder, mend
 from bidex_meta.record.schemas import read_evaluation, read_versions
 from bidex_meta.witness.store import load_witness
+from tests.fakes import run_config
 from tests.robust.damage import NO_FILES, listing, of_bytes, of_values, remove, replace
 from tests.robust.lines import called, working_folder
 
@@ -103,7 +104,7 @@ def test_evaluations(content: dict[str, Any], tmp_path: Path) -> None:
         found = one_line_or(lambda: recorded_evaluation(tmp_path, path))
         if found is not None:  # and what verify makes of it
             now = {"packages": {"mujoco": "4.1.0"}, "device": "cpu", "engine": "c", "threads": 1}
-            others(recorded_conditions(found, {}, {}), now | {"physics": "x", "suite_version": 1})
+            others(recorded_conditions(found, {}, run_config()), now | {"physics": "x", "suite_version": 1})
             one_line_or(lambda: agreements(classes_of(found), classes_of(content)))
 
     draws(150, st.one_of(of_bytes(), of_values(), st.sampled_from(NO_FILES)), check)

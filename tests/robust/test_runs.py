@@ -15,7 +15,7 @@ import torch
 from bidex_meta.cli import main
 from bidex_meta.record import RunFolder
 from bidex_meta.worlds.own import OwnSuite
-from tests.fakes import ToyWorld
+from tests.fakes import ToyWorld, run_config
 
 SMALL = ["--suite", "MT4", "--num-envs", "6", "--threads", "1", "--device", "cpu", "--learner.hidden", "8"]
 SMALL += ["--learner.rollout-steps", "4", "--no-evaluate"]
@@ -238,7 +238,7 @@ def test_a_terminal_that_is_gone_is_a_reader_that_has_ended() -> None:
 def test_names_are_text(tmp_path: Path, capsys: pytest.CaptureFixture[str], toy: None) -> None:
     names = ["[/x]", "[red]", "a\x1b[2J"]
     for seed in (0, 1):
-        config = {"suite": "MT4", "task": None, "algo": "mtppo", "seed": seed, "steps": 8, "num_envs": 4, "learner": {}}
+        config = run_config(seed=seed, steps=8, num_envs=4)
         folder = RunFolder.create(config, tmp_path / str(seed))
         classes = {name: {"success": 0.5, "return": 1.0, "score": None} for name in names}
         (folder.path / "evaluation.json").write_text(json.dumps({"policy": {"classes": classes}}))

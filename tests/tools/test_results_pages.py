@@ -8,6 +8,7 @@ import pytest
 
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
+from tests.fakes import change
 from tests.pages import ROOT
 from tests.test_histories import log
 from tests.tools import test_collect
@@ -120,8 +121,8 @@ def test_rows_by_learners(tmp_path: Path) -> None:
         for seed in (0, 1):
             path = test_collect.run(tmp_path, seed, {"C": value + seed / 10}, algo, task="place/C")
             path = path.rename(tmp_path / f"C-{algo} {rows}-seed{seed}")
-            folder = log(path, {"step": 500, "Train/return/C": 1.0}, {"step": 1000, "Train/return/C": 2.0})
-            folder.change_config({**folder.config(), "num_envs": rows})
+            log(path, {"step": 500, "Train/return/C": 1.0}, {"step": 1000, "Train/return/C": 2.0})
+            change(path, num_envs=rows)
             (path / "versions.json").write_text(json.dumps({"git": {"commit": test_collect.COMMIT, "dirty": False}}))
             collect(path, into=tmp_path / "data" / "many")
     page = tmp_path / "page.md"

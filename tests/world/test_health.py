@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from bidex_meta.world import World
-from bidex_meta.world.checking import clean
+from bidex_meta.world.checked import clean
 from tests.world.play import assert_same, engine_place, flat, play, random_actions, suite_world, world_at
 
 ROWS, BROKEN = 12, [1, 7, 10]

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.comparison import classes_of
-from bidex_meta.evaluation.histories import curves_of
+from bidex_meta.evaluation.comparison import classes_of, curves_of
 from bidex_meta.record import plots
 from bidex_meta.record.stored import StoredRun
 from tools.pages.studies import Study, refuse_differing

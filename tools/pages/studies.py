@@ -9,8 +9,7 @@ from typing import Any
 
 from bidex_meta.config import flat
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.comparison import Estimate, Group, classes_of, estimates, group_of, iqm
-from bidex_meta.evaluation.histories import curves_of
+from bidex_meta.evaluation.comparison import Estimate, Group, classes_of, curves_of, estimates, group_of, iqm
 from bidex_meta.outside import short_name
 from bidex_meta.record import plots
 from bidex_meta.record.stored import StoredRun
