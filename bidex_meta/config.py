@@ -116,7 +116,7 @@ class RunConfig(Generic[LearnerSettings]):
     demonstrations: Several = ()
     """Imitate this data set too (as --dataset; see `bidex-meta record demonstrations`), with a weight that decays: with
     --algo mtppo and ppo, see --learner.demonstration-weight. Given several times: all of them."""
-    record: Whole = 0
+    record: Steps = 0
     """Keep about so many transitions of the training as the data set replay/ in the run's folder, whole episodes of
     some of the environments (docs/data.md). 0: none."""
     record_share: tyro.conf.Suppress[tyro.conf.Fixed[NonNegative]] = 0.0

@@ -55,8 +55,8 @@ def test_a_run_on_data_sets_is_evaluated_resumed_and_reported(folder: Path, caps
     printed(capsys, *run, "--steps", "20", "--run-dir", halves, "--no-evaluate")
     printed(capsys, "run", "--resume", halves, "--steps", "40", "--no-evaluate")
     config = RunFolder.open(whole).config()
-    assert (config["suite"], config["task"], config["task_seed"], config["num_envs"]) == ("MT4", None, 0, 4)
-    assert config["dataset"] == ["a-v0", str((folder / "sets" / "b-v0").resolve())]
+    assert (config.suite, config.task, config.task_seed, config.num_envs) == ("MT4", None, 0, 4)
+    assert list(config.dataset) == ["a-v0", str((folder / "sets" / "b-v0").resolve())]
     a, b = (RunFolder.open(name).checkpoints.load()[0]["learner"] for name in (whole, halves))
     for name, weight in a["policy"]["weights"].items():
         assert torch.equal(weight, b["policy"]["weights"][name])
@@ -104,7 +104,7 @@ def test_gymnasiums_humanoid_is_learned_without_being_named(folder: Path, capsys
         "--run-dir",
         folder / "a",
     )
-    assert RunFolder.open(folder / "a").config()["task"] == HUMANOID
+    assert RunFolder.open(folder / "a").config().task == HUMANOID
 
 
 def test_what_does_not_go_together_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
