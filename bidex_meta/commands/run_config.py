@@ -101,7 +101,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     # Where neither is named, `run --help` still has defaults to show; without --help _resolved refuses it.
     named = {"suite": suite or (None if task else _EXAMPLE), "task": task}
     source = Worlds.open({**named, "object": given("object") or implied.get("object")})
-    kind = learner_kind(given("algo") or "mtppo", getattr(source, "class_name", None))
+    kind = learner_kind(given("algo") or "mtppo", source.class_name)
     device = resolve_device(given("device") or "auto", source.on_gpu)
     preset, reason = choose_preset(kind, given("preset") or "auto", device, source.preset)
     if folder and stored:
@@ -147,7 +147,7 @@ def _resolved(config: RunConfig[Any], source: Worlds, device: str, fresh: bool) 
         raise BidexError(f"--base {config.base} goes with --task; a suite's file says whether bases move.")
     if config.object is not None and config.task is None:
         raise BidexError("--object goes with --task; a suite's file names objects itself (docs/objects.md).")
-    name = getattr(source, "class_name", None) or source.name
+    name = source.class_name or source.name
     suite = None if config.suite is None else str(absolute(name)) if name.endswith(".toml") else name
     return replace(
         config,
