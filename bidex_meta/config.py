@@ -24,7 +24,6 @@ from bidex_meta.validation import (
     Seed,
     Text,
     Threads,
-    Whole,
     check_fields,
     parse,
 )
