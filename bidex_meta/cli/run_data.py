@@ -38,17 +38,15 @@ def dataset_metadata(
         ``observation_groups``, [name, index ranges]; ``kind``, ``policies``, ``seed`` of the tasks, ``references``
         ({class: {random, zero, expert}}, unscaled returns), ``versions`` and ``commit``; all ready for JSON.
     """
-    alone = getattr(source, "class_name", None)
-    versions = collect_versions()
+    alone, versions = source.class_name, collect_versions()
     names = {name.partition("/")[0] for name in world.task_names}
-    moving = getattr(source, "moving_base", None)
     return {
         "suite": None if alone else source.name,
-        "suite_version": getattr(getattr(source, "suite", None), "version", None),
+        "suite_version": source.suite.version if source.suite else None,
         "task": alone,
-        "object": getattr(source, "object", None),
+        "object": source.object,
         "points": source.points,
-        "base": {None: "own", True: "moving", False: "fixed"}[moving] if alone else None,
+        "base": {None: "own", True: "moving", False: "fixed"}[source.moving_base] if alone else None,
         "tasks": list(world.task_names),
         "reward_scales": {slot.name: slot.reward_scale for slot in getattr(world, "slots", ())},
         "hides_goals": source.hides_goals,

@@ -219,7 +219,7 @@ def test_stopping_at_a_return(toy: None, folder: Path, capsys: pytest.CaptureFix
     assert "Enough: Train/mean_return is" in said and RunFolder.open(folder / "r").evaluation()["steps"] == steps[-1]
     assert [row["step"] for row in RunFolder.open(folder / "r").metrics()] == steps
     assert "Add --evaluate-every" in printed(capsys, "run", *SMALL, "--stop-at-score", "33", code=2)
-    assert "such as 0.8, not 80" in printed(capsys, "run", *SMALL, "--stop-at-success", "80", code=2)
+    assert "--stop-at-success" in printed(capsys, "run", *SMALL, "--stop-at-success", "80", code=2)
 
 
 @pytest.mark.parametrize(
