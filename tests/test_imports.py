@@ -51,7 +51,7 @@ MUTUAL = {
 }
 """Modules that import each other all the same."""
 
-TWICE = {"base", "config", "episodes", "replay", "starts"}
+TWICE = {"base", "config", "learner", "replay", "starts"}
 """Names of several modules. ``base`` is a room's own, ``learner`` contract and base; the others are older."""
 
 
