@@ -35,7 +35,7 @@ def test_bench_world_as_a_table_of_mt4(capsys: pytest.CaptureFixture[str]) -> No
         ("world --repeats 0", "--repeats must be at least 1"),
         ("world --suite MT5", "MT4"),
         ("world --device tpu", "device: expected auto"),
-        ("world --engine d", "Expected an engine"),
+        ("world --engine d", "Unknown engine"),
         ("world --against HEAD", "Unknown flag --against"),
         ("soak", "Unknown bench 'soak'"),
     ],

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from msgspec import Meta
 
-from bidex_meta.data import foreign, part_files, seals
+from bidex_meta.data import other_formats, part_files, seals
 from bidex_meta.data.episode import Episode
 from bidex_meta.errors import BidexError, shortened, unknown_name
-from bidex_meta.memory import check_memory
-from bidex_meta.reading import expanded, is_file, read_bytes, read_json
-from bidex_meta.validation import Finite, Positive, Seed, Text, Whole, parse
+from bidex_meta.utils.files import expanded, is_file, read_bytes, read_json
+from bidex_meta.utils.memory import check_memory
+from bidex_meta.utils.validation import Finite, Positive, Seed, Text, Whole, parse
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -206,7 +206,9 @@ class Dataset:
         Raises:
             BidexError: Its metadata have no finite ones.
         """
-        return None if "bidex" in self.content else foreign.action_bounds(self.content, self.name, self.action_size)
+        return (
+            None if "bidex" in self.content else other_formats.action_bounds(self.content, self.name, self.action_size)
+        )
 
     @cached_property
     def _sizes(self) -> tuple[int, int]:
@@ -227,7 +229,7 @@ class Dataset:
         Raises:
             BidexError: A file is damaged, or observations or actions of a data set from elsewhere are not flat.
         """
-        foreign.check_spaces(self.content, self.name)
+        other_formats.check_spaces(self.content, self.name)
         number, sizes = 0, None
         for path, table in zip(self._paths, self._tables, strict=True):
             if "bidex" in self.content:
@@ -249,7 +251,7 @@ class Dataset:
         """An episode of HDF5's group, its arrays as long as the table says."""
         row = {name: column[number].item() for name, column in self.table.items() if name != "variation"}
         arrays = {
-            ours: foreign.numbers(group[name], name, self.name, row["steps"] + (name == "observations"))
+            ours: other_formats.numbers(group[name], name, self.name, row["steps"] + (name == "observations"))
             for name, ours in part_files.ARRAYS.items()
         }
         variation = self.table["variation"][number]
@@ -303,7 +305,7 @@ class Dataset:
         steps, returns = [], []
         with part_files.reading(self.folder / part_files.MAIN) as file:
             for number in range(self.num_episodes):
-                rewards = foreign.numbers(file[f"episode_{number}"]["rewards"], "rewards", self.name)
+                rewards = other_formats.numbers(file[f"episode_{number}"]["rewards"], "rewards", self.name)
                 steps.append(len(rewards))
                 returns.append(rewards.sum(dtype=np.float64))
         table = {name: np.zeros(len(steps), kind) for name, kind in part_files.TABLE.items()}

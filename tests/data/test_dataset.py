@@ -14,7 +14,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box
 
-from bidex_meta.commands.run_data import implied
+from bidex_meta.cli.run_data import implied
 from bidex_meta.data import Dataset, open_dataset, part_files
 from bidex_meta.data.checking import coverage, summary, verify
 from bidex_meta.data.joined import gathered, join

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from bidex_meta.data import collect, open_dataset, writer
-from bidex_meta.record import RunFolder
+from bidex_meta.runs import RunFolder
 from bidex_meta.witness.demonstrators import ShiftedStarts
 from bidex_meta.witness.replay import Simulator
 from bidex_meta.witness.scripts import SCRIPTS
@@ -166,7 +166,7 @@ def test_a_run_imitates_several_sets_and_is_resumed(sets: Path, capsys: pytest.C
     suite = ["--suite", "MT4", *RUN[7:], "--num-envs", "200", *shown]
     assert f"Demonstrations: {sum(counts)} transitions" in printed(capsys, "run", *suite, "--run-dir", sets / "many")
     kept = ["HandOver/demonstrations-v0", str((sets / "other").resolve())]
-    assert RunFolder.open(sets / "many").config()["demonstrations"] == kept
+    assert list(RunFolder.open(sets / "many").config().demonstrations) == kept
     printed(capsys, "run", "--resume", sets / "many", "--steps", "1600", "--no-evaluate")
-    assert RunFolder.open(sets / "many").config()["demonstrations"] == kept
+    assert list(RunFolder.open(sets / "many").config().demonstrations) == kept
     assert "Switch" in printed(capsys, "run", "--task", "Switch", *RUN[5:], *shown, "--run-dir", sets / "bad", code=2)
