@@ -13,9 +13,9 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 from bidex_meta.clients.gymnasium_ids import register_ids
-from bidex_meta.drawing import set_aside_what_is_missing
 from bidex_meta.errors import BidexError
 from bidex_meta.suite import Suite, load_suite, suite_names
+from bidex_meta.utils.gl_backend import set_aside_what_is_missing
 
 if TYPE_CHECKING:
     from bidex_meta.benchmark import Benchmark, Task, make_task_world

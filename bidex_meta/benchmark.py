@@ -13,12 +13,12 @@ import torch
 from gymnasium.vector import AutoresetMode
 
 from bidex_meta.errors import BidexError, shortened, unknown_name
-from bidex_meta.outside import name_with_object
 from bidex_meta.suite import MOST_POINTS, SPLITS, ListedTask, Split, Suite, SuiteClass, load_suite
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.variation import VariationSpace
-from bidex_meta.validation import whole_number
+from bidex_meta.utils.plugins import name_with_object
+from bidex_meta.utils.validation import whole_number
 from bidex_meta.world import PointsRule, Slot, World
 from bidex_meta.world.episodes import checked_mode
 from bidex_meta.world.single_env import EnvRecipe, SuiteEnv

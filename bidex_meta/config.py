@@ -13,9 +13,9 @@ from msgspec import Meta
 from tyro.constructors import PrimitiveConstructorSpec
 
 from bidex_meta.errors import BidexError, shortened
-from bidex_meta.reading import read_json
 from bidex_meta.suite import MOST_POINTS
-from bidex_meta.validation import (
+from bidex_meta.utils.files import read_json
+from bidex_meta.utils.validation import (
     Count,
     Environments,
     Finite,

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from bidex_meta.benchmark import Benchmark
-from bidex_meta.memory import usable_cores
+from bidex_meta.utils.memory import usable_cores
 from bidex_meta.world import World
 
 

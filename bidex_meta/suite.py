@@ -13,10 +13,10 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from bidex_meta.errors import BidexError, known_name, shortened, unknown_name
-from bidex_meta.outside import name_with_object
-from bidex_meta.paths import suites_dir
-from bidex_meta.reading import absolute, expanded, read_toml
-from bidex_meta.validation import parse
+from bidex_meta.utils.files import absolute, expanded, read_toml
+from bidex_meta.utils.paths import suites_dir
+from bidex_meta.utils.plugins import name_with_object
+from bidex_meta.utils.validation import parse
 
 Split = Literal["train", "test"]
 SPLITS: tuple[Split, Split] = ("train", "test")

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 from bidex_meta.config import config_of
-from bidex_meta.record import RunFolder
+from bidex_meta.runs import RunFolder
 
 STEPS = 6
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.config import RunConfig, config_of
-from bidex_meta.record import RunFolder
+from bidex_meta.runs import RunFolder
 from tests.fake_world import FakeWorld
 
 SLOT_TASKS = [3, 2]

@@ -9,9 +9,8 @@ import time
 import pytest
 import torch
 
-from bidex_meta.cli import main
-from bidex_meta.commands import COMMANDS
-from bidex_meta.record import RunFolder, read_metrics
+from bidex_meta.cli import COMMANDS, main
+from bidex_meta.runs import RunFolder, read_metrics
 from bidex_meta.worlds import Worlds
 from bidex_meta.worlds.own import OwnSuite
 from tests.fakes import ToyWorld
@@ -318,7 +317,7 @@ def test_a_run_can_start_from_the_policy_of_another(toy_worlds, tmp_path, capsys
 
 _TRAIN = """
 import functools, sys, time
-import bidex_meta.record.progress as progress
+import bidex_meta.runs.progress as progress
 import bidex_meta.train.runner as runner
 from bidex_meta.cli import main
 from bidex_meta.worlds.own import OwnSuite

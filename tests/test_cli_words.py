@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from bidex_meta.cli import main
-from bidex_meta.commands import COMMANDS
+from bidex_meta.cli import COMMANDS, main
 
 
 def test_lists_of_suites_need_no_torch():

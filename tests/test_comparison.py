@@ -8,7 +8,7 @@ import pytest
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import iqm, iqm_difference, read_groups
-from bidex_meta.record import RunFolder
+from bidex_meta.runs import RunFolder
 from tests.fakes import change, run_config
 
 

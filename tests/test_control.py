@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from bidex_meta.cli import main
-from bidex_meta.commands import learners
+from bidex_meta.cli import learners, main
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import meta_test as metatest
 from bidex_meta.evaluation.control_arms import arms, control

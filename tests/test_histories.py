@@ -10,7 +10,7 @@ from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import over_runs, read_histories
 from bidex_meta.evaluation.statistics import bootstrap_band, bootstrap_interval, mean
-from bidex_meta.record import RunFolder
+from bidex_meta.runs import RunFolder
 from tests.test_comparison import run
 
 

@@ -133,7 +133,7 @@ def test_one_table_alone_names_learners() -> None:
         strings = [node for node in ast.walk(tree) if isinstance(node, ast.Constant) and id(node) not in texts]
         if any(isinstance(node.value, str) and "bidex_algos" in node.value for node in strings):
             naming.add(module)
-    assert naming == {"bidex_meta.commands.learners"}
+    assert naming == {"bidex_meta.cli.learners"}
 
 
 def test_a_name_means_one_module() -> None:

@@ -6,11 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from bidex_meta.cli import main
-from bidex_meta.commands import learners
-from bidex_meta.commands.metatest import environments_for, rollouts_of
+from bidex_meta.cli import learners, main
+from bidex_meta.cli.metatest import environments_for, rollouts_of
 from bidex_meta.evaluation.comparison import read_groups
-from bidex_meta.record import RunFolder
+from bidex_meta.runs import RunFolder
 from bidex_meta.worlds import Worlds
 from bidex_meta.worlds.own import OwnSuite
 from tests.adapting_learner import Learner

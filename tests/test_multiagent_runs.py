@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from bidex_meta.cli import main
-from bidex_meta.commands.learners import learner_kind
-from bidex_meta.commands.policies import load_policy
-from bidex_meta.record import RunFolder
+from bidex_meta.cli.learners import learner_kind
+from bidex_meta.cli.policies import load_policy
+from bidex_meta.runs import RunFolder
 from bidex_meta.world.agent_views import agent_views
 from tests.world.play import suite_world
 

@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from bidex_meta import Benchmark, BidexError, make_task_world, paths
+from bidex_meta import Benchmark, BidexError, make_task_world
 from bidex_meta.cli import main
 from bidex_meta.tasks.scene import compile_scene
+from bidex_meta.utils import paths
 from tests.pages import ROOT, files_of
 
 NAME = "my_tasks:SlideBlock"

@@ -12,9 +12,8 @@ from typing import Any
 import pytest
 import torch
 
-from bidex_meta.cli import main
-from bidex_meta.commands import COMMANDS
-from bidex_meta.commands.parsing import flags_of, parse
+from bidex_meta.cli import COMMANDS, main
+from bidex_meta.cli.parsing import flags_of, parse
 from bidex_meta.evaluation.play import RandomAgent
 from tests.pages import PAGES, ROOT, blocks, files_of
 

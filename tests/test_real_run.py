@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from bidex_meta.cli import main
-from bidex_meta.record import RunFolder, read_metrics
+from bidex_meta.runs import RunFolder, read_metrics
 from tests.tasks.tables import SIZES
 
 SMALL = ["--suite", "MT4", "--num-envs", "8", "--threads", "1", "--device", "cpu", "--seed", "3"]

@@ -3,12 +3,12 @@ from pathlib import Path
 
 import pytest
 
-from bidex_meta import paths
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import references
 from bidex_meta.evaluation.references import Reference
 from bidex_meta.tasks import registry
+from bidex_meta.utils import paths
 from bidex_meta.worlds import Worlds
 from bidex_meta.worlds.own import OwnSuite
 from tests.fakes import ToyWorld, run_config

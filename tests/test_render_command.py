@@ -2,8 +2,7 @@
 
 import pytest
 
-from bidex_meta.cli import main
-from bidex_meta.commands import policies
+from bidex_meta.cli import main, policies
 from bidex_meta.tasks import registry
 from bidex_meta.worlds.own import OwnSuite, SingleClass
 from tests.test_cli import run, toy, toy_worlds
@@ -100,7 +99,7 @@ def test_a_tile_of_a_row_that_ends_goes_on_and_its_name_is_green_while_solved():
 def test_tiles_are_wider_than_high_with_a_name_under_each():
     import numpy as np
 
-    from bidex_meta.record.video import grid, tiled
+    from bidex_meta.runs.video import grid, tiled
 
     assert [grid(n) for n in (1, 2, 4, 5, 20)] == [(1, 1), (2, 1), (2, 2), (3, 2), (5, 4)]
     pictures = [np.full((30, 80, 3), 10 * i, np.uint8) for i in range(3)]

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from bidex_meta.cli import main
-from bidex_meta.commands import report as page
-from bidex_meta.record import RunFolder
+from bidex_meta.cli import report as page
+from bidex_meta.runs import RunFolder
 from tests.test_comparison import run
 from tests.test_histories import log
 

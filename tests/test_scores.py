@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bidex_meta.commands.tables import evaluation_table
+from bidex_meta.cli.tables import evaluation_table
 from bidex_meta.evaluation import references
 from bidex_meta.evaluation.meta_test import meta_evaluate
 from bidex_meta.evaluation.play import RandomAgent, ZeroAgent, evaluate

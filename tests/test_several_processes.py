@@ -17,7 +17,7 @@ import torch
 from bidex_meta.cli import main
 from bidex_meta.config import config_of
 from bidex_meta.errors import BidexError
-from bidex_meta.record import RunFolder, read_metrics
+from bidex_meta.runs import RunFolder, read_metrics
 from bidex_meta.train import distributed
 from bidex_meta.train.distributed import TIMEOUT
 from tests.algos.ranks import same
@@ -186,7 +186,7 @@ def test_a_run_of_two_processes_is_not_resumed_by_one(tmp_path: Path, capsys: py
 
 
 def test_each_process_takes_its_share_of_threads_and_a_gpu_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    from bidex_meta.commands import run_config
+    from bidex_meta.cli import run_config
     from bidex_meta.train.launch import launch, resume_command
 
     places = {"RANK": 5, "WORLD_SIZE": 8, "LOCAL_RANK": 1, "LOCAL_WORLD_SIZE": 4, "MASTER_ADDR": "a"}
@@ -202,7 +202,7 @@ def test_each_process_takes_its_share_of_threads_and_a_gpu_of_its_own(monkeypatc
 
 
 def test_a_run_from_before_several_processes_is_one_of_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from bidex_meta.commands.run_config import plan_run
+    from bidex_meta.cli.run_config import plan_run
 
     folder = RunFolder.create(plan_run(SMALL).config, tmp_path / "r")
     config = folder.config().to_json()
@@ -212,8 +212,8 @@ def test_a_run_from_before_several_processes_is_one_of_one(tmp_path: Path, capsy
 
 
 def test_processes_that_disagree_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    from bidex_meta.commands.run import _agree
-    from bidex_meta.commands.run_config import plan_run
+    from bidex_meta.cli.run import _agree
+    from bidex_meta.cli.run_config import plan_run
 
     plan = plan_run(SMALL)
 

@@ -223,7 +223,7 @@ def test_any_other_content_is_a_bidex_error(tmp_path_factory: pytest.TempPathFac
 
 
 def test_readme_explains_every_key() -> None:
-    from bidex_meta.paths import suites_dir
+    from bidex_meta.utils.paths import suites_dir
 
     readme = (suites_dir() / "README.md").read_text(encoding="utf-8")
     for key in [*KEYS[:-1], "description", "split", "reward_scale", "gamma", "options", "tasks", "fixed"]:

@@ -13,12 +13,12 @@ from typing import Any
 import pytest
 
 from bidex_meta.cli import main
-from bidex_meta.commands import sweep as queue
-from bidex_meta.commands.sweep import State, state_of
-from bidex_meta.commands.sweep_plan import PlannedRun, read_sweep
+from bidex_meta.cli import sweep as queue
+from bidex_meta.cli.sweep import State, state_of
+from bidex_meta.cli.sweep_plan import PlannedRun, read_sweep
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
-from bidex_meta.record import RunFolder
+from bidex_meta.runs import RunFolder
 from tests.fakes import run_config
 from tests.pages import ROOT
 from tools import collect
@@ -40,9 +40,7 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(queue, "COMMAND", FAKE)
     # Configs are `bidex-meta run`'s matter; the stand-in has but a few entries.
-    monkeypatch.setattr(
-        "bidex_meta.commands.sweep._configs", lambda sweep, _: {run.words: CONFIG for run in sweep.runs}
-    )
+    monkeypatch.setattr("bidex_meta.cli.sweep._configs", lambda sweep, _: {run.words: CONFIG for run in sweep.runs})
     path = tmp_path / "sweep.toml"
     path.write_text(FILE)
     return path
@@ -86,7 +84,7 @@ def test_a_run_that_its_return_ended_is_done_at_the_steps_it_made(
 ) -> None:
     file.write_text(FILE.replace("steps = 6", "steps = 6, stop_at_return = 4"))
     config = replace(CONFIG, stop_at_return=4.0)
-    monkeypatch.setattr("bidex_meta.commands.sweep._configs", lambda sweep, _: {r.words: config for r in sweep.runs})
+    monkeypatch.setattr("bidex_meta.cli.sweep._configs", lambda sweep, _: {r.words: config for r in sweep.runs})
     assert main(["sweep", str(file)]) == 0
     assert "2 done, 0 runs, 0 failed, 0 left" in capsys.readouterr().out
     begun = starts(tmp_path)
@@ -160,7 +158,7 @@ def test_what_starts_from_another_waits_for_it_and_fails_with_it(file: Path, tmp
 def test_a_sweep_that_was_stopped_loses_no_run(file: Path, tmp_path: Path, how: str) -> None:
     """SIGKILL of the sweep, and of its runs or not, which then go on and are waited for; or SIGTERM of the sweep."""
     code = (
-        "import signal; from bidex_meta.commands import sweep as queue; from tests.test_sweep import planned; "
+        "import signal; from bidex_meta.cli import sweep as queue; from tests.test_sweep import planned; "
         "signal.signal(signal.SIGTERM, signal.default_int_handler); "
         f"queue.COMMAND = {FAKE!r}; queue.work(planned(), [None, None], print)"
     )
@@ -248,7 +246,7 @@ def test_how_long_the_rest_takes(file: Path, tmp_path: Path, monkeypatch, capsys
     assert main(["sweep", str(file), "--status"]) == 0
     assert "0 done, 0 runs, 0 failed, 3 left; about 5.00 core-hours" in capsys.readouterr().out, "1 h of 2, and 2 · 2 h"
     timed = replace(CONFIG, minutes=90.0)
-    monkeypatch.setattr("bidex_meta.commands.sweep._configs", lambda sweep, _: {r.words: timed for r in sweep.runs})
+    monkeypatch.setattr("bidex_meta.cli.sweep._configs", lambda sweep, _: {r.words: timed for r in sweep.runs})
     assert main(["sweep", str(file), "--status"]) == 0
     assert "about 3.50 core-hours" in capsys.readouterr().out, "0.5 h, and 2 · 1.5 h"
 

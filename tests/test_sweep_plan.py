@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from bidex_meta.cli import main
-from bidex_meta.commands.sweep_plan import read_sweep
+from bidex_meta.cli.sweep_plan import read_sweep
 from bidex_meta.errors import BidexError
 from tests.pages import ROOT
 
@@ -66,7 +66,7 @@ def test_a_flag_may_name_the_subject(tmp_path: Path) -> None:
 
 
 def test_several_data_sets_are_named_one_by_one_as_run_takes_them(tmp_path: Path) -> None:
-    from bidex_meta.commands.parsing import peek_all
+    from bidex_meta.cli.parsing import peek_all
 
     path = tmp_path / "s.toml"
     path.write_text(FILE.replace("steps = 6", 'steps = 6, dataset = ["a/x", "b/x"]'))
@@ -144,8 +144,8 @@ def test_what_run_would_refuse_is_told_before_anything_begins(tmp_path: Path, mo
 def test_the_sweeps_of_the_repository_are_what_run_takes(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     # Data sets are recorded before; which, the files say.
-    monkeypatch.setattr("bidex_meta.commands.run_data.open_datasets", lambda names: [])
-    monkeypatch.setattr("bidex_meta.commands.run_data.check_offline", lambda *_: None)
+    monkeypatch.setattr("bidex_meta.cli.run_data.open_datasets", lambda names: [])
+    monkeypatch.setattr("bidex_meta.cli.run_data.check_offline", lambda *_: None)
     for path in sorted((ROOT / "results" / "sweeps").glob("*.toml")):
         if "seeds" in path.read_text():
             assert main(["sweep", str(path), "--dry-run"]) == 0

@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from bidex_meta.cli import main
-from bidex_meta.commands import learners
-from bidex_meta.commands.evaluate import conditions
-from bidex_meta.commands.verify import others, recorded_conditions
+from bidex_meta.cli import learners, main
+from bidex_meta.cli.evaluate import conditions
+from bidex_meta.cli.verify import others, recorded_conditions
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.agreement import agreements, classes_of
 from bidex_meta.evaluation.results import ClassResult
-from bidex_meta.record import RunFolder
+from bidex_meta.runs import RunFolder
 from bidex_meta.worlds import Worlds
 from bidex_meta.worlds.own import OwnSuite
 from tests.fakes import ToyWorld, run_config

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from bidex_meta import drawing
-from bidex_meta.cli import main
-from bidex_meta.commands import watching
-from bidex_meta.record import RunFolder, read_metrics
-from bidex_meta.record.writers import LOGGERS, NoWriter
+from bidex_meta.cli import main, watching
+from bidex_meta.runs import RunFolder, read_metrics
+from bidex_meta.runs.writers import LOGGERS, NoWriter
+from bidex_meta.utils import gl_backend
 from tests.test_cli import final, run, same, toy_worlds
 
 __all__ = ["toy_worlds"]
@@ -21,7 +20,7 @@ __all__ = ["toy_worlds"]
 def screen(monkeypatch, request):
     """Some way to draw, and small tiles."""
     if "real_drawing" not in request.keywords:
-        monkeypatch.setattr(drawing, "prepare", lambda: None)
+        monkeypatch.setattr(gl_backend, "prepare", lambda: None)
     monkeypatch.setattr(watching, "_FILM", {"width": 64, "height": 44})
     monkeypatch.setattr(watching, "_MOST_FILM_STEPS", 4)
 
@@ -144,16 +143,16 @@ def test_a_film_that_fails_ends_nothing(toy_worlds, tmp_path, monkeypatch, capsy
     def full(*arguments):
         raise OSError("disk full")
 
-    monkeypatch.setattr("bidex_meta.record.recorder.write_video", full)
+    monkeypatch.setattr("bidex_meta.runs.recorder.write_video", full)
     assert run("--steps", 48, "--run-dir", tmp_path / "r", "--no-evaluate", "--video-every", 1) == 0
     assert "No film at 24 steps: disk full" in capsys.readouterr().err
 
 
 def test_what_cannot_be_watched_is_refused_before_the_run(toy_worlds, tmp_path, monkeypatch, capsys):
     def blind():
-        raise drawing.BidexError("no way to draw")
+        raise gl_backend.BidexError("no way to draw")
 
-    monkeypatch.setattr(drawing, "prepare", blind)
+    monkeypatch.setattr(gl_backend, "prepare", blind)
     monkeypatch.setitem(__import__("sys").modules, "wandb", None)
     for flags, told in (
         (["--video-every", "1"], "no way to draw"),

@@ -17,7 +17,8 @@ from pathlib import Path
 
 import bidex_meta
 import bidex_algos
-from bidex_meta import Benchmark, paths
+from bidex_meta import Benchmark
+from bidex_meta.utils import paths
 
 benchmark = Benchmark("ML4", seed=0)
 assert list(benchmark.test_classes) == ["TwoCatchUnderarm"] and len(benchmark.train_tasks) == 150

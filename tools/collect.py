@@ -1,6 +1,6 @@
 """``python -m tools.collect RUN... --into results/data/STUDY``: what the repository keeps of evaluated runs.
 
-One file of JSON for each run, without weights, as :mod:`bidex_meta.record.stored` reads it.
+One file of JSON for each run, without weights, as :mod:`bidex_meta.runs.stored` reads it.
 """
 
 import json
@@ -15,15 +15,15 @@ from typing import Any
 import tyro
 from torch import nn
 
-from bidex_meta.commands.policies import load_policy
-from bidex_meta.commands.sweep_plan import read_sweep
+from bidex_meta.cli.policies import load_policy
+from bidex_meta.cli.sweep_plan import read_sweep
 from bidex_meta.errors import BidexError
-from bidex_meta.outside import short_name
-from bidex_meta.reading import read_text
-from bidex_meta.record.folder import RunFolder
-from bidex_meta.record.metrics import training_seconds
-from bidex_meta.record.stored import FORMAT, StoredRun
+from bidex_meta.runs.folder import RunFolder
+from bidex_meta.runs.metrics import training_seconds
+from bidex_meta.runs.stored import FORMAT, StoredRun
 from bidex_meta.suite import load_suite, suite_names
+from bidex_meta.utils.files import read_text
+from bidex_meta.utils.plugins import short_name
 
 POINTS = 60
 """Points of a curve at most."""

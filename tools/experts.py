@@ -8,8 +8,8 @@ import tyro
 
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.references import load, store
-from bidex_meta.record.stored import open_run
-from bidex_meta.record.versions import collect_versions
+from bidex_meta.runs.stored import open_run
+from bidex_meta.runs.versions import collect_versions
 from bidex_meta.witness.replay import replay
 from bidex_meta.witness.store import load_witness, witness_path
 from bidex_meta.worlds import Worlds

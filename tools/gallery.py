@@ -8,7 +8,7 @@ import tyro
 from bidex_meta.benchmark import make_task_world
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import references
-from bidex_meta.record import video
+from bidex_meta.runs import video
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.hidden import hidden

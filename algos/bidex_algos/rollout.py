@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from bidex_meta.errors import BidexError
-from bidex_meta.maths import check_precision
 from bidex_meta.train.distributed import all_sum
+from bidex_meta.utils.maths import check_precision
 from bidex_meta.world.contract import VectorWorld
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from bidex_meta.engine.cpu import CpuEngine
 from bidex_meta.errors import BidexError, unknown_name
-from bidex_meta.validation import whole_number
+from bidex_meta.utils.validation import whole_number
 from bidex_meta.world.base import Transition
 from bidex_meta.world.checked import fits
 from bidex_meta.world.contract import State

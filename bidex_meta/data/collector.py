@@ -13,7 +13,7 @@ from bidex_meta.data import part_files
 from bidex_meta.data.episode import Episode
 from bidex_meta.data.writer import DatasetWriter
 from bidex_meta.errors import BidexError
-from bidex_meta.record.atomic import write_json
+from bidex_meta.runs.atomic import write_json
 from bidex_meta.world.checked import clean
 from bidex_meta.world.contract import PooledWorld, TaskWorld, VectorWorld
 from bidex_meta.world.wrapper import PooledWorldWrapper

@@ -15,9 +15,9 @@ from msgspec import Meta
 from bidex_meta.data import foreign, part_files, seals
 from bidex_meta.data.episode import Episode
 from bidex_meta.errors import BidexError, shortened, unknown_name
-from bidex_meta.memory import check_memory
-from bidex_meta.reading import expanded, is_file, read_bytes, read_json
-from bidex_meta.validation import Finite, Positive, Seed, Text, Whole, parse
+from bidex_meta.utils.files import expanded, is_file, read_bytes, read_json
+from bidex_meta.utils.memory import check_memory
+from bidex_meta.utils.validation import Finite, Positive, Seed, Text, Whole, parse
 
 if TYPE_CHECKING:
     from torch import Tensor

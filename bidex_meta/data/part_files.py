@@ -26,8 +26,8 @@ import numpy as np
 from bidex_meta.data import seals
 from bidex_meta.data.episode import Episode
 from bidex_meta.errors import BidexError, one_line
-from bidex_meta.reading import is_file
-from bidex_meta.record.atomic import sync_folder
+from bidex_meta.runs.atomic import sync_folder
+from bidex_meta.utils.files import is_file
 
 MAIN, METADATA, RECORDING = "main_data.hdf5", "metadata.json", "recording.json"
 FORMAT = 1

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from bidex_meta.errors import BidexError
-from bidex_meta.reading import open_regular
+from bidex_meta.utils.files import open_regular
 
 BLOCK = 512
 """Bytes of the user block: the least that HDF5 takes."""

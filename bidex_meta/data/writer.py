@@ -19,11 +19,11 @@ from bidex_meta.data import part_files, seals
 from bidex_meta.data.dataset import data_folder
 from bidex_meta.data.episode import Episode
 from bidex_meta.errors import BidexError, shortened
-from bidex_meta.outside import short_name
-from bidex_meta.reading import absolute, exists, expanded, is_file, read_json
-from bidex_meta.record import RunFolder
-from bidex_meta.record.atomic import check_writable, remove_leftovers, write_atomic, write_json
-from bidex_meta.validation import Threads, parse
+from bidex_meta.runs import RunFolder
+from bidex_meta.runs.atomic import check_writable, remove_leftovers, write_atomic, write_json
+from bidex_meta.utils.files import absolute, exists, expanded, is_file, read_json
+from bidex_meta.utils.plugins import short_name
+from bidex_meta.utils.validation import Threads, parse
 
 _MARGIN = 1.05
 """What file systems take beside the files."""

@@ -5,7 +5,7 @@ import torch
 from bidex_meta.engine.cpu import CpuEngine
 from bidex_meta.engine.protocol import EngineMaker
 from bidex_meta.errors import BidexError, known_name, shortened
-from bidex_meta.validation import whole_number
+from bidex_meta.utils.validation import whole_number
 
 ENGINES = ("auto", "c", "warp")
 _MOST_THREADS = 1024

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from bidex_meta.engine.health import LARGEST, LONGEST, SHORTEST, checked_state, outside, quaternion_columns
 from bidex_meta.errors import BidexError
-from bidex_meta.memory import usable_cores
+from bidex_meta.utils.memory import usable_cores
 
 # What a simulation carries from one step to the next; the fields that a model has none of are skipped.
 _STATE_FIELDS = (

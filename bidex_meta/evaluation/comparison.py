@@ -12,10 +12,10 @@ from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.references import rescored
 from bidex_meta.evaluation.statistics import Interval, bootstrap_band, bootstrap_interval
-from bidex_meta.outside import name_with_object, short_name
-from bidex_meta.record.metrics import training_seconds
-from bidex_meta.record.plots import Curve
-from bidex_meta.record.stored import Run
+from bidex_meta.runs.metrics import training_seconds
+from bidex_meta.runs.plots import Curve
+from bidex_meta.runs.stored import Run
+from bidex_meta.utils.plugins import name_with_object, short_name
 
 _POINTS = 200
 """Of a curve over several runs."""

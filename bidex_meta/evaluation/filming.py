@@ -9,7 +9,7 @@ from bidex_meta.agents import Agent
 from bidex_meta.points.cloud import Cloud, beside, camera_of, draw
 from bidex_meta.points.depth_sensor import CANDIDATES
 from bidex_meta.points.surfaces import sample
-from bidex_meta.record.video import tiled
+from bidex_meta.runs.video import tiled
 
 
 def film_row(

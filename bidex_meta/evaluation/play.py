@@ -18,8 +18,8 @@ from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError, shortened
 from bidex_meta.evaluation.references import Reference, references_of
 from bidex_meta.evaluation.results import Evaluation, results_by_class
-from bidex_meta.maths import check_precision
-from bidex_meta.validation import whole_number
+from bidex_meta.utils.maths import check_precision
+from bidex_meta.utils.validation import whole_number
 from bidex_meta.world.contract import TaskWorld
 
 EVALUATION_SEED = 1_000_000

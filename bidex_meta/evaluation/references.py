@@ -13,12 +13,12 @@ from typing import Any, Literal, TypedDict
 
 import numpy as np
 
-from bidex_meta import paths
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
-from bidex_meta.reading import exists, read_json
-from bidex_meta.record.atomic import write_json
-from bidex_meta.validation import Finite, parse
+from bidex_meta.runs.atomic import write_json
+from bidex_meta.utils import paths
+from bidex_meta.utils.files import exists, read_json
+from bidex_meta.utils.validation import Finite, parse
 
 Kind = Literal["random", "zero", "expert", "witness", "script"]
 _Row = TypedDict("_Row", {"return": Finite})

@@ -6,8 +6,8 @@ from functools import lru_cache
 import mujoco
 import numpy as np
 
-from bidex_meta import paths
 from bidex_meta.hands.poses import HandPose
+from bidex_meta.utils import paths
 
 FINGERS = ("ff", "mf", "rf", "lf", "th")
 """Fingers in the order of Table 7."""

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from bidex_meta.maths import quaternion_from_rpy, quaternion_product
+from bidex_meta.utils.maths import quaternion_from_rpy, quaternion_product
 
 MOUNT_QUATERNION = (0.0, 0.0, -math.sqrt(0.5), math.sqrt(0.5))
 """Orientation (w, x, y, z) of the mount for an unrotated actor: fingers to world -y, palm up, thumb to -x."""

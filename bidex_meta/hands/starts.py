@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.hand import DISTAL_PER_MIDDLE, hand
-from bidex_meta.maths import constant, dot, norm
+from bidex_meta.utils.maths import constant, dot, norm
 
 _WRIST = (0.0, 0.01, 0.256)
 """Wrist origin in the mount frame, metres; the palm lies 0.034 further along the turned z (docs/figures.md,

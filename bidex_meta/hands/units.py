@@ -15,8 +15,8 @@ from typing import Annotated
 from msgspec import Meta
 
 from bidex_meta.errors import BidexError
-from bidex_meta.reading import expanded, read_toml
-from bidex_meta.validation import Text, parse
+from bidex_meta.utils.files import expanded, read_toml
+from bidex_meta.utils.validation import Text, parse
 
 UNITS: dict[str, str] = {
     "palm": "WR", "first": "FF", "middle": "MF", "ring": "RF", "little": "LF", "thumb": "TH",

@@ -12,7 +12,7 @@ from bidex_meta.points.surfaces import sample
 from bidex_meta.suite import MOST_POINTS
 from bidex_meta.tasks.scene import Scene
 from bidex_meta.tasks.state import TaskState
-from bidex_meta.validation import true_or_false, whole_number
+from bidex_meta.utils.validation import true_or_false, whole_number
 
 CANDIDATES = 3072
 """Points fixed on a scene at least: fewer leave gaps through which hidden points are seen."""

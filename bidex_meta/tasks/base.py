@@ -14,7 +14,7 @@ from bidex_meta.hands.poses import HandPose
 from bidex_meta.tasks.layout import Block, Layout, both_hands
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace
-from bidex_meta.validation import true_or_false
+from bidex_meta.utils.validation import true_or_false
 
 
 @dataclass(frozen=True)

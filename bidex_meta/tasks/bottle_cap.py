@@ -9,7 +9,6 @@ from torch import Tensor
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.hand import hand
 from bidex_meta.hands.poses import HandPose
-from bidex_meta.maths import constant, dot, indices
 from bidex_meta.tasks.base import FIRM
 from bidex_meta.tasks.layout import object_blocks, point_block
 from bidex_meta.tasks.objects.pointed import OwnObjectClass
@@ -18,6 +17,7 @@ from bidex_meta.tasks.reach import apart, reach
 from bidex_meta.tasks.scene import SceneObject, add_table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace
+from bidex_meta.utils.maths import constant, dot, indices
 
 _TILT = 0.87
 _PALM_NORMAL = (math.sin(_TILT), 0.0, math.cos(_TILT))

@@ -4,7 +4,7 @@ import math
 
 from torch import Tensor
 
-from bidex_meta.maths import conjugate, rotate, uprightness
+from bidex_meta.utils.maths import conjugate, rotate, uprightness
 
 FLOOR, RIM = -0.049, 0.0445
 """Heights of the inner floor and of the rim in the bucket's frame, metres (assets/objects/bucket.xml)."""

@@ -6,9 +6,9 @@ from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_UP_BACK, HandPose
-from bidex_meta.maths import constant, norm
 from bidex_meta.tasks.eggs import OneEgg
 from bidex_meta.tasks.state import TaskState
+from bidex_meta.utils.maths import constant, norm
 
 _ANCHOR_RADIUS = 0.1
 

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
-from bidex_meta.maths import quaternion_from_rpy, xyzw
 from bidex_meta.tasks.base import FAST, TaskClass
 from bidex_meta.tasks.goals import frozen_goal, observe_goal
 from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
@@ -17,6 +16,7 @@ from bidex_meta.tasks.reach import apart, reach
 from bidex_meta.tasks.scene import SceneObject
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace, component, join
+from bidex_meta.utils.maths import quaternion_from_rpy, xyzw
 
 _BASE = (0.0, 0.0, 0.7)
 _SHIFT = 0.05

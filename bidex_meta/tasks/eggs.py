@@ -12,7 +12,6 @@ from torch import Tensor
 
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.hands.starts import make_room, noisy_joints
-from bidex_meta.maths import conjugate, constant, norm, random_orientation, rotate, rotation_angle, wxyz, xyzw
 from bidex_meta.tasks.base import LIGHT, TaskClass
 from bidex_meta.tasks.goals import frozen_goal, observe_goal, rotation_difference
 from bidex_meta.tasks.layout import goal_blocks, object_blocks
@@ -20,6 +19,7 @@ from bidex_meta.tasks.objects.held import EGG, HeldObject, held_object
 from bidex_meta.tasks.scene import SceneObject
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace, box, join, orientation
+from bidex_meta.utils.maths import conjugate, constant, norm, random_orientation, rotate, rotation_angle, wxyz, xyzw
 
 RADIUS, HALF_LENGTH = 0.03, 0.04
 """Short and long semi-axis of the egg, metres (docs/figures.md, objects)."""

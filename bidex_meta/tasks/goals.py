@@ -2,8 +2,8 @@
 
 from torch import Tensor
 
-from bidex_meta.maths import conjugate, multiply
 from bidex_meta.tasks.state import TaskState
+from bidex_meta.utils.maths import conjugate, multiply
 
 
 def frozen_goal(pose: Tensor, goal: str = "goal") -> dict[str, Tensor]:

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
-from bidex_meta.maths import norm, uprightness
 from bidex_meta.tasks.base import FAST
 from bidex_meta.tasks.goals import frozen_goal, observe_goal
 from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
@@ -18,6 +17,7 @@ from bidex_meta.tasks.reach import reach
 from bidex_meta.tasks.scene import SceneObject, add_table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import component, join
+from bidex_meta.utils.maths import norm, uprightness
 
 _START = (0.0, -0.6, 0.465)
 _GOAL_SHIFT = 0.05

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
-from bidex_meta.maths import rotate, xyzw
 from bidex_meta.tasks.base import THIN, TaskClass
 from bidex_meta.tasks.goals import frozen_goal, observe_goal
 from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
@@ -17,6 +16,7 @@ from bidex_meta.tasks.placement import DRAWS, place, placed
 from bidex_meta.tasks.reach import apart, reach
 from bidex_meta.tasks.scene import SceneObject, add_table
 from bidex_meta.tasks.state import TaskState
+from bidex_meta.utils.maths import rotate, xyzw
 
 _PEN = SceneObject("pen", "pen", (0.0, 0.0, 0.612), (0.5 * math.pi, 0.5 * math.pi, 0.0))
 _OPEN = 0.3

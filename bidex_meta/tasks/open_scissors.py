@@ -8,7 +8,6 @@ from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
-from bidex_meta.maths import conjugate, constant, multiply, rotate, xyzw
 from bidex_meta.tasks.base import THIN, TaskClass
 from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, place, placed, yaw_quaternion
@@ -16,6 +15,7 @@ from bidex_meta.tasks.reach import reach
 from bidex_meta.tasks.scene import SceneObject, add_table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import component, join
+from bidex_meta.utils.maths import conjugate, constant, multiply, rotate, xyzw
 
 _SCISSORS = SceneObject("scissors", "scissors", (0.0, 0.0, 0.608), (0.0, 0.0, 0.5 * math.pi))
 _SHUT = -0.59

@@ -9,8 +9,8 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-from bidex_meta.maths import constant, multiply, wxyz, xyzw
 from bidex_meta.tasks.variation import VariationSpace
+from bidex_meta.utils.maths import constant, multiply, wxyz, xyzw
 
 SHIFT = 0.03
 """Half width of a task's shift along x and y, metres (docs/figures.md, decisions)."""

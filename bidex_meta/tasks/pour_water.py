@@ -8,7 +8,6 @@ from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
-from bidex_meta.maths import conjugate, multiply, norm, quaternion_from_rpy, rotate, xyzw
 from bidex_meta.tasks.base import THIN, TaskClass
 from bidex_meta.tasks.bucket import FLOOR, MOUTH, inside_bucket, stands
 from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
@@ -17,7 +16,8 @@ from bidex_meta.tasks.reach import reach
 from bidex_meta.tasks.scene import SceneObject, add_table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import join
-from bidex_meta.validation import whole_number
+from bidex_meta.utils.maths import conjugate, multiply, norm, quaternion_from_rpy, rotate, xyzw
+from bidex_meta.utils.validation import whole_number
 
 _KETTLE = SceneObject("kettle", "kettle", (0.0, 0.0, 0.478), (0.0, 0.0, 0.5 * math.pi))
 _BUCKET = SceneObject("bucket", "bucket", (0.0, -0.3, 0.457))

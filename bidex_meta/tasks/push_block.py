@@ -6,7 +6,6 @@ from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
-from bidex_meta.maths import norm
 from bidex_meta.tasks.base import FAST, TaskClass
 from bidex_meta.tasks.layout import object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, place_all, placed
@@ -14,6 +13,7 @@ from bidex_meta.tasks.reach import reach
 from bidex_meta.tasks.scene import SceneObject, add_table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import join
+from bidex_meta.utils.maths import norm
 
 _STARTS = {"block1": (0.0, -0.2, 0.625), "block2": (0.0, 0.2, 0.625)}
 _GOALS = {"block1": (-0.2, -0.2, 0.625), "block2": (-0.2, 0.2, 0.625)}

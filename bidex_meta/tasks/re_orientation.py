@@ -6,7 +6,6 @@ from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
-from bidex_meta.maths import constant, multiply, rotation_angle, wxyz, xyzw
 from bidex_meta.tasks import eggs
 from bidex_meta.tasks.base import FIRM, TaskClass
 from bidex_meta.tasks.goals import frozen_goal, observe_goal
@@ -14,6 +13,7 @@ from bidex_meta.tasks.layout import goal_blocks, object_blocks
 from bidex_meta.tasks.scene import SceneObject
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import orientation
+from bidex_meta.utils.maths import constant, multiply, rotation_angle, wxyz, xyzw
 
 _BOUNDING_RADIUS = 0.0434
 """Half the space diagonal of a cube with an edge of 5 cm, metres."""

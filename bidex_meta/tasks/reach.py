@@ -2,8 +2,8 @@
 
 from torch import Tensor
 
-from bidex_meta.maths import norm
 from bidex_meta.tasks.state import TaskState
+from bidex_meta.utils.maths import norm
 
 
 def reach(state: TaskState, side: str, point: str) -> Tensor:

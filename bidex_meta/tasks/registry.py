@@ -5,7 +5,7 @@ import inspect
 from typing import TYPE_CHECKING
 
 from bidex_meta.errors import BidexError, known_name, unknown_name
-from bidex_meta.outside import is_outside, outside_class
+from bidex_meta.utils.plugins import is_outside, outside_class
 
 if TYPE_CHECKING:
     from bidex_meta.tasks.base import TaskClass

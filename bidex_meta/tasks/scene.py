@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from bidex_meta import paths
 from bidex_meta.hands.hand import FIXTURE, OBJECT, SIDES, add_hands, damp_bases, hand, set_contact_bits
-from bidex_meta.maths import quaternion_from_rpy
 from bidex_meta.tasks.state import unknown_sensor
+from bidex_meta.utils import paths
+from bidex_meta.utils.maths import quaternion_from_rpy
 
 if TYPE_CHECKING:
     from bidex_meta.tasks.base import TaskClass

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable
 from torch import Tensor
 
 from bidex_meta.errors import BidexError, unknown_name
-from bidex_meta.maths import xyzw
+from bidex_meta.utils.maths import xyzw
 
 
 def unknown_sensor(name: str, known: Iterable[str]) -> BidexError:

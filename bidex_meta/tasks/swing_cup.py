@@ -8,7 +8,6 @@ from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
-from bidex_meta.maths import multiply, norm, rotation_angle, xyzw
 from bidex_meta.tasks.base import FIRM
 from bidex_meta.tasks.goals import frozen_goal, observe_goal, rotation_difference
 from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
@@ -18,6 +17,7 @@ from bidex_meta.tasks.reach import reach
 from bidex_meta.tasks.scene import SceneObject, add_table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import component, join
+from bidex_meta.utils.maths import multiply, norm, rotation_angle, xyzw
 
 _CUP = SceneObject("cup", "cup", (0.0, 0.0, 0.6845), (0.0, 0.0, 0.5 * math.pi))
 _SUCCESS_ANGLE = 0.25 * math.pi

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
-from bidex_meta.maths import norm, quaternion_from_rpy, quaternion_product, xyzw
 from bidex_meta.tasks.base import FAST, TaskClass
 from bidex_meta.tasks.goals import frozen_goal, observe_goal
 from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
@@ -17,6 +16,7 @@ from bidex_meta.tasks.reach import reach
 from bidex_meta.tasks.scene import SceneObject, add_table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import component, join
+from bidex_meta.utils.maths import norm, quaternion_from_rpy, quaternion_product, xyzw
 
 _BASES = {"switch1": (0.0, -0.2, 0.65), "switch2": (0.0, 0.2, 0.65)}
 _FACE_UP = (math.pi, 0.5 * math.pi, 0.0)

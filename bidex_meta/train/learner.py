@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from bidex_meta.errors import BidexError
-from bidex_meta.validation import Checked
+from bidex_meta.utils.validation import Checked
 
 if TYPE_CHECKING:
     import torch

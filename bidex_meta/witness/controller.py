@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.hand import ANGULAR_DAMPING, FORCE_PER_SCALE, LINEAR_DAMPING, SIDES, TORQUE_PER_SCALE, hand
-from bidex_meta.maths import conjugate, multiply, quaternion_from_rpy, rotate, xyzw
+from bidex_meta.utils.maths import conjugate, multiply, quaternion_from_rpy, rotate, xyzw
 from bidex_meta.witness.replay import Simulator
 from bidex_meta.witness.store import quantised
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from bidex_meta.errors import BidexError
 from bidex_meta.hands.hand import SIDES
-from bidex_meta.maths import conjugate, multiply, rotate, rotation_angle
+from bidex_meta.utils.maths import conjugate, multiply, rotate, rotation_angle
 from bidex_meta.witness.controller import GAIN, HandController, Point
 
 _FINGERS = 0.085

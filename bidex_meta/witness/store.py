@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
-from bidex_meta import paths
 from bidex_meta.errors import BidexError, one_line
-from bidex_meta.reading import bounded, read_bytes
-from bidex_meta.record.atomic import write_atomic
+from bidex_meta.runs.atomic import write_atomic
 from bidex_meta.tasks import registry
-from bidex_meta.validation import Finite, Whole, parse
+from bidex_meta.utils import paths
+from bidex_meta.utils.files import bounded, read_bytes
+from bidex_meta.utils.validation import Finite, Whole, parse
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -15,7 +15,7 @@ from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
 from bidex_meta.errors import BidexError
-from bidex_meta.validation import true_or_false
+from bidex_meta.utils.validation import true_or_false
 from bidex_meta.world import checked
 from bidex_meta.world.contract import Info, ObservationGroup, Options, State, Step
 from bidex_meta.world.episodes import Clock, Episodes, checked_mode, checked_seed, ended_info, reset_mask

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from bidex_meta.engine.health import dense
 from bidex_meta.errors import BidexError, shortened, unknown_name
-from bidex_meta.maths import check_precision
-from bidex_meta.validation import whole_number
+from bidex_meta.utils.maths import check_precision
+from bidex_meta.utils.validation import whole_number
 from bidex_meta.world.contract import Info, Options, VectorWorld
 
 _MODES = {"SAME_STEP": AutoresetMode.SAME_STEP, "DISABLED": AutoresetMode.DISABLED}

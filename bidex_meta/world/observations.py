@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.hand import SIDES, hand
-from bidex_meta.maths import conjugate, multiply, roll_pitch_yaw, xyzw
 from bidex_meta.tasks.layout import CLIP, Layout, hand_blocks
 from bidex_meta.tasks.scene import Scene
+from bidex_meta.utils.maths import conjugate, multiply, roll_pitch_yaw, xyzw
 from bidex_meta.world.contract import ObservationGroup
 
 Rule = Literal["plain", "one-hot", "masked"]

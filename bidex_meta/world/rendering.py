@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 import torch
 
-from bidex_meta import drawing
 from bidex_meta.errors import BidexError, shortened
-from bidex_meta.maths import wxyz
+from bidex_meta.utils import gl_backend
+from bidex_meta.utils.maths import wxyz
 
 if TYPE_CHECKING:
     from bidex_meta.engine.protocol import Engine
@@ -60,7 +60,7 @@ class Painter:
     def _renderer(self, engine: "Engine", row: int, key: tuple[int, int, int]) -> mujoco.Renderer:
         """That of a slot (its rows have one model) and a size, width and height."""
         if key not in self._renderers:
-            drawing.prepare()
+            gl_backend.prepare()
             model = engine.model(row)
             most = model.vis.global_.offwidth, model.vis.global_.offheight
             if not (0 < key[1] <= most[0] and 0 < key[2] <= most[1]):

@@ -17,11 +17,11 @@ from torch import Tensor
 
 from bidex_meta.engine.choice import choose_engine
 from bidex_meta.errors import BidexError
-from bidex_meta.memory import POINT_BYTES, ROW_BYTES, check_memory
 from bidex_meta.points.depth_sensor import PointsRule
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.layout import CLIP
-from bidex_meta.validation import whole_number
+from bidex_meta.utils.memory import POINT_BYTES, ROW_BYTES, check_memory
+from bidex_meta.utils.validation import whole_number
 from bidex_meta.world import checked
 from bidex_meta.world.base import BatchedWorld, Slots, Transition
 from bidex_meta.world.contract import Info, State

@@ -3,8 +3,8 @@
 from typing import TYPE_CHECKING, Any
 
 from bidex_meta.errors import BidexError
-from bidex_meta.memory import check_memory
 from bidex_meta.suite import metaworld_classes
+from bidex_meta.utils.memory import check_memory
 from bidex_meta.worlds.base import WorldConfig, Worlds
 
 if TYPE_CHECKING:

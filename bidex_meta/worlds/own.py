@@ -5,9 +5,9 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, cast
 
 from bidex_meta.errors import BidexError
-from bidex_meta.outside import name_with_object
 from bidex_meta.suite import Split, Suite, load_suite
 from bidex_meta.tasks import registry
+from bidex_meta.utils.plugins import name_with_object
 from bidex_meta.worlds.base import WorldConfig, Worlds, physics_of
 
 if TYPE_CHECKING:

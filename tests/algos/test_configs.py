@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from bidex_meta.commands.learners import ALGOS, learner_kind
+from bidex_meta.cli.learners import ALGOS, learner_kind
 from bidex_meta.errors import BidexError
 
 WRONG: dict[str, dict[str, Any]] = {

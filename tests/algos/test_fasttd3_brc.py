@@ -13,7 +13,7 @@ from torch.testing import assert_close
 from bidex_algos.offpolicy.brc import BRC, BRCConfig
 from bidex_algos.offpolicy.fasttd3 import FastTD3, FastTD3Config
 from bidex_algos.replay import Transitions
-from bidex_meta.commands.learners import learner_kind
+from bidex_meta.cli.learners import learner_kind
 from bidex_meta.errors import BidexError
 from bidex_meta.train import distributed
 from bidex_meta.world.contract import plain_groups

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from bidex_meta.commands.learners import learner_kind
+from bidex_meta.cli.learners import learner_kind
 from tests.algos.families import PointGoals
 from tests.algos.toy import ToyWorld, nearness
 from tests.offline.stored import as_data, noisy, played

@@ -13,7 +13,7 @@ from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.recurrent import RecurrentNet
 from bidex_meta import Benchmark
 from bidex_meta.agents import MetaLearningAgent, Timestep
-from bidex_meta.commands.learners import learner_kind
+from bidex_meta.cli.learners import learner_kind
 from bidex_meta.errors import BidexError
 from bidex_meta.worlds import Worlds
 from tests.algos.families import PointClass, PointGoals, circle

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from bidex_meta.cli import main
+from bidex_meta.cli import main, watching
 from bidex_meta.clients.humanoid_world import NAME, HumanoidWorld
-from bidex_meta.commands import watching
 from bidex_meta.errors import BidexError
-from bidex_meta.record import RunFolder
+from bidex_meta.runs import RunFolder
 from bidex_meta.worlds import Worlds
 from bidex_meta.worlds.external import HUMANOID
 

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bidex_meta import memory
 from bidex_meta.cli import main
 from bidex_meta.commands import run_recording
 from bidex_meta.commands.run_data import dataset_metadata
@@ -20,6 +19,7 @@ from bidex_meta.data.checking import verify
 from bidex_meta.data.writer import DatasetWriter, estimated_bytes, finish
 from bidex_meta.errors import BidexError
 from bidex_meta.record import RunFolder
+from bidex_meta.utils import memory
 from bidex_meta.worlds import Worlds
 from bidex_meta.worlds.own import OwnSuite
 from tests.data.worlds import changed, printed, rough

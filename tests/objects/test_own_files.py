@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from bidex_meta import BidexError, make_task_world, paths
+from bidex_meta import BidexError, make_task_world
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import compile_scene
+from bidex_meta.utils import paths
 from tests.tasks.worlds import Lens, depths, engine_of, scene_of
 
 OBJ = "\n".join(f"v {x} {y} {z}" for x in (-0.02, 0.02) for y in (-0.03, 0.03) for z in (-0.04, 0.04)) + (

@@ -21,8 +21,8 @@ import scipy.stats
 import torch
 from torch import Tensor
 
-from bidex_meta.commands.learners import learner_kind
-from bidex_meta.commands.run_data import implied, task_seed
+from bidex_meta.cli.learners import learner_kind
+from bidex_meta.cli.run_data import implied, task_seed
 from bidex_meta.data import open_dataset
 from bidex_meta.data.joined import Joined, join
 from bidex_meta.evaluation.play import EVALUATION_SEED

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from bidex_meta.data import collect, open_dataset, writer
-from bidex_meta.record import RunFolder
+from bidex_meta.runs import RunFolder
 from bidex_meta.witness.demonstrators import ShiftedStarts
 from bidex_meta.witness.replay import Simulator
 from bidex_meta.witness.scripts import SCRIPTS

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from bidex_meta.data import open_dataset
-from bidex_meta.record import RunFolder, read_metrics
+from bidex_meta.runs import RunFolder, read_metrics
 from tests.robust.marks import PHASES, read
 
 ROOT = Path(__file__).parents[2]

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from bidex_meta.cli import main
-from bidex_meta.record import RunFolder
+from bidex_meta.runs import RunFolder
 from bidex_meta.worlds.own import OwnSuite
 from tests.fakes import ToyWorld, run_config
 
@@ -149,7 +149,7 @@ def test_a_full_disk_is_one_line(run: Path, capsys: pytest.CaptureFixture[str], 
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device", "checkpoints/step_96.pt")
 
-    monkeypatch.setattr("bidex_meta.record.checkpoints.write_atomic", full)
+    monkeypatch.setattr("bidex_meta.runs.checkpoints.write_atomic", full)
     told = refused(capsys, "run", "--resume", run, "--steps", "96").splitlines()[-1]
     assert told.startswith("bidex-meta: checkpoints/step_96.pt: No space left on device.")
 
@@ -157,7 +157,7 @@ def test_a_full_disk_is_one_line(run: Path, capsys: pytest.CaptureFixture[str], 
 def test_a_deleted_run_folder_is_one_line(run: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
     import shutil
 
-    from bidex_meta.record import Recorder
+    from bidex_meta.runs import Recorder
 
     save = Recorder.save
     monkeypatch.setattr(Recorder, "save", lambda *a: (shutil.rmtree(run), save(*a)))
@@ -222,7 +222,7 @@ def test_output_that_nobody_takes_is_no_traceback(line: str, code: int, tmp_path
 def test_a_terminal_that_is_gone_is_a_reader_that_has_ended() -> None:
     from io import StringIO
 
-    from bidex_meta.record import Progress
+    from bidex_meta.runs import Progress
 
     class Gone(StringIO):
         def write(self, text: str) -> int:

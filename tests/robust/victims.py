@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.cli import main
-from bidex_meta.commands.learners import learner_kind
+from bidex_meta.cli.learners import learner_kind
 from bidex_meta.train import runner
 from bidex_meta.worlds import Worlds
 from bidex_meta.worlds.own import OwnSuite
@@ -51,7 +51,7 @@ FLAGS = {
 }
 """Of each learner; ``tests/robust/test_kills.py`` holds that none is missing."""
 _LOADED = ("bidex_meta.benchmark", "bidex_meta.cli", "scipy.optimize", "scipy.stats", "torch._dynamo", "typeguard")
-_LOADED += tuple(f"bidex_meta.commands.{name}" for name in ("metatest", "policies", "run", "tables", "watching"))
+_LOADED += tuple(f"bidex_meta.cli.{name}" for name in ("metatest", "policies", "run", "tables", "watching"))
 _LOADED += tuple(f"bidex_meta.evaluation.{name}" for name in ("meta_test", "play", "references", "untrained"))
 """What each process would load by itself, for longer than it runs."""
 ADAPTS = ("promp", "maml", "rl2")

@@ -12,12 +12,12 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from bidex_meta.maths import norm
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.bucket import inside_bucket
 from bidex_meta.tasks.eggs import distances
 from bidex_meta.tasks.goals import rotation_difference
 from bidex_meta.tasks.state import TaskState
+from bidex_meta.utils.maths import norm
 from tests.tasks.formulas import FORMULAS
 from tests.tasks.formulas_blocks import StackBlock
 from tests.tasks.formulas_fixtures import TRAVEL

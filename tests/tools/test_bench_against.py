@@ -12,7 +12,7 @@ import pytest
 
 from bidex_meta.errors import BidexError
 from bidex_meta.metaworld import batched
-from bidex_meta.record.versions import git_state
+from bidex_meta.runs.versions import git_state
 from tools.bench import against, field
 from tools.bench.__main__ import main
 from tools.bench.against import HERE, checkout, commit_name, recorded

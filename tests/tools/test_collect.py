@@ -8,8 +8,8 @@ import pytest
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import read_groups
-from bidex_meta.record import RunFolder
-from bidex_meta.record.stored import StoredRun, open_run
+from bidex_meta.runs import RunFolder
+from bidex_meta.runs.stored import StoredRun, open_run
 from tests.fakes import change
 from tests.pages import ROOT
 from tests.test_comparison import run

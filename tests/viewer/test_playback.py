@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from bidex_meta import drawing
 from bidex_meta.cli import main
 from bidex_meta.evaluation.play import ZeroAgent
+from bidex_meta.utils import gl_backend
 from bidex_meta.viewer import playback
 from bidex_meta.viewer.browser import colour, shape, visible
 from bidex_meta.viewer.playback import Stage
@@ -143,7 +143,7 @@ def test_the_page_shows_the_row_and_obeys(stage):
 
 
 def test_without_a_screen_and_viser_one_line_says_what_to_install(monkeypatch, capsys):
-    monkeypatch.setattr(drawing, "has_screen", lambda: False)
+    monkeypatch.setattr(gl_backend, "has_screen", lambda: False)
     monkeypatch.setitem(sys.modules, "viser", None)
     assert main(["play", "--task", "CatchUnderarm"]) == 2
     assert "bidex-meta[viewer]" in capsys.readouterr().err

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 import torch
 
-from bidex_meta import paths
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
-from bidex_meta.record.versions import collect_versions
+from bidex_meta.runs.versions import collect_versions
 from bidex_meta.tasks import registry
+from bidex_meta.utils import paths
 from bidex_meta.witness.controller import rest_action
 from bidex_meta.witness.demonstrators import OpenLoopReplay
 from bidex_meta.witness.replay import SHIFT, Replay, Simulator, replay, task_slot
@@ -118,7 +118,7 @@ def test_a_missing_witness_says_where_others_are_listed(monkeypatch: pytest.Monk
 def test_replay_of_what_is_missing_is_not_found(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("bidex_meta.commands.witness.witness_path", lambda name: tmp_path / name)
+    monkeypatch.setattr("bidex_meta.cli.witness.witness_path", lambda name: tmp_path / name)
     assert main(["witness", "--task", "HandOver", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)[0]["found"] is False
 

@@ -6,8 +6,8 @@ import torch
 from bidex_meta.benchmark import make_task_world
 from bidex_meta.errors import BidexError
 from bidex_meta.hands.hand import hand
-from bidex_meta.maths import conjugate, multiply, xyzw
 from bidex_meta.tasks.base import CONTROL_RATE
+from bidex_meta.utils.maths import conjugate, multiply, xyzw
 from bidex_meta.witness.controller import GAIN, HandController
 from bidex_meta.witness.demonstrators import Scripted
 from bidex_meta.witness.replay import Simulator

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from bidex_meta.errors import BidexError
-from bidex_meta.validation import whole_number
+from bidex_meta.utils.validation import whole_number
 from bidex_meta.world import World
 from tests.world.play import engine_state, flat, suite_world
 

@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from bidex_meta import drawing
 from bidex_meta.benchmark import make_task_world
 from bidex_meta.errors import BidexError
+from bidex_meta.utils import gl_backend
 
 
 class FakeRenderer:
@@ -35,7 +35,7 @@ class FakeRenderer:
 
 @pytest.fixture
 def world(monkeypatch):
-    monkeypatch.setattr(drawing, "prepare", lambda: None)
+    monkeypatch.setattr(gl_backend, "prepare", lambda: None)
     monkeypatch.setattr(mujoco, "Renderer", FakeRenderer)
     FakeRenderer.made = FakeRenderer.open = 0
     made = make_task_world("CatchUnderarm", num_envs=3, seed=0, autoreset_mode="DISABLED", threads=1)

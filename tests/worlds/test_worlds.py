@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from bidex_meta import paths
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import ZeroAgent
+from bidex_meta.utils import paths
 from bidex_meta.worlds import WorldConfig, Worlds
 
 CORE = Path(paths.__file__).parent

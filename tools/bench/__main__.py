@@ -10,7 +10,7 @@ from typing import Any
 
 import tyro
 
-from bidex_meta.commands.tables import plain_table, print_table
+from bidex_meta.cli.tables import plain_table, print_table
 from bidex_meta.errors import BidexError
 from tools.bench.adapt import adapt
 from tools.bench.against import against

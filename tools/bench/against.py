@@ -20,9 +20,9 @@ from typing import Any
 import tyro
 
 from bidex_meta.errors import BidexError
-from bidex_meta.memory import usable_cores
-from bidex_meta.record.atomic import write_json
-from bidex_meta.record.versions import git_state
+from bidex_meta.runs.atomic import write_json
+from bidex_meta.runs.versions import git_state
+from bidex_meta.utils.memory import usable_cores
 
 HERE = Path(__file__).resolve().parents[2]
 """The checkout that this code runs from."""

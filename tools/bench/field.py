@@ -13,9 +13,9 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 
 from bidex_meta.benchmark import Benchmark
-from bidex_meta.memory import usable_cores
 from bidex_meta.metaworld.batched import MetaWorldWorld
 from bidex_meta.tasks.base import CONTROL_RATE
+from bidex_meta.utils.memory import usable_cores
 
 _METAWORLD_ROWS = 10
 _HANDS = ("HandReach-v3", "HandManipulateEgg-v1")

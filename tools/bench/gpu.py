@@ -10,7 +10,7 @@ import torch
 
 from bidex_meta.benchmark import Benchmark, make_task_world
 from bidex_meta.errors import BidexError
-from bidex_meta.record.atomic import write_json
+from bidex_meta.runs.atomic import write_json
 from bidex_meta.world import World
 from tools.bench.soak import chosen_learner, resident
 from tools.bench.timing import now, random_steps

@@ -4,7 +4,7 @@ import statistics
 from typing import Any
 
 from bidex_meta.benchmark import make_task_world
-from bidex_meta.memory import usable_cores
+from bidex_meta.utils.memory import usable_cores
 from tools.bench.timing import Seconds, random_steps
 
 

@@ -4,7 +4,7 @@ import statistics
 from typing import Any
 
 from bidex_meta.benchmark import Benchmark
-from bidex_meta.memory import usable_cores
+from bidex_meta.utils.memory import usable_cores
 from bidex_meta.world import Slot, World
 from tools.bench.timing import random_steps
 

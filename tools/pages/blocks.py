@@ -17,7 +17,7 @@ from pathlib import Path
 from PIL import Image
 
 from bidex_meta.errors import BidexError
-from bidex_meta.record import plots
+from bidex_meta.runs import plots
 from tools.pages import tables
 from tools.pages.gained import gains_table
 from tools.pages.offline import offline_table

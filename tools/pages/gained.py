@@ -6,7 +6,7 @@ from typing import Any
 
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import Estimate
-from bidex_meta.record.stored import StoredRun
+from bidex_meta.runs.stored import StoredRun
 from tools.pages.studies import Study
 from tools.pages.tables import table
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from bidex_meta.evaluation.comparison import classes_of, scored_classes
-from bidex_meta.record.stored import StoredRun
+from bidex_meta.runs.stored import StoredRun
 from tools.pages.studies import Study, refuse_differing
 from tools.pages.tables import mean_and_range, table
 

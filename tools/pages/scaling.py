@@ -7,8 +7,8 @@ import numpy as np
 
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import classes_of, curves_of
-from bidex_meta.record import plots
-from bidex_meta.record.stored import StoredRun
+from bidex_meta.runs import plots
+from bidex_meta.runs.stored import StoredRun
 from tools.pages.studies import Study, refuse_differing
 from tools.pages.tables import mean_and_range, random_rows, table
 

@@ -10,9 +10,9 @@ from typing import Any
 from bidex_meta.config import flat
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import Estimate, Group, classes_of, curves_of, estimates, group_of, iqm
-from bidex_meta.outside import short_name
-from bidex_meta.record import plots
-from bidex_meta.record.stored import StoredRun
+from bidex_meta.runs import plots
+from bidex_meta.runs.stored import StoredRun
+from bidex_meta.utils.plugins import short_name
 
 _FREE = ("seed", "start_from", "device", "threads", "logger", "evaluate_every", "video_every", "processes", "preset")
 """Config entries in which seeds of an arm may differ."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from bidex_meta.evaluation.comparison import Estimate, Group, iqm, scored_classes
 from bidex_meta.evaluation.references import Kind, load
-from bidex_meta.record.stored import StoredRun
+from bidex_meta.runs.stored import StoredRun
 from bidex_meta.tasks import registry
 from tools.pages.studies import Study
 

@@ -10,7 +10,7 @@ import numpy as np
 import tyro
 
 from bidex_meta.errors import BidexError
-from bidex_meta.record.versions import collect_versions
+from bidex_meta.runs.versions import collect_versions
 from bidex_meta.witness.controller import HandController
 from bidex_meta.witness.replay import SHIFTED, Replay, Simulator, replay
 from bidex_meta.witness.scripts import script_of

@@ -7,7 +7,7 @@ from bidex_algos.meta.adaptation import Adapted, StepSizeKind
 from bidex_algos.nets.architecture import network_bytes
 from bidex_algos.nets.networks import Activation, Layers
 from bidex_meta.train.learner import LearnerConfig
-from bidex_meta.validation import Count, Fraction, Positive, check_rising
+from bidex_meta.utils.validation import Count, Fraction, Positive, check_rising
 
 
 @dataclass(frozen=True)

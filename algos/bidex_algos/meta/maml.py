@@ -20,7 +20,7 @@ from bidex_algos.meta.adaptation import TaskBatch, weighted_mean
 from bidex_algos.meta.base import MetaLearner
 from bidex_algos.meta.config import TABLE_48, TUNED, UNSEEN, OuterConfig
 from bidex_algos.trust_region import trust_region_step
-from bidex_meta.validation import Count, Fraction, NonNegative, Positive
+from bidex_meta.utils.validation import Count, Fraction, NonNegative, Positive
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from bidex_algos.meta.adaptation import TaskBatch, weighted_mean
 from bidex_algos.meta.base import MetaLearner
 from bidex_algos.meta.config import TABLE_48, TUNED, UNSEEN, OuterConfig
 from bidex_algos.step_size import factor_of
-from bidex_meta.validation import Count, NonNegative, Positive, check_rising
+from bidex_meta.utils.validation import Count, NonNegative, Positive, check_rising
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from bidex_algos.step_size import AdaptiveAdams
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import all_sum, own_seed, rank, sum_gradients, world_size
 from bidex_meta.train.learner import AutoresetMode, Parts, State
-from bidex_meta.validation import Finite, Positive, check_rising
+from bidex_meta.utils.validation import Finite, Positive, check_rising
 from bidex_meta.world.contract import PooledWorld
 
 

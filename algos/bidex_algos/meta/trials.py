@@ -16,7 +16,7 @@ from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.recurrent import Memory, RecurrentNet, RecurrentPolicy
 from bidex_algos.rollout import EpisodeStatistics, may_look
 from bidex_meta.train.learner import LearnerConfig
-from bidex_meta.validation import Count, Fraction, Positive, Widths
+from bidex_meta.utils.validation import Count, Fraction, Positive, Widths
 from bidex_meta.world.contract import VectorWorld
 
 

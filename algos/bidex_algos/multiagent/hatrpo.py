@@ -16,7 +16,7 @@ from bidex_algos.onpolicy.base import Batch
 from bidex_algos.onpolicy.mttrpo import MTTRPOConfig
 from bidex_algos.trust_region import trust_region_step
 from bidex_meta.train.distributed import all_sum
-from bidex_meta.validation import Positive
+from bidex_meta.utils.validation import Positive
 from bidex_meta.world.contract import VectorWorld
 
 

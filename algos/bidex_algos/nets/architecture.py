@@ -9,7 +9,7 @@ from bidex_algos.nets.multitask import Moore, PaCo, SoftModules
 from bidex_algos.nets.networks import MLP, Activation, Layers
 from bidex_meta.errors import BidexError
 from bidex_meta.train.learner import LearnerConfig
-from bidex_meta.validation import Count, Whole, Widths
+from bidex_meta.utils.validation import Count, Whole, Widths
 
 MakeNetwork = Callable[..., Any]
 """Takes the arguments of :class:`~bidex_algos.nets.networks.MLP`."""

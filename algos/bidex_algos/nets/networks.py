@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from bidex_algos.nets.inputs import GroupEncoder, Inputs
 from bidex_algos.nets.products import Linear, affine, stacked_affine
-from bidex_meta.validation import Width
+from bidex_meta.utils.validation import Width
 
 Activation = Literal["elu", "relu", "tanh"]
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}

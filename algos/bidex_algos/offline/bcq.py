@@ -26,7 +26,7 @@ from bidex_algos.offline.base import PAPER, CriticConfig, Offline
 from bidex_algos.offpolicy.critics import Critics, follow
 from bidex_algos.replay import Transitions
 from bidex_meta.train.learner import Parts
-from bidex_meta.validation import Count, Fraction, NonNegative, Positive
+from bidex_meta.utils.validation import Count, Fraction, NonNegative, Positive
 from bidex_meta.world.contract import VectorWorld
 
 _FARTHEST = 0.5

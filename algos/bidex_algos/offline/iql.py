@@ -22,7 +22,7 @@ from bidex_algos.offline.base import PAPER, CriticConfig, Offline
 from bidex_algos.offpolicy.critics import follow
 from bidex_algos.replay import Transitions
 from bidex_meta.train.learner import Parts
-from bidex_meta.validation import NonNegative, Positive, check_rising
+from bidex_meta.utils.validation import NonNegative, Positive, check_rising
 from bidex_meta.world.contract import VectorWorld
 
 

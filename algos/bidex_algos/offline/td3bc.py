@@ -18,7 +18,7 @@ from bidex_algos.offline.bc import BC
 from bidex_algos.offpolicy.critics import follow
 from bidex_algos.replay import Transitions
 from bidex_meta.train.learner import Parts
-from bidex_meta.validation import Count, NonNegative
+from bidex_meta.utils.validation import Count, NonNegative
 from bidex_meta.world.contract import VectorWorld
 
 

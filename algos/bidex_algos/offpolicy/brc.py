@@ -26,7 +26,7 @@ from bidex_algos.offpolicy.categorical import Categorical, CategoricalConfig
 from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_algos.replay import Transitions
 from bidex_meta.errors import BidexError
-from bidex_meta.validation import Count, Finite, NonNegative, Share, Whole
+from bidex_meta.utils.validation import Count, Finite, NonNegative, Share, Whole
 
 
 class ResidualBlock(nn.Module):

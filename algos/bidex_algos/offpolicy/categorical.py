@@ -23,7 +23,7 @@ from bidex_algos.offpolicy.base import OffPolicy, OffPolicyConfig
 from bidex_algos.offpolicy.return_scale import ReturnBound
 from bidex_algos.replay import Transitions
 from bidex_meta.train.learner import State
-from bidex_meta.validation import MOST, Positive
+from bidex_meta.utils.validation import MOST, Positive
 
 
 class Atoms(nn.Module):

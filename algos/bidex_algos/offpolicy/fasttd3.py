@@ -18,7 +18,7 @@ from torch import Tensor
 from bidex_algos.offpolicy.categorical import Categorical, CategoricalConfig
 from bidex_algos.offpolicy.td3 import TD3, TD3Config
 from bidex_algos.replay import Transitions
-from bidex_meta.validation import Count, NonNegative, Share
+from bidex_meta.utils.validation import Count, NonNegative, Share
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from bidex_algos.offpolicy.critics import follow
 from bidex_algos.replay import Transitions
 from bidex_meta.errors import BidexError
 from bidex_meta.train.learner import Parts
-from bidex_meta.validation import Finite, Positive
+from bidex_meta.utils.validation import Finite, Positive
 from bidex_meta.world.contract import VectorWorld
 
 

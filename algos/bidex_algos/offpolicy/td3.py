@@ -13,7 +13,7 @@ from torch import Tensor
 
 from bidex_algos.offpolicy.ddpg import DDPG, DDPGConfig, of_paper
 from bidex_meta.train.learner import State
-from bidex_meta.validation import Count, NonNegative
+from bidex_meta.utils.validation import Count, NonNegative
 from bidex_meta.world.contract import VectorWorld
 
 

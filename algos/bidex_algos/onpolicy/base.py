@@ -39,7 +39,7 @@ from bidex_algos.rollout import EpisodeStatistics, Rollout, collect
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import all_sum, world_size
 from bidex_meta.train.learner import Parts, State
-from bidex_meta.validation import Count, Fraction, Positive, Whole, Widths, check_rising
+from bidex_meta.utils.validation import Count, Fraction, Positive, Whole, Widths, check_rising
 from bidex_meta.world.contract import VectorWorld
 
 

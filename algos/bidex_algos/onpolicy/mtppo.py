@@ -21,7 +21,7 @@ from bidex_algos.step_size import AdaptiveAdams
 from bidex_meta.data.joined import Joined
 from bidex_meta.train.distributed import sum_gradients, world_size
 from bidex_meta.train.learner import Parts, State
-from bidex_meta.validation import BelowOne, Count, Finite, NonNegative, Positive, Whole
+from bidex_meta.utils.validation import BelowOne, Count, Finite, NonNegative, Positive, Whole
 from bidex_meta.world.contract import VectorWorld
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from bidex_algos.nets.networks import gaussian_entropy, gaussian_kl, gaussian_log_prob
 from bidex_meta.train.distributed import all_sum
 from bidex_meta.train.learner import LearnerConfig
-from bidex_meta.validation import Count, Positive, check_rising
+from bidex_meta.utils.validation import Count, Positive, check_rising
 
 
 @dataclass(frozen=True)

@@ -11,15 +11,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bidex_meta import paths
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.errors import BidexError, known_name, shortened
 from bidex_meta.hands.poses import PALM_UP_AWAY, HandPose
 from bidex_meta.hands.starts import make_room_for
-from bidex_meta.maths import conjugate, constant, multiply, rotate, wxyz, xyzw
-from bidex_meta.reading import expanded
 from bidex_meta.tasks.objects.mjcf import check_collisions, compiled, extents, outline, read_own, set_contacts
 from bidex_meta.tasks.scene import attach
+from bidex_meta.utils import paths
+from bidex_meta.utils.files import expanded
+from bidex_meta.utils.maths import conjugate, constant, multiply, rotate, wxyz, xyzw
 
 EGG = "egg"
 _MASS = (0.002, 2.0)

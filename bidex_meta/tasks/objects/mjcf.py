@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from bidex_meta.errors import BidexError, one_line, shortened
-from bidex_meta.reading import is_file, read_bytes
+from bidex_meta.utils.files import is_file, read_bytes
 
 _MOST_BYTES, _MOST_MESH_BYTES = 1_000_000, 20_000_000
 _MOST_TAGS = 2_000

@@ -11,13 +11,13 @@ import mujoco
 import numpy as np
 import torch
 
-from bidex_meta import paths
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.errors import BidexError, shortened
-from bidex_meta.reading import absolute
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.objects.mjcf import check_collisions, compiled, outline, read_own, set_contacts
 from bidex_meta.tasks.scene import SceneObject, attach, compile_scene
+from bidex_meta.utils import paths
+from bidex_meta.utils.files import absolute
 
 _MOST_MASS, _LARGEST, _MOST_GEOMS = 10.0, 0.6, 64
 """kg; metres of the box around it; geoms that collide."""

@@ -1,0 +1,205 @@
+"""The command ``bidex-meta``: finds the subcommand, calls it, and turns errors into one line.
+
+Nothing heavy is imported here: each subcommand is a module of this package with a function ``main(arguments)``,
+imported when it is called.
+"""
+
+import contextlib
+import importlib
+import os
+import re
+import signal
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from types import FrameType
+from typing import NamedTuple
+
+from bidex_meta.errors import (
+    EXIT_BAD_INPUT,
+    EXIT_FAILED,
+    EXIT_INTERRUPTED,
+    EXIT_UNREAD,
+    BidexError,
+    known_name,
+    one_line,
+    shortened,
+)
+from bidex_meta.train.launch import hangup, launch
+from bidex_meta.utils.plugins import own_fault
+from bidex_meta.utils.streams import open_missing, silence, unread
+
+_LONGEST = 2000
+"""Letters of an error: what was given may be any text."""
+_EXAMPLE = "bidex-meta run --suite MT4 --algo mtppo"
+
+
+class Command(NamedTuple):
+    """Where a subcommand lives and what it does."""
+
+    module: str
+    summary: str
+
+
+COMMANDS: dict[str, Command] = {
+    "run": Command("bidex_meta.cli.run", "train a learner on a suite or a task, then evaluate it"),
+    "sweep": Command("bidex_meta.cli.sweep", "many runs from one file, resumed where they were stopped"),
+    "evaluate": Command("bidex_meta.cli.evaluate", "success and return of a trained run, per task class"),
+    "verify": Command("bidex_meta.cli.verify", "evaluate a run again and compare with what it recorded"),
+    "compare": Command("bidex_meta.cli.compare", "several runs beside each other, intervals over seeds"),
+    "control": Command("bidex_meta.cli.control", "held-out tasks, adapted to their own data and to others'"),
+    "record": Command("bidex_meta.cli.record", "record a data set: episodes of a policy, for offline learners"),
+    "data": Command("bidex_meta.cli.data", "the data sets there are, one of them, or a check of it"),
+    "list": Command("bidex_meta.cli.list", "the suites, tasks, algos or objects there are"),
+    "render": Command("bidex_meta.cli.render", "a picture or a film of a task, or of all of a run"),
+    "play": Command("bidex_meta.cli.play_live", "a policy at work, live: in a window or in the browser"),
+    "witness": Command("bidex_meta.cli.witness", "replay actions that solve a task"),
+    "baseline": Command("bidex_meta.cli.baseline", "measure the references of the normalised score"),
+    "plot": Command("bidex_meta.cli.plot", "learning curves of runs, as a picture"),
+    "report": Command("bidex_meta.cli.report", "runs as one HTML page: tables, curves, films"),
+    "completion": Command("bidex_meta.cli.completion", "a script that completes commands and flags in a shell"),
+    "bench": Command("bidex_meta.cli.bench", "measure the speed of a suite's world"),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        arguments: What follows ``bidex-meta``; the process's own by default.
+
+    Returns:
+        The exit code: 0, 1 where training diverged or a run differs from what it recorded, 2 for bad input or what the
+        system refuses (a full disk, a folder that cannot be written, no memory), 129 after SIGHUP, 130 after Ctrl-C,
+        141 where nobody reads stderr any more, 143 after SIGTERM (0 where training saved and ended at SIGTERM).
+
+    Raises:
+        SystemExit: With another exit code, from a subcommand.
+    """
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in given
+    given = [argument for argument in given if argument != "--debug"]
+    open_missing()
+    try:
+        with _signals_raise():
+            try:
+                _check_text(given)
+                return _dispatch(given)
+            finally:
+                sys.stdout.flush()  # at Python's own end nobody would catch that it cannot be written
+    except BidexError as error:
+        return _failed(str(error), EXIT_BAD_INPUT, debug)
+    except FloatingPointError as error:
+        return _failed(f"{error} What was saved before stays as it is.", EXIT_FAILED, debug)
+    except _Terminated as stop:
+        return _failed(f"stopped by {stop}.", 128 + stop.number, debug=False)
+    except KeyboardInterrupt:
+        return _failed("interrupted.", EXIT_INTERRUPTED, debug=False)
+    except MemoryError as error:
+        return _failed(f"out of memory: {error or 'ask for fewer rows'}.", EXIT_BAD_INPUT, debug)
+    except BrokenPipeError:
+        # A reader of results alone has seen enough (`| head`); without one of stderr work may have been broken off.
+        code = EXIT_UNREAD if unread(sys.stderr) else 0
+        silence(sys.stdout)  # Python complains otherwise when it flushes at its end
+        silence(sys.stderr)
+        return code
+    except OSError as error:
+        silence(sys.stdout)  # what it could not write it would try again at its end
+        place = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
+        return _failed(f"{place}{error.strerror or error}. Mend the path, or make room.", EXIT_BAD_INPUT, debug)
+    except (Exception, SystemExit) as error:
+        message = own_fault(error)
+        if message is None:
+            raise
+        return _failed(f"{message} Mend it there; --debug shows the traceback.", EXIT_BAD_INPUT, debug)
+
+
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM or SIGHUP came: everything is cleaned up as after Ctrl-C."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+
+@contextlib.contextmanager
+def _signals_raise() -> Iterator[None]:
+    """Turns SIGTERM and SIGHUP into an exception, so that they leave no half-written file and it is said why it ended.
+
+    Not in one of several processes: a collective operation, which waits outside Python, would hold it up.
+    """
+    if threading.current_thread() is not threading.main_thread() or launch().count > 1:
+        yield
+        return
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise _Terminated(number)
+
+    before = {number: signal.getsignal(number) or signal.SIG_DFL for number in (signal.SIGTERM, *hangup())}
+    for number in before:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _failed(reason: str, code: int, debug: bool) -> int:
+    """Says why, on one line; within an ``except`` whose error ``--debug`` shows."""
+    if debug:
+        raise
+    message = one_line(reason)
+    if len(message) > _LONGEST:
+        message = f"{message[: _LONGEST - 300]} ... {message[-200:]}"  # the end says how to mend it
+    with contextlib.suppress(OSError):  # nobody may read it
+        print(f"bidex-meta: {message}", file=sys.stderr)
+    return code
+
+
+def _dispatch(arguments: list[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_help())
+        return 0
+    name, *rest = arguments
+    if name == "--version":
+        from bidex_meta import __version__
+
+        print(__version__)
+        return 0
+    name = known_name("command", name, COMMANDS)
+    for place, word in enumerate(rest):
+        if not word or re.fullmatch(r"--[\w.-]+=", word):
+            flag = word.rstrip("=") or (rest[place - 1] if place else "a word")
+            raise BidexError(f"{flag} after bidex-meta {name} has no value. Give it one, or leave it out.")
+    importlib.import_module(COMMANDS[name].module).main(rest)
+    return 0
+
+
+def _check_text(arguments: Sequence[str]) -> None:
+    """Refuses what cannot be written into a config, a log or an event file; Python gives such bytes as surrogates."""
+    for word in arguments:
+        try:
+            word.encode()
+        except UnicodeEncodeError:
+            raise BidexError(
+                f"Expected arguments in UTF-8, got {shortened(word)}. Rename the file or folder, or name another."
+            ) from None
+
+
+def _help() -> str:
+    width = max(map(len, COMMANDS))
+    commands = [f"  {name:<{width}}  {command.summary}" for name, command in COMMANDS.items()]
+    return "\n".join(
+        [
+            "Multi-task and meta reinforcement learning for two dexterous hands: train, judge and look at policies.",
+            f"Example: {_EXAMPLE}",
+            "",
+            "usage: bidex-meta COMMAND [OPTIONS]",
+            "",
+            *commands,
+            "",
+            "bidex-meta COMMAND --help shows the options of a command; --debug shows the traceback of an error;",
+            "--version the version.",
+        ]
+    )

@@ -1,0 +1,122 @@
+"""``bidex-meta baseline``: the references of the normalised score."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from bidex_meta.agents import Agent
+from bidex_meta.cli.parsing import Switch, parse
+from bidex_meta.cli.tables import evaluation_table, print_table
+from bidex_meta.errors import BidexError, known_name
+from bidex_meta.evaluation import references
+from bidex_meta.evaluation.play import EVALUATION_SEED, RandomAgent, ZeroAgent, evaluate
+from bidex_meta.evaluation.results import Evaluation
+from bidex_meta.runs.atomic import check_writable
+from bidex_meta.runs.versions import collect_versions
+from bidex_meta.utils.validation import Few, Seed, Threads
+from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted
+from bidex_meta.witness.scripts import SCRIPTS
+from bidex_meta.witness.store import load_witness, witness_path
+from bidex_meta.world.contract import TaskWorld
+from bidex_meta.world.world import World
+from bidex_meta.worlds import WorldConfig, Worlds
+
+_POLICIES = {
+    "random": "uniform actions",
+    "zero": "zero actions",
+    "witness": "the witness of task 0, open loop",
+    "script": "the script of the class, led anew from each start",
+}
+
+
+@dataclass(frozen=True)
+class BaselineFlags:
+    """Measure the two ends of the normalised score: what a policy that has learned nothing gets, and the best known.
+
+    Example: bidex-meta baseline random --suite MT20 --out random.json
+
+    The better of random and zero actions scores 0, the expert 100. An episode in which the physics breaks counts here
+    with the worst finished one of its class, elsewhere with what is stored of random actions.
+    """
+
+    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="random|zero|witness|script")]
+    """random: uniform actions; zero: the action 0, joints held in the middle of their range and bases at rest;
+    witness: the actions that solve task 0 of a class, in all its tasks; script: hands that a script leads, which knows
+    the whole state (seven classes have one)."""
+    suite: str = "MT20"
+    """Suite whose train tasks are played."""
+    episodes: Few = 4
+    """Episodes of each task."""
+    seed: Seed = 0
+    """Seed of tasks, starts and actions."""
+    threads: Threads | None = None
+    """Threads of the physics; None: one per core."""
+    out: Path | None = None
+    """JSON file that takes the figures, beside those it has of other classes; None: print them alone. `evaluate` reads
+    assets/references/ of the installation, which is not written unless this names it."""
+    json: Switch = False
+    """Print JSON."""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Measure, print, and store where it was asked."""
+    flags = parse(BaselineFlags, arguments, "baseline")
+    what = known_name("baseline", flags.what, _POLICIES)
+    if flags.out is not None:
+        references.load_from(flags.out)
+        check_writable(flags.out)
+    worlds = Worlds.open(WorldConfig(suite=flags.suite, seed=flags.seed, threads=flags.threads))
+    if not worlds.moving_bases:
+        raise BidexError(f'References are of moving bases, but {flags.suite} has fixed ones. Write base = "moving".')
+    found = _scripted(worlds, flags) if what == "script" else _played(what, worlds, flags)
+    numbers = {name: result.to_json() for name, result in found.classes.items()}
+    if flags.out is not None:
+        stored = ("return", "return_interval", "success", "episodes", "unstable")
+        made = {"policy": _POLICIES[what], "suite": flags.suite, "seed": flags.seed, "versions": collect_versions()}
+        classes = {name: {key: row[key] for key in stored} for name, row in numbers.items()}
+        references.store(flags.out, classes, made)
+    if flags.json:
+        print(json.dumps(numbers, indent=2))
+        return
+    where = "" if flags.out is None else f", stored in {flags.out}"
+    print_table(evaluation_table(f"{_POLICIES[what]} on {flags.suite}{where}", found))
+
+
+def _played(what: str, worlds: Worlds, flags: BaselineFlags) -> Evaluation:
+    world = worlds.world()
+    agent, names = _agent(what, world, flags.seed)
+    found = evaluate(agent, world, flags.episodes, seed=EVALUATION_SEED, references={})
+    world.close()
+    return replace(found, classes={name: found.classes[name] for name in names})
+
+
+def _scripted(worlds: Worlds, flags: BaselineFlags) -> Evaluation:
+    """Each class that has a script on its own: alone it has the tasks that it has in suites."""
+    names = [name for name in worlds.task_classes() if name in SCRIPTS]
+    if not names:
+        raise BidexError(f"Expected a suite with a class that has a script ({', '.join(SCRIPTS)}), got {flags.suite}.")
+    classes = {}
+    for name in names:
+        config = WorldConfig(task=name, base="moving", seed=flags.seed, engine="c", threads=flags.threads)
+        world = Worlds.open(config).world()
+        assert isinstance(world, World)
+        played = evaluate(Scripted(world), world, flags.episodes, seed=EVALUATION_SEED, references={})
+        classes |= played.classes
+        world.close()
+    return Evaluation(classes, flags.episodes)
+
+
+def _agent(what: str, world: TaskWorld, seed: int) -> tuple[Agent, list[str]]:
+    """The policy, and the classes that it can play."""
+    names = list(world.task_names)
+    if what == "random":
+        return RandomAgent(world.action_space, seed), names
+    if what == "zero":
+        return ZeroAgent(world.action_space), names
+    witnesses = {name: load_witness(name) for name in names if witness_path(name).is_file()}
+    agent = OpenLoopReplay(witnesses, names, world.task_id, world.single_action_space.shape[0])
+    return agent, list(witnesses)

@@ -1,0 +1,68 @@
+"""``bidex-meta bench world``: the speed of a suite's world on this machine."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+
+from bidex_meta.cli.parsing import Switch, parse
+from bidex_meta.config import Steps
+from bidex_meta.errors import BidexError, known_name
+from bidex_meta.utils.validation import Environments, Few, Seed, Threads
+
+
+@dataclass(frozen=True)
+class BenchFlags:
+    """Measure how fast a suite's world is stepped here, and how fast its physics alone would be.
+
+    Example: bidex-meta bench world --suite MT4 --num-envs 1024 --json
+    """
+
+    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="world")]
+    """world: environment steps per second of the world and of its bare physics, and their ratio."""
+    suite: str = "MT4"
+    """Suite to measure."""
+    num_envs: Environments = 1024
+    """Environments stepped together."""
+    steps: Steps = 40
+    """Environment steps of each repeat."""
+    repeats: Few = 7
+    """Interleaved repeats; medians are reported."""
+    threads: Threads | None = None
+    """Threads of the physics on a CPU; None takes all cores."""
+    device: str = "cpu"
+    """auto, cpu or cuda:N."""
+    engine: str = "auto"
+    """auto, c or warp."""
+    seed: Seed = 0
+    """Seed of world and actions."""
+    json: Switch = False
+    """Print JSON."""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Measure and print."""
+    flags = parse(BenchFlags, arguments, "bench")
+    known_name("bench", flags.what, ["world"])
+    if flags.steps == 0:
+        raise BidexError("bench world: expected --steps of 1 or more, got 0.")
+    from bidex_meta.speed import world_speed
+
+    result = world_speed(
+        flags.suite,
+        flags.num_envs,
+        flags.steps,
+        flags.repeats,
+        threads=flags.threads,
+        device=flags.device,
+        engine=flags.engine,
+        seed=flags.seed,
+    )
+    if flags.json:
+        print(json.dumps(result, indent=2))
+        return
+    from bidex_meta.cli.tables import plain_table, print_table
+
+    print_table(plain_table(["measure", "value"], list(result.items())))

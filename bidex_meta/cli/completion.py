@@ -1,0 +1,72 @@
+"""``bidex-meta completion``: a script that completes commands, flags and names in a shell."""
+
+import contextlib
+import importlib
+import io
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from bidex_meta.cli.parsing import FlagsFound, flags_of, parse
+
+
+@dataclass(frozen=True)
+class CompletionFlags:
+    """Print a script that completes commands, flags, suites, tasks, algos and objects of bidex-meta.
+
+    Example: bidex-meta completion bash > ~/.local/share/bash-completion/completions/bidex-meta
+
+    zsh: write it to a file _bidex-meta in a folder of $fpath; fish: to ~/.config/fish/completions/bidex-meta.fish.
+    """
+
+    shell: Annotated[Literal["bash", "zsh", "fish"], tyro.conf.Positional]
+    """The shell."""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Print the script. Flags of ``run`` that are the learner's are MT-PPO's."""
+    shell = parse(CompletionFlags, arguments, "completion").shell
+    from bidex_meta.cli import COMMANDS
+
+    app = tyro.extras.SubcommandApp()
+    for name, command in COMMANDS.items():
+        found = flags_of(importlib.import_module(command.module).main)
+        app.command(name=name, help=command.summary)(_takes(found))
+    script = io.StringIO()
+    # tyro prints and exits.
+    with contextlib.redirect_stdout(script), contextlib.suppress(SystemExit):
+        app.cli(prog="bidex-meta", args=["--tyro-print-completion", shell])
+    for line in script.getvalue().splitlines():
+        if line.startswith("COMPLETION_SPEC = "):
+            # tyro's script gives a line to each completion, but keeps the line breaks of help texts.
+            line = re.sub(r"\\+n", " ", line)
+            for flag, names in _names().items():
+                line = re.sub(
+                    rf"({{'flags': \['{flag}'\].*?)'type': '\w+'", rf"\1'type': 'choice', 'choices': {names}", line
+                )
+        print(line)
+
+
+def _names() -> dict[str, list[str]]:
+    """What the values of flags may be."""
+    from bidex_meta.cli.learners import ALGOS
+    from bidex_meta.tasks import registry
+    from bidex_meta.tasks.objects.held import EGG, shelf
+    from bidex_meta.worlds import suites_to_run
+
+    names = {"--suite": suites_to_run(), "--task": registry.names(), "--algo": list(ALGOS)}
+    return {**names, "--object": [EGG, *shelf()]}
+
+
+def _takes(found: FlagsFound) -> Callable[..., None]:
+    """A function of a command's flags, from which tyro reads them."""
+
+    def command(flags: Any) -> None: ...
+
+    # A name of its own would stand before every flag.
+    command.__annotations__["flags"] = Annotated[found.options, tyro.conf.arg(name="")]
+    command.__defaults__ = None if found.default is None else (found.default,)
+    return command

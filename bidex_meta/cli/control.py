@@ -1,0 +1,150 @@
+"""``bidex-meta control``: is it the task's own data that adaptation learns from?"""
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from bidex_meta.cli import metatest
+from bidex_meta.cli.learners import learner_kind, resolve_device
+from bidex_meta.cli.parsing import RunPaths, Switch, parse
+from bidex_meta.cli.policies import policy_loader
+from bidex_meta.cli.tables import control_table, print_table
+from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.comparison import run_kind
+from bidex_meta.evaluation.control_arms import Control, arms, control
+from bidex_meta.evaluation.play import EVALUATION_SEED
+from bidex_meta.runs import RunFolder
+from bidex_meta.utils.validation import Environments, Few, Seed, Shots
+from bidex_meta.world.threads import set_up_torch
+from bidex_meta.worlds import Worlds
+
+
+@dataclass(frozen=True)
+class ControlFlags:
+    """Adapt held-out tasks to their own data and to data of each train task, with common random numbers.
+
+    Example: bidex-meta control runs/ML1-wide/promp/*
+
+    For suites whose classes stand in both splits (ML1, ML1-wide). Several runs are seeds of one experiment.
+    """
+
+    runs: RunPaths
+    """Run folders that differ in the seed alone."""
+    trials: Few = 25
+    """Adaptations of each task, each from the start and to other episodes."""
+    episodes: Few = 80
+    """Evaluation episodes after each adaptation."""
+    shots: Shots = 1
+    """Adapt so often, one after the other."""
+    rollouts: Few | None = None
+    """Episodes of each task in a shot; None: as the run was trained, but 40 at most."""
+    num_envs: Environments = 1024
+    """Environments stepped together at most; bounds memory."""
+    seed: Seed | None = None
+    """Seed of the episodes' starts; None: one that training does not use."""
+    device: str = "auto"
+    """auto, cpu or cuda:N."""
+    engine: Literal["auto", "c", "warp"] = "auto"
+    """Physics; auto: the one that is fast on the device."""
+    json: Switch = False
+    """Print JSON."""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Play all arms of all runs and print a table of each class, or JSON.
+
+    Raises:
+        BidexError: No run is named, one cannot be used, or they are not seeds of one experiment.
+    """
+    flags = parse(ControlFlags, arguments, "control")
+    if not flags.runs:
+        raise BidexError("Name the run folders: bidex-meta control RUN...")
+    folders = [RunFolder.open(path) for path in flags.runs]
+    config = folders[0].config()
+    worlds = Worlds.open(config.to_json())
+    _check(folders)
+    played = [_play(folder, flags) for folder in folders]
+    tasks = worlds.tasks("train")
+    found = {name: arms(played, name, tasks[name]) for name in played[0].own.classes}
+    episodes = {name: result.episodes * len(played) for name, result in played[0].own.classes.items()}
+    if flags.json:
+        report = {
+            "runs": [str(folder.path) for folder in folders],
+            "shots": flags.shots,
+            "rollouts": played[0].rollouts,
+            "trials": flags.trials,
+            "episodes": episodes,
+            "classes": {
+                name: {arm: _plain(values) for arm, values in by_arm.items()} for name, by_arm in found.items()
+            },
+        }
+        print(json.dumps(report, indent=2))
+        return
+    for name, by_arm in found.items():
+        title = f"{config.algo} on {worlds.name}, held-out tasks of {name}, "
+        title += f"{len(played)} run{'s' * (len(played) > 1)}, {episodes[name]:,} episodes an arm"
+        print_table(control_table(title, by_arm))
+
+
+def _plain(arm: dict[str, Any]) -> dict[str, Any]:
+    gains = arm.get("own_minus", {})
+    return arm | {"own_minus": {name: None if gain is None else asdict(gain) for name, gain in gains.items()}}
+
+
+def _check(folders: Sequence[RunFolder]) -> None:
+    """All runs adapt, on a suite with the same classes in both splits, and differ in the seed alone."""
+    first = run_kind(folders[0].config())
+    seeds: dict[int, Path] = {}
+    for folder in folders:
+        config = folder.config()
+        if not learner_kind(config.algo).adapts:
+            raise BidexError(f"{folder.path}: {config.algo} does not adapt to tasks. Name runs of maml, promp or rl2.")
+        metatest.check_worlds(Worlds.open(config.to_json()), config.algo)
+        if config.seed in seeds:
+            raise BidexError(
+                f"{folder.path} and {seeds[config.seed]} both have seed {config.seed}. Name one run for each seed."
+            )
+        seeds[config.seed] = folder.path
+        differing = [name for name, value in run_kind(config).items() if value != first.get(name)]
+        if differing:
+            raise BidexError(
+                f"Expected runs that differ in the seed alone, but {folders[0].path} and {folder.path} differ in "
+                f"{', '.join(differing)}. Name them in separate calls."
+            )
+
+
+def _play(folder: RunFolder, flags: ControlFlags) -> Control:
+    """The arms of one run."""
+    stored = folder.config()
+    device = resolve_device(flags.device, Worlds.open(stored.to_json()).on_gpu)
+    config = replace(stored, device=device, engine=flags.engine)
+    worlds = Worlds.open(config.to_json())
+    set_up_torch(config.threads)
+    counts = [len(pool) for pool in worlds.tasks("test").values()]
+    rollouts = metatest.rollouts_of(worlds, config, flags.rollouts, max(1, flags.num_envs // len(counts)))
+    size = metatest.environments_for(len(counts), max(counts) * flags.trials, rollouts, flags.num_envs)
+    _say(f"{folder.path}: {flags.trials} adaptations of each held-out task, {size} environments.")
+    test, train = (worlds.world(split, size) for split in ("test", "train"))
+    found = control(
+        policy_loader(folder, device)[0],
+        test,
+        train,
+        flags.shots,
+        say=_say,
+        rollouts=rollouts,
+        episodes_per_task=flags.episodes,
+        trials=flags.trials,
+        max_adapt_steps=metatest.adapt_steps_of(config),
+        seed=EVALUATION_SEED if flags.seed is None else flags.seed,
+        references=worlds.references(),
+    )
+    test.close()
+    train.close()
+    return found
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)

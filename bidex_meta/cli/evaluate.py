@@ -1,0 +1,124 @@
+"""``bidex-meta evaluate``: how good is a trained run."""
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
+
+from bidex_meta.cli.learners import learner_kind, resolve_device
+from bidex_meta.cli.metatest import Options, check_worlds, meta_test, print_tables, splits_of
+from bidex_meta.cli.parsing import RunPath, Switch, parse
+from bidex_meta.cli.policies import load_policy, policy_loader
+from bidex_meta.cli.tables import evaluation_table, print_table
+from bidex_meta.config import RunConfig
+from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.play import RandomAgent
+from bidex_meta.evaluation.results import compare
+from bidex_meta.runs import RunFolder
+from bidex_meta.runs.versions import package_versions
+from bidex_meta.world.threads import set_up_torch
+from bidex_meta.worlds import Worlds
+
+_PACKAGES = ("bidex-meta", "mujoco", "torch", "numpy")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateFlags(Options):
+    """Success and return of a run's policy (mean action), the same number of episodes for every task.
+
+    Example: bidex-meta evaluate runs/MT4/mtppo/2026-11-21_10-00-00_seed0 --random
+
+    Learners that adapt (maml, promp, rl2, ...) are shown before and after --shots shots, on train and on test tasks.
+    """
+
+    run: RunPath
+    """Run folder."""
+    checkpoint: str = "last"
+    """Which policy: last, best (kept by `bidex-meta run --evaluate-every N`) or a file."""
+    split: Literal["auto", "train", "test", "both"] = "auto"
+    """Tasks to play: those trained on, or a meta suite's unseen ones; auto: train, and both for learners that adapt."""
+    random: Switch = False
+    """Also play a random policy, and show the difference."""
+    device: str = "auto"
+    """auto, cpu or cuda:N."""
+    engine: Literal["auto", "c", "warp"] = "auto"
+    """Physics; auto: the one that is fast on the device."""
+    json: Switch = False
+    """Print JSON."""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Evaluate a checkpoint and print a table or JSON."""
+    flags = parse(EvaluateFlags, arguments, "evaluate")
+    folder = RunFolder.open(flags.run)
+    stored = folder.config()
+    device = resolve_device(flags.device, Worlds.open(stored.to_json()).on_gpu)
+    config = replace(stored, device=device, engine=flags.engine)
+    worlds = Worlds.open(config.to_json())
+    set_up_torch(config.threads)
+    play = _meta_test if learner_kind(config.algo).adapts else _evaluate
+    result = play(flags, folder, config, worlds)
+    if flags.json:
+        run = {"run": str(folder.path), **result, "conditions": conditions(worlds, flags.num_envs)}
+        print(json.dumps(run, indent=2))
+
+
+def _evaluate(flags: EvaluateFlags, folder: RunFolder, config: RunConfig[Any], worlds: Worlds) -> dict[str, Any]:
+    """Plays, and prints the table if no JSON is wanted."""
+    for name in ("shots", "rollouts", "tasks", "trials"):
+        if getattr(flags, name) is not None:
+            raise BidexError(
+                f"{config.algo} does not adapt to tasks, got --{name} {getattr(flags, name)}. Leave it out."
+            )
+    if flags.split == "both":
+        raise BidexError(
+            f"{config.algo} does not adapt to tasks: its splits are shown one by one. Use --split train or test."
+        )
+    policy, step = load_policy(folder, config.device, flags.checkpoint)
+    split = "train" if flags.split == "auto" else flags.split
+    world = worlds.world(split, flags.num_envs)
+    found = worlds.judge(policy, world, flags.episodes, flags.starts)
+    result = {"steps": step, "split": split, "seed": flags.starts, "policy": found.to_json()}
+    random = None
+    if flags.random:
+        random = worlds.judge(RandomAgent(world.action_space), world, flags.episodes, flags.starts)
+        differences = {name: asdict(difference) for name, difference in compare(found, random).items()}
+        result |= {"random": random.to_json(), "return_above_random": differences}
+    world.close()
+    if not flags.json:
+        title = f"{config.algo} on {worlds.name}, {split} tasks, {step:,} steps"
+        print_table(evaluation_table(title, found, random))
+    return result
+
+
+def _meta_test(flags: EvaluateFlags, folder: RunFolder, config: RunConfig[Any], worlds: Worlds) -> dict[str, Any]:
+    """As ``_evaluate``, of a learner that adapts."""
+    if flags.random:
+        raise BidexError(f"{config.algo} is compared with itself before adaptation. Leave --random out.")
+    check_worlds(worlds, config.algo)
+    splits = splits_of(worlds, flags.split)
+    load, step = policy_loader(folder, config.device, flags.checkpoint)
+    found = meta_test(worlds, config, load, flags, splits, lambda text: print(text, file=sys.stderr, flush=True))
+    if not flags.json:
+        print_tables(f"{config.algo} on {worlds.name}, {step:,} steps", found)
+    tests = {split: result.to_json() for split, result in found.items()}
+    return {"steps": step, "seed": flags.starts, "splits": tests}
+
+
+def conditions(worlds: Worlds, num_envs: int | None = None) -> dict[str, Any]:
+    """What else than the policy an evaluation's numbers depend on: its ``conditions`` in ``evaluation.json``.
+
+    Args:
+        worlds: Those of the worlds that were played.
+        num_envs: Environments that were asked for; None: the default.
+    """
+    wanted, identity = [*_PACKAGES], worlds.identity()
+    if worlds.device.startswith("cuda") or worlds.engine == "warp":
+        wanted.append("mujoco-warp")
+    if identity["physics"] is None:
+        wanted.append("metaworld")
+    installed = package_versions()
+    packages = {name: installed[name] for name in wanted}
+    where = {"device": worlds.device, "engine": worlds.engine, "threads": worlds.threads, "num_envs": num_envs}
+    return {**where, "packages": packages, **identity}

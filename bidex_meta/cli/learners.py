@@ -1,0 +1,184 @@
+"""The learners by name, and how one is loaded; :mod:`bidex_meta.train.learner` says what a learner is."""
+
+import dataclasses
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from bidex_meta.errors import BidexError, known_name
+from bidex_meta.train.launch import launch
+from bidex_meta.train.learner import Learner
+from bidex_meta.utils.plugins import is_outside, outside_class
+
+ALGOS: dict[str, str] = {
+    "mtppo": "bidex_algos.onpolicy.mtppo:MTPPO",
+    "mttrpo": "bidex_algos.onpolicy.mttrpo:MTTRPO",
+    "mtsac": "bidex_algos.offpolicy.mtsac:MTSAC",
+    "mttd3": "bidex_algos.offpolicy.td3:TD3",
+    "fasttd3": "bidex_algos.offpolicy.fasttd3:FastTD3",
+    "brc": "bidex_algos.offpolicy.brc:BRC",
+    "promp": "bidex_algos.meta.promp:ProMP",
+    "maml": "bidex_algos.meta.maml:MAML",
+    "rl2": "bidex_algos.meta.rl2:RL2",
+    "ippo": "bidex_algos.multiagent.ippo:IPPO",
+    "mappo": "bidex_algos.multiagent.mappo:MAPPO",
+    "happo": "bidex_algos.multiagent.happo:HAPPO",
+    "hatrpo": "bidex_algos.multiagent.hatrpo:HATRPO",
+    "maddpg": "bidex_algos.multiagent.maddpg:MADDPG",
+    # For a single task.
+    "ppo": "bidex_algos.onpolicy.mtppo:PPO",
+    "trpo": "bidex_algos.onpolicy.mttrpo:TRPO",
+    "sac": "bidex_algos.offpolicy.mtsac:SAC",
+    "ddpg": "bidex_algos.offpolicy.ddpg:DDPG",
+    "td3": "bidex_algos.offpolicy.td3:TD3",
+    # These learn from data sets (`--dataset`), of one class or of many.
+    "bc": "bidex_algos.offline.bc:BC",
+    "bcq": "bidex_algos.offline.bcq:BCQ",
+    "td3bc": "bidex_algos.offline.td3bc:TD3BC",
+    "iql": "bidex_algos.offline.iql:IQL",
+}
+
+_RENAMED = {"autoreset": "autoreset_mode(config)", "adapts_by_row": "independent_adaptation"}
+"""Members of learners before version 0.3, and what they are now."""
+
+
+@dataclass(frozen=True)
+class LearnerKind:
+    """A learner and its presets."""
+
+    name: str
+    """Name in ``ALGOS``, or ``package.module:Class``."""
+    make: type[Learner]
+    """The learner's class."""
+    presets: Mapping[str, Any]
+    """Configs by name; all of one dataclass."""
+
+    @property
+    def adapts(self) -> bool:
+        """See :class:`Learner`."""
+        return self.make.adapts
+
+    @property
+    def offline(self) -> bool:
+        """See :class:`Learner`."""
+        return self.make.offline
+
+    @property
+    def imitates(self) -> bool:
+        """See :class:`Learner`."""
+        return self.make.imitates
+
+    @property
+    def adapts_by_row(self) -> bool:
+        """``independent_adaptation`` of :class:`Learner`."""
+        return self.make.independent_adaptation
+
+    def autoreset(self, config: dict[str, Any]) -> str:
+        """Mode of the world it trains on, for fields of its config."""
+        config_type = type(next(iter(self.presets.values())))
+        return self.make.autoreset_mode(config_type(**config))
+
+
+def start_from(learner: Learner, policy: dict[str, Any]) -> None:
+    """Gives a fresh learner the policy of another run's checkpoint."""
+    learner.start_from(policy)
+
+
+def learner_kind(name: str, task: str | None = None) -> LearnerKind:
+    """Load a learner by name.
+
+    Args:
+        name: As in ``ALGOS``, in any case, or ``package.module:Class``.
+        task: The task class it shall learn alone, for which it may have presets of its own.
+
+    Raises:
+        BidexError: There is none of this name, its package is not installed, or it is no learner.
+    """
+    if is_outside(name):
+        make = _from_elsewhere(name)
+    else:
+        name = known_name("algo", name, ALGOS)
+        module_name, _, class_name = ALGOS[name].partition(":")
+        try:
+            make = vars(importlib.import_module(module_name))[class_name]
+        except ModuleNotFoundError as error:
+            raise BidexError(f"The algo {name!r} needs {error.name}, which is not installed.") from error
+    return LearnerKind(name, make, {**make.presets, **make.task_presets.get(task or "", {})})
+
+
+def _from_elsewhere(name: str) -> type[Learner]:
+    """The learner ``package.module:Class``, of an installed package or of the working folder.
+
+    A class that does not derive from :class:`Learner` gets its defaults, and the presets of a class without any are
+    its module's ``PRESETS``.
+    """
+    make, module = outside_class(name, "--algo")
+    for old, new in _RENAMED.items():
+        if old in vars(make):
+            raise BidexError(f"--algo {name}: {old} is now {new}; see docs/own-learner.md.")
+    bases = (make,) if issubclass(make, Learner) else (make, Learner)
+    members = {"__module__": make.__module__, "__doc__": make.__doc__}
+    learner: type[Learner] = type(make.__name__, bases, members)
+    learner.presets = learner.presets or vars(module).get("PRESETS", {})
+    presets = learner.presets
+    if not isinstance(presets, dict) or not presets or not all(map(dataclasses.is_dataclass, presets.values())):
+        raise BidexError(
+            f"--algo {name}: expected presets in {make.__name__}, a dict from a preset's name to an instance of the "
+            f"learner's config dataclass, got {presets!r}."
+        )
+    if missing := sorted(learner.__abstractmethods__):
+        raise BidexError(f"--algo {name}: expected {make.__name__} to have {missing[0]}, see bidex_meta.train.learner.")
+    return learner
+
+
+def choose_preset(kind: LearnerKind, asked: str, device: str, first: tuple[str, str] | None = None) -> tuple[str, str]:
+    """The preset's name and, in words, why this one.
+
+    Args:
+        kind: The learner.
+        asked: A preset's name, or ``auto``.
+        device: ``cpu``, ``cuda``, ``cuda:0``, ...
+        first: A preset that goes before others where the learner has it, and why; ``Worlds.preset``.
+    """
+    if asked.casefold() != "auto":
+        return known_name("preset", asked, ["auto", *kind.presets]), "as asked"
+    if first is not None and first[0] in kind.presets:
+        return first
+    if not {"laptop", "paper"} <= kind.presets.keys():
+        return next(iter(kind.presets)), "it is the learner's first"
+    if device.startswith("cpu"):
+        return "laptop", "the device is a CPU"
+    if "tuned" in kind.presets:
+        return "laptop", "paper is known not to be best, and tuned goes on from what another run has learned"
+    return "paper", "the device is a GPU"
+
+
+def resolve_device(asked: str, on_gpu: bool) -> str:
+    """``auto`` to ``cuda`` where there is one, else ``cpu``; anything else as it is.
+
+    Args:
+        asked: ``auto``, ``cpu``, ``cuda``, ``cuda:0``, ...
+        on_gpu: Whether a GPU is of use; ``Worlds.on_gpu``.
+
+    Raises:
+        BidexError: torch does not know the device, or it is not there (for each of several processes).
+    """
+    import torch
+
+    if asked == "auto":
+        asked = "cuda" if on_gpu and torch.cuda.is_available() else "cpu"
+    here = launch()
+    if here.count > 1 and asked.startswith("cuda:"):
+        raise BidexError(f"Expected device auto, cpu or cuda, since each process takes a GPU of its own; got {asked}.")
+    if here.count > 1 and asked == "cuda" and here.local_count > torch.cuda.device_count():
+        raise BidexError(
+            f"Expected a GPU for each of the {here.local_count} processes on this machine, found "
+            f"{torch.cuda.device_count()}. Start fewer, or add --device cpu."
+        )
+    try:
+        torch.zeros(1, device=here.own_device(asked))
+    except Exception as error:  # torch raises RuntimeError, AssertionError or its own kinds
+        reason = str(error).splitlines()[0]
+        raise BidexError(f"Device {asked!r} cannot be used ({reason}). Expected auto, cpu or cuda:N.") from None
+    return asked

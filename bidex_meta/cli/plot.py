@@ -1,0 +1,54 @@
+"""``bidex-meta plot``: learning curves."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from bidex_meta.cli.parsing import RunPaths, Switch, named_runs, output, parse
+from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.comparison import read_histories
+from bidex_meta.runs import plots
+from bidex_meta.runs.stored import StoredRun
+
+
+@dataclass(frozen=True)
+class PlotFlags:
+    """Return and success of every task against environment steps, or against shots of adaptation, as a picture.
+
+    Example: bidex-meta plot runs/MT4/mtppo/* --out curves.png
+
+    Runs that differ in the seed alone are one line, with the 95 % bootstrap interval over runs.
+    """
+
+    runs: RunPaths
+    """Run folders, or files of results/data/."""
+    adaptation: Switch = False
+    """Against shots of adaptation, from the meta-test in the run's evaluation.json; of one run."""
+    evaluation: Path | None = None
+    """The output of another `bidex-meta evaluate RUN --shots K --json`, instead of the run's evaluation.json."""
+    out: Path | None = None
+    """The picture; None: curves.png or adaptation.png, in the run folder or, of several, here."""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Draw the curves and print where they are.
+
+    Raises:
+        BidexError: No run is named, or there is nothing to draw.
+    """
+    flags = parse(PlotFlags, arguments, "plot")
+    runs = named_runs(flags.runs, "plot")
+    if not (flags.adaptation or flags.evaluation):
+        out = output(flags.out, runs, "curves.png")
+        figure = plots.draw_learning([(history.label, history.curves) for history in read_histories(runs)])
+    elif len(runs) > 1:
+        raise BidexError(f"--adaptation draws one run, got {len(runs)}. bidex-meta report shows all.")
+    else:
+        out = output(flags.out, runs, "adaptation.png")
+        if isinstance(runs[0], StoredRun) and flags.evaluation is None:
+            figure = plots.draw_adaptation(runs[0].evaluation(), runs[0].path)
+        else:
+            source = flags.evaluation or runs[0].path / "evaluation.json"
+            figure = plots.draw_adaptation(plots.read_evaluation(source), source)
+    plots.save(figure, out)
+    print(out)

@@ -1,0 +1,171 @@
+"""From a run folder to its policy: the commands' one way."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from bidex_meta.agents import Agent
+from bidex_meta.cli.learners import learner_kind
+from bidex_meta.errors import BidexError, one_line
+from bidex_meta.evaluation.play import RandomAgent, ZeroAgent
+from bidex_meta.runs import RunFolder
+from bidex_meta.train.distributed import LostProcess
+from bidex_meta.train.learner import Learner
+from bidex_meta.utils.files import is_file
+from bidex_meta.utils.plugins import is_outside
+from bidex_meta.worlds import WorldConfig, Worlds
+
+
+def checkpoint(folder: RunFolder, which: str = "last") -> tuple[dict[str, Any], int]:
+    """State and environment steps of a run's checkpoint.
+
+    Args:
+        folder: The run.
+        which: ``last``, the newest one; ``best``, of which the state holds the policy alone; or a file, by its path or
+            by its name in the run's folder of checkpoints.
+
+    Raises:
+        BidexError: The run has not saved such a one.
+    """
+    if which == "best":
+        if not folder.checkpoints.best.is_file():
+            raise BidexError(
+                f"{folder.path} has no best.pt: it was not evaluated while training (run --evaluate-every N). Use "
+                "--checkpoint last."
+            )
+        return folder.checkpoints.load_one(folder.checkpoints.best)
+    if which != "last":
+        own = folder.checkpoints.folder / which
+        return folder.checkpoints.load_one(own if is_file(own) else Path(which))
+    loaded = folder.checkpoints.load()
+    if loaded is None:
+        raise BidexError(f"{folder.path} has no checkpoint yet. Train on: bidex-meta run --resume {folder.path}")
+    return loaded
+
+
+@contextlib.contextmanager
+def fitting(path: Path) -> Iterator[None]:
+    """What happens within puts a run's checkpoint into what its config describes; each error says that it does not fit.
+
+    A checkpoint may be of another version, or of anybody: its tensors and words can be any.
+
+    Raises:
+        BidexError: It does not fit.
+    """
+    try:
+        yield
+    except (BidexError, LostProcess):
+        raise
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        reason = f"{type(error).__name__}: {one_line(error)[:200].rstrip('.')}"
+        raise BidexError(
+            f"The checkpoint of {path} does not fit its config ({reason}). Use the version in versions.json, or start "
+            "a new run."
+        ) from error
+
+
+def load_policy(folder: RunFolder, device: str, which: str = "last") -> tuple[Agent, int]:
+    """The policy of a run's checkpoint and the environment steps it was trained for.
+
+    Raises:
+        BidexError: The run has not saved such a checkpoint.
+    """
+    load, step = policy_loader(folder, device, which)
+    return load(), step
+
+
+def policy_of(folder: RunFolder, state: dict[str, Any], device: str) -> Agent:
+    """The policy in a run's checkpoint.
+
+    Raises:
+        BidexError: It does not fit the run's config, or its own.
+    """
+    algo = folder.config().algo
+    make = learner_kind(algo).make
+    with fitting(folder.path):
+        policy = state["learner"]["policy"]
+        if not is_outside(algo):
+            _refuse_other_layers(make, policy)
+        return make.load_policy(policy, device)
+
+
+def _refuse_other_layers(make: type[Learner], policy: dict[str, Any]) -> None:
+    """Refuses a policy whose config asks for other layers than its weights have, before these take memory."""
+    weights = {name: weight.to("meta") for name, weight in policy["weights"].items()}
+    total = sum(weight.numel() for weight in weights.values())
+    if max((size for size in policy["shape"].values() if isinstance(size, int)), default=0) > total:
+        raise ValueError(f"its shape is larger than its {total:,} weights")
+    with torch.device("meta"):
+        make.load_policy({**policy, "weights": weights}, "meta")
+
+
+def policy_loader(folder: RunFolder, device: str, which: str = "last") -> tuple[Callable[[], Agent], int]:
+    """What makes the policy of a run's checkpoint anew with each call, and that checkpoint's steps.
+
+    The checkpoint is read once: a run that trains on meanwhile gives no other.
+
+    Raises:
+        BidexError: The run has not saved such a checkpoint.
+    """
+    state, step = checkpoint(folder, which)
+    return lambda: policy_of(folder, state, device), step
+
+
+def acting(policy: str, world: Any, seed: int, which: str = "last") -> Agent:
+    """What acts in a world to be looked at: ``zero``, ``random``, or the policy of a run folder.
+
+    Raises:
+        BidexError: The policy is of other observations or actions than the world's.
+    """
+    if policy == "zero":
+        return ZeroAgent(world.action_space)
+    if policy == "random":
+        return RandomAgent(world.action_space, seed)
+    folder = RunFolder.open(Path(policy))
+    state, _ = checkpoint(folder, which)
+    with fitting(folder.path):
+        shape: dict[str, Any] = state["learner"]["policy"].get("shape", {})
+    spaces = {"observations": world.single_observation_space, "actions": world.single_action_space}
+    given = {name: space.shape[0] for name, space in spaces.items()}
+    if any(shape.get(name, size) != size for name, size in given.items()):
+        raise BidexError(
+            f"The policy of {policy} takes {shape['observations']} observations and gives {shape['actions']} "
+            f"actions, but here are {given['observations']} and {given['actions']}. Leave --suite out, or name the "
+            "policy's own."
+        )
+    return policy_of(folder, state, "cpu")
+
+
+def looked_at(policy: str, suite: str | None, task: str | None, seed: int, held: str | None = None) -> Worlds:
+    """The worlds in which a policy is looked at: those of its run, or of a suite or a task that is named.
+
+    Args:
+        policy: ``zero``, ``random`` or a run folder.
+        suite: A suite; None: the run's, if it has one.
+        task: A class; alone where there is no suite.
+        seed: Of the tasks.
+        held: Object of the class alone; None: the run's, or the class's own.
+
+    Raises:
+        BidexError: Nothing is named, or what is not there.
+    """
+    if held is not None and (suite is not None or task is None):
+        raise BidexError("--object goes with --task alone: bidex-meta render --task CatchUnderarm --object mug ...")
+    config = WorldConfig(suite=suite, task=task, object=held, threads=1, seed=seed)
+    if policy not in ("zero", "random"):
+        run = RunFolder.open(Path(policy)).config()
+        config = replace(config, suite=suite or run.suite, task=task or run.task, base=run.base, points=run.points)
+        if not task and not held:
+            config = replace(config, object=run.object)
+    if config.suite is None and config.task is None:
+        raise BidexError("Name what to show: a run folder, --task TASK or --suite SUITE.")
+    return Worlds.open(config)
+
+
+def slots_of(worlds: Worlds) -> list[str]:
+    """The class of each slot of some worlds; a slot of listed tasks is named Class/task."""
+    return [name.split("/")[0] for name in worlds.tasks("train")]

@@ -1,0 +1,365 @@
+"""``bidex-meta record``: data sets of whole episodes, for learners that train offline."""
+
+import contextlib
+import math
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+from msgspec import Meta
+
+from bidex_meta.cli.learners import learner_kind, resolve_device
+from bidex_meta.cli.parsing import Switch, parse
+from bidex_meta.cli.run_data import dataset_metadata
+from bidex_meta.config import Steps
+from bidex_meta.data import open_dataset, part_files, writer
+from bidex_meta.errors import BidexError, known_name
+from bidex_meta.runs import RunFolder
+from bidex_meta.utils.files import absolute
+from bidex_meta.utils.memory import usable_cores
+from bidex_meta.utils.validation import Environments, Seed, Threads
+from bidex_meta.worlds import Worlds
+
+if TYPE_CHECKING:
+    from bidex_meta.agents import Agent
+    from bidex_meta.data.collect import Actor, Progress
+    from bidex_meta.data.writer import DatasetWriter
+    from bidex_meta.world.contract import PooledWorld
+
+RUNS = {"random": 0, "medium": 1, "expert": 1, "medium-expert": 2, "replay": 1, "demonstrations": 0}
+"""Kinds of data sets, and how many runs each takes."""
+SIZE = {"medium-expert": 2_000_000, "demonstrations": 20_000}
+_USUAL_SIZE = 1_000_000
+_DEMONSTRATORS = {"witness": 32, "tasks": 200}
+"""Environments of demonstrations by default, by ``starts``."""
+_MOST_HELD = 1_200_000_000
+"""Bytes of running episodes beside the world."""
+_PATIENCE = 3
+"""Rounds of demonstrations that may all fail."""
+_OF_RUN = {"suite": None, "task": None, "base": "own", "object": None, "points": 0, "seed": None}
+"""Entries of a run's config that decide which tasks are played."""
+
+
+@dataclass(frozen=True)
+class RecordFlags:
+    """Record a data set: whole episodes of a policy, as Minari and HDF5.
+
+    Example: bidex-meta record random --task CatchUnderarm
+
+    Killed or interrupted, the same command goes on where it stopped and ends with the same data.
+    """
+
+    kind: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="|".join(RUNS))]
+    """random: uniform actions; medium, expert: the policy of one run; medium-expert: of two runs, half each; replay:
+    the transitions that `bidex-meta run --record N` stored; demonstrations: successful replays of the class's witness,
+    a stored reference solution (see --starts)."""
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = ()
+    """Run folders, as many as the kind takes."""
+    suite: str | None = None
+    """random: suite to play, a name or the path of a TOML file; otherwise the run's own is played."""
+    task: str | None = None
+    """random: class to play on its own, in place of a suite; demonstrations: class of the witness."""
+    base: Literal["own", "moving", "fixed"] = "own"
+    """With --task: whether the hands' bases move; own: as the class has it alone."""
+    size: Steps = 0
+    """Transitions; 0: 1e6, of medium-expert 2e6, of demonstrations 2e4. The last episodes are whole: there may be a few
+    more."""
+    checkpoint: str = "last"
+    """Which policy of a run: last, best or a file."""
+    actions: Literal["sampled", "mean"] = "sampled"
+    """sampled: drawn from the policy's distribution, where it has one; mean: its mean action."""
+    noise: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
+    """Standard deviation of Gaussian noise on a policy's actions, for those that have no distribution, or on a
+    witness's."""
+    starts: Literal["witness", "tasks"] = "witness"
+    """demonstrations: replay the witness from its own start in its own task, objects shifted; or on all tasks of the
+    class, from their starts, where it succeeds less often but shows more."""
+    script: Switch = False
+    """demonstrations, --starts tasks: play a scripted policy in place of the witness, computed anew from each start
+    (about a second for 500 steps): seven classes have one, and it succeeds more often."""
+    shift: Annotated[float, Meta(ge=0.0, le=0.1)] = 1e-4
+    """demonstrations, --starts witness: how far the objects' start is shifted, metres."""
+    num_envs: Environments | None = None
+    """Environments stepped together; None: one per task, 200 at least."""
+    seed: Seed = 0
+    """Seed of starts and actions, and of random's tasks (a run keeps its own tasks)."""
+    out: Path | None = None
+    """Folder of the data set; None: NAME/KIND-v0 in the folder that BIDEX_DATA names, else in data/."""
+    device: str = "auto"
+    """auto, cpu or cuda:N."""
+    engine: Literal["auto", "c", "warp"] = "auto"
+    """Physics; auto: the one that is fast on the device."""
+    threads: Threads | None = None
+    """Threads of torch and of the physics; None: one per core."""
+    estimate: Switch = False
+    """Print what it would take, and stop."""
+
+
+@dataclass(frozen=True)
+class _Collection:
+    """A data set to collect."""
+
+    source: Worlds
+    name: str
+    """Kind in the data set's name."""
+    plan: dict[str, Any]
+    """What decides its content, ready for JSON; it has ``kind``, ``size`` and ``num_envs``."""
+    policies: list[dict[str, Any]]
+    """Who acts, for the metadata."""
+    world: "Callable[[], PooledWorld]"
+    episode_share: float
+    """Mean length of an episode as a share of the time limit, at least."""
+    collect: "Callable[[PooledWorld, DatasetWriter], None]"
+    """Plays in the world until the writer has all transitions."""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Record, or go on with a recording."""
+    flags = parse(RecordFlags, arguments, "record")
+    kind = known_name("kind of data set", flags.kind, RUNS)
+    _check(flags, kind)
+    if kind == "replay":
+        _publish_replay(flags)
+        return
+
+    part_files.hdf5()  # refuses it where it is not installed
+    _record(flags, _demonstrations(flags) if kind == "demonstrations" else _episodes(flags, kind))
+
+
+def _check(flags: RecordFlags, kind: str) -> None:
+    if len(flags.runs) != RUNS[kind]:
+        takes = f"{RUNS[kind] or 'no'} run folder{'s' * (RUNS[kind] != 1)}"
+        raise BidexError(f"record {kind} takes {takes}, got {len(flags.runs)}.")
+    if kind == "random" and (flags.suite is None) == (flags.task is None):
+        raise BidexError("Name what to play: either --suite SUITE or --task TASK, for example --task CatchUnderarm.")
+    if kind == "demonstrations" and (flags.task is None or flags.suite is not None):
+        raise BidexError("Name the class whose witness is replayed: --task TASK, for example --task Switch.")
+    if flags.script and (kind != "demonstrations" or flags.starts != "tasks"):
+        raise BidexError("--script computes actions from each start: it goes with demonstrations and --starts tasks.")
+    if RUNS[kind] and (flags.suite is not None or flags.task is not None):
+        raise BidexError(f"record {kind} plays what its run was trained on. Leave --suite and --task out.")
+    if flags.base != "own" and flags.task is None:
+        raise BidexError(f"--base {flags.base} goes with --task; a suite's file says whether bases move.")
+
+
+def _record(flags: RecordFlags, collection: _Collection) -> None:
+    """Collects a data set, or goes on with it."""
+    from bidex_meta.data.collect import resumed_writer
+
+    plan, size = collection.plan, collection.plan["size"]
+    folder, name = writer.dataset_path(flags.out, collection.source.name, collection.name)
+    with contextlib.ExitStack() as stack:
+        if not flags.estimate:
+            stack.enter_context(writer.claimed(folder, plan))
+        world = collection.world()
+        stack.callback(world.close)
+        sizes = world.single_observation_space.shape[0], world.single_action_space.shape[0]
+        length = collection.episode_share * float(world.max_episode_steps.float().mean())
+        needed = writer.estimated_bytes(size, *sizes, length)
+        _say(
+            f"{name}: {size:,} transitions of {len(world.task_names)} task class(es), observations {sizes[0]}, actions "
+            f"{sizes[1]}: at most about {needed / 1e9:.2f} GB on the disk{_checked_memory(world, plan)}."
+        )
+        if flags.estimate:
+            return
+        there = sum(path.stat().st_size for path in part_files.parts_of(folder / "data"))
+        writer.check_room(folder, max(0, needed - there), f"{size:,} transitions")
+        writer.begin(folder, plan)
+        out = resumed_writer(folder)
+        stack.callback(out.close)
+        collection.collect(world, out)
+        about = dataset_metadata(collection.source, world, plan["kind"], collection.policies, starts=flags.seed)
+        writer.finish(folder, name, world.single_observation_space, world.single_action_space, about)
+    _say_complete(folder, name)
+
+
+def _checked_memory(world: "PooledWorld", plan: dict[str, Any]) -> str:
+    """The memory of running episodes, for a message; refuses more than is allowed."""
+    from bidex_meta.data.collect import bytes_held
+
+    memory = bytes_held(world)
+    if memory > _MOST_HELD:
+        raise BidexError(
+            f"The episodes of {plan['num_envs']:,} rows would take {memory / 1e9:.1f} GB while they run, and "
+            f"{_MOST_HELD / 1e9:.1f} are allowed. Lower --num-envs."
+        )
+    return f", and up to {memory / 1e9:.2f} GB of memory beside the world"
+
+
+def _episodes(flags: RecordFlags, kind: str) -> _Collection:
+    """Episodes of uniform actions, or of runs' policies."""
+    from bidex_meta.data.collect import collect
+    from bidex_meta.world.threads import set_up_torch
+
+    config = _config(flags)
+    source = Worlds.open(config)
+    # Sums depend on how torch splits them over threads: a collection keeps those that it began with.
+    before = writer.stored_plan(writer.dataset_path(flags.out, source.name, kind)[0])
+    config["threads"] = flags.threads or before.get("threads") or usable_cores()
+    set_up_torch(config["threads"])
+    actors, policies = _actors(flags, kind, config["device"])
+    rows, size = flags.num_envs or _one_per_task(source), flags.size or SIZE.get(kind, _USUAL_SIZE)
+    plan = {"kind": kind, "size": size, "num_envs": rows, "noise": flags.noise, "policies": policies}
+    plan |= config | {"starts": flags.seed}
+
+    def play(world: "PooledWorld", out: "DatasetWriter") -> None:
+        collect(world, actors, out, size, flags.seed, _Report(size, out, len(actors)))
+
+    # Where episodes may end early there are more of them: a third of the time limit is measured on falls.
+    return _Collection(source, kind, plan, policies, lambda: source.world("train", rows), 1.0 / 3.0, play)
+
+
+def _config(flags: RecordFlags) -> dict[str, Any]:
+    """The config of the source: the run's, or the flags'."""
+    if flags.runs:
+        configs = []
+        for run in flags.runs:
+            stored = RunFolder.open(run).config()
+            config = {name: value for name, value in stored.to_json().items() if name in _OF_RUN}
+            if stored.task_seed is not None:  # an offline learner plays the tasks of its data
+                config["seed"] = stored.task_seed
+            configs.append(config)
+        first, last = configs[0], configs[-1]
+        if differ := [name for name in first if first[name] != last[name]]:
+            raise BidexError(
+                f"The two runs differ in {differ[0]}: {first[differ[0]]} and {last[differ[0]]}. Name runs on the same "
+                "tasks."
+            )
+        config = first
+    else:
+        config = _OF_RUN | {"suite": flags.suite, "task": flags.task, "base": flags.base, "seed": flags.seed}
+        if flags.suite is not None and flags.suite.endswith(".toml"):
+            config["suite"] = str(absolute(flags.suite))
+    return config | {"device": resolve_device(flags.device, Worlds.open(config).on_gpu), "engine": flags.engine}
+
+
+def _actors(flags: RecordFlags, kind: str, device: str) -> "tuple[list[Actor], list[dict[str, Any]]]":
+    """Who acts, and the metadata of each."""
+    from bidex_meta.cli.policies import load_policy
+    from bidex_meta.data.collect import Actor, SamplingAgent
+
+    if kind == "random":
+        return [Actor(None)], [{"algo": None, "actions": "uniform"}]
+    actors, policies = [], []
+    for path in flags.runs:
+        folder = RunFolder.open(path)
+        algo = folder.config().algo
+        if learner_kind(algo).adapts:
+            raise BidexError(f"{algo} adapts to tasks: it has no one policy to record. Name a run of another learner.")
+        policy, steps = load_policy(folder, device, flags.checkpoint)
+        sampled = flags.actions == "sampled" and isinstance(policy, SamplingAgent)
+        actors.append(Actor(policy, sampled, flags.noise))
+        about = {"algo": algo, "run": folder.path.resolve().name, "steps": steps, "checkpoint": flags.checkpoint}
+        policies.append(about | {"actions": "sampled" if sampled else "mean", "noise": flags.noise})
+    return actors, policies
+
+
+def _demonstrations(flags: RecordFlags) -> _Collection:
+    """Successful replays of a class's witness or scripted policy, with moving bases, as suites have them."""
+    from bidex_meta.data.collect import collect_successes, progress
+    from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted, ShiftedStarts
+    from bidex_meta.witness.scripts import script_of
+    from bidex_meta.witness.store import load_witness
+
+    if flags.base == "fixed" or flags.engine == "warp" or flags.device not in ("auto", "cpu"):
+        raise BidexError(
+            "Witnesses are of moving bases and of C MuJoCo on the CPU. Leave --base, --engine, --device out."
+        )
+    source = Worlds.open({"task": flags.task, "base": "moving", "seed": 0, "threads": flags.threads})
+    name, size, rows = source.name, flags.size or SIZE["demonstrations"], flags.num_envs or _DEMONSTRATORS[flags.starts]
+    if name not in source.task_classes() or ":" in name:
+        raise BidexError(f"{name} is none of the classes that have witnesses (bidex-meta witness --all).")
+    witness = {} if flags.script else {name: load_witness(name)}
+    if flags.script:
+        script_of(name)  # refuses a class without one
+    drawn: dict[str, Any] = {"noise": flags.noise}
+    drawn |= {"starts": "tasks"} if flags.starts == "tasks" else {"shift": flags.shift}
+    plan = {"kind": "demonstrations", "task": name, "size": size, "num_envs": rows, "seed": flags.seed, **drawn}
+    plan |= {"script": True} if flags.script else {}
+
+    def world() -> "PooledWorld":
+        if flags.starts == "tasks":
+            return source.world("train", rows)
+        return ShiftedStarts(name, rows, flags.shift, flags.threads)  # pyright: ignore[reportAbstractUsage]
+
+    def agent(world: Any, seed: int) -> "Agent":
+        if flags.script:
+            return Scripted(world, flags.noise, seed)
+        return OpenLoopReplay(witness, [name], world.task_id, world.single_action_space.shape[0], flags.noise, seed)
+
+    def play(world: "PooledWorld", out: "DatasetWriter") -> None:
+        while (now := progress(out)).steps[0] < size:
+            if not now.steps[0] and out.parts >= _PATIENCE:
+                raise _nothing_succeeds(_PATIENCE * rows, name, flags)
+            collect_successes(world, lambda seed: agent(world, seed), out, flags.seed)
+            after = progress(out)
+            stored = after.episodes[0] - now.episodes[0]
+            _say(f"{after.steps[0]:,} of {size:,} transitions | {stored} of {rows} replays succeed")
+
+    policy = {"algo": None, "actions": "script" if flags.script else "witness", **drawn}
+    kind = "demonstrations-tasks" if flags.starts == "tasks" else "demonstrations"
+    return _Collection(source, kind, plan, [policy], world, 1.0, play)
+
+
+def _nothing_succeeds(played: int, name: str, flags: RecordFlags) -> BidexError:
+    if flags.script:
+        return BidexError(f"None of {played} episodes of {name}'s scripted policy succeeds. Lower --noise.")
+    other = "play --starts witness" if flags.starts == "tasks" else "--shift"
+    return BidexError(f"None of {played} replays of {name}'s witness succeeds. Lower --noise or {other}.")
+
+
+def _one_per_task(source: Worlds) -> int:
+    """One environment per task; where tasks are few, several."""
+    pools = source.tasks("train")
+    tasks = max(map(len, pools.values())) * len(pools)
+    return tasks * math.ceil(200 / tasks)
+
+
+class _Report:
+    """Prints a line after each round."""
+
+    def __init__(self, size: int, out: "DatasetWriter", policies: int) -> None:
+        from bidex_meta.data.collect import progress
+
+        self._size, self._before = size, sum(progress(out, policies).steps)
+        if out.parts:
+            _say(f"Going on after {self._before:,} transitions in {out.parts} parts.")
+
+    def __call__(self, now: "Progress", seconds: float) -> None:
+        """Takes the progress, and the seconds since the collection began or was resumed."""
+        done = sum(now.steps)
+        speed = (done - self._before) / max(seconds, 1e-9)
+        left = max(0, self._size - done) / max(speed, 1e-9)
+        _say(
+            f"{done:,} of {self._size:,} transitions | {sum(now.episodes):,} episodes | return {now.returns:.3g} | "
+            f"success {100 * now.success:.1f} % | {speed:,.0f} steps/s | "
+            f"{f'{left / 60:.0f} min' if left >= 90 else f'{left:.0f} s'} left"
+        )
+
+
+def _publish_replay(flags: RecordFlags) -> None:
+    """Links or copies what a run recorded of its training into the data folder."""
+    (run,) = flags.runs
+    folder = RunFolder.open(run)
+    config = folder.config()
+    if not config.record:
+        raise BidexError(f"{run} kept nothing of its training. Train one that does: bidex-meta run --record 1e6 ...")
+    dataset = open_dataset(folder.path / "replay")
+    out, name = writer.dataset_path(flags.out, Worlds.open(config.to_json()).name, "replay")
+    writer.adopt(dataset.folder, out, name)
+    _say_complete(out, name)
+
+
+def _say_complete(folder: Path, name: str) -> None:
+
+    found = open_dataset(folder)
+    left = ", ".join(f"{count:,} {reason.replace('_', ' ')}" for reason, count in found.metadata["left_out"].items())
+    _say(f"{name}: {found.num_steps:,} transitions in {found.num_episodes:,} episodes. Left out: {left or 'nothing'}.")
+    _say(f"Look: bidex-meta data info {folder}   Check: bidex-meta data check {folder}")
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)

@@ -1,0 +1,200 @@
+"""``bidex-meta report``: runs as one HTML page.
+
+Pictures and films stand in the file itself, so that it needs no network. Needs the extra ``plot``.
+"""
+
+import base64
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from bidex_meta.cli.parsing import RunPaths, named_runs, output, parse
+from bidex_meta.cli.tables import class_table, group_table
+from bidex_meta.config import flat, printed
+from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.comparison import History, estimates, read_groups, read_histories
+from bidex_meta.runs import plots, training_seconds
+from bidex_meta.runs.atomic import write_atomic
+from bidex_meta.runs.stored import Run
+from bidex_meta.utils.files import is_file
+
+FILM_BYTES = 40_000_000
+"""Films of a page together at most; what is above is named alone."""
+_SPEED = {"Perf/steps_per_second": "environment steps / s", "Perf/training_time": "training time (s)"}
+
+
+@dataclass(frozen=True)
+class ReportFlags:
+    """Runs as one HTML page: final table, curves, adaptation, throughput, differences of configs, films.
+
+    Example: bidex-meta report runs/MT4/mtppo/* runs/MT4/mttrpo/* --out mt4.html
+
+    The page needs no network and no other file. Runs that differ in the seed alone are one line, with intervals.
+    """
+
+    runs: RunPaths
+    """Run folders, or files of results/data/."""
+    out: Path | None = None
+    """The page; None: report.html, in the run folder or, of several, here."""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Write the page and print where it is.
+
+    Raises:
+        BidexError: No run is named, or none has logged anything.
+    """
+    flags = parse(ReportFlags, arguments, "report")
+    runs = named_runs(flags.runs, "report")
+    out = output(flags.out, runs, "report.html")
+    text = render(runs)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(out, lambda file: file.write(text.encode()))
+    print(out)
+
+
+def render(runs: Sequence[Run]) -> str:
+    """The page of some runs.
+
+    Raises:
+        BidexError: None of them has logged anything, or matplotlib or jinja2 is missing.
+    """
+    try:
+        from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    except ImportError:
+        raise BidexError("Reports need jinja2 and matplotlib: pip install 'bidex-meta[plot]'.") from None
+    histories = read_histories(runs)
+    short = [f"{_letter(place)} {history.label.partition(',')[0]}" for place, history in enumerate(histories)]
+    named = list(zip(short, histories, strict=True))
+    curves = [(name, history.curves) for name, history in named]
+    names = _names(named)
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+    )
+    return environment.get_template("report.html").render(
+        title=_title(runs),
+        groups=[(name, history.label, len(history.runs)) for name, history in named],
+        runs=[_run(run, names[run.path]) for run in runs],
+        final=_final(runs, {run.path: name for name, history in named for run in history.runs}),
+        learning=_picture(lambda: plots.draw_learning(curves)),
+        speed=_picture(lambda: plots.draw_metrics(curves, _SPEED)),
+        adaptation=list(_adaptation(runs, names)),
+        differences=_differences(runs, names),
+        configs=[(names[run.path], printed(run.config())) for run in runs],
+        films=list(_films(runs, names)),
+    )
+
+
+def _title(runs: Sequence[Run]) -> str:
+    configs = [run.config() for run in runs]
+    algos = ", ".join(dict.fromkeys(config.algo for config in configs))
+    subjects = ", ".join(dict.fromkeys(Path(config.suite or config.task or "").stem for config in configs))
+    return f"{algos} on {subjects}"
+
+
+def _letter(place: int) -> str:
+    """A, B, ..., Z, AA, ...: labels tell all that differs, which is too much for a legend."""
+    return ("" if place < 26 else _letter(place // 26 - 1)) + chr(ord("A") + place % 26)
+
+
+def _names(histories: Sequence[tuple[str, History]]) -> dict[Path, str]:
+    """What each run is called on the page."""
+    names: dict[Path, str] = {}
+    for group, history in histories:
+        for run in history.runs:
+            config = run.config()
+            of_task = f", {config.task}" if config.task else ""
+            name = f"{group}{of_task}, seed {config.seed}"
+            twice = sum(known.split(" (")[0] == name for known in names.values())
+            names[run.path] = f"{name} ({twice + 1})" if twice else name
+    return names
+
+
+def _run(run: Run, name: str) -> dict[str, Any]:
+    config, rows, versions = run.config(), run.metrics(), run.versions()
+    speeds = [row["Perf/steps_per_second"] for row in rows if row.get("Perf/steps_per_second") is not None]
+    hardware = ", ".join(versions.get("gpus") or []) or f"{versions.get('cpus', '?')} processors"
+    git = versions.get("git") or {}
+    return {
+        "name": name,
+        "path": str(run.path),
+        "on": config.suite or config.task,
+        "steps": f"{max((row['step'] for row in rows), default=0):,}",
+        "hours": f"{training_seconds(rows) / 3600.0:.2f}",
+        "speed": f"{median(speeds):,.0f}" if speeds else "–",
+        "environments": f"{config.num_envs:,}",
+        "device": f"{config.device} ({hardware})",
+        "commit": (git.get("commit") or "–")[:10] + ("+" if git.get("dirty") else ""),
+    }
+
+
+def _final(runs: Sequence[Run], short: dict[Path, str]) -> dict[str, Any]:
+    """Tables of the groups' final evaluations, and why runs are missing; ``short`` has the groups' names."""
+    evaluated = [run for run in runs if run.evaluated]
+    found: dict[str, Any] = {"missing": len(runs) - len(evaluated), "reason": "", "picture": None, "tables": []}
+    try:
+        groups = [replace(group, label=short[group.paths[0]]) for group in read_groups(evaluated)]
+    except BidexError as error:
+        return {**found, "reason": str(error)}
+    if not groups:
+        return found
+    picture = _picture(lambda: plots.draw_comparison(estimates(groups))) if len(groups) > 1 else None
+    return {**found, "tables": [group_table(groups), class_table(groups)], "picture": picture}
+
+
+def _adaptation(runs: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[str, str]]:
+    """Name and picture of each run that ended with a meta-test."""
+    for run in filter(lambda run: run.evaluated, runs):
+        with suppress(BidexError):  # the final table says what is wrong with it
+            found = run.evaluation()
+            if found.get("splits"):
+                picture = _picture(lambda found=found, path=run.path: plots.draw_adaptation(found, path))
+                if picture is not None:
+                    yield names[run.path], picture
+
+
+def _differences(runs: Sequence[Run], names: dict[Path, str]) -> dict[str, Any]:
+    """What of config and versions is not the same in all runs."""
+    columns = [run.config().flat() | flat({"versions": run.versions()}) for run in runs]
+    keys = dict.fromkeys(key for column in columns for key in column)
+    differing = [key for key in keys if len({json.dumps(column.get(key)) for column in columns}) > 1]
+    cells = [[key, *(_cell(column.get(key)) for column in columns)] for key in differing]
+    return {"names": [names[run.path] for run in runs], "rows": cells}
+
+
+def _cell(value: object) -> str:
+    return "–" if value is None else value if isinstance(value, str) else json.dumps(value)
+
+
+def _films(runs: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[str, str, str | None]]:
+    """Run, file and content of the newest film of each kind (its name before ``_<step>``); None where it is large."""
+    room = FILM_BYTES
+    for run in runs:
+        newest: dict[str, Path] = {}
+        films = filter(is_file, run.videos_path.glob("*.mp4"))  # a pipe of that name would never end
+        for path in sorted(films, key=lambda path: path.stat().st_mtime):
+            kind, _, step = path.stem.rpartition("_")
+            newest[kind if step.isdigit() and kind else path.stem] = path
+        for path in newest.values():
+            fits = path.stat().st_size <= room
+            room -= path.stat().st_size if fits else 0
+            yield names[run.path], path.name, _data(path.read_bytes(), "video/mp4") if fits else None
+
+
+def _picture(draw: Callable[[], Any]) -> str | None:
+    """A figure as the address of an image; None where there is nothing to draw."""
+    missing = plots.missing()
+    if missing is not None:
+        raise BidexError(missing)
+    try:
+        return _data(plots.svg(draw()), "image/svg+xml")
+    except BidexError:
+        return None
+
+
+def _data(content: bytes, kind: str) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"

@@ -1,0 +1,239 @@
+"""``bidex-meta verify``: does a run's checkpoint still do what its recorded evaluation says?"""
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, NotRequired, TypedDict
+
+from bidex_meta.cli.evaluate import conditions
+from bidex_meta.cli.learners import learner_kind, resolve_device
+from bidex_meta.cli.metatest import TASKS, Options, meta_test
+from bidex_meta.cli.parsing import RunPath, Switch, parse
+from bidex_meta.cli.policies import checkpoint, policy_of
+from bidex_meta.cli.tables import agreement_table, print_table
+from bidex_meta.config import RunConfig
+from bidex_meta.errors import EXIT_FAILED, BidexError, one_line
+from bidex_meta.evaluation.agreement import DIFFERS, EQUAL, WITHIN, agreements, classes_of
+from bidex_meta.runs import RunFolder, schemas
+from bidex_meta.utils.files import exists
+from bidex_meta.utils.validation import Environments, Few, Finite, Seed, Shots, Text, Whole
+from bidex_meta.utils.validation import parse as parse_content
+from bidex_meta.world.threads import set_up_torch
+from bidex_meta.worlds import Worlds
+
+Engine = Literal["auto", "c", "warp"]
+
+
+class _Row(TypedDict):
+    episodes: NotRequired[Few]
+    tasks: NotRequired[Few]
+    length: NotRequired[Finite]
+
+
+class _Part(TypedDict):
+    episodes_per_task: Few
+    classes: dict[str, _Row]
+
+
+class _Split(TypedDict):
+    shots: Shots
+    rollouts: Few
+    trials: Few
+    before: _Part
+    after: _Part
+
+
+class _Conditions(TypedDict):
+    device: NotRequired[Text]
+    engine: NotRequired[Engine]
+    num_envs: NotRequired[Environments | None]
+    packages: NotRequired[dict[str, Any]]
+    physics: NotRequired[Text | None]
+    suite_version: NotRequired[Whole | None]
+
+
+class _Recorded(TypedDict):
+    """What ``evaluation.json`` must hold beyond :mod:`bidex_meta.runs.schemas` to be made again."""
+
+    steps: Whole
+    seed: Seed
+    conditions: NotRequired[_Conditions]
+    splits: NotRequired[dict[str, _Split]]
+    policy: NotRequired[_Part]
+
+
+@dataclass(frozen=True)
+class VerifyFlags:
+    """Evaluates a run's checkpoint again as its evaluation.json was made, and compares the two class by class.
+
+    Example: bidex-meta verify runs/MT4/mtppo/2026-11-21_10-00-00_seed0
+
+    Exit code 0 where all is equal bit for bit or within the intervals, 1 where something differs.
+    """
+
+    run: RunPath
+    """Run folder."""
+    evaluation: Path | None = None
+    """What `bidex-meta evaluate --json` wrote of the run; None: its evaluation.json."""
+    device: str = "auto"
+    """auto, cpu or cuda:N; auto: where the evaluation was made, if that is here, else the CPU."""
+    engine: Engine | None = None
+    """auto, c or warp; None: as the evaluation was made, on another device auto."""
+    num_envs: Environments | None = None
+    """Environments stepped together; None: as the evaluation was made."""
+    json: Switch = False
+    """Print JSON."""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Verify a run and print a table or JSON.
+
+    Raises:
+        BidexError: There is nothing to compare with, or the checkpoint is not the one that was evaluated.
+        SystemExit: With exit code 1: something differs.
+    """
+    flags = parse(VerifyFlags, arguments, "verify")
+    folder = RunFolder.open(flags.run)
+    config = folder.config()
+    recorded = recorded_evaluation(folder.path, flags.evaluation)
+    then = recorded_conditions(recorded, schemas.read_versions(folder.path), config)
+    config = _where(flags, then, config)
+    worlds = Worlds.open(config.to_json())
+    set_up_torch(config.threads)
+    num_envs = then["num_envs"] if flags.num_envs is None else flags.num_envs
+    state, step = _checkpoint(folder, recorded["steps"])
+    apart = others(then, conditions(worlds, num_envs))
+    for line in apart:
+        _say(f"Conditions: {one_line(line)}.")
+    again = _again(folder, config, worlds, recorded, num_envs, state)
+    found = agreements(classes_of(recorded), classes_of(again))
+    counts = {outcome: sum(each.outcome == outcome for each in found) for outcome in (EQUAL, WITHIN, DIFFERS)}
+    if flags.json:
+        report = {"run": str(folder.path), "steps": step, "conditions": apart, **counts}
+        print(json.dumps(report | {"classes": {each.name: each.to_json() for each in found}}, indent=2))
+    else:
+        print_table(agreement_table(f"{config.algo} on {worlds.name}, {step:,} steps, recorded and again", found))
+        verdict = f"{counts[EQUAL]} equal bit for bit, {counts[WITHIN]} within, {counts[DIFFERS]} differ"
+        end = ": this run is not what its evaluation says" if counts[DIFFERS] else ""
+        print(f"{len(found)} classes: {verdict}{end}")
+    if counts[DIFFERS]:
+        raise SystemExit(EXIT_FAILED)
+
+
+def recorded_evaluation(run: Path, named: Path | None = None) -> dict[str, Any]:
+    """The evaluation to compare with, all that is read of it checked.
+
+    Args:
+        run: The run folder.
+        named: A file in the place of its ``evaluation.json``.
+
+    Raises:
+        BidexError: There is none, or it is damaged, or does not say how it was made.
+    """
+    path = named or run / "evaluation.json"
+    again = f"bidex-meta evaluate {run} --json > {path}"
+    if named is None and not exists(path):
+        raise BidexError(f"{run} has no evaluation.json to be verified. Let the run end, or write one: {again}")
+    found = schemas.read_evaluation(path, again)
+    parse_content(found, _Recorded, str(path))
+    if "splits" not in found and "policy" not in found:
+        parse_content(found, _Part, str(path))
+    return found
+
+
+def _where(flags: VerifyFlags, then: Mapping[str, Any], config: RunConfig[Any]) -> RunConfig[Any]:
+    """The run's config with device and engine to evaluate with."""
+    on_gpu = Worlds.open(config.to_json()).on_gpu
+    try:
+        device = resolve_device(then["device"] if flags.device == "auto" else flags.device, on_gpu)
+    except BidexError:
+        if flags.device != "auto":
+            raise
+        device = "cpu"
+    same = device.partition(":")[0] == then["device"].partition(":")[0]
+    return replace(config, device=device, engine=flags.engine or (then["engine"] if same else "auto"))
+
+
+def _checkpoint(folder: RunFolder, steps: int) -> tuple[dict[str, Any], int]:
+    """The checkpoint that was evaluated.
+
+    Raises:
+        BidexError: It is not there any more.
+    """
+    for which in ("last", f"step_{steps}.pt", "best"):
+        there = which == "last" or exists(folder.checkpoints.folder / (f"{which}.pt" if which == "best" else which))
+        found = checkpoint(folder, which) if there else None
+        if found is not None and found[1] == steps:
+            return found
+    raise BidexError(
+        f"The evaluation is of {steps:,} steps, and {folder.path} has no checkpoint of these: its newest is at "
+        f"{folder.checkpoints.newest_step() or 0:,}. Evaluate anew: bidex-meta evaluate {folder.path} --json"
+    )
+
+
+def _again(
+    folder: RunFolder,
+    config: RunConfig[Any],
+    worlds: Worlds,
+    recorded: dict[str, Any],
+    num_envs: int | None,
+    state: dict[str, Any],
+) -> dict[str, Any]:
+    """The recorded evaluation, made again."""
+    if learner_kind(config.algo).adapts != ("splits" in recorded):
+        kind = "a meta-test" if "splits" in recorded else "no meta-test"
+        raise BidexError(f"{folder.path}: the evaluation is {kind}, which is not how {config.algo} is judged.")
+    if "splits" not in recorded:
+        world = worlds.world(recorded.get("split", "train"), num_envs)
+        episodes = recorded.get("policy", recorded)["episodes_per_task"]
+        found = worlds.judge(policy_of(folder, state, config.device), world, episodes, recorded["seed"])
+        world.close()
+        return {"policy": found.to_json()}
+    splits = {}
+    for split, part in recorded["splits"].items():
+        if split not in worlds.splits:
+            raise BidexError(f"{worlds.name} has no {split} tasks, which the evaluation is of.")
+        options = Options(
+            shots=part["shots"],
+            rollouts=part["rollouts"],
+            episodes=part["before"]["episodes_per_task"],
+            tasks=max(row.get("tasks", TASKS) for row in part["before"]["classes"].values()),
+            trials=part["trials"],
+            num_envs=num_envs,
+            seed=recorded["seed"],
+        )
+        load = lambda: policy_of(folder, state, config.device)  # noqa: E731
+        splits[split] = meta_test(worlds, config, load, options, [split], _say)[split].to_json()
+    return {"splits": splits}
+
+
+def recorded_conditions(evaluation: dict[str, Any], versions: dict[str, Any], config: RunConfig[Any]) -> dict[str, Any]:
+    """The same of an evaluation as it was recorded; of an older one what its run was trained with.
+
+    Args:
+        evaluation: Of ``evaluation.json``.
+        versions: Of ``versions.json``, empty where there is none.
+        config: The run's.
+    """
+    found = {"device": config.device, "engine": config.engine, "num_envs": None}
+    found |= {name: versions.get(name) for name in ("packages", "physics", "suite_version")}
+    found |= evaluation.get("conditions", {})
+    packages = found["packages"]
+    return found | {"packages": packages if isinstance(packages, dict) else {}}
+
+
+def others(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
+    """What differs between recorded conditions and those now, a text each; the last names what was not recorded."""
+    packages = then["packages"]
+    pairs = [(name, packages.get(name), version) for name, version in now["packages"].items()]
+    pairs += [(name, then.get(name), now[name]) for name in ("device", "engine", "threads")]
+    pairs += [(name.replace("_", " "), then.get(name), now[name]) for name in ("physics", "suite_version")]
+    texts = [f"{name} {old} then, {new} now" for name, old, new in pairs if None not in (old, new) and old != new]
+    unknown = [name for name, old, new in pairs if old is None and new is not None and name != "threads"]
+    return texts + ([f"not recorded: {', '.join(unknown)}"] if unknown else [])
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)

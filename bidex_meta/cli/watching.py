@@ -1,0 +1,196 @@
+"""Watching a learner while it learns: evaluations, the best policy, films. Nothing of the training depends on it."""
+
+import math
+import random
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+
+import numpy as np
+import torch
+
+from bidex_meta.agents import Agent
+from bidex_meta.cli import metatest
+from bidex_meta.cli.policies import slots_of
+from bidex_meta.cli.run_config import RunPlan
+from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.filming import film_tiles
+from bidex_meta.evaluation.play import EVALUATION_SEED, evaluate
+from bidex_meta.evaluation.results import Evaluation
+from bidex_meta.runs import Recorder, RunFolder
+from bidex_meta.runs.video import check_films
+from bidex_meta.runs.writers import check_logger
+from bidex_meta.tasks.base import CONTROL_RATE
+from bidex_meta.train.launch import launch
+from bidex_meta.train.learner import Learner
+from bidex_meta.utils import gl_backend
+from bidex_meta.world.contract import PooledWorld
+from bidex_meta.worlds import Worlds
+
+TASKS = 10
+"""Tasks of each class in such an evaluation, the first of its pool; one episode each."""
+_LEAST = 10
+"""Episodes over all classes: where there are fewer tasks each is played several times, so that not one fall decides."""
+_FILM = {"width": 240, "height": 180}
+_FILM_EVERY, _MOST_FILM_STEPS = 2, 300
+
+
+def check(plan: RunPlan) -> None:
+    """Refuse what would fail in the middle of the training.
+
+    Raises:
+        BidexError: There are no pictures of such a suite, no way to draw here, no ffmpeg, or no such logger.
+    """
+    check_logger(plan.config.logger)
+    if plan.config.video_every is not None:
+        plan.source.task_classes()
+        check_films()
+        gl_backend.prepare()
+
+
+@contextmanager
+def watch(
+    plan: RunPlan, folder: RunFolder, learner: Learner, record: Recorder, iterations: int
+) -> Iterator["Watch | None"]:
+    """What the config asks for, with its worlds closed at the end; None where it asks for nothing."""
+    if plan.config.evaluate_every is None and plan.config.video_every is None:
+        yield None
+        return
+    watched = Watch(plan, folder, learner, record, iterations)
+    try:
+        yield watched
+    finally:
+        watched.close()
+
+
+class Watch:
+    """Called after each iteration; every so many it evaluates or films.
+
+    Args:
+        plan: The run.
+        folder: Its folder.
+        learner: Its learner.
+        record: Takes the films.
+        iterations: Iterations that a resumed run has made before.
+    """
+
+    def __init__(self, plan: RunPlan, folder: RunFolder, learner: Learner, record: Recorder, iterations: int) -> None:
+        self._plan, self._folder, self._learner, self._record = plan, folder, learner, record
+        self._iterations = iterations
+        self._device = launch().own_device(plan.config.device)
+        self._worlds: dict[str, PooledWorld] = {}
+        self._best = folder.checkpoints.found_of_best()
+
+    def __call__(self) -> dict[str, float]:
+        """Metrics of this iteration's evaluation, ``Eval/...``; none without one."""
+        self._iterations += 1
+        metrics: dict[str, float] = {}
+        with undisturbed(torch.device(self._device)):
+            if self._is_due(self._plan.config.evaluate_every):
+                metrics = self._evaluate()
+            if self._is_due(self._plan.config.video_every):
+                self._film()
+        return metrics
+
+    def close(self) -> None:
+        """Frees the worlds."""
+        for world in self._worlds.values():
+            world.close()
+
+    def _is_due(self, every: int | None) -> bool:
+        return every is not None and self._iterations % every == 0
+
+    def _policy(self, device: str) -> Agent:
+        """A copy: recurrent ones remember what they saw, adapting ones learn."""
+        return self._plan.kind.make.load_policy(self._learner.policy_state_dict(), device)
+
+    def _evaluate(self) -> dict[str, float]:
+        metrics = self._meta_test() if self._plan.kind.adapts else _metrics(self._judge())
+        ranks = ("Eval/success_rate", "Eval/score", "Eval/mean_return")
+        found = {name: metrics[name] for name in ranks if name in metrics}
+        if self._best is None or _better(found, self._best):
+            self._best = found
+            self._folder.checkpoints.save_best(self._learner.policy_state_dict(), self._learner.env_steps, found)
+        return metrics
+
+    def _judge(self) -> Evaluation:
+        source = self._plan.source
+        pools = source.tasks("train")
+        tasks, episodes = played(pools)
+        if "evaluation" not in self._worlds:
+            world = self._worlds["evaluation"] = source.world("train", tasks * len(pools) * episodes)
+            if isinstance(world, PooledWorld):
+                first = zip(world.task_names, world.pools, strict=True)
+                world.set_tasks({name: pool[:tasks] for name, pool in first})
+        world = self._worlds["evaluation"]
+        return evaluate(
+            self._policy(self._device), world, episodes, seed=EVALUATION_SEED, references=source.references()
+        )
+
+    def _meta_test(self) -> dict[str, float]:
+        """One shot on train tasks: test tasks must not choose the policy that is judged on them."""
+        load, options = partial(self._policy, self._device), metatest.Options()
+        found = metatest.meta_test(self._plan.source, self._plan.config, load, options, ["train"])["train"]
+        before = _metrics(found.before)["Eval/success_rate"]
+        return {**_metrics(found.after), "Eval/success_before_adapt": before}
+
+    def _film(self) -> None:
+        """A film of an environment of each class beside each other; its failure is reported and ends nothing."""
+        try:
+            if "film" not in self._worlds:
+                worlds = Worlds.open({**self._plan.config.to_json(), "device": "cpu", "engine": "auto"})
+                self._worlds["film"] = worlds.world("train", len(slots_of(worlds)))
+            world = self._worlds["film"]
+            steps = min(_MOST_FILM_STEPS, int(world.max_episode_steps.max()))
+            frames = film_tiles(
+                self._policy("cpu"),
+                world,
+                range(world.num_envs),
+                steps,
+                self._plan.config.seed,
+                _FILM_EVERY,
+                **_FILM,
+            )
+            self._record.film("training", frames, CONTROL_RATE / _FILM_EVERY, self._learner.env_steps)
+        except (BidexError, OSError) as error:
+            print(f"No film at {self._learner.env_steps:,} steps: {error}", file=sys.stderr, flush=True)
+
+
+def played(pools: Mapping[str, Sequence[str]]) -> tuple[int, int]:
+    """Of an evaluation while training the tasks of each class, and the episodes of each task, by the pools' names."""
+    tasks = min(TASKS, max(map(len, pools.values())))
+    return tasks, math.ceil(_LEAST / (tasks * len(pools)))
+
+
+@contextmanager
+def undisturbed(device: torch.device) -> Iterator[None]:
+    """Whatever is drawn inside, the random numbers outside go on as if it had not been."""
+    python, legacy = random.getstate(), np.random.get_state()
+    with torch.random.fork_rng([device] if device.type == "cuda" else []), torch.no_grad():
+        yield
+    random.setstate(python)
+    np.random.set_state(legacy)
+
+
+def _metrics(found: Evaluation) -> dict[str, float]:
+    """Means over classes, and each class."""
+    classes = found.classes
+    metrics = {
+        "Eval/success_rate": float(np.mean([result.success for result in classes.values()])),
+        "Eval/mean_return": float(np.mean([result.mean_return for result in classes.values()])),
+    }
+    scores = [result.score for result in classes.values()]
+    known = [score for score in scores if score is not None]
+    if len(known) == len(scores):
+        metrics["Eval/score"] = float(np.mean(known))
+    for name, result in classes.items():
+        metrics[f"Eval/success/{name}"], metrics[f"Eval/return/{name}"] = result.success, result.mean_return
+    return metrics
+
+
+def _better(found: dict[str, float], best: dict[str, float]) -> bool:
+    """By success; where that is equal by the score, or the return where there is no score."""
+    second = "Eval/score" if "Eval/score" in found and "Eval/score" in best else "Eval/mean_return"
+    names = ("Eval/success_rate", second)
+    return [found[name] for name in names] > [best[name] for name in names]

@@ -1,0 +1,245 @@
+"""Checkpoints: ``step_<N>.pt`` (the last few), ``last.pt`` and ``best.pt``.
+
+Written atomically and read without unpickling code. Each is sealed by a format number and a digest of every number and
+tensor in it: ``torch.load`` checks no checksum, so a flipped bit would be loaded as another weight. Files of format 1,
+which had no seal, are still held to the checksums that every zip archive carries.
+"""
+
+import hashlib
+import re
+import shutil
+import sys
+import zipfile
+from pathlib import Path
+from typing import IO, Any
+
+from bidex_meta.errors import BidexError, one_line, shortened
+from bidex_meta.runs.atomic import refuse_links, remove_leftovers, write_atomic
+from bidex_meta.utils.files import exists, is_file, open_regular
+
+_STEP_FILE = re.compile(r"step_(\d{1,18})\.pt", re.ASCII)
+FORMAT = 2
+"""Goes up when older code could not read a checkpoint; 1 had no seal."""
+_DEEPEST = 100
+
+
+class Checkpoints:
+    """The checkpoints of one run.
+
+    Args:
+        folder: Where they lie; made by the first ``save``.
+        keep: How many ``step_<N>.pt`` are kept. More than one, so that a file damaged after it was written
+            (a full disk, a failing one) does not end the run.
+    """
+
+    def __init__(self, folder: Path, keep: int = 3):
+        self.folder = folder
+        self.keep = keep
+
+    @property
+    def last(self) -> Path:
+        """The newest checkpoint; exists after the first ``save``."""
+        return self.folder / "last.pt"
+
+    @property
+    def best(self) -> Path:
+        """The policy that did best in an evaluation while training; exists if there was one."""
+        return self.folder / "best.pt"
+
+    def save(self, state: dict[str, Any], step: int) -> None:
+        """Write ``step_<step>.pt`` and ``last.pt``, then forget the oldest.
+
+        Args:
+            state: Nested dicts and lists of tensors, numbers and strings; nothing that needs code to be read back.
+            step: Environment steps so far; ``load`` returns it.
+        """
+        import torch
+
+        refuse_links(self.folder)
+        self.folder.mkdir(exist_ok=True)
+        remove_leftovers(self.folder)
+        path, content = self.folder / f"step_{step}.pt", _sealed({"step": step, "state": state})
+        write_atomic(path, lambda file: torch.save(content, file))
+        self._follow(path)
+
+    def finish(self, step: int) -> None:
+        """Does what a :meth:`save` that was killed left undone.
+
+        Args:
+            step: Of the checkpoint that was loaded. Where a newer one is there, which was then damaged, all stay.
+        """
+        if not self.folder.is_dir():
+            return
+        refuse_links(self.folder)
+        remove_leftovers(self.folder)
+        path = self.folder / f"step_{step}.pt"
+        if self.newest_step() != step:
+            return
+        behind = not exists(self.last) or self.last.stat().st_mtime_ns <= path.stat().st_mtime_ns
+        if behind or len(self._step_files()) > self.keep:
+            self._follow(path)
+
+    def _follow(self, newest: Path) -> None:
+        """Makes ``last.pt`` a copy of the newest, then forgets the oldest."""
+        with newest.open("rb") as source:
+            write_atomic(self.last, lambda file: shutil.copyfileobj(source, file))
+        for old in self._step_files()[self.keep :]:
+            old.unlink(missing_ok=True)
+
+    def save_best(self, policy: dict[str, Any], step: int, found: dict[str, float]) -> None:
+        """Write ``best.pt``: a policy alone, from which no training continues.
+
+        Args:
+            policy: Entry ``learner.policy`` of a checkpoint.
+            step: Environment steps so far.
+            found: What was found of it; ``found_of_best`` returns it.
+        """
+        import torch
+
+        refuse_links(self.folder)
+        self.folder.mkdir(exist_ok=True)
+        remove_leftovers(self.folder)
+        content = _sealed({"step": step, "state": {"learner": {"policy": policy}}, "found": found})
+        write_atomic(self.best, lambda file: torch.save(content, file))
+
+    def found_of_best(self) -> dict[str, float] | None:
+        """What was found of the policy in ``best.pt``; None where there is none that can be read."""
+        content = _read(self.best, "none is known") if exists(self.best) else None
+        return None if content is None else content.get("found")
+
+    def load_one(self, path: Path) -> tuple[dict[str, Any], int]:
+        """A certain checkpoint as ``load`` gives it.
+
+        Raises:
+            BidexError: There is no such file, or it cannot be read.
+        """
+        if not is_file(path):
+            there = ", ".join(sorted(found.name for found in self.folder.glob("*.pt"))) or "none"
+            raise BidexError(f"There is no {path}. Checkpoints in {self.folder}: {there}.")
+        try:
+            content = _opened(path)
+        except Exception as error:
+            raise BidexError(f"{path} is no checkpoint that can be read ({_reason(error)}). Name another.") from None
+        return content["state"], content["step"]
+
+    def newest_step(self) -> int | None:
+        """Environment steps of the newest checkpoint, by the names of the files; None where there is none yet."""
+        files = self._step_files()
+        return int(files[0].stem.removeprefix("step_")) if files else None
+
+    def load(self) -> tuple[dict[str, Any], int] | None:
+        """The newest readable checkpoint as ``(state, step)`` with tensors on the CPU; None where there is none yet.
+
+        A damaged file is passed over with a line on stderr, which names the one that is taken in its place.
+
+        Raises:
+            BidexError: There are checkpoints, but none of them can be read.
+        """
+        # last.pt comes last: a process that died between the two renames leaves it older than the newest step_<N>.pt.
+        candidates = [path for path in [*self._step_files(), self.last] if exists(path)]
+        for path in candidates:
+            loaded = _read(path)
+            if loaded is not None:
+                if path != candidates[0]:
+                    print(f"Taking {path}, of {loaded['step']:,} steps.", file=sys.stderr)
+                return loaded["state"], loaded["step"]
+        if candidates:
+            raise BidexError(
+                f"None of the {len(candidates)} checkpoints in {self.folder} can be read. Start a new run."
+            )
+        return None
+
+    def _step_files(self) -> list[Path]:
+        """``step_<N>.pt``, newest first."""
+        paths = self.folder.iterdir() if self.folder.is_dir() else ()
+        found = [(int(match[1]), path) for path in paths if (match := _STEP_FILE.fullmatch(path.name))]
+        return [path for _, path in sorted(found, reverse=True)]
+
+
+def _read(path: Path, then: str = "trying an older one") -> dict[str, Any] | None:
+    try:
+        return _opened(path)
+    except Exception as error:  # torch raises a dozen kinds for a damaged file; each means "try the one before"
+        print(f"Checkpoint {path} cannot be read ({_reason(error)}); {then}.", file=sys.stderr)
+        return None
+
+
+def _reason(error: Exception) -> str:
+    kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+    return kind + one_line(error)[:100].rstrip(".")
+
+
+def _sealed(content: dict[str, Any]) -> dict[str, Any]:
+    """Content to be saved, with its format and digest."""
+    return {**content, "format": FORMAT, "digest": _digest(content)}
+
+
+def _opened(path: Path) -> dict[str, Any]:
+    """A sealed file's content, read from a file without running any code of it; at least ``step`` and ``state``.
+
+    Raises:
+        BidexError: It is no regular file, or of a newer format.
+        Exception: torch's own, of a dozen kinds, where the file is damaged or something else.
+    """
+    import torch
+
+    with open_regular(path, "a checkpoint") as file:
+        _check_archive(file)
+        # weights_only: a checkpoint from somebody else must not be able to run code.
+        content = torch.load(file, map_location="cpu", weights_only=True)
+    if not isinstance(content, dict) or not isinstance(content.get("state"), dict):
+        raise ValueError("it holds no training's state")
+    if type(content.get("step")) is not int or content["step"] < 0:
+        raise ValueError(f"its step is {shortened(content.get('step'))}, no whole number")
+    version, digest = content.pop("format", 1), content.pop("digest", None)
+    if type(version) is not int or not 1 <= version <= FORMAT:
+        raise BidexError(f"format {shortened(version)} is none this version knows (1 to {FORMAT})")
+    if version > 1 and digest != _digest(content):
+        raise ValueError("its content does not have the digest it was saved with")
+    return content
+
+
+def _check_archive(file: IO[bytes]) -> None:
+    """Refuses an archive that is damaged, or whose parts are larger than the file: torch stores them as they are."""
+    with zipfile.ZipFile(file) as archive:
+        for part in archive.infolist():
+            if part.compress_type != zipfile.ZIP_STORED or part.file_size != part.compress_size:
+                raise ValueError(f"its part {shortened(part.filename)} is compressed")
+        damaged = archive.testzip()
+    if damaged is not None:
+        raise ValueError(f"its part {shortened(damaged)} does not have its checksum")
+    file.seek(0)
+
+
+def _digest(content: dict[str, Any]) -> str:
+    found = hashlib.blake2b(digest_size=32)
+    _feed(content, found, 0)
+    return found.hexdigest()
+
+
+def _feed(value: Any, found: Any, depth: int) -> None:
+    """Feeds a hash with a value, its type and its shape, so that no two contents look alike."""
+    import torch
+
+    if depth > _DEEPEST:
+        raise ValueError(f"it is nested more than {_DEEPEST} deep")
+    if isinstance(value, torch.Tensor):
+        found.update(f"tensor {value.dtype} {tuple(value.shape)}:".encode())
+        flat = value.detach().cpu().contiguous()
+        # Of a single number the stride can be any, and a view of bytes asks for 1.
+        flat = flat.as_strided((flat.numel(),), (1,))
+        found.update(flat.view(torch.uint8).numpy().data)
+    elif isinstance(value, dict):
+        found.update(f"dict {len(value)}:".encode())
+        for name, each in value.items():
+            _feed(name, found, depth + 1)
+            _feed(each, found, depth + 1)
+    elif isinstance(value, list | tuple):
+        found.update(f"{'list' if isinstance(value, list) else 'tuple'} {len(value)}:".encode())
+        for each in value:
+            _feed(each, found, depth + 1)
+    else:
+        # Of floats repr gives every bit but NaN's.
+        told = value if isinstance(value, bytes) else repr(value).encode()
+        found.update(f"{type(value).__name__} {len(told)}:".encode())
+        found.update(told)

@@ -1,0 +1,295 @@
+"""The run folder: what was run, with what, and what came out.
+
+::
+
+    runs/<suite>/<algo>/<UTC date-time>_seed<seed>/
+        config.json     the resolved config: every value, also the defaults
+        versions.json   Python, packages, machine, git commit; physics profile and version of the suite
+        metrics.jsonl   one line a log call: {"step": ..., "time": ..., "Train/mean_return": ...}
+        events.out...   the same for TensorBoard
+        checkpoints/    step_<N>.pt (the last few), last.pt, best.pt
+        videos/         <name>_<N>.mp4
+        evaluation.json what the trained policy reaches
+"""
+
+import contextlib
+import os
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from bidex_meta.config import RunConfig, read_config
+from bidex_meta.errors import BidexError
+from bidex_meta.runs.atomic import TEMPORARY_SUFFIX, check_writable, refuse_links, remove_leftovers, write_json
+from bidex_meta.runs.checkpoints import Checkpoints
+from bidex_meta.runs.metrics import last_rows, read_metrics
+from bidex_meta.runs.schemas import read_evaluation, read_versions
+from bidex_meta.runs.versions import collect_versions
+from bidex_meta.utils.files import exists, is_file, read_json
+from bidex_meta.utils.plugins import name_with_object, short_name
+
+_ENTRIES = ("checkpoints", "videos", "metrics.jsonl", "versions.json", "config.json", "replay", "wandb", "wandb-id")
+"""What stands in a run folder before its first iteration has ended, beside TensorBoard's file."""
+_EVENTS = "events.out.tfevents."
+_MOST_LOOKED_AT = 2000
+"""Entries that are looked at to find runs below a folder that is none."""
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """One run on disk. Made by ``create`` or ``open``."""
+
+    path: Path
+
+    @classmethod
+    def create(
+        cls,
+        config: RunConfig[Any],
+        path: Path | None = None,
+        root: Path = Path("runs"),
+        identity: dict[str, Any] | None = None,
+    ) -> "RunFolder":
+        """Make a new, complete run folder: after this call only metrics, checkpoints and videos are added.
+
+        Args:
+            config: The resolved config; its ``suite`` (or ``task``), ``algo`` and ``seed`` name the folder.
+            path: The folder itself, instead of one under ``root`` named after the config.
+            root: Where runs are collected.
+            identity: What tells the run's worlds from others of their name; kept in ``versions.json``.
+
+        Raises:
+            BidexError: ``path`` exists and is not empty.
+        """
+        folder = cls(_new_folder(config, root) if path is None else _given_folder(path))
+        for made in (folder.checkpoints_path, folder.videos_path):
+            made.mkdir(exist_ok=True)  # there where a start was killed before its config stood
+        folder.metrics_path.touch()
+        write_json(folder.path / "versions.json", collect_versions() | (identity or {}))
+        write_json(folder.config_path, config.to_json())  # last: a folder with a config.json is a complete one
+        return folder
+
+    @classmethod
+    def open(cls, path: Path) -> "RunFolder":
+        """An existing run.
+
+        Raises:
+            BidexError: There is no readable ``config.json``.
+        """
+        folder = cls(Path(path))
+        if not is_file(folder.config_path):
+            near = sorted(map(str, _runs_below(folder.path)))[:3]
+            hint = f" There are runs below it: {', '.join(near)}." if near else ""
+            if not near and _torn_start(folder.path):
+                hint = f" Its run was killed as it began. Begin again: --run-dir {path}"
+            raise BidexError(f"{path} is not a run folder: it has no config.json.{hint}")
+        return folder
+
+    @property
+    def config_path(self) -> Path:
+        """``config.json``."""
+        return self.path / "config.json"
+
+    @property
+    def metrics_path(self) -> Path:
+        """``metrics.jsonl``."""
+        return self.path / "metrics.jsonl"
+
+    @property
+    def checkpoints_path(self) -> Path:
+        """``checkpoints/``."""
+        return self.path / "checkpoints"
+
+    @property
+    def videos_path(self) -> Path:
+        """``videos/``."""
+        return self.path / "videos"
+
+    @property
+    def checkpoints(self) -> Checkpoints:
+        """The run's checkpoints."""
+        return Checkpoints(self.checkpoints_path)
+
+    def config(self) -> RunConfig[dict[str, Any]]:
+        """The resolved config.
+
+        Raises:
+            BidexError: ``config.json`` cannot be read, is not valid JSON, or not a run's.
+        """
+        return read_config(self.config_path)
+
+    @property
+    def evaluation_path(self) -> Path:
+        """``evaluation.json``, which stands there when a run has ended and was evaluated."""
+        return self.path / "evaluation.json"
+
+    @property
+    def again(self) -> str:
+        """The command that writes its evaluation anew, for messages."""
+        return f"bidex-meta evaluate {self.path} --json > {self.evaluation_path}"
+
+    @property
+    def evaluated(self) -> bool:
+        """Whether there is an ``evaluation.json``."""
+        return is_file(self.evaluation_path)
+
+    def metrics(self) -> list[dict[str, Any]]:
+        """The rows of ``metrics.jsonl`` that can be read."""
+        return read_metrics(self.metrics_path)
+
+    @property
+    def goal(self) -> int:
+        """Steps that it trains for; of a run that time, a return or a score has ended those it made."""
+        rows = last_rows(self.metrics_path)
+        return self.config().goal(rows[-1] if rows else {"step": 0})
+
+    def versions(self) -> dict[str, Any]:
+        """``versions.json``; empty where there is none."""
+        return read_versions(self.path)
+
+    def evaluation(self) -> dict[str, Any]:
+        """The final evaluation, or the meta-test of what adapts.
+
+        Raises:
+            BidexError: There is none, or ``evaluation.json`` holds something else.
+        """
+        if not exists(self.evaluation_path):
+            raise BidexError(f"{self.path} has no evaluation.json. Let the run end, or write one: {self.again}")
+        return read_evaluation(self.evaluation_path, self.again)
+
+    def change_config(self, config: RunConfig[Any]) -> None:
+        """Replace ``config.json``, atomically, where it says something else."""
+        if read_json(self.config_path, "a run's config") != config.to_json():
+            write_json(self.config_path, config.to_json())
+
+    def finish(self, step: int | None) -> None:
+        """Clears away what a process that was killed in this folder left half done; only where it is locked.
+
+        Args:
+            step: Of the checkpoint that the run goes on from, if any.
+        """
+        remove_leftovers(self.path)
+        if step is not None:
+            self.checkpoints.finish(step)
+
+    def check_own(self) -> None:
+        """Makes sure that the run can go on here, before anything is built.
+
+        Raises:
+            BidexError: A part of it is a link that leads elsewhere, or the folder cannot be written.
+        """
+        refuse_links(self.checkpoints_path, self.videos_path, self.metrics_path, self.path / "wandb-id")
+        for folder in (self.path, self.checkpoints_path):
+            if folder == self.path or folder.exists():
+                check_writable(folder / "last.pt")
+
+    @contextlib.contextmanager
+    def locked(self, told: str | None = None) -> Iterator[None]:
+        """Keeps other processes from training in this folder; the lock dies with its process, and leaves no file.
+
+        Args:
+            told: What is said to another one; None: that a process trains here.
+
+        Raises:
+            BidexError: Another process does.
+        """
+        handle = os.open(self.path, os.O_RDONLY)
+        try:
+            with contextlib.suppress(ImportError):  # Windows has no such locks
+                import fcntl
+
+                try:
+                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    told = told or f"Another process trains in {self.path}. Wait for its end, or stop it."
+                    raise BidexError(told) from None
+                except OSError:
+                    pass  # a network's file system may lock no folders
+            yield
+        finally:
+            os.close(handle)
+
+
+def _runs_below(path: Path) -> Iterator[Path]:
+    """Run folders up to three levels below: as deep as runs/SUITE/ALGO/RUN, and no walk over a whole disk."""
+    waiting, looked_at = deque([(path, 0)]), 0
+    while waiting:
+        folder, depth = waiting.popleft()
+        with contextlib.suppress(OSError, ValueError), os.scandir(folder) as entries:
+            for entry in entries:
+                looked_at += 1
+                if looked_at > _MOST_LOOKED_AT:
+                    return
+                if entry.name == "config.json" and entry.is_file():
+                    yield folder
+                elif depth < 3 and entry.is_dir(follow_symlinks=False):
+                    waiting.append((Path(entry.path), depth + 1))
+
+
+def _torn_start(path: Path) -> bool:
+    """Whether a folder holds nothing but what a run makes before its first iteration has ended, and no result."""
+    try:
+        entries = list(path.iterdir())
+        found = [entry for entry in entries if not entry.name.endswith(TEMPORARY_SUFFIX)]
+        folders = [entry for entry in found if entry.name in _ENTRIES[:2]]
+        known = all(
+            (entry.name in _ENTRIES or entry.name.startswith(_EVENTS)) and not entry.is_symlink() for entry in found
+        )
+        # A file that was to be written alone: the first look at whether the folder can be written was killed.
+        known = known and (bool(found) or all(_is_own_leftover(entry) for entry in entries))
+        empty = not any(any(folder.iterdir()) for folder in folders)
+        return bool(entries) and known and empty and all(e.stat().st_size == 0 for e in found if e.name == _ENTRIES[2])
+    except OSError:
+        return False
+
+
+def _is_own_leftover(path: Path) -> bool:
+    return path.name.startswith(".config.json.") and path.name.endswith(TEMPORARY_SUFFIX) and not path.is_symlink()
+
+
+def new_folder_name(config: RunConfig[Any], root: Path = Path("runs")) -> Path:
+    """Where a run is kept that is given no folder, by its config and the present time."""
+    # A suite may be a path to a TOML file, task and algo package.module:Class.
+    subject = short_name(Path(config.suite or str(config.task)).stem)
+    subject = name_with_object(subject, config.object)
+    now = datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S")
+    algo = short_name(config.algo)
+    return root / subject / algo / f"{now}_seed{config.seed}"
+
+
+def _new_folder(config: RunConfig[Any], root: Path) -> Path:
+    base = new_folder_name(config, root)
+    base.parent.mkdir(parents=True, exist_ok=True)
+    path, count = base, 1
+    while True:
+        try:
+            path.mkdir()  # fails where it exists, so two runs started in one second never share a folder
+            return path
+        except FileExistsError:
+            count += 1
+            path = base.with_name(f"{base.name}_{count}")
+
+
+def _given_folder(path: Path) -> Path:
+    check_new(path)
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def check_new(path: Path) -> None:
+    """Makes sure that a run can begin in a folder.
+
+    Raises:
+        BidexError: There is something in it other than a run that failed or was killed before it had learned anything;
+            another process trains there; or it cannot be made or written.
+    """
+    if exists(path) and not (path.is_dir() and (_torn_start(path) or not any(path.iterdir()))):
+        raise BidexError(
+            f"--run-dir {path} exists and is not empty. Name a new folder, or continue it by --resume {path}."
+        )
+    if is_file(path / "config.json"):
+        with RunFolder(path).locked():
+            pass
+    check_writable(path / "config.json")

@@ -1,0 +1,161 @@
+"""How training, or filming, goes, on stderr: a live table in a terminal, a plain line every few seconds elsewhere."""
+
+import contextlib
+import math
+import sys
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TextIO, TypeVar
+
+from rich.console import Console
+from rich.live import Live
+from rich.markup import escape
+from rich.progress import track
+from rich.table import Table
+
+from bidex_meta.utils.streams import silence
+
+Item = TypeVar("Item")
+
+_PLAIN_SECONDS = 5.0
+_SUCCESS = "Train/success/"
+_RETURN = "Train/return/"
+
+
+class PlainConsole(Console):
+    """Leaves it to whoever prints what to do where nobody reads it; rich would end the process."""
+
+    def on_broken_pipe(self) -> None:
+        """Goes on with the error that is being handled."""
+        raise
+
+
+class Progress:
+    """Shows steps per second, time left, mean return and success, and both per task.
+
+    Args:
+        total_steps: Environment steps of the whole run.
+        total_seconds: Training time of the whole run; what is up comes from the metric ``Perf/training_time``.
+        start_step: Where this process begins (a resumed run); its speed counts from there.
+        stream: Where to write; stderr by default, so that stdout keeps to results.
+    """
+
+    def __init__(
+        self, total_steps: int, total_seconds: float = math.inf, start_step: int = 0, stream: TextIO | None = None
+    ):
+        self._console = PlainConsole(file=stream or sys.stderr)
+        self._total, self._total_seconds = total_steps, total_seconds
+        self._start_step = start_step
+        self._start_time = time.monotonic()
+        self._last_line = -float("inf")
+        self._shown: dict[str, float] = {}
+        self._live = Live(console=self._console, auto_refresh=False) if self._console.is_terminal else None
+
+    def start(self) -> None:
+        """Begin; speed counts from here."""
+        self._start_time = time.monotonic()
+        if self._live is not None:
+            self._live.start()
+
+    def update(self, metrics: Mapping[str, float], step: int) -> None:
+        """Show what is new.
+
+        Args:
+            metrics: Tags of this iteration; those of earlier ones stay shown (an iteration may end no episode).
+            step: Environment steps so far.
+
+        Raises:
+            BrokenPipeError: It cannot be shown: the reader has ended, the terminal is gone. What is shown later goes
+                nowhere.
+        """
+        self._shown.update({tag: value for tag, value in metrics.items() if value == value})
+        try:
+            if self._live is not None:
+                self._live.update(self._table(step), refresh=True)
+            elif time.monotonic() - self._last_line >= _PLAIN_SECONDS or self._seconds_left(step) <= 0.0:
+                self._last_line = time.monotonic()
+                self._console.print(self._line(step), soft_wrap=True, highlight=False, markup=False)
+        except OSError as error:  # of a terminal that is gone: EIO
+            silence(self._console.file)
+            raise BrokenPipeError(f"progress cannot be shown: {error.strerror or error}") from error
+
+    def close(self) -> None:
+        """Leave the terminal as it was found, the last table standing; where it is gone, quietly."""
+        if self._live is not None:
+            with contextlib.suppress(OSError):
+                self._live.stop()
+
+    def _tasks(self) -> list[str]:
+        prefixes = (_SUCCESS, _RETURN)
+        names = [tag[len(prefix) :] for tag in self._shown for prefix in prefixes if tag.startswith(prefix)]
+        return list(dict.fromkeys(names))
+
+    def _line(self, step: int) -> str:
+        parts = [self._speed(step), *self._overall()]
+        parts += [f"{name} {_percent(self._shown.get(_SUCCESS + name))}" for name in self._tasks()]
+        return " | ".join(parts)
+
+    def _table(self, step: int) -> Table:
+        title = "  ".join([self._speed(step), *self._overall()])
+        table = Table(title=title, title_justify="left", title_style="bold")
+        table.add_column("task")
+        for column in ("success", "return"):
+            table.add_column(column, justify="right")
+        for name in self._tasks():
+            table.add_row(
+                escape(name), _percent(self._shown.get(_SUCCESS + name)), _number(self._shown.get(_RETURN + name))
+            )
+        return table
+
+    def _speed(self, step: int) -> str:
+        seconds = self._seconds_left(step)
+        left = _duration(seconds) if seconds < math.inf else "?"
+        return f"{step:,} / {self._total:,} steps  {self._rate(step):,.0f} steps/s  {left} left"
+
+    def _rate(self, step: int) -> float:
+        return (step - self._start_step) / max(time.monotonic() - self._start_time, 1e-9)
+
+    def _seconds_left(self, step: int) -> float:
+        """Until the steps are done or the time is up, whichever comes first."""
+        steps, rate = self._total - step, self._rate(step)
+        by_steps = 0.0 if steps <= 0 else steps / rate if rate > 0 else math.inf
+        return min(by_steps, self._total_seconds - self._shown.get("Perf/training_time", 0.0))
+
+    def _overall(self) -> list[str]:
+        mean_return, success = self._shown.get("Train/mean_return"), self._shown.get("Train/success_rate")
+        return [f"return {_number(mean_return)}", f"success {_percent(success)}"]
+
+
+def counted(items: Iterable[Item], total: int, what: str, stream: TextIO | None = None) -> Iterator[Item]:
+    """The items, with how far it is on stderr: a bar in a terminal, a plain line every few seconds elsewhere.
+
+    Args:
+        items: What is made one after the other.
+        total: How many there will be at most.
+        what: Their name in the plural.
+        stream: Where to write instead.
+    """
+    console = PlainConsole(file=stream or sys.stderr)
+    if console.is_terminal:
+        yield from track(items, description=what, total=total, console=console, transient=True)
+        return
+    said = time.monotonic()
+    for number, item in enumerate(items, start=1):
+        yield item
+        if time.monotonic() - said >= _PLAIN_SECONDS:
+            said = time.monotonic()
+            console.print(f"{number} of {total} {what}", highlight=False, markup=False)
+
+
+def _percent(value: float | None) -> str:
+    return "–" if value is None else f"{100 * value:.1f} %"
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.4g}"
+
+
+def _duration(seconds: float) -> str:
+    minutes, seconds = divmod(round(max(seconds, 0)), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"

@@ -1,0 +1,158 @@
+"""Pictures and films from rendered frames. PNG and WebP need nothing extra, MP4 the extra ``video``."""
+
+import errno
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bidex_meta.errors import BidexError
+from bidex_meta.runs.atomic import write_atomic
+
+SUFFIXES = (".png", ".mp4", ".webp")
+_STRIP = 20
+"""Height of a name, pixels."""
+_BACK, _INK, _DONE = (24, 26, 30), (215, 218, 224), (110, 220, 130)
+
+
+def check_suffix(path: Path) -> str:
+    """The ending of ``path`` in lower case.
+
+    Raises:
+        BidexError: It is another than these three.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise BidexError(f"A picture ends in .png, a film in .mp4 or .webp, but {path.name!r} in none of them.")
+    return suffix
+
+
+def write_image(path: Path, frame: np.ndarray) -> None:
+    """Write one frame as PNG.
+
+    Args:
+        path: The file; missing folders are made.
+        frame: ``(height, width, 3)`` uint8.
+    """
+    import imageio.v3 as imageio
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    picture = imageio.imwrite("<bytes>", frame, extension=".png")
+    write_atomic(path, lambda file: file.write(picture))
+
+
+def check_films() -> None:
+    """Refuse MP4 where it cannot be written.
+
+    Raises:
+        BidexError: imageio-ffmpeg is missing.
+    """
+    try:
+        import imageio_ffmpeg  # noqa: F401
+    except ImportError:
+        raise BidexError("Films need imageio-ffmpeg: pip install 'bidex-meta[video]', or write .webp.") from None
+
+
+def write_animation(path: Path, frames: Iterable[np.ndarray], fps: float, quality: int = 60) -> None:
+    """Write frames as an animated WebP that plays for ever, as web pages show it without a player.
+
+    Args:
+        path: The file; missing folders are made.
+        frames: ``(height, width, 3)`` uint8 each.
+        fps: Frames per second.
+        quality: Of the pictures, 0 to 100; smaller makes smaller files.
+    """
+    from PIL import Image
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pictures = (Image.fromarray(frame) for frame in frames)
+    options: dict[str, Any] = {"duration": round(1000 / fps), "loop": 0, "quality": quality, "method": 6}
+    first = next(pictures)
+    write_atomic(path, lambda file: first.save(file, "WEBP", save_all=True, append_images=pictures, **options))
+
+
+def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
+    """Write frames as an MP4 (H.264), one at a time, so that a long film needs no memory.
+
+    Args:
+        path: The file; missing folders are made.
+        frames: ``(height, width, 3)`` uint8 each; height and width even, as H.264 demands.
+        fps: Frames per second.
+
+    Returns:
+        How many frames were written.
+
+    Raises:
+        BidexError: imageio-ffmpeg is missing.
+        OSError: It cannot be written; what was there before stays.
+    """
+    check_films()
+    import imageio
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial, count = path.with_name(f".{path.name}.part.mp4"), 0
+    # macro_block_size 2: the default of 16 would resize 1000x750 in silence.
+    try:
+        with imageio.get_writer(partial, format="FFMPEG", fps=fps, codec="libx264", macro_block_size=2) as writer:  # type: ignore[arg-type]
+            for frame in frames:
+                writer.append_data(frame)  # type: ignore[attr-defined]
+                count += 1
+        if not _whole(partial):
+            raise OSError(errno.EIO, "ffmpeg could not write all of the film; is the disk full?", str(path))
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return count
+
+
+def _whole(path: Path) -> bool:
+    """Whether an MP4 ends in the table of its frames, which is written last: imageio does not say how ffmpeg ended."""
+    with path.open("rb") as file:
+        end, place, kind = file.seek(0, 2), 0, b""
+        while place < end:
+            file.seek(place)
+            size, kind = int.from_bytes(file.read(4)), file.read(4)
+            size = int.from_bytes(file.read(8)) if size == 1 else size  # 1: a length of eight bytes follows
+            if size < 8:
+                return False
+            place += size
+        return place == end and kind == b"moov"
+
+
+def grid(count: int) -> tuple[int, int]:
+    """Columns and rows for so many tiles: as square as it goes, wider than high."""
+    columns = math.ceil(math.sqrt(count))
+    return columns, math.ceil(count / columns)
+
+
+def tiled(pictures: Sequence[np.ndarray], names: Sequence[str], done: Sequence[bool]) -> np.ndarray:
+    """One picture of all.
+
+    Args:
+        pictures: Each ``(height, width, 3)`` uint8, of one size.
+        names: Under each.
+        done: Whose name is written in green.
+
+    Returns:
+        ``(rows * (height + 20), columns * width, 3)`` uint8.
+    """
+    height, width, _ = pictures[0].shape
+    columns, rows = grid(len(pictures))
+    whole = np.empty((rows * (height + _STRIP), columns * width, 3), np.uint8)
+    whole[:] = _BACK
+    for place, picture in enumerate(pictures):
+        top, left = place // columns * (height + _STRIP), place % columns * width
+        whole[top : top + height, left : left + width] = picture
+        whole[top + height : top + height + _STRIP, left : left + width] = _label(names[place], width, done[place])
+    return whole
+
+
+def _label(name: str, width: int, done: bool) -> np.ndarray:
+    from PIL import Image, ImageDraw, ImageFont
+
+    strip = Image.new("RGB", (width, _STRIP), _BACK)
+    pen = ImageDraw.Draw(strip)
+    pen.text((width / 2, _STRIP / 2), name, fill=_DONE if done else _INK, font=ImageFont.load_default(13), anchor="mm")
+    return np.asarray(strip)

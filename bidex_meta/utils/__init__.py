@@ -1,0 +1,1 @@
+"""What every package may use: validation, files, rotations, memory, plugins, streams."""

@@ -1,0 +1,256 @@
+import io
+import json
+import math
+import os
+
+import numpy as np
+import pytest
+
+from bidex_meta.config import RunConfig
+from bidex_meta.errors import BidexError
+from bidex_meta.runs import MetricsWriter, Progress, RunFolder, read_metrics, training_seconds
+from bidex_meta.runs import progress as progress_module
+from bidex_meta.runs.metrics import last_rows
+from bidex_meta.runs.plots import Curve, draw_adaptation, draw_learning, read_evaluation, save, svg
+from bidex_meta.runs.video import check_suffix, write_animation, write_image, write_video
+
+CONFIG = RunConfig(suite="MT4", task=None, algo="mtppo", seed=3, learner={"hidden": [8]}, num_envs=8, steps=100)
+
+
+def board_points(folder, tag):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(folder))
+    events.Reload()
+    return [(event.step, event.value) for event in events.Scalars(tag)]
+
+
+def test_run_folder_is_complete_when_made(tmp_path):
+    folder = RunFolder.create(CONFIG, root=tmp_path)
+    assert folder.path.parent == tmp_path / "MT4" / "mtppo"
+    assert folder.path.name.endswith("_seed3")
+    assert {path.name for path in folder.path.iterdir()} == {
+        "config.json",
+        "versions.json",
+        "metrics.jsonl",
+        "checkpoints",
+        "videos",
+    }
+    assert RunFolder.open(folder.path).config() == CONFIG
+    versions = json.loads((folder.path / "versions.json").read_text())
+    assert versions["packages"]["torch"]
+
+
+def test_two_runs_in_one_second_do_not_share_a_folder(tmp_path):
+    paths = {RunFolder.create(CONFIG, root=tmp_path).path for _ in range(3)}
+    assert len(paths) == 3
+
+
+def test_a_used_folder_is_refused_and_left_alone(tmp_path):
+    (tmp_path / "mine").write_text("precious")
+    with pytest.raises(BidexError, match="not empty"):
+        RunFolder.create(CONFIG, path=tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+
+
+def test_opening_a_parent_names_the_runs_below(tmp_path):
+    folder = RunFolder.create(CONFIG, root=tmp_path)
+    with pytest.raises(BidexError, match=folder.path.name):
+        RunFolder.open(tmp_path)
+
+
+def test_metrics_go_to_both_and_resume_drops_what_came_after_the_checkpoint(tmp_path):
+    writer = MetricsWriter(tmp_path)
+    for step in (10, 20, 30):
+        writer.log({"Train/mean_return": step}, step)
+    writer.close()
+    with (tmp_path / "metrics.jsonl").open("a") as file:
+        file.write('{"step": 40, "Train/me')  # torn by the crash
+    resumed = MetricsWriter(tmp_path, resume_step=20)
+    assert [row["step"] for row in read_metrics(tmp_path / "metrics.jsonl")] == [10, 20]
+    resumed.log({"Train/mean_return": -1.0}, 30)
+    resumed.close()
+    rows = read_metrics(tmp_path / "metrics.jsonl")
+    assert [(row["step"], row["Train/mean_return"]) for row in rows] == [(10, 10.0), (20, 20.0), (30, -1.0)]
+    assert board_points(tmp_path, "Train/mean_return") == [(10, 10.0), (20, 20.0), (30, -1.0)]
+
+
+def test_a_value_that_is_not_finite_stays_valid_json(tmp_path):
+    writer = MetricsWriter(tmp_path)
+    writer.log({"Loss/value": math.nan, "Loss/policy": math.inf, "ok": 1}, 1)
+    writer.close()
+    row = json.loads((tmp_path / "metrics.jsonl").read_text(), parse_constant=pytest.fail)
+    assert (row["Loss/value"], row["Loss/policy"], row["ok"]) == (None, None, 1.0)
+
+
+@pytest.fixture
+def rare_lines(monkeypatch):
+    """However slow the machine, no second line is due."""
+    monkeypatch.setattr(progress_module, "_PLAIN_SECONDS", math.inf)
+
+
+def test_progress_without_a_terminal_is_one_plain_line(rare_lines):
+    stream = io.StringIO()
+    progress = Progress(1000, start_step=500, stream=stream)
+    progress.start()
+    metrics = {"Train/mean_return": 3.25, "Train/success_rate": 0.5, "Train/success/HandOver": 0.25}
+    progress.update(metrics, 600)
+    progress.update(metrics, 700)
+    progress.close()
+    lines = stream.getvalue().splitlines()
+    assert len(lines) == 1
+    for part in ("600 / 1,000 steps", "steps/s", "left", "return 3.25", "success 50.0 %", "HandOver 25.0 %"):
+        assert part in lines[0]
+
+
+def test_time_left_is_that_of_what_ends_first(rare_lines):
+    stream = io.StringIO()
+    progress = Progress(10**15, total_seconds=300.0, stream=stream)  # more steps than any machine's microseconds make
+    progress.start()
+    progress.update({"Perf/training_time": 60.0}, 10)
+    progress.update({"Perf/training_time": 120.0}, 20)
+    progress.update({"Perf/training_time": 301.0}, 30)
+    progress.close()
+    first, last = stream.getvalue().splitlines()
+    assert "10 / 1,000,000,000,000,000 steps" in first and "4:00 left" in first
+    assert "30 / 1,000,000,000,000,000 steps" in last and "0:00 left" in last
+
+
+def test_training_time_is_counted_over_resumes_and_known_of_older_runs():
+    older = [{"step": 1, "Perf/collection_time": 3.0, "Perf/learning_time": 1.0}, {"step": 2}]
+    assert training_seconds([]) == 0.0
+    assert training_seconds(older) == 4.0
+    assert training_seconds([*older, {"step": 3, "Perf/training_time": 6.0}]) == 6.0
+
+
+def test_progress_in_a_terminal_is_a_table(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    monkeypatch.setenv("TERM", "xterm")
+    stream = Terminal()
+    progress = Progress(1000, stream=stream)
+    progress.start()
+    progress.update({"Train/success/HandOver": 0.25, "Train/return/HandOver": 7.0}, 600)
+    progress.close()
+    assert "HandOver" in stream.getvalue()
+    assert "25.0 %" in stream.getvalue()
+
+
+def curve(*values, spread=None):
+    mean = np.array(values, float)
+    ends = (None, None) if spread is None else (mean - spread, mean + spread)
+    return Curve(np.arange(len(values), dtype=float), mean, *ends)
+
+
+def test_curves_are_drawn_and_an_empty_run_says_so(tmp_path):
+    with pytest.raises(BidexError, match="no finished episode"):
+        draw_learning([("mtppo", {"Loss/value": curve(1.0)})])
+    tags = {f"Train/{kind}/T{i}": curve(0.1, 0.2, spread=0.05) for i in range(5) for kind in ("return", "success")}
+    other = {"Eval/success/T0": curve(0.5), "Train/return/T5": curve(1.0, 2.0)}
+    figure = draw_learning([("mtppo, gamma $0.9$", tags), ("mtsac", other)])
+    shown = [axis for axis in figure.axes if axis.axison]
+    assert len(shown) == 2 * 6
+    assert [len(axis.lines) for axis in shown[:4]] == [1, 1, 1, 1]
+    success = next(axis for axis in figure.axes if axis.get_ylabel() == "success")
+    assert [line.get_linestyle() for line in success.lines] == ["-", "--"]
+    assert len(success.collections) == 1  # the interval of the first group
+    save(figure, tmp_path / "new" / "c.png")
+    assert (tmp_path / "new" / "c.png").read_bytes()[:4] == b"\x89PNG"
+    assert b"gamma $0.9$" in svg(figure)
+
+
+def test_twenty_groups_have_twenty_colours():
+    figure = draw_learning([(f"arm {i}", {"Train/success/T": curve(0.1, 0.2)}) for i in range(20)])
+    assert len({line.get_color() for line in figure.axes[1].lines}) == 20
+    assert len({line.get_color() for line in figure.legends[0].get_lines()}) == 20
+
+
+def test_an_ending_that_is_no_pictures_is_one_line(tmp_path):
+    figure = draw_learning([("mtppo", {"Train/return/Near": curve(2.0)})])
+    with pytest.raises(BidexError, match=r"png.*got 'c\.txt'"):
+        save(figure, tmp_path / "c.txt")
+
+
+@pytest.mark.parametrize("text", ["[1]", "{}"])
+def test_a_file_without_a_meta_test_is_one_line(text, tmp_path):
+    path = tmp_path / "evaluation.json"
+    with pytest.raises(BidexError, match="There is no"):
+        read_evaluation(path)
+    path.write_text(text)
+    with pytest.raises(BidexError, match="holds no meta-test"):
+        draw_adaptation(read_evaluation(path), path)
+
+
+@pytest.mark.parametrize("text", ["[]", '{"algo": "mtppo"}'])
+def test_a_config_that_is_no_runs_is_one_line(text, tmp_path):
+    (tmp_path / "config.json").write_text(text)
+    with pytest.raises(BidexError, match=r"config.json: .*expected"):
+        RunFolder.open(tmp_path).config()
+
+
+def test_missing_matplotlib_names_the_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
+    with pytest.raises(BidexError, match=r"bidex-meta\[plot\]"):
+        draw_learning([])
+
+
+def test_picture_and_film_read_back(tmp_path):
+    import imageio.v3 as imageio
+
+    frame = np.zeros((50, 70, 3), np.uint8)
+    frame[:, :35, 0] = 255
+    write_image(tmp_path / "a.png", frame)
+    assert (imageio.imread(tmp_path / "a.png") == frame).all()
+    assert write_video(tmp_path / "a.mp4", [frame] * 5, fps=60) == 5
+    film = imageio.imread(tmp_path / "a.mp4")
+    assert film.shape == (5, 50, 70, 3)
+    assert abs(film[2].astype(int) - frame).mean() < 10
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a limit of a file's size")
+@pytest.mark.parametrize("name", ["a.png", "a.webp", "a.mp4", "figure.png"])
+def test_a_disk_that_fills_leaves_what_was_there(name, tmp_path):
+    import resource
+
+    path, frames = tmp_path / name, list(np.random.default_rng(0).integers(0, 256, (5, 200, 200, 3), np.uint8))
+    path.write_text("earlier")
+    figure = draw_learning([("mtppo", {"Train/return/Near": curve(2.0)})])
+
+    def write():
+        if name == "figure.png":
+            save(figure, path)
+        elif name == "a.png":
+            write_image(path, frames[0])
+        else:
+            (write_animation if name == "a.webp" else write_video)(path, frames, fps=60)
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (8192, before[1]))  # in place of a full disk
+    try:
+        with pytest.raises(OSError) as raised:
+            write()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not isinstance(raised.value, BrokenPipeError)  # which would be the end of a reader
+    assert [entry.name for entry in tmp_path.iterdir()] == [name] and path.read_text() == "earlier"
+    write()
+    assert path.stat().st_size > 8192
+
+
+def test_endings_and_the_missing_extra(tmp_path, monkeypatch):
+    with pytest.raises(BidexError, match=r"\.mp4"):
+        check_suffix(tmp_path / "a.gif")
+    monkeypatch.setitem(__import__("sys").modules, "imageio_ffmpeg", None)
+    with pytest.raises(BidexError, match=r"bidex-meta\[video\]"):
+        write_video(tmp_path / "a.mp4", [], fps=60)
+
+
+def test_the_last_rows_are_those_of_the_whole_file(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    path.write_text("".join(json.dumps({"step": i, "x": 0.1234567}) + "\n" for i in range(5000)) + '{"torn')
+    found = last_rows(path)
+    assert 100 < len(found) < 5000 and found == read_metrics(path)[-len(found) :]
+    path.write_text('{"step": 1}\n')
+    assert last_rows(path) == [{"step": 1}]
