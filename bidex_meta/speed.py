@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from bidex_meta.benchmark import Benchmark
-from bidex_meta.engine.cpu import default_threads
+from bidex_meta.utils.memory import usable_cores
 from bidex_meta.world import World
 
 
@@ -58,7 +58,7 @@ def world_speed(
     return {
         "suite": suite,
         "num_envs": num_envs,
-        "threads": threads or default_threads(),
+        "threads": threads or usable_cores(),
         "env_steps_per_s": round(statistics.median(done / t for t, _ in times)),
         "engine_steps_per_s": round(statistics.median(done / t for _, t in times)),
         "ratio": round(statistics.median(b / f for f, b in times), 4),

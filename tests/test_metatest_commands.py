@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from bidex_meta.cli import learners, main
-from bidex_meta.cli.metatest import rollouts_of, rows_for
+from bidex_meta.cli.metatest import environments_for, rollouts_of
 from bidex_meta.evaluation.comparison import read_groups
 from bidex_meta.runs import RunFolder
 from bidex_meta.worlds import Worlds
@@ -60,7 +60,7 @@ def test_a_run_ends_with_both_tables_of_both_splits_and_trains_on_the_learners_k
         assert f"{split} tasks, after 1 shot of 4 episodes" in shown.out
         assert all(name in shown.out for name in classes)
     assert "return gained [95 %]" in shown.out
-    assert "5 of 6 tasks of each, 1 shot of 4 episodes, 4 evaluation episodes, 40 rows." in shown.err
+    assert "5 of 6 tasks of each, 1 shot of 4 episodes, 4 evaluation episodes, 40 environments." in shown.err
     loaded = RunFolder.open(run).checkpoints.load()
     assert loaded is not None and loaded[0]["learner"]["mode"] == "DISABLED"
     stored = json.loads((run / "evaluation.json").read_text())
@@ -185,7 +185,7 @@ def test_where_rows_share_nothing_each_plays_one_episode_a_shot(monkeypatch):
     ],
 )
 def test_rows_fit_the_limit_and_the_rollouts(classes, adaptations, rollouts, limit, rows):
-    assert rows_for(classes, adaptations, rollouts, limit) == rows
+    assert environments_for(classes, adaptations, rollouts, limit) == rows
 
 
 def test_while_training_an_adapting_learner_is_judged_after_a_shot_on_train_tasks(tmp_path):

@@ -192,7 +192,7 @@ def test_each_process_takes_its_share_of_threads_and_a_gpu_of_its_own(monkeypatc
     places = {"RANK": 5, "WORLD_SIZE": 8, "LOCAL_RANK": 1, "LOCAL_WORLD_SIZE": 4, "MASTER_ADDR": "a"}
     for name, value in places.items():
         monkeypatch.setenv(name, str(value))
-    monkeypatch.setattr(run_config, "_cores", lambda: 10)
+    monkeypatch.setattr(run_config, "usable_cores", lambda: 10)
     config = run_config.plan_run(["--suite", "MT4", "--device", "cpu"]).config
     assert (config.threads, config.processes, config.device) == (2, 8, "cpu")
     assert launch().own_device("cuda") == "cuda:1"

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from bidex_meta.cli import main
+from bidex_meta.cli.sweep_plan import read_sweep
 from bidex_meta.errors import BidexError
-from bidex_meta.sweep.plan import read_sweep
 from tests.pages import ROOT
 
 FILE = """

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from bidex_meta.cli import learners, main
-from bidex_meta.cli.conditions import conditions, others, recorded_conditions
+from bidex_meta.cli.evaluate import conditions
+from bidex_meta.cli.verify import others, recorded_conditions
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.agreement import agreements, classes_of
 from bidex_meta.evaluation.results import ClassResult

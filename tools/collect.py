@@ -16,12 +16,12 @@ import tyro
 from torch import nn
 
 from bidex_meta.cli.policies import load_policy
+from bidex_meta.cli.sweep_plan import read_sweep
 from bidex_meta.errors import BidexError
 from bidex_meta.runs.folder import RunFolder
 from bidex_meta.runs.metrics import training_seconds
 from bidex_meta.runs.stored import FORMAT, StoredRun
 from bidex_meta.suite import load_suite, suite_names
-from bidex_meta.sweep.plan import read_sweep
 from bidex_meta.utils.files import read_text
 from bidex_meta.utils.plugins import short_name
 

@@ -58,7 +58,7 @@ COMMANDS: dict[str, Command] = {
     "plot": Command("bidex_meta.cli.plot", "learning curves of runs, as a picture"),
     "report": Command("bidex_meta.cli.report", "runs as one HTML page: tables, curves, films"),
     "completion": Command("bidex_meta.cli.completion", "a script that completes commands and flags in a shell"),
-    "bench": Command("bidex_meta.cli.bench", "measure speed, scaling or stability of the world"),
+    "bench": Command("bidex_meta.cli.bench", "measure the speed of a suite's world"),
 }
 
 

@@ -4,18 +4,26 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import tyro
 
+from bidex_meta.agents import Agent
 from bidex_meta.cli.parsing import Switch, parse
+from bidex_meta.cli.tables import evaluation_table, print_table
 from bidex_meta.errors import BidexError, known_name
+from bidex_meta.evaluation import references
+from bidex_meta.evaluation.play import EVALUATION_SEED, RandomAgent, ZeroAgent, evaluate
+from bidex_meta.evaluation.results import Evaluation
+from bidex_meta.runs.atomic import check_writable
+from bidex_meta.runs.versions import collect_versions
 from bidex_meta.utils.validation import Few, Seed, Threads
-from bidex_meta.worlds import Worlds
-
-if TYPE_CHECKING:
-    from bidex_meta.agents import Agent
-    from bidex_meta.evaluation.results import Evaluation
+from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted
+from bidex_meta.witness.scripts import SCRIPTS
+from bidex_meta.witness.store import load_witness, witness_path
+from bidex_meta.world.contract import TaskWorld
+from bidex_meta.world.world import World
+from bidex_meta.worlds import WorldConfig, Worlds
 
 _POLICIES = {
     "random": "uniform actions",
@@ -59,64 +67,51 @@ def main(arguments: Sequence[str]) -> None:
     flags = parse(BaselineFlags, arguments, "baseline")
     what = known_name("baseline", flags.what, _POLICIES)
     if flags.out is not None:
-        from bidex_meta.evaluation.references import load_from
-        from bidex_meta.runs.atomic import check_writable
-
-        load_from(flags.out)
+        references.load_from(flags.out)
         check_writable(flags.out)
-    source = Worlds.open({"suite": flags.suite, "seed": flags.seed, "threads": flags.threads})
-    if not source.moving_bases:
+    worlds = Worlds.open(WorldConfig(suite=flags.suite, seed=flags.seed, threads=flags.threads))
+    if not worlds.moving_bases:
         raise BidexError(f'References are of moving bases, but {flags.suite} has fixed ones. Write base = "moving".')
-    found = _scripted(source, flags) if what == "script" else _played(what, source, flags)
+    found = _scripted(worlds, flags) if what == "script" else _played(what, worlds, flags)
     numbers = {name: result.to_json() for name, result in found.classes.items()}
-    kept = ("return", "return_interval", "success", "episodes", "unstable")
-    made = {"policy": _POLICIES[what], "suite": flags.suite, "seed": flags.seed}
-    _store(flags.out, {n: {k: row[k] for k in kept} for n, row in numbers.items()}, made)
+    if flags.out is not None:
+        stored = ("return", "return_interval", "success", "episodes", "unstable")
+        made = {"policy": _POLICIES[what], "suite": flags.suite, "seed": flags.seed, "versions": collect_versions()}
+        classes = {name: {key: row[key] for key in stored} for name, row in numbers.items()}
+        references.store(flags.out, classes, made)
     if flags.json:
         print(json.dumps(numbers, indent=2))
         return
-    from bidex_meta.cli.tables import evaluation_table, print_table
-
-    stored = "" if flags.out is None else f", stored in {flags.out}"
-    print_table(evaluation_table(f"{_POLICIES[what]} on {flags.suite}{stored}", found, None))
+    where = "" if flags.out is None else f", stored in {flags.out}"
+    print_table(evaluation_table(f"{_POLICIES[what]} on {flags.suite}{where}", found))
 
 
-def _played(what: str, source: Worlds, flags: BaselineFlags) -> "Evaluation":
-    from bidex_meta.evaluation.play import EVALUATION_SEED, evaluate
-
-    world = source.world()
+def _played(what: str, worlds: Worlds, flags: BaselineFlags) -> Evaluation:
+    world = worlds.world()
     agent, names = _agent(what, world, flags.seed)
     found = evaluate(agent, world, flags.episodes, seed=EVALUATION_SEED, references={})
     world.close()
     return replace(found, classes={name: found.classes[name] for name in names})
 
 
-def _scripted(source: Worlds, flags: BaselineFlags) -> "Evaluation":
+def _scripted(worlds: Worlds, flags: BaselineFlags) -> Evaluation:
     """Each class that has a script on its own: alone it has the tasks that it has in suites."""
-    from bidex_meta.evaluation.play import EVALUATION_SEED, evaluate
-    from bidex_meta.evaluation.results import Evaluation
-    from bidex_meta.witness.demonstrators import Scripted
-    from bidex_meta.witness.scripts import SCRIPTS
-
-    names = [name for name in source.task_classes() if name in SCRIPTS]
+    names = [name for name in worlds.task_classes() if name in SCRIPTS]
     if not names:
         raise BidexError(f"Expected a suite with a class that has a script ({', '.join(SCRIPTS)}), got {flags.suite}.")
     classes = {}
     for name in names:
-        config = {"task": name, "base": "moving", "seed": flags.seed, "device": "cpu", "engine": "c"}
-        world: Any = Worlds.open(config | {"threads": flags.threads}).world()
+        config = WorldConfig(task=name, base="moving", seed=flags.seed, engine="c", threads=flags.threads)
+        world = Worlds.open(config).world()
+        assert isinstance(world, World)
         played = evaluate(Scripted(world), world, flags.episodes, seed=EVALUATION_SEED, references={})
         classes |= played.classes
         world.close()
     return Evaluation(classes, flags.episodes)
 
 
-def _agent(what: str, world: Any, seed: int) -> tuple["Agent", list[str]]:
+def _agent(what: str, world: TaskWorld, seed: int) -> tuple[Agent, list[str]]:
     """The policy, and the classes that it can play."""
-    from bidex_meta.evaluation.play import RandomAgent, ZeroAgent
-    from bidex_meta.witness.demonstrators import OpenLoopReplay
-    from bidex_meta.witness.store import load_witness, witness_path
-
     names = list(world.task_names)
     if what == "random":
         return RandomAgent(world.action_space, seed), names
@@ -125,11 +120,3 @@ def _agent(what: str, world: Any, seed: int) -> tuple["Agent", list[str]]:
     witnesses = {name: load_witness(name) for name in names if witness_path(name).is_file()}
     agent = OpenLoopReplay(witnesses, names, world.task_id, world.single_action_space.shape[0])
     return agent, list(witnesses)
-
-
-def _store(out: Path | None, classes: dict[str, dict[str, Any]], made: dict[str, Any]) -> None:
-    from bidex_meta.evaluation import references
-    from bidex_meta.runs.versions import collect_versions
-
-    if out is not None:
-        references.store(out, classes, made | {"versions": collect_versions()})

@@ -1,51 +1,45 @@
 """``bidex-meta evaluate``: how good is a trained run."""
 
 import json
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
+from bidex_meta.cli.learners import learner_kind, resolve_device
+from bidex_meta.cli.metatest import Options, check_worlds, meta_test, print_tables, splits_of
 from bidex_meta.cli.parsing import RunPath, Switch, parse
+from bidex_meta.cli.policies import load_policy, policy_loader
+from bidex_meta.cli.tables import evaluation_table, print_table
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
-from bidex_meta.utils.validation import Environments, Few, Seed, Shots
+from bidex_meta.evaluation.play import RandomAgent
+from bidex_meta.evaluation.results import compare
+from bidex_meta.runs import RunFolder
+from bidex_meta.runs.versions import package_versions
+from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds
 
+_PACKAGES = ("bidex-meta", "mujoco", "torch", "numpy")
 
-@dataclass(frozen=True)
-class EvaluateFlags:
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateFlags(Options):
     """Success and return of a run's policy (mean action), the same number of episodes for every task.
 
     Example: bidex-meta evaluate runs/MT4/mtppo/2026-11-21_10-00-00_seed0 --random
 
-    What adapts to tasks (maml, promp, rl2, ...) is shown before and after --shots shots, on train and on test tasks.
+    Learners that adapt (maml, promp, rl2, ...) are shown before and after --shots shots, on train and on test tasks.
     """
 
     run: RunPath
     """Run folder."""
     checkpoint: str = "last"
     """Which policy: last, best (kept by `bidex-meta run --evaluate-every N`) or a file."""
-    episodes: Few | None = None
-    """Episodes of each task; None: 4, or 1 where a task fixes its start (metaworld/...); for what adapts, as many as
-    --rollouts."""
     split: Literal["auto", "train", "test", "both"] = "auto"
-    """Tasks to play: those trained on, or a meta suite's unseen ones; auto: train, and both for what adapts."""
-    shots: Shots | None = None
-    """Adapt so often, one after the other, to --rollouts episodes each; None: 1."""
-    rollouts: Few | None = None
-    """Episodes of each task in a shot; None: as the run was trained, but 40 at most, else 10."""
-    tasks: Few | None = None
-    """Adapt to the first so many tasks of each class; None: 5."""
-    trials: Few | None = None
-    """Adapt to each task so often, each time from the start and to other episodes; None: once, or
-    as often as makes five adaptations of each class."""
+    """Tasks to play: those trained on, or a meta suite's unseen ones; auto: train, and both for learners that adapt."""
     random: Switch = False
     """Also play a random policy, and show the difference."""
-    seed: Seed | None = None
-    """Seed of the episodes' starts; None: one that training does not use."""
-    num_envs: Environments | None = None
-    """Rows stepped together, a multiple of the number of tasks; None: one per task (metaworld/...: 5 per class). For
-    what adapts, at most so many, which bounds memory and not results' meaning; None: 1024."""
     device: str = "auto"
     """auto, cpu or cuda:N."""
     engine: Literal["auto", "c", "warp"] = "auto"
@@ -57,82 +51,74 @@ class EvaluateFlags:
 def main(arguments: Sequence[str]) -> None:
     """Evaluate a checkpoint and print a table or JSON."""
     flags = parse(EvaluateFlags, arguments, "evaluate")
-
-    from bidex_meta.cli.conditions import conditions
-    from bidex_meta.cli.learners import learner_kind, resolve_device
-    from bidex_meta.cli.policies import load_policy
-    from bidex_meta.cli.tables import evaluation_table, print_table
-    from bidex_meta.evaluation.play import EVALUATION_SEED, RandomAgent
-    from bidex_meta.evaluation.results import compare
-    from bidex_meta.runs import RunFolder
-    from bidex_meta.world.threads import set_up_torch
-
     folder = RunFolder.open(flags.run)
     stored = folder.config()
     device = resolve_device(flags.device, Worlds.open(stored.to_json()).on_gpu)
     config = replace(stored, device=device, engine=flags.engine)
-    source = Worlds.open(config.to_json())
+    worlds = Worlds.open(config.to_json())
     set_up_torch(config.threads)
-    kind = learner_kind(stored.algo)
-    if kind.adapts:
-        _meta_test(flags, folder, config, source)
-        return
-    _refuse_adaptation(flags, stored.algo)
-    policy, step = load_policy(folder, device, flags.checkpoint)
-    split = "train" if flags.split == "auto" else flags.split
-    world = source.world(split, flags.num_envs)
-    seed = EVALUATION_SEED if flags.seed is None else flags.seed
-    found = source.judge(policy, world, flags.episodes, seed)
-    random = None
-    if flags.random:
-        random = source.judge(RandomAgent(world.action_space), world, flags.episodes, seed)
-    world.close()
-    if not flags.json:
-        title = f"{config.algo} on {source.name}, {split} tasks, {step:,} steps"
-        print_table(evaluation_table(title, found, random))
-        return
-    result = {"run": str(folder.path), "steps": step, "split": split, "seed": seed, "policy": found.to_json()}
-    if random is not None:
-        differences = {name: asdict(difference) for name, difference in compare(found, random).items()}
-        result |= {"random": random.to_json(), "return_above_random": differences}
-    result["conditions"] = conditions(source, flags.num_envs)
-    print(json.dumps(result, indent=2))
+    play = _meta_test if learner_kind(config.algo).adapts else _evaluate
+    result = play(flags, folder, config, worlds)
+    if flags.json:
+        run = {"run": str(folder.path), **result, "conditions": conditions(worlds, flags.num_envs)}
+        print(json.dumps(run, indent=2))
 
 
-def _refuse_adaptation(flags: EvaluateFlags, algo: str) -> None:
+def _evaluate(flags: EvaluateFlags, folder: RunFolder, config: RunConfig[Any], worlds: Worlds) -> dict[str, Any]:
+    """Plays, and prints the table if no JSON is wanted."""
     for name in ("shots", "rollouts", "tasks", "trials"):
         if getattr(flags, name) is not None:
-            raise BidexError(f"{algo} does not adapt to tasks, got --{name} {getattr(flags, name)}. Leave it out.")
+            raise BidexError(
+                f"{config.algo} does not adapt to tasks, got --{name} {getattr(flags, name)}. Leave it out."
+            )
     if flags.split == "both":
-        raise BidexError(f"{algo} does not adapt to tasks: its splits are shown one by one. Use --split train or test.")
+        raise BidexError(
+            f"{config.algo} does not adapt to tasks: its splits are shown one by one. Use --split train or test."
+        )
+    policy, step = load_policy(folder, config.device, flags.checkpoint)
+    split = "train" if flags.split == "auto" else flags.split
+    world = worlds.world(split, flags.num_envs)
+    found = worlds.judge(policy, world, flags.episodes, flags.starts)
+    result = {"steps": step, "split": split, "seed": flags.starts, "policy": found.to_json()}
+    random = None
+    if flags.random:
+        random = worlds.judge(RandomAgent(world.action_space), world, flags.episodes, flags.starts)
+        differences = {name: asdict(difference) for name, difference in compare(found, random).items()}
+        result |= {"random": random.to_json(), "return_above_random": differences}
+    world.close()
+    if not flags.json:
+        title = f"{config.algo} on {worlds.name}, {split} tasks, {step:,} steps"
+        print_table(evaluation_table(title, found, random))
+    return result
 
 
-def _meta_test(flags: EvaluateFlags, folder: Any, config: RunConfig[Any], source: Worlds) -> None:
-    import sys
-
-    from bidex_meta.cli import metatest
-    from bidex_meta.cli.conditions import conditions
-    from bidex_meta.cli.policies import policy_loader
-    from bidex_meta.evaluation.play import EVALUATION_SEED
-
+def _meta_test(flags: EvaluateFlags, folder: RunFolder, config: RunConfig[Any], worlds: Worlds) -> dict[str, Any]:
+    """As ``_evaluate``, of a learner that adapts."""
     if flags.random:
         raise BidexError(f"{config.algo} is compared with itself before adaptation. Leave --random out.")
-    metatest.check_source(source, config.algo)
-    splits = metatest.splits_of(source, flags.split)
-    seed = EVALUATION_SEED if flags.seed is None else flags.seed
-    numbers = (flags.shots, flags.rollouts, flags.episodes, flags.tasks, flags.trials, flags.num_envs)
+    check_worlds(worlds, config.algo)
+    splits = splits_of(worlds, flags.split)
     load, step = policy_loader(folder, config.device, flags.checkpoint)
-    found = metatest.meta_test(
-        source,
-        config,
-        load,
-        metatest.Options(*numbers, seed),
-        splits,
-        lambda text: print(text, file=sys.stderr, flush=True),
-    )
+    found = meta_test(worlds, config, load, flags, splits, lambda text: print(text, file=sys.stderr, flush=True))
     if not flags.json:
-        metatest.print_tables(f"{config.algo} on {source.name}, {step:,} steps", found)
-        return
-    result = {"run": str(folder.path), "steps": step, "seed": seed, "splits": metatest.report(found)}
-    result["conditions"] = conditions(source, flags.num_envs)
-    print(json.dumps(result, indent=2))
+        print_tables(f"{config.algo} on {worlds.name}, {step:,} steps", found)
+    tests = {split: result.to_json() for split, result in found.items()}
+    return {"steps": step, "seed": flags.starts, "splits": tests}
+
+
+def conditions(worlds: Worlds, num_envs: int | None = None) -> dict[str, Any]:
+    """What else than the policy an evaluation's numbers depend on: its ``conditions`` in ``evaluation.json``.
+
+    Args:
+        worlds: Those of the worlds that were played.
+        num_envs: Environments that were asked for; None: the default.
+    """
+    wanted, identity = [*_PACKAGES], worlds.identity()
+    if worlds.device.startswith("cuda") or worlds.engine == "warp":
+        wanted.append("mujoco-warp")
+    if identity["physics"] is None:
+        wanted.append("metaworld")
+    installed = package_versions()
+    packages = {name: installed[name] for name in wanted}
+    where = {"device": worlds.device, "engine": worlds.engine, "threads": worlds.threads, "num_envs": num_envs}
+    return {**where, "packages": packages, **identity}

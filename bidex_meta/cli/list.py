@@ -7,8 +7,12 @@ from typing import Annotated, Any
 
 import tyro
 
+from bidex_meta.cli.learners import ALGOS, learner_kind
 from bidex_meta.cli.parsing import Switch, parse
+from bidex_meta.cli.tables import plain_table, print_table
 from bidex_meta.errors import known_name
+from bidex_meta.tasks import registry
+from bidex_meta.worlds import listed
 
 
 @dataclass(frozen=True)
@@ -28,26 +32,16 @@ def main(arguments: Sequence[str]) -> None:
     """Print a table or JSON, one row for each."""
     flags = parse(ListFlags, arguments, "list")
     kinds: dict[str, Callable[[], list[dict[str, Any]]]]
-    kinds = {"suites": _suites, "tasks": _tasks, "algos": _algos, "objects": _objects}
+    kinds = {"suites": listed, "tasks": _tasks, "algos": _algos, "objects": _objects}
     rows = kinds[known_name("list", flags.what, kinds)]()
     if flags.json:
         print(json.dumps(rows, indent=2))
         return
-    from bidex_meta.cli.tables import plain_table, print_table
-
     columns = list(rows[0]) if rows else ["name"]
     print_table(plain_table([column.replace("_", " ") for column in columns], [_cells(row) for row in rows]))
 
 
-def _suites() -> list[dict[str, Any]]:
-    from bidex_meta.worlds import listed
-
-    return listed()
-
-
 def _tasks() -> list[dict[str, Any]]:
-    from bidex_meta.tasks import registry
-
     tasks = [(name, registry.get(name)) for name in registry.names()]
     return [
         {
@@ -62,8 +56,6 @@ def _tasks() -> list[dict[str, Any]]:
 
 
 def _algos() -> list[dict[str, Any]]:
-    from bidex_meta.cli.learners import ALGOS, learner_kind
-
     rows = []
     for name in ALGOS:
         kind = learner_kind(name)

@@ -1,95 +1,94 @@
-"""The meta-test of a run whose learner adapts: its worlds, its defaults, its tables, its JSON."""
+"""The meta-test of a run whose learner adapts: its size, its worlds, its tables."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from bidex_meta.agents import Agent
 from bidex_meta.cli.learners import learner_kind
+from bidex_meta.cli.tables import evaluation_table, print_table
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.meta_test import MAX_ADAPT_STEPS, MetaEvaluation, meta_evaluate
 from bidex_meta.evaluation.play import EVALUATION_SEED
 from bidex_meta.utils.validation import Environments, Few, Seed, Shots
 from bidex_meta.worlds import Worlds
 
-SHOTS = 1
-"""Shots where nobody says otherwise."""
 TASKS = 5
-"""Tasks of each class, the first of its pool, where nobody says otherwise: all of ML1's, a tenth of ML20's."""
-ROLLOUTS = 10
-"""Episodes of each task in a shot, where neither flags nor the run's config say otherwise."""
-MOST_ROLLOUTS = 40
-"""The most that are taken from the run's config: ML1's three tasks may be trained with hundreds."""
-ROWS = 1024
-"""Rows stepped together at most, where nobody says otherwise: half a GB for the world."""
+"""Default tasks of each class, the first of its pool: all of ML1's, a tenth of ML20's."""
+_ROLLOUTS, _MOST_ROLLOUTS = 10, 40
+"""Episodes of each task in a shot where the run's config has none; the most that are taken from it."""
+_ENVIRONMENTS = 1024
+"""Environments stepped together at most, by default: half a GB for the world."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Options:
-    """How much is played; None: as the run was trained, else the default above."""
+    """How much an evaluation plays."""
 
-    shots: Shots | None = None
-    """Shots of adaptation."""
-    rollouts: Few | None = None
-    """Episodes of each task in a shot."""
     episodes: Few | None = None
-    """Evaluation episodes of each task; None: as many as rollouts, which the same rows play at once."""
+    """Episodes of each task; None: 4, or 1 where a task fixes its start (metaworld/...); for learners that adapt, as
+    many as --rollouts."""
+    shots: Shots | None = None
+    """Adapt so often, one after the other, to --rollouts episodes each; None: 1."""
+    rollouts: Few | None = None
+    """Episodes of each task in a shot; None: as the run was trained, but 40 at most, else 10."""
     tasks: Few | None = None
-    """Tasks of each class."""
+    """Adapt to the first so many tasks of each class; None: 5."""
     trials: Few | None = None
-    """Adaptations of each task; None: so many that a class has as many as ``TASKS``, since an interval over the
-    episodes of a single adaptation says nothing of another."""
+    """Adapt to each task so often, each time from the start and to other episodes; None: once, or as often as makes
+    five adaptations of each class, since an interval over one adaptation's episodes says nothing of another."""
     num_envs: Environments | None = None
-    """Rows stepped together at most."""
-    seed: Seed = EVALUATION_SEED
-    """Of all starts."""
+    """Environments stepped together, a multiple of the number of tasks; None: one per task (metaworld/...: 5 per
+    class). For learners that adapt, at most so many, which bounds memory and not results' meaning; None: 1024."""
+    seed: Seed | None = None
+    """Seed of the episodes' starts; None: one that training does not use."""
+
+    @property
+    def starts(self) -> int:
+        """The seed of the episodes' starts."""
+        return EVALUATION_SEED if self.seed is None else self.seed
 
 
 def meta_test(
-    source: Worlds,
+    worlds: Worlds,
     config: RunConfig[Any],
     load: Callable[[], Agent],
     options: Options,
     splits: list[str],
     say: Callable[[str], None] = lambda text: None,
-) -> dict[str, Any]:
+) -> dict[str, MetaEvaluation]:
     """The meta-test on some of a run's splits.
 
     Args:
-        source: Of the run's worlds.
+        worlds: The run's.
         config: The run's config; read are ``algo``, ``num_envs`` and ``learner``.
         load: Makes the agent, a MetaLearningAgent; called anew for each split, so that neither depends on the other.
         options: How much is played.
-        splits: Out of ``source.splits``.
-        say: Told what begins.
-
-    Returns:
-        A MetaEvaluation for each split, by its name.
+        splits: Out of ``worlds.splits``.
+        say: Called with what begins.
 
     Raises:
-        BidexError: The suite shows its tasks, or a number is out of range.
+        BidexError: The suite shows its tasks.
     """
-    from bidex_meta.evaluation.meta_test import MAX_ADAPT_STEPS, meta_evaluate
-
-    check_source(source, config.algo)
-    check_numbers(options, "rollouts", "episodes", "tasks", "trials", "num_envs")
+    check_worlds(worlds, config.algo)
     found = {}
-    limit = options.num_envs or ROWS
+    limit = options.num_envs or _ENVIRONMENTS
     for split in splits:
-        counts = [len(pool) for pool in source.tasks(split).values()]
-        rollouts = rollouts_of(source, config, options.rollouts, max(1, limit // len(counts)))
+        counts = [len(pool) for pool in worlds.tasks(split).values()]
+        rollouts = rollouts_of(worlds, config, options.rollouts, max(1, limit // len(counts)))
         tasks = min(options.tasks or TASKS, max(counts))
         trials = options.trials or -(-TASKS // tasks)
-        rows = rows_for(len(counts), tasks * trials, rollouts, limit)
-        shots = SHOTS if options.shots is None else options.shots
-        episodes = options.episodes or rollouts
+        num_envs = environments_for(len(counts), tasks * trials, rollouts, limit)
+        shots = 1 if options.shots is None else options.shots
+        episodes = options.episodes or rollouts  # which the same environments play at once
         often = f", each {trials} times" if trials > 1 else ""
         say(
             f"Meta-test on {split} tasks: {len(counts)} class{'es' * (len(counts) > 1)}, {tasks} of {max(counts)} "
             f"tasks of each{often}, {shots} shot{'s' * (shots != 1)} of {rollouts} episodes, {episodes} evaluation "
-            f"episodes, {rows} rows."
+            f"episodes, {num_envs} environments."
         )
-        world = source.world(split, rows)
+        world = worlds.world(split, num_envs)
         found[split] = meta_evaluate(
             load(),
             world,
@@ -98,105 +97,86 @@ def meta_test(
             episodes_per_task=episodes,
             tasks=tasks,
             trials=trials,
-            max_adapt_steps=config.learner_values.get("max_adapt_steps", MAX_ADAPT_STEPS),
-            seed=options.seed,
-            references=source.references(),
+            max_adapt_steps=adapt_steps_of(config),
+            seed=options.starts,
+            references=worlds.references(),
             split=split,
         )
         world.close()
     return found
 
 
-def rollouts_of(source: Worlds, config: RunConfig[Any], asked: int | None, rows: int) -> int:
+def adapt_steps_of(config: RunConfig[Any]) -> int:
+    """Longest episode that a run's learner adapts to."""
+    return config.learner_values.get("max_adapt_steps", MAX_ADAPT_STEPS)
+
+
+def rollouts_of(worlds: Worlds, config: RunConfig[Any], asked: int | None, most: int) -> int:
     """Episodes of each task in a shot.
 
     Args:
-        source: Of the run's worlds.
+        worlds: The run's.
         config: The run's config.
         asked: What the user wants; None: what the run was trained with.
-        rows: Rows that a class has at most. Where each row learns from its own episodes alone it must have no second
-            one in a shot: then there are fewer.
+        most: Environments that a class has at most. Where each adapts from its own episodes alone it must have no
+            second one in a shot: then there are fewer.
     """
-    rollouts = asked or trained_rollouts(source, config)
-    return min(rollouts, rows) if learner_kind(config.algo).adapts_by_row else rollouts
+    rollouts = asked or _trained_rollouts(worlds, config)
+    return min(rollouts, most) if learner_kind(config.algo).adapts_by_row else rollouts
 
 
-def trained_rollouts(source: Worlds, config: RunConfig[Any]) -> int:
-    """Episodes of each task that the run's learner adapted to."""
+def _trained_rollouts(worlds: Worlds, config: RunConfig[Any]) -> int:
     of_batch = config.learner_values.get("tasks_per_class")
     if of_batch is None:
-        return ROLLOUTS
-    counts = [len(pool) for pool in source.tasks("train").values()]
+        return _ROLLOUTS
+    counts = [len(pool) for pool in worlds.tasks("train").values()]
     of_class = config.num_envs // len(counts)
-    return max(1, min(of_class // min(of_batch, max(counts)), MOST_ROLLOUTS))
+    return max(1, min(of_class // min(of_batch, max(counts)), _MOST_ROLLOUTS))
 
 
-def check_numbers(options: Any, *names: str) -> None:
-    """Refuse fields below 1; None is whatever the default is.
-
-    Raises:
-        BidexError: One is.
-    """
-    for name in names:
-        number = getattr(options, name)
-        if number is not None and number < 1:
-            raise BidexError(f"--{name.replace('_', '-')} must be at least 1, not {number}.")
-
-
-def check_source(source: Worlds, algo: str) -> None:
-    """Refuse a source on which there is no meta-test.
-
-    Raises:
-        BidexError: It shows its tasks: it is Meta-World's, multi-task or a class alone.
-    """
-    if not source.hides_goals:
-        raise BidexError(
-            f"{algo} adapts to hidden goals, but {source.name} shows them. Name an ML suite: "
-            "--suite ML1, ML4, ML20, or a file of kind meta."
-        )
-
-
-def splits_of(source: Worlds, asked: str) -> list[str]:
-    """The splits that a meta-test plays.
-
-    Args:
-        source: Of the run's worlds.
-        asked: A split's name; ``both`` or ``auto``: all there are.
-
-    Raises:
-        BidexError: The source has no such split.
-    """
-    if asked in ("train", "test") and asked not in source.splits:
-        raise BidexError(f"{source.name} has no {asked} tasks. Leave --split out.")
-    return [name for name in source.splits if asked in ("auto", "both", name)]
-
-
-def rows_for(classes: int, adaptations: int, rollouts: int, limit: int) -> int:
-    """Rows of a world that plays as many adaptations of each class at once as the limit allows.
+def environments_for(classes: int, adaptations: int, rollouts: int, limit: int) -> int:
+    """Environments of a world that plays as many adaptations of each class at once as the limit allows.
 
     Args:
         classes: Classes of the world.
         adaptations: Adaptations (tasks times trials) of each class.
-        rollouts: Rows each takes, if there are so many; else it takes several rounds.
-        limit: Rows at most, but never fewer than one for each class.
+        rollouts: Environments each takes, if there are so many; else it takes several rounds.
+        limit: Environments at most, but never fewer than one for each class.
     """
     of_class = max(1, limit // classes)
     if of_class < rollouts:
-        # A divisor, so that every row plays in every round.
+        # A divisor, so that every environment plays in every round.
         return classes * max(number for number in range(1, of_class + 1) if rollouts % number == 0)
     portions = -(-adaptations // (of_class // rollouts))
     return classes * -(-adaptations // portions) * rollouts
 
 
-def report(found: dict[str, Any]) -> dict[str, Any]:
-    """All splits, ready for JSON; what ``evaluation.json`` of such a run holds under ``splits``."""
-    return {split: result.to_json() for split, result in found.items()}
+def check_worlds(worlds: Worlds, algo: str) -> None:
+    """Refuses worlds on which there is no meta-test.
+
+    Raises:
+        BidexError: They show their tasks: they are Meta-World's, multi-task or of a class alone.
+    """
+    if not worlds.hides_goals:
+        raise BidexError(
+            f"{algo} adapts to hidden goals, but {worlds.name} shows them. Name an ML suite: "
+            "--suite ML1, ML4, ML20, or a file of kind meta."
+        )
 
 
-def print_tables(subject: str, found: dict[str, Any]) -> None:
+def splits_of(worlds: Worlds, asked: str) -> list[str]:
+    """The splits that a meta-test plays: the one of this name, or all there are for ``both`` and ``auto``.
+
+    Raises:
+        BidexError: There is no such split.
+    """
+    if asked in ("train", "test") and asked not in worlds.splits:
+        raise BidexError(f"{worlds.name} has no {asked} tasks. Leave --split out.")
+    return [name for name in worlds.splits if asked in ("auto", "both", name)]
+
+
+def print_tables(subject: str, found: Mapping[str, MetaEvaluation]) -> None:
     """For each split a table before adaptation and one after, the latter with the gains."""
-    from bidex_meta.cli.tables import evaluation_table, print_table
-
     for split, result in found.items():
         shots = len(result.adapt_steps)
         print_table(evaluation_table(f"{subject}, {split} tasks, before adaptation", result.before))

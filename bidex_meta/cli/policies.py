@@ -1,20 +1,23 @@
 """From a run folder to its policy: the commands' one way."""
 
 import contextlib
-import itertools
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import torch
 
 from bidex_meta.agents import Agent
 from bidex_meta.cli.learners import learner_kind
 from bidex_meta.errors import BidexError, one_line
+from bidex_meta.evaluation.play import RandomAgent, ZeroAgent
 from bidex_meta.runs import RunFolder
+from bidex_meta.train.distributed import LostProcess
+from bidex_meta.train.learner import Learner
 from bidex_meta.utils.files import is_file
-from bidex_meta.worlds import Worlds
-
-_SMALL = 1_000_000
-"""Numbers that fit anywhere."""
+from bidex_meta.utils.plugins import is_outside
+from bidex_meta.worlds import WorldConfig, Worlds
 
 
 def checkpoint(folder: RunFolder, which: str = "last") -> tuple[dict[str, Any], int]:
@@ -53,8 +56,6 @@ def fitting(path: Path) -> Iterator[None]:
     Raises:
         BidexError: It does not fit.
     """
-    from bidex_meta.train.distributed import LostProcess
-
     try:
         yield
     except (BidexError, LostProcess):
@@ -68,7 +69,7 @@ def fitting(path: Path) -> Iterator[None]:
 
 
 def load_policy(folder: RunFolder, device: str, which: str = "last") -> tuple[Agent, int]:
-    """The policy of a run's ``checkpoint`` and the environment steps it was trained for.
+    """The policy of a run's checkpoint and the environment steps it was trained for.
 
     Raises:
         BidexError: The run has not saved such a checkpoint.
@@ -77,35 +78,33 @@ def load_policy(folder: RunFolder, device: str, which: str = "last") -> tuple[Ag
     return load(), step
 
 
-def policy_shape(state: dict[str, Any]) -> dict[str, Any]:
-    """Numbers of ``observations`` and ``actions`` of a checkpoint's policy; empty where its learner tells none."""
-    with fitting(Path("the policy")):
-        return dict(_checked(state).get("shape", {}))
-
-
 def policy_of(folder: RunFolder, state: dict[str, Any], device: str) -> Agent:
-    """The policy in a run's ``checkpoint``."""
+    """The policy in a run's checkpoint.
+
+    Raises:
+        BidexError: It does not fit the run's config, or its own.
+    """
+    algo = folder.config().algo
+    make = learner_kind(algo).make
     with fitting(folder.path):
-        return learner_kind(folder.config().algo).make.load_policy(_checked(state), device)
+        policy = state["learner"]["policy"]
+        if not is_outside(algo):
+            _refuse_other_layers(make, policy)
+        return make.load_policy(policy, device)
 
 
-def _checked(state: dict[str, Any]) -> dict[str, Any]:
-    """The policy in a checkpoint; refused where it would be larger than the weights that stand beside it."""
-    policy = state["learner"]["policy"]
-    hidden, weights = policy.get("config", {}).get("hidden", ()), policy.get("weights")
-    if not isinstance(weights, dict):
-        return policy  # of a learner from elsewhere
-    there = sum(each.numel() for each in weights.values())
-    sizes = [size for size in policy.get("shape", {}).values() if isinstance(size, int)]
-    # Of the first layer only roughly: what it sees need not be as wide as the observations.
-    asked = [a * b for a, b in itertools.pairwise(hidden)] + [size * max([*hidden, 1]) // 100 for size in sizes]
-    if max(asked, default=0) > there + _SMALL:
-        raise ValueError(f"its layers ask for more than the {there:,} weights there are")
-    return policy
+def _refuse_other_layers(make: type[Learner], policy: dict[str, Any]) -> None:
+    """Refuses a policy whose config asks for other layers than its weights have, before these take memory."""
+    weights = {name: weight.to("meta") for name, weight in policy["weights"].items()}
+    total = sum(weight.numel() for weight in weights.values())
+    if max((size for size in policy["shape"].values() if isinstance(size, int)), default=0) > total:
+        raise ValueError(f"its shape is larger than its {total:,} weights")
+    with torch.device("meta"):
+        make.load_policy({**policy, "weights": weights}, "meta")
 
 
 def policy_loader(folder: RunFolder, device: str, which: str = "last") -> tuple[Callable[[], Agent], int]:
-    """What makes the policy of a run's ``checkpoint`` anew, as often as it is asked, and that checkpoint's steps.
+    """What makes the policy of a run's checkpoint anew with each call, and that checkpoint's steps.
 
     The checkpoint is read once: a run that trains on meanwhile gives no other.
 
@@ -122,15 +121,14 @@ def acting(policy: str, world: Any, seed: int, which: str = "last") -> Agent:
     Raises:
         BidexError: The policy is of other observations or actions than the world's.
     """
-    from bidex_meta.evaluation.play import RandomAgent, ZeroAgent
-
     if policy == "zero":
         return ZeroAgent(world.action_space)
     if policy == "random":
         return RandomAgent(world.action_space, seed)
     folder = RunFolder.open(Path(policy))
     state, _ = checkpoint(folder, which)
-    shape = policy_shape(state)
+    with fitting(folder.path):
+        shape: dict[str, Any] = state["learner"]["policy"].get("shape", {})
     spaces = {"observations": world.single_observation_space, "actions": world.single_action_space}
     given = {name: space.shape[0] for name, space in spaces.items()}
     if any(shape.get(name, size) != size for name, size in given.items()):
@@ -142,7 +140,7 @@ def acting(policy: str, world: Any, seed: int, which: str = "last") -> Agent:
     return policy_of(folder, state, "cpu")
 
 
-def looked_at(policy: str, suite: str | None, task: str | None, seed: int, thing: str | None = None) -> Worlds:
+def looked_at(policy: str, suite: str | None, task: str | None, seed: int, held: str | None = None) -> Worlds:
     """The worlds in which a policy is looked at: those of its run, or of a suite or a task that is named.
 
     Args:
@@ -150,23 +148,24 @@ def looked_at(policy: str, suite: str | None, task: str | None, seed: int, thing
         suite: A suite; None: the run's, if it has one.
         task: A class; alone where there is no suite.
         seed: Of the tasks.
-        thing: Object of the class alone; None: the run's, or the class's own.
+        held: Object of the class alone; None: the run's, or the class's own.
 
     Raises:
         BidexError: Nothing is named, or what is not there.
     """
-    if thing is not None and (suite is not None or task is None):
+    if held is not None and (suite is not None or task is None):
         raise BidexError("--object goes with --task alone: bidex-meta render --task CatchUnderarm --object mug ...")
-    config: dict[str, Any] = {"suite": suite, "task": task, "object": thing, "threads": 1}
+    config = WorldConfig(suite=suite, task=task, object=held, threads=1, seed=seed)
     if policy not in ("zero", "random"):
-        stored = RunFolder.open(Path(policy)).config()
-        config |= {"suite": suite or stored.suite, "base": stored.base, "points": stored.points}
-        config |= {"task": task or stored.task, "object": thing if task or thing else stored.object}
-    if config["suite"] is None and config["task"] is None:
+        run = RunFolder.open(Path(policy)).config()
+        config = replace(config, suite=suite or run.suite, task=task or run.task, base=run.base, points=run.points)
+        if not task and not held:
+            config = replace(config, object=run.object)
+    if config.suite is None and config.task is None:
         raise BidexError("Name what to show: a run folder, --task TASK or --suite SUITE.")
-    return Worlds.open({**config, "seed": seed})
+    return Worlds.open(config)
 
 
-def slots_of(source: Worlds) -> list[str]:
-    """The class of each slot of a source's worlds; a slot of listed tasks is named Class/task."""
-    return [name.split("/")[0] for name in source.tasks("train")]
+def slots_of(worlds: Worlds) -> list[str]:
+    """The class of each slot of some worlds; a slot of listed tasks is named Class/task."""
+    return [name.split("/")[0] for name in worlds.tasks("train")]

@@ -2,7 +2,6 @@
 
 import contextlib
 import math
-import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from bidex_meta.data import open_dataset, part_files, writer
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.runs import RunFolder
 from bidex_meta.utils.files import absolute
+from bidex_meta.utils.memory import usable_cores
 from bidex_meta.utils.validation import Environments, Seed, Threads
 from bidex_meta.worlds import Worlds
 
@@ -198,7 +198,7 @@ def _episodes(flags: RecordFlags, kind: str) -> _Collection:
     source = Worlds.open(config)
     # Sums depend on how torch splits them over threads: a collection keeps those that it began with.
     before = writer.stored_plan(writer.dataset_path(flags.out, source.name, kind)[0])
-    config["threads"] = flags.threads or before.get("threads") or _cores()
+    config["threads"] = flags.threads or before.get("threads") or usable_cores()
     set_up_torch(config["threads"])
     actors, policies = _actors(flags, kind, config["device"])
     rows, size = flags.num_envs or _one_per_task(source), flags.size or SIZE.get(kind, _USUAL_SIZE)
@@ -316,10 +316,6 @@ def _one_per_task(source: Worlds) -> int:
     pools = source.tasks("train")
     tasks = max(map(len, pools.values())) * len(pools)
     return tasks * math.ceil(200 / tasks)
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 class _Report:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from bidex_meta.cli import metatest, run_data, run_recording, watching
-from bidex_meta.cli.conditions import conditions
+from bidex_meta.cli.evaluate import conditions
 from bidex_meta.cli.learners import start_from
 from bidex_meta.cli.policies import checkpoint, fitting
 from bidex_meta.cli.run_config import RunPlan, plan_run
@@ -107,7 +107,7 @@ def _check(plan: RunPlan, held: contextlib.ExitStack) -> None:
             check_new(plan.flags.run_dir or name.with_name(f"{name.name}_0"))
         watching.check(plan)
     if plan.kind.adapts:
-        metatest.check_source(plan.source, plan.config.algo)
+        metatest.check_worlds(plan.source, plan.config.algo)
         metatest.splits_of(plan.source, plan.flags.split)
     if plan.folder is None and plan.config.start_from is not None:
         start = RunFolder.open(Path(plan.config.start_from))
@@ -292,10 +292,11 @@ def _evaluate(plan: RunPlan, folder: RunFolder, learner: Any) -> None:
 def _meta_test(plan: RunPlan, folder: RunFolder, learner: Any) -> None:
     device = launch().own_device(plan.config.device)
     flags, source = plan.flags, plan.source
-    options = metatest.Options(flags.shots, flags.rollouts, flags.episodes, flags.tasks)
+    options = metatest.Options(shots=flags.shots, rollouts=flags.rollouts, episodes=flags.episodes, tasks=flags.tasks)
     load = partial(plan.kind.make.load_policy, learner.policy_state_dict(), device)
     result = metatest.meta_test(source, plan.config, load, options, metatest.splits_of(source, flags.split), _say)
-    report = {"steps": learner.env_steps, "seed": options.seed, "splits": metatest.report(result)}
+    report = {"steps": learner.env_steps, "seed": options.starts}
+    report["splits"] = {split: each.to_json() for split, each in result.items()}
     write_json(folder.evaluation_path, report | {"conditions": conditions(source)})
     metatest.print_tables(f"{plan.config.algo} on {source.name}, {learner.env_steps:,} steps", result)
     _say(f"More: bidex-meta evaluate {folder.path} --shots 3 --tasks 50   See bidex-meta plot --help for curves.")

@@ -1,8 +1,6 @@
 """What ``bidex-meta run`` was asked for, resolved to values: flags, presets, and the config of a run to be resumed."""
 
 import dataclasses
-import os
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,7 +18,7 @@ from bidex_meta.errors import BidexError, one_line
 from bidex_meta.runs.folder import RunFolder
 from bidex_meta.train.launch import launch, resume_command
 from bidex_meta.utils.files import absolute
-from bidex_meta.utils.memory import POINT_BYTES, ROW_BYTES, check_memory
+from bidex_meta.utils.memory import POINT_BYTES, ROW_BYTES, check_memory, usable_cores
 from bidex_meta.utils.validation import Count, Few, Shots
 from bidex_meta.worlds import Worlds
 
@@ -116,7 +114,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
             steps=sizes[1],
             seed=0,
             task_seed=run_data.task_seed(datasets),
-            threads=max(1, _cores() // launch().local_count),
+            threads=max(1, usable_cores() // launch().local_count),
         )
     flags = _parse(arguments, default)
     run_data.check_offline(kind, flags.config.record, datasets, source)
@@ -192,11 +190,6 @@ def _check_memory(config: RunConfig[Any]) -> None:
     check_memory(
         launch().local_count * (of_world + of_learner), what, "Lower it, or the learner's layers, steps or replay."
     )
-
-
-def _cores() -> int:
-    # The cores we may use, not those of the machine: containers and batch systems give a share.
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 def _stored_learner(config_class: Any, stored: RunConfig[dict[str, Any]], folder: RunFolder) -> Any:

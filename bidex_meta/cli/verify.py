@@ -2,17 +2,66 @@
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NotRequired, TypedDict
 
+from bidex_meta.cli.evaluate import conditions
+from bidex_meta.cli.learners import learner_kind, resolve_device
+from bidex_meta.cli.metatest import TASKS, Options, meta_test
 from bidex_meta.cli.parsing import RunPath, Switch, parse
+from bidex_meta.cli.policies import checkpoint, policy_of
+from bidex_meta.cli.tables import agreement_table, print_table
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import EXIT_FAILED, BidexError, one_line
+from bidex_meta.evaluation.agreement import DIFFERS, EQUAL, WITHIN, agreements, classes_of
+from bidex_meta.runs import RunFolder, schemas
 from bidex_meta.utils.files import exists
-from bidex_meta.utils.validation import Environments
+from bidex_meta.utils.validation import Environments, Few, Finite, Seed, Shots, Text, Whole
+from bidex_meta.utils.validation import parse as parse_content
+from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds
+
+Engine = Literal["auto", "c", "warp"]
+
+
+class _Row(TypedDict):
+    episodes: NotRequired[Few]
+    tasks: NotRequired[Few]
+    length: NotRequired[Finite]
+
+
+class _Part(TypedDict):
+    episodes_per_task: Few
+    classes: dict[str, _Row]
+
+
+class _Split(TypedDict):
+    shots: Shots
+    rollouts: Few
+    trials: Few
+    before: _Part
+    after: _Part
+
+
+class _Conditions(TypedDict):
+    device: NotRequired[Text]
+    engine: NotRequired[Engine]
+    num_envs: NotRequired[Environments | None]
+    packages: NotRequired[dict[str, Any]]
+    physics: NotRequired[Text | None]
+    suite_version: NotRequired[Whole | None]
+
+
+class _Recorded(TypedDict):
+    """What ``evaluation.json`` must hold beyond :mod:`bidex_meta.runs.schemas` to be made again."""
+
+    steps: Whole
+    seed: Seed
+    conditions: NotRequired[_Conditions]
+    splits: NotRequired[dict[str, _Split]]
+    policy: NotRequired[_Part]
 
 
 @dataclass(frozen=True)
@@ -30,10 +79,10 @@ class VerifyFlags:
     """What `bidex-meta evaluate --json` wrote of the run; None: its evaluation.json."""
     device: str = "auto"
     """auto, cpu or cuda:N; auto: where the evaluation was made, if that is here, else the CPU."""
-    engine: str | None = None
+    engine: Engine | None = None
     """auto, c or warp; None: as the evaluation was made, on another device auto."""
     num_envs: Environments | None = None
-    """Rows stepped together; None: as the evaluation was made."""
+    """Environments stepped together; None: as the evaluation was made."""
     json: Switch = False
     """Print JSON."""
 
@@ -46,37 +95,29 @@ def main(arguments: Sequence[str]) -> None:
         SystemExit: With exit code 1: something differs.
     """
     flags = parse(VerifyFlags, arguments, "verify")
-
-    from bidex_meta.cli.conditions import conditions, others, recorded_conditions
-    from bidex_meta.evaluation.agreement import DIFFERS, EQUAL, WITHIN, agreements, classes_of
-    from bidex_meta.runs import RunFolder
-    from bidex_meta.runs.schemas import read_versions
-    from bidex_meta.world.threads import set_up_torch
-
     folder = RunFolder.open(flags.run)
     config = folder.config()
     recorded = recorded_evaluation(folder.path, flags.evaluation)
-    then = recorded_conditions(recorded, read_versions(folder.path), config)
-    config = replace(config, **_place(flags, then, config))
-    source = Worlds.open(config.to_json())
+    then = recorded_conditions(recorded, schemas.read_versions(folder.path), config)
+    config = _where(flags, then, config)
+    worlds = Worlds.open(config.to_json())
     set_up_torch(config.threads)
-    rows = then["num_envs"] if flags.num_envs is None else flags.num_envs
+    num_envs = then["num_envs"] if flags.num_envs is None else flags.num_envs
     state, step = _checkpoint(folder, recorded["steps"])
-    apart = others(then, conditions(source, rows))
+    apart = others(then, conditions(worlds, num_envs))
     for line in apart:
-        print(f"Conditions: {one_line(line)}.", file=sys.stderr, flush=True)
-    again = _again(folder, config, source, recorded, rows, state)
+        _say(f"Conditions: {one_line(line)}.")
+    again = _again(folder, config, worlds, recorded, num_envs, state)
     found = agreements(classes_of(recorded), classes_of(again))
     counts = {outcome: sum(each.outcome == outcome for each in found) for outcome in (EQUAL, WITHIN, DIFFERS)}
-    verdict = (
-        f"{len(found)} classes: {counts[EQUAL]} equal bit for bit, {counts[WITHIN]} within, {counts[DIFFERS]} differ"
-    )
     if flags.json:
         report = {"run": str(folder.path), "steps": step, "conditions": apart, **counts}
         print(json.dumps(report | {"classes": {each.name: each.to_json() for each in found}}, indent=2))
     else:
-        _print(f"{config.algo} on {source.name}, {step:,} steps, recorded and again", found)
-        print(verdict if not counts[DIFFERS] else f"{verdict}: this run is not what its evaluation says")
+        print_table(agreement_table(f"{config.algo} on {worlds.name}, {step:,} steps, recorded and again", found))
+        verdict = f"{counts[EQUAL]} equal bit for bit, {counts[WITHIN]} within, {counts[DIFFERS]} differ"
+        end = ": this run is not what its evaluation says" if counts[DIFFERS] else ""
+        print(f"{len(found)} classes: {verdict}{end}")
     if counts[DIFFERS]:
         raise SystemExit(EXIT_FAILED)
 
@@ -91,35 +132,19 @@ def recorded_evaluation(run: Path, named: Path | None = None) -> dict[str, Any]:
     Raises:
         BidexError: There is none, or it is damaged, or does not say how it was made.
     """
-    from bidex_meta.runs.schemas import read_evaluation
-    from bidex_meta.utils.files import TABLE, TEXT, check, choice, number, whole
-
     path = named or run / "evaluation.json"
     again = f"bidex-meta evaluate {run} --json > {path}"
     if named is None and not exists(path):
         raise BidexError(f"{run} has no evaluation.json to be verified. Let the run end, or write one: {again}")
-    found = read_evaluation(path, again)
-    many = whole(1, 1_000_000)
-    check(found, {"seed": whole(0), "conditions": TABLE}, path, ("steps", "seed"))
-    rules = {"device": TEXT, "engine": choice("auto", "c", "warp"), "num_envs": whole(1, 10_000_000).or_none()}
-    rules |= {"packages": TABLE, "physics": TEXT.or_none(), "suite_version": whole(0).or_none()}
-    check(found.get("conditions", {}), rules, path, place="conditions.")
-    parts = [("policy.", found.get("policy", found))] if "splits" not in found else []
-    for split, part in found.get("splits", {}).items():
-        limits = {"shots": whole(0, 1000), "rollouts": many, "trials": many}
-        check(part, limits, path, tuple(limits), f"splits.{split}.")
-        parts += [(f"splits.{split}.before.", part["before"]), (f"splits.{split}.after.", part["after"])]
-    for place, part in parts:
-        check(part, {"episodes_per_task": many}, path, ("episodes_per_task",), place)
-        for name, row in part["classes"].items():
-            check(row, {"episodes": many, "tasks": many, "length": number()}, path, (), f"{place}classes.{name}.")
+    found = schemas.read_evaluation(path, again)
+    parse_content(found, _Recorded, str(path))
+    if "splits" not in found and "policy" not in found:
+        parse_content(found, _Part, str(path))
     return found
 
 
-def _place(flags: VerifyFlags, then: dict[str, Any], config: RunConfig[Any]) -> dict[str, Any]:
-    """Device and engine to evaluate with."""
-    from bidex_meta.cli.learners import resolve_device
-
+def _where(flags: VerifyFlags, then: Mapping[str, Any], config: RunConfig[Any]) -> RunConfig[Any]:
+    """The run's config with device and engine to evaluate with."""
     on_gpu = Worlds.open(config.to_json()).on_gpu
     try:
         device = resolve_device(then["device"] if flags.device == "auto" else flags.device, on_gpu)
@@ -127,23 +152,16 @@ def _place(flags: VerifyFlags, then: dict[str, Any], config: RunConfig[Any]) -> 
         if flags.device != "auto":
             raise
         device = "cpu"
-    same = _kind(device) == _kind(then["device"])
-    return {"device": device, "engine": flags.engine or (then["engine"] if same else "auto")}
+    same = device.partition(":")[0] == then["device"].partition(":")[0]
+    return replace(config, device=device, engine=flags.engine or (then["engine"] if same else "auto"))
 
 
-def _kind(device: str) -> str:
-    """``cuda`` of ``cuda:0``."""
-    return device.partition(":")[0]
-
-
-def _checkpoint(folder: Any, steps: int) -> tuple[dict[str, Any], int]:
+def _checkpoint(folder: RunFolder, steps: int) -> tuple[dict[str, Any], int]:
     """The checkpoint that was evaluated.
 
     Raises:
         BidexError: It is not there any more.
     """
-    from bidex_meta.cli.policies import checkpoint
-
     for which in ("last", f"step_{steps}.pt", "best"):
         there = which == "last" or exists(folder.checkpoints.folder / (f"{which}.pt" if which == "best" else which))
         found = checkpoint(folder, which) if there else None
@@ -156,44 +174,66 @@ def _checkpoint(folder: Any, steps: int) -> tuple[dict[str, Any], int]:
 
 
 def _again(
-    folder: Any, config: RunConfig[Any], source: Worlds, recorded: dict[str, Any], rows: int | None, state: Any
+    folder: RunFolder,
+    config: RunConfig[Any],
+    worlds: Worlds,
+    recorded: dict[str, Any],
+    num_envs: int | None,
+    state: dict[str, Any],
 ) -> dict[str, Any]:
     """The recorded evaluation, made again."""
-    from bidex_meta.cli.learners import learner_kind
-    from bidex_meta.cli.policies import policy_of
-
     if learner_kind(config.algo).adapts != ("splits" in recorded):
         kind = "a meta-test" if "splits" in recorded else "no meta-test"
         raise BidexError(f"{folder.path}: the evaluation is {kind}, which is not how {config.algo} is judged.")
     if "splits" not in recorded:
-        world = source.world(recorded.get("split", "train"), rows)
+        world = worlds.world(recorded.get("split", "train"), num_envs)
         episodes = recorded.get("policy", recorded)["episodes_per_task"]
-        found = source.judge(policy_of(folder, state, config.device), world, episodes, recorded["seed"])
+        found = worlds.judge(policy_of(folder, state, config.device), world, episodes, recorded["seed"])
         world.close()
         return {"policy": found.to_json()}
-    from bidex_meta.cli import metatest
-
     splits = {}
     for split, part in recorded["splits"].items():
-        if split not in source.splits:
-            raise BidexError(f"{source.name} has no {split} tasks, which the evaluation is of.")
-        tasks = max(row.get("tasks", metatest.TASKS) for row in part["before"]["classes"].values())
-        options = metatest.Options(
+        if split not in worlds.splits:
+            raise BidexError(f"{worlds.name} has no {split} tasks, which the evaluation is of.")
+        options = Options(
             shots=part["shots"],
             rollouts=part["rollouts"],
             episodes=part["before"]["episodes_per_task"],
-            tasks=tasks,
+            tasks=max(row.get("tasks", TASKS) for row in part["before"]["classes"].values()),
             trials=part["trials"],
-            num_envs=rows,
+            num_envs=num_envs,
             seed=recorded["seed"],
         )
-        say = lambda text: print(text, file=sys.stderr, flush=True)  # noqa: E731
         load = lambda: policy_of(folder, state, config.device)  # noqa: E731
-        splits |= metatest.report(metatest.meta_test(source, config, load, options, [split], say))
+        splits[split] = meta_test(worlds, config, load, options, [split], _say)[split].to_json()
     return {"splits": splits}
 
 
-def _print(title: str, found: list[Any]) -> None:
-    from bidex_meta.cli.tables import agreement_table, print_table
+def recorded_conditions(evaluation: dict[str, Any], versions: dict[str, Any], config: RunConfig[Any]) -> dict[str, Any]:
+    """The same of an evaluation as it was recorded; of an older one what its run was trained with.
 
-    print_table(agreement_table(title, found))
+    Args:
+        evaluation: Of ``evaluation.json``.
+        versions: Of ``versions.json``, empty where there is none.
+        config: The run's.
+    """
+    found = {"device": config.device, "engine": config.engine, "num_envs": None}
+    found |= {name: versions.get(name) for name in ("packages", "physics", "suite_version")}
+    found |= evaluation.get("conditions", {})
+    packages = found["packages"]
+    return found | {"packages": packages if isinstance(packages, dict) else {}}
+
+
+def others(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
+    """What differs between recorded conditions and those now, a text each; the last names what was not recorded."""
+    packages = then["packages"]
+    pairs = [(name, packages.get(name), version) for name, version in now["packages"].items()]
+    pairs += [(name, then.get(name), now[name]) for name in ("device", "engine", "threads")]
+    pairs += [(name.replace("_", " "), then.get(name), now[name]) for name in ("physics", "suite_version")]
+    texts = [f"{name} {old} then, {new} now" for name, old, new in pairs if None not in (old, new) and old != new]
+    unknown = [name for name, old, new in pairs if old is None and new is not None and name != "threads"]
+    return texts + ([f"not recorded: {', '.join(unknown)}"] if unknown else [])
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""Looking at a learner while it learns: evaluations, the best policy, films. Nothing of the training depends on it."""
+"""Watching a learner while it learns: evaluations, the best policy, films. Nothing of the training depends on it."""
 
 import math
 import random
@@ -6,17 +6,26 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
 
 from bidex_meta.agents import Agent
+from bidex_meta.cli import metatest
+from bidex_meta.cli.policies import slots_of
 from bidex_meta.cli.run_config import RunPlan
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.filming import film_tiles
+from bidex_meta.evaluation.play import EVALUATION_SEED, evaluate
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.runs import Recorder, RunFolder
+from bidex_meta.runs.video import check_films
+from bidex_meta.runs.writers import check_logger
+from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.train.launch import launch
+from bidex_meta.train.learner import Learner
+from bidex_meta.utils import gl_backend
+from bidex_meta.world.contract import PooledWorld
 from bidex_meta.worlds import Worlds
 
 TASKS = 10
@@ -33,13 +42,8 @@ def check(plan: RunPlan) -> None:
     Raises:
         BidexError: There are no pictures of such a suite, no way to draw here, no ffmpeg, or no such logger.
     """
-    from bidex_meta.runs.writers import check_logger
-
     check_logger(plan.config.logger)
     if plan.config.video_every is not None:
-        from bidex_meta.runs.video import check_films
-        from bidex_meta.utils import gl_backend
-
         plan.source.task_classes()
         check_films()
         gl_backend.prepare()
@@ -47,7 +51,7 @@ def check(plan: RunPlan) -> None:
 
 @contextmanager
 def watch(
-    plan: RunPlan, folder: RunFolder, learner: Any, record: Recorder, iterations: int
+    plan: RunPlan, folder: RunFolder, learner: Learner, record: Recorder, iterations: int
 ) -> Iterator["Watch | None"]:
     """What the config asks for, with its worlds closed at the end; None where it asks for nothing."""
     if plan.config.evaluate_every is None and plan.config.video_every is None:
@@ -64,18 +68,18 @@ class Watch:
     """Called after each iteration; every so many it evaluates or films.
 
     Args:
-        plan: What is run.
-        folder: Where it is run.
-        learner: What is looked at.
-        record: Where films go.
+        plan: The run.
+        folder: Its folder.
+        learner: Its learner.
+        record: Takes the films.
         iterations: Iterations that a resumed run has made before.
     """
 
-    def __init__(self, plan: RunPlan, folder: RunFolder, learner: Any, record: Recorder, iterations: int) -> None:
+    def __init__(self, plan: RunPlan, folder: RunFolder, learner: Learner, record: Recorder, iterations: int) -> None:
         self._plan, self._folder, self._learner, self._record = plan, folder, learner, record
         self._iterations = iterations
         self._device = launch().own_device(plan.config.device)
-        self._worlds: dict[str, Any] = {}
+        self._worlds: dict[str, PooledWorld] = {}
         self._best = folder.checkpoints.found_of_best()
 
     def __call__(self) -> dict[str, float]:
@@ -111,10 +115,8 @@ class Watch:
         return metrics
 
     def _judge(self) -> Evaluation:
-        from bidex_meta.evaluation.play import EVALUATION_SEED, evaluate
-        from bidex_meta.world.contract import PooledWorld
-
-        source, pools = self._plan.source, self._plan.source.tasks("train")
+        source = self._plan.source
+        pools = source.tasks("train")
         tasks, episodes = played(pools)
         if "evaluation" not in self._worlds:
             world = self._worlds["evaluation"] = source.world("train", tasks * len(pools) * episodes)
@@ -128,23 +130,17 @@ class Watch:
 
     def _meta_test(self) -> dict[str, float]:
         """One shot on train tasks: test tasks must not choose the policy that is judged on them."""
-        from bidex_meta.cli import metatest
-
-        load, source = partial(self._policy, self._device), self._plan.source
-        found = metatest.meta_test(source, self._plan.config, load, metatest.Options(), ["train"])["train"]
+        load, options = partial(self._policy, self._device), metatest.Options()
+        found = metatest.meta_test(self._plan.source, self._plan.config, load, options, ["train"])["train"]
         before = _metrics(found.before)["Eval/success_rate"]
         return {**_metrics(found.after), "Eval/success_before_adapt": before}
 
     def _film(self) -> None:
-        """A film of a row of each class beside each other; its failure is told and ends nothing."""
-        from bidex_meta.cli.policies import slots_of
-        from bidex_meta.evaluation.filming import film_tiles
-        from bidex_meta.tasks.base import CONTROL_RATE
-
+        """A film of an environment of each class beside each other; its failure is reported and ends nothing."""
         try:
             if "film" not in self._worlds:
-                source = Worlds.open({**self._plan.config.to_json(), "device": "cpu", "engine": "auto"})
-                self._worlds["film"] = source.world("train", len(slots_of(source)))
+                worlds = Worlds.open({**self._plan.config.to_json(), "device": "cpu", "engine": "auto"})
+                self._worlds["film"] = worlds.world("train", len(slots_of(worlds)))
             world = self._worlds["film"]
             steps = min(_MOST_FILM_STEPS, int(world.max_episode_steps.max()))
             frames = film_tiles(

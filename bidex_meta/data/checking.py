@@ -241,7 +241,7 @@ class ClassSummary:
         length: Mean length of an episode, steps.
         returns: Unscaled returns: least, median, mean, largest.
         success: Share of episodes that met their goal.
-        score: Mean normalised score (``evaluation.scores``); None where a reference is missing.
+        score: Mean normalised score (``evaluation.references``); None where a reference is missing.
         tasks: Different tasks played.
         broken: Episodes ended by broken physics.
     """

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from bidex_meta.engine.health import LARGEST, LONGEST, SHORTEST, checked_state, outside, quaternion_columns
 from bidex_meta.errors import BidexError
+from bidex_meta.utils.memory import usable_cores
 
 # What a simulation carries from one step to the next; the fields that a model has none of are skipped.
 _STATE_FIELDS = (
@@ -23,11 +24,6 @@ _STATE = tuple(_STATE_FIELDS.split())
 # A full arena drops contacts or constraints in silence: as broken as a bad number.
 _BAD_NAMES = ("BADQPOS", "BADQVEL", "BADQACC", "CONTACTFULL", "CNSTRFULL")
 _BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_{name}")) for name in _BAD_NAMES]
-
-
-def default_threads() -> int:
-    """Number of CPUs this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class CpuEngine:
@@ -60,7 +56,7 @@ class CpuEngine:
         self._after_step = mujoco.mjtStage.mjSTAGE_VEL if refresh else mujoco.mjtStage.mjSTAGE_NONE
         # MuJoCo would print each broken row to stderr and to a log file in the working folder; unstable() tells it.
         mujoco.set_mju_user_warning(_silent)
-        threads = default_threads() if threads is None else threads
+        threads = usable_cores() if threads is None else threads
         self._batch = mujoco.batch.Batch(models[0], self.num, nthread=threads, persistent=True)
         self._forked = False
         if threads > 1:

@@ -1,6 +1,7 @@
 """What a world, a replay or a network will take, told before it is taken: a system out of memory ends others' work."""
 
 import os
+import sys
 from pathlib import Path
 
 from bidex_meta.errors import BidexError
@@ -10,6 +11,11 @@ ROW_BYTES = 500_000
 
 POINT_BYTES = 100
 """Of a point of a row's cloud: calculated, in the observation, its copies in a step's info and what makes them."""
+
+
+def usable_cores() -> int:
+    """Cores that this process may use, not those of the machine: containers and batch systems give a share."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 def available() -> int | None:

@@ -9,9 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from bidex_meta.engine.cpu import CpuEngine, default_threads
+from bidex_meta.engine.cpu import CpuEngine
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import Scene, build_spec, compile_scene
+from bidex_meta.utils.memory import usable_cores
 from tests.tasks.worlds import Lens, depths
 
 SUBSTEPS, ROWS = 4, 4
@@ -129,7 +130,7 @@ def test_inactive_rows_stand_still(scene: Scene) -> None:
 
 def test_threads_change_nothing(scene: Scene) -> None:
     assert same(run(fresh(scene, 8, threads=1), 10, seed=10), run(fresh(scene, 8, threads=2), 10, seed=10))
-    assert default_threads() >= 1
+    assert usable_cores() >= 1
 
 
 AFTER_FORK = """

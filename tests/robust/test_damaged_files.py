@@ -14,8 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from bidex_meta.benchmark import Benchmark
-from bidex_meta.cli.conditions import others, recorded_conditions
-from bidex_meta.cli.verify import recorded_evaluation
+from bidex_meta.cli.verify import others, recorded_conditions, recorded_evaluation
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.agreement import agreements, classes_of
 from bidex_meta.evaluation.references import load_from

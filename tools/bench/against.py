@@ -19,10 +19,10 @@ from typing import Any
 
 import tyro
 
-from bidex_meta.engine.cpu import default_threads
 from bidex_meta.errors import BidexError
 from bidex_meta.runs.atomic import write_json
 from bidex_meta.runs.versions import git_state
+from bidex_meta.utils.memory import usable_cores
 
 HERE = Path(__file__).resolve().parents[2]
 """The checkout that this code runs from."""
@@ -65,7 +65,7 @@ def against(
         CalledProcessError: git does not know the commit.
     """
     other, then = recorded(other)
-    setting = {"suite": suite, "num_envs": num_envs, "threads": threads or default_threads(), "steps": steps}
+    setting = {"suite": suite, "num_envs": num_envs, "threads": threads or usable_cores(), "steps": steps}
     with checkout(other) as folder, _Worker(folder) as old, _Worker(HERE) as new:
         result: dict[str, Any] = {
             "old": git_state(folder / "bidex_meta") or {"commit": commit_name(other), "dirty": False},

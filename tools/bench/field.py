@@ -13,9 +13,9 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 
 from bidex_meta.benchmark import Benchmark
-from bidex_meta.engine.cpu import default_threads
 from bidex_meta.metaworld.batched import MetaWorldWorld
 from bidex_meta.tasks.base import CONTROL_RATE
+from bidex_meta.utils.memory import usable_cores
 
 _METAWORLD_ROWS = 10
 _HANDS = ("HandReach-v3", "HandManipulateEgg-v1")
@@ -56,7 +56,7 @@ def field(num_envs: int = 1024, steps: int = 10_000, repeats: int = 7, seed: int
     table = [_row(entry, found, speeds[0]) for entry, found in zip(entries, speeds, strict=True)]
     for _, vector, _, _ in entries:
         vector.close()
-    return {"cpus": default_threads(), "skipped": skipped, "table": table}
+    return {"cpus": usable_cores(), "skipped": skipped, "table": table}
 
 
 Entry = tuple[str, VectorEnv, float, list[int]]

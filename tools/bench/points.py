@@ -4,7 +4,7 @@ import statistics
 from typing import Any
 
 from bidex_meta.benchmark import make_task_world
-from bidex_meta.engine.cpu import default_threads
+from bidex_meta.utils.memory import usable_cores
 from tools.bench.timing import Seconds, random_steps
 
 
@@ -51,7 +51,7 @@ def points(
         "task": task,
         "num_envs": num_envs,
         "points": count,
-        "threads": threads or default_threads(),
+        "threads": threads or usable_cores(),
         "frames_per_s": {n: round(statistics.median(frames / t.wall for t in took)) for n, took in times.items()},
         "frames_per_cpu_s": {n: round(statistics.median(frames / t.cpu for t in took)) for n, took in times.items()},
         "ratio": round(statistics.median(s / p for p, s in pairs), 3),

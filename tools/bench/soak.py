@@ -12,9 +12,9 @@ from torch import Tensor
 
 from bidex_meta.cli.learners import LearnerKind, choose_preset, learner_kind
 from bidex_meta.config import Steps
-from bidex_meta.engine.cpu import default_threads
 from bidex_meta.errors import BidexError
 from bidex_meta.runs.atomic import write_json
+from bidex_meta.utils.memory import usable_cores
 from bidex_meta.world.contract import PooledWorld
 from bidex_meta.world.wrapper import PooledWorldWrapper
 from bidex_meta.worlds import Worlds
@@ -90,7 +90,7 @@ def soak(
         "suite": suite,
         "what": "random actions" if algo is None else "training",
         "num_envs": num_envs,
-        "threads": threads or default_threads(),
+        "threads": threads or usable_cores(),
         "device": device,
         "table": [],
     }

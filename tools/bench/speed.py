@@ -4,7 +4,7 @@ import statistics
 from typing import Any
 
 from bidex_meta.benchmark import Benchmark
-from bidex_meta.engine.cpu import default_threads
+from bidex_meta.utils.memory import usable_cores
 from bidex_meta.world import Slot, World
 from tools.bench.timing import random_steps
 
@@ -24,7 +24,7 @@ def scaling(
     Returns:
         ``env_steps_per_s`` by number of threads and ``speedup`` against one thread.
     """
-    most = default_threads()
+    most = usable_cores()
     worlds = {
         n: Benchmark(suite, seed=seed).make_world("train", device="cpu", num_envs=num_envs, threads=n)
         for n in sorted({1, min(2, most), most})
@@ -92,7 +92,7 @@ def mixing(
     return {
         "suite": suite,
         "num_envs": num_envs,
-        "threads": threads or default_threads(),
+        "threads": threads or usable_cores(),
         "mixed": round(statistics.median(mixed)),
         "harmonic_mean": round(harmonic),
         "ratio": round(statistics.median(mixed) / harmonic, 4),

@@ -122,7 +122,7 @@ def stacked_forward(network: MLP, params: Mapping[str, Tensor], prefix: str, x: 
 def linear(inputs: int, outputs: int, gain: float, generator: torch.Generator) -> nn.Linear:
     """A layer with orthogonal weights of this gain, drawn from a CPU generator, and zero biases."""
     # Made without memory first: the default initialisation would draw from (and so disturb) the global generator.
-    layer = Linear(inputs, outputs, device="meta").to_empty(device="cpu")
+    layer = Linear(inputs, outputs, device="meta").to_empty(device=torch.get_default_device())
     nn.init.orthogonal_(layer.weight, gain, generator=generator)
     nn.init.zeros_(layer.bias)
     return layer

@@ -1,1 +1,0 @@
-"""Many runs from one file: which they are, and the queue that runs them."""
