@@ -36,7 +36,8 @@ def test_render_refuses_a_policy_of_other_observations(monkeypatch, toy_class, t
     flags = ["render", "--task", "Near", "--width", "64", "--height", "48", "--policy", str(tmp_path / "a")]
     capsys.readouterr()
     assert main([*flags, "--out", str(tmp_path / "a.png"), "--steps", "2"]) == 0
-    monkeypatch.setattr(policies, "policy_shape", lambda folder: {"observations": 7, "actions": 1})
+    shape = {"observations": 7, "actions": 1}
+    monkeypatch.setattr(policies, "checkpoint", lambda *_: ({"learner": {"policy": {"shape": shape}}}, 24))
     assert main([*flags, "--out", str(tmp_path / "b.png"), "--steps", "2"]) == 2
     assert "takes 7 observations" in capsys.readouterr().err
 

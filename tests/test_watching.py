@@ -9,7 +9,7 @@ import torch
 
 from bidex_meta.cli import main, watching
 from bidex_meta.runs import RunFolder, read_metrics
-from bidex_meta.runs.writers import LOGGERS, NoWriter
+from bidex_meta.runs.writers import LOGGERS, Writer
 from bidex_meta.utils import gl_backend
 from tests.test_cli import final, run, same, toy_worlds
 
@@ -121,7 +121,7 @@ def test_equal_success_is_settled_by_the_score_or_the_return():
 def test_films_are_of_every_class_and_go_to_the_logger(toy_worlds, tmp_path, monkeypatch):
     seen = []
 
-    class Notes(NoWriter):
+    class Notes(Writer):
         def config(self, values):
             seen.append(values["algo"])
 

@@ -194,11 +194,22 @@ class Learner(Contract):
 
     @classmethod
     def load_policy(cls, state: State, device: str | torch.device = "cpu") -> Any:
-        """The agent of a checkpoint (its entry ``learner.policy``), for a world of any number of environments."""
-        init = torch.Generator().manual_seed(0)
-        config, shape = cls.config_type(**state["config"]), Shape.load(state["shape"])
-        policy = cls._make_policy(config, shape, init, torch.device(device))
-        policy.load_state_dict(state["weights"])
+        """The agent of a checkpoint (its entry ``learner.policy``), for a world of any number of environments.
+
+        Raises:
+            ValueError: The config asks for other layers than the weights; found out before these take memory.
+        """
+        init, weights, sizes = torch.Generator().manual_seed(0), state["weights"], state["shape"]
+        total = sum(weight.numel() for weight in weights.values())
+        if max(size for size in sizes.values() if isinstance(size, int)) > total:
+            raise ValueError(f"shape: expected sizes up to the {total:,} numbers of its weights, got {sizes}")
+        config, shape = cls.config_type(**state["config"]), Shape.load(sizes)
+        with torch.device("meta"):
+            planned = cls._make_policy(config, shape, init, torch.device("meta")).state_dict()
+        if _shapes(planned) != _shapes(weights):
+            raise ValueError("weights: expected those of the layers in its config, got others")
+        policy = cls._make_policy(config, shape, init.manual_seed(0), torch.device(device))
+        policy.load_state_dict(weights)
         return policy
 
     def start_from(self, policy: State) -> None:

@@ -6,17 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from bidex_meta.agents import Agent
 from bidex_meta.cli.learners import learner_kind
 from bidex_meta.errors import BidexError, one_line
 from bidex_meta.evaluation.play import RandomAgent, ZeroAgent
 from bidex_meta.runs import RunFolder
 from bidex_meta.train.distributed import LostProcess
-from bidex_meta.train.learner import Learner
 from bidex_meta.utils.files import is_file
-from bidex_meta.utils.plugins import is_outside
 from bidex_meta.worlds import WorldConfig, Worlds
 
 
@@ -84,23 +80,8 @@ def policy_of(folder: RunFolder, state: dict[str, Any], device: str) -> Agent:
     Raises:
         BidexError: It does not fit the run's config, or its own.
     """
-    algo = folder.config().algo
-    make = learner_kind(algo).make
     with fitting(folder.path):
-        policy = state["learner"]["policy"]
-        if not is_outside(algo):
-            _refuse_other_layers(make, policy)
-        return make.load_policy(policy, device)
-
-
-def _refuse_other_layers(make: type[Learner], policy: dict[str, Any]) -> None:
-    """Refuses a policy whose config asks for other layers than its weights have, before these take memory."""
-    weights = {name: weight.to("meta") for name, weight in policy["weights"].items()}
-    total = sum(weight.numel() for weight in weights.values())
-    if max((size for size in policy["shape"].values() if isinstance(size, int)), default=0) > total:
-        raise ValueError(f"its shape is larger than its {total:,} weights")
-    with torch.device("meta"):
-        make.load_policy({**policy, "weights": weights}, "meta")
+        return learner_kind(folder.config().algo).make.load_policy(state["learner"]["policy"], device)
 
 
 def policy_loader(folder: RunFolder, device: str, which: str = "last") -> tuple[Callable[[], Agent], int]:

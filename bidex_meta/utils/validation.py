@@ -11,7 +11,7 @@ import math
 import operator
 import re
 import types
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints, is_typeddict
 
 import msgspec
 import numpy as np
@@ -263,7 +263,7 @@ def _annotation_at(kind: Any, path: str) -> Any:
     """The annotation of the value at a path."""
     for name, _ in _STEP.findall(path):
         parts = [kind]
-        while parts and not dataclasses.is_dataclass(parts[0]) and name:
+        while parts and name and not (dataclasses.is_dataclass(parts[0]) or is_typeddict(parts[0])):
             parts = [*parts[1:], *(each for each in get_args(parts[0]) if not isinstance(each, Meta))]
         if name:
             kind = get_type_hints(parts[0], include_extras=True).get(name) if parts else None
