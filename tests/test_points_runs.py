@@ -10,7 +10,7 @@ from bidex_meta.benchmark import Benchmark, make_task_world
 from bidex_meta.cli import main
 from bidex_meta.cli.policies import checkpoint
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation import seen
+from bidex_meta.evaluation import filming
 from bidex_meta.runs import RunFolder, read_metrics
 from bidex_meta.suite import load_suite
 from tests.pages import ROOT
@@ -106,7 +106,7 @@ def test_render_puts_the_cloud_beside_the_picture(monkeypatch: pytest.MonkeyPatc
 
     world = make_task_world("HandOver", 3, "cpu", autoreset_mode="DISABLED", threads=1)
     monkeypatch.setattr(type(world), "render", lambda self, row, width, height, camera: np.zeros((height, width, 3), np.uint8))  # fmt: skip  # noqa: E501
-    looked = seen.SeenWorld(world, 200)
+    looked = filming.SeenWorld(world, 200)
     looked.reset(seed=0)
     pictures = [looked.render(row=row, width=60, height=50) for row in (0, 2)]
     assert pictures[0].shape == (50, 180, 3) and (pictures[0][:, :60] == 0).all()

@@ -50,7 +50,7 @@ COMMANDS: dict[str, Command] = {
     "control": Command("bidex_meta.cli.control", "held-out tasks, adapted to their own data and to others'"),
     "record": Command("bidex_meta.cli.record", "record a data set: episodes of a policy, for offline learners"),
     "data": Command("bidex_meta.cli.data", "the data sets there are, one of them, or a check of it"),
-    "list": Command("bidex_meta.cli.list", "the suites, tasks, algos or objects there are"),
+    "list": Command("bidex_meta.cli.listing", "the suites, tasks, algos or objects there are"),
     "render": Command("bidex_meta.cli.render", "a picture or a film of a task, or of all of a run"),
     "play": Command("bidex_meta.cli.play_live", "a policy at work, live: in a window or in the browser"),
     "witness": Command("bidex_meta.cli.witness", "replay actions that solve a task"),
