@@ -9,6 +9,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -18,7 +19,6 @@ from bidex_meta.cli import main
 from bidex_meta.config import config_of
 from bidex_meta.errors import BidexError
 from bidex_meta.runs import RunFolder, read_metrics
-from bidex_meta.train import distributed
 from bidex_meta.train.distributed import TIMEOUT
 from tests.algos.ranks import same
 
@@ -93,7 +93,7 @@ def final(path: Path) -> tuple[dict[str, Any], int]:
 def test_two_processes_train_mt4_and_end_with_equal_networks(tmp_path: Path) -> None:
     code, said = finish(start(tmp_path, *SMALL, "--steps", 6 * ITERATION, "--run-dir", "r"))
     assert code == 0, said
-    assert said.count("mtppo on MT4, 2 x 4 rows on cpu, seed 3") == 1
+    assert said.count("mtppo on MT4, 2 x 4 environments on cpu, seed 3") == 1
     assert len([line for line in said if line.startswith("Run folder")]) == 1
     rows = read_metrics(tmp_path / "r" / "metrics.jsonl")
     assert [row["step"] for row in rows] == [ITERATION * (i + 1) for i in range(6)]
@@ -212,14 +212,15 @@ def test_a_run_from_before_several_processes_is_one_of_one(tmp_path: Path, capsy
 
 
 def test_processes_that_disagree_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    from bidex_meta.cli.run import _agree
+    from bidex_meta.cli import run
     from bidex_meta.cli.run_config import plan_run
 
     plan = plan_run(SMALL)
 
     def agree(step: int | None = None, **other: Any) -> Any:
-        monkeypatch.setattr(distributed, "share", lambda mine: [mine, (replace(plan.config, **other), step)])
-        return _agree(plan, None)
+        everyone = SimpleNamespace(share=lambda mine: [mine, (replace(plan.config, **other), step)])
+        monkeypatch.setattr(run, "distributed", everyone)
+        return run._agree(plan, None)
 
     assert agree(threads=99).config.threads == 1
     with pytest.raises(BidexError, match=r"Process 1 has steps = 5, not .* Start all with the same flags"):
