@@ -1,7 +1,6 @@
 """`Benchmark("ML20")`: a suite file and a seed become task classes, tasks and worlds.
 
-The four properties and `Task` are Meta-World's, so that code written against it finds what it looks for. No task and no
-physics is made here: this module decides which numbers belong to which task and what a world is asked for.
+The four properties and `Task` are Meta-World's, so that code written against it finds what it looks for.
 """
 
 import hashlib
@@ -44,11 +43,7 @@ class Task(NamedTuple):
 
     @property
     def variation(self) -> np.ndarray:
-        """The numbers of `data`: shape (size,), float64, a copy.
-
-        Raises:
-            BidexError: `data` holds no such numbers.
-        """
+        """The numbers of `data`: shape (size,), float64, a copy; BidexError where it holds none."""
         try:
             return np.frombuffer(self.data, dtype=_NUMBERS).astype(np.float64)
         except (TypeError, ValueError):
@@ -61,17 +56,15 @@ class Task(NamedTuple):
 class Benchmark:
     """A suite with its task classes, its tasks and the worlds made of them.
 
-    The same name and seed give the same tasks in every process; no global random generator is read or written.
-
-    Its classes make single environments as Meta-World's do; with `bidex_meta.metaworld` imported it is a
+    The same name and seed give the same tasks in every process; no global random generator is read or written. Its
+    classes make single environments as Meta-World's do; with `bidex_meta.metaworld` imported it is a
     `metaworld.Benchmark`.
 
     Args:
         name_or_path: A shipped suite (`bidex_meta.suite_names()`), the path of a suite file of your own, or a `Suite`.
         seed: Chooses the tasks; also the default seed of the worlds. A whole number from 0 on.
 
-    Raises:
-        BidexError: Unknown suite, faulty suite file, or a seed that is none.
+    Raises BidexError for an unknown suite, a faulty suite file or seed.
 
     Example:
         >>> from bidex_meta import Benchmark
@@ -162,8 +155,7 @@ class Benchmark:
             stagger: In training worlds the first episodes begin at random elapsed steps (and do not count), so that
                 environments do not end together; False: at 0.
 
-        Raises:
-            BidexError: A split without classes, too few environments, an unknown mode, device or engine.
+        Raises BidexError for a split without classes, too few environments, an unknown mode, device or engine.
         """
         slots, mode = self._slots(self._checked_split(split)), checked_mode(autoreset_mode)
         return World(
@@ -191,11 +183,12 @@ class Benchmark:
 
     def _env_classes(self, split: Split) -> dict[str, type[SuiteEnv]]:
         moving, hides = True if self.suite.base == "moving" else None, self.suite.observation == "masked"
-        points, found = (self.suite.points, self.suite.point_kinds), {}
+        points, classes = (self.suite.points, self.suite.point_kinds), {}
         for entry in self.suite.split_classes(split):
             look = (moving, tuple(entry.options.items()), self.padded_size, hides)
-            found[entry.name] = EnvRecipe(entry.name, *look, entry.reward_scale, entry.class_name, points).make_class()
-        return found
+            recipe = EnvRecipe(entry.name, *look, entry.reward_scale, entry.class_name, points)
+            classes[entry.name] = recipe.make_class()
+        return classes
 
     def _checked_split(self, split: str) -> Split:
         if not isinstance(split, str) or split not in self.suite.splits:
@@ -237,21 +230,20 @@ def make_task_world(
     Args:
         task_name: A task class, e.g. `"HandOver"` (which alone has a fixed base: 398 observations, 40 actions), or
             `"package.module:Class"` of your own (docs/own-task.md).
-        num_envs: How many; left out, 1024 on the CPU and 8192 on an accelerator.
-        device: As in `Benchmark.make_world`.
+        num_envs: As in `Benchmark.make_world`, as are `device`, `autoreset_mode`, `threads`, `engine` and `stagger`.
+        device: See `num_envs`.
         seed: Chooses the tasks, the starts and the task draws.
-        autoreset_mode: As in `Benchmark.make_world`.
-        threads: As in `Benchmark.make_world`.
+        autoreset_mode: See `num_envs`.
+        threads: See `num_envs`.
         task_sampling: `"uniform"`: each episode draws a task; `"fixed"`: environment j keeps task j modulo 50. Left
             out: uniform in training worlds, fixed in evaluation worlds.
         moving_base: Drive the hands' bases or fix them; left out, as the class has it on its own.
-        engine: As in `Benchmark.make_world`.
-        stagger: As in `Benchmark.make_world`.
+        engine: See `num_envs`.
+        stagger: See `num_envs`.
         points: Points of the cloud shown in the place of the object's state (docs/points.md); 0: the state.
         object: In the place of its own: a name, or an MJCF file (docs/objects.md); in the slot's name behind a dash.
 
-    Raises:
-        BidexError: Unknown class or object, too few environments, an unknown mode, device or engine.
+    Raises BidexError for an unknown class or object, too few environments, an unknown mode, device or engine.
     """
     task_name, mode = registry.resolve(task_name), checked_mode(autoreset_mode)
     task_class = registry.get(task_name, moving_base, **registry.with_object(object))

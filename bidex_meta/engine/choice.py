@@ -21,8 +21,7 @@ def choose_engine(
         engine: "c", "warp" or "auto": C MuJoCo on the CPU, mujoco_warp on a GPU.
         threads: Threads of C MuJoCo; None takes all CPUs.
 
-    Raises:
-        BidexError: Unknown engine, a device that is not there, C MuJoCo on a GPU, or an impossible number of threads.
+    Raises BidexError for an unknown engine, a missing device, C MuJoCo on a GPU, or an impossible number of threads.
     """
     if threads is not None:
         threads = whole_number("threads", threads, 1, _MOST_THREADS)

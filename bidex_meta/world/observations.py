@@ -22,17 +22,15 @@ _HAND_OF = {block.name: f"{side}_hand" for side in SIDES for block in hand_block
 class Observer:
     """Builds the observations of rows of one layout: a gather of sensors, then actions and base rotations.
 
-    The blocks that only a task can compute (goal pose and its like) are left at zero, which is also how a masked goal
-    looks, and so is the padding; ``Part`` fills in the former.
+    Blocks that only a task can compute (goal pose and the like) are left at zero, as a masked goal and padding are;
+    ``Part`` fills in the former.
     """
 
     def __init__(self, scene: Scene, start_mounts: Tensor, width: int) -> None:
-        """Finds for every entry its sensor, factor and offset.
+        """Looks up sensor, factor and offset of every entry; ``scene`` is any whose task has the layout.
 
-        Args:
-            scene: A scene whose task has the layout.
-            start_mounts: Start orientation (x, y, z, w) of both mounts of each row, shape (num, 2, 4).
-            width: Entries of the observation with padding and task id.
+        ``start_mounts``: start orientation (x, y, z, w) of both mounts of each row, (num, 2, 4). ``width``: entries of
+        the observation with padding and task id.
         """
         self.layout: Layout = scene.task.layout
         device = start_mounts.device
@@ -56,16 +54,13 @@ class Observer:
         self._rotations = [self.layout.range(f"{side}_base_rotation") for side in SIDES] if moving else []
 
     def __call__(self, sensors: Tensor, action: Tensor, rows: Tensor | slice, out: Tensor | None = None) -> Tensor:
-        """Observations without the tasks' own blocks, not yet clipped.
+        """Observations (n, width), float32, without the tasks' own blocks, not yet clipped.
 
         Args:
             sensors: Sensor values of the rows, shape (n, nsensordata).
             action: Their last actions, shape (n, a).
             rows: Which of all rows these are.
             out: Where to write them, shape (n, width), or None for a new tensor.
-
-        Returns:
-            Shape (n, width), float32.
         """
         floats = self._sensors[: len(sensors)].copy_(sensors)
         values = torch.index_select(floats, 1, self._source, out=out).mul_(self._scale).add_(self._offset)
@@ -99,7 +94,7 @@ def observation_groups(
     hidden: Sequence[Sequence[int]] | None = None,
     points: tuple[str, int] | None = None,
 ) -> tuple[ObservationGroup, ...]:
-    """Groups that hold for rows of all these classes.
+    """Groups that hold for all of a world's classes; entries of different kinds are in ``task``.
 
     Args:
         layouts: Of the world's slots.
@@ -107,10 +102,6 @@ def observation_groups(
         num_id_columns: Entries of the task id.
         hidden: Entries of each layout that are zero, as padding is.
         points: Name and entries of the cloud between the padded observation and the task id.
-
-    Returns:
-        In the order of their first entries. An entry that is of one kind in some classes and of another one in others
-        is in ``task``.
     """
     hidden = [()] * len(layouts) if hidden is None else hidden
     by_class = zip(*(_kinds(layout, width, zero) for layout, zero in zip(layouts, hidden, strict=True)), strict=True)

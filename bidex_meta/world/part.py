@@ -20,8 +20,7 @@ from bidex_meta.world.observations import Observer, Rule, clip
 class Controls:
     """Writes actions into a group's engine: position targets and base forces.
 
-    The action order is the appendix's: per hand 20 joints, 3 base translations, 3 base rotations; the right hand first
-    (Tables 9 and 11).
+    Order (Tables 9 and 11): right hand first, per hand 20 joints, 3 base translations, 3 base rotations.
     """
 
     def __init__(self, group: Group) -> None:
@@ -29,8 +28,7 @@ class Controls:
         self._engine, self._moving = engine, scene.task.moving_base
         low, high = (engine.ctrl.new_tensor(x) for x in (hand().control_low, hand().control_high))
         self._middle, self._half = 0.5 * (high + low), 0.5 * (high - low)
-        self._joints = len(low)
-        self._bodies = scene.base_bodies
+        self._joints, self._bodies = len(low), scene.base_bodies
         self._wrench = engine.ctrl.new_empty(engine.num, 6)
         for member in group.members:
             task = member.scene.task
@@ -40,8 +38,7 @@ class Controls:
     def write(self, action: Tensor) -> None:
         """Sets targets lo + (a + 1)/2 (hi - lo), and force (N) and torque (N m) at the bases, in the world frame.
 
-        Args:
-            action: Clean actions of the group's environments, shape (num, 52 or 40).
+        ``action``: clean, shape (num, 52 or 40).
         """
         action = action.to(self._engine.ctrl.dtype)
         share = action.shape[1] // len(SIDES)
@@ -55,14 +52,7 @@ class Controls:
 
 
 class Part:
-    """A group of environments with everything that turns engine numbers into transitions and back.
-
-    Attributes:
-        group: The environments and their engine.
-        substeps: Engine steps per control step.
-        engine_rows: Engine row of each environment of the world, -1 where it is not of this part, shape (num_envs,).
-        start_size: Numbers of a start: ``qpos`` and the poses of movable fixtures.
-    """
+    """A group of environments with everything that turns engine numbers into transitions and back."""
 
     def __init__(
         self,
@@ -81,25 +71,24 @@ class Part:
             rule: What observations show.
             width: Entries of an observation with padding and task id.
             num_envs: Environments of the world.
-            sights: What environments of each of the world's slots see of objects; None: their state.
+            sights: Depth sensor of each of the world's slots; None: observations show objects' states.
         """
-        device = group.engine.device
-        self.engine_rows = torch.full((num_envs,), -1, device=device)
-        self.engine_rows[group.rows] = torch.arange(group.engine.num, device=device)
-        self.group, self._rule = group, rule
+        self.group, self._engine, self._rule, self._sights = group, group.engine, rule, sights
+        self.engine_rows = torch.full((num_envs,), -1, device=self._engine.device)
+        """Engine row of each environment of the world, -1 where it is not of this part, shape (num_envs,)."""
+        self.engine_rows[group.rows] = torch.arange(self._engine.num, device=self._engine.device)
         self.substeps = round(1.0 / (CONTROL_RATE * group.members[0].scene.model.opt.timestep))
-        self._engine = group.engine
+        """Engine steps per control step."""
         self._controls = Controls(group)
-        self._start = torch.stack([torch.from_numpy(m.scene.start_qpos) for m in group.members]).to(group.engine.qpos)
+        self._start = torch.stack([torch.from_numpy(m.scene.start_qpos) for m in group.members]).to(self._engine.qpos)
         self.start_size = self._start.shape[1]
+        """Numbers of a start: ``qpos`` and the poses of movable fixtures."""
         for member in group.members:
             tasks = slots[member.slot].tasks
             checked.formulas(member.scene, tasks, self._engine.sensordata, observed=rule != "masked")
         self._observer = Observer(group.members[0].scene, self._start_mounts(), width)
-        self._sights = sights
         if sights is not None:
-            group.engine.body_poses()  # from now on the engine gives them
-        self._pools: list[dict[str, Tensor]] = []
+            self._engine.body_poses()  # from now on the engine gives them
         self.set_pools(slots)
 
     def _start_mounts(self) -> Tensor:
@@ -138,11 +127,9 @@ class Part:
         return self._engine.unstable()
 
     def states(self, task_index: Tensor, rows: Tensor | None = None) -> Iterator[tuple[Member, slice, TaskState]]:
-        """The members among the chosen rows, the slice of their rows, and their state.
+        """The members among some rows, the slice of their rows, and their state.
 
-        Args:
-            task_index: Task of each of the part's environments, shape (num,).
-            rows: Chosen engine rows in ascending order, or None for all.
+        ``task_index``: task of each of the part's environments, (num,); ``rows``: engine rows, ascending, None for all.
         """
         for i, member, where, chosen in self._members(rows):
             frozen = self.frozen(i, task_index[chosen])
@@ -166,13 +153,10 @@ class Part:
         rows: Tensor | None = None,
         out: Tensor | None = None,
     ) -> Tensor:
-        """Observations of rows (None: all) without the task id, shape (n, width), float32.
+        """Observations of engine rows (ascending; None: all) without the task id, shape (n, width), float32.
 
-        Args:
-            states: What ``states`` gave for these rows.
-            action: Last actions of these rows, shape (n, a).
-            rows: Engine rows in ascending order.
-            out: Where to write them, shape (n, width), or None for a new tensor.
+        ``states`` is what ``states()`` returned for these rows, ``action`` their last actions (n, a); ``out`` (n,
+        width) is written into where it is given.
         """
         chosen = slice(None) if rows is None else rows
         values = self._observer(self._engine.sensordata[chosen], action, chosen, out)
@@ -226,10 +210,10 @@ def judge(task: TaskClass, state: TaskState) -> Judgement:
 def collect(
     parts: Iterable[Part], task_index: Tensor, action: Tensor, width: int, with_id: Callable[[Tensor, Tensor], Tensor]
 ) -> Transition:
-    """Judges and observes all environments after a step.
+    """Judges and observes all environments after a step; each part is taken when its turn comes.
 
     Args:
-        parts: The world's parts; each is taken when its turn comes.
+        parts: The world's parts.
         task_index: Task of each environment, shape (n,).
         action: Actions of the step, shape (n, a).
         width: Entries of an observation.
