@@ -26,11 +26,8 @@ class Timestep(NamedTuple):
     observation: Tensor
     """Observations the actions were chosen for, ``(num_envs, observation)``."""
     action: Tensor
-    """What ``adapt_action`` returned, ``(num_envs, action)``."""
     reward: Tensor
-    """Rewards, ``(num_envs,)``."""
     terminated: Tensor
-    """Bool ``(num_envs,)``: the episode came to a true end."""
     truncated: Tensor
     """Bool ``(num_envs,)``: the episode was cut, by its time limit or since it was long enough to adapt."""
     aux_policy_outputs: dict[str, Tensor]

@@ -227,21 +227,15 @@ def make_task_world(
 ) -> World:
     """A world of one class as it is on its own: goal visible, no one-hot, no padding, 50 tasks drawn by the seed.
 
-    Args:
-        task_name: A task class, e.g. `"HandOver"` (which alone has a fixed base: 398 observations, 40 actions), or
-            `"package.module:Class"` of your own (docs/own-task.md).
-        num_envs: As in `Benchmark.make_world`, as are `device`, `autoreset_mode`, `threads`, `engine` and `stagger`.
-        device: See `num_envs`.
-        seed: Chooses the tasks, the starts and the task draws.
-        autoreset_mode: See `num_envs`.
-        threads: See `num_envs`.
-        task_sampling: `"uniform"`: each episode draws a task; `"fixed"`: environment j keeps task j modulo 50. Left
-            out: uniform in training worlds, fixed in evaluation worlds.
-        moving_base: Drive the hands' bases or fix them; left out, as the class has it on its own.
-        engine: See `num_envs`.
-        stagger: See `num_envs`.
-        points: Points of the cloud shown in the place of the object's state (docs/points.md); 0: the state.
-        object: In the place of its own: a name, or an MJCF file (docs/objects.md); in the slot's name behind a dash.
+    `task_name` is a task class, e.g. `"HandOver"` (which alone has a fixed base: 398 observations, 40 actions), or
+    `"package.module:Class"` of your own (docs/own-task.md). Beside the arguments of `Benchmark.make_world`:
+
+    - `task_sampling`: `"uniform"`: each episode draws a task; `"fixed"`: environment j keeps task j modulo 50. Left
+    out:
+      uniform in training worlds, fixed in evaluation worlds.
+    - `moving_base`: drive the hands' bases or fix them; left out, as the class has it on its own.
+    - `points`: points of the cloud shown in the place of the object's state (docs/points.md); 0: the state.
+    - `object`: in the place of its own: a name, or an MJCF file (docs/objects.md); in the slot's name behind a dash.
 
     Raises BidexError for an unknown class or object, too few environments, an unknown mode, device or engine.
     """

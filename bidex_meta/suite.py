@@ -40,7 +40,6 @@ class ListedTask:
     name: str
     """Unique within its class, e.g. `"left"`."""
     split: Split
-    """The split it belongs to."""
     fixed: Mapping[str, float]
     """Given components of the variation (metres and radians, world frame); the others are drawn by the seed."""
 
@@ -52,11 +51,8 @@ class SuiteClass:
     name: str
     """What it is called in the suite, e.g. `"CatchUnderarm"` or, with an object, `"CatchUnderarm-block"`."""
     class_name: str
-    """The task class, e.g. `"CatchUnderarm"`."""
     splits: tuple[Split, ...]
-    """Where it appears: train, test or both."""
     reward_scale: float
-    """Factor on the reward the learner sees."""
     gamma: float | None
     """Discount per step of this class; None: the learner's own."""
     tasks: tuple[ListedTask, ...]
@@ -70,27 +66,22 @@ class Suite:
     """A suite file, checked."""
 
     name: str
-    """E.g. `"MT4"`."""
     version: int
     """The `-vN` of the Gymnasium id; goes up when results change."""
     kind: Literal["multi-task", "meta"]
     """Multi-task suites have a train split only; meta suites both, without a task in common."""
     description: str
-    """One line for lists."""
     observation: Literal["plain", "one-hot", "masked"]
     """What is done to the padded observation: nothing, task id appended, goal entries zeroed."""
     task_id: Literal["class", "task"]
     """What one entry of the one-hot stands for: a class or a listed task."""
     reward: Literal["paper"]
-    """Which reward formulas."""
     base: Literal["moving", "alone"]
     """Whether every class gets the moving base, or each what it has on its own."""
     tasks_per_class: int | None
     """Tasks drawn per class and split; None when every class lists its tasks."""
     classes: tuple[SuiteClass, ...]
-    """In the order of environments, one-hot and task lists."""
     file: Path
-    """Where it was read from."""
     points: int = 0
     """Points of the cloud that observations show in the place of objects' states; 0: they show the states."""
     point_kinds: bool = False

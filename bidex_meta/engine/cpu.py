@@ -50,7 +50,7 @@ class CpuEngine:
         self.num = len(rows)
         self._after_step = mujoco.mjtStage.mjSTAGE_VEL if refresh else mujoco.mjtStage.mjSTAGE_NONE
         # MuJoCo would print each broken row to stderr and to a log file in the working folder; unstable() reports it.
-        mujoco.set_mju_user_warning(_silent)
+        mujoco.set_mju_user_warning(lambda message: None)
         threads = default_threads() if threads is None else threads
         self._batch = mujoco.batch.Batch(models[0], self.num, nthread=threads, persistent=True)
         self._forked = False
@@ -65,7 +65,11 @@ class CpuEngine:
         self._mocap = [self._state[name] for name in ("mocap_pos", "mocap_quat") if name in self._state]
         self._failed = torch.zeros(self.num, dtype=torch.bool)
         self._numbers = torch.from_numpy(self._batch.state)
-        self._quaternions = self._quaternion_columns(models[0])
+        columns = [self._column("qpos") + quaternion_columns(models[0])]
+        if self._mocap:
+            columns.append(self._column("mocap_quat") + np.arange(4 * models[0].nmocap))
+        self._quaternions = torch.from_numpy(np.concatenate(columns))
+        """Columns of ``_numbers`` that hold quaternions, four for each, shape (4 k,)."""
         self._models, self._model_of = list(models), list(rows)
         self._probe: mujoco.MjData | None = None
         self._poses: tuple[Tensor, Tensor] | None = None
@@ -79,13 +83,6 @@ class CpuEngine:
                 "they are not. Make it with threads=1, or in the child."
             )
         return self._batch
-
-    def _quaternion_columns(self, model: mujoco.MjModel) -> Tensor:
-        """Columns of the batch's numbers that hold quaternions, four for each, shape (4 k,)."""
-        columns = [self._column("qpos") + quaternion_columns(model)]
-        if self._mocap:
-            columns.append(self._column("mocap_quat") + np.arange(4 * model.nmocap))
-        return torch.from_numpy(np.concatenate(columns))
 
     def _column(self, name: str) -> int:
         return (self._state[name].data_ptr() - self._numbers.data_ptr()) // self._numbers.element_size()
@@ -208,7 +205,3 @@ def _after_fork() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_after_fork)
-
-
-def _silent(message: str) -> None:
-    """Swallows MuJoCo's warnings: the counters that ``unstable`` reads hold the same facts."""

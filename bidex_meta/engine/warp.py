@@ -83,7 +83,9 @@ class WarpEngine:
         self._failed_view.zero_()
 
     def _put(self, capacity: Capacity) -> None:
-        _check_sensors(self._models[0])
+        kinds = {mujoco.mjtSensor(kind).name for kind in self._models[0].sensor_type if kind not in _SENSORS}
+        if kinds:
+            raise BidexError(f"Expected sensors among {_SENSOR_NAMES}, got {', '.join(sorted(kinds))}.")
         self._m = _put_models([_adapted(model) for model in self._models], self._rows)
         self._m.opt.warn_overflow = 0  # unstable() reports it; printing from kernels wrecks the speed
         self._m.opt.ccd_tolerance.fill_(_CCD_TOLERANCE)
@@ -307,9 +309,3 @@ def _put_static_frames(data: mjw.Data, models: Sequence[mujoco.MjModel], rows: S
     for name in ("xquat", "xmat", "ximat", "geom_xpos", "geom_xmat"):
         array = getattr(data, name)
         array.assign(np.stack([getattr(x, name) for x in frames])[rows].reshape(array.numpy().shape))
-
-
-def _check_sensors(model: mujoco.MjModel) -> None:
-    unknown = sorted({mujoco.mjtSensor(kind).name for kind in model.sensor_type if kind not in _SENSORS})
-    if unknown:
-        raise BidexError(f"Expected sensors among {_SENSOR_NAMES}, got {', '.join(unknown)}.")

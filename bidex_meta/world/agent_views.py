@@ -39,13 +39,9 @@ class AgentView:
 def agent_views(groups: Sequence[ObservationGroup], num_actions: int, agents: Agents) -> tuple[AgentView, ...]:
     """The agents of a world, in the order of the partition; ``hands`` and ``fingers`` begin with the right hand.
 
-    Args:
-        groups: The world's ``observation_groups``.
-        num_actions: Entries of its action.
-        agents: ``single``, ``hands``, ``fingers``, a TOML file, or units by agent. A world without hands has the units
-            ``action/0``, ``action/1``, ..., and shows every agent everything.
-
-    Raises BidexError for a unit that is unknown, missing or there twice, and where only some bases move.
+    ``agents`` is ``single``, ``hands``, ``fingers``, a TOML file, or units by agent; a world without hands has the
+    units ``action/0``, ``action/1``, ..., and shows every agent everything. Raises BidexError for a unit that is
+    unknown, missing or there twice, and where only some bases move.
     """
     units, views = _units(groups, num_actions), []
     for name, own in _units_of_agents(units, partition_line(agents)).items():
@@ -56,7 +52,6 @@ def agent_views(groups: Sequence[ObservationGroup], num_actions: int, agents: Ag
 
 
 def _joined(parts: Iterable[slice]) -> tuple[slice, ...]:
-    """Ascending ranges, those side by side as one."""
     found: list[slice] = []
     for part in parts:
         if found and found[-1].stop == part.start:

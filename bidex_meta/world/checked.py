@@ -75,13 +75,7 @@ def clean(action: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def state(given: Any, own: Mapping[str, Any], slots: Sequence[Slot], task_id: Tensor) -> list[Slot]:
-    """The slots with a saved state's pools of tasks.
-
-    Args:
-        given: The saved state of a world built alike.
-        own: The state of the world that takes it.
-        slots: Its slots.
-        task_id: Slot of each of its environments, shape (n,).
+    """The slots with the pools of a saved state, checked against the world's own state and slots (task_id: (n,)).
 
     Raises BidexError for another world's state, or a damaged one.
     """
@@ -102,12 +96,9 @@ def state(given: Any, own: Mapping[str, Any], slots: Sequence[Slot], task_id: Te
 
 
 def fits(given: Any, own: Mapping[str, Any], inside: str = "") -> None:
-    """Raises BidexError where a saved state has other names, types or shapes than a world's own, or non-finite numbers.
+    """Raises BidexError where a saved state has other names, types or shapes than the own one, or non-finite numbers.
 
-    Args:
-        given: The saved state.
-        own: That of the world that takes it: tensors, plain values, and mappings of such.
-        inside: Where in a larger state both stand.
+    ``inside``: where in a larger state both stand.
     """
     if not isinstance(given, Mapping) or not own.keys() <= given.keys():
         got = sorted(map(str, given)) if isinstance(given, Mapping) else type(given).__name__
@@ -142,13 +133,8 @@ def _check_tensor(name: str, given: object, own: Tensor) -> None:
 def formulas(scene: Scene, tasks: np.ndarray, sensors: Tensor, observed: bool) -> None:
     """Calls a class's methods once, for a few rows of its first task and sensors that all read 0.
 
-    Args:
-        scene: Its scene.
-        tasks: Its pool of variations, shape (n, variation_space.size).
-        sensors: Any tensor of the engine's precision and device.
-        observed: Whether ``observe`` is called too.
-
-    Raises BidexError with class, method, the expected and the returned where a method returns something else.
+    ``sensors`` has the engine's precision and device; ``observed``: whether ``observe`` is called too. Raises
+    BidexError with class, method, the expected and the returned where a method returns something else.
     """
     task = scene.task
     name = type(task).__name__
@@ -179,7 +165,6 @@ def _named(where: str, given: object) -> dict[str, Tensor]:
 
 
 def _check_shape(where: str, value: object, *sizes: int | None, kind: torch.dtype | None = None) -> None:
-    """Refuses all but tensors of ``_ROWS`` times ``sizes`` (None: any); ``kind`` None: of any numbers."""
     expected = (_ROWS, *sizes)
     if isinstance(value, Tensor):
         pairs = zip(expected, value.shape, strict=False)

@@ -75,7 +75,7 @@ class ForeignWorld(BatchedWorld):
 
     @abstractmethod
     def _place(self, mask: Tensor) -> None:
-        """Puts the environments of a mask at the start of ``task_index`` and writes their states into ``_obs``."""
+        """Starts ``task_index`` in the environments of a mask and writes their states into ``_obs``."""
 
     def _finish(self, active: Tensor, broken: Tensor, made: Transition) -> tuple[Tensor, Tensor, Tensor, Info]:
         step = super()._finish(active, broken, made)

@@ -9,12 +9,13 @@ from torch import Tensor
 from bidex_meta.hands.hand import FORCE_PER_SCALE, SIDES, TORQUE_PER_SCALE, hand
 from bidex_meta.points.depth_sensor import DepthSensor
 from bidex_meta.tasks.base import CONTROL_RATE, TaskClass
+from bidex_meta.tasks.layout import CLIP
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.utils.maths import xyzw
 from bidex_meta.world import checked
 from bidex_meta.world.base import Transition
 from bidex_meta.world.groups import Group, Member, Slot
-from bidex_meta.world.observations import Observer, Rule, clip
+from bidex_meta.world.observations import Observer, Rule
 
 
 class Controls:
@@ -63,15 +64,9 @@ class Part:
         num_envs: int,
         sights: list[DepthSensor] | None = None,
     ) -> None:
-        """Prepares controls and observers.
+        """``slots``, ``rule``, ``width`` (with padding and task id) and ``num_envs`` are the world's.
 
-        Args:
-            group: The environments and their engine.
-            slots: The world's slots.
-            rule: What observations show.
-            width: Entries of an observation with padding and task id.
-            num_envs: Environments of the world.
-            sights: Depth sensor of each of the world's slots; None: observations show objects' states.
+        ``sights``: depth sensor of each of its slots; None: observations show objects' states.
         """
         self.group, self._engine, self._rule, self._sights = group, group.engine, rule, sights
         self.engine_rows = torch.full((num_envs,), -1, device=self._engine.device)
@@ -98,15 +93,14 @@ class Part:
             mounts[member.engine_rows] = xyzw(mounts.new_tensor([task.right.quaternion, task.left.quaternion]))
         return mounts
 
-    def set_pools(self, slots: list[Slot]) -> None:
-        """Takes over the slots' pools of tasks."""
+    def set_pools(self, slots: list[Slot]) -> None:  # noqa: D102
         self._pools = [
             m.scene.task.freeze(torch.as_tensor(slots[m.slot].tasks).to(self._engine.sensordata))
             for m in self.group.members
         ]
 
     def frozen(self, member: int, task_index: Tensor) -> dict[str, Tensor]:
-        """Frozen numbers of environments of a member, by their tasks' indices in the pool."""
+        """Frozen numbers of a member's environments, by their tasks' indices in the pool."""
         return {name: values[task_index] for name, values in self._pools[member].items()}
 
     def control(self, action: Tensor) -> None:
@@ -169,15 +163,13 @@ class Part:
             for member, where, _ in states:
                 own = member.engine_rows if rows is None else rows[where]
                 self._sights[member.slot].show(values[where], position[own], rotation[own])
-        return clip(values)
+        return values.clamp_(-CLIP, CLIP)
 
     def starts(self, rows: Tensor | None, draws: Tensor, task_index: Tensor) -> Tensor:
         """Start positions of episodes, shape (n, start_size): a pure function of the draws and the tasks.
 
-        Args:
-            rows: Engine rows in ascending order, shape (n,); None: every row equally often, one after the other.
-            draws: Their uniform numbers in [-1, 1], shape (n, at least the classes' start_draws).
-            task_index: Their tasks, shape (n,).
+        ``rows``: engine rows (n,), ascending; None: every row equally often, one after the other. ``draws``: uniform
+        numbers in [-1, 1], (n, at least the classes' start_draws). ``task_index``: (n,).
         """
         qpos = self._engine.qpos.new_empty(len(draws), self.start_size)
         each = len(draws) // self._engine.num if rows is None else 1
@@ -212,12 +204,8 @@ def collect(
 ) -> Transition:
     """Judges and observes all environments after a step; each part is taken when its turn comes.
 
-    Args:
-        parts: The world's parts.
-        task_index: Task of each environment, shape (n,).
-        action: Actions of the step, shape (n, a).
-        width: Entries of an observation.
-        with_id: Writes the task id into observations (k, d) of environments (k,) and returns them.
+    ``task_index`` (n,) and ``action`` (n, a) are of the step, ``width`` of observations; ``with_id`` writes the task id
+    into observations (k, d) of environments (k,) and returns them.
     """
     n, device = len(action), action.device
     reward, obs = torch.empty(n, device=device), torch.empty(n, width, device=device)

@@ -44,17 +44,13 @@ class EnvRecipe:
     """A task class as a suite has it: what decides observations and rewards."""
 
     name: str
-    """What it is called in the suite."""
     moving_base: bool | None
     """Whether the hands' bases are driven; None: as the class has it alone."""
     options: tuple[tuple[str, float | str], ...]
-    """What else the suite chose of the class."""
     padded_size: int
     """Entries of an observation, without a point cloud."""
     hides_goal: bool
-    """Whether the goal entries are zero."""
     reward_scale: float
-    """Factor on the reward."""
     class_name: str | None = None
     """The task class, where it is called otherwise: with an object."""
     points: tuple[int, bool] = (0, False)
@@ -86,15 +82,9 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
     has `success` (1.0 or 0.0 in this state), `unscaled_reward` and `unstable` (physics broke: the episode is
     truncated).
 
-    Args:
-        render_mode: None or `"rgb_array"`.
-        camera_name: `"front"` (default), `"side"`, `"top"` or `"back"`; `camera_id` is its index in that list instead.
-        camera_id: See `camera_name`.
-        width: Of pictures, pixels, as `height`.
-        height: See `width`.
-        reward_function_version: There is one reward, the paper's; `"v2"`, Meta-World's default, is taken for it.
-
-    Raises BidexError for another render mode, camera or reward.
+    `render_mode` is None or `"rgb_array"`; `camera_name` is `"front"` (default), `"side"`, `"top"` or `"back"`, or
+    `camera_id` its index in that list; pictures have `width` x `height` pixels. There is one reward, the paper's:
+    `reward_function_version="v2"`, Meta-World's default, stands for it. Raises BidexError for another of these.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_RATE}  # noqa: RUF012  (Gymnasium's own convention)

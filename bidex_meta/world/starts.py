@@ -40,13 +40,10 @@ class Starts:
     def take(self, mask: Tensor, number: Tensor, task_index: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
         """The starts of the rows in ``mask``, bool (n,).
 
-        Args:
-            mask: Rows whose episodes begin.
-            number: Number of the episode that begins, or would begin next, of every row, shape (n,).
-            task_index: Task that every row keeps where none is drawn, shape (n,).
-
-        Returns task (n,) and elapsed share in [0, 1) (n,) of every row, and for each part the starts (k, start_size) of
-        its k rows in the mask, or of all its rows where the engine is masked; all of them valid where the mask is true.
+        ``number``: of the episode that begins, or would begin next, of every row, (n,); ``task_index``: task that a row
+        keeps where none is drawn. Returns task and elapsed share in [0, 1) of every row, (n,), and for each part the
+        starts (k, start_size) of its k rows in the mask, or of all where the engine is masked; all valid where the mask
+        is true.
         """
         if self._masked:
             return self._take_masked(number, task_index)

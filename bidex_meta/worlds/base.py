@@ -27,28 +27,21 @@ _ADAPTING_SIZE_AND_STEPS = (300, 20_000_000)
 
 @dataclass(frozen=True)
 class WorldConfig:
-    """Which worlds, and how they are made. One of ``suite`` and ``task`` names them."""
+    """Which worlds (one of ``suite`` and ``task``; ``base`` and ``object`` are of a single class) and how they run."""
 
     suite: str | None = None
-    """Name or path of a suite."""
     task: str | None = None
-    """A task class on its own, where there is no suite."""
     base: Base = "own"
-    """Whether the bases of a single class move."""
     points: int = 0
     """Points of the cloud in place of objects' states; 0: as the suite has it."""
     object: str | None = None
-    """The object of a single class; None: its own."""
     seed: int = 0
     """Of starts, and of tasks without ``task_seed``."""
     task_seed: int | None = None
     """Of tasks and starts instead."""
     device: str = "cpu"
-    """Of this process."""
     threads: int | None = None
-    """Of the engine; None: one per core."""
     engine: str = "auto"
-    """auto, c or warp."""
 
     @staticmethod
     def of(config: "Mapping[str, Any] | WorldConfig") -> "WorldConfig":
@@ -64,11 +57,9 @@ class Worlds(ABC):
     hides_goals: bool = False
     """Whether it is a meta suite, whose goals have to be found out."""
     suite: Suite | None = None
-    """The suite's file, where there is one."""
     class_name: str | None = None
     """The class, where it is a single one."""
     object: str | None = None
-    """The object of a single class, where it is not its own."""
     moving_base: bool | None = None
     """Whether the bases of a single class move; None: as it has them."""
     on_gpu: ClassVar[bool] = True
