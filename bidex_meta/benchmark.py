@@ -170,16 +170,17 @@ class Benchmark:
             task_sampling="fixed" if mode.name == "DISABLED" or self.suite.kind == "meta" else "uniform",
             threads=threads,
             stagger=stagger,
-            points=_points_rule(self.suite.points, self.suite.point_kinds),
+            points=PointsRule(self.suite.points, self.suite.point_kinds) if self.suite.points else None,
         )
 
     def _draw(self, entry: SuiteClass, split: Split) -> list[Task]:
         # By the class's name, so that all objects of a class have the same goals.
         space, key = self._classes[entry.name].variation_space, entry.class_name
         if entry.tasks:
-            listed = [task for task in entry.tasks if task.split == split]
-            return [Task.from_variation(entry.name, _listed(space, self.seed, key, task)) for task in listed]
-        return _drawn(space, self.seed, key, split, self.suite.tasks_per_class or 0, entry.name)
+            variations = [_listed(space, self.seed, key, task) for task in entry.tasks if task.split == split]
+        else:
+            variations = _drawn(space, self.seed, key, split, self.suite.tasks_per_class or 0)
+        return [Task.from_variation(entry.name, variation) for variation in variations]
 
     def _env_classes(self, split: Split) -> dict[str, type[SuiteEnv]]:
         moving, hides = True if self.suite.base == "moving" else None, self.suite.observation == "masked"
@@ -242,7 +243,7 @@ def make_task_world(
     task_name, mode = registry.resolve(task_name), checked_mode(autoreset_mode)
     task_class = registry.get(task_name, moving_base, **registry.with_object(object))
     tasks = _drawn(task_class.variation_space, whole_number("seed", seed, 0), task_name, "train", _TASKS_ALONE)
-    slot = Slot(name_with_object(task_name, object), task_class, np.stack([task.variation for task in tasks]))
+    slot = Slot(name_with_object(task_name, object), task_class, tasks)
     return World(
         [slot],
         num_envs,
@@ -253,12 +254,8 @@ def make_task_world(
         task_sampling=task_sampling or ("fixed" if mode.name == "DISABLED" else "uniform"),
         threads=threads,
         stagger=stagger,
-        points=_points_rule(whole_number("points", points, 0, MOST_POINTS)),
+        points=PointsRule(points) if whole_number("points", points, 0, MOST_POINTS) else None,
     )
-
-
-def _points_rule(count: int, kinds: bool = False) -> PointsRule | None:
-    return PointsRule(count, kinds) if count else None
 
 
 def _task_class(suite: Suite, entry: SuiteClass) -> TaskClass:
@@ -279,11 +276,8 @@ def _generator(*key: object) -> np.random.Generator:
     return np.random.Generator(np.random.Philox(np.random.SeedSequence(int.from_bytes(digest, "little"))))
 
 
-def _drawn(
-    space: VariationSpace, seed: int, name: str, split: Split, count: int, called: str | None = None
-) -> list[Task]:
-    variations = space.sample(_generator(seed, name, split), count)
-    return [Task.from_variation(called or name, variation) for variation in variations]
+def _drawn(space: VariationSpace, seed: int, name: str, split: Split, count: int) -> np.ndarray:
+    return space.sample(_generator(seed, name, split), count)
 
 
 def _listed(space: VariationSpace, seed: int, name: str, task: ListedTask) -> np.ndarray:

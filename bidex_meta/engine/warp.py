@@ -220,13 +220,8 @@ class WarpEngine:
     def _begin(self) -> None:
         d = self._d
         mjw.reset_data(self._m, d, reset=self._mask)
-        wp.launch(
-            kernels.place,
-            dim=self.num,
-            inputs=[self._mask, self._start, LARGEST],
-            outputs=[d.qpos, d.mocap_pos, d.mocap_quat, self._guard.failed],
-            device=self._device,
-        )
+        inputs, outputs = [self._mask, self._start, LARGEST], [d.qpos, d.mocap_pos, d.mocap_quat, self._guard.failed]
+        wp.launch(kernels.place, dim=self.num, inputs=inputs, outputs=outputs, device=self._device)
         self._refresh()
 
     def _play(self, name: str, work: Callable[[], None]) -> None:

@@ -194,15 +194,15 @@ class BatchedWorld(VectorEnv, ABC):
         ``broken``: those of them whose action was not finite; of these nothing is read.
         """
 
-    def _finish(self, active: Tensor, broken: Tensor, made: Transition) -> tuple[Tensor, Tensor, Tensor, Info]:
-        obs, unstable = made.obs, made.unstable | broken
+    def _finish(self, active: Tensor, broken: Tensor, transition: Transition) -> tuple[Tensor, Tensor, Tensor, Info]:
+        obs, unstable = transition.obs, transition.unstable | broken
         valid = active & ~unstable
-        success = made.success & ~unstable
-        unscaled = torch.where(valid, made.reward, 0.0)
+        success = transition.success & ~unstable
+        unscaled = torch.where(valid, transition.reward, 0.0)
         reward = unscaled * self._scale
         episodes = self.episodes
         episodes.add(active, reward, unscaled, success)
-        terminated = made.failed & valid | episodes.terminated
+        terminated = transition.failed & valid | episodes.terminated
         late = (episodes.elapsed >= self.max_episode_steps) & ~terminated
         truncated = (late | unstable) & active | episodes.truncated
         ended = (terminated | truncated) & active
@@ -217,8 +217,8 @@ class BatchedWorld(VectorEnv, ABC):
             "so_far": episodes.statistics(),
             "counted": ended & episodes.counts,
         }
-        if made.terms:
-            info["reward_terms"] = {name: torch.where(valid, term, 0.0) for name, term in made.terms.items()}
+        if transition.terms:
+            info["reward_terms"] = {name: torch.where(valid, term, 0.0) for name, term in transition.terms.items()}
         if self._masked or ended.any():
             info |= ended_info(info)
         self._obs = obs.clone()

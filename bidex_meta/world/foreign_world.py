@@ -77,8 +77,8 @@ class ForeignWorld(BatchedWorld):
     def _place(self, mask: Tensor) -> None:
         """Starts ``task_index`` in the environments of a mask and writes their states into ``_obs``."""
 
-    def _finish(self, active: Tensor, broken: Tensor, made: Transition) -> tuple[Tensor, Tensor, Tensor, Info]:
-        step = super()._finish(active, broken, made)
+    def _finish(self, active: Tensor, broken: Tensor, transition: Transition) -> tuple[Tensor, Tensor, Tensor, Info]:
+        step = super()._finish(active, broken, transition)
         self._success = step[3]["success"].clone()
         return step
 

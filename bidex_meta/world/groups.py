@@ -120,7 +120,8 @@ def build_groups(slots: list[Slot], rows: list[slice], make_engine: EngineMaker)
 def sights(groups: list[Group], rule: PointsRule, first: int) -> list[DepthSensor]:
     """The depth sensor of each slot, in the slots' order; ``first``: where in an observation the clouds begin."""
     scenes = {m.slot: (m.scene, group.engine.device) for group in groups for m in group.members}
-    sensors = {id(scene): DepthSensor(scene, rule, first, device) for scene, device in scenes.values()}
+    unique = {id(scene): (scene, device) for scene, device in scenes.values()}
+    sensors = {key: DepthSensor(scene, rule, first, device) for key, (scene, device) in unique.items()}
     return [sensors[id(scenes[slot][0])] for slot in sorted(scenes)]
 
 

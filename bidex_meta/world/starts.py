@@ -31,9 +31,8 @@ class Starts:
         self._first = torch.full((num,), -_AHEAD, device=device)
         self._task_index = torch.zeros(num, _AHEAD, dtype=torch.int64, device=device)
         self._elapsed_share = torch.zeros(num, _AHEAD, dtype=torch.float64, device=device)
-        self._qpos = [
-            torch.zeros(p.group.engine.num, _AHEAD, p.start_size, dtype=torch.float64, device=device) for p in parts
-        ]
+        shapes = [(part.group.engine.num, _AHEAD, part.start_size) for part in parts]
+        self._qpos = [torch.zeros(shape, dtype=torch.float64, device=device) for shape in shapes]
         self._masked = parts[0].group.engine.masked
         self._takes = 0
 
