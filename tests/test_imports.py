@@ -28,7 +28,7 @@ ORDER = (
     ("bidex_meta",),  # the package's own names
     ("witness", "data", "worlds"),
     ("train",),
-    ("speed", "viewer"),
+    ("viewer",),
     tuple(
         f"bidex_algos.{name}" for name in ("advantages", "balancing", "replay", "rollout", "step_size", "trust_region")
     ),
