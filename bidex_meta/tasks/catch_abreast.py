@@ -6,16 +6,14 @@ from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import HandPose
-from bidex_meta.tasks.eggs import OneEgg
+from bidex_meta.tasks.eggs import EggTask, left_anchor
 from bidex_meta.tasks.state import TaskState
-from bidex_meta.utils.maths import constant, norm
 
-_ANCHORS = {"right": (-0.3, -0.55, 0.5), "left": (-0.3, -1.15, 0.5)}
-_ANCHOR_RADIUS = 0.1
+_ANCHORS = ((-0.3, -0.55, 0.5), (-0.3, -1.15, 0.5))
 _TILT = 0.3925
 
 
-class CatchAbreast(OneEgg):
+class CatchAbreast(EggTask):
     """Throw an egg sideways between two palms that lie side by side, tilted to each other.
 
     Observation: Table 16 (422). Reward: equation 5. The episode also fails when a palm is 0.1 m off its anchor.
@@ -29,8 +27,8 @@ class CatchAbreast(OneEgg):
     left = HandPose((0.0, -1.15, 0.5), (0.0, -_TILT, -0.5 * math.pi))
     transition_scale = 0.5
     orientation_scale = 1.0
-    egg_start = (-0.39, -0.55, 0.54)
-    goal_centre = (-0.39, -1.15, 0.54)
+    starts = ((-0.39, -0.55, 0.54),)
+    goals = ((-0.39, -1.15, 0.54),)
     position_noise = 0.0
     joint_noise = 0.0
     floor = 0.2
@@ -39,8 +37,4 @@ class CatchAbreast(OneEgg):
 
     def failed(self, state: TaskState) -> Tensor:
         """The egg dropped, or a palm has left its anchor."""
-        dropped = super().failed(state)
-        for side, anchor in _ANCHORS.items():
-            palm = state[f"{side}/palm_position"]
-            dropped = dropped | (norm(palm - constant(anchor, palm)) >= _ANCHOR_RADIUS)
-        return dropped
+        return left_anchor(state, "palm_position", _ANCHORS, super().failed(state))

@@ -6,14 +6,11 @@ from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_UP_BACK, HandPose
-from bidex_meta.tasks.eggs import OneEgg
+from bidex_meta.tasks.eggs import EggTask, left_anchor
 from bidex_meta.tasks.state import TaskState
-from bidex_meta.utils.maths import constant, norm
-
-_ANCHOR_RADIUS = 0.1
 
 
-class CatchOver2Underarm(OneEgg):
+class CatchOver2Underarm(EggTask):
     """Throw an egg from an upright hand down to an upturned palm.
 
     Observation: Table 12 (422). Reward: equation 3 with alpha 20. The episode also fails when a mount is 0.1 m off its
@@ -30,11 +27,11 @@ class CatchOver2Underarm(OneEgg):
     left = HandPose((0.0, -0.8, 0.5), PALM_UP_BACK)
     transition_scale = 0.1
     orientation_scale = 2.0
-    egg_start = (0.0, 0.05, 1.03)
-    goal_centre = (0.0, -0.40, 0.55)
+    starts = ((0.0, 0.05, 1.03),)
+    goals = ((0.0, -0.40, 0.55),)
     position_noise = 0.0
     joint_noise = 0.0
-    lies_on_right_hand = False
+    lies_on_hand = False
     alpha = 20.0
     floor = 0.3
     camera_target = (0.0, -0.3, 0.7)
@@ -42,8 +39,5 @@ class CatchOver2Underarm(OneEgg):
 
     def failed(self, state: TaskState) -> Tensor:
         """The egg dropped, or a mount has left its anchor."""
-        dropped = super().failed(state)
-        for side, pose in (("right", self.right), ("left", self.left)):
-            mount = state[f"{side}/mount_position"]
-            dropped = dropped | (norm(mount - constant(pose.position, mount)) >= _ANCHOR_RADIUS)
-        return dropped
+        anchors = (self.right.position, self.left.position)
+        return left_anchor(state, "mount_position", anchors, super().failed(state))

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import mujoco
 import numpy as np
@@ -60,15 +60,10 @@ def attach(
     quaternion: tuple[float, float, float, float],
     colour: tuple[float, float, float, float] | None = None,
 ) -> None:
-    """Puts an object into a scene.
+    """Puts a part with a body called ``object`` into a scene, sensors and joints under the prefix ``name``.
 
-    Args:
-        scene: The scene.
-        part: The object: a body called ``object``.
-        name: Prefix of its sensors and joints.
-        position: Nominal start in the world, metres.
-        quaternion: Nominal orientation (w, x, y, z).
-        colour: Red, green, blue, alpha of its materials, or None to keep its own.
+    Nominal start in the world: position, metres, and quaternion (w, x, y, z). Without a colour (red, green, blue,
+    alpha) it keeps its own.
     """
     set_contact_bits(part.geoms, OBJECT)
     if colour is not None:
@@ -78,6 +73,22 @@ def attach(
     scene.attach(part, prefix=f"{name}/", frame=scene.worldbody.add_frame())
 
 
+class Table(NamedTuple):
+    """The table of a task.
+
+    Attributes:
+        size: Full edge lengths, metres.
+        centre: Its centre in the world, metres.
+        friction: Sliding friction.
+        priority: Above 0 the table's friction rules every contact with it; else the larger friction of a pair does.
+    """
+
+    size: tuple[float, float, float]
+    centre: tuple[float, float, float]
+    friction: float = 1.0
+    priority: int = 0
+
+
 def add_table(
     scene: mujoco.MjSpec,
     size: tuple[float, float, float],
@@ -85,15 +96,7 @@ def add_table(
     friction: float = 1.0,
     priority: int = 0,
 ) -> None:
-    """Adds a fixed box, the table of a task.
-
-    Args:
-        scene: The scene.
-        size: Full edge lengths, metres.
-        centre: Its centre in the world, metres.
-        friction: Sliding friction.
-        priority: Above 0 the table's friction rules every contact with it; else the larger friction of a pair does.
-    """
+    """Adds a fixed box, the table of a task; see ``Table``."""
     floor = scene.geom("floor")
     scene.worldbody.add_geom(
         name="table",
@@ -130,25 +133,17 @@ class Scene:
 
     @cached_property
     def sensors(self) -> dict[str, slice]:
-        """Sensor name to its slice of ``sensordata``."""
         m = self.model
-        return {
-            m.sensor(i).name: slice(a, a + n) for i, (a, n) in enumerate(zip(m.sensor_adr, m.sensor_dim, strict=True))
-        }
+        return {m.sensor(i).name: slice(a := m.sensor_adr[i], a + m.sensor_dim[i]) for i in range(m.nsensor)}
 
     def sensor(self, name: str) -> slice:
-        """Its slice of ``sensordata``.
-
-        Raises:
-            BidexError: The scene has no such sensor.
-        """
+        """Its slice of ``sensordata``; raises BidexError where the scene has no such sensor."""
         if name not in self.sensors:
             raise unknown_sensor(name, self.sensors)
         return self.sensors[name]
 
     @cached_property
     def qpos(self) -> dict[str, slice]:
-        """Name of a part to its slice of a start."""
         found: dict[str, slice] = {}
         for side in SIDES:
             first = self.model.joint(f"{side}/{hand().joints[0]}").qposadr[0]
@@ -174,7 +169,6 @@ class Scene:
 
     @cached_property
     def base_bodies(self) -> tuple[int, int]:
-        """Body ids of the two bases, right and left."""
         right, left = (self.model.body(f"{side}/base").id for side in SIDES)
         return right, left
 
@@ -202,9 +196,8 @@ def build_spec(task: "TaskClass") -> mujoco.MjSpec:
 
 
 def _let_objects_fall(spec: mujoco.MjSpec) -> None:
-    """Gives weight to objects alone; the hands float, as in the original."""
-    # Compensating gravity on the hands' 52 bodies costs 8 % of a step. Hardly any gravity, with a compensation a
-    # million times as large on a few objects, costs nothing.
+    # Objects alone have weight; the hands float, as in the original. Compensating gravity on the hands' 52 bodies costs
+    # 8 % of a step. Hardly any gravity, with a compensation a million times as large on a few objects, costs nothing.
     for body in spec.bodies:
         if body.name != "world" and not body.name.startswith(tuple(f"{side}/" for side in SIDES)):
             body.gravcomp = _FALL
