@@ -9,7 +9,7 @@ from bidex_meta.tasks.base import FAST
 from bidex_meta.tasks.bucket import inside_bucket, stands
 from bidex_meta.tasks.layout import Block, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, placed
-from bidex_meta.tasks.reach import ReachTask, apart, reach
+from bidex_meta.tasks.reach import ReachTask, apart
 from bidex_meta.tasks.scene import SceneObject, Table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import join
@@ -46,6 +46,9 @@ class GraspAndPlace(ReachTask):
         SceneObject("bucket", "bucket", (0.0, 0.2, 0.657)),
         SceneObject("block", "cube", (0.0, -0.2, 0.625), colour=(0.85, 0.43, 0.30, 1.0)),
     )
+    points = ("block/position", "bucket/position")
+    exponential = True
+    terms = ("left", "right", "target")
     camera_target = (0.1, 0.0, 0.68)
     camera_distance = 1.7
     variation_space = join(placed("bucket"), placed("block"))
@@ -59,13 +62,6 @@ class GraspAndPlace(ReachTask):
 
     def target(self, state: TaskState) -> Tensor:
         return 2.0 * torch.exp(-10.0 * apart(state, "bucket/position", "block/position"))
-
-    def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
-        return {
-            "left": torch.exp(-10.0 * reach(state, "left", "block/position")),
-            "right": torch.exp(-10.0 * reach(state, "right", "bucket/position")),
-            "target": self.target(state),
-        }
 
     def success(self, state: TaskState) -> Tensor:
         block, turn = state["block/position"][:, None], state.quaternion("bucket/quaternion")

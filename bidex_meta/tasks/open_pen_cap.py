@@ -13,7 +13,7 @@ from bidex_meta.tasks.base import THIN
 from bidex_meta.tasks.goals import frozen_goal
 from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, place, placed
-from bidex_meta.tasks.reach import ReachTask, apart, reach
+from bidex_meta.tasks.reach import ReachTask, apart
 from bidex_meta.tasks.scene import SceneObject, Table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.utils.maths import rotate, xyzw
@@ -47,6 +47,9 @@ class OpenPenCap(ReachTask):
     solver = replace(THIN, integrator=mujoco.mjtIntegrator.mjINT_IMPLICIT)
     table = Table((0.5, 1.0, 0.6), (0.0, 0.0, 0.3))
     objects = (_PEN,)
+    points = ("pen/body_position", "pen/cap_position")
+    constant = -0.8
+    exponential = True
     ghost = (0.012, 0.012, 0.012)
     camera_target = (0.12, 0.0, 0.66)
     variation_space = placed("pen")
@@ -66,16 +69,7 @@ class OpenPenCap(ReachTask):
         return {"pen": variation, **frozen_goal(torch.cat((cap, rotation), dim=1))}
 
     def target(self, state: TaskState) -> Tensor:
-        return 5.0 * _gap(state)
-
-    def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
-        left = torch.exp(-10.0 * reach(state, "left", "pen/body_position"))
-        right = torch.exp(-10.0 * reach(state, "right", "pen/cap_position"))
-        return {"left": left, "right": right, "target": self.target(state), "constant": torch.full_like(left, -0.8)}
+        return 5.0 * apart(state, *self.points)
 
     def success(self, state: TaskState) -> Tensor:
-        return _gap(state) > _OPEN
-
-
-def _gap(state: TaskState) -> Tensor:
-    return apart(state, "pen/body_position", "pen/cap_position")
+        return apart(state, *self.points) > _OPEN

@@ -36,6 +36,7 @@ class ReachTask(TaskClass):
         objects: Objects that a task shifts and turns and an episode jitters, in the order of variation and draws.
         points: Sensors of the points that the left and the right hand shall reach.
         constant: Constant of the reward.
+        exponential: Whether ``left`` and ``right`` are exp(-10 d_left) and exp(-10 d_right) instead.
         terms: Order in which the reward's terms are summed.
         ghost: Semi-axes of the ellipsoid that is the goal in pictures, metres; None: no goal is drawn.
     """
@@ -43,7 +44,8 @@ class ReachTask(TaskClass):
     table: ClassVar[Table]
     objects: tuple[SceneObject, ...]
     points: ClassVar[tuple[str, str]]
-    constant: ClassVar[float]
+    constant: ClassVar[float] = 0.0
+    exponential: ClassVar[bool] = False
     terms: ClassVar[tuple[str, ...]] = ("left", "right", "target", "constant")
     ghost: ClassVar[tuple[float, float, float] | None] = None
 
@@ -67,13 +69,11 @@ class ReachTask(TaskClass):
         """The reward's target term, (n,)."""
 
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
-        target, (left, right) = self.target(state), self.points
-        values = {
-            "left": -reach(state, "left", left),
-            "right": -reach(state, "right", right),
-            "target": target,
-            "constant": torch.full_like(target, self.constant),
-        }
+        target = self.target(state)
+        values = {"target": target, "constant": torch.full_like(target, self.constant)}
+        for side, point in zip(("left", "right"), self.points, strict=True):
+            distance = reach(state, side, point)
+            values[side] = torch.exp(-10.0 * distance) if self.exponential else -distance
         return {term: values[term] for term in self.terms}
 
     def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
