@@ -1,11 +1,9 @@
 """Points with normals on the visible surfaces of a scene, fixed to its bodies: the candidates of a cloud.
 
-Surfaces are of MuJoCo's primitives and meshes in a geom's own frame, sizes those of ``mjModel.geom_size`` (metres). The
-formulas are textbook geometry; even coverage comes from the additive recurrence R2 (Roberts 2018, "The Unreasonable
-Effectiveness of Quasirandom Sequences").
+Even coverage comes from the additive recurrence R2 (Roberts 2018, "The Unreasonable Effectiveness of Quasirandom
+Sequences").
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import mujoco
@@ -49,13 +47,9 @@ def area(model: mujoco.MjModel, geom: int) -> float:
 
 
 def surface(model: mujoco.MjModel, geom: int, count: int, offset: np.ndarray) -> Surface:
-    """Points spread over a geom's surface in proportion to area.
+    """Points spread over the surface of a geom, of a type in ``DRAWN``, in proportion to area.
 
-    Args:
-        model: The compiled model.
-        geom: A geom of a type in ``DRAWN``.
-        count: How many, n.
-        offset: Where the even numbers begin, (2,) in [0, 1).
+    ``offset``, (2,) in [0, 1), is where the even numbers begin.
     """
     size, kind = np.asarray(model.geom_size[geom], dtype=np.float64), int(model.geom_type[geom])
     if kind == _SPHERE:
@@ -85,7 +79,6 @@ def inside(model: mujoco.MjModel, geom: int, points: np.ndarray, margin: float) 
 
 
 def _sphere(u: np.ndarray) -> np.ndarray:
-    """Unit vectors (n, 3) from even numbers (n, 2)."""
     z, turn = 2.0 * u[:, 0] - 1.0, 2.0 * np.pi * u[:, 1]
     across = np.sqrt(1.0 - z * z)
     return np.stack((across * np.cos(turn), across * np.sin(turn), z), axis=1)
@@ -174,12 +167,7 @@ def _mesh(model: mujoco.MjModel, geom: int, u: np.ndarray) -> Surface:
     return (1.0 - root) * a + root * (1.0 - second) * b + root * second * c, normals[face]
 
 
-_OF_UNIT: dict[int, Callable[[np.ndarray, np.ndarray], Surface]] = {
-    _CAPSULE: _capsule,
-    _CYLINDER: _cylinder,
-    _BOX: _box,
-}
-
+_OF_UNIT = {_CAPSULE: _capsule, _CYLINDER: _cylinder, _BOX: _box}
 
 FIXTURE, HAND, OBJECT = -1.0, 0.0, 1.0
 """Kinds of points: what stands still in an episode; either hand; what physics moves."""
@@ -233,15 +221,9 @@ def body_kinds(model: mujoco.MjModel) -> list[float]:
 
 
 def sample(model: mujoco.MjModel, count: int, seed: int = 0) -> Surfaces:
-    """Spreads points over the visible surfaces of a model, by area within hands, objects and fixtures.
+    """Spreads ``count`` points over a model's visible surfaces, by area within hands, objects and fixtures.
 
-    Args:
-        model: The compiled scene.
-        count: Points, P.
-        seed: Seed of the points.
-
-    Raises:
-        BidexError: Fewer points than visible geoms, or none visible.
+    Raises BidexError for fewer points than visible geoms, or none visible.
     """
     geoms = visible_geoms(model)
     if not 0 < len(geoms) <= count:

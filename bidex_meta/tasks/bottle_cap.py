@@ -51,8 +51,7 @@ class BottleCap(OwnObjectClass):
     episode_steps = 125
     right = HandPose((0.0, -0.25, 0.45), (0.0, _TILT, 0.0))
     left = HandPose((0.0, -1.05, 0.5), (0.5, math.pi, math.pi))
-    transition_scale = 0.1
-    orientation_scale = 0.1
+    transition_scale, orientation_scale = 0.1, 0.1
     start_draws = DRAWS
     solver = FIRM
     table = Table((0.3, 0.3, 0.1), (0.0, -0.6, 0.05))

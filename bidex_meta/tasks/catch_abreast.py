@@ -25,15 +25,12 @@ class CatchAbreast(EggTask):
     episode_steps = 150
     right = HandPose((0.0, -0.55, 0.5), (0.0, _TILT, -0.5 * math.pi))
     left = HandPose((0.0, -1.15, 0.5), (0.0, -_TILT, -0.5 * math.pi))
-    transition_scale = 0.5
-    orientation_scale = 1.0
+    transition_scale, orientation_scale = 0.5, 1.0
     starts = ((-0.39, -0.55, 0.54),)
     goals = ((-0.39, -1.15, 0.54),)
-    position_noise = 0.0
-    joint_noise = 0.0
+    position_noise, joint_noise = 0.0, 0.0
     floor = 0.2
-    camera_target = (-0.25, -0.85, 0.5)
-    camera_distance = 1.4
+    camera_target, camera_distance = (-0.25, -0.85, 0.5), 1.4
 
     def failed(self, state: TaskState) -> Tensor:
         """The egg dropped, or a palm has left its anchor."""

@@ -25,17 +25,14 @@ class CatchOver2Underarm(EggTask):
     episode_steps = 75
     right = HandPose((0.0, 0.0, 0.5), (1.67, math.pi, 0.0))
     left = HandPose((0.0, -0.8, 0.5), PALM_UP_BACK)
-    transition_scale = 0.1
-    orientation_scale = 2.0
+    transition_scale, orientation_scale = 0.1, 2.0
     starts = ((0.0, 0.05, 1.03),)
     goals = ((0.0, -0.40, 0.55),)
-    position_noise = 0.0
-    joint_noise = 0.0
+    position_noise, joint_noise = 0.0, 0.0
     lies_on_hand = False
     alpha = 20.0
     floor = 0.3
-    camera_target = (0.0, -0.3, 0.7)
-    camera_distance = 1.6
+    camera_target, camera_distance = (0.0, -0.3, 0.7), 1.6
 
     def failed(self, state: TaskState) -> Tensor:
         """The egg dropped, or a mount has left its anchor."""

@@ -17,10 +17,8 @@ class CatchUnderarm(EggTask):
     episode_steps = 75
     right = HandPose((0.0, 0.0, 0.5), PALM_UP_AWAY)
     left = HandPose((0.0, -1.15, 0.5), PALM_UP_BACK)
-    transition_scale = 0.05
-    orientation_scale = 0.5
+    transition_scale, orientation_scale = 0.05, 0.5
     starts = ((0.0, -0.39, 0.54),)
     goals = ((0.0, -0.79, 0.54),)
-    position_noise = 0.01
-    joint_noise = 0.2
+    position_noise, joint_noise = 0.01, 0.2
     floor = 0.1

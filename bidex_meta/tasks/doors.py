@@ -44,14 +44,12 @@ class _Door(ReachTask):
     episode_steps = 250
     right = HandPose((0.55, 0.2, 0.6), PALM_LEFT_AHEAD)
     left = HandPose((0.55, -0.2, 0.6), PALM_RIGHT_AHEAD)
-    transition_scale = 0.5
-    orientation_scale = 0.5
+    transition_scale, orientation_scale = 0.5, 0.5
     start_draws = 0
     solver = FAST
     points = ("object/left_handle_position", "object/right_handle_position")
     constant = 0.2
-    camera_target = (0.05, 0.0, 0.68)
-    camera_distance = 2.0
+    camera_target, camera_distance = (0.05, 0.0, 0.68), 2.0
     blocks = (
         *object_blocks("object"),
         *goal_blocks("goal"),
@@ -140,8 +138,7 @@ class DoorCloseInward(_Close):
     inward = True
     right = HandPose((0.9, 0.5, 0.6), PALM_LEFT_AHEAD)
     left = HandPose((0.9, -0.5, 0.6), PALM_RIGHT_AHEAD)
-    camera_target = (0.3, 0.0, 0.65)
-    camera_distance = 2.3
+    camera_target, camera_distance = (0.3, 0.0, 0.65), 2.3
 
 
 class DoorOpenInward(_Open):

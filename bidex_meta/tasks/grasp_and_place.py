@@ -37,8 +37,7 @@ class GraspAndPlace(ReachTask):
     episode_steps = 500
     right = HandPose((0.55, 0.2, 0.8), PALM_DOWN_AHEAD)
     left = HandPose((0.55, -0.2, 0.8), PALM_DOWN_AHEAD)
-    transition_scale = 0.5
-    orientation_scale = 0.1
+    transition_scale, orientation_scale = 0.5, 0.1
     start_draws = 2 * DRAWS
     solver = FAST
     table = Table((1.0, 1.0, 0.6), (0.0, 0.0, 0.3))
@@ -49,8 +48,7 @@ class GraspAndPlace(ReachTask):
     points = ("block/position", "bucket/position")
     exponential = True
     terms = ("left", "right", "target")
-    camera_target = (0.1, 0.0, 0.68)
-    camera_distance = 1.7
+    camera_target, camera_distance = (0.1, 0.0, 0.68), 1.7
     variation_space = join(placed("bucket"), placed("block"))
     blocks = (
         *object_blocks("bucket"),

@@ -21,11 +21,9 @@ class HandOver(EggTask):
     right = HandPose((0.0, 0.0, 0.5), PALM_UP_AWAY)
     left = HandPose((0.0, -1.0, 0.5), PALM_UP_BACK)
     # With a moving base the figures of CatchUnderarm hold (docs/figures.md, decisions); the original gives none.
-    transition_scale = 0.05
-    orientation_scale = 0.5
+    transition_scale, orientation_scale = 0.05, 0.5
     starts = ((0.0, -0.39, 0.54),)
     goals = ((0.0, -0.64, 0.54),)
-    position_noise = 0.01
-    joint_noise = 0.2
+    position_noise, joint_noise = 0.01, 0.2
     floor = 0.2
     solver = GENTLE

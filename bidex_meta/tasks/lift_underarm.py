@@ -44,8 +44,7 @@ class LiftUnderarm(OwnObjectClass):
     episode_steps = 500
     right = HandPose((0.0, 0.05, 0.45), PALM_UP_AWAY)
     left = HandPose((0.0, -1.25, 0.45), PALM_UP_BACK)
-    transition_scale = 0.25
-    orientation_scale = 1.0
+    transition_scale, orientation_scale = 0.25, 1.0
     start_draws = DRAWS
     solver = FAST
     table = Table((0.3, 0.3, 0.4), (0.0, -0.6, 0.2), friction=3.0)
@@ -53,8 +52,7 @@ class LiftUnderarm(OwnObjectClass):
     points = ("object/left_handle_position", "object/right_handle_position")
     constant = 0.2
     ghost = (0.12, 0.12, 0.06)
-    camera_target = (0.0, -0.6, 0.55)
-    camera_distance = 1.5
+    camera_target, camera_distance = (0.0, -0.6, 0.55), 1.5
     variation_space = join(
         placed("object"),
         *(component(f"goal_{axis}", -_GOAL_SHIFT, _GOAL_SHIFT) for axis in "xy"),

@@ -47,8 +47,7 @@ class OpenScissors(ReachTask):
     episode_steps = 150
     right = HandPose((0.55, 0.2, 0.8), PALM_DOWN_AHEAD)
     left = HandPose((0.55, -0.2, 0.8), PALM_DOWN_AHEAD)
-    transition_scale = 0.5
-    orientation_scale = 0.1
+    transition_scale, orientation_scale = 0.5, 0.1
     start_draws = DRAWS
     solver = THIN
     table = Table((0.5, 1.0, 0.6), (0.0, 0.0, 0.3))

@@ -73,8 +73,7 @@ class PourWater(ReachTask):
     episode_steps = 125
     right = HandPose((0.55, 0.2, 0.6), PALM_LEFT_AHEAD)
     left = HandPose((0.55, -0.2, 0.6), PALM_RIGHT_AHEAD)
-    transition_scale = 0.5
-    orientation_scale = 0.1
+    transition_scale, orientation_scale = 0.5, 0.1
     start_draws = 2 * DRAWS
     solver = THIN
     table = Table((0.5, 1.0, 0.4), (0.0, 0.0, 0.2))
@@ -82,8 +81,7 @@ class PourWater(ReachTask):
     points = ("bucket/position", "kettle/handle_position")
     constant = 1.0
     terms = ("constant", "left", "right", "target")
-    camera_target = (0.1, -0.05, 0.5)
-    camera_distance = 1.4
+    camera_target, camera_distance = (0.1, -0.05, 0.5), 1.4
     variation_space = join(placed("kettle"), placed("bucket"))
     blocks = (
         *object_blocks("kettle"),

@@ -37,8 +37,7 @@ class PushBlock(ReachTask):
     episode_steps = 125
     right = HandPose((0.55, 0.2, 0.8), PALM_DOWN_AHEAD)
     left = HandPose((0.55, -0.2, 0.8), PALM_DOWN_AHEAD)
-    transition_scale = 0.5
-    orientation_scale = 0.1
+    transition_scale, orientation_scale = 0.5, 0.1
     start_draws = 2 * DRAWS
     solver = FAST
     table = Table((1.0, 1.0, 0.6), (0.0, 0.0, 0.3), _TABLE_FRICTION, priority=1)
@@ -49,8 +48,7 @@ class PushBlock(ReachTask):
     points = ("block1/position", "block2/position")
     constant = 2.0
     terms = ("constant", "left", "right", "target")
-    camera_target = (0.1, 0.0, 0.68)
-    camera_distance = 1.7
+    camera_target, camera_distance = (0.1, 0.0, 0.68), 1.7
     variation_space = join(placed("block1"), placed("block2"))
     blocks = (
         *object_blocks("block1"),

@@ -52,8 +52,7 @@ class ReOrientation(TaskClass):
     episode_steps = 600
     right = HandPose((0.0, 0.0, 0.5), PALM_UP_AWAY)
     left = HandPose((0.0, -1.15, 0.5), PALM_UP_BACK)
-    transition_scale = 0.05
-    orientation_scale = 0.5
+    transition_scale, orientation_scale = 0.05, 0.5
     start_draws = eggs.JOINT_DRAWS + 5
     solver = FIRM
     variation_space = orientation("goal")

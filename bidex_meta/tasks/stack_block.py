@@ -50,8 +50,7 @@ class StackBlock(ReachTask):
     episode_steps = 250
     right = HandPose((0.0, 0.6, 0.7), PALM_DOWN_AWAY)
     left = HandPose((0.0, -0.6, 0.7), PALM_DOWN_BACK)
-    transition_scale = 0.2
-    orientation_scale = 0.02
+    transition_scale, orientation_scale = 0.2, 0.02
     start_draws = 2 * DRAWS
     solver = FIRM
     table = Table((0.5, 1.0, 0.6), (0.0, 0.0, 0.3), _TABLE_FRICTION, priority=2)
@@ -62,8 +61,7 @@ class StackBlock(ReachTask):
     points = ("block1/position", "block2/position")
     constant = 1.5
     terms = ("constant", "left", "right", "target")
-    camera_target = (0.0, 0.0, 0.66)
-    camera_distance = 1.5
+    camera_target, camera_distance = (0.0, 0.0, 0.66), 1.5
     variation_space = join(
         placed("block1"),
         placed("block2"),

@@ -44,8 +44,7 @@ class SwingCup(OwnObjectClass):
     episode_steps = 300
     right = HandPose((0.35, 0.2, 0.8), PALM_LEFT_AHEAD)
     left = HandPose((0.35, -0.2, 0.8), PALM_RIGHT_AHEAD)
-    transition_scale = 0.1
-    orientation_scale = 0.1
+    transition_scale, orientation_scale = 0.1, 0.1
     start_draws = DRAWS
     solver = FIRM
     table = Table((0.3, 0.3, 0.6), (0.0, 0.0, 0.3))

@@ -49,8 +49,7 @@ class Switch(ReachTask):
     episode_steps = 125
     right = HandPose((0.55, 0.2, 0.8), PALM_DOWN_AHEAD)
     left = HandPose((0.55, -0.2, 0.8), PALM_DOWN_AHEAD)
-    transition_scale = 0.5
-    orientation_scale = 0.1
+    transition_scale, orientation_scale = 0.5, 0.1
     start_draws = 0
     solver = FAST
     table = Table((0.5, 1.0, 0.55), (0.0, 0.0, 0.275))
@@ -60,8 +59,7 @@ class Switch(ReachTask):
     )
     points = ("switch1/button_position", "switch2/button_position")
     constant = 2.0
-    camera_target = (0.08, 0.0, 0.70)
-    camera_distance = 1.1
+    camera_target, camera_distance = (0.08, 0.0, 0.70), 1.1
     variation_space = join(*(component(f"switch{i}_{axis}", -SHIFT, SHIFT) for i in (1, 2) for axis in "xy"))
     blocks = (
         *object_blocks("switch1"),

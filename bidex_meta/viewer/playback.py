@@ -14,17 +14,9 @@ from bidex_meta.world.rendering import Ghost, ghosts, simulation
 
 
 class Stage:
-    """Episodes one after the other, in all environments.
+    """Episodes one after the other, in all environments of a world in autoreset mode DISABLED, one of each slot.
 
-    Args:
-        world: In autoreset mode DISABLED, one environment of each slot.
-        agent: The policy.
-        row: The environment that is shown first.
-        seed: Of the starts.
-
-    Attributes:
-        names: Class of each environment.
-        row: The environment that is shown; may be set.
+    ``row`` is the environment that is shown, may be set; ``names`` has the class of each.
     """
 
     def __init__(self, world: World, agent: Agent, row: int = 0, seed: int = 0) -> None:
@@ -112,12 +104,7 @@ _PICTURES = 30
 
 
 class Screen(Protocol):
-    """A viewer.
-
-    Attributes:
-        paused: Whether time stands still.
-        speed: Of the clock, 1 in real time.
-    """
+    """A viewer; ``speed`` of the clock is 1 in real time."""
 
     paused: bool
     speed: float

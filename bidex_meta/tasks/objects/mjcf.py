@@ -1,7 +1,7 @@
 """An object's MJCF file from a user, checked before MuJoCo reads it, and the outline of what it collides with.
 
 MuJoCo opens whatever file a model names, so tags are allowed by a list: no entities, no includes, no file from another
-folder. The outline is a set of balls whose convex hull holds the colliding geoms: enough to lay an object on a hand.
+folder.
 """
 
 import math
@@ -32,15 +32,10 @@ _FOLDERS = ("meshdir", "texturedir", "assetdir")
 
 
 def read_own(path: Path, points: bool = False) -> mujoco.MjSpec:
-    """The specification in an MJCF file, with absolute paths of the files that it names.
+    """The specification in an MJCF file, with absolute paths of the files that it names; ``points`` allows sensors.
 
-    Args:
-        path: The file.
-        points: Whether it may have sensors.
-
-    Raises:
-        BidexError: It cannot be read, is no MJCF, has a tag that no object needs, or names a file that is missing or
-            outside its folder.
+    Raises BidexError where it cannot be read, is no MJCF, has a tag that no object needs, or names a file that is
+    missing or outside its folder.
     """
     content = read_bytes(path, "an object's MJCF file", _MOST_BYTES)
     _check_tags(path, content, _TAGS | _SENSOR_TAGS if points else _TAGS)
@@ -60,11 +55,7 @@ def read_own(path: Path, points: bool = False) -> mujoco.MjSpec:
 
 
 def compiled(path: Path, spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """The model of a specification.
-
-    Raises:
-        BidexError: MuJoCo refuses it (a size below zero, a mesh that is none, ...), or its numbers are not finite.
-    """
+    """The model of a specification; BidexError where MuJoCo refuses it or its numbers are not finite."""
     try:
         model = spec.copy().compile()
     except ValueError as error:
