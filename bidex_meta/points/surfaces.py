@@ -30,20 +30,16 @@ def even_numbers(count: int, offset: np.ndarray) -> np.ndarray:
 
 def area(model: mujoco.MjModel, geom: int) -> float:
     """Area of a geom's surface, m²; that of an ellipsoid to 1.1 % (Thomsen's formula)."""
-    a, b, c = (float(x) for x in model.geom_size[geom])
-    kind = int(model.geom_type[geom])
-    if kind == _SPHERE:
-        return 4.0 * np.pi * a * a
-    if kind == _CAPSULE:
-        return 4.0 * np.pi * a * (a + b)
-    if kind == _CYLINDER:
-        return 2.0 * np.pi * a * (a + 2.0 * b)
-    if kind == _BOX:
-        return 8.0 * (a * b + b * c + c * a)
-    if kind == _ELLIPSOID:
-        p = 1.6075
-        return 4.0 * np.pi * float((((a * b) ** p + (b * c) ** p + (c * a) ** p) / 3.0) ** (1.0 / p))
-    return float(_faces(model, geom)[1].sum())
+    (a, b, c), p, kind = (float(x) for x in model.geom_size[geom]), 1.6075, int(model.geom_type[geom])
+    if kind == _MESH:
+        return float(_faces(model, geom)[1].sum())
+    return {
+        _SPHERE: 4.0 * np.pi * a * a,
+        _CAPSULE: 4.0 * np.pi * a * (a + b),
+        _CYLINDER: 2.0 * np.pi * a * (a + 2.0 * b),
+        _BOX: 8.0 * (a * b + b * c + c * a),
+        _ELLIPSOID: 4.0 * np.pi * float((((a * b) ** p + (b * c) ** p + (c * a) ** p) / 3.0) ** (1.0 / p)),
+    }[kind]
 
 
 def surface(model: mujoco.MjModel, geom: int, count: int, offset: np.ndarray) -> Surface:
@@ -184,13 +180,8 @@ _BURIED = 5e-4
 class Surfaces:
     """P points fixed to bodies, those of a body side by side.
 
-    Attributes:
-        bodies: Bodies that carry points, ascending, (k,).
-        ends: Where each body's points end, (k,).
-        points: In the body's frame, metres, (P, 3).
-        normals: Outward, of length 1, in the body's frame, (P, 3).
-        kinds: FIXTURE, HAND or OBJECT, (P,).
-        geoms: The geom of each point, (P,).
+    Bodies that carry points, ascending, and where each body's points end, (k,); points, metres, and outward unit
+    normals in the body's frame, (P, 3); their kinds (FIXTURE, HAND or OBJECT) and geoms, (P,).
     """
 
     bodies: np.ndarray

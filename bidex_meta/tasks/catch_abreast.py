@@ -1,15 +1,12 @@
 """CatchAbreast: appendix A.2.5; docs/figures.md, classes."""
 
 import math
-
-from torch import Tensor
+from typing import ClassVar
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import HandPose
-from bidex_meta.tasks.eggs import EggTask, left_anchor
-from bidex_meta.tasks.state import TaskState
+from bidex_meta.tasks.eggs import EggTask
 
-_ANCHORS = ((-0.3, -0.55, 0.5), (-0.3, -1.15, 0.5))
 _TILT = 0.3925
 
 
@@ -30,8 +27,5 @@ class CatchAbreast(EggTask):
     goals = ((-0.39, -1.15, 0.54),)
     position_noise, joint_noise = 0.0, 0.0
     floor = 0.2
+    anchors: ClassVar = {"right/palm_position": (-0.3, -0.55, 0.5), "left/palm_position": (-0.3, -1.15, 0.5)}
     camera_target, camera_distance = (-0.25, -0.85, 0.5), 1.4
-
-    def failed(self, state: TaskState) -> Tensor:
-        """The egg dropped, or a palm has left its anchor."""
-        return left_anchor(state, "palm_position", _ANCHORS, super().failed(state))

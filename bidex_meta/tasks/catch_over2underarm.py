@@ -1,13 +1,11 @@
 """CatchOver2Underarm: appendix A.2.3; docs/figures.md, classes."""
 
 import math
-
-from torch import Tensor
+from typing import ClassVar
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_UP_BACK, HandPose
-from bidex_meta.tasks.eggs import EggTask, left_anchor
-from bidex_meta.tasks.state import TaskState
+from bidex_meta.tasks.eggs import EggTask
 
 
 class CatchOver2Underarm(EggTask):
@@ -32,9 +30,5 @@ class CatchOver2Underarm(EggTask):
     lies_on_hand = False
     alpha = 20.0
     floor = 0.3
+    anchors: ClassVar = {"right/mount_position": right.position, "left/mount_position": left.position}
     camera_target, camera_distance = (0.0, -0.3, 0.7), 1.6
-
-    def failed(self, state: TaskState) -> Tensor:
-        """The egg dropped, or a mount has left its anchor."""
-        anchors = (self.right.position, self.left.position)
-        return left_anchor(state, "mount_position", anchors, super().failed(state))

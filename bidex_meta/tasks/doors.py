@@ -35,9 +35,9 @@ class _Door(ReachTask):
 
     Leaf and handle of the right hand are those at +y. Success of the classes that open is measured along y, since a
     leaf alone makes a full distance of 0.5 m at 1.26 rad. A task freezes the door's place along y and one start angle
-    for both leaves, which start at rest; an episode draws nothing. The goal block holds the base pose, which is also
-    the object's. d_target is the full distance of the two handle points. The Inward classes have the same door turned
-    upside down, so that it swings towards the hands; their handle points lie behind the pulls that then face the hands.
+    for both leaves; an episode draws nothing. The goal block holds the base pose, also the object's. The Inward classes
+    have the same door upside down, so that it swings towards the hands; their handle points lie behind the pulls that
+    then face the hands.
     """
 
     inward: ClassVar[bool]

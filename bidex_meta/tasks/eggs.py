@@ -1,6 +1,7 @@
 """What the throwing and catching classes share: eggs, their goal poses, the exponential reward of equations 1 to 5."""
 
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Mapping
+from types import MappingProxyType
 from typing import ClassVar
 
 import mujoco
@@ -88,14 +89,9 @@ def put_down(
 ) -> None:
     """The start of an egg, in any orientation, or of an object in its place, on a broad side; clear of the hand.
 
-    Args:
-        place: Its positions (n, 7), written in place.
-        held: The object; None: an egg.
-        draws: As of ``start_egg``.
-        noise: Half width of the position noise, metres.
-        joints: Joint angles (n, 24) of the hand that it lies on, written in place; None where it lies on none: what
-            reaches further down than an egg then starts so much higher.
-        pose: Start pose of that hand.
+    Its positions (n, 7) and the joint angles (n, 24) of the hand that it lies on are written in place. Without joints
+    it lies on none: an object that reaches further down than an egg then starts so much higher. Draws and noise as of
+    ``start_egg``.
     """
     if held is None:
         start_egg(place, draws, noise)
@@ -129,6 +125,7 @@ class EggTask(TaskClass):
         lies_on_hand: Whether an egg starts on a palm, so that room is cleared for it.
         alpha: Weight of the distance in the reward, per metre.
         floor: The episode fails when an egg's height falls to this, metres.
+        anchors: The episode fails when a point is 0.1 m off its anchor (world, metres); by the point's sensor.
         numbers: Ends of the names of eggs and goals.
     """
 
@@ -141,6 +138,7 @@ class EggTask(TaskClass):
     lies_on_hand: ClassVar[bool] = True
     alpha: ClassVar[float] = 50.0
     floor: ClassVar[float]
+    anchors: ClassVar[Mapping[str, Point]] = MappingProxyType({})
     start_draws: ClassVar[int] = JOINT_DRAWS + 5
     numbers: ClassVar[tuple[str, ...]] = ("",)
     blocks = goal_object_blocks(("",))
@@ -149,8 +147,7 @@ class EggTask(TaskClass):
     def __init__(self, moving_base: bool | None = None, object: str = EGG) -> None:
         """Chooses the base and the object: ``"egg"``, a name of the shelf, or an MJCF file (docs/objects.md).
 
-        Raises:
-            BidexError: There is no such object, or its file holds none for a hand.
+        Raises BidexError where there is no such object, or its file holds none for a hand.
         """
         super().__init__(moving_base)
         self.held = held_object(object)
@@ -203,18 +200,13 @@ class EggTask(TaskClass):
         return (off < SUCCESS_DISTANCE).all(dim=0)
 
     def failed(self, state: TaskState) -> Tensor:
-        """An egg dropped: the reward is positive throughout, so an early end is never worth seeking."""
-        heights = torch.stack([state[f"object{i}/position"][:, 2] for i in self.numbers])
-        return (heights <= self.floor).any(dim=0)
+        """An egg dropped or a hand left: the reward is positive throughout, so an early end is never worth seeking."""
+        ends = [state[f"object{i}/position"][:, 2] <= self.floor for i in self.numbers]
+        for name, anchor in self.anchors.items():
+            point = state[name]
+            ends.append(norm(point - constant(anchor, point)) >= _ANCHOR_RADIUS)
+        return torch.stack(ends).any(dim=0)
 
     def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, Point]]:
         size = SEMI_AXES if self.held is None else self.held.half_extents
         return [(frozen[f"goal{i}"], size) for i in self.numbers]
-
-
-def left_anchor(state: TaskState, sensor: str, anchors: Iterable[Point], failed: Tensor) -> Tensor:
-    """``failed`` (n,), or where a point of the right or the left hand (``<side>/<sensor>``) is 0.1 m off its anchor."""
-    for side, anchor in zip(SIDES, anchors, strict=True):
-        point = state[f"{side}/{sensor}"]
-        failed = failed | (norm(point - constant(anchor, point)) >= _ANCHOR_RADIUS)
-    return failed

@@ -43,18 +43,15 @@ class PourWater(ReachTask):
     bucket's its origin.
 
     The goal of a bucket that stands on the table is the point on its axis 1 cm below the rim. It moves with the bucket,
-    but sinks by 5 cm for each that the bucket's floor is lifted, to 20 cm below its height on the table at most. A goal
-    fixed to the bucket would not ask for pouring: spout and goal meet as well when the kettle stands upright and the
-    bucket is lifted and tipped under it, since a distance does not tell which of the two is tilted. This goal is never
-    higher than the standing bucket's, 5.6 cm below the spout of an upright kettle on the table, and a bucket that is
-    lifted or tipped takes it under the table. What is left is to tilt the kettle over the bucket's rim: below 30
-    degrees, where no water leaves, the spout stays 3 cm off, at 40 degrees 2 cm; from 60 degrees on it gets there. The
-    goal's orientation is the kettle's at the task's start, tilted by 40 degrees towards the spout.
+    but sinks by 5 cm for each that the bucket's floor is lifted, to 20 cm below its height on the table at most: with a
+    goal fixed to the bucket, spout and goal would meet as well where the bucket is lifted and tipped under an upright
+    kettle. So only a kettle tilted over the rim gets near: below 30 degrees, where no water leaves, the spout stays 3
+    cm off, at 40 degrees 2 cm; from 60 degrees on it gets there. The goal's orientation is the kettle's at the task's
+    start, tilted by 40 degrees towards the spout.
 
     A task shifts and turns kettle and bucket, and the water with the kettle. Water is drops of 5 mm radius without
     friction, which no observation shows: twelve by default, 1.4 times the physics of HandOver; the paper's 30 take 2.4
-    times. The kettle has about the original's outline, a high floor and an open trough as spout, so that drops run out
-    at less than the goal's tilt. It weighs 1.5 kg; the original's 2.46 kg are those of the full body.
+    times. The kettle has about the original's outline and weighs 1.5 kg; the original's 2.46 kg are of the full body.
     """
 
     name = "PourWater"
@@ -94,8 +91,7 @@ class PourWater(ReachTask):
         """Chooses the base and the number of drops, 1 to 125."""
         super().__init__(moving_base)
         self.water = whole_number("water", water, 1, _MOST_WATER)
-        # Most seen in 600 states each of 12 drops, 30 and 125: contacts 41, 73, 246; convex 16, 34, 129; rows 103, 124,
-        # 282. So a drop adds 1.8, 1 and 1.6 at most.
+        # Measured for 12, 30 and 125 drops: a drop adds 1.8 contacts, 1 convex pair and 1.6 rows at most.
         more = max(0, water - 12)
         self.needs = Capacity(71 + 3 * more, 20 + more, 134 + 3 * more)
 
@@ -144,7 +140,7 @@ class PourWater(ReachTask):
 
 
 def _goal(state: TaskState) -> Tensor:
-    """Where the spout shall be, world, metres, shape (n, 3): the class's docstring says why it sinks."""
+    """Where the spout shall be, world, metres, (n, 3)."""
 
     def sunk() -> Tensor:
         x, y, height = state["bucket/mouth_position"].unbind(1)

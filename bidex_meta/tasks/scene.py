@@ -29,8 +29,7 @@ class SceneObject:
         name: Prefix of its sensors and joints in the scene.
         asset: File under assets/objects/, or an absolute path, without its ending. Its body is called ``object``; the
             joint of a free one is called ``free``.
-        position: Nominal start in the world, metres.
-        rpy: Nominal roll, pitch, yaw, radians; R = Rz(yaw) Ry(pitch) Rx(roll).
+        position: Nominal start in the world, metres, with ``rpy``, radians; R = Rz(yaw) Ry(pitch) Rx(roll).
         colour: Red, green, blue, alpha of its materials, or None to keep the asset's.
     """
 
@@ -47,7 +46,6 @@ class SceneObject:
 
     def add_to(self, scene: mujoco.MjSpec) -> None:
         """Puts the object into a scene at its nominal start."""
-        # An absolute path takes the place of what stands before it.
         part = mujoco.MjSpec.from_file(str(paths.assets_dir() / "objects" / f"{self.asset}.xml"))
         attach(scene, part, self.name, self.position, self.quaternion, self.colour)
 
@@ -106,11 +104,7 @@ def add_table(
         material="table",
         friction=[friction, 0.005, 0.001],
         priority=priority,
-        contype=floor.contype,
-        conaffinity=floor.conaffinity,
-        margin=floor.margin,
-        solref=floor.solref,
-        solimp=floor.solimp,
+        **{name: getattr(floor, name) for name in ("contype", "conaffinity", "margin", "solref", "solimp")},
     )
 
 
@@ -180,7 +174,7 @@ class Scene:
 
 
 def build_spec(task: "TaskClass") -> mujoco.MjSpec:
-    """The editable scene of a task class: floor, hands, objects."""
+    """The editable scene of a task class: floor, hands, objects. Objects alone have weight, as in the original."""
     spec = mujoco.MjSpec.from_file(str(paths.assets_dir() / "scene" / "scene.xml"))
     spec.modelname = task.name
     spec.option.iterations, spec.option.ls_iterations = task.solver.iterations, task.solver.line_search
@@ -189,30 +183,22 @@ def build_spec(task: "TaskClass") -> mujoco.MjSpec:
     set_contact_bits(spec.geoms, FIXTURE)
     add_hands(spec, task.right, task.left, task.moving_base)
     task.add_objects(spec)
-    _let_objects_fall(spec)
+    # Compensating gravity on the hands' 52 bodies costs 8 % of a step. Hardly any gravity, with a compensation a
+    # million times as large on a few objects, costs nothing.
+    for body in spec.bodies:
+        if body.name != "world" and not body.name.startswith(("right/", "left/")):
+            body.gravcomp = _FALL
     for geom in spec.geoms:
         geom.condim = min(geom.condim, task.solver.most_condim)
     return spec
-
-
-def _let_objects_fall(spec: mujoco.MjSpec) -> None:
-    # Objects alone have weight; the hands float, as in the original. Compensating gravity on the hands' 52 bodies costs
-    # 8 % of a step. Hardly any gravity, with a compensation a million times as large on a few objects, costs nothing.
-    for body in spec.bodies:
-        if body.name != "world" and not body.name.startswith(tuple(f"{side}/" for side in SIDES)):
-            body.gravcomp = _FALL
 
 
 def compile_scene(task: "TaskClass") -> Scene:
     """The compiled scene of a task class."""
     model = build_spec(task).compile()
     damp_bases(model)
-    _stiffen(model)
-    return Scene(task, model)
-
-
-def _stiffen(model: mujoco.MjModel) -> None:
-    """The assets state the stiffest contacts and limits that 1/240 s allows; a longer step allows softer ones alone."""
+    # The assets state the stiffest contacts and limits that 1/240 s allows; a longer step allows softer ones alone.
     factor = model.opt.timestep / _STATED_TIME_STEP
     for solref in (model.geom_solref, model.pair_solref, model.jnt_solref, model.dof_solref, model.tendon_solref_lim):
         solref[np.isclose(solref[:, 0], _STATED_SOLREF), 0] *= factor
+    return Scene(task, model)

@@ -33,8 +33,8 @@ class Stage:
 
     def _start(self, mask: torch.Tensor) -> None:
         self._agent.reset(mask)
-        chosen = mask.cpu().numpy()
-        self._steps[chosen], self._returns[chosen], self._success[chosen] = 0, 0.0, False
+        where = mask.cpu().numpy()
+        self._steps[where], self._returns[where], self._success[where] = 0, 0.0, False
 
     @torch.no_grad()
     def step(self) -> None:
@@ -115,15 +115,12 @@ class Screen(Protocol):
 
     def obey(self, stage: Stage) -> None:
         """Applies the user's requests since the last call to the stage."""
-        ...
 
     def show(self, stage: Stage) -> None:
         """Shows its present state."""
-        ...
 
     def close(self) -> None:
         """Ends the view."""
-        ...
 
 
 def play(stage: Stage, screen: Screen, seconds: float | None = None) -> None:
