@@ -1,6 +1,6 @@
-"""What the printed formulas are told with: MuJoCo's own frames and joints, in float64 with NumPy and SciPy.
+"""What the printed formulas are written with: MuJoCo's own frames and joints, in float64 with NumPy and SciPy.
 
-Nothing here or in the ``formulas_*`` modules imports the project. ``data`` is MuJoCo's own; a task is the dict of the
+Nothing here or in ``formulas`` imports the project. ``data`` is MuJoCo's own; a task is the dict of the
 numbers that it froze, by component name. Points on objects stand where the original puts them in the frame of the
 object's root body (docs/figures.md, classes and objects).
 """
@@ -25,6 +25,11 @@ class Judgement:
     success: bool
     failed: bool
     margin: float
+
+
+def within(terms: dict[str, float], *edges: float) -> Judgement:
+    """Solved where all edges are below zero; never failed."""
+    return Judgement(terms, max(edges) < 0, False, float(min(abs(edge) for edge in edges)))
 
 
 class Oracle:
@@ -132,12 +137,11 @@ def reach(data: mujoco.MjData, left: np.ndarray, right: np.ndarray) -> tuple[flo
 
 
 def linear(
-    data: mujoco.MjData, left: np.ndarray, right: np.ndarray, target: float, constant: float | None
+    data: mujoco.MjData, left: np.ndarray, right: np.ndarray, target: float, constant: float
 ) -> dict[str, float]:
     """Terms of the formulas of the form constant - d_left - d_right + target."""
     d_left, d_right = reach(data, left, right)
-    terms = {"left": -d_left, "right": -d_right, "target": target}
-    return terms if constant is None else terms | {"constant": constant}
+    return {"left": -d_left, "right": -d_right, "target": target, "constant": constant}
 
 
 def pose(position: np.ndarray, turn: Rotation) -> np.ndarray:

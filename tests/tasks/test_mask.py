@@ -1,4 +1,4 @@
-"""The mask means something: goals are told in multi-task worlds, hidden in meta ones (docs/figures.md, decisions)."""
+"""The mask: goals are shown in multi-task worlds and hidden in meta ones (docs/figures.md, decisions)."""
 
 import numpy as np
 import pytest
@@ -67,14 +67,6 @@ def test_shears_show_the_angle_that_is_missing() -> None:
     engine.reset(torch.ones(2, dtype=torch.bool), engine.placement()[:1].repeat(2, 1))
     obs, reward, *_ = world.step(torch.zeros(2, world.action_size))
     assert reward[0] != reward[1] and (obs[0] - obs[1]).abs().max() > 0.05
-
-
-@each_case
-def test_what_differs_are_goal_entries(name: str, moving: bool) -> None:
-    _, obs, _ = twins(name, moving, "plain")
-    goal = registry.get(name, moving).layout.goal_indices()
-    rest = [i for i in range(obs.shape[1]) if i not in set(goal)]
-    assert torch.equal(obs[1:, rest], obs[:1, rest].expand(len(obs) - 1, -1))
 
 
 def played(world: World) -> list[Tensor]:

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.tasks.formulas import FORMULAS
-from tests.tasks.formulas_blocks import BOTTOM, MOUTH
+from tests.tasks.formulas import BOTTOM, FORMULAS, MOUTH
 from tests.tasks.oracle import about_z, at, length, pose, shifted
 from tests.tasks.worlds import Lens, observe, scene_of, set_pose, task_of, world_of
 
