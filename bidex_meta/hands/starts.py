@@ -79,14 +79,8 @@ def make_room(joints: Tensor, position: Tensor, axis: Tensor, radius: float, hal
     The egg is a spheroid; its distance to the palm's plane and to the capsules of the four fingers is bounded from
     below by its support in the direction of its centre.
 
-    Args:
-        joints: Joint angles, rad, shape (n, 24).
-        position: Centre of the egg in the mount frame, metres, shape (n, 3).
-        axis: Its long axis in the mount frame, unit, shape (n, 3).
-        radius: Short semi-axis, metres.
-        half: Long semi-axis, metres.
-
-    Returns the joints with opened fingers and the egg's shift in the mount frame, metres, (n, 3).
+    Joint angles, rad, (n, 24); the egg's centre and long axis (unit) in the mount frame, (n, 3); its short and long
+    semi-axis. Returns the joints with opened fingers and the egg's shift in the mount frame, (n, 3). Lengths in metres.
     """
     axes = _palm_axes(joints)
     centre = _in_palm(position, joints, axes)

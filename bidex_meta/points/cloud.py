@@ -60,13 +60,10 @@ _CHUNK = 32
 
 @dataclass(frozen=True)
 class Sharpness:
-    """Tolerances of the visibility test.
+    """Tolerances of the visibility test in a depth buffer of ``pixels`` squared.
 
-    Attributes:
-        pixels: Width and height of the depth buffer.
-        depth: How far behind the nearest depth around its pixel a visible point may lie, metres.
-        slope: Addition for slanted surfaces, as a share of the change of depth across a pixel.
-        most: Largest such addition, metres.
+    A visible point may lie ``depth`` (m) behind the nearest one around its pixel, on slanted surfaces further by
+    a share ``slope`` of the change of depth across a pixel, at most ``most`` (m).
     """
 
     pixels: int = 128
@@ -81,13 +78,7 @@ class Cloud:
     A candidate is visible if it faces the camera, lies in its frustum, and nothing nearer was drawn around its pixel of
     a coarse depth buffer. Shapes depend on no value, so that CUDA graphs can hold it.
 
-    Args:
-        surfaces: The candidates, P.
-        camera: The depth camera.
-        count: Points of a cloud.
-        kinds: Whether each point has a fourth entry, its kind (``surfaces.FIXTURE``, ...).
-        device: Where to compute.
-        sharpness: Tolerances.
+    A cloud has ``count`` points; with ``kinds`` each has a fourth entry, its kind (``surfaces.FIXTURE``, ...).
     """
 
     def __init__(

@@ -55,10 +55,9 @@ CONTROL_RATE = 60
 
 
 class TaskClass(ABC):
-    """One of the manipulation tasks, batched over environments.
+    """One of the manipulation tasks, batched over environments: the first axis of all tensors, in engine precision.
 
-    The first axis of all tensors counts environments, in the engine's precision. A class has no loops over them and no
-    state: what a task freezes is in ``frozen``, what an episode draws is in ``draws``.
+    A class has no state: what a task freezes is in ``frozen``, what an episode draws is in ``draws``.
 
     Attributes:
         name: Name of the class, e.g. ``CatchUnderarm``.
@@ -67,10 +66,8 @@ class TaskClass(ABC):
         solved: When it counts as solved, one line.
         deviations: What differs from the appendix on purpose, a line each.
         episode_steps: Time limit, control steps.
-        right: Start pose of the right hand.
-        left: Start pose of the left hand.
-        transition_scale: Scale of the base forces (docs/figures.md, base).
-        orientation_scale: Scale of the base torques.
+        right: Start pose of the right hand; ``left`` of the left one.
+        transition_scale: Scale of the base forces (docs/figures.md, base); ``orientation_scale`` of the torques.
         start_draws: How many uniform numbers the start of an episode takes.
         variation_space: What a task of this class freezes; an attribute or a property.
         blocks: The observation behind both hands' blocks.
@@ -79,8 +76,7 @@ class TaskClass(ABC):
         solver: What the class asks of the contact solver.
         needs: Most contacts and constraint rows in 30,208 states under rough actions, for mujoco_warp's fixed room,
             by ``python -m tools.bench capacity --steps 30000``. A class that was not measured has the largest of all.
-        camera_target: Point that pictures look at, world, metres.
-        camera_distance: Distance of the camera from it, metres.
+        camera_target: Point that pictures look at, world, metres, from ``camera_distance``.
         depth_camera: Where the camera of point clouds stands and what it looks at, world, metres; None: it looks down
             at ``camera_target`` from the front.
     """

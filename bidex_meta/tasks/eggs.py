@@ -15,7 +15,7 @@ from bidex_meta.tasks.base import LIGHT, TaskClass
 from bidex_meta.tasks.goals import frozen_goal, observe_goal, rotation_difference
 from bidex_meta.tasks.layout import Block, goal_blocks, object_blocks
 from bidex_meta.tasks.objects.held import EGG, HeldObject, held_object
-from bidex_meta.tasks.scene import SceneObject
+from bidex_meta.tasks.scene import Point, SceneObject
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace, box, join, orientation
 from bidex_meta.utils.maths import conjugate, constant, norm, random_orientation, rotate, rotation_angle, wxyz, xyzw
@@ -30,7 +30,6 @@ GOAL_RANGE = 0.03
 """Half width of the goals' box, metres."""
 _ANCHOR_RADIUS = 0.1
 _GREEN = (0.45, 0.62, 0.30, 1.0)
-Point = tuple[float, float, float]
 
 
 def goal_object_blocks(numbers: Iterable[str]) -> tuple[Block, ...]:

@@ -25,8 +25,6 @@ class Block:
     """Consecutive entries of an observation.
 
     Attributes:
-        name: What it is, e.g. ``right_joint_position``.
-        size: Number of entries.
         sensors: Names of the sensors it is read from, in order; empty if the entries are computed.
         scale: Factor on the sensors' values.
         goal: Whether it shows the goal, so that meta suites zero it.

@@ -31,8 +31,7 @@ class OpenScissors(ReachTask):
     Observation: Table 30 (428). Reward: equation 14. The formula leaves the target angle open: a task freezes it (0 is
     34 degrees open; shut, where episodes start, is -0.59). The object pose is that of the left hand's half. The goal
     block is of the half that moves: its handle's point and its orientation at the target angle, with the other half
-    where it is now; the rotation difference is that half's too, so that it shows the missing angle. Were the other half
-    taken at the task's start, tasks with different angles would share a block.
+    where it is now; the rotation difference is that half's too, so that it shows the missing angle.
     """
 
     needs = Capacity(57, 0, 131)
@@ -98,5 +97,4 @@ def _opened(position: Tensor, rotation: Tensor, turn: Tensor) -> Tensor:
 
 
 def _missing(state: TaskState) -> Tensor:
-    """Distance (rad) of the hinge from the target angle, shape (n,)."""
     return state.once("missing", lambda: (state["scissors/angle"] - state.frozen["target"]).abs()[:, 0])

@@ -1,5 +1,6 @@
 """From a task class to a compiled model, and the addresses in it that the world reads and writes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -15,6 +16,8 @@ from bidex_meta.utils.maths import quaternion_from_rpy
 if TYPE_CHECKING:
     from bidex_meta.tasks.base import TaskClass
 
+Point = tuple[float, float, float]
+Colour = tuple[float, float, float, float]
 _STATED_TIME_STEP, _STATED_SOLREF = 1.0 / 240.0, 0.0084
 """Time step and contact time constant of the files under assets/, seconds."""
 _FALL = 1.0 + 1e6
@@ -35,9 +38,9 @@ class SceneObject:
 
     name: str
     asset: str
-    position: tuple[float, float, float]
-    rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    colour: tuple[float, float, float, float] | None = None
+    position: Point
+    rpy: Point = (0.0, 0.0, 0.0)
+    colour: Colour | None = None
 
     @property
     def quaternion(self) -> tuple[float, float, float, float]:
@@ -54,9 +57,9 @@ def attach(
     scene: mujoco.MjSpec,
     part: mujoco.MjSpec,
     name: str,
-    position: tuple[float, float, float],
-    quaternion: tuple[float, float, float, float],
-    colour: tuple[float, float, float, float] | None = None,
+    position: Point,
+    quaternion: Sequence[float],
+    colour: Colour | None,
 ) -> None:
     """Puts a part with a body called ``object`` into a scene, sensors and joints under the prefix ``name``.
 
@@ -81,19 +84,13 @@ class Table(NamedTuple):
         priority: Above 0 the table's friction rules every contact with it; else the larger friction of a pair does.
     """
 
-    size: tuple[float, float, float]
-    centre: tuple[float, float, float]
+    size: Point
+    centre: Point
     friction: float = 1.0
     priority: int = 0
 
 
-def add_table(
-    scene: mujoco.MjSpec,
-    size: tuple[float, float, float],
-    centre: tuple[float, float, float],
-    friction: float = 1.0,
-    priority: int = 0,
-) -> None:
+def add_table(scene: mujoco.MjSpec, size: Point, centre: Point, friction: float = 1.0, priority: int = 0) -> None:
     """Adds a fixed box, the table of a task; see ``Table``."""
     floor = scene.geom("floor")
     scene.worldbody.add_geom(

@@ -76,5 +76,4 @@ class SwingCup(OwnObjectClass):
 
 
 def _angle(state: TaskState) -> Tensor:
-    """Rotation from cup to goal, rad in [0, pi], shape (n,)."""
     return state.once("angle", lambda: rotation_angle(rotation_difference(state, "cup/quaternion")))

@@ -34,11 +34,7 @@ def colour(model: mujoco.MjModel, geom: int) -> tuple[float, float, float, float
 
 
 def shape(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3), metres, in the geom's frame, and triangles (m, 3) of a geom.
-
-    Raises:
-        BidexError: A height field or the like.
-    """
+    """Points (n, 3), metres, in the geom's frame, and triangles (m, 3) of a geom; BidexError for height fields."""
     make = import_module("trimesh.creation")  # of viser's packages
     kind, size = model.geom_type[geom], model.geom_size[geom]
     if kind == _TYPE.mjGEOM_MESH:

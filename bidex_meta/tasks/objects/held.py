@@ -16,7 +16,7 @@ from bidex_meta.errors import BidexError, known_name, shortened
 from bidex_meta.hands.poses import PALM_UP_AWAY, HandPose
 from bidex_meta.hands.starts import make_room_for
 from bidex_meta.tasks.objects.mjcf import check_collisions, compiled, extents, outline, read_own, set_contacts
-from bidex_meta.tasks.scene import attach
+from bidex_meta.tasks.scene import Colour, Point, attach
 from bidex_meta.utils import paths
 from bidex_meta.utils.files import expanded
 from bidex_meta.utils.maths import conjugate, constant, multiply, rotate, wxyz, xyzw
@@ -43,25 +43,19 @@ class HeldObject:
     name: str
     file: Path
     mass: float
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
+    low: Point
+    high: Point
     geoms: int
     centres: np.ndarray = field(repr=False, compare=False)
     radii: np.ndarray = field(repr=False, compare=False)
 
     @property
-    def half_extents(self) -> tuple[float, float, float]:
+    def half_extents(self) -> Point:
         """Extent from its origin along its axes, metres."""
         x, y, z = (max(-low, high) for low, high in zip(self.low, self.high, strict=True))
         return x, y, z
 
-    def add_to(
-        self,
-        scene: mujoco.MjSpec,
-        name: str,
-        position: tuple[float, float, float],
-        colour: tuple[float, float, float, float] | None = None,
-    ) -> None:
+    def add_to(self, scene: mujoco.MjSpec, name: str, position: Point, colour: Colour | None = None) -> None:
         """Puts it into a scene as a free body; arguments as of ``attach``."""
         part = read_own(self.file)
         body = part.worldbody.first_body()
@@ -185,11 +179,9 @@ def _loaded(file: Path, _state: tuple[int, int]) -> HeldObject:
 
 
 def _check_figures(file: Path, model: mujoco.MjModel, low: np.ndarray, high: np.ndarray) -> None:
-    mass, longest = float(model.body_mass[1]), float((high - low).max())
-    if not _MASS[0] <= mass <= _MASS[1]:
-        raise BidexError(
-            f"{file}: expected a mass of {_MASS[0]:g} to {_MASS[1]:g} kg, got {mass:.4g}. Mend mass or density."
-        )
+    mass, longest, (least, most) = float(model.body_mass[1]), float((high - low).max()), _MASS
+    if not least <= mass <= most:
+        raise BidexError(f"{file}: expected a mass of {least:g} to {most:g} kg, got {mass:.4g}. Mend mass or density.")
     if not _SHORTEST <= longest <= _LONGEST:
         raise BidexError(
             f"{file}: expected an object of {100 * _SHORTEST:g} to {100 * _LONGEST:g} cm on its longest side, which "
