@@ -198,7 +198,6 @@ class OpenScissors(Oracle):
     pivot = np.array((-0.0034, 0.0698, 0.0))
 
     def right(self, base: Goal, q: float) -> np.ndarray:
-        """The right handle with the root at a given pose and the hinge at q."""
         return base[0] + base[1].apply(self.pivot + about_z(q).apply((0.1, -0.2, 0.0)))
 
     def points(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
@@ -392,7 +391,6 @@ class StackBlock(Oracle):
         return {f"block{i} position": data.body(f"block{i}/object").xpos.copy() for i in (1, 2)}
 
     def targets(self, task: Task) -> tuple[np.ndarray, np.ndarray]:
-        """Where block 1 and block 2 shall be."""
         bottom = np.array((task["target_x"], task["target_y"], 0.625))
         return shifted(bottom, 0, 0, 0.05), bottom
 
@@ -435,7 +433,6 @@ class PourWater(Oracle):
 
     @staticmethod
     def water(data: mujoco.MjData) -> list[str]:
-        """Names of the drops."""
         bodies = [data.model.body(i).name for i in range(data.model.nbody)]
         return [name.removesuffix("/object") for name in bodies if name.startswith("water")]
 

@@ -33,13 +33,8 @@ def within(terms: dict[str, float], *edges: float) -> Judgement:
 
 
 class Oracle:
-    """A class's formulas.
-
-    Attributes:
-        body_of_goal: Goal, as the tables name it, to the body whose orientation is compared with it.
-        entering: Components of a variation that enter the reward of a given state (None: all of them).
-        deciding: Components that enter its success alone.
-    """
+    """A class's formulas: goals, as the tables name them, to the bodies whose orientation is compared with them, and
+    the components of a variation that enter the reward of a given state (None: all of them), or its success alone."""
 
     body_of_goal: Mapping[str, str] = MappingProxyType({})
     entering: frozenset[str] | set[str] | None = frozenset()
@@ -63,17 +58,14 @@ class Oracle:
 
 
 def frame(data: mujoco.MjData, body: str) -> Goal:
-    """Origin and orientation of a body."""
     return data.body(body).xpos.copy(), Rotation.from_quat(data.body(body).xquat, scalar_first=True)
 
 
 def at(data: mujoco.MjData, body: str, offset: tuple[float, float, float]) -> np.ndarray:
-    """World position of a point given in a body's frame."""
     return data.body(body).xpos + data.body(body).xmat.reshape(3, 3) @ np.array(offset)
 
 
 def angle(data: mujoco.MjData, joint: str) -> float:
-    """Position of a joint, m or rad."""
     return float(data.joint(joint).qpos[0])
 
 
@@ -90,7 +82,6 @@ def start(data: mujoco.MjData, name: str, task: Task) -> Goal:
 
 
 def about_z(yaw: float) -> Rotation:
-    """A turn about the vertical."""
     return Rotation.from_rotvec([0.0, 0.0, yaw])
 
 
@@ -111,7 +102,6 @@ def hand_point(data: mujoco.MjData, side: str) -> np.ndarray:
 
 
 def shifted(position: np.ndarray, x: float, y: float, z: float) -> np.ndarray:
-    """A position moved along the world's axes."""
     return position + np.array((x, y, z))
 
 
@@ -127,7 +117,6 @@ def some_tilt(rng: np.random.Generator, widest: float) -> Rotation:
 
 
 def length(vector: np.ndarray) -> float:
-    """Euclidean length."""
     return float(np.linalg.norm(vector))
 
 

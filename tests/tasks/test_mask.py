@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.tasks import registry
+from bidex_meta.tasks.hidden import hidden
 from bidex_meta.world import World
 from tests.tasks.formulas import FORMULAS
 from tests.tasks.worlds import each_case, engine_of, mixed_world, world_of
@@ -86,11 +87,11 @@ def played(world: World) -> list[Tensor]:
 def test_the_mask_zeroes_the_goal_and_nothing_else(name: str, moving: bool) -> None:
     goal = registry.get(name, moving).layout.goal_indices()
     plain, masked = (played(world_of(name, moving, 4, observation=rule)) for rule in ("plain", "masked"))
-    for seen, hidden in zip(plain, masked, strict=True):
+    for seen, zeroed in zip(plain, masked, strict=True):
         assert not goal or seen[:, goal].any(dim=1).all()
         wanted = seen.clone()
         wanted[:, goal] = 0.0
-        assert torch.equal(hidden, wanted)
+        assert torch.equal(zeroed, wanted)
 
 
 def test_the_mask_in_a_mixed_world() -> None:
@@ -99,14 +100,30 @@ def test_the_mask_in_a_mixed_world() -> None:
         played(mixed_world(2, observation=rule, pad_to=450)) for rule in ("plain", "masked", "one-hot")
     )
     world = mixed_world(2)
-    for seen, hidden, named in zip(plain, masked, told, strict=True):
+    for seen, zeroed, named in zip(plain, masked, told, strict=True):
         assert torch.equal(named[:, :450], seen)
         assert torch.equal(named[:, 450:], torch.eye(world.num_tasks).repeat_interleave(2, dim=0))
         for slot, rows in zip(world.slots, world.slot_rows, strict=True):
             layout = slot.task_class.layout
             wanted = seen[rows].clone()
             wanted[:, layout.goal_indices()] = 0.0
-            assert torch.equal(hidden[rows], wanted)
+            assert torch.equal(zeroed[rows], wanted)
             assert (seen[rows, layout.size :] == 0).all()
             goal = layout.goal_indices()
             assert not goal or (seen[rows][:, goal] != 0).any(dim=1).all()
+
+
+OPEN = {name for name in FORMULAS if name.startswith("Door")} | set(
+    ("BottleCap", "PushBlock", "OpenPenCap", "Switch", "PourWater", "GraspAndPlace")
+)
+"""The ten classes whose tasks are told apart by nothing that reward or success depends on, or by a fixture's place."""
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_what_the_mask_hides_is_what_the_formulas_use(name: str) -> None:
+    task, oracle = registry.get(name, True), FORMULAS[name]
+    entering = set(task.variation_space.names) if oracle.entering is None else oracle.entering
+    found = hidden(task)
+    assert set(found.reward) == entering - FIXTURES.get(name, set())
+    assert set(found.success) == set(oracle.deciding)
+    assert (not found.reward and not found.success) == (name in OPEN)

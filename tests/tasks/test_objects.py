@@ -58,14 +58,12 @@ def test_contacts_and_limits_are_as_stiff_as_the_time_step_allows(name: str) -> 
 
 
 def wait(world: World, steps: int) -> None:
-    """Lets time pass, bases unmoved."""
     for _ in range(steps):
         world.parts[0].step(torch.zeros(world.num_envs, world.action_size).double(), None)
     assert not engine_of(world).unstable().any()
 
 
 def joints_of(scene: Scene) -> list[str]:
-    """Joints of objects, but of water."""
     return [joint for joint in object_joints_of(scene) if not joint.startswith("water")]
 
 

@@ -32,7 +32,6 @@ class Start(NamedTuple):
 
 
 def tip(degrees: float) -> Rotation:
-    """A turn about the world's x axis."""
     return Rotation.from_rotvec([np.deg2rad(degrees), 0.0, 0.0])
 
 
@@ -91,7 +90,6 @@ def doors_close(at: Start) -> list[State]:
 
 
 def joint(name: str, good: float, *bad: float) -> Callable[[Start], list[State]]:
-    """States of one joint."""
 
     def states(at: Start) -> list[State]:
         return [State(f"{name} {q}", {name: np.array([q])}, q == good) for q in (good, *bad)]
