@@ -19,14 +19,10 @@ class RslRlVecEnv(VecEnv):
     """All environments of one world on its device; observations in the groups `policy` and `critic`.
 
     `extras`: `time_outs` (cut by the time limit or broken physics) and `log` (`EpisodeLog`; empty where none ended).
-
-    Args:
-        world: In autoreset mode SAME_STEP.
-        policy: The world's `observation_groups` for the policy; none: all. The critic gets everything.
-        cfg: A dict that rsl-rl's loggers store as the environment's config.
-        stagger: Shortened first episodes (docs/clients.md), which "Mean reward" counts and `log` does not.
-
-    Raises BidexError for another mode, an unknown group, or `episode_length_buf` set to no whole numbers from 0 on.
+    `policy` names the world's `observation_groups` for the policy, none: all; the critic gets everything. `cfg` is a
+    dict that rsl-rl's loggers store. `stagger`: shortened first episodes (docs/clients.md), which "Mean reward" counts
+    and `log` does not. Raises BidexError for another mode than SAME_STEP, an unknown group, or `episode_length_buf` set
+    to no whole numbers from 0 on.
     """
 
     def __init__(self, world: TaskWorld, policy: Sequence[str] = (), cfg: Any = None, stagger: bool = False) -> None:

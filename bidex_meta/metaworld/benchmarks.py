@@ -73,8 +73,7 @@ class ML20(_Shipped):
 def _suite(name: str, observation: Literal["plain", "one-hot", "masked"], classes: dict[Split, Sequence[str]]) -> Suite:
     splits: dict[str, tuple[Split, ...]] = {}
     for split, given in classes.items():
-        for entry in _named(given):
-            splits[entry] = (*splits.get(entry, ()), split)
+        splits |= {entry: (*splits.get(entry, ()), split) for entry in _named(given)}
     if not all(classes.values()):
         raise BidexError(f"{name}: expected at least one class in each list, got an empty one.")
     return Suite(

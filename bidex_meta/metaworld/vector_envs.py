@@ -150,24 +150,12 @@ def make_env(
     reward_alpha: float = 0.001,
     **options: Any,
 ) -> gymnasium.Env:
-    """One environment in Meta-World's wrappers: it draws its tasks itself.
+    """One environment in Meta-World's wrappers, by Meta-World's keywords: it draws its tasks itself.
 
-    Args:
-        recipe: The class, as a suite has it.
-        tasks: Tasks of that class.
-        seed: Of starts and task draws; None: another one each time.
-        max_episode_steps: A shorter time limit.
-        terminate_on_success: Whether an episode ends at its first success; `toggle_terminate_on_success` changes it.
-        use_one_hot: Append the one-hot of `env_id` among `num_tasks`.
-        env_id: Index in the one-hot.
-        num_tasks: Size of the one-hot.
-        recurrent_info_in_obs: Append the last action, the last reward and whether the episode ended.
-        normalize_reward_in_recurrent_info: That reward divided by 10.
-        task_select: `"random"`: a task drawn at each reset; `"pseudorandom"`: in turn, at `sample_tasks()`.
-        reward_normalization_method: Gymnasium's `NormalizeReward`, or Meta-World's exponential average.
-        normalize_observations: Gymnasium's `NormalizeObservation`.
-        reward_alpha: Of the exponential average.
-        **options: Those of `SuiteEnv`.
+    `seed` is of starts and task draws (None: another one each time); `use_one_hot` appends the one-hot of `env_id`
+    among `num_tasks`, `recurrent_info_in_obs` the last action, the last reward (divided by 10 if normalised) and
+    whether the episode ended. `task_select`: `"random"` draws a task at each reset, `"pseudorandom"` takes them in
+    turn, at `sample_tasks()`. Other options are those of `SuiteEnv`.
     """
     from metaworld import wrappers  # not needed by the package's other names
 

@@ -50,9 +50,9 @@ def train(
 ) -> int:
     """Trains until ``total_steps`` environment steps are done or ``total_seconds`` are up, whichever comes first.
 
-    Both include those of a run that is resumed. Time counts from the first world step to the end of an iteration, with
-    checkpoints: the iteration in which it is up is the last one, and there is at least one. Metrics get it as
-    ``Perf/training_time``.
+    Both include those of a run that is resumed (``spent_seconds``). Time counts from the first world step to the end of
+    an iteration, with checkpoints: the iteration in which it is up is the last one, and there is at least one. Metrics
+    get it as ``Perf/training_time``.
 
     SIGINT, SIGTERM or SIGHUP, in any process, finishes the current iteration, saves and returns; so does the end of the
     printed output's reader (BrokenPipeError of ``record``, ``watch`` or ``enough``). A second SIGINT or SIGTERM acts at
@@ -62,17 +62,14 @@ def train(
         learner: Made on ``world``.
         world: Its state is saved beside the learner's.
         total_steps: Environment steps in all.
-        record: Where metrics and checkpoints go; None in processes other than 0.
+        record: Where metrics and checkpoints go; in process 0 only, as ``watch`` and ``last``.
         total_seconds: Training time in all.
         spent_seconds: Training time of a resumed run before.
         checkpoint_seconds: Least time between two checkpoints, and never less than 50 times what the last one took to
             save: a replay makes them large. 0 saves after every iteration. One more is always saved at the end.
-        watch: Evaluates the learner after each iteration without changing it; its metrics join the iteration's, and its
-            time is no time of training. None in processes other than 0.
-        enough: Whether metrics of an iteration, the watch's too, end the training; process 0's decide. None in no
-            process or in all.
-        last: Metrics of the iteration before a resumed run: where they were enough, nothing is trained. None in
-            processes other than 0.
+        watch: Evaluates the learner after each iteration without changing it; adds metrics, and no training time.
+        enough: Whether metrics of an iteration end the training, by process 0's; None in no process or in all.
+        last: Metrics of the iteration before a resumed run: where they were enough, nothing is trained.
 
     Returns the number of the signal that ended the training early, SIGPIPE's where nobody reads what is printed, 0 if
     none did; where another process got it, SIGTERM's. Raises LostProcess where another process is gone; what was saved

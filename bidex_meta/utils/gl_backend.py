@@ -15,14 +15,11 @@ from typing import Any
 from bidex_meta.errors import BidexError
 
 _VARIABLE = "MUJOCO_GL"
+# Backends that need no screen, in the order they are tried, and the library of each; other values that MuJoCo knows.
 _LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
-"""Backends that need no screen, in the order they are tried, and the library of each."""
 _OTHERS = {"enable", "enabled", "on", "true", "1", "glfw", "glx", "disable", "disabled", "off", "false", "0"}
-"""Other values that MuJoCo knows on Linux."""
-_INSTALL = "Install one (Debian, Ubuntu: apt-get install libegl1 libosmesa6)"
-
-_impossible: str | None = None
-"""What ``MUJOCO_GL`` asked for and this machine does not have."""
+_INSTALL = "(Debian, Ubuntu: apt-get install libegl1 libosmesa6)"
+_impossible: str | None = None  # what ``MUJOCO_GL`` asked for and this machine does not have
 
 
 def set_aside_what_is_missing() -> None:
@@ -46,7 +43,7 @@ def prepare() -> None:
     if _impossible is not None:
         raise BidexError(
             f"{_VARIABLE}={_impossible} cannot be used here: expected egl, osmesa or glfw, and its library. "
-            "Unset it to take what there is, or install it (Debian, Ubuntu: apt-get install libegl1 libosmesa6)."
+            f"Unset it to take what there is, or install it {_INSTALL}."
         )
     from mujoco.rendering.classic import gl_context
 
@@ -62,7 +59,9 @@ def prepare() -> None:
         if reason is None:
             return
         reasons.append(f"{backend}: {reason}")
-    raise BidexError(f"Expected a screen, EGL or OSMesa to draw with, found none ({'; '.join(reasons)}). {_INSTALL}.")
+    raise BidexError(
+        f"Expected a screen, EGL or OSMesa to draw with, found none ({'; '.join(reasons)}). Install one {_INSTALL}."
+    )
 
 
 def _asked() -> str:

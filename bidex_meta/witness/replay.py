@@ -27,14 +27,10 @@ State = dict[str, Tensor]
 class Trace:
     """Results of T steps of N environments."""
 
-    rewards: Tensor
-    """Unscaled reward (T, N), float64; 0 from the step after an end on."""
-    least: Tensor
-    """The least of the reward's terms, times their number; else as ``rewards``."""
-    success: Tensor
-    """Bool (T, N), counted until the end of the episode."""
-    alive: Tensor
-    """Bool (N,): the episode has not failed nor its physics broken."""
+    rewards: Tensor  # unscaled, (T, N), float64; 0 from the step after an end on
+    least: Tensor  # the least of the reward's terms, times their number; else as ``rewards``
+    success: Tensor  # bool (T, N), until the end of the episode
+    alive: Tensor  # bool (N,): the episode has not failed nor its physics broken
 
 
 def task_slot(name: str) -> Slot:
@@ -136,14 +132,10 @@ class Simulator:
 class Replay:
     """Result of a replay."""
 
-    total: float
-    """Return from the unshifted start."""
-    first_success: int | None
-    """Index of its first successful step."""
-    succeeded: int
-    """Shifted starts that succeed."""
-    depths: Tensor
-    """Deepest contact after each step from each start, metres, shape (steps, 1 + shifted starts)."""
+    total: float  # return from the unshifted start
+    first_success: int | None  # index of its first successful step
+    succeeded: int  # shifted starts that succeed
+    depths: Tensor  # deepest contact after each step from each start, metres, (steps, 1 + shifted starts)
 
     @property
     def deepest(self) -> float:

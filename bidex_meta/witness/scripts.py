@@ -126,8 +126,10 @@ def stack_block(hands: HandController) -> None:
     behind1, behind2 = -0.03 - _FINGERS, 0.05 + _FINGERS
     hands.lead(_from(block2, 0.0, behind2, 0.70), _from(block1, 0.0, behind1 - 0.03, 0.70), 10, speed=0.66)
     hands.lead(_from(block2, 0.0, behind2, 0.655), _from(block1, 0.0, behind1 - 0.03, 0.655), 12)
-    _push_block2(hands, block1, block2)
-
+    y, goal = float(hands.at("right")[1]), float(hands.frozen("target2")[1])
+    while float(hands.where("block2/position")[1]) > goal + 0.004 and len(hands.actions) < 80:
+        y -= 0.0028
+        hands.lead((float(block2[0]) + 0.008, y, 0.655), _from(block1, 0.0, -0.05 - _FINGERS, 0.655), speed=0.4)
     hands.bend("right", 1.35, 0.15)  # a hook, to reach between the blocks from above
     back = float(hands.at("right")[1]) + 0.01
     hands.lead((float(block1[0]), back, 0.76), _from(block1, 0.0, behind1 - 0.02, 0.655), 10)
@@ -136,13 +138,6 @@ def stack_block(hands: HandController) -> None:
     hooked = float(block1[0]), float(hands.at("right")[1]), 0.684
     hands.lead(hooked, _from(block1, 0.0, behind1, 0.655), 12, speed=0.4)
     _carry_block1(hands, float(block1[0]))
-
-
-def _push_block2(hands: HandController, block1: Tensor, block2: Tensor) -> None:
-    y, goal = float(hands.at("right")[1]), float(hands.frozen("target2")[1])
-    while float(hands.where("block2/position")[1]) > goal + 0.004 and len(hands.actions) < 80:
-        y -= 0.0028
-        hands.lead((float(block2[0]) + 0.008, y, 0.655), _from(block1, 0.0, -0.05 - _FINGERS, 0.655), speed=0.4)
 
 
 def _carry_block1(hands: HandController, x: float) -> None:
@@ -303,19 +298,13 @@ def _next(hands: HandController, side: str) -> Point:
     hands.bend(side, **{name: (1.0 - closed) * cup + closed * _FIST[name] for name, cup in _CUP.items()})
     moving = abs(_knuckles(hands, side, "velocity"))
     held = (1.0 - _falls(knuckles, 0.7, 0.8)) * _falls(moving, 0.3, 1.1)
-    hands.turn(side, held * _turn(hands, cube, goal))
+    left = multiply(hands.frozen(goal)[3:].double(), conjugate(hands.orientation(f"{cube}/quaternion")))
+    axis = left[:3] * left[3].sign()  # of the turn that takes the cube to its goal's orientation
+    hands.turn(side, held * (min(_RATE * float(rotation_angle(left)), _FASTEST) / GAIN * axis / (axis.norm() + 1e-9)))
     below = place - hands.at(side)
     below[2] = 0.0
     x, y, z = (hands.at(side) + (1.0 - closed) * _FOLLOW * below + held * (hands.frozen(goal)[:3] - place)).tolist()
     return x, y, z
-
-
-def _turn(hands: HandController, cube: str, goal: str) -> Tensor:
-    """The turn (3,) that takes a cube to its goal's orientation, for one step, rad about the world's axes."""
-    left = multiply(hands.frozen(goal)[3:].double(), conjugate(hands.orientation(f"{cube}/quaternion")))
-    axis = left[:3] * left[3].sign()
-    speed = min(_RATE * float(rotation_angle(left)), _FASTEST)
-    return speed / GAIN * axis / (axis.norm() + 1e-9)
 
 
 def _knuckles(hands: HandController, side: str, what: str) -> float:
