@@ -1,4 +1,4 @@
-"""What a learner is to the commands and to the training loop; knows no particular one."""
+"""Interface of a learner to the commands and to the training loop."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -32,25 +32,15 @@ class LearnerConfig(Checked):
         return type(self).__name__.removesuffix("Config").lower()
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """About how much memory a learner takes.
-
-        Args:
-            num_envs: Environments of its world.
-            width: Numbers stored of a step of an environment.
-        """
+        """Approximate memory of a learner, where a step of an environment stores ``width`` numbers."""
         return 0
 
 
 class Learner(ABC):
-    """Base of all learners.
+    """Base of all learners, made on a world in the mode that :meth:`autoreset_mode` returns.
 
-    Args:
-        world: A world in the mode that :meth:`autoreset_mode` returns.
-        config: An instance of the dataclass of its presets.
-        seed: Of all that is random, the world's first reset among it.
-
-    Attributes:
-        env_steps: Environment steps so far, over all environments of all processes; offline: updates.
+    ``config`` is an instance of the dataclass of its presets; ``seed`` is of all that is random, the world's first
+    reset among it.
     """
 
     name: ClassVar[str] = "learner"
@@ -73,6 +63,7 @@ class Learner(ABC):
     per_process: tuple[str, ...] = ()
     """Entries of ``state_dict`` that differ from process to process; the others are equal in all."""
     env_steps: int
+    """Environment steps so far, over all environments of all processes; offline: updates."""
 
     @abstractmethod
     def __init__(self, world: "VectorWorld", config: Any, seed: int):
@@ -85,7 +76,7 @@ class Learner(ABC):
 
     @classmethod
     def bytes_held(cls, config: Any, num_envs: int, width: int) -> int:
-        """About how much memory it takes; see :meth:`LearnerConfig.bytes_held`."""
+        """Approximate memory; see :meth:`LearnerConfig.bytes_held`."""
         return config.bytes_held(num_envs, width) if isinstance(config, LearnerConfig) else 0
 
     @abstractmethod

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.engine.cpu import CpuEngine
-from bidex_meta.utils.memory import usable_cores
 from bidex_meta.engine.warp import WarpEngine
 from bidex_meta.errors import BidexError
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import Scene, build_spec, compile_scene
+from bidex_meta.utils.memory import usable_cores
 from tests.tasks.worlds import Lens, depths
 
 SUBSTEPS, ROWS = 2, 4
