@@ -39,11 +39,7 @@ TASK_PRESETS = {"LiftUnderarm": {"paper": replace(PRESETS["paper"], **LIFT)}}
 
 
 class HAPPO(Sequential):
-    """HAPPO, agents in turn (Kuba et al. 2022, arXiv 2109.11251).
-
-    Attributes:
-        adams: An optimiser of each agent.
-    """
+    """HAPPO, agents in turn (Kuba et al. 2022, arXiv 2109.11251)."""
 
     name, remedy = "happo", "lower learning_rate"
     config_type, presets, task_presets = HAPPOConfig, PRESETS, TASK_PRESETS
@@ -77,15 +73,9 @@ class HAPPO(Sequential):
         for first, index, count in self._mini_batches(share.weights, cfg.epochs, cfg.num_minibatches):
             part = share.select(index)
             loss = policy_loss(
-                part.actions,
-                *self._distribution(agent, part),
-                part.old_means,
-                part.old_log_std,
-                part.old_log_probs,
-                part.gain,
-                weights=part.weights / count,
-                clip=cfg.clip,
-            )
+                part.actions, *self._distribution(agent, part), part.old_means, part.old_log_std, part.old_log_probs,
+                part.gain, weights=part.weights / count, clip=cfg.clip
+            )  # fmt: skip
             adam.zero_grad()
             (loss.surrogate - cfg.entropy_weight * loss.entropy).backward(inputs=parameters)
             numbers = torch.stack([loss.surrogate.detach(), loss.kl, loss.outside])

@@ -39,11 +39,7 @@ TASK_PRESETS = {"LiftUnderarm": {"paper": replace(PRESETS["paper"], **LIFT)}}
 
 
 class MAPPO(MultiAgent):
-    """MAPPO, multi-agent PPO (Yu et al. 2022, arXiv 2103.01955).
-
-    Attributes:
-        adams: An optimiser of each network of the actors.
-    """
+    """MAPPO, multi-agent PPO (Yu et al. 2022, arXiv 2103.01955)."""
 
     name, remedy = "mappo", "lower learning_rate"
     config_type, presets, task_presets = MAPPOConfig, PRESETS, TASK_PRESETS

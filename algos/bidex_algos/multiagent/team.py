@@ -14,31 +14,15 @@ from bidex_meta.world.agent_views import AgentView
 
 
 class Team(nn.Module):
-    """One :class:`MLP` an agent; with ``share`` one for all agents of one form, which reads who acts.
+    """One :class:`MLP` an agent; with ``share`` one for all of a form (columns of each group, actions), told who acts.
 
-    Args:
-        views: The agents.
-        config: Of a learner; it has ``hidden``, ``activation`` and ``task_embedding``.
-        outputs: Outputs of each agent.
-        output_gain: Gain of the output layers.
-        generator: CPU generator of the initial weights.
-        share: Whether agents of one form (as many columns of each group, as many actions) have a network together.
-
-    Attributes:
-        nets: The networks.
-        net_of: Which of them each agent has.
-        families: The agents of each form.
+    Agent i has network ``net_of[i]``; ``families`` are the agents of each form.
     """
 
     def __init__(
-        self,
-        views: Sequence[AgentView],
-        config: Any,
-        outputs: Sequence[int],
-        output_gain: float,
-        generator: torch.Generator,
-        share: bool = False,
-    ):
+        self, views: Sequence[AgentView], config: Any, outputs: Sequence[int], output_gain: float,
+        generator: torch.Generator, share: bool = False
+    ):  # fmt: skip
         super().__init__()
         forms = [(tuple(group.size for group in view.own_groups()), len(view.actions)) for view in views]
         self.families = [[i for i, other in enumerate(forms) if other == form] for form in dict.fromkeys(forms)]
@@ -97,23 +81,13 @@ class Team(nn.Module):
 class TeamActor(Team):
     """Diagonal Gaussians of all agents, together one of the world's action: in the place of a ``GaussianActor``.
 
-    ``groups`` are those of the world's observation; ``heads`` output layers and deviations of each agent, which the
-    group ``task_id`` chooses.
-
-    Attributes:
-        own: The world's actions that are each agent's, int64 (a_i,).
-        log_stds: Of each network: logarithms of standard deviations, (a_i,) or (heads, a_i).
+    ``log_stds`` are of each network, (a_i,), or (heads, a_i), which the group ``task_id`` chooses.
     """
 
     def __init__(
-        self,
-        views: Sequence[AgentView],
-        config: Any,
-        groups: Inputs,
-        generator: torch.Generator,
-        heads: int = 1,
-        share: bool = False,
-    ):
+        self, views: Sequence[AgentView], config: Any, groups: Inputs, generator: torch.Generator, heads: int = 1,
+        share: bool = False
+    ):  # fmt: skip
         super().__init__(views, config, [heads * len(view.actions) for view in views], 0.01, generator, share)
         self.heads, self.one_hot = heads, groups.columns(*["task_id"] * (heads > 1))
         order = torch.tensor([action for view in views for action in view.actions])
@@ -147,10 +121,7 @@ class TeamActor(Team):
         return [self._chosen(task, out) for out in self.outputs(x)]
 
     def distribution_of(self, agent: int, seen: Tensor, task: Tensor) -> tuple[Tensor, Tensor]:
-        """One agent's Gaussian: mean (B, a_i) and logarithm of the deviation, (a_i,) with one head, else (B, a_i).
-
-        ``seen`` is what its network is fed (B, d_i), ``task`` the tasks' one-hot (B, heads).
-        """
+        """One agent's mean (B, a_i), and its log deviation (a_i,) or (B, a_i), of what it sees and the one-hot."""
         return self._chosen(task, self.nets[self.net_of[agent]](seen)), self.own_log_std(agent, task)
 
     def own_log_std(self, agent: int, task: Tensor) -> Tensor:

@@ -34,7 +34,6 @@ class ArchitectureConfig(LearnerConfig):
         return self.architecture in ("shared", "multi_head")
 
     def __post_init__(self) -> None:
-        """Turns multi_head into both heads, and refuses what does not go together."""
         super().__post_init__()
         config: Any = self
         if self.architecture == "multi_head":

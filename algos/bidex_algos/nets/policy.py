@@ -14,13 +14,7 @@ from bidex_algos.nets.normalise import ObservationNormaliser
 
 
 class ActorPolicy(nn.Module):
-    """An actor on raw observations; with ``eval_action`` it follows the Agent protocol of evaluation.
-
-    Args:
-        observations: Normaliser of raw observations.
-        actor: Network on normalised observations.
-        low_precision: Whether hidden layers run in bfloat16.
-    """
+    """A normaliser and an actor, on raw observations; an agent for evaluation, with ``eval_action``."""
 
     def __init__(self, observations: ObservationNormaliser, actor: nn.Module, low_precision: bool):
         super().__init__()
@@ -64,15 +58,9 @@ class DeterministicActor(nn.Module):
     """One action for each observation, squashed by tanh; arguments are those of :class:`GaussianActor`."""
 
     def __init__(
-        self,
-        inputs: int | Inputs,
-        hidden: Sequence[int],
-        actions: int,
-        heads: int,
-        generator: torch.Generator,
-        activation: Activation,
-        network: Callable[..., Any] = MLP,
-    ):
+        self, inputs: int | Inputs, hidden: Sequence[int], actions: int, heads: int, generator: torch.Generator,
+        activation: Activation, network: Callable[..., Any] = MLP
+    ):  # fmt: skip
         super().__init__()
         self.heads = heads
         self.one_hot = Inputs.of(inputs).columns(*["task_id"] * (heads > 1))
@@ -128,24 +116,14 @@ def sample_squashed(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Tenso
 class SquashedActor(nn.Module):
     """Mean and log standard deviation, before the squashing, from one network.
 
-    The log standard deviation moves between its bounds on a tanh: a hard clamp would have no gradient beyond them, so
-    that an output that went there would never return.
-
-    Arguments are those of :class:`GaussianActor`, and ``std_range``, the bounds.
+    The latter moves between its bounds on a tanh: from beyond a hard clamp, without a gradient, it would never return.
     """
 
     def __init__(
-        self,
-        inputs: int | Inputs,
-        hidden: Sequence[int],
-        actions: int,
-        heads: int,
-        init_std: float,
-        std_range: tuple[float, float],
-        generator: torch.Generator,
-        activation: Activation,
-        network: Callable[..., Any] = MLP,
-    ):
+        self, inputs: int | Inputs, hidden: Sequence[int], actions: int, heads: int, init_std: float,
+        std_range: tuple[float, float], generator: torch.Generator, activation: Activation,
+        network: Callable[..., Any] = MLP
+    ):  # fmt: skip
         super().__init__()
         self.heads = heads
         self.one_hot = Inputs.of(inputs).columns(*["task_id"] * (heads > 1))

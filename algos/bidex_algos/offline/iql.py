@@ -42,7 +42,6 @@ class IQLConfig(CriticConfig):
     """Its bounds, exp(-5) and exp(2)."""
 
     def __post_init__(self) -> None:
-        """Checks what annotations cannot say."""
         super().__post_init__()
         check_rising(self, self.algo, "std_range")
 
@@ -60,11 +59,7 @@ class BoundedMean(GaussianActor):
 
 
 class IQL(Offline):
-    """Implicit Q-learning on data sets (Kostrikov et al. 2022, arXiv 2110.06169).
-
-    Attributes:
-        value: Network of the state's value.
-    """
+    """Implicit Q-learning on data sets (Kostrikov et al. 2022, arXiv 2110.06169)."""
 
     name, remedy = "iql", "lower beta"
     config_type, presets = IQLConfig, PRESETS

@@ -47,7 +47,6 @@ class DDPGConfig(OffPolicyConfig):
     """Price, in the actor's loss, on the mean square of what tanh makes the actions of; 0: none."""
 
     def __post_init__(self) -> None:
-        """Checks what annotations cannot say."""
         super().__post_init__()
         check_rising(self, self.algo, "exploration_std")
 
@@ -72,12 +71,7 @@ PRESETS: dict[str, DDPGConfig] = {"paper": DDPGConfig(**of_paper()), "laptop": D
 
 
 class DDPG(OffPolicy):
-    """Multi-task DDPG (Lillicrap et al. 2016, arXiv 1509.02971) on a batched world.
-
-    Attributes:
-        target_actor: Follows the actor; only with ``delayed_targets``.
-        noise_std: Of each environment (N, 1).
-    """
+    """Multi-task DDPG (Lillicrap et al. 2016, arXiv 1509.02971) on a batched world."""
 
     name, remedy = "ddpg", "lower critic_learning_rate"
     config_type, presets = DDPGConfig, PRESETS

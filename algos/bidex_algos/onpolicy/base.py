@@ -1,8 +1,4 @@
-"""What the on-policy learners share: rollouts, a critic per task, statistics, checkpoints. They differ in the update.
-
-An iteration collects ``rollout_steps`` steps in every environment, makes them a :class:`Batch`, and hands it to the
-learner.
-"""
+"""What the on-policy learners share: rollouts, made a :class:`Batch`, a critic per task, statistics, checkpoints."""
 
 from abc import abstractmethod
 from collections.abc import Iterator
@@ -84,7 +80,6 @@ class OnPolicyConfig(ArchitectureConfig):
     """Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX or AVX-512's BF16."""
 
     def __post_init__(self) -> None:
-        """Checks what annotations cannot say."""
         super().__post_init__()
         check_rising(self, self.algo, "std_range")
 
@@ -129,14 +124,7 @@ def check_samples(name: str, config: Any, num_envs: int) -> None:
 
 
 class OnPolicy(Learner):
-    """A Gaussian policy and a critic that learn from what the policy has just done.
-
-    Attributes:
-        policy: The agent that evaluation uses: mean action, clamped.
-        critic: Values of normalised observations, in units of the task's returns.
-        gamma: Discount of all environments, or of each (N,).
-        num_critics: How many values a state has: more than one where each of several agents has a critic of its own.
-    """
+    """A Gaussian policy, and a critic (``num_critics`` values of a state), that learn from what it has just done."""
 
     config: OnPolicyConfig
     policy: GaussianPolicy
@@ -155,8 +143,6 @@ class OnPolicy(Learner):
         sizes = self.shape.observations, self.shape.actions
         self.rollout = Rollout(config.rollout_steps, world.num_envs, *sizes, self.device, self.num_critics)
         self.episodes = EpisodeStatistics(world.task_id, world.task_names)
-
-    # What a learner adds.
 
     def _make_critic(self, heads: int) -> nn.Module:
         """The critic, with one output per task or one for all."""
@@ -182,8 +168,6 @@ class OnPolicy(Learner):
         self.policy.observations.update(self.rollout.obs)
         self.env_steps += self.rollout.rewards.numel() * world_size()
         return self._metrics(losses, explained)
-
-    # The rollout.
 
     def _sample(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         mean, log_std = self.policy.distribution(obs)
@@ -254,15 +238,12 @@ class OnPolicy(Learner):
 
         actions, old_means = r.actions.flatten(0, 1), r.means.flatten(0, 1)
         batch = Batch(
-            obs=obs,
-            task_id=flat_task_id,
-            actions=actions,
-            old_means=old_means,
+            obs=obs, task_id=flat_task_id, actions=actions, old_means=old_means,
             old_log_probs=gaussian_log_prob(actions, old_means, self.policy.actor.log_std_of(obs)),
             advantages=advantages.reshape(judged.shape),
             targets=self._in_critic_units(returns.reshape(judged.shape), flat_task_id),
-            weights=r.valid.flatten().float(),
-        )
+            weights=r.valid.flatten().float()
+        )  # fmt: skip
         return batch, explained
 
     def _metrics(self, losses: dict[str, Tensor], explained: Tensor) -> dict[str, float]:
@@ -272,8 +253,6 @@ class OnPolicy(Learner):
         for name, value in zip(self.world.task_names, explained, strict=True):
             tensors[f"Value/explained_variance/{name}"] = value
         return self.episodes.metrics() | as_numbers(tensors)
-
-    # Checkpoints.
 
     @classmethod
     def _make_policy(

@@ -69,11 +69,7 @@ PRESETS: dict[str, MTTRPOConfig] = {
 
 
 class MTTRPO(OnPolicy):
-    """Multi-task TRPO (Schulman et al. 2015, arXiv 1502.05477) on a batched world.
-
-    Attributes:
-        critic_adam: Moves the critic; the actor has no optimiser.
-    """
+    """Multi-task TRPO (Schulman et al. 2015, arXiv 1502.05477) on a batched world."""
 
     name, remedy = "mttrpo", "lower max_kl or critic_learning_rate"
     config_type, presets = MTTRPOConfig, PRESETS
