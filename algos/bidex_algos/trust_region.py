@@ -112,16 +112,16 @@ class Stepped(NamedTuple):
 
 def trust_region_step(
     parameters: Sequence[nn.Parameter], objective: Tensor, kl: Tensor, measure: Callable[[], tuple[float, float]],
-    config: Any, accept_ratio: float = 0.0
+    config: Any, max_kl: float, accept_ratio: float = 0.0
 ) -> Stepped:  # fmt: skip
     """Moves parameters along :func:`natural_step`, back along it by :func:`line_search`.
 
-    The config has ``max_kl``, ``damping``, ``cg_iterations``, ``backtracks`` and ``backtrack_factor``.
+    The config has ``damping``, ``cg_iterations``, ``backtracks`` and ``backtrack_factor``.
     """
-    size = {"max_kl": config.max_kl, "damping": config.damping, "iterations": config.cg_iterations}
-    step, promised = natural_step(objective, kl, parameters, **size)
+    damping, iterations = config.damping, config.cg_iterations
+    step, promised = natural_step(objective, kl, parameters, max_kl=max_kl, damping=damping, iterations=iterations)
     share = line_search(
-        parameters, step, measure, expected=promised, max_kl=config.max_kl, accept_ratio=accept_ratio,
+        parameters, step, measure, expected=promised, max_kl=max_kl, accept_ratio=accept_ratio,
         factor=config.backtrack_factor, tries=config.backtracks
     )  # fmt: skip
     return Stepped(*measure(), share)

@@ -20,6 +20,7 @@ from bidex_algos.nets.policy import GaussianPolicy
 from bidex_algos.nets.shape import Shape
 from bidex_algos.onpolicy.base import Batch, OnPolicy, OnPolicyConfig, check_samples
 from bidex_algos.onpolicy.ppo import PPOConfig
+from bidex_algos.step_size import AdaptiveAdam
 from bidex_meta.errors import BidexError
 from bidex_meta.hands.units import partition_line
 from bidex_meta.train.distributed import sum_gradients
@@ -235,6 +236,20 @@ class MultiAgent(OnPolicy):
 
     def _optimisers(self) -> Parts:
         return {"critic_adam": self.critic_adam}
+
+
+class OwnAdams(MultiAgent):
+    """Agents whose networks have an optimiser each, whose step size follows their share of the KL."""
+
+    config: Any
+
+    def __init__(self, world: VectorWorld, config: Any, seed: int):
+        super().__init__(world, config, seed)
+        own, given = self.policy.actor.parameters_of, (config, self.device, config.adam_eps, self.kl_share)
+        self.adams = [AdaptiveAdam(own(k), *given) for k in range(len(self.policy.actor.nets))]
+
+    def _optimisers(self) -> Parts:
+        return super()._optimisers() | {"agents": [adam.parts() for adam in self.adams]}
 
 
 class Sequential(MultiAgent):

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.nets.inputs import Columns, Inputs, with_task_embedding
-from bidex_algos.nets.networks import MLP, stacked_forward
+from bidex_algos.nets.networks import MLP, head_of, row_of, stacked_forward
 from bidex_algos.nets.point_net import with_point_net
 from bidex_meta.world.agent_views import AgentView
 
@@ -118,19 +118,15 @@ class TeamActor(Team):
     def means(self, x: Tensor) -> list[Tensor]:
         """The mean action (B, a_i) of each agent."""
         task = self.one_hot(x)
-        return [self._chosen(task, out) for out in self.outputs(x)]
+        return [head_of(task, out, self.heads) for out in self.outputs(x)]
 
     def distribution_of(self, agent: int, seen: Tensor, task: Tensor) -> tuple[Tensor, Tensor]:
         """One agent's mean (B, a_i), and its log deviation (a_i,) or (B, a_i), of what it sees and the one-hot."""
-        return self._chosen(task, self.nets[self.net_of[agent]](seen)), self.own_log_std(agent, task)
+        return head_of(task, self.nets[self.net_of[agent]](seen), self.heads), self.own_log_std(agent, task)
 
     def own_log_std(self, agent: int, task: Tensor) -> Tensor:
         """The second of :meth:`distribution_of`."""
-        log_std = self.log_stds[self.net_of[agent]]
-        if self.heads == 1:
-            return log_std
-        with torch.autocast(task.device.type, enabled=False):
-            return task.to(log_std.dtype) @ log_std
+        return row_of(task, self.log_stds[self.net_of[agent]])
 
     def parts(self, joint: Tensor) -> tuple[Tensor, ...]:
         """Each agent's entries (..., a_i) of what the world's actions have (..., a)."""
@@ -138,11 +134,7 @@ class TeamActor(Team):
 
     def log_std_of(self, x: Tensor, log_std: Tensor | None = None) -> Tensor:
         """The joint ``log_std`` that holds for observations (B, d): (a,) with one head, else (B, a)."""
-        log_std = self.log_std if log_std is None else log_std
-        if self.heads == 1:
-            return log_std
-        with torch.autocast(x.device.type, enabled=False):
-            return self.one_hot(x).to(log_std.dtype) @ log_std
+        return row_of(self.one_hot(x), self.log_std if log_std is None else log_std)
 
     def parameters_of(self, net: int) -> list[nn.Parameter]:
         """The parameters of a network and its standard deviations."""
@@ -153,12 +145,6 @@ class TeamActor(Team):
         """Keeps all standard deviations within bounds."""
         for log_std in self.log_stds:
             log_std.clamp_(math.log(low), math.log(high))
-
-    def _chosen(self, task: Tensor, out: Tensor) -> Tensor:
-        if self.heads == 1:
-            return out
-        with torch.autocast(task.device.type, enabled=False):
-            return torch.einsum("...h,...ha->...a", task.to(out.dtype), out.unflatten(-1, (self.heads, -1)))
 
 
 class TeamCritic(Team):

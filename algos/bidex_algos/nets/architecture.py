@@ -62,7 +62,7 @@ class ArchitectureConfig(LearnerConfig):
 
 @dataclass(frozen=True)
 class NetworkConfig(ArchitectureConfig):
-    """Networks of learners from a replay or from data."""
+    """Networks of actor and critics."""
 
     hidden: Layers = (256, 256)
     """Widths of the hidden layers, of actor and critics alike."""

@@ -104,6 +104,22 @@ def linear(inputs: int, outputs: int, gain: float, generator: torch.Generator) -
     return layer
 
 
+def head_of(one_hot: Tensor, out: Tensor, heads: int) -> Tensor:
+    """Of outputs (..., heads * n) those (..., n) of the head that a one-hot (..., heads) names."""
+    if heads == 1:
+        return out
+    with torch.autocast(out.device.type, enabled=False):  # like the output layer: means would be rounded
+        return torch.einsum("...h,...ha->...a", one_hot.to(out.dtype), out.unflatten(-1, (heads, -1)))
+
+
+def row_of(one_hot: Tensor, rows: Tensor) -> Tensor:
+    """The rows (..., n) of (heads, n) that a one-hot (..., heads) names; a single one, (n,), as it is."""
+    if rows.dim() == 1:
+        return rows
+    with torch.autocast(rows.device.type, enabled=False):
+        return one_hot.to(rows.dtype) @ rows
+
+
 class GaussianActor(nn.Module):
     """Diagonal Gaussian: the mean from a network, a standard deviation per action that knows no state.
 
@@ -123,20 +139,11 @@ class GaussianActor(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Mean action of normalised observations (batch, observations), float32 (batch, actions), not clamped."""
-        out = self.mean(x)
-        if self.heads == 1:
-            return out
-        heads = out.unflatten(-1, (self.heads, -1))
-        with torch.autocast(x.device.type, enabled=False):  # like the output layer: means would be rounded
-            return torch.einsum("...h,...ha->...a", self.one_hot(x).to(out.dtype), heads)
+        return head_of(self.one_hot(x), self.mean(x), self.heads)
 
     def log_std_of(self, x: Tensor, log_std: Tensor | None = None) -> Tensor:
         """The ``log_std`` that holds for observations (batch, d): (actions,) with one head, else (batch, actions)."""
-        log_std = self.log_std if log_std is None else log_std
-        if self.heads == 1:
-            return log_std
-        with torch.autocast(x.device.type, enabled=False):
-            return self.one_hot(x).to(log_std.dtype) @ log_std
+        return row_of(self.one_hot(x), self.log_std if log_std is None else log_std)
 
 
 def gaussian_log_prob(action: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:

@@ -102,7 +102,7 @@ class ObservationNormaliser(nn.Module):
 
 def observation_normaliser(config: Any, inputs: Inputs, tasks: int) -> ObservationNormaliser:
     """What a config asks for by ``normalise_observations`` and ``normalise_per_task``, of so many tasks."""
-    if config.normalise_per_task and config.normalise_observations and tasks > 1:
+    if vars(config).get("normalise_per_task") and config.normalise_observations and tasks > 1:
         return TaskNormaliser(inputs, tasks)
     return ObservationNormaliser(inputs, config.normalise_observations)
 

@@ -8,9 +8,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
+from bidex_algos.nets.architecture import network_of
 from bidex_algos.nets.inputs import Inputs
-from bidex_algos.nets.networks import MLP, Activation, GaussianActor, autocast, gaussian_log_prob
-from bidex_algos.nets.normalise import ObservationNormaliser
+from bidex_algos.nets.networks import MLP, Activation, GaussianActor, autocast, gaussian_log_prob, use_bfloat16
+from bidex_algos.nets.normalise import ObservationNormaliser, observation_normaliser
+from bidex_algos.nets.shape import Shape
 
 
 class ActorPolicy(nn.Module):
@@ -94,6 +96,27 @@ class DeterministicPolicy(ActorPolicy):
     def eval_action(self, obs: Tensor) -> Tensor:
         """The action for raw observations (N, d): (N, a) in [-1, 1]."""
         return torch.tanh(self.raw(self.observations(obs)))
+
+
+def gaussian_policy(
+    config: Any, inputs: Inputs, shape: Shape, init: torch.Generator, device: torch.device,
+    make: type[GaussianActor] = GaussianActor
+) -> GaussianPolicy:  # fmt: skip
+    """A policy with the networks of a learner's config, drawn from ``init``, a CPU generator."""
+    heads, network = shape.num_id_columns if config.policy_heads else 1, network_of(config)
+    actor = make(inputs, config.hidden, shape.actions, config.init_std, init, config.activation, heads, network)
+    observations = observation_normaliser(config, inputs, shape.num_id_columns)
+    return GaussianPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
+
+
+def deterministic_policy(
+    config: Any, inputs: Inputs, shape: Shape, init: torch.Generator, device: torch.device
+) -> DeterministicPolicy:
+    """The same without a distribution."""
+    heads, network = shape.num_id_columns if config.policy_heads else 1, network_of(config)
+    actor = DeterministicActor(inputs, config.hidden, shape.actions, heads, init, config.activation, network)
+    observations = observation_normaliser(config, inputs, shape.num_id_columns)
+    return DeterministicPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
 
 
 def squashed_log_prob(raw: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:

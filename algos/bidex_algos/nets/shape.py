@@ -35,11 +35,7 @@ class Shape:
 
     def sizes(self) -> dict[str, int]:
         """The numbers without the places of the groups."""
-        return {
-            "observations": self.observations,
-            "actions": self.actions,
-            "num_id_columns": self.num_id_columns,
-        }
+        return {"observations": self.observations, "actions": self.actions, "num_id_columns": self.num_id_columns}
 
     def state_dict(self) -> State:
         """Plain values for a checkpoint."""

@@ -210,7 +210,7 @@ class OffPolicy(Learner):
         return values.amin(0)
 
     def _bootstrapped(self, draw: Transitions, following: Tensor) -> Tensor:
-        """Targets (B,): scaled reward + gamma^steps * ``following`` (B,), the next state's value, 0 after a true end."""
+        """Targets (B,): scaled reward + gamma^steps * ``following`` (B,), the next value, 0 after a true end."""
         rewards = draw.rewards / self._reward_scale()[self.task_of_draw]
         return rewards + self.gamma_of_draw**draw.steps * following.masked_fill(draw.terminated, 0.0)
 

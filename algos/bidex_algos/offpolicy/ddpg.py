@@ -24,10 +24,8 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from bidex_algos.nets.architecture import network_of
-from bidex_algos.nets.networks import autocast, use_bfloat16
-from bidex_algos.nets.normalise import ObservationNormaliser
-from bidex_algos.nets.policy import DeterministicActor, DeterministicPolicy
+from bidex_algos.nets.networks import autocast
+from bidex_algos.nets.policy import DeterministicPolicy, deterministic_policy
 from bidex_algos.nets.shape import Shape
 from bidex_algos.offpolicy.base import OffPolicy, OffPolicyConfig
 from bidex_algos.offpolicy.critics import follow
@@ -145,11 +143,7 @@ class DDPG(OffPolicy):
     def _make_policy(
         cls, config: DDPGConfig, shape: Shape, init: torch.Generator, device: torch.device
     ) -> DeterministicPolicy:
-        inputs, heads = cls._inputs(config, shape), shape.num_id_columns if config.policy_heads else 1
-        network = network_of(config)
-        actor = DeterministicActor(inputs, config.hidden, shape.actions, heads, init, config.activation, network)
-        observations = ObservationNormaliser(inputs, config.normalise_observations)
-        return DeterministicPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
+        return deterministic_policy(config, cls._inputs(config, shape), shape, init, device)
 
     def _own_parts(self) -> Parts:
         follows = {"target_actor": self.target_actor} if self.delayed_targets else {}
