@@ -13,7 +13,6 @@ from torch.testing import assert_close
 from bidex_algos.offpolicy.brc import BRC, BRCConfig
 from bidex_algos.offpolicy.fasttd3 import FastTD3, FastTD3Config
 from bidex_algos.replay import Transitions
-from bidex_meta.cli.learners import learner_kind
 from bidex_meta.errors import BidexError
 from bidex_meta.train import distributed
 from bidex_meta.world.contract import plain_groups
@@ -215,13 +214,3 @@ def test_one_task_needs_no_embedding_and_several_need_their_one_hot() -> None:
     world.num_id_columns, world.observation_groups = 0, plain_groups(3, 0)
     with pytest.raises(BidexError, match="brc: task_embedding needs the one-hot of 2 tasks"):
         BRC(world, SMALL, seed=0)
-
-
-@pytest.mark.parametrize("name", ["fasttd3", "brc"])
-@pytest.mark.parametrize("preset", ["paper", "laptop"])
-def test_they_are_found_by_name_and_every_preset_runs(name: str, preset: str) -> None:
-    kind = learner_kind(name)
-    assert kind.make is {"fasttd3": FastTD3, "brc": BRC}[name] and list(kind.presets)[:2] == ["paper", "laptop"]
-    small: dict[str, Any] = {"hidden": (16, 16), "critic_hidden": (16, 16), "replay_steps": 50, "batch_size": 64}
-    config = replace(kind.presets[preset], **small, warmup_steps=1, steps_per_iteration=3)
-    assert "Loss/critic" in kind.make(opposite_bandits(), config, seed=0).iterate()

@@ -18,7 +18,6 @@ from bidex_algos.offline.td3bc import TD3BC, TD3BCConfig
 from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
 from tests.algos.problems import PointMass, discounted_return, one_step_bandit, opposite_bandits
-from tests.algos.resume import resumed
 from tests.offline.stored import as_data, noisy, played
 
 PLAIN: dict[str, Any] = {
@@ -229,24 +228,6 @@ def rows_of(episodes: list[Any]) -> list[tuple[Tensor, ...]]:
 
 
 # Checkpoints, configs.
-
-
-@each
-def test_two_halves_are_one_whole(name: str) -> None:
-    world, data = bad_bandit()
-    kind, config = SMALL[name]
-
-    def make(seed: int) -> Any:
-        learner = kind(one_step_bandit(0.6), replace(config, updates_per_iteration=5), seed)
-        learner.world.reset(seed=0)
-        learner.learn_from(data)
-        return learner
-
-    whole, again = resumed(make)
-    obs, _ = world.reset(seed=1)
-    loaded = kind.load_policy(again.policy_state_dict())
-    assert torch.equal(whole.eval_action(obs), loaded.eval_action(obs))
-    assert whole.env_steps == 30
 
 
 def test_a_checkpoint_of_other_data_is_refused() -> None:
