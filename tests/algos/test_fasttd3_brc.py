@@ -16,8 +16,7 @@ from bidex_algos.replay import Transitions
 from bidex_meta.errors import BidexError
 from bidex_meta.train import distributed
 from bidex_meta.world.contract import plain_groups
-from tests.algos.off_policy import trained
-from tests.algos.problems import LQR, opposite_bandits
+from tests.algos.problems import LQR, opposite_bandits, trained
 from tests.algos.ranks import in_two_processes, same
 from tests.algos.test_categorical import slow_projection
 from tests.algos.toy import ToyWorld, nearness
@@ -30,9 +29,6 @@ SHARED: dict[str, Any] = {
 FAST = FastTD3Config(**SHARED | {"updates_per_step": 4}, critic_layer_norm=False, n_steps=1, squash_price=0.0)
 SMALL = BRCConfig(**SHARED, n_steps=1, task_embedding=4, init_alpha=0.01, target_entropy_per_action=-2.0)
 both = pytest.mark.parametrize(("kind", "config"), [(FastTD3, FAST), (BRC, SMALL)], ids=["fasttd3", "brc"])
-
-
-# One update, against an independent computation.
 
 
 def a_draw() -> Transitions:
@@ -182,9 +178,6 @@ def test_weights_decay_but_no_temperature(kind: Any, config: Any) -> None:
     learner.adams["critic"].step()
     for p, was in zip(learner.critic.parameters(), before, strict=True):
         assert_close(p.detach(), was * (1.0 - 0.5 * 5e-3))
-
-
-# Several processes, checkpoints, metrics, errors.
 
 
 def _bounds(rank: int) -> Tensor:

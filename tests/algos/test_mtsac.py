@@ -8,8 +8,7 @@ from torch.testing import assert_close
 from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.world.contract import plain_groups
-from tests.algos.off_policy import errors, trained
-from tests.algos.problems import one_step_bandit, opposite_bandits
+from tests.algos.problems import errors, one_step_bandit, opposite_bandits, trained
 from tests.algos.toy import ToyWorld, nearness
 
 SMALL = MTSACConfig(
@@ -23,9 +22,6 @@ def test_without_rewards_per_task_the_small_task_is_lost():
     config = replace(SMALL, per_task_rewards=False)
     learner = trained(MTSAC, opposite_bandits(0.5, scale=1000.0), config, 12)
     assert errors(learner, 0.5, -0.5)[0] > 0.3
-
-
-# One update, against an independent computation.
 
 
 def density(learner: MTSAC, obs: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -119,9 +115,6 @@ def test_actor_and_critics_are_clipped_apart():
         assert_close(gradient.norm(), torch.tensor(1e-3), rtol=1e-3, atol=0)
 
 
-# What must not teach.
-
-
 def test_uniform_actions_come_first_and_teach_nothing_yet():
     learner = MTSAC(one_step_bandit(), replace(SMALL, warmup_steps=8, cut_share=1.0), seed=0)
     before = [p.detach().clone() for p in [*learner.policy.parameters(), *learner.critic.parameters()]]
@@ -145,9 +138,6 @@ def test_rewards_are_scaled_by_the_deviation_of_discounted_returns():
     scale = (returns.var(correction=0) + (0.1 * returns.mean()).square()).sqrt()
     assert_close(learner._reward_scale().double(), scale[None], rtol=1e-5, atol=0)
     assert torch.equal(learner.returns.discounted.double(), returns[2])
-
-
-# Bounds and bad input.
 
 
 def test_the_replay_is_cut_to_its_memory_and_says_so(capsys: pytest.CaptureFixture[str]):

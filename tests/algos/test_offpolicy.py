@@ -12,8 +12,7 @@ from bidex_algos.offpolicy.ddpg import DDPG, DDPGConfig
 from bidex_algos.offpolicy.fasttd3 import FastTD3, FastTD3Config
 from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_algos.offpolicy.td3 import TD3, TD3Config
-from tests.algos.off_policy import errors, trained
-from tests.algos.problems import LQR, PointMass, discounted_return, opposite_bandits
+from tests.algos.problems import LQR, PointMass, discounted_return, errors, opposite_bandits, trained
 from tests.algos.toy import ToyWorld
 
 SHARED: dict[str, Any] = {

@@ -59,9 +59,6 @@ def point() -> tuple[Joined, float]:
     return as_data(played(world, behaviour, 200)), discounted_return(PointMass(256), noisy(world.best, 0, 0.4), 0.8, 20)
 
 
-# Problems with a known answer.
-
-
 def test_bc_does_on_the_bandit_what_the_data_did() -> None:
     world, data = bad_bandit()
     action = learned("bc", world, data, 2).eval_action(world.reset(seed=1)[0])
@@ -96,9 +93,6 @@ def test_one_policy_of_two_tasks_at_odds_tells_them_apart() -> None:
     first, second = (float(action[world.task_id == task].mean()) for task in (0, 1))
     assert first > 0.25 and second < -0.25
     assert 500 < float(learner.reward_scale[1] / learner.reward_scale[0]) < 2000
-
-
-# Parts against independent computations.
 
 
 def test_without_a_value_td3bc_is_bc() -> None:
@@ -225,9 +219,6 @@ def rows_of(episodes: list[Any]) -> list[tuple[Tensor, ...]]:
         return tuple(torch.from_numpy(np.atleast_1d(each)) for each in told)
 
     return [row(episode, t) for episode in episodes for t in range(len(episode))]
-
-
-# Checkpoints, configs.
 
 
 def test_a_checkpoint_of_other_data_is_refused() -> None:
