@@ -94,7 +94,7 @@ def _check(folders: "Sequence[RunFolder]") -> None:
     seeds: dict[int, Path] = {}
     for folder in folders:
         config = folder.config()
-        if not learner_kind(config.algo).adapts:
+        if not learner_kind(config.algo).make.adapts:
             raise BidexError(f"{folder.path}: {config.algo} does not adapt to tasks. Name runs of maml, promp or rl2.")
         metatest.check_source(Worlds.open(config.to_json()), config.algo)
         kinds.append(run_kind(config))

@@ -74,7 +74,7 @@ def main(arguments: Sequence[str]) -> None:
     source = Worlds.open(config.to_json())
     set_up_torch(config.threads)
     kind = learner_kind(stored.algo)
-    if kind.adapts:
+    if kind.make.adapts:
         _meta_test(flags, folder, config, source)
         return
     _refuse_adaptation(flags, stored.algo)

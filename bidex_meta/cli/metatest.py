@@ -118,7 +118,7 @@ def rollouts_of(source: Worlds, config: RunConfig[Any], asked: int | None, rows:
             one in a shot: then there are fewer.
     """
     rollouts = asked or trained_rollouts(source, config)
-    return min(rollouts, rows) if learner_kind(config.algo).adapts_by_row else rollouts
+    return min(rollouts, rows) if learner_kind(config.algo).make.independent_adaptation else rollouts
 
 
 def trained_rollouts(source: Worlds, config: RunConfig[Any]) -> int:

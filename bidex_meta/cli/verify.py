@@ -162,7 +162,7 @@ def _again(
     from bidex_meta.cli.learners import learner_kind
     from bidex_meta.cli.policies import policy_of
 
-    if learner_kind(config.algo).adapts != ("splits" in recorded):
+    if learner_kind(config.algo).make.adapts != ("splits" in recorded):
         kind = "a meta-test" if "splits" in recorded else "no meta-test"
         raise BidexError(f"{folder.path}: the evaluation is {kind}, which is not how {config.algo} is judged.")
     if "splits" not in recorded:
