@@ -147,9 +147,6 @@ def test_famo_lets_losses_of_very_different_size_fall_at_one_rate():
     assert shares.max() < 0.6 and shares.max() / shares.min() < 1.1
 
 
-# In MT-PPO.
-
-
 @pytest.mark.parametrize("way", ["cagrad", "famo"])
 def test_two_tasks_at_odds_are_learned(way: Any):
     world = ToyWorld([nearness(0.4), nearness(-0.4, scale=1000.0)], rows=16)

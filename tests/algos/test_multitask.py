@@ -26,10 +26,7 @@ from tests.algos.toy import ToyWorld, nearness
 
 TRUNKS = {"soft_modules": SoftModules, "paco": PaCo, "moore": Moore}
 # The task id stands in the middle: nothing may assume that it is last.
-GROUPS = (
-    ObservationGroup("state", (slice(0, 3), slice(6, 9))),
-    ObservationGroup("task_id", (slice(3, 6),)),
-)
+GROUPS = (ObservationGroup("state", (slice(0, 3), slice(6, 9))), ObservationGroup("task_id", (slice(3, 6),)))
 TASKS = torch.arange(8) % 3
 
 
