@@ -1,5 +1,6 @@
 """A small world that keeps the contract of ``bidex_meta.world.World``, without physics."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,26 @@ def change(path: Path, **entries: Any) -> Path:
     folder = RunFolder.open(path)
     folder.change_config(run_config(**{**folder.config().to_json(), **entries}))
     return path
+
+
+def evaluated_run(
+    root: Path, seed: int, successes: dict[str, float], algo: str = "mtppo", task: str | None = None, **learner: Any
+) -> Path:
+    """A run's folder with metrics and an evaluation of classes with these success rates."""
+    path = root / f"{algo}_{task}_{seed}_{learner}"
+    folder = RunFolder.create(run_config(task=task, algo=algo, seed=seed, learner=learner), path)
+    metrics = [{"step": 500, "Perf/collection_time": 1700.0, "Perf/learning_time": 100.0}, {"step": 1000}]
+    folder.metrics_path.write_text("".join(json.dumps(row) + "\n" for row in metrics))
+    classes = {name: {"success": s, "return": 10 * s, "score": 100 * s} for name, s in successes.items()}
+    (path / "evaluation.json").write_text(json.dumps({"policy": {"classes": classes}}))
+    return path
+
+
+def log(path: Path, *rows: dict) -> RunFolder:
+    """A run's folder with these lines of metrics alone."""
+    folder = RunFolder.open(path)
+    folder.metrics_path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return folder
 
 
 class ToyWorld(FakeWorld):

@@ -106,7 +106,7 @@ def test_render_puts_the_cloud_beside_the_picture(monkeypatch: pytest.MonkeyPatc
 
     world = make_task_world("HandOver", 3, "cpu", autoreset_mode="DISABLED", threads=1)
     monkeypatch.setattr(type(world), "render", lambda self, row, width, height, camera: np.zeros((height, width, 3), np.uint8))  # fmt: skip  # noqa: E501
-    looked = filming.SeenWorld(world, 200)
+    looked = filming.CloudView(world, 200)
     looked.reset(seed=0)
     pictures = [looked.render(row=row, width=60, height=50) for row in (0, 2)]
     assert pictures[0].shape == (50, 180, 3) and (pictures[0][:, :60] == 0).all()

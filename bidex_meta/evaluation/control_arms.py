@@ -50,9 +50,9 @@ def control(
     Args:
         load: Makes the agent, a MetaLearningAgent; called anew for each arm, so that all draw the same numbers.
         test_world: The held-out tasks, in autoreset mode DISABLED.
-        train_world: The train tasks of the same classes, with as many rows. Its pools are replaced.
+        train_world: The train tasks of the same classes, with as many environments. Its pools are replaced.
         shots: How often each arm adapts.
-        say: Told the mean returns of each arm when it has been played, which may take minutes.
+        say: Called with the mean returns of each arm when it has been played, which may take minutes.
         played: ``rollouts``, ``episodes_per_task``, ``trials``, ``max_adapt_steps``, ``seed`` and ``references`` of
             ``meta_evaluate``.
 

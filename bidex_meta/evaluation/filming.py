@@ -1,4 +1,4 @@
-"""Frames of a policy at work: of one row, or of a row of each class beside each other."""
+"""Frames of a policy at work: of one environment, or of one of each class beside each other."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -20,7 +20,7 @@ def film_row(
     Args:
         agent: The policy.
         world: A world that draws, in autoreset mode DISABLED.
-        row: Which row.
+        row: Index of the environment.
         steps: Steps at most.
         seed: Of the start.
         every: Steps from one frame to the next; None: the last state alone.
@@ -40,14 +40,14 @@ def film_row(
 def film_tiles(
     agent: Agent, world: Any, rows: Sequence[int], steps: int, seed: int, every: int = 1, **look: Any
 ) -> Iterator[np.ndarray]:
-    """So many steps of several rows beside each other; a row that ends begins its next episode.
+    """So many steps of several environments beside each other; each begins its next episode when one ends.
 
-    The name of a row is green from its first success on, until its episode ends.
+    An environment's name is green from its first success on, until its episode ends.
 
     Args:
         agent: The policy.
         world: A world that draws, in autoreset mode DISABLED.
-        rows: Which rows, one for each tile.
+        rows: Indices of the environments, one for each tile.
         steps: Steps.
         seed: Of the starts.
         every: Steps from one frame to the next.
@@ -72,11 +72,10 @@ def film_tiles(
             solved = solved & ~ended
 
 
-class SeenWorld:
-    """A world whose pictures have the cloud of the row beside them: from its camera, then from the side.
+class CloudView:
+    """A world whose pictures have the environment's point cloud beside them: from its camera, then from the side.
 
-    The cloud is made of the physics' state, whatever observations show: a policy that reads the state can be looked at
-    too. Everything but ``render`` is the world's own.
+    The cloud is made of the physics' state, whatever observations show. Everything but ``render`` is the world's own.
 
     Args:
         world: One that draws, of scenes of our own.

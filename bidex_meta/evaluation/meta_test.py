@@ -26,6 +26,7 @@ from bidex_meta.evaluation.play import EVALUATION_SEED, check_world, play_tasks,
 from bidex_meta.evaluation.portions import Portions, task_of_row
 from bidex_meta.evaluation.references import Reference, references_of
 from bidex_meta.evaluation.results import Evaluation, results_by_class
+from bidex_meta.utils.validation import whole_number
 from bidex_meta.world.contract import TaskWorld
 
 MAX_ADAPT_STEPS = 150
@@ -102,31 +103,23 @@ def meta_evaluate(
 ) -> MetaEvaluation:
     """Evaluate an agent before and after adaptation to each task of a world.
 
-    Rows that play the same task share one adaptation. Where the world has fewer rows than tasks times ``rollouts``, its
-    pools of tasks are played in portions (``world.set_tasks``), or a shot takes several rounds; memory is that of the
-    world and of what the agent keeps of a shot. The world must be reset afterwards.
-
-    To tell adaptation to a task from mere further training, let it adapt to data of another one: ``adapt_world`` has
-    the same rows and as many tasks in each pool, e.g. for the held-out task of ML1 and the data of its first train task
-
-        test, other = ml1.make_world("test", 40, autoreset_mode="DISABLED"), ml1.make_world(...)  # alike
-        other.set_tasks({"CatchUnderarm": ml1.train_tasks[0].variation[None]})
-        own, foreign = (meta_evaluate(agent, test, 1, adapt_world=w, seed=7) for w in (None, other))
-
-    All starts, of evaluation and adaptation, are then the same in both arms.
+    Environments that play the same task share one adaptation. Where the world has fewer environments than tasks times
+    ``rollouts``, its pools of tasks are played in portions (``world.set_tasks``), or a shot takes several rounds. The
+    world must be reset afterwards.
 
     Args:
         agent: A MetaLearningAgent; any Agent if ``shots`` is 0. Its ``assign``, if it has one, is told the tasks.
-        world: A world in autoreset mode DISABLED whose rows keep their tasks.
+        world: A world in autoreset mode DISABLED whose environments keep their tasks.
         shots: How often it adapts, one after the other.
-        rollouts: Episodes of each task in a shot; None: one in each row that plays it.
+        rollouts: Episodes of each task in a shot; None: one in each environment that plays it.
         episodes_per_task: Evaluation episodes of each task, after each trial.
         tasks: Only the first so many of each pool; None takes all.
         trials: How often each task is adapted to, from the start and with other episodes.
         max_adapt_steps: Episodes of adaptation are cut (``truncated``) after so many steps.
         seed: Of all starts; without adaptation, and with all tasks in the world at once, those of ``evaluate``.
         references: As in ``evaluate``.
-        adapt_world: Where episodes of adaptation are played, if not on ``world``.
+        adapt_world: Where episodes of adaptation are played, if not on ``world``: of as many environments and tasks,
+            so that adaptation to other tasks' data has the same starts (``bidex_meta.evaluation.control_arms``).
         evaluated: After how many shots to evaluate (0: before all); None: always.
         split: Kept in the result.
 
@@ -174,26 +167,22 @@ def _seed(seed: int, *key: object) -> int:
 
 
 def _begin(agent: Agent, world: TaskWorld, field: TaskWorld) -> MetaLearningAgent:
-    """The agent as it was meta-learned, told which rows share a task."""
+    """The agent as it was meta-learned, with the environments that share a task assigned."""
     shared = task_of_row(world)
     if not torch.equal(shared, task_of_row(field)):
         raise BidexError(
-            "Expected adapt_world to have as many rows and tasks of each class as world, so that each task has data to "
-            "adapt to; they differ. Give both the same num_envs and pools of one length (set_tasks)."
+            "Expected adapt_world to have as many environments and tasks of each class as world, so that each task has "
+            "data to adapt to; they differ. Give both the same num_envs and pools of one length (set_tasks)."
         )
     learner = cast(MetaLearningAgent, agent)
     for method, arguments in (("assign", (shared,)), ("init", ())):
-        if hasattr(agent, method):  # a plain agent has neither, one written for Meta-World no assign
+        if hasattr(agent, method):  # a plain agent has neither, one written for Meta-World no ``assign``
             getattr(agent, method)(*arguments)
     return learner
 
 
 def _adapt(agent: MetaLearningAgent, world: TaskWorld, rollouts: int, max_steps: int, seed: int) -> int:
-    """One shot: ``rollouts`` exploring episodes of each task, then ``adapt``.
-
-    Returns:
-        Transitions that were valid.
-    """
+    """One shot: ``rollouts`` exploring episodes of each task, then ``adapt``; returns its valid transitions."""
     obs, _ = world.reset(seed=seed)
     remaining, first, steps = quota(world, rollouts), True, 0
     while bool((playing := remaining > 0).any()):
@@ -209,7 +198,7 @@ def _adapt(agent: MetaLearningAgent, world: TaskWorld, rollouts: int, max_steps:
 
 @torch.no_grad()
 def _explore(agent: MetaLearningAgent, world: TaskWorld, obs: Tensor, playing: Tensor, max_steps: int) -> int:
-    """One exploring episode in each row of ``playing``, told to the agent; its valid transitions, over all rows."""
+    """One exploring episode in each environment of ``playing``, given to the agent; returns its valid transitions."""
     limit = world.max_episode_steps.clamp(max=max_steps)
     running, steps = playing.clone(), torch.zeros((), dtype=torch.int64, device=playing.device)
     for step in range(1, int(limit[playing].max()) + 1):
@@ -217,7 +206,7 @@ def _explore(agent: MetaLearningAgent, world: TaskWorld, obs: Tensor, playing: T
         action = torch.as_tensor(action, device=obs.device)
         new, reward, terminated, truncated, info = world.step(action)
         valid = running & ~info["unstable"]
-        # The world goes on with rows that were cut here; nobody looks at them until their next reset.
+        # The world goes on with environments that were cut here; they are ignored until their next reset.
         truncated = truncated | ((limit <= step) & ~terminated)
         agent.step(Timestep(obs, action, reward, terminated, truncated, outputs, new, valid))
         steps += valid.sum()
@@ -231,10 +220,8 @@ def _explore(agent: MetaLearningAgent, world: TaskWorld, obs: Tensor, playing: T
 def _check(
     agent: Any, world: TaskWorld, adapt_world: TaskWorld | None, shots: int, episodes_per_task: int, max_steps: int
 ) -> None:
-    if shots < 0:
-        raise BidexError(f"Shots must be 0 or more, not {shots}.")
-    if max_steps < 1:
-        raise BidexError(f"Steps of an episode of adaptation must be at least 1, not {max_steps}.")
+    whole_number("shots", shots, 0)
+    whole_number("max_adapt_steps", max_steps, 1)
     lacking = [name for name in _ADAPTS if not callable(getattr(agent, name, None))]
     if shots and lacking:
         raise BidexError(
@@ -249,5 +236,5 @@ def _check(
         ]
         if sizes[0] != sizes[1]:
             raise BidexError(
-                f"Expected adapt_world with rows, observations and actions as world's, {sizes[0]}, got {sizes[1]}."
+                f"Expected adapt_world with num_envs, observations and actions of world, {sizes[0]}, got {sizes[1]}."
             )

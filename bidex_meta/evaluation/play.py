@@ -1,6 +1,6 @@
 """How good is a policy: success and return per class, over a fixed number of episodes of every task.
 
-The protocol: the world keeps each row on one task of its slot and does not reset by itself (autoreset DISABLED). Every
+The protocol: each environment keeps to one task of its slot and is not reset by itself (autoreset DISABLED). Every
 task is played ``episodes_per_task`` times, whole episodes, by the mean action; a task that ends early is not played
 more often, so easy tasks cannot crowd out hard ones. An episode is a success if ``info["success"]`` was true at any
 step; its return is the sum of the unscaled reward. An episode in which the physics broke is no success and counts with
@@ -38,16 +38,16 @@ def evaluate(
 
     Args:
         agent: The policy.
-        world: A world in autoreset mode DISABLED with at least one row for each task. Rows that share a task share
-            its episodes.
+        world: A world in autoreset mode DISABLED with at least one environment for each task. Environments that share
+            a task share its episodes.
         episodes_per_task: Episodes of each task.
         seed: Passed to the world's reset; None keeps the world's own.
         references: Per class name, what the normalised score and broken episodes are measured against; left out, those
             that the installation stores of the world's classes. ``{}``: none.
 
     Raises:
-        BidexError: The world resets by itself, lacks rows, or ``episodes_per_task`` is not positive;
-            or torch's default precision is not single.
+        BidexError: The world resets by itself or lacks environments, ``episodes_per_task`` is not positive, or torch's
+            default precision is not single.
     """
     check_precision()
     check_world(world, episodes_per_task)
@@ -79,12 +79,11 @@ def play_tasks(agent: Agent, world: TaskWorld, episodes_per_task: int, seed: int
 
 
 def check_world(world: TaskWorld, episodes_per_task: int) -> None:
-    """Refuse what cannot be evaluated on.
+    """Refuses a world that cannot be evaluated on.
 
     Raises:
         BidexError: The world resets by itself or its names are not unique, or ``episodes_per_task`` is not positive.
     """
-    # numpy's whole numbers are some too.
     whole_number("episodes_per_task", episodes_per_task, 1, 1_000_000)
     if not isinstance(getattr(world, "metadata", None), Mapping):
         raise BidexError(f"Expected a world to evaluate on, as Benchmark.make_world makes it, got {shortened(world)}.")
@@ -98,10 +97,10 @@ def check_world(world: TaskWorld, episodes_per_task: int) -> None:
 
 
 def quota(world: TaskWorld, episodes_per_task: int) -> torch.Tensor:
-    """Episodes each row has to play, ``(num_envs,)``: those of a task are split over the rows that play it.
+    """Episodes each environment has to play, ``(num_envs,)``: those of a task are split over its environments.
 
     Raises:
-        BidexError: A task has no row.
+        BidexError: A task has none.
     """
     tasks = world.task_index
     shares = torch.zeros_like(tasks)
@@ -111,7 +110,7 @@ def quota(world: TaskWorld, episodes_per_task: int) -> torch.Tensor:
             if len(rows) == 0:
                 needed = max(world.num_slot_tasks) * world.num_tasks
                 raise BidexError(
-                    f"No row plays task {task} of {name}: {world.num_envs} rows are too few for "
+                    f"No environment plays task {task} of {name}: {world.num_envs} are too few for "
                     f"{sum(world.num_slot_tasks)} tasks. Use num_envs={needed}, or several times that."
                 )
             share, extra = divmod(episodes_per_task, len(rows))
@@ -122,7 +121,7 @@ def quota(world: TaskWorld, episodes_per_task: int) -> torch.Tensor:
 
 @torch.no_grad()
 def _play(agent: Agent, world: TaskWorld, obs: torch.Tensor, playing: torch.Tensor) -> dict[str, torch.Tensor]:
-    """One episode in each row of ``playing``; its return, success, length, unstable, each ``(rows that played,)``."""
+    """An episode in each environment of ``playing``: return, success, length, unstable, each ``(those playing,)``."""
     running = playing.clone()
     returns = torch.zeros(world.num_envs, dtype=torch.float64, device=running.device)
     lengths = torch.zeros(world.num_envs, dtype=torch.int64, device=running.device)
@@ -138,7 +137,7 @@ def _play(agent: Agent, world: TaskWorld, obs: torch.Tensor, playing: torch.Tens
         if not bool(running.any()):
             break
     else:
-        raise RuntimeError(f"{int(running.sum())} rows did not end within their time limit; the world is at fault.")
+        raise RuntimeError(f"{int(running.sum())} environments exceed their time limit; the world is at fault.")
     played = {"return": returns, "success": success, "length": lengths, "unstable": unstable}
     return {key: value[playing] for key, value in played.items()}
 

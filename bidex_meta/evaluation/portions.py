@@ -1,8 +1,8 @@
-"""The tasks of a world in portions that fit its rows, for the meta-test.
+"""The tasks of a world in portions that fit its environments, for the meta-test.
 
-Each adaptation (a trial of a task) takes as many rows as it has rollouts. Where the pools hold more than fit, they are
-cut into portions of equal size and put into the world one after the other. The last portion is filled up with the first
-adaptations, which are played once more and not counted, so that every portion groups the rows alike.
+Each adaptation (a trial of a task) takes as many environments as it has rollouts. Where the pools hold more than fit,
+they are cut into portions of equal size. The last portion is filled up with the first adaptations, which are played
+once more and not counted, so that every portion groups the environments alike.
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,11 +13,12 @@ import torch
 from torch import Tensor
 
 from bidex_meta.errors import BidexError
+from bidex_meta.utils.validation import whole_number
 from bidex_meta.world.contract import PooledWorld, TaskWorld
 
 
 def task_of_row(world: TaskWorld) -> Tensor:
-    """Numbers from 0 on of the tasks of all slots, int64 ``(num_envs,)``: rows with the same number share a task."""
+    """Numbers of the tasks of all slots, int64 ``(num_envs,)``: environments with the same number share a task."""
     before = torch.tensor([0, *world.num_slot_tasks[:-1]], device=world.task_id.device).cumsum(0)
     return world.task_index + before[world.task_id]
 
@@ -26,8 +27,8 @@ def _with_pools(world: TaskWorld) -> PooledWorld:
     if isinstance(world, PooledWorld):
         return world
     raise BidexError(
-        f"Expected as many rows as tasks times rollouts from a {type(world).__name__}, whose tasks cannot be set; it "
-        f"has {world.num_envs}. Raise num_envs, or leave out tasks, trials and rollouts."
+        f"Expected num_envs of tasks times rollouts from a {type(world).__name__}, whose tasks cannot be set; it has "
+        f"{world.num_envs}. Raise num_envs, or leave out tasks, trials and rollouts."
     )
 
 
@@ -44,16 +45,16 @@ class Portions:
 
         Args:
             world: The world, with its pools of tasks.
-            rollouts: Episodes of each task in a shot; None: as many as each has rows, with all tasks in the world.
+            rollouts: Episodes of each task in a shot; None: one in each of its environments, with all tasks at once.
             tasks: Only the first so many of each pool; None: all.
             trials: Adaptations of each task.
 
         Raises:
             BidexError: A number below 1.
         """
-        for name, number in (("Rollouts", rollouts), ("Tasks of each class", tasks), ("Trials", trials)):
-            if number is not None and number < 1:
-                raise BidexError(f"{name} must be at least 1, not {number}.")
+        for name, number in (("rollouts", rollouts), ("tasks", tasks), ("trials", trials)):
+            if number is not None:
+                whole_number(name, number, 1)
         self._pool_sizes = list(world.num_slot_tasks)
         chosen = [min(tasks or size, size) for size in self._pool_sizes]
         # The task of each adaptation, for each slot.

@@ -10,10 +10,8 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import read_groups
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.stored import StoredRun, open_run
-from tests.fakes import change
+from tests.fakes import change, evaluated_run, log
 from tests.pages import ROOT
-from tests.test_comparison import run
-from tests.test_histories import log
 from tools import collect as tool
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
@@ -21,7 +19,7 @@ COMMIT = "0123456789abcdef0123456789abcdef01234567"
 
 def evaluated(root: Path, seed: int, success: float, name: str | None = None, rows: int = 500, **learner) -> Path:
     """A run of two classes with a curve, as the commands leave it; without weights."""
-    path = run(root, seed, {"A": success, "B": 0.25}, **learner)
+    path = evaluated_run(root, seed, {"A": success, "B": 0.25}, **learner)
     lines = [
         {"step": 2 * i, "time": 1.0, "Train/success/A": i / rows, "Train/return/B": 1.0, "Perf/training_time": 3.0 * i}
         for i in range(1, rows + 1)
@@ -152,7 +150,7 @@ def test_what_is_refused_leaves_nothing_written(tmp_path: Path) -> None:
     (bad / "metrics.jsonl").write_text("")
     refused("holds nothing")
     (bad / "config.json").write_text("{}")
-    refused("is not a run's config")
+    refused("config.json: ")
     collect(good, into=into)
     collect(good, into=into)  # once more is no harm
     folder = RunFolder.open(good)

@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 from bidex_meta.errors import BidexError
-from tests.fakes import change
-from tests.test_histories import log
+from tests.fakes import change, evaluated_run, log
 from tests.tools import test_collect
 from tests.tools.test_collect import collect
 from tools.collect import portable
@@ -19,7 +18,7 @@ RANDOM = {"classes": {"C": {"success": 0.0, "return": 2.0}}}
 
 def made(root: Path, name: str, algo: str, seed: int, score: float, dataset: str | None, **learner: float) -> Path:
     """An evaluated run on class C whose return is 2 + 0.2 ``score``; the expert's is 22."""
-    path = test_collect.run(root, seed, {"C": 0.5}, algo, task="C", **learner)
+    path = evaluated_run(root, seed, {"C": 0.5}, algo, task="C", **learner)
     log(path, {"step": 1000, "Perf/training_time": 7.0})
     change(path, steps=1000, **({} if dataset is None else {"dataset": [dataset], "task_seed": 0}))
     found = json.loads((path / "evaluation.json").read_text())

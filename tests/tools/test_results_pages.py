@@ -8,9 +8,8 @@ import pytest
 
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
-from tests.fakes import change
+from tests.fakes import change, evaluated_run, log
 from tests.pages import ROOT
-from tests.test_histories import log
 from tests.tools import test_collect
 from tests.tools.test_collect import collect, evaluated
 from tools.pages import __main__ as pages
@@ -98,8 +97,8 @@ def test_pictures_are_drawn_anew_where_the_data_changed(page: Path) -> None:
 
 def test_suites_of_the_same_classes_and_classes_alone_stand_beside_each_other(tmp_path: Path) -> None:
     whole = evaluated(tmp_path, 0, 0.5, "MT4-base-seed0")
-    alone = [test_collect.run(tmp_path, 0, {name: 0.7}, "ppo", task=name) for name in "AB"]
-    other = test_collect.run(tmp_path, 0, {"C": 0.7}, "ppo", task="C", gamma=0.3)
+    alone = [evaluated_run(tmp_path, 0, {name: 0.7}, "ppo", task=name) for name in "AB"]
+    other = evaluated_run(tmp_path, 0, {"C": 0.7}, "ppo", task="C", gamma=0.3)
     for path in (*alone, other):
         log(path, {"step": 1000, "Perf/training_time": 7.0})
         shutil.copy(whole / "versions.json", path)
@@ -119,7 +118,7 @@ def test_rows_by_learners(tmp_path: Path) -> None:
     """The paper's Figure 6: a cell a number of rows, of each learner; a panel a learner."""
     for algo, rows, value in (("sac", 8, 0.9), ("sac", 64, 0.1), ("ppo", 64, 0.5)):
         for seed in (0, 1):
-            path = test_collect.run(tmp_path, seed, {"C": value + seed / 10}, algo, task="place/C")
+            path = evaluated_run(tmp_path, seed, {"C": value + seed / 10}, algo, task="place/C")
             path = path.rename(tmp_path / f"C-{algo} {rows}-seed{seed}")
             log(path, {"step": 500, "Train/return/C": 1.0}, {"step": 1000, "Train/return/C": 2.0})
             change(path, num_envs=rows)
@@ -142,7 +141,7 @@ def test_the_best_run_of_each_class(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("tools.pages.tables.load", lambda kind: {"C": {"success": 0.125}} if kind == "witness" else {})
     monkeypatch.setattr("tools.pages.tables.registry.names", lambda: ["D"])  # first, though its file is read last
     for name, arm, success, value in (("C", "ppo", 0.5, 9.0), ("C", "sac", 0.75, 2.0), ("D", "ppo", 0.0, 3.0)):
-        path = test_collect.run(tmp_path, 0, {name: success}, arm, task=f"place/{name}")
+        path = evaluated_run(tmp_path, 0, {name: success}, arm, task=f"place/{name}")
         path = path.rename(tmp_path / f"{name}-{arm}-seed0")
         log(path, {"step": 1000, f"Train/return/{name}": 1.0, "Perf/training_time": 1800.0})
         row = {"success": success, "success_interval": [0.0, 1.0], "return": value, "score": None}

@@ -158,7 +158,7 @@ def test_what_starts_from_another_waits_for_it_and_fails_with_it(file: Path, tmp
 def test_a_sweep_that_was_stopped_loses_no_run(file: Path, tmp_path: Path, how: str) -> None:
     """SIGKILL of the sweep, and of its runs or not, which then go on and are waited for; or SIGTERM of the sweep."""
     code = (
-        "import signal; from bidex_meta.cli import sweep as queue; from tests.test_sweep import planned; "
+        "import signal; from bidex_meta.cli import sweep as queue; from tests.cli.test_sweep import planned; "
         "signal.signal(signal.SIGTERM, signal.default_int_handler); "
         f"queue.COMMAND = {FAKE!r}; queue.work(planned(), [None, None], print)"
     )

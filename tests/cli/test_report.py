@@ -11,8 +11,7 @@ import pytest
 from bidex_meta.cli import main
 from bidex_meta.cli import report as page
 from bidex_meta.runs import RunFolder
-from tests.test_comparison import run
-from tests.test_histories import log
+from tests.fakes import evaluated_run, log
 
 ROWS = [
     {
@@ -44,8 +43,8 @@ class Tags(HTMLParser):
 
 @pytest.fixture
 def runs(tmp_path: Path) -> list[Path]:
-    paths = [run(tmp_path, seed, {"A": 0.5 + seed / 10, "<b>&": 0.1}, gamma=0.9) for seed in (0, 1)]
-    paths += [run(tmp_path, 0, {"A": 0.9, "<b>&": 0.2}, gamma=0.8, activation="<script>")]
+    paths = [evaluated_run(tmp_path, seed, {"A": 0.5 + seed / 10, "<b>&": 0.1}, gamma=0.9) for seed in (0, 1)]
+    paths += [evaluated_run(tmp_path, 0, {"A": 0.9, "<b>&": 0.2}, gamma=0.8, activation="<script>")]
     for path in paths:
         log(path, *ROWS)
     return paths

@@ -5,7 +5,7 @@ import pytest
 from bidex_meta.cli import main, policies
 from bidex_meta.tasks import registry
 from bidex_meta.worlds.own import OwnSuite, SingleClass
-from tests.test_cli import run, toy, toy_worlds
+from tests.cli.test_run import run, toy, toy_worlds
 
 __all__ = ["toy_worlds"]
 

@@ -33,7 +33,7 @@ def test_names_are_taken_in_any_case_and_kept_as_they_are_written(capsys):
 
 
 def test_hints_name_extras_that_there_are():
-    root = Path(__file__).parents[1]
+    root = Path(__file__).parents[2]
     extras = tomllib.loads((root / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     sources = [*root.glob("bidex_meta/**/*.py"), *root.glob("algos/**/*.py"), *root.glob("docs/**/*.md")]
     named = {found for path in sources for found in re.findall(r"bidex-meta\[([\w-]+)\]", path.read_text())}

@@ -1,27 +1,15 @@
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.comparison import iqm, iqm_difference, read_groups
+from bidex_meta.evaluation.comparison import iqm, iqm_difference, over_runs, read_groups, read_histories
+from bidex_meta.evaluation.statistics import bootstrap_band, bootstrap_interval, mean
 from bidex_meta.runs import RunFolder
-from tests.fakes import change, run_config
-
-
-def run(
-    root: Path, seed: int, successes: dict[str, float], algo: str = "mtppo", task: str | None = None, **learner: Any
-) -> Path:
-    path = root / f"{algo}_{task}_{seed}_{learner}"
-    folder = RunFolder.create(run_config(task=task, algo=algo, seed=seed, learner=learner), path)
-    metrics = [{"step": 500, "Perf/collection_time": 1700.0, "Perf/learning_time": 100.0}, {"step": 1000}]
-    folder.metrics_path.write_text("".join(json.dumps(row) + "\n" for row in metrics))
-    classes = {name: {"success": s, "return": 10 * s, "score": 100 * s} for name, s in successes.items()}
-    (path / "evaluation.json").write_text(json.dumps({"policy": {"classes": classes}}))
-    return path
+from tests.fakes import change, evaluated_run, log
 
 
 def groups(*paths: Path):
@@ -29,8 +17,8 @@ def groups(*paths: Path):
 
 
 def test_runs_that_differ_in_the_seed_alone_are_one_group(tmp_path: Path):
-    paths = [run(tmp_path, seed, {"A": 0.5, "B": seed / 10}, gamma=0.9) for seed in (2, 1)]
-    other = run(tmp_path, 1, {"A": 0.1, "B": 0.1}, gamma=0.8)
+    paths = [evaluated_run(tmp_path, seed, {"A": 0.5, "B": seed / 10}, gamma=0.9) for seed in (2, 1)]
+    other = evaluated_run(tmp_path, 1, {"A": 0.1, "B": 0.1}, gamma=0.8)
     first, second = groups(*paths, other)
     assert (first.label, first.seeds, second.label) == ("mtppo, gamma 0.9", [1, 2], "mtppo, gamma 0.8")
     assert np.array_equal(first.success, [[0.5, 0.1], [0.5, 0.2]]) and np.array_equal(first.returns, 10 * first.success)
@@ -38,7 +26,7 @@ def test_runs_that_differ_in_the_seed_alone_are_one_group(tmp_path: Path):
 
 
 def test_runs_that_start_from_runs_of_their_own_seed_are_one_group(tmp_path: Path):
-    paths = [run(tmp_path, seed, {"A": 0.5}) for seed in (0, 1, 2)]
+    paths = [evaluated_run(tmp_path, seed, {"A": 0.5}) for seed in (0, 1, 2)]
     for number, path in enumerate(paths[:2]):
         change(path, start_from=f"/runs/{number}")
     started, fresh = groups(*paths)
@@ -60,24 +48,28 @@ def test_runs_that_start_from_runs_of_their_own_seed_are_one_group(tmp_path: Pat
 def test_runs_of_other_data_or_worlds_are_other_groups(
     tmp_path: Path, entry: str, usual: object, other: object, label: str
 ):
-    runs = [change(run(tmp_path, s, {"A": 0.5}, "bc", task="HandOver"), **{entry: usual}) for s in (0, 1)]
-    runs += [run(tmp_path, 2, {"A": 0.5}, "bc", task="HandOver")] if not usual or usual == "own" else []
+    runs = [change(evaluated_run(tmp_path, s, {"A": 0.5}, "bc", task="HandOver"), **{entry: usual}) for s in (0, 1)]
+    runs += [evaluated_run(tmp_path, 2, {"A": 0.5}, "bc", task="HandOver")] if not usual or usual == "own" else []
     (tmp_path / "x").mkdir()
-    first, second = groups(*runs, change(run(tmp_path / "x", 0, {"A": 0.5}, "bc", task="HandOver"), **{entry: other}))
+    first, second = groups(
+        *runs, change(evaluated_run(tmp_path / "x", 0, {"A": 0.5}, "bc", task="HandOver"), **{entry: other})
+    )
     assert (len(first.seeds), second.seeds) == (len(runs), [0]), "configs that do not know the entry have the usual"
     assert second.label == f"bc, {entry} {label}"
 
 
 def test_data_sets_called_as_their_class_leave_classes_one_group(tmp_path: Path):
     paths = [
-        change(run(tmp_path, 0, {c: 0.5}, "bc", task=c), dataset=[f"{c}/medium-v0"], demonstrations=[f"{c}/d"])
+        change(
+            evaluated_run(tmp_path, 0, {c: 0.5}, "bc", task=c), dataset=[f"{c}/medium-v0"], demonstrations=[f"{c}/d"]
+        )
         for c in ("A", "B")
     ]
     assert [(group.label, group.classes) for group in groups(*paths)] == [("bc", ["A", "B"])]
 
 
 def test_runs_of_single_classes_make_one_seed_together(tmp_path: Path):
-    paths = [run(tmp_path, seed, {c: 0.5}, "ppo", task=c) for seed in (0, 1) for c in "AB"]
+    paths = [evaluated_run(tmp_path, seed, {c: 0.5}, "ppo", task=c) for seed in (0, 1) for c in "AB"]
     [group] = groups(*paths)
     assert (group.label, group.classes, group.seeds, group.steps, group.hours) == ("ppo", ["A", "B"], [0, 1], 2000, 1.0)
 
@@ -100,7 +92,11 @@ def test_a_difference_that_seeds_blur_holds_zero_and_a_clear_one_does_not():
 
 
 def test_the_command_prints_tables_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    paths = [str(run(tmp_path, s, {"A": 0.5, "B": 0.2 + s / 10}, algo)) for algo in ("mtppo", "mttrpo") for s in (0, 1)]
+    paths = [
+        str(evaluated_run(tmp_path, s, {"A": 0.5, "B": 0.2 + s / 10}, algo))
+        for algo in ("mtppo", "mttrpo")
+        for s in (0, 1)
+    ]
     assert main(["compare", *paths]) == 0
     out = capsys.readouterr().out
     assert "mttrpo" in out and "50 % (50 to 50)" in out and "is no difference" in out
@@ -111,8 +107,11 @@ def test_the_command_prints_tables_and_json(tmp_path: Path, capsys: pytest.Captu
 
 
 def test_the_table_shows_each_class_under_its_own_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    first = run(tmp_path, 0, {"B": 0.25, "A": 0.75})
-    second, third = run(tmp_path, 0, {"A": 1.0, "B": 0.5}, "mttrpo"), run(tmp_path, 0, {"C": 1.0}, "mtsac")
+    first = evaluated_run(tmp_path, 0, {"B": 0.25, "A": 0.75})
+    second, third = (
+        evaluated_run(tmp_path, 0, {"A": 1.0, "B": 0.5}, "mttrpo"),
+        evaluated_run(tmp_path, 0, {"C": 1.0}, "mtsac"),
+    )
     assert main(["compare", str(first), str(second), str(third)]) == 0
     table = capsys.readouterr().out
     lines = [line.split("│") for line in table.splitlines() if "success" in line and "(" in line and "IQM" not in line]
@@ -123,7 +122,7 @@ def test_the_table_shows_each_class_under_its_own_name(tmp_path: Path, capsys: p
 
 
 def test_an_evaluation_that_is_torn_or_of_fewer_steps_is_refused(tmp_path: Path):
-    path = run(tmp_path, 0, {"A": 0.5})
+    path = evaluated_run(tmp_path, 0, {"A": 0.5})
     found = json.loads((path / "evaluation.json").read_text())
     (path / "evaluation.json").write_text(json.dumps({"steps": 1016, **found}))
     assert groups(path)[0].steps == 1000
@@ -136,7 +135,7 @@ def test_an_evaluation_that_is_torn_or_of_fewer_steps_is_refused(tmp_path: Path)
 
 
 def test_a_run_that_time_ended_is_of_the_steps_it_made(tmp_path: Path):
-    path = run(tmp_path, 0, {"A": 0.5})
+    path = evaluated_run(tmp_path, 0, {"A": 0.5})
     change(path, steps=10**9, minutes=4.0)
     found = json.loads((path / "evaluation.json").read_text())
     (path / "evaluation.json").write_text(json.dumps({"steps": 1000, **found}))
@@ -148,7 +147,7 @@ def test_a_run_that_time_ended_is_of_the_steps_it_made(tmp_path: Path):
 
 
 def test_steps_are_the_mean_over_seeds_that_time_ended_with_their_range(tmp_path: Path, capsys):
-    paths = [change(run(tmp_path, seed, {"A": 0.5}), steps=10**9, minutes=4.0) for seed in range(3)]
+    paths = [change(evaluated_run(tmp_path, seed, {"A": 0.5}), steps=10**9, minutes=4.0) for seed in range(3)]
     for path, steps in zip(paths, (1000, 1600, 4000), strict=True):
         found = json.loads((path / "evaluation.json").read_text())
         (path / "evaluation.json").write_text(json.dumps({"steps": steps, **found}))
@@ -163,7 +162,7 @@ def test_steps_are_the_mean_over_seeds_that_time_ended_with_their_range(tmp_path
 
 
 def test_a_run_that_a_return_or_score_ended_is_of_the_steps_it_made(tmp_path: Path):
-    path = run(tmp_path, 0, {"A": 0.5})
+    path = evaluated_run(tmp_path, 0, {"A": 0.5})
     found = json.loads((path / "evaluation.json").read_text())
     (path / "evaluation.json").write_text(json.dumps({"steps": 1000, **found}))
     rows = [{"step": 500, "Train/mean_return": 2.0, "Eval/score": None}, {"step": 1000, "Train/mean_return": 8.5}]
@@ -193,7 +192,7 @@ def test_a_run_that_a_return_or_score_ended_is_of_the_steps_it_made(tmp_path: Pa
 
 
 def test_a_class_without_a_reference_leaves_the_group_without_a_score(tmp_path: Path):
-    path = run(tmp_path, 0, {"A": 0.5})
+    path = evaluated_run(tmp_path, 0, {"A": 0.5})
     (path / "evaluation.json").write_text(
         json.dumps({"classes": {"A": {"success": 0.5, "return": 1.0, "score": None}}})
     )
@@ -201,12 +200,12 @@ def test_a_class_without_a_reference_leaves_the_group_without_a_score(tmp_path: 
 
 
 def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    one = run(tmp_path, 0, {"A": 0.5}, gamma=0.9)
+    one = evaluated_run(tmp_path, 0, {"A": 0.5}, gamma=0.9)
     (tmp_path / "again").mkdir()
     with pytest.raises(BidexError, match="second run of mtppo with seed 0"):
-        groups(one, run(tmp_path / "again", 0, {"A": 0.5}, gamma=0.9))
+        groups(one, evaluated_run(tmp_path / "again", 0, {"A": 0.5}, gamma=0.9))
     with pytest.raises(BidexError, match="same classes"):
-        groups(one, run(tmp_path / "again", 1, {"B": 0.5}, gamma=0.9))
+        groups(one, evaluated_run(tmp_path / "again", 1, {"B": 0.5}, gamma=0.9))
     (one / "evaluation.json").unlink()
     for words, told in (
         ([], "Name the run"),
@@ -215,3 +214,60 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     ):
         assert main(["compare", *words]) == 2
         assert told in capsys.readouterr().err
+
+
+# Curves over training.
+
+
+def test_a_band_is_the_interval_of_each_point():
+    values = np.random.default_rng(3).normal(size=(8, 4))
+    low, high = bootstrap_band(values)
+    for point in range(4):
+        ends = bootstrap_interval(mean, values[:, point])
+        assert ends is not None
+        width = ends[1] - ends[0]
+        assert (low[point], high[point]) == pytest.approx(ends, abs=0.08 * width)
+
+
+def test_curves_of_runs_meet_where_all_have_values():
+    one = over_runs([(np.array([10.0, 20.0]), np.array([1.0, 2.0]))])
+    assert one is not None and one.low is None and one.steps.tolist() == [10.0, 20.0]
+    both = over_runs([(np.array([0.0, 100.0]), np.array([0.0, 100.0])), (np.array([50.0, 70.0]), np.array([1.0, 1.0]))])
+    assert both is not None and both.low is not None and both.high is not None
+    assert (both.steps[0], both.steps[-1], both.mean[0], both.mean[-1]) == (50.0, 70.0, 25.5, 35.5)
+    assert (both.low[0], both.high[0]) == (1.0, 50.0)
+    nothing = (np.array([]), np.array([]))
+    assert over_runs([nothing]) is None
+    left = over_runs([nothing, (np.array([1.0]), np.array([5.0]))])
+    assert left is not None and left.low is None and left.mean.tolist() == [5.0]
+
+
+def test_runs_are_grouped_whether_evaluated_or_not(tmp_path: Path):
+    paths = [evaluated_run(tmp_path, seed, {"A": 0.5}, gamma=0.9) for seed in (0, 1)]
+    (paths[1] / "evaluation.json").unlink()
+    other = evaluated_run(tmp_path, 0, {"A": 0.5}, gamma=0.8)
+    rows = [{"step": s, "time": 1.0, "Train/success/A": s / 100, "Loss/value": None} for s in (10, 20)]
+    folders = [log(path, *rows) for path in (*paths, other)]
+    first, second = read_histories(folders)
+    assert (first.label, second.label) == ("mtppo, gamma 0.9", "mtppo, gamma 0.8")
+    assert [len(each.runs) for each in (first, second)] == [2, 1]
+    assert list(first.curves) == ["Train/success/A"]
+    with pytest.raises(BidexError, match="holds nothing yet"):
+        read_histories([log(paths[0])])
+
+
+def test_plot_takes_several_runs_and_compare_draws(tmp_path: Path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rows = [{"step": s, "Train/success/A": s / 100, "Train/return/A": float(s)} for s in (10, 20)]
+    paths = [evaluated_run(tmp_path, seed, {"A": 0.5}) for seed in (0, 1)]
+    for path in paths:
+        log(path, *rows, {"step": 1000})
+    names = list(map(str, paths))
+    assert main(["plot", *names]) == 0
+    assert capsys.readouterr().out == "curves.png\n"
+    assert (tmp_path / "curves.png").read_bytes()[:4] == b"\x89PNG"
+    assert main(["compare", *names, "--out", str(tmp_path / "c.svg")]) == 0
+    assert "success, IQM" in (tmp_path / "c.svg").read_text()
+    assert main(["plot", *names, "--adaptation"]) == 2
+    assert "draws one run, got 2" in capsys.readouterr().err
+    assert main(["plot"]) == 2

@@ -16,8 +16,8 @@ from bidex_meta.evaluation.results import ClassResult
 from bidex_meta.runs import RunFolder
 from bidex_meta.worlds import Worlds
 from bidex_meta.worlds.own import OwnSuite
+from tests.cli.test_metatest import COUNTS, points
 from tests.fakes import ToyWorld, run_config
-from tests.test_metatest_commands import COUNTS, points
 
 SMALL = ["--suite", "MT4", "--num-envs", "6", "--threads", "1", "--device", "cpu", "--learner.hidden", "8"]
 
