@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     import torch
 
     from bidex_meta.agents import Agent
-    from bidex_meta.data.joined import Joined
     from bidex_meta.world.contract import VectorWorld
 
 AutoresetMode = Literal["SAME_STEP", "DISABLED"]
@@ -100,12 +99,12 @@ class Learner(ABC):
     def load_policy(cls, state: State, device: "str | torch.device" = "cpu") -> "Agent":
         """The agent of a checkpoint (its entry ``learner.policy``), for a world of any number of environments."""
 
-    def learn_from(self, data: "Joined") -> None:
-        """Takes the transitions to learn from, before the first iteration and before a checkpoint is loaded."""
+    def learn_from(self, data: Any) -> None:
+        """Takes the transitions to learn from (``bidex_meta.data.joined.Joined``), before anything else."""
         raise BidexError(f"{self.name}: learns by playing, not from data sets.")
 
-    def learn_from_demonstrations(self, data: "Joined") -> None:
-        """Takes transitions to imitate, before the first iteration and before a checkpoint is loaded."""
+    def learn_from_demonstrations(self, data: Any) -> None:
+        """Takes transitions to imitate (likewise), before the first iteration and before a checkpoint is loaded."""
         raise BidexError(f"{self.name}: imitates no demonstrations.")
 
     def start_from(self, policy: State) -> None:

@@ -9,11 +9,11 @@ from torch import Tensor
 
 from bidex_meta.engine.health import checked_state, dense
 from bidex_meta.errors import BidexError, shortened, unknown_name
-from bidex_meta.points.depth_sensor import PointsRule
 from bidex_meta.tasks.scene import Scene
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.utils.maths import check_precision
 from bidex_meta.utils.validation import whole_number
+from bidex_meta.world.depth_sensor import PointsRule
 from bidex_meta.world.groups import Slot, with_pool
 from bidex_meta.world.observations import Rule
 

@@ -11,9 +11,9 @@ from bidex_meta.engine.capacity import room_for
 from bidex_meta.engine.models import same_structure
 from bidex_meta.engine.protocol import Engine, EngineMaker
 from bidex_meta.errors import BidexError
-from bidex_meta.points.depth_sensor import DepthSensor, PointsRule
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.scene import Scene, compile_scene
+from bidex_meta.world.depth_sensor import DepthSensor, PointsRule
 
 _LARGEST = 1e6
 """Bound of a variation's numbers (metres, radians, draws): single precision keeps the square of a distance finite."""

@@ -7,13 +7,13 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.hand import FORCE_PER_SCALE, SIDES, TORQUE_PER_SCALE, hand
-from bidex_meta.points.depth_sensor import DepthSensor
 from bidex_meta.tasks.base import CONTROL_RATE, TaskClass
 from bidex_meta.tasks.layout import CLIP
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.utils.maths import xyzw
 from bidex_meta.world import checked
 from bidex_meta.world.base import Transition
+from bidex_meta.world.depth_sensor import DepthSensor
 from bidex_meta.world.groups import Group, Member, Slot
 from bidex_meta.world.observations import Observer, Rule
 

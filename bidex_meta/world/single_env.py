@@ -14,10 +14,10 @@ import torch
 from gymnasium.spaces import Box
 
 from bidex_meta.errors import BidexError
-from bidex_meta.points.depth_sensor import PointsRule
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import CONTROL_RATE, TaskClass
 from bidex_meta.world.contract import Info, Options
+from bidex_meta.world.depth_sensor import PointsRule
 from bidex_meta.world.groups import Slot
 from bidex_meta.world.rendering import CAMERAS
 from bidex_meta.world.world import World

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from bidex_meta.engine.choice import choose_engine
 from bidex_meta.errors import BidexError
-from bidex_meta.points.depth_sensor import PointsRule
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.layout import CLIP
 from bidex_meta.utils.memory import POINT_BYTES, ROW_BYTES, check_memory
@@ -25,6 +24,7 @@ from bidex_meta.utils.validation import whole_number
 from bidex_meta.world import checked
 from bidex_meta.world.base import BatchedWorld, Slots, Transition
 from bidex_meta.world.contract import Info, State
+from bidex_meta.world.depth_sensor import PointsRule
 from bidex_meta.world.graphs import GraphCache, SideBySide, Work, cuda_graph, fresh
 from bidex_meta.world.groups import Group, Slot, build_groups, sights, with_pool, with_pools
 from bidex_meta.world.observations import Rule, observation_groups

@@ -241,7 +241,7 @@ def test_masks_of_other_types_start_the_same_rows() -> None:
 
 
 def test_states_of_worlds_of_others() -> None:
-    from bidex_meta.clients.humanoid_world import HumanoidWorld
+    from bidex_meta.worlds.humanoid import HumanoidWorld
 
     world = HumanoidWorld(2, threads=1)
     world.reset(seed=0)

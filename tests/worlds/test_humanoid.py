@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from bidex_meta.cli import main, watching
-from bidex_meta.clients.humanoid_world import NAME, HumanoidWorld
 from bidex_meta.errors import BidexError
 from bidex_meta.runs import RunFolder
 from bidex_meta.worlds import Worlds
 from bidex_meta.worlds.external import HUMANOID
+from bidex_meta.worlds.humanoid import NAME, HumanoidWorld
 
 
 def test_as_gymnasiums() -> None:

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bidex_meta.points.surfaces import FIXTURE, HAND, OBJECT, Surfaces
 from bidex_meta.tasks.base import TaskClass
+from bidex_meta.world.surfaces import FIXTURE, HAND, OBJECT, Surfaces
 
 _DIRECTION = (0.49, 0.0, 0.75)
 """From the target to the camera, of HandOver in the original code."""

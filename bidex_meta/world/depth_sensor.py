@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.hand import SIDES
-from bidex_meta.points.cloud import Cloud, camera_of
-from bidex_meta.points.surfaces import sample
 from bidex_meta.suite import MOST_POINTS
 from bidex_meta.tasks.scene import Scene
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.utils.validation import true_or_false, whole_number
+from bidex_meta.world.cloud import Cloud, camera_of
+from bidex_meta.world.surfaces import sample
 
 CANDIDATES = 3072
 """Points fixed on a scene at least: fewer leave gaps through which hidden points are seen."""
