@@ -97,7 +97,7 @@ def final(path: Path) -> tuple[dict[str, Any], int]:
 def test_two_processes_train_mt4_and_end_with_equal_networks(tmp_path: Path) -> None:
     code, said = finish(start(tmp_path, *SMALL, "--steps", 6 * ITERATION, "--run-dir", "r"))
     assert code == 0, said
-    assert said.count("mtppo on MT4, 2 x 4 rows on cpu, seed 3") == 1
+    assert said.count("mtppo on MT4, 2 x 4 environments on cpu, seed 3") == 1
     assert len([line for line in said if line.startswith("Run folder")]) == 1
     rows = read_metrics(tmp_path / "r" / "metrics.jsonl")
     assert [row["step"] for row in rows] == [ITERATION * (i + 1) for i in range(6)]
@@ -214,7 +214,8 @@ def test_processes_that_disagree_are_refused(monkeypatch: pytest.MonkeyPatch) ->
     plan = plan_run(SMALL)
 
     def agree(step: int | None = None, **other: Any) -> Any:
-        monkeypatch.setattr(distributed, "share", lambda mine: [mine, (replace(plan.config, **other), step)])
+        theirs = (replace(plan.config, **other), step)
+        monkeypatch.setattr(distributed, "share", lambda mine: [mine, theirs] if isinstance(mine, tuple) else [mine])
         return _agree(plan, None)
 
     assert agree(threads=99).config.threads == 1
