@@ -9,6 +9,7 @@ import torch
 
 from bidex_meta.cli.learners import ALGOS, learner_kind
 from bidex_meta.errors import BidexError
+from bidex_meta.world.contract import plain_groups
 from tests.algos.families import PointClass, PointGoals
 from tests.algos.problems import opposite_bandits
 from tests.algos.ranks import same
@@ -72,6 +73,15 @@ CASES = {
     "rl2": Case("rl2", {"hidden": (8,), "memory": 8, "chunk": 4, "num_minibatches": 2}), "bc": Case("bc", DATA),
     "td3bc": Case("td3bc", DATA), "iql": Case("iql", DATA), "bcq": Case("bcq", DATA | {"vae_hidden": (16, 16)}),
 }  # fmt: skip
+SHARING = {
+    f"{algo} {name}": Case(algo, more | shared | {"hidden": (16, 8)})
+    for algo, more in (("mtppo", ON), ("mttrpo", ON), ("mtsac", OFF), ("td3", OFF))
+    for name, shared in (
+        *((trunk, {"architecture": trunk, "modules": 2}) for trunk in ("soft_modules", "paco", "moore")),
+        ("embedding", {"task_embedding": 4}),
+        *((way, {"gradient_surgery": way}) for way in ("pcgrad", "cagrad", "famo") if algo == "mtppo"),
+    )
+}
 PLAYING = {name: case for name, case in CASES.items() if not learner_kind(case.algo).make.offline}
 
 
@@ -79,7 +89,7 @@ def each(cases: dict[str, Case]) -> Callable[..., Any]:
     return pytest.mark.parametrize("case", cases.values(), ids=cases)
 
 
-@each(CASES)
+@each(CASES | SHARING)
 def test_save_load_resume_is_bit_equal(case: Case) -> None:
     unbroken, again = resumed(case.make, iterations=2)
     policy = type(again).load_policy(again.policy_state_dict())
@@ -117,6 +127,18 @@ def test_a_checkpoint_of_another_number_of_environments_is_refused(case: Case) -
     state = case.trained().state_dict()
     with pytest.raises(BidexError, match=r"num_envs"):
         case.make(world=case.world(rows=9)).load_state_dict(state)
+
+
+@pytest.mark.parametrize("option", [{"policy_heads": True}, {"task_embedding": 4}, {"architecture": "paco"}])
+@pytest.mark.parametrize("algo", ["mtppo", "mttrpo", "mtsac", "td3", "brc"])
+def test_what_tells_tasks_apart_needs_their_one_hot(algo: str, option: dict[str, Any]) -> None:
+    case = Case(algo, {"hidden": (16, 16), "task_embedding": 0} | option)
+    world = case.world()
+    world.num_id_columns, world.observation_groups = 0, plain_groups(3, 0)
+    if (algo, "architecture" in option) == ("brc", True):
+        return  # its networks are residual
+    with pytest.raises(BidexError, match=rf"{algo}: {next(iter(option))}.* needs the one-hot of 2 tasks"):
+        case.make(world=world)
 
 
 @each(CASES)

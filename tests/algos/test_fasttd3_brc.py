@@ -13,9 +13,7 @@ from torch.testing import assert_close
 from bidex_algos.offpolicy.brc import BRC, BRCConfig
 from bidex_algos.offpolicy.fasttd3 import FastTD3, FastTD3Config
 from bidex_algos.replay import Transitions
-from bidex_meta.errors import BidexError
 from bidex_meta.train import distributed
-from bidex_meta.world.contract import plain_groups
 from tests.algos.problems import LQR, opposite_bandits, trained
 from tests.algos.ranks import in_two_processes, same
 from tests.algos.test_categorical import slow_projection
@@ -200,10 +198,6 @@ def test_wide_critics_are_counted_as_memory(kind: Any, config: Any) -> None:
     assert wide.bytes_held(64, 500) - config.bytes_held(64, 500) > 2 * 2 * 4096**2 * 4 * 4
 
 
-def test_one_task_needs_no_embedding_and_several_need_their_one_hot() -> None:
+def test_one_task_needs_no_embedding() -> None:
     assert LQR().num_id_columns == 0
     trained(BRC, LQR(rows=4), SMALL, 1)
-    world = opposite_bandits()
-    world.num_id_columns, world.observation_groups = 0, plain_groups(3, 0)
-    with pytest.raises(BidexError, match="brc: task_embedding needs the one-hot of 2 tasks"):
-        BRC(world, SMALL, seed=0)

@@ -8,7 +8,6 @@ from bidex_algos.nets.networks import gaussian_log_prob
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.rollout import collect
 from bidex_meta.errors import BidexError
-from bidex_meta.world.contract import plain_groups
 from tests.algos.toy import ToyWorld, nearness
 
 SMALL = MTPPOConfig(
@@ -21,27 +20,6 @@ def mean_errors(learner: MTPPO, world: ToyWorld, targets: list[float]) -> list[f
     obs, _ = world.reset(seed=1)
     action = learner.eval_action(obs)
     return [float((action[world.task_id == k] - t).abs().max()) for k, t in enumerate(targets)]
-
-
-@pytest.mark.parametrize("heads", [True, False])
-def test_two_tasks_at_odds_are_learned_though_one_pays_a_thousandfold(heads: bool):
-    world = ToyWorld([nearness(0.4), nearness(-0.4, scale=1000.0)])
-    learner = MTPPO(world, replace(SMALL, value_heads=heads), seed=0)
-    for _ in range(60):
-        learner.iterate()
-    assert max(mean_errors(learner, world, [0.4, -0.4])) < 0.2
-
-
-@pytest.mark.parametrize("options", [{"policy_heads": True}, {"gradient_surgery": "pcgrad"}])
-def test_options_for_many_tasks_learn_them_too(options: dict[str, object]):
-    world = ToyWorld([nearness(0.4), nearness(-0.4, scale=1000.0)])
-    learner = MTPPO(world, replace(SMALL, **options), seed=0)
-    metrics = [learner.iterate() for _ in range(60)]
-    assert max(mean_errors(learner, world, [0.4, -0.4])) < 0.2
-    assert ("Policy/conflicts" in metrics[0]) == ("gradient_surgery" in options)
-    policy = MTPPO.load_policy(learner.state_dict()["policy"])
-    obs, _ = world.reset(seed=2)
-    assert torch.equal(policy.eval_action(obs), learner.eval_action(obs))
 
 
 def test_surgery_between_tasks_that_agree_changes_nothing_but_rounding():
@@ -57,13 +35,6 @@ def test_surgery_between_tasks_that_agree_changes_nothing_but_rounding():
         gradients.append(torch.cat([p.grad.flatten() for p in learner.policy.actor.parameters()]))
     assert gradients[0].norm() > 0
     assert_close(*gradients)
-
-
-def test_policy_heads_need_a_world_that_shows_the_task():
-    world = ToyWorld([nearness(0.4), nearness(-0.4)])
-    world.num_id_columns, world.observation_groups = 0, plain_groups(3, 0)
-    with pytest.raises(BidexError, match="policy_heads"):
-        MTPPO(world, replace(SMALL, policy_heads=True), seed=0)
 
 
 def test_without_normalisation_per_task_the_small_task_is_lost():

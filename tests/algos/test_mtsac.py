@@ -7,7 +7,6 @@ from torch.testing import assert_close
 
 from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_meta.errors import BidexError
-from bidex_meta.world.contract import plain_groups
 from tests.algos.problems import errors, one_step_bandit, opposite_bandits, trained
 from tests.algos.toy import ToyWorld, nearness
 
@@ -160,11 +159,8 @@ def test_a_batch_is_split_evenly_over_the_tasks():
     assert MTSAC(world, replace(SMALL, batch_per_task=7), seed=0).batch_per_task == 7
 
 
-def test_worlds_that_do_not_fit_are_refused():
+def test_a_task_without_environments_is_refused():
     world = opposite_bandits()
-    world.num_id_columns, world.observation_groups = 0, plain_groups(3, 0)
-    with pytest.raises(BidexError, match="policy_heads needs the one-hot of 2 tasks"):
-        MTSAC(world, replace(SMALL, policy_heads=True), seed=0)
     world.task_id = torch.zeros_like(world.task_id)
     with pytest.raises(BidexError, match="task1 has no environments"):
         MTSAC(world, SMALL, seed=0)
