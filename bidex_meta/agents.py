@@ -13,12 +13,12 @@ class Agent(Protocol):
         ...
 
     def reset(self, env_mask: Tensor) -> None:
-        """A new episode begins in the rows of ``env_mask``, bool ``(num_envs,)``: forget what was known of them."""
+        """A new episode begins in the environments of a mask, bool ``(num_envs,)``: forget what was known of them."""
         ...
 
 
 class Timestep(NamedTuple):
-    """One transition of every row, as an adapting agent is told of it.
+    """One transition of every environment, as an adapting agent gets it.
 
     The first six are Meta-World's; from its evaluation the others are missing (None).
     """
@@ -26,11 +26,8 @@ class Timestep(NamedTuple):
     observation: Tensor
     """Observations the actions were chosen for, ``(num_envs, observation)``."""
     action: Tensor
-    """What ``adapt_action`` returned, ``(num_envs, action)``."""
     reward: Tensor
-    """Rewards, ``(num_envs,)``."""
     terminated: Tensor
-    """Bool ``(num_envs,)``: the episode came to a true end."""
     truncated: Tensor
     """Bool ``(num_envs,)``: the episode was cut, by its time limit or since it was long enough to adapt."""
     aux_policy_outputs: dict[str, Tensor]
@@ -44,15 +41,14 @@ class Timestep(NamedTuple):
 class MetaLearningAgent(Agent, Protocol):
     """An agent that adapts to the tasks it is put into.
 
-    The order: ``assign`` (ours alone), ``init``; then for each shot ``reset`` of all rows, ``adapt_action`` and
-    ``step`` until every row has played its episodes, ``adapt``; in between and at the end ``reset`` and
-    ``eval_action``.
+    The order: ``assign`` (ours alone), ``init``; then for each shot ``reset`` of all environments, ``adapt_action`` and
+    ``step`` until each has played its episodes, ``adapt``; in between and at the end ``reset`` and ``eval_action``.
     """
 
     def assign(self, task_of_row: Tensor | None) -> None:
-        """Which rows play the same task: numbers from 0 on, int64 ``(num_envs,)``; they share what they learn.
+        """Which environments play the same task and share what they learn: numbers from 0 on, int64 ``(num_envs,)``.
 
-        None: each row has a task of its own, as in Meta-World's evaluation, which does not call this.
+        None: each has a task of its own, as in Meta-World's evaluation, which does not call this.
         """
         ...
 
@@ -65,7 +61,7 @@ class MetaLearningAgent(Agent, Protocol):
         ...
 
     def step(self, timestep: Timestep) -> None:
-        """Takes in one transition of every row."""
+        """Takes in one transition of every environment."""
         ...
 
     def adapt(self) -> None:

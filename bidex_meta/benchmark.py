@@ -1,7 +1,6 @@
 """`Benchmark("ML20")`: a suite file and a seed become task classes, tasks and worlds.
 
-The four properties and `Task` are Meta-World's, so that code written against it finds what it looks for. No task and no
-physics is made here: this module decides which numbers belong to which task and what a world is asked for.
+The four properties and `Task` are Meta-World's, so that code written against it finds what it looks for.
 """
 
 import hashlib
@@ -44,11 +43,7 @@ class Task(NamedTuple):
 
     @property
     def variation(self) -> np.ndarray:
-        """The numbers of `data`: shape (size,), float64, a copy.
-
-        Raises:
-            BidexError: `data` holds no such numbers.
-        """
+        """The numbers of `data`: shape (size,), float64, a copy; BidexError where it holds none."""
         try:
             return np.frombuffer(self.data, dtype=_NUMBERS).astype(np.float64)
         except (TypeError, ValueError):
@@ -61,17 +56,15 @@ class Task(NamedTuple):
 class Benchmark:
     """A suite with its task classes, its tasks and the worlds made of them.
 
-    The same name and seed give the same tasks in every process; no global random generator is read or written.
-
-    Its classes make single environments as Meta-World's do; with `bidex_meta.metaworld` imported it is a
+    The same name and seed give the same tasks in every process; no global random generator is read or written. Its
+    classes make single environments as Meta-World's do; with `bidex_meta.metaworld` imported it is a
     `metaworld.Benchmark`.
 
     Args:
         name_or_path: A shipped suite (`bidex_meta.suite_names()`), the path of a suite file of your own, or a `Suite`.
         seed: Chooses the tasks; also the default seed of the worlds. A whole number from 0 on.
 
-    Raises:
-        BidexError: Unknown suite, faulty suite file, or a seed that is none.
+    Raises BidexError for an unknown suite, a faulty suite file or seed.
 
     Example:
         >>> from bidex_meta import Benchmark
@@ -162,8 +155,7 @@ class Benchmark:
             stagger: In training worlds the first episodes begin at random elapsed steps (and do not count), so that
                 environments do not end together; False: at 0.
 
-        Raises:
-            BidexError: A split without classes, too few environments, an unknown mode, device or engine.
+        Raises BidexError for a split without classes, too few environments, an unknown mode, device or engine.
         """
         slots, mode = self._slots(self._checked_split(split)), checked_mode(autoreset_mode)
         return World(
@@ -178,24 +170,26 @@ class Benchmark:
             task_sampling="fixed" if mode.name == "DISABLED" or self.suite.kind == "meta" else "uniform",
             threads=threads,
             stagger=stagger,
-            points=_points_rule(self.suite.points, self.suite.point_kinds),
+            points=PointsRule(self.suite.points, self.suite.point_kinds) if self.suite.points else None,
         )
 
     def _draw(self, entry: SuiteClass, split: Split) -> list[Task]:
         # By the class's name, so that all objects of a class have the same goals.
         space, key = self._classes[entry.name].variation_space, entry.class_name
         if entry.tasks:
-            listed = [task for task in entry.tasks if task.split == split]
-            return [Task.from_variation(entry.name, _listed(space, self.seed, key, task)) for task in listed]
-        return _drawn(space, self.seed, key, split, self.suite.tasks_per_class or 0, entry.name)
+            variations = [_listed(space, self.seed, key, task) for task in entry.tasks if task.split == split]
+        else:
+            variations = _drawn(space, self.seed, key, split, self.suite.tasks_per_class or 0)
+        return [Task.from_variation(entry.name, variation) for variation in variations]
 
     def _env_classes(self, split: Split) -> dict[str, type[SuiteEnv]]:
         moving, hides = True if self.suite.base == "moving" else None, self.suite.observation == "masked"
-        points, found = (self.suite.points, self.suite.point_kinds), {}
+        points, classes = (self.suite.points, self.suite.point_kinds), {}
         for entry in self.suite.split_classes(split):
             look = (moving, tuple(entry.options.items()), self.padded_size, hides)
-            found[entry.name] = EnvRecipe(entry.name, *look, entry.reward_scale, entry.class_name, points).make_class()
-        return found
+            recipe = EnvRecipe(entry.name, *look, entry.reward_scale, entry.class_name, points)
+            classes[entry.name] = recipe.make_class()
+        return classes
 
     def _checked_split(self, split: str) -> Split:
         if not isinstance(split, str) or split not in self.suite.splits:
@@ -234,29 +228,22 @@ def make_task_world(
 ) -> World:
     """A world of one class as it is on its own: goal visible, no one-hot, no padding, 50 tasks drawn by the seed.
 
-    Args:
-        task_name: A task class, e.g. `"HandOver"` (which alone has a fixed base: 398 observations, 40 actions), or
-            `"package.module:Class"` of your own (docs/own-task.md).
-        num_envs: How many; left out, 1024 on the CPU and 8192 on an accelerator.
-        device: As in `Benchmark.make_world`.
-        seed: Chooses the tasks, the starts and the task draws.
-        autoreset_mode: As in `Benchmark.make_world`.
-        threads: As in `Benchmark.make_world`.
-        task_sampling: `"uniform"`: each episode draws a task; `"fixed"`: environment j keeps task j modulo 50. Left
-            out: uniform in training worlds, fixed in evaluation worlds.
-        moving_base: Drive the hands' bases or fix them; left out, as the class has it on its own.
-        engine: As in `Benchmark.make_world`.
-        stagger: As in `Benchmark.make_world`.
-        points: Points of the cloud shown in the place of the object's state (docs/points.md); 0: the state.
-        object: In the place of its own: a name, or an MJCF file (docs/objects.md); in the slot's name behind a dash.
+    `task_name` is a task class, e.g. `"HandOver"` (which alone has a fixed base: 398 observations, 40 actions), or
+    `"package.module:Class"` of your own (docs/own-task.md). Beside the arguments of `Benchmark.make_world`:
 
-    Raises:
-        BidexError: Unknown class or object, too few environments, an unknown mode, device or engine.
+    - `task_sampling`: `"uniform"`: each episode draws a task; `"fixed"`: environment j keeps task j modulo 50. Left
+    out:
+      uniform in training worlds, fixed in evaluation worlds.
+    - `moving_base`: drive the hands' bases or fix them; left out, as the class has it on its own.
+    - `points`: points of the cloud shown in the place of the object's state (docs/points.md); 0: the state.
+    - `object`: in the place of its own: a name, or an MJCF file (docs/objects.md); in the slot's name behind a dash.
+
+    Raises BidexError for an unknown class or object, too few environments, an unknown mode, device or engine.
     """
     task_name, mode = registry.resolve(task_name), checked_mode(autoreset_mode)
     task_class = registry.get(task_name, moving_base, **registry.with_object(object))
     tasks = _drawn(task_class.variation_space, whole_number("seed", seed, 0), task_name, "train", _TASKS_ALONE)
-    slot = Slot(name_with_object(task_name, object), task_class, np.stack([task.variation for task in tasks]))
+    slot = Slot(name_with_object(task_name, object), task_class, tasks)
     return World(
         [slot],
         num_envs,
@@ -267,12 +254,8 @@ def make_task_world(
         task_sampling=task_sampling or ("fixed" if mode.name == "DISABLED" else "uniform"),
         threads=threads,
         stagger=stagger,
-        points=_points_rule(whole_number("points", points, 0, MOST_POINTS)),
+        points=PointsRule(points) if whole_number("points", points, 0, MOST_POINTS) else None,
     )
-
-
-def _points_rule(count: int, kinds: bool = False) -> PointsRule | None:
-    return PointsRule(count, kinds) if count else None
 
 
 def _task_class(suite: Suite, entry: SuiteClass) -> TaskClass:
@@ -293,11 +276,8 @@ def _generator(*key: object) -> np.random.Generator:
     return np.random.Generator(np.random.Philox(np.random.SeedSequence(int.from_bytes(digest, "little"))))
 
 
-def _drawn(
-    space: VariationSpace, seed: int, name: str, split: Split, count: int, called: str | None = None
-) -> list[Task]:
-    variations = space.sample(_generator(seed, name, split), count)
-    return [Task.from_variation(called or name, variation) for variation in variations]
+def _drawn(space: VariationSpace, seed: int, name: str, split: Split, count: int) -> np.ndarray:
+    return space.sample(_generator(seed, name, split), count)
 
 
 def _listed(space: VariationSpace, seed: int, name: str, task: ListedTask) -> np.ndarray:

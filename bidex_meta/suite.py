@@ -1,12 +1,12 @@
 """Reads and checks `suites/*.toml` into frozen dataclasses; `suites/README.md` explains the files field by field.
 
-Names of task classes and of the components of their variations are checked where the classes are known, in
-`bidex_meta.benchmark`.
+Names of task classes and of their variations are checked where the classes are known, in `bidex_meta.benchmark`.
 """
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -24,20 +24,12 @@ MOST_POINTS = 16_384
 """Of a cloud: more than a coarse image has pixels are no finer."""
 METAWORLD_SUITES: dict[str, tuple[str, ...]] = {
     "metaworld/MT10": (
-        "reach-v3",
-        "push-v3",
-        "pick-place-v3",
-        "door-open-v3",
-        "drawer-open-v3",
-        "drawer-close-v3",
-        "button-press-topdown-v3",
-        "peg-insert-side-v3",
-        "window-open-v3",
-        "window-close-v3",
+        "reach-v3", "push-v3", "pick-place-v3", "door-open-v3", "drawer-open-v3", "drawer-close-v3",
+        "button-press-topdown-v3", "peg-insert-side-v3", "window-open-v3", "window-close-v3",
     ),
     # No suite of Meta-World's: three of its classes that are learned within minutes.
     "metaworld/MT3": ("reach-v3", "drawer-close-v3", "button-press-topdown-v3"),
-}
+}  # fmt: skip
 """Suites of Meta-World's own environments, and their classes in its order."""
 
 
@@ -48,7 +40,6 @@ class ListedTask:
     name: str
     """Unique within its class, e.g. `"left"`."""
     split: Split
-    """The split it belongs to."""
     fixed: Mapping[str, float]
     """Given components of the variation (metres and radians, world frame); the others are drawn by the seed."""
 
@@ -60,11 +51,8 @@ class SuiteClass:
     name: str
     """What it is called in the suite, e.g. `"CatchUnderarm"` or, with an object, `"CatchUnderarm-block"`."""
     class_name: str
-    """The task class, e.g. `"CatchUnderarm"`."""
     splits: tuple[Split, ...]
-    """Where it appears: train, test or both."""
     reward_scale: float
-    """Factor on the reward the learner sees."""
     gamma: float | None
     """Discount per step of this class; None: the learner's own."""
     tasks: tuple[ListedTask, ...]
@@ -78,27 +66,22 @@ class Suite:
     """A suite file, checked."""
 
     name: str
-    """E.g. `"MT4"`."""
     version: int
     """The `-vN` of the Gymnasium id; goes up when results change."""
     kind: Literal["multi-task", "meta"]
     """Multi-task suites have a train split only; meta suites both, without a task in common."""
     description: str
-    """One line for lists."""
     observation: Literal["plain", "one-hot", "masked"]
     """What is done to the padded observation: nothing, task id appended, goal entries zeroed."""
     task_id: Literal["class", "task"]
     """What one entry of the one-hot stands for: a class or a listed task."""
     reward: Literal["paper"]
-    """Which reward formulas."""
     base: Literal["moving", "alone"]
     """Whether every class gets the moving base, or each what it has on its own."""
     tasks_per_class: int | None
     """Tasks drawn per class and split; None when every class lists its tasks."""
     classes: tuple[SuiteClass, ...]
-    """In the order of environments, one-hot and task lists."""
     file: Path
-    """Where it was read from."""
     points: int = 0
     """Points of the cloud that observations show in the place of objects' states; 0: they show the states."""
     point_kinds: bool = False
@@ -120,24 +103,16 @@ def suite_names() -> list[str]:
 
 
 def metaworld_classes(suite: str) -> tuple[str, ...]:
-    """The classes of one of Meta-World's suites.
-
-    Raises:
-        BidexError: There is no such suite; with the nearest name and the list.
-    """
+    """The classes of one of Meta-World's suites; BidexError where there is none, with the nearest name."""
     if suite not in METAWORLD_SUITES:
         raise unknown_name("suite of Meta-World", suite, METAWORLD_SUITES)
     return METAWORLD_SUITES[suite]
 
 
 def load_suite(name_or_path: str | Path) -> Suite:
-    """Reads a shipped suite by name, or any suite file by path.
+    """Reads a shipped suite by name, in any case, or a suite file by path: a `Path`, or a text ending in `.toml`.
 
-    Args:
-        name_or_path: E.g. `"MT4"`, in any case, or the path of a `.toml` file: a `Path`, or a text that ends so.
-
-    Raises:
-        BidexError: No such suite or file, or the file is not as `suites/README.md` describes.
+    Raises BidexError for a missing suite or file, or a file that is not as `suites/README.md` describes.
     """
     text = str(name_or_path)
     if isinstance(name_or_path, Path) or text.endswith(".toml"):
@@ -207,21 +182,9 @@ def _parse(file: Path) -> Suite:
         if not isinstance(text, str) or not text.strip() or not text.isprintable():
             raise _error(file, place, "printable text", shortened(text))
     points = content.points or _PointsEntry(0)
-    suite = Suite(
-        name=content.name,
-        version=content.version,
-        kind=content.kind,
-        description=content.description,
-        observation=content.observation,
-        task_id=content.task_id,
-        reward=content.reward,
-        base=content.base,
-        tasks_per_class=content.tasks_per_class,
-        classes=tuple(made for i, entry in enumerate(content.classes) for made in _classes(file, i, entry)),
-        file=file,
-        points=points.count,
-        point_kinds=points.kinds,
-    )
+    given = {f.name: getattr(content, f.name) for f in fields(content) if f.name not in ("classes", "points")}
+    classes = tuple(each for i, entry in enumerate(content.classes) for each in _classes(file, i, entry))
+    suite = Suite(**given, classes=classes, file=file, points=points.count, point_kinds=points.kinds)
     _check(suite)
     return suite
 
@@ -237,15 +200,15 @@ def _classes(file: Path, index: int, entry: _ClassEntry) -> Iterator[SuiteClass]
         mend = "Leave one of them out."
         raise _error(file, f"classes[{index}].objects", "either objects or options.object", "both", mend)
     for name in entry.objects or [given]:
-        thing = None if name is None else _object(file, str(name))
+        object = None if name is None else _object(file, str(name))
         yield SuiteClass(
-            name=name_with_object(entry.name, thing),
+            name=name_with_object(entry.name, object),
             class_name=entry.name,
             splits=SPLITS if entry.split == "both" else (entry.split,),
             reward_scale=entry.reward_scale,
             gamma=entry.gamma,
             tasks=tuple(ListedTask(task.name, task.split, task.fixed) for task in entry.tasks),
-            options=options if thing is None else {**options, "object": thing},
+            options=options if object is None else {**options, "object": object},
         )
 
 
@@ -282,11 +245,10 @@ def _check_listed(file: Path, place: str, entry: SuiteClass) -> None:
         mend = f"Make split of {entry.name} and of its tasks agree."
         raise _error(file, place, f"tasks in {' and '.join(entry.splits)}", f"in {' and '.join(splits)}", mend)
     train, test = ([task for task in entry.tasks if task.split == split] for split in SPLITS)
-    for held_out in test:
-        for other in train:
-            if held_out.fixed == other.fixed:
-                got = f"{other.name!r} and {held_out.name!r} with the same fixed values"
-                raise _error(file, place, "train and test tasks that differ", got, "Change one of them.")
+    for held_out, other in product(test, train):
+        if held_out.fixed == other.fixed:
+            got = f"{other.name!r} and {held_out.name!r} with the same fixed values"
+            raise _error(file, place, "train and test tasks that differ", got, "Change one of them.")
 
 
 def _check_unique(file: Path, place: str, names: list[str]) -> None:

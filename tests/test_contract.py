@@ -13,12 +13,12 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
-from bidex_meta.clients.humanoid_world import HumanoidWorld
 from bidex_meta.errors import BidexError
 from bidex_meta.metaworld.batched import MetaWorldWorld
 from bidex_meta.world import World
 from bidex_meta.world.contract import PooledWorld, TaskWorld, VectorWorld
 from bidex_meta.world.wrapper import PooledWorldWrapper, TaskWorldWrapper, WorldWrapper
+from bidex_meta.worlds.humanoid import HumanoidWorld
 from tests.algos.families import PointClass, PointGoals
 from tests.algos.problems import LQR, PointMass
 from tests.algos.toy import ToyWorld as Bandits

@@ -13,31 +13,20 @@ import bidex_meta
 
 PACKAGES = {package.__name__: Path(next(iter(package.__path__))) for package in (bidex_meta, bidex_algos)}
 
+SHARED = ("advantages", "balancing", "nets", "replay", "rollout", "step_size", "trust_region")
+"""What learners share."""
+
 ORDER = (
-    ("errors", "agents"),
+    ("errors", "agents", "bidex_algos"),
     ("utils",),
     ("engine", "hands", "suite"),
-    ("config",),
-    ("runs",),
-    ("tasks",),
-    ("points",),
-    ("world",),
-    ("evaluation", "benchmark"),
-    ("metaworld",),
-    ("clients",),
-    ("bidex_meta",),  # the package's own names
-    ("witness", "data", "worlds"),
-    ("train",),
-    ("speed", "viewer"),
-    tuple(
-        f"bidex_algos.{name}" for name in ("advantages", "balancing", "replay", "rollout", "step_size", "trust_region")
-    ),
-    ("bidex_algos.nets",),
-    ("bidex_algos.learner",),
-    ("bidex_algos.onpolicy", "bidex_algos.offpolicy"),
-    ("bidex_algos.meta", "bidex_algos.multiagent", "bidex_algos.offline"),  # RL² takes PPO's loss
-    ("bidex_algos",),
-    ("cli",),
+    ("config", "tasks"),
+    ("runs", "world"),
+    ("benchmark", "evaluation", "train", "viewer"),
+    ("data", "metaworld", "witness", *(f"bidex_algos.{name}" for name in SHARED)),
+    ("clients", "worlds", "bidex_algos.learner"),
+    ("bidex_meta", "bidex_algos.offpolicy", "bidex_algos.onpolicy"),  # bidex_meta: the package's own names
+    ("cli", "bidex_algos.meta", "bidex_algos.multiagent", "bidex_algos.offline"),
 )
 """A room imports from earlier lines only, not from its own neighbours; a module outside rooms counts as one."""
 

@@ -17,8 +17,6 @@ import torch
 
 @dataclass(frozen=True)
 class Config:
-    """Of the search."""
-
     rollout_steps: int = 4
     """Steps between two changes."""
 
@@ -38,8 +36,6 @@ class Constant:
 
 
 class RandomSearch:
-    """Random search over constant actions."""
-
     def __init__(self, world, config, seed):
         self.world, self.config = world, config
         self.generator = torch.Generator().manual_seed(seed)
@@ -63,10 +59,8 @@ class RandomSearch:
         return Constant(state["action"].to(device))
 
     def state_dict(self):
-        return {
-            "policy": self.policy_state_dict(), "paid": self.paid, "env_steps": self.env_steps,
-            "generator": self.generator.get_state(),
-        }
+        state = {"policy": self.policy_state_dict(), "paid": self.paid, "env_steps": self.env_steps}
+        return {**state, "generator": self.generator.get_state()}
 
     def load_state_dict(self, state):
         self.best, self.paid, self.env_steps = state["policy"]["action"], state["paid"], state["env_steps"]

@@ -84,18 +84,9 @@ def test_an_object_of_its_own_lies_beside_the_file() -> None:
 _MISTAKES = {
     '"block/position"]': ('"cube/pos"]', "Unknown sensor 'cube/pos'"),
     '*goal_blocks("goal")': ('Block("goal", 3, ("block/posture",))', "Unknown sensor 'block/posture'. Did you mean"),
-    '"target": -5.0 * distance': (
-        '"target": distance[:, None]',
-        "reward_terms: 'target': expected a tensor of shape (n,)",
-    ),
-    "return self._distance(state) < _NEAR": (
-        "return self._distance(state)",
-        "success: expected a tensor of shape (n,) of bool",
-    ),
-    "return observe_goal(state": (
-        'return {"gaol": state.frozen["goal"]} or (state',
-        "observe: expected blocks of the layout",
-    ),
+    '"target": -5.0 * distance': ('"target": distance[:, None]', "'target': expected a tensor of shape (n,)"),
+    "_distance(state) < _NEAR": ("_distance(state)", "success: expected a tensor of shape (n,) of bool"),
+    "observe_goal(state": ('{"gaol": state.frozen["goal"]} or (state', "observe: expected blocks of the layout"),
     '{"constant": torch.ones_like(distance)': ('{"constant": 1.0', "reward_terms: 'constant': expected a tensor"),
     '"block": variation[:, :3]': ('"block": variation[0, :3]', "freeze: 'block': expected a tensor of shape (n, k)"),
 }

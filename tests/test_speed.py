@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from bidex_meta.cli import main
-from bidex_meta.speed import paired_steps
+from bidex_meta.cli.bench import paired_steps
 from tests.world.play import suite_world
 
 FEW = ["--num-envs", "8", "--steps", "2", "--repeats", "3", "--threads", "1"]
@@ -32,7 +32,7 @@ def test_bench_world_as_a_table_of_mt4(capsys: pytest.CaptureFixture[str]) -> No
     ("words", "expected"),
     [
         ("world --steps 0", "--steps of 1 or more"),
-        ("world --repeats 0", "--repeats must be at least 1"),
+        ("world --repeats 0", "--repeats: expected a whole number >= 1"),
         ("world --suite MT5", "MT4"),
         ("world --device tpu", "device: expected auto"),
         ("world --engine d", "Unknown engine"),

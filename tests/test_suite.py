@@ -60,10 +60,6 @@ def write(folder: Path, text: str) -> Path:
     return file
 
 
-def test_shipped_suites() -> None:
-    assert suite_names() == ["ML1", "ML1-objects", "ML1-wide", "ML20", "ML4", "MT1", "MT1-objects", "MT20", "MT4"]
-
-
 @pytest.mark.parametrize("name", suite_names())
 def test_shipped_suite_is_sound(name: str) -> None:
     suite = load_suite(name)
@@ -120,23 +116,16 @@ def test_listed_goals(name: str, distance: float) -> None:
     assert held_out == ([] if name == "MT1" else ["back"])
 
 
-def test_unknown_name_names_the_nearest_and_all() -> None:
+def test_names_and_paths(tmp_path: Path) -> None:
+    file = write(tmp_path, META)
+    assert load_suite(file) == load_suite(str(file)) and load_suite(file).classes[0].reward_scale == 1.0
+    with pytest.raises(BidexError, match=r"absent\.toml, but No such file"):
+        load_suite(tmp_path / "absent.toml")
     with pytest.raises(
         BidexError,
         match=r"Did you mean 'MT4'\? Known: ML1, ML1-objects, ML1-wide, ML20, ML4, MT1, MT1-objects, MT20, MT4",
     ):
         load_suite("MT44")
-
-
-def test_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(BidexError, match=r"absent\.toml, but No such file"):
-        load_suite(tmp_path / "absent.toml")
-
-
-def test_own_file_as_path_and_as_text(tmp_path: Path) -> None:
-    file = write(tmp_path, META)
-    assert load_suite(file) == load_suite(str(file))
-    assert load_suite(file).classes[0].reward_scale == 1.0
 
 
 FAULTS = {
@@ -157,25 +146,10 @@ FAULTS = {
     "no class": (META, META[META.index("[[") :], "classes = []", "classes: expected"),
     "class is no table": (META, META[META.index("[[") :], 'classes = ["HandOver"]', "classes[0]: expected"),
     "one-hot over tasks that are not listed": (META, '"class"', '"task"', 'task_id: expected "class"'),
-    "negative scale": (
-        META,
-        'split = "test"',
-        'split = "test"\nreward_scale = -1',
-        "classes[1].reward_scale: expected",
-    ),
+    "negative scale": (META, 'split = "test"', "reward_scale = -1", "classes[1].reward_scale: expected"),
     "discount of 1": (META, 'split = "test"', 'split = "test"\ngamma = 1.0', "classes[1].gamma: expected"),
-    "an option that is no number": (
-        META,
-        'split = "test"',
-        'options = {water = "3"}',
-        "classes[1].options.water: expected",
-    ),
-    "an object that is no name": (
-        META,
-        'split = "test"',
-        "options = {object = 3}",
-        "classes[1].options.object: expected",
-    ),
+    "a text option": (META, 'split = "test"', 'options = {water = "3"}', "classes[1].options.water: expected"),
+    "a number as object": (META, 'split = "test"', "options = {object = 3}", "classes[1].options.object: expected"),
     "object and objects": (
         META,
         'split = "test"',

@@ -15,42 +15,22 @@ def discounts(world: VectorWorld, gamma: float, task_id: Tensor) -> float | Tens
 
 
 def successor_values(values: Tensor, last_values: Tensor, ended: Tensor, final_values: Tensor) -> Tensor:
-    """Value of the state each transition led to, in a world that resets within the step.
+    """V (T, N) of the state each transition led to, in a world that resets within the step.
 
-    Args:
-        values: V(s_t), shape (T, N).
-        last_values: V of the state after the last transition, shape (N,).
-        ended: Transitions that ended an episode, bool (T, N); what follows belongs to another episode.
-        final_values: V of the last observation of the episodes that ended, (T, N); read only where ``ended``.
+    ``last_values`` (N,) are of the state after the last one; ``final_values`` (T, N) of where episodes ``ended``.
     """
     following = torch.cat([values[1:], last_values[None]])
     return torch.where(ended, final_values, following)
 
 
 def gae(
-    rewards: Tensor,
-    values: Tensor,
-    next_values: Tensor,
-    terminated: Tensor,
-    ended: Tensor,
-    gamma: float | Tensor,
-    lam: float,
-    valid: Tensor | None = None,
-) -> Tensor:
+    rewards: Tensor, values: Tensor, next_values: Tensor, terminated: Tensor, ended: Tensor, gamma: float | Tensor,
+    lam: float, valid: Tensor | None = None
+) -> Tensor:  # fmt: skip
     """Advantages A_t = sum_k (gamma lam)^k delta_{t+k} within an episode, delta_t = r_t + gamma V(s'_t) - V(s_t).
 
-    Args:
-        rewards: Shape (T, N).
-        values: V(s_t), shape (T, N).
-        next_values: V(s'_t) of the true successor (see :func:`successor_values`), shape (T, N).
-        terminated: Bool (T, N): nothing follows, V(s') counts as 0. A time limit is not such an end.
-        ended: Bool (T, N): the episode ended here, by either flag.
-        gamma: Discount, one for all, one for each environment, (N,), or one for each transition, (T, N).
-        lam: Trace decay.
-        valid: Bool (T, N); the advantage of an invalid transition is 0 and nothing flows through it. Default: all.
-
-    Returns:
-        Advantages, shape (T, N).
+    All are (T, N); ``next_values`` of the true successors (:func:`successor_values`), 0 where terminated, which a time
+    limit is not; ``gamma`` one for all, (N,) or (T, N). Nothing flows through what is not ``valid``.
     """
     delta = rewards + gamma * next_values.masked_fill(terminated, 0.0) - values
     keep = gamma * lam * (~ended).to(delta.dtype)
@@ -65,10 +45,7 @@ def gae(
 
 
 def task_moments(x: Tensor, task_id: Tensor, num_tasks: int, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean, biased variance and count (num_tasks,) of ``x`` (T, N) per task, over the valid entries of all processes.
-
-    ``task_id`` is int64 (N,), ``valid`` bool (T, N). An empty task has mean, variance and count 0.
-    """
+    """Mean, biased variance and count (num_tasks,) of x (T, N), where valid, in all processes; 0 for an empty task."""
 
     def total(values: Tensor) -> Tensor:
         sums = torch.zeros(num_tasks, dtype=values.dtype, device=values.device)

@@ -24,13 +24,8 @@ class Balance(ABC):
     def backward(self, losses: Tensor, least: Tensor, parameters: Sequence[nn.Parameter]) -> Tensor:
         """Puts the gradient into the parameters, which have none yet, and keeps the graph.
 
-        Args:
-            losses: Of each task, this process's part (num_tasks,).
-            least: What each could become at best, its part (num_tasks,).
-            parameters: The shared weights.
-
-        Returns:
-            A number to be told, divided by the processes that will sum it, as they will the gradients.
+        ``losses`` of each task, and the ``least`` they can become, are this process's part (num_tasks,). Returns a
+        number to be logged, divided by the processes that will sum it, as they will the gradients.
         """
 
     def learn(self, above: Callable[[], Tensor]) -> None:  # noqa: B027
@@ -80,12 +75,8 @@ def conflict_averse(gradients: Tensor, radius: float) -> tuple[Tensor, Tensor]:
 
         min_w  <g_w, g_0> + radius |g_0| |g_w|        d = g_0 + radius |g_0| g_w / |g_w|
 
-    Args:
-        gradients: One a task, (num_tasks, P).
-        radius: Their c, from 0 (the mean) on; below 1, so that the mean loss still falls.
-
-    Returns:
-        The direction, (P,); the share of pairs of tasks whose gradients point apart, a scalar.
+    ``gradients``: one a task, (num_tasks, P); ``radius``: their c, from 0 (the mean) on; below 1, so that the mean loss
+    still falls. Returns the direction, (P,); the share of pairs of tasks whose gradients point apart, a scalar.
     """
     count = len(gradients)
     gram = (gradients @ gradients.T).double()
@@ -101,14 +92,11 @@ def conflict_averse(gradients: Tensor, radius: float) -> tuple[Tensor, Tensor]:
 def worst_served(gram: Tensor, even: Tensor, reach: Tensor) -> Tensor:
     """The weights w (n,) on the simplex that minimise w'G e + reach sqrt(w'G w), to 1e-4 of e'G e.
 
-    An interior-point method: the weights' logarithms, times a mu that is halved at each step, keep them positive, and
-    a cone of the same mu rounds off the tip where w'G w is 0, at which a descent along w would get stuck. Each step is
-    Newton's, as long as is best of some lengths. It looks at no number, so that a GPU need not be waited for.
-
-    Args:
-        gram: Products of the gradients (n, n), float64.
-        even: The weights e of the mean (n,), where it starts.
-        reach: A scalar.
+    An interior-point method: the weights' logarithms, times a mu that is halved at each step, keep them positive, and a
+    cone of the same mu rounds off the tip where w'G w is 0, at which a descent along w would get stuck. Each step is
+    Newton's, as long as is best of some lengths. It looks at no number, so that a GPU need not be waited for. ``gram``:
+    products of the gradients (n, n), float64; ``even``: the weights e of the mean (n,), where it starts; ``reach``: A
+    scalar.
     """
     weights, mean, square = even, gram @ even, reach.square()
     lengths = 0.7 ** torch.arange(15, dtype=gram.dtype, device=gram.device)[:, None]
@@ -161,15 +149,8 @@ class Famo(Balance):
 
     The slower a loss falls, the more it weighs. Losses have to be positive: what counts is how far each is above the
     least that it can become (``min_losses`` of the authors' code). Adam moves xi with a decay towards even weights.
-
-    Args:
-        num_tasks: How many tasks.
-        rate: Adam's step size of xi.
-        decay: By which xi is drawn to zero.
-        device: Of the losses.
-
-    Attributes:
-        logits: xi (num_tasks,), float64, in checkpoints.
+    ``rate``: adam's step size of xi; ``decay``: by which xi is drawn to zero. ``logits``: xi (num_tasks,), float64, in
+    checkpoints.
     """
 
     tag = "Policy/largest_weight"
@@ -180,11 +161,7 @@ class Famo(Balance):
         self.above = torch.zeros_like(self.logits)
 
     def weights(self, above: Tensor) -> Tensor:
-        """Factors of the losses (num_tasks,), 1 in the mean; 0 for a task whose loss cannot fall.
-
-        Args:
-            above: How far each loss is above its least (num_tasks,); kept until :meth:`learn`.
-        """
+        """Factors of losses (num_tasks,) so far above their least, 1 in the mean; 0 for one that cannot fall."""
         self.above = above.detach().double()
         shares = self.logits.detach().softmax(0) / self.above.clamp_min(_LEAST)
         shares = shares.masked_fill(self.above <= _LEAST, 0.0)

@@ -1,8 +1,4 @@
-"""What every learner is: seeds, shapes read from the world, timers, the finite check, checkpoints, several processes.
-
-A family (``onpolicy/base.py``, ``offpolicy/base.py``, ``meta/base.py``, RL²) adds where its data come from, an
-algorithm its update.
-"""
+"""All learners: seeds, shapes read from the world, timers, the finite check, checkpoints, several processes."""
 
 import copy
 import math
@@ -38,11 +34,7 @@ def as_numbers(tensors: dict[str, Tensor]) -> dict[str, float]:
 
 
 def check_finite(metrics: dict[str, float], losses: Iterable[str], learner: str, steps: int, remedy: str) -> None:
-    """Ends a training that can no longer learn.
-
-    Raises:
-        FloatingPointError: One of the ``losses`` among the metrics is not finite.
-    """
+    """Ends a training that can no longer learn: a FloatingPointError where one of the ``losses`` is not finite."""
     if not math.isfinite(sum(metrics.get(name, 0.0) for name in losses)):
         raise FloatingPointError(f"{learner}: the loss is not finite after {steps} steps; {remedy}.")
 
@@ -53,27 +45,12 @@ _FORM = ("hidden", "activation", "normalise_observations", "reward_unit", "task_
 
 
 class Learner(Contract):
-    """Base of all learners of this package.
+    """Base of all learners of this package; ``policy`` acts, ``agent`` is what evaluation plays of it.
 
-    In a run of several processes each has a world and samples of its own, and all have the same networks: statistics
-    and gradients are those of the samples of all.
-
-    Args:
-        world: A world in autoreset mode :attr:`autoreset`.
-        config: An instance of :attr:`config_type`.
-        seed: Of the initial weights, all that is drawn, and the world's first reset.
-
-    Attributes:
-        env_steps: Environment steps taken so far, over all environments of all processes; a waiting one takes none.
-        shape: Sizes of the world's spaces and the groups of its observation.
-        inputs: How networks read the observation.
-        generator: Of all that is drawn while learning, on the device; another one in each process.
-        policy: The network that acts and its statistics of observations, a ``torch.nn.Module``.
-        agent: What evaluation plays; the policy itself, but for RL².
-
-    Raises:
-        BidexError: A world in another mode, with discounts of its classes where the learner has one for all, or without
-            the task's one-hot where an option of the config needs it.
+    In a run of several processes each has a world, samples and ``generator`` of its own, and all have the same
+    networks: statistics and gradients are those of the samples of all, and so is ``env_steps``. Raises BidexError for a
+    world in another mode, with discounts of its classes where the learner has one for all, or without a one-hot that an
+    option needs.
     """
 
     remedy: ClassVar[str]
@@ -99,8 +76,6 @@ class Learner(Contract):
         self.agent: Agent = self.policy
         self._collected = 0.0
 
-    # What a family or an algorithm adds.
-
     @classmethod
     @abstractmethod
     def _make_policy(cls, config: Any, shape: Shape, init: torch.Generator, device: torch.device) -> nn.Module:
@@ -122,11 +97,7 @@ class Learner(Contract):
 
     @abstractmethod
     def _parts(self) -> Parts:
-        """What a checkpoint holds beside the policy, by name.
-
-        Modules, optimisers, statistics, tensors that keep their shape, generators, and dicts and lists of these. The
-        modules' weights are made the same in all processes when training begins.
-        """
+        """What a checkpoint holds beside the policy, by name."""
 
     def _place(self) -> State:
         """Tensors, numbers and None from which the next iteration goes on, for the checkpoint."""
@@ -140,17 +111,8 @@ class Learner(Contract):
         """Refuses a state of a world of another size."""
         self._expect("", Shape.load(state["policy"]["shape"]).sizes(), self.shape.sizes())
 
-    # Training.
-
     def iterate(self) -> dict[str, float]:
-        """Collects experience and learns from it.
-
-        Returns:
-            Metrics under TensorBoard-like tags; ``docs/metrics.md`` explains each.
-
-        Raises:
-            FloatingPointError: A loss, or what is told of the policy, is no longer finite.
-        """
+        """Collects experience, learns from it; metrics (``docs/metrics.md``), or the error of :func:`check_finite`."""
         started, steps, self._collected = time.perf_counter(), self.env_steps, 0.0
         metrics = self._iterate()
         judged = [name for name in metrics if name.startswith(("Loss/", "Policy/"))]
@@ -176,8 +138,6 @@ class Learner(Contract):
         self.policy.observations.update(obs)
         return obs
 
-    # The learner as an agent.
-
     def eval_action(self, obs: Tensor) -> Tensor:
         """Actions (N, a) in [-1, 1] for raw observations (N, d), no exploration. N need not be the world's."""
         return self.agent.eval_action(obs)
@@ -185,8 +145,6 @@ class Learner(Contract):
     def reset(self, env_mask: Tensor) -> None:
         """A new episode begins in the rows of ``env_mask``, bool (N,)."""
         self.agent.reset(env_mask)
-
-    # Checkpoints.
 
     def policy_state_dict(self) -> State:
         """What :meth:`load_policy` needs: network, observation statistics, sizes and config."""
@@ -218,7 +176,7 @@ class Learner(Contract):
         given = policy["config"] | _seen(Shape.load(policy["shape"]))
         _agree(own, given, _FORM)
         network, weights = _network(self.policy.state_dict()), _network(policy["weights"])
-        if _shapes(network) != _shapes(weights):
+        if {n: w.shape for n, w in network.items()} != {n: w.shape for n, w in weights.items()}:
             raise BidexError(
                 "Expected a policy to start from of the same kind (mtppo, mttrpo, promp and maml share one; mtsac and "
                 "rl2 have their own, other architectures, policy heads and a task embedding others), got one with "
@@ -234,11 +192,7 @@ class Learner(Contract):
         return copy.deepcopy({"policy": self.policy_state_dict(), **_saved(self._parts()), **self._place()})
 
     def load_state_dict(self, state: State) -> None:
-        """Restores what :meth:`state_dict` gave.
-
-        Raises:
-            BidexError: The checkpoint comes from a world of another size.
-        """
+        """Restores what :meth:`state_dict` gave; a BidexError where it comes from a world of another size."""
         self._check_size(state)
         self.policy.load_state_dict(state["policy"]["weights"])
         _restore(self._parts(), state)

@@ -7,6 +7,7 @@ has a shape that depends on data, and nothing makes the host wait for the device
 
 import math
 import sys
+from bisect import bisect_right
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,34 +33,16 @@ class Transitions:
 
 
 class Replay:
-    """The last ``steps`` vector steps of all environments.
+    """The last ``steps`` vector steps of all environments, in parts no other task (``task_id``, (N,)) can crowd out.
 
-    Environments of one task are its part of the replay: draws are made per task, and no task can crowd out another.
-
-    Args:
-        steps: Vector steps kept.
-        task_id: Task of each environment, int64 (N,).
-        num_tasks: Number of tasks; each has rows.
-        observations: Width of the observation.
-        actions: Number of actions.
-        device: Where it lies.
-        cut_share: Room for last observations of episodes cut by a time limit, as a share of all transitions (but for
-            at least one vector step). Where they do not fit, the oldest lose their weight.
-
-    Attributes:
-        added: Vector steps taken in so far.
+    ``cut_share`` is the room for last observations of episodes cut by a time limit, as a share of all transitions;
+    where they do not fit, the oldest lose their weight. ``added`` counts the vector steps taken in.
     """
 
     def __init__(
-        self,
-        steps: int,
-        task_id: Tensor,
-        num_tasks: int,
-        observations: int,
-        actions: int,
-        device: torch.device,
-        cut_share: float = 1 / 16,
-    ):
+        self, steps: int, task_id: Tensor, num_tasks: int, observations: int, actions: int, device: torch.device,
+        cut_share: float = 1 / 16
+    ):  # fmt: skip
         rows = len(task_id)
         self.steps, self.rows, self.num_tasks, self.device = steps, rows, num_tasks, device
         self.added = 0
@@ -168,8 +151,6 @@ class Replay:
         """What was stored under a name at ``places``, in their shape: rewards, terminated, valid, cut."""
         return self._steps[name].flatten(0, 1)[places]
 
-    # Checkpoints hold what is filled and no more.
-
     def state_dict(self) -> State:
         """A copy of all that was taken in."""
         cuts = min(int(self._cuts), self.cuts_kept)
@@ -183,11 +164,7 @@ class Replay:
         }
 
     def load_state_dict(self, state: State) -> None:
-        """Restores what :meth:`state_dict` gave.
-
-        Raises:
-            BidexError: It comes from a replay of another size.
-        """
+        """Restores what :meth:`state_dict` gave. Raises BidexError: it comes from a replay of another size."""
         here, there = (self.steps, *self._obs.shape[1:]), (state["steps"], *state["obs"].shape[1:])
         if here != there:
             raise BidexError(
@@ -212,16 +189,9 @@ def steps_within(
     memory: float, steps: int, rows: int, observations: int, actions: int, cut_share: float = 1 / 16
 ) -> int:
     """The most vector steps, up to ``steps``, that take no more than ``memory`` bytes; 0 if not even one does."""
-    if replay_bytes(steps, rows, observations, actions, cut_share) <= memory:
-        return steps
-    low, high = 0, steps  # low fits (or is 0), high does not
-    while high - low > 1:
-        middle = (low + high) // 2
-        if replay_bytes(middle, rows, observations, actions, cut_share) <= memory:
-            low = middle
-        else:
-            high = middle
-    return low
+    return bisect_right(
+        range(1, steps + 1), memory, key=lambda n: replay_bytes(n, rows, observations, actions, cut_share)
+    )
 
 
 def _cuts_kept(steps: int, rows: int, cut_share: float) -> int:
@@ -230,20 +200,13 @@ def _cuts_kept(steps: int, rows: int, cut_share: float) -> int:
 
 
 class Stretches:
-    """Up to ``n`` steps in a row from each of ``places``, int64 (batches, B).
-
-    Attributes:
-        last: Places of the last steps, (batches, B).
-    """
+    """Up to ``n`` steps in a row from each of ``places``, int64 (batches, B); ``last``: places of their last steps."""
 
     def __init__(self, replay: Replay, places: Tensor, n: int, gamma: float | Tensor):
         self.replay, self.first, self.last = replay, places, places
         self.rewards: Tensor | None = None
-        if n > 1:
-            self._walk(n, gamma)
-
-    def _walk(self, n: int, gamma: float | Tensor) -> None:
-        replay = self.replay
+        if n == 1:
+            return
         newest = replay.added % replay.slots  # the slot of an observation that no step has left yet
         self.rewards, self.steps = replay.at("rewards", self.first), torch.ones_like(self.first)
         going = replay.at("valid", self.first) & ~self._ended(self.first)
@@ -270,11 +233,7 @@ class Stretches:
 def replay_within(
     learner: str, world: VectorWorld, observations: int, actions: int, asked: int, memory: float, share: float
 ) -> Replay:
-    """The replay of ``asked`` vector steps, or as much of it as ``memory`` (GB, 10^9 bytes) holds.
-
-    Raises:
-        BidexError: A task has no environments, or not one vector step fits.
-    """
+    """The replay of ``asked`` vector steps, or as many as ``memory`` (10^9 bytes) holds; a BidexError if that is 0."""
     rows = world.num_envs
     present = torch.bincount(world.task_id, minlength=world.num_tasks).tolist()
     if 0 in present:

@@ -34,10 +34,7 @@ class EpisodeStatistics:
         self.sums = self.sums * (1.0 - 1.0 / self.window) ** new[3] + new
 
     def metrics(self) -> dict[str, float]:
-        """Means per task, and means over the tasks that have finished an episode; a task without one is left out.
-
-        The episodes of all processes count.
-        """
+        """Means of each task, and over tasks, of all processes; a task that has finished no episode is left out."""
         returns, lengths, successes, counts = all_sum(self.sums).tolist()
         seen = [i for i, count in enumerate(counts) if count > 0]
         out: dict[str, float] = {}
@@ -67,20 +64,7 @@ FinalValue = Callable[[Tensor, Tensor], Tensor]
 
 
 class Rollout:
-    """Transitions of T steps in N environments, preallocated on the device and overwritten by each :func:`collect`.
-
-    Attributes:
-        obs: Raw observations before each step, (T, N, d).
-        actions: Sampled actions, not clamped, (T, N, a).
-        means: Mean actions of the sampling policy, (T, N, a).
-        rewards: (T, N); 0 where not valid.
-        terminated: Bool (T, N), the episode came to a true end.
-        ended: Bool (T, N), terminated, truncated or not valid.
-        valid: Bool (T, N), False where physics broke: such a transition teaches nothing.
-        final_values: Value of the last observation of episodes cut by a time limit, 0 elsewhere, (T, N); of several
-            critics (T, N, critics).
-        last_obs: Raw observations after the last step, (N, d).
-    """
+    """Transitions of T steps in N environments, preallocated and overwritten by each :func:`collect`."""
 
     def __init__(
         self, steps: int, num_envs: int, observations: int, actions: int, device: torch.device, critics: int = 1
@@ -89,26 +73,23 @@ class Rollout:
             return torch.zeros(*shape, dtype=dtype, device=device)
 
         self.steps = steps
-        self.obs = zeros(steps, num_envs, observations)
-        self.actions = zeros(steps, num_envs, actions)
-        self.means = zeros(steps, num_envs, actions)
-        self.rewards = zeros(steps, num_envs)
-        self.terminated = zeros(steps, num_envs, dtype=torch.bool)
-        self.ended = zeros(steps, num_envs, dtype=torch.bool)
-        self.valid = zeros(steps, num_envs, dtype=torch.bool)
+        self.obs = zeros(steps, num_envs, observations)  # raw, before each step
+        self.actions = zeros(steps, num_envs, actions)  # sampled, not clamped
+        self.means = zeros(steps, num_envs, actions)  # of the sampling policy
+        self.rewards = zeros(steps, num_envs)  # 0 where not valid
+        self.terminated = zeros(steps, num_envs, dtype=torch.bool)  # the episode came to a true end
+        self.ended = zeros(steps, num_envs, dtype=torch.bool)  # terminated, truncated or not valid
+        self.valid = zeros(steps, num_envs, dtype=torch.bool)  # False where physics broke: teaches nothing
+        # Values of the last observations of episodes cut by a time limit, 0 elsewhere; of several critics one each.
         self.final_values = zeros(steps, num_envs, *([critics] if critics > 1 else []))
-        self.last_obs = zeros(num_envs, observations)
+        self.last_obs = zeros(num_envs, observations)  # raw, after the last step
 
 
 @torch.no_grad()
 def collect(
-    world: VectorWorld,
-    rollout: Rollout,
-    obs: Tensor,
-    sample: Sampler,
-    final_value: FinalValue,
-    episodes: EpisodeStatistics,
-) -> Tensor:
+    world: VectorWorld, rollout: Rollout, obs: Tensor, sample: Sampler, final_value: FinalValue,
+    episodes: EpisodeStatistics
+) -> Tensor:  # fmt: skip
     """Fills ``rollout`` from ``world``, starting at the observations ``obs``; returns those to continue from."""
     for t in range(rollout.steps):
         action, mean = sample(obs)
@@ -127,11 +108,7 @@ def collect(
 
 
 def check_autoreset(world: VectorWorld, learner: str, expected: str) -> None:
-    """Refuses a world that resets in another way than the learner needs.
-
-    Raises:
-        BidexError: It is in another autoreset mode, or torch's default precision is not single.
-    """
+    """Refuses, by a BidexError, another autoreset mode than the learner's, or another default precision than single."""
     check_precision()
     name = world.metadata["autoreset_mode"].name
     if name != expected:

@@ -33,25 +33,14 @@ def _weights(optimiser: torch.optim.Optimizer) -> list[nn.Parameter]:
 class AdaptiveAdam:
     """Adam whose step size is divided by 1.5 above twice the desired KL, multiplied below half of it.
 
-    The step size is a tensor: adapting it needs no wait for the device.
-
-    Args:
-        parameters: What it moves.
-        config: Of a learner. It has ``learning_rate``, the step size at the start, and, if ``adaptive_learning_rate``,
-            ``desired_kl`` and ``learning_rate_range``, what it aims at and its bounds.
-        device: Where the parameters lie.
-        eps: What Adam adds to its denominators.
-        share: The part of ``desired_kl`` that is these parameters' own: of several agents', each has one.
+    The step size is a tensor: adapting it needs no wait for the device. ``share`` is the part of the config's
+    ``desired_kl`` that is these parameters' own: of several agents', each has one.
     """
 
     def __init__(
-        self,
-        parameters: Iterable[nn.Parameter],
-        config: Any,
-        device: torch.device,
-        eps: float = 1e-8,
-        share: float = 1.0,
-    ):
+        self, parameters: Iterable[nn.Parameter], config: Any, device: torch.device, eps: float = 1e-8,
+        share: float = 1.0
+    ):  # fmt: skip
         self.desired_kl = share * config.desired_kl if config.adaptive_learning_rate else None
         self.bounds = config.learning_rate_range
         self.rate = torch.tensor(config.learning_rate, device=device)
@@ -62,12 +51,7 @@ class AdaptiveAdam:
         self.actor.zero_grad()
 
     def descend(self, kl: Tensor | None, max_grad_norm: float) -> None:
-        """One step along shortened gradients, its size adapted to the KL of the last one.
-
-        Args:
-            kl: A scalar; None for PPO's first mini-batch, which compares the sampling policy with itself.
-            max_grad_norm: Gradients longer than this are shortened to it.
-        """
+        """One step along gradients of at most this norm, its size adapted to the last one's KL (None: none yet)."""
         if kl is not None:
             self.follow(kl)
         nn.utils.clip_grad_norm_(_weights(self.actor), max_grad_norm)
@@ -85,10 +69,7 @@ class AdaptiveAdam:
 
 
 class AdaptiveAdams(AdaptiveAdam):
-    """An adaptive one for the actor, and one for its critic.
-
-    ``config`` has ``critic_learning_rate`` too, a fixed step size for the critic (None makes it follow the actor's).
-    """
+    """One for the actor, one for the critic: of ``critic_learning_rate``, fixed, or None, which follows the actor's."""
 
     def __init__(
         self, actor: Iterable[nn.Parameter], critic: Iterable[nn.Parameter], config: Any, device: torch.device
@@ -104,14 +85,7 @@ class AdaptiveAdams(AdaptiveAdam):
         self.critic.zero_grad()
 
     def descend(self, kl: Tensor | None, max_grad_norm: float, apart: bool = True, critic_alone: bool = False) -> None:
-        """One step of both along shortened gradients, its size adapted to the KL of the last one.
-
-        Args:
-            kl: As in the base.
-            max_grad_norm: As in the base.
-            apart: Whether gradients of actor and critic are shortened apart.
-            critic_alone: Whether the actor stays as it is.
-        """
+        """One step of both; ``apart``: each has a norm of its own; ``critic_alone``: the actor stays as it is."""
         if kl is not None and not critic_alone:
             self.follow(kl)
         actor, critic = _weights(self.actor), _weights(self.critic)

@@ -48,11 +48,7 @@ def conjugate_gradient(product: Product, b: Tensor, iterations: int, tolerance: 
 def fisher_product(kl: Tensor, parameters: Sequence[nn.Parameter], damping: float) -> Product:
     """Fisher-vector products F v + damping v by differentiating the KL twice.
 
-    Args:
-        kl: This process's part of the mean KL of the policy from itself, a scalar whose graph reaches the parameters;
-            its Hessian is the Fisher matrix.
-        parameters: The policy's.
-        damping: Added to the diagonal.
+    ``kl`` is this process's part of the policy's mean KL from itself, with its graph; its Hessian is the Fisher matrix.
     """
     slope = flatten(torch.autograd.grad(kl, parameters, create_graph=True))
 
@@ -68,13 +64,7 @@ def natural_step(
 ) -> tuple[Tensor, float]:
     """The step (P,) along F^-1 g that has the KL ``max_kl`` to second order, and the rise it promises.
 
-    Args:
-        objective: This process's part of what shall rise, a scalar with a graph.
-        kl: As for :func:`fisher_product`.
-        parameters: The policy's.
-        max_kl: The KL to use.
-        damping: Added to the diagonal of the Fisher matrix.
-        iterations: Of conjugate gradients.
+    ``objective`` is this process's part of what shall rise, with its graph; ``kl`` as for :func:`fisher_product`.
     """
     gradient = all_sum(flatten(torch.autograd.grad(objective, parameters, retain_graph=True)))
     product = fisher_product(kl, parameters, damping)
@@ -85,30 +75,13 @@ def natural_step(
 
 
 def line_search(
-    parameters: Sequence[nn.Parameter],
-    step: Tensor,
-    measure: Callable[[], tuple[float, float]],
-    *,
-    expected: float,
-    max_kl: float,
-    accept_ratio: float,
-    factor: float,
-    tries: int,
-) -> float:
-    """Goes back along ``step`` until the objective has risen and the KL is kept; else nothing changes.
+    parameters: Sequence[nn.Parameter], step: Tensor, measure: Callable[[], tuple[float, float]], *, expected: float,
+    max_kl: float, accept_ratio: float, factor: float, tries: int
+) -> float:  # fmt: skip
+    """Goes back along ``step`` (P,) until the objective has risen and the KL is kept; else nothing changes.
 
-    Args:
-        parameters: Overwritten with the accepted point.
-        step: The full step (P,).
-        measure: Objective and KL from the sampling policy at the parameters' present values.
-        expected: Rise of the objective that its gradient promises for the full step.
-        max_kl: The KL to keep.
-        accept_ratio: Share of the promised rise that must come true.
-        factor: By which the step is shortened from try to try.
-        tries: How many points are tried.
-
-    Returns:
-        The accepted share of the step, 0 if there was none.
+    ``measure`` gives objective and KL of the present parameters; ``expected`` is the rise promised for the whole step,
+    of which ``accept_ratio`` must come true. Returns the accepted share of the step, 0 if there was none.
     """
     start = flatten(parameters).detach().clone()
     before, _ = measure()
@@ -138,34 +111,17 @@ class Stepped(NamedTuple):
 
 
 def trust_region_step(
-    parameters: Sequence[nn.Parameter],
-    objective: Tensor,
-    kl: Tensor,
-    measure: Callable[[], tuple[float, float]],
-    config: Any,
-    accept_ratio: float = 0.0,
-) -> Stepped:
-    """Moves parameters along the natural gradient, back along it until objective and KL are what was asked for.
+    parameters: Sequence[nn.Parameter], objective: Tensor, kl: Tensor, measure: Callable[[], tuple[float, float]],
+    config: Any, max_kl: float, accept_ratio: float = 0.0
+) -> Stepped:  # fmt: skip
+    """Moves parameters along :func:`natural_step`, back along it by :func:`line_search`.
 
-    Args:
-        parameters: The policy's.
-        objective: As for :func:`natural_step`.
-        kl: As for :func:`fisher_product`.
-        measure: As for :func:`line_search`.
-        config: Of a learner. It has ``max_kl``, ``damping``, ``cg_iterations``, ``backtracks`` (points tried) and
-            ``backtrack_factor`` (by which the step is shortened from one to the next).
-        accept_ratio: Share of the promised rise that must come true.
+    The config has ``damping``, ``cg_iterations``, ``backtracks`` and ``backtrack_factor``.
     """
-    size = {"max_kl": config.max_kl, "damping": config.damping, "iterations": config.cg_iterations}
-    step, promised = natural_step(objective, kl, parameters, **size)
+    damping, iterations = config.damping, config.cg_iterations
+    step, promised = natural_step(objective, kl, parameters, max_kl=max_kl, damping=damping, iterations=iterations)
     share = line_search(
-        parameters,
-        step,
-        measure,
-        expected=promised,
-        max_kl=config.max_kl,
-        accept_ratio=accept_ratio,
-        factor=config.backtrack_factor,
-        tries=config.backtracks,
-    )
+        parameters, step, measure, expected=promised, max_kl=max_kl, accept_ratio=accept_ratio,
+        factor=config.backtrack_factor, tries=config.backtracks
+    )  # fmt: skip
     return Stepped(*measure(), share)

@@ -100,7 +100,7 @@ def _check(folders: Sequence[RunFolder]) -> None:
     seeds: dict[int, Path] = {}
     for folder in folders:
         config = folder.config()
-        if not learner_kind(config.algo).adapts:
+        if not learner_kind(config.algo).make.adapts:
             raise BidexError(f"{folder.path}: {config.algo} does not adapt to tasks. Name runs of maml, promp or rl2.")
         metatest.check_worlds(Worlds.open(config.to_json()), config.algo)
         if config.seed in seeds:

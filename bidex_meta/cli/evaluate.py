@@ -57,7 +57,7 @@ def main(arguments: Sequence[str]) -> None:
     config = replace(stored, device=device, engine=flags.engine)
     worlds = Worlds.open(config.to_json())
     set_up_torch(config.threads)
-    play = _meta_test if learner_kind(config.algo).adapts else _evaluate
+    play = _meta_test if learner_kind(config.algo).make.adapts else _evaluate
     result = play(flags, folder, config, worlds)
     if flags.json:
         run = {"run": str(folder.path), **result, "conditions": conditions(worlds, flags.num_envs)}

@@ -54,35 +54,10 @@ class LearnerKind:
     presets: Mapping[str, Any]
     """Configs by name; all of one dataclass."""
 
-    @property
-    def adapts(self) -> bool:
-        """See :class:`Learner`."""
-        return self.make.adapts
-
-    @property
-    def offline(self) -> bool:
-        """See :class:`Learner`."""
-        return self.make.offline
-
-    @property
-    def imitates(self) -> bool:
-        """See :class:`Learner`."""
-        return self.make.imitates
-
-    @property
-    def adapts_by_row(self) -> bool:
-        """``independent_adaptation`` of :class:`Learner`."""
-        return self.make.independent_adaptation
-
     def autoreset(self, config: dict[str, Any]) -> str:
         """Mode of the world it trains on, for fields of its config."""
         config_type = type(next(iter(self.presets.values())))
         return self.make.autoreset_mode(config_type(**config))
-
-
-def start_from(learner: Learner, policy: dict[str, Any]) -> None:
-    """Gives a fresh learner the policy of another run's checkpoint."""
-    learner.start_from(policy)
 
 
 def learner_kind(name: str, task: str | None = None) -> LearnerKind:

@@ -122,7 +122,7 @@ def rollouts_of(worlds: Worlds, config: RunConfig[Any], asked: int | None, most:
             second one in a shot: then there are fewer.
     """
     rollouts = asked or _trained_rollouts(worlds, config)
-    return min(rollouts, most) if learner_kind(config.algo).adapts_by_row else rollouts
+    return min(rollouts, most) if learner_kind(config.algo).make.independent_adaptation else rollouts
 
 
 def _trained_rollouts(worlds: Worlds, config: RunConfig[Any]) -> int:

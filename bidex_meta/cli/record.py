@@ -247,7 +247,7 @@ def _actors(flags: RecordFlags, kind: str, device: str) -> "tuple[list[Actor], l
     for path in flags.runs:
         folder = RunFolder.open(path)
         algo = folder.config().algo
-        if learner_kind(algo).adapts:
+        if learner_kind(algo).make.adapts:
             raise BidexError(f"{algo} adapts to tasks: it has no one policy to record. Name a run of another learner.")
         policy, steps = load_policy(folder, device, flags.checkpoint)
         sampled = flags.actions == "sampled" and isinstance(policy, SamplingAgent)

@@ -103,8 +103,8 @@ def main(arguments: Sequence[str]) -> None:
 def _with_clouds(world: Any) -> Any:
     """The world with clouds in its pictures."""
     from bidex_meta.evaluation.filming import CloudView
-    from bidex_meta.points.depth_sensor import PointsRule
     from bidex_meta.world import World
+    from bidex_meta.world.depth_sensor import PointsRule
 
     if not isinstance(world, World):
         raise BidexError("Point clouds are made of scenes of our own, not of Meta-World's. Leave --points out.")

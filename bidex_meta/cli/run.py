@@ -15,7 +15,6 @@ from typing import Any
 
 from bidex_meta.cli import metatest, run_data, run_recording, watching
 from bidex_meta.cli.evaluate import conditions
-from bidex_meta.cli.learners import start_from
 from bidex_meta.cli.policies import checkpoint, fitting
 from bidex_meta.cli.run_config import RunPlan, plan_run
 from bidex_meta.cli.tables import evaluation_table, print_table
@@ -106,7 +105,7 @@ def _check(plan: RunPlan, held: contextlib.ExitStack) -> None:
             name = new_folder_name(plan.config)
             check_new(plan.flags.run_dir or name.with_name(f"{name.name}_0"))
         watching.check(plan)
-    if plan.kind.adapts:
+    if plan.kind.make.adapts:
         metatest.check_worlds(plan.source, plan.config.algo)
         metatest.splits_of(plan.source, plan.flags.split)
     if plan.folder is None and plan.config.start_from is not None:
@@ -164,7 +163,7 @@ def _make_learner(plan: RunPlan, world: VectorWorld, fresh: bool) -> Any:
     """The learner with its data; a fresh one with the weights that it shall start from."""
     config = plan.config
     learner = plan.kind.make(world, config.learner, config.seed)
-    if plan.kind.offline:
+    if plan.kind.make.offline:
         run_data.give_datasets(config.dataset, learner)
     if config.demonstrations:
         run_data.give_demonstrations(config.demonstrations, learner)
@@ -172,7 +171,7 @@ def _make_learner(plan: RunPlan, world: VectorWorld, fresh: bool) -> Any:
         start = RunFolder.open(Path(config.start_from))
         state, step = checkpoint(start)
         with fitting(start.path):
-            start_from(learner, state["learner"]["policy"])
+            learner.start_from(state["learner"]["policy"])
         _say(f"Starting from the policy of {config.start_from} at {step:,} steps.")
     return learner
 
@@ -270,7 +269,7 @@ def _what_is_left(folder: RunFolder, processes: int) -> str:
 
 
 def _evaluate(plan: RunPlan, folder: RunFolder, learner: Any) -> None:
-    if plan.kind.adapts:
+    if plan.kind.make.adapts:
         _meta_test(plan, folder, learner)
         return
     source, seed = plan.source, EVALUATION_SEED

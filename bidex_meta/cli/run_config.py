@@ -100,12 +100,13 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     named = {"suite": suite or (None if task else _EXAMPLE), "task": task}
     source = Worlds.open({**named, "object": given("object") or implied.get("object")})
     kind = learner_kind(given("algo") or "mtppo", source.class_name)
+    make = kind.make
     device = resolve_device(given("device") or "auto", source.on_gpu)
     preset, reason = choose_preset(kind, given("preset") or "auto", device, source.preset)
     if folder and stored:
         default = replace(stored, learner=_stored_learner(type(kind.presets[preset]), stored, folder))
     else:
-        sizes = run_data.rows_and_steps(source) if kind.offline else source.rows_and_steps(device, kind.adapts)
+        sizes = run_data.rows_and_steps(source) if make.offline else source.rows_and_steps(device, make.adapts)
         default = RunConfig(
             **{"suite": None, "task": None, **implied},
             algo=kind.name,
@@ -169,7 +170,7 @@ def _check(flags: RunFlags[Any], config: RunConfig[Any], kind: LearnerKind) -> N
     if config.stop_at_score is not None and config.evaluate_every is None:
         raise BidexError("--stop-at-score is judged by evaluations while training. Add --evaluate-every 50, say.")
     asked = [name for name in ("split", "shots", "rollouts", "tasks") if getattr(flags, name) not in (None, "auto")]
-    if asked and not kind.adapts:
+    if asked and not kind.make.adapts:
         raise BidexError(f"--{asked[0]} is for learners that adapt (maml, promp, rl2), not {kind.name}. Leave it out.")
     if config.record:
         part_files.hdf5()  # refuses it where it is not installed

@@ -114,9 +114,9 @@ def check_offline(kind: LearnerKind, record: int, datasets: Sequence[Dataset], s
     Raises:
         BidexError: Says what to add or leave out.
     """
-    if not kind.offline:
+    if not kind.make.offline:
         if datasets:
-            names = ", ".join(name for name in ALGOS if learner_kind(name).offline)
+            names = ", ".join(name for name in ALGOS if learner_kind(name).make.offline)
             raise BidexError(f"{kind.name} learns by playing; --dataset goes with {names}. Leave one of them out.")
         return
     if not datasets:
@@ -136,8 +136,8 @@ def check_demonstrations(kind: LearnerKind, names: Sequence[str], source: Worlds
         BidexError: The learner takes none, there is no such data set, or it is of another class, of other bases or with
             other goals shown.
     """
-    if names and not kind.imitates:
-        takers = ", ".join(name for name in ALGOS if learner_kind(name).imitates)
+    if names and not kind.make.imitates:
+        takers = ", ".join(name for name in ALGOS if learner_kind(name).make.imitates)
         raise BidexError(f"{kind.name} imitates nothing; --demonstrations goes with {takers}. Leave one of them out.")
     for dataset in open_datasets(names):
         _check_demonstration(dataset, source)

@@ -182,7 +182,7 @@ def _again(
     state: dict[str, Any],
 ) -> dict[str, Any]:
     """The recorded evaluation, made again."""
-    if learner_kind(config.algo).adapts != ("splits" in recorded):
+    if learner_kind(config.algo).make.adapts != ("splits" in recorded):
         kind = "a meta-test" if "splits" in recorded else "no meta-test"
         raise BidexError(f"{folder.path}: the evaluation is {kind}, which is not how {config.algo} is judged.")
     if "splits" not in recorded:

@@ -106,7 +106,7 @@ class Watch:
         return self._plan.kind.make.load_policy(self._learner.policy_state_dict(), device)
 
     def _evaluate(self) -> dict[str, float]:
-        metrics = self._meta_test() if self._plan.kind.adapts else _metrics(self._judge())
+        metrics = self._meta_test() if self._plan.kind.make.adapts else _metrics(self._judge())
         ranks = ("Eval/success_rate", "Eval/score", "Eval/mean_return")
         found = {name: metrics[name] for name in ranks if name in metrics}
         if self._best is None or _better(found, self._best):

@@ -1,7 +1,6 @@
-"""One row of a world as a plain `gymnasium.Env` with NumPy arrays, for `gymnasium.make("bidex-meta/CatchUnderarm-v1")`.
+"""A single environment as `gymnasium.Env` with NumPy arrays: `gymnasium.make("bidex-meta/CatchUnderarm-v1")`.
 
-For trying things out and for libraries that know single environments only; for speed use the world itself. Its copies
-and pickles go on where it was.
+For trying things out and for libraries of single environments; a world is faster. Copies and pickles continue exactly.
 """
 
 import gymnasium
@@ -17,14 +16,8 @@ from bidex_meta.world.contract import Info, Options
 class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """A task class as a single environment: goal visible, one of 50 tasks drawn each episode.
 
-    Args:
-        task_name: E.g. `"CatchUnderarm"`.
-        render_mode: None or `"rgb_array"`.
-        seed: Chooses the 50 tasks, and the starts until `reset(seed=...)` says otherwise.
-        device: Where the physics runs; one row is fastest on the CPU.
-
-    Raises:
-        BidexError: Unknown task class or render mode.
+    `seed` chooses the 50 tasks, and the starts until `reset(seed=...)`. Raises BidexError for an unknown task class or
+    a render mode other than None and `"rgb_array"`.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 60}  # noqa: RUF012  (Gymnasium's own convention)
@@ -41,45 +34,30 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.action_space = self.world.single_action_space
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
-        """Starts an episode; with a seed, the same one every time.
-
-        Returns:
-            The observation, shape (d,), float32, and an empty info.
-
-        Raises:
-            BidexError: An option: there are none.
-        """
+        """Starts an episode, the same for the same seed: observation (d,), float32, and an empty info. No options."""
         super().reset(seed=seed, options=options)
         if options:
             raise BidexError(f"Expected no reset options, got {', '.join(map(str, options))}.")
         obs, _ = self.world.reset(seed=seed)
-        return _array(obs), {}
+        return obs[0].cpu().numpy(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
-        """One control step of 1/60 s.
+        """Advances 1/60 s by an action (a,) in [-1, 1]: observation (d,) float32, reward, terminated, truncated, info.
 
-        Args:
-            action: Shape (a,), in [-1, 1].
-
-        Returns:
-            Observation (d,) float32, reward, terminated, truncated, and info: ``success`` (of this state),
-            ``unstable`` and ``reward_terms``; at the end of an episode also ``is_success``: at any of its steps.
+        `info`: ``success`` (of this state), ``unstable``, ``reward_terms``, and at an episode's end ``is_success`` (at
+        any step).
         """
-        obs, reward, terminated, truncated, told = self.world.step(torch.as_tensor(action)[None])
-        info: Info = {"success": bool(told["success"][0]), "unstable": bool(told["unstable"][0])}
-        info["reward_terms"] = {name: float(term[0]) for name, term in told["reward_terms"].items()}
+        obs, reward, terminated, truncated, batch = self.world.step(torch.as_tensor(action)[None])
+        info: Info = {"success": bool(batch["success"][0]), "unstable": bool(batch["unstable"][0])}
+        info["reward_terms"] = {name: float(term[0]) for name, term in batch["reward_terms"].items()}
         if terminated[0] or truncated[0]:
-            info["is_success"] = bool(told["so_far"]["success"][0])
-        return _array(obs), float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
+            info["is_success"] = bool(batch["so_far"]["success"][0])
+        return obs[0].cpu().numpy(), float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """The picture of this row, shape (height, width, 3), uint8; None without a render mode."""
+        """A picture (height, width, 3), uint8; None without a render mode."""
         return None if self.render_mode is None else self.world.render()
 
     def close(self) -> None:
         """Frees the world."""
         self.world.close()
-
-
-def _array(batch: torch.Tensor) -> np.ndarray:
-    return batch[0].cpu().numpy()

@@ -1,7 +1,6 @@
 """Gymnasium ids of every shipped suite and every task class.
 
-Suites register a vector entry point only: a suite is a batch of different tasks. Task classes register both. Entry
-points are text and their arguments plain values, so an id says the same whenever and wherever it is made.
+Suites register a vector entry point only: a suite is a batch of different tasks. Task classes register both.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -34,29 +33,22 @@ def task_id(task_name: str) -> str:
 
 def register_ids() -> None:
     """Registers all ids; ids that are registered already stay as they are."""
-    for name in suite_names():
-        for env_id, split in suite_ids(load_suite(name)).items():
-            if env_id not in gymnasium.registry:
-                gymnasium.register(
-                    env_id,
-                    vector_entry_point="bidex_meta.clients.gymnasium_ids:make_suite_world",
-                    kwargs={"suite": name, "split": split},
-                )
-    for kind in ("mt", "ml"):
-        if (env_id := f"{NAMESPACE}/custom-{kind}-envs") not in gymnasium.registry:
-            gymnasium.register(env_id, vector_entry_point="bidex_meta.metaworld.vector_envs:make_custom")
+    specs: dict[str, dict[str, Any]] = {
+        env_id: {"vector_entry_point": f"{__name__}:make_suite_world", "kwargs": {"suite": name, "split": split}}
+        for name in suite_names()
+        for env_id, split in suite_ids(load_suite(name)).items()
+    }
+    custom = {"vector_entry_point": "bidex_meta.metaworld.vector_envs:make_custom"}
+    specs |= {f"{NAMESPACE}/custom-{kind}-envs": custom for kind in ("mt", "ml")}
     for name in registry.names():
-        if task_id(name) not in gymnasium.registry:
-            gymnasium.register(
-                task_id(name),
-                entry_point="bidex_meta.clients.gymnasium_env:TaskEnv",
-                vector_entry_point="bidex_meta.clients.gymnasium_ids:make_class_world",
-                kwargs={"task_name": name},
-            )
-
-
-_METAWORLD = ("vector_strategy", "meta_batch_size", "total_tasks_per_cls", "env_name")
-"""Keywords of Meta-World's that ask for its kind of vector environment."""
+        specs[task_id(name)] = {
+            "entry_point": "bidex_meta.clients.gymnasium_env:TaskEnv",
+            "vector_entry_point": f"{__name__}:make_class_world",
+            "kwargs": {"task_name": name},
+        }
+    for env_id, spec in specs.items():
+        if env_id not in gymnasium.registry:
+            gymnasium.register(env_id, **spec)
 
 
 def make_suite_world(
@@ -69,23 +61,17 @@ def make_suite_world(
     stagger: bool = False,
     **options: Any,
 ) -> "World | VectorEnv":
-    """What `gymnasium.make_vec("bidex-meta/MT4-v1", num_envs=...)` calls.
+    """The world of `gymnasium.make_vec("bidex-meta/MT4-v1", num_envs=...)`, environments over all classes.
 
-    Args:
-        suite: Name of the suite.
-        split: `"train"` or `"test"`.
-        num_envs: Rows over all classes.
-        seed: Chooses the tasks, the starts and the task draws; None: 0.
-        benchmark_seed: Chooses the tasks instead, and the rest where there is no seed.
-        render_mode: None or `"rgb_array"`, which are the same: a world draws when it is asked to.
-        stagger: As in `Benchmark.make_world`, but left out: not, since who counts for himself would count those.
-        **options: The other keywords of `Benchmark.make_world`. With `vector_strategy`, `meta_batch_size`,
-            `total_tasks_per_cls` or `env_name` those of Meta-World's ids, and what comes is what `metaworld` gives:
-            single environments of NumPy arrays side by side, however many `num_envs` says.
+    `seed` (None: 0) chooses tasks, starts and task draws; `benchmark_seed` the tasks instead, and the rest without a
+    seed. Both render modes, None and `"rgb_array"`, are the same: a world draws on request. The rest as in
+    `Benchmark.make_world`, except that `stagger` is off: wrappers would count shortened episodes. `vector_strategy`,
+    `meta_batch_size`, `total_tasks_per_cls` or `env_name` give Meta-World's single environments of NumPy arrays side by
+    side, whatever `num_envs` says.
     """
     check_render_mode(render_mode)
     of_tasks = next(given for given in (benchmark_seed, seed, 0) if given is not None)
-    if any(name in options for name in _METAWORLD):
+    if options.keys() & {"vector_strategy", "meta_batch_size", "total_tasks_per_cls", "env_name"}:
         from bidex_meta.metaworld.vector_envs import make_split
 
         return make_split(suite, split, of_tasks, **options)
@@ -98,15 +84,7 @@ def make_suite_world(
 def make_class_world(
     task_name: str, num_envs: int = 1, render_mode: str | None = None, stagger: bool = False, **options: Any
 ) -> "World":
-    """What `gymnasium.make_vec("bidex-meta/CatchUnderarm-v1", num_envs=...)` calls.
-
-    Args:
-        task_name: Name of the task class.
-        num_envs: Rows.
-        render_mode: As in `make_suite_world`.
-        stagger: As in `make_suite_world`.
-        **options: The other keywords of `make_task_world`.
-    """
+    """The world of `gymnasium.make_vec("bidex-meta/CatchUnderarm-v1", num_envs=...)`, as by `make_task_world`."""
     from bidex_meta.benchmark import make_task_world
 
     check_render_mode(render_mode)
@@ -114,10 +92,6 @@ def make_class_world(
 
 
 def check_render_mode(render_mode: str | None) -> None:
-    """Refuses what cannot be drawn.
-
-    Raises:
-        BidexError: Neither None nor `"rgb_array"`.
-    """
+    """Raises BidexError for a render mode other than None and `"rgb_array"`."""
     if not isinstance(render_mode, str | None) or render_mode not in (None, "rgb_array"):
         raise BidexError(f"render_mode: expected None or 'rgb_array', got {shortened(render_mode)}.")

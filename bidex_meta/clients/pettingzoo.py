@@ -17,18 +17,11 @@ with extra("marl"):
 
 
 class HandsEnv(ParallelEnv):
-    """One row of a task class with several agents; they share reward, ends and `info`.
+    """A single environment of a task class with several agents, which share reward, ends and `info`.
 
-    Args:
-        task: E.g. `"CatchUnderarm"`.
-        agents: The partition: `"hands"`, `"fingers"`, `"single"`, a TOML file, or units by agent
-            (docs/learners/multiagent.md).
-        render_mode: None or `"rgb_array"`.
-        seed: Chooses the 50 tasks, and the starts until `reset(seed=...)` says otherwise.
-        device: Where the physics runs.
-
-    Raises:
-        BidexError: Unknown task class or render mode, or a bad partition.
+    `agents` is the partition: `"hands"`, `"fingers"`, `"single"`, a TOML file, or units by agent
+    (docs/learners/multiagent.md); the rest as of `TaskEnv`. Raises BidexError for an unknown task class or render mode,
+    or a bad partition.
     """
 
     metadata = {"name": "bidex_meta", "render_modes": ["rgb_array"], "render_fps": 60}  # noqa: RUF012  (PettingZoo's)
@@ -57,35 +50,24 @@ class HandsEnv(ParallelEnv):
         self._state = np.zeros(whole.shape, np.float32)
 
     def observation_space(self, agent: str) -> Space:
-        """Of an agent, the same object each time."""
+        """Returns the same object each time."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> Space:
-        """Of an agent, the same object each time."""
+        """Returns the same object each time."""
         return self.action_spaces[agent]
 
     def reset(self, seed: int | None = None, options: dict | None = None) -> tuple[dict[str, np.ndarray], dict]:
-        """Starts an episode of all agents; with a seed, the same one every time. There are no options: they do nothing.
-
-        Returns:
-            Observations by agent, and empty infos.
-        """
+        """Starts an episode, the same for the same seed: observations by agent, and empty infos. Options do nothing."""
         self._state, _ = self._env.reset(seed=seed)
         self.agents = list(self.possible_agents)
-        return self._seen(self.agents), {name: {} for name in self.agents}
+        return self._observations(), {name: {} for name in self.agents}
 
     def step(self, actions: dict[str, np.ndarray]) -> tuple[dict, dict, dict, dict, dict]:
-        """One control step of 1/60 s.
+        """Advances 1/60 s by an action of each agent in [-1, 1], in ascending order of the world's actions.
 
-        Args:
-            actions: Of every agent, in [-1, 1], in ascending order of the world's actions.
-
-        Returns:
-            Observations, rewards, terminated, truncated and infos (`TaskEnv.step`), each by agent; empty once the
-            episode is over.
-
-        Raises:
-            BidexError: An agent without an action, or of another shape.
+        Returns observations, rewards, terminated, truncated and infos (`TaskEnv.step`), each by agent; empty once the
+        episode is over. Raises BidexError where an agent's action is missing or of another shape.
         """
         if not self.agents:
             return {}, {}, {}, {}, {}
@@ -97,34 +79,28 @@ class HandsEnv(ParallelEnv):
                 raise BidexError(f"Expected an action of shape {expected} of agent {name}, got {got}.")
             joint[self._actions[name]] = given
         self._state, reward, terminated, truncated, info = self._env.step(joint)
-        every = self.agents
+        every, obs = self.agents, self._observations()
         if terminated or truncated:
             self.agents = []
         rewards, ends, cuts = (dict.fromkeys(every, value) for value in (reward, terminated, truncated))
-        return self._seen(every), rewards, ends, cuts, {name: dict(info) for name in every}
+        return obs, rewards, ends, cuts, {name: dict(info) for name in every}
 
     def state(self) -> np.ndarray:
         """The full observation, for critics of all agents."""
         return self._state.copy()
 
     def render(self) -> np.ndarray | None:
-        """The picture of the scene, shape (height, width, 3), uint8; None without a render mode."""
+        """A picture (height, width, 3), uint8; None without a render mode."""
         return self._env.render()
 
     def close(self) -> None:
         """Frees the world."""
         self._env.close()
 
-    def _seen(self, agents: list[str]) -> dict[str, np.ndarray]:
-        return {name: self._state[self._columns[name]] for name in agents}
+    def _observations(self) -> dict[str, np.ndarray]:
+        return {name: self._state[self._columns[name]] for name in self.agents}
 
 
 def parallel_env(task: str, agents: Agents = "hands", **options: Any) -> HandsEnv:
-    """A task class as a parallel environment, as PettingZoo's packages name it.
-
-    Args:
-        task: E.g. `"CatchUnderarm"`.
-        agents: The partition.
-        options: `render_mode`, `seed` and `device` of :class:`HandsEnv`.
-    """
+    """`HandsEnv` under the name of PettingZoo's packages."""
     return HandsEnv(task, agents, **options)

@@ -6,8 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bidex_meta.clients.needs import check_training, extra, whole_steps
-from bidex_meta.errors import unknown_name
+from bidex_meta.clients.needs import check_training, extra
+from bidex_meta.errors import BidexError, shortened, unknown_name
 from bidex_meta.world.contract import Info, TaskWorld, VectorWorld
 
 with extra("rsl-rl"):
@@ -19,15 +19,10 @@ class RslRlVecEnv(VecEnv):
     """All environments of one world on its device; observations in the groups `policy` and `critic`.
 
     `extras`: `time_outs` (cut by the time limit or broken physics) and `log` (`EpisodeLog`; empty where none ended).
-
-    Args:
-        world: In autoreset mode SAME_STEP.
-        policy: The world's `observation_groups` that the policy sees; none: all. The critic sees everything.
-        cfg: A dict: what rsl-rl's loggers shall keep as the environment's config.
-        stagger: Shortened first episodes (docs/clients.md), which "Mean reward" counts and `log` does not.
-
-    Raises:
-        BidexError: Another autoreset mode, or an unknown group; `episode_length_buf` set to no whole numbers from 0 on.
+    `policy` names the world's `observation_groups` for the policy, none: all; the critic gets everything. `cfg` is a
+    dict that rsl-rl's loggers store. `stagger`: shortened first episodes (docs/clients.md), which "Mean reward" counts
+    and `log` does not. Raises BidexError for another mode than SAME_STEP, an unknown group, or `episode_length_buf` set
+    to no whole numbers from 0 on.
     """
 
     def __init__(self, world: TaskWorld, policy: Sequence[str] = (), cfg: Any = None, stagger: bool = False) -> None:
@@ -52,7 +47,13 @@ class RslRlVecEnv(VecEnv):
 
     @episode_length_buf.setter
     def episode_length_buf(self, value: Tensor) -> None:
-        steps = whole_steps("episode_length_buf", value, self.world)
+        given = torch.as_tensor(value, device=self.world.device)
+        steps = given.to(torch.int64)
+        if steps.shape != (self.num_envs,) or not bool(((given >= 0) & (given == steps)).all()):
+            raise BidexError(
+                f"episode_length_buf: expected whole numbers from 0 on, shape ({self.num_envs},), "
+                f"got {shortened(given.tolist())}. Give steps, one number for each environment."
+            )
         self.get_observations()
         episodes = self.world.episodes
         episodes.counts = episodes.counts & (steps == episodes.elapsed)
@@ -87,17 +88,11 @@ class EpisodeLog:
         self._terms: dict[str, Tensor] = {}
 
     def update(self, info: Info, terminated: Tensor, truncated: Tensor) -> dict[str, Tensor]:
-        """What ended in a step.
+        """Values of the environments that ended in a step, (k,), float32, to be averaged; empty where none did.
 
-        Args:
-            info: The step's.
-            terminated: Shape (N,), bool.
-            truncated: Shape (N,), bool.
-
-        Returns:
-            Values of the environments that ended, (k,), float32, to be averaged; nothing where none did. Of episodes
-            that count `Metrics/success_rate`, `Metrics/return`, `Metrics/length`, `Metrics/success/<task>` and, as sums
-            over an episode, `Episode_Reward/<term>`; of all `Episode_Termination/terminated`, `time_out`, `unstable`.
+        Of episodes that count `Metrics/success_rate`, `Metrics/return`, `Metrics/length`, `Metrics/success/<task>` and,
+        as sums over an episode, `Episode_Reward/<term>`; of all `Episode_Termination/terminated`, `time_out`,
+        `unstable`.
         """
         ended, counted, world = info["_final_obs"], info["counted"], self._world
         for name, term in info.get("reward_terms", {}).items():

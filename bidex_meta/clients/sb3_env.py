@@ -14,17 +14,12 @@ with extra("sb3"):
 
 
 class SB3VecEnv(VecEnv):
-    """All rows of one world, NumPy arrays in and out.
+    """All environments of one world, NumPy arrays in and out; one seed of SB3's starts them all.
 
-    `infos` of a row that ended: `terminal_observation`, `TimeLimit.truncated` (cut: SB3 goes on with the value of that
+    `infos` at an end: `terminal_observation`, `TimeLimit.truncated` (cut: SB3 goes on with the value of that
     observation) and, unless it was a shortened first episode, `episode` (r, l, t) and `is_success` (at any step).
-
-    Args:
-        world: In autoreset mode SAME_STEP. One seed of SB3's starts all its rows.
-        stagger: Shortened first episodes (docs/clients.md), which SB3 does not count but `VecMonitor` does.
-
-    Raises:
-        BidexError: Another autoreset mode.
+    `stagger`: shortened first episodes (docs/clients.md), which SB3 does not count but `VecMonitor` does. Raises
+    BidexError for a world in another autoreset mode than SAME_STEP.
     """
 
     def __init__(self, world: VectorWorld, stagger: bool = False) -> None:
@@ -33,26 +28,26 @@ class SB3VecEnv(VecEnv):
         super().__init__(world.num_envs, world.single_observation_space, world.single_action_space)
 
     def reset(self) -> np.ndarray:
-        """Starts episodes of all rows; observations (num_envs, d)."""
+        """Starts all episodes; observations (num_envs, d)."""
         obs, _ = self.world.reset(seed=self._seeds[0], options=self._options[0])
         self._reset_seeds()
         self._reset_options()
         return obs.cpu().numpy()
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Keeps the actions (num_envs, a)."""
+        """Stores the actions (num_envs, a)."""
         self._actions = torch.as_tensor(actions, dtype=torch.float32, device=self.world.device)
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Info]]:
         """Takes them: observations (num_envs, d), rewards and dones (num_envs,), infos."""
-        obs, reward, _, truncated, told = self.world.step(self._actions)
+        obs, reward, _, truncated, info = self.world.step(self._actions)
         infos: list[Info] = [{} for _ in range(self.num_envs)]
-        ended = told["_final_obs"]
+        ended = info["_final_obs"]
         rows = ended.nonzero().squeeze(1).tolist()
         if rows:
-            values = {"truncated": truncated, "counted": told["counted"], **told.get("episode", told["so_far"])}
+            values = {"truncated": truncated, "counted": info["counted"], **info.get("episode", info["so_far"])}
             columns = {name: value[ended].tolist() for name, value in values.items()}
-            for i, (row, final) in enumerate(zip(rows, told["final_obs"][ended].cpu().numpy(), strict=True)):
+            for i, (row, final) in enumerate(zip(rows, info["final_obs"][ended].cpu().numpy(), strict=True)):
                 infos[row] = {"terminal_observation": final, "TimeLimit.truncated": columns["truncated"][i]}
                 if columns["counted"][i]:
                     episode = {name: columns[name][i] for name in ("r", "l", "t") if name in columns}
@@ -60,15 +55,15 @@ class SB3VecEnv(VecEnv):
         return obs.cpu().numpy(), reward.cpu().numpy(), ended.cpu().numpy(), infos
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """The world's attribute for each row."""
+        """The world's attribute for each environment."""
         return [self.world.get_attr(attr_name)[i] for i in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Sets an attribute of the world, for all rows."""
+        """Sets an attribute of the world."""
         setattr(self.world, attr_name, value)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Calls a method of the world once; its result for each row."""
+        """Calls a method of the world once; its result for each environment."""
         return [getattr(self.world, method_name)(*method_args, **method_kwargs)] * len(list(self._get_indices(indices)))
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:

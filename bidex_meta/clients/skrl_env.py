@@ -14,17 +14,11 @@ with extra("skrl"):
 
 
 class SkrlEnv(Wrapper):
-    """All rows of one world on its device, without a way over NumPy (as `wrap_env` takes it).
+    """All environments of one world on its device, without NumPy in between (as `wrap_env` takes it).
 
-    `infos`: the world's; where episodes that count ended, `episode` has their means as skrl's trainers log them.
-
-    Args:
-        world: In autoreset mode SAME_STEP.
-        seed: Of the first reset; None: the world's.
-        stagger: Shortened first episodes (docs/clients.md), which skrl's "Total reward" counts.
-
-    Raises:
-        BidexError: Another autoreset mode.
+    `infos`: the world's; where episodes that count ended, `episode` has their means as skrl's trainers log them. `seed`
+    is of the first reset, None: the world's. `stagger`: shortened first episodes (docs/clients.md), which skrl's "Total
+    reward" counts. Raises BidexError for a world in another autoreset mode than SAME_STEP.
     """
 
     def __init__(self, world: VectorWorld, seed: int | None = None, stagger: bool = False) -> None:
@@ -35,16 +29,16 @@ class SkrlEnv(Wrapper):
 
     @property
     def observation_space(self) -> Box:
-        """Of a row."""
+        """Of one environment."""
         return self.world.single_observation_space
 
     @property
     def action_space(self) -> Box:
-        """Of a row."""
+        """Of one environment."""
         return self.world.single_action_space
 
     def reset(self) -> tuple[Tensor, Info]:
-        """Starts the rows once; later the present observations (num_envs, d), since rows start anew by themselves."""
+        """Starts all once; later the present observations (num_envs, d), since episodes restart by themselves."""
         if self._obs is None:
             self._obs, _ = self.world.reset(seed=self._seed)
         return self._obs, {}
@@ -52,20 +46,20 @@ class SkrlEnv(Wrapper):
     def step(self, actions: Tensor) -> Step:
         """Takes actions (num_envs, a): observations (num_envs, d); reward and both ends (num_envs, 1); infos."""
         with torch.no_grad():
-            self._obs, *made, told = self.world.step(actions)
-        infos = {name: value for name, value in told.items() if name not in ("episode", "_episode")}
-        counted = told["counted"]
+            self._obs, *results, info = self.world.step(actions)
+        infos = {name: value for name, value in info.items() if name not in ("episode", "_episode")}
+        counted = info["counted"]
         if bool(counted.any()):
             names = {"r": "Episode / Return", "l": "Episode / Length", "success": "Episode / Success"}
-            infos["episode"] = {names[name]: told["so_far"][name][counted].float().mean() for name in names}
-        reward, terminated, truncated = (each[:, None] for each in made)
+            infos["episode"] = {names[name]: info["so_far"][name][counted].float().mean() for name in names}
+        reward, terminated, truncated = (each[:, None] for each in results)
         return self._obs, reward, terminated, truncated, infos
 
     def state(self) -> None:
         """None: the policy sees what there is."""
 
     def render(self, *args: Any, **kwargs: Any) -> Any:
-        """A picture of a row, (height, width, 3), uint8."""
+        """A picture of one environment, (height, width, 3), uint8."""
         world: Any = self.world
         return world.render(*args, **kwargs)
 

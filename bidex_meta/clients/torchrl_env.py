@@ -17,18 +17,12 @@ _EPISODE = {"r": torch.float32, "l": torch.int64, "success": torch.bool}
 
 
 class TorchRLEnv(EnvBase):
-    """All rows of one world, batch size (num_envs,).
+    """All environments of one world, batch size (num_envs,), each entry (num_envs, ...).
 
     `next` holds the observation that the step led to, also where an episode ended; the reset that TorchRL asks for then
-    hands out the new episode's, which the world has begun by itself. Beside `observation` there are `success` (of this
-    state) and `episode` (r, l, success so far), each (num_envs, 1).
-
-    Args:
-        world: In autoreset mode SAME_STEP.
-        stagger: Shortened first episodes (docs/clients.md), which TorchRL's transforms count.
-
-    Raises:
-        BidexError: Another autoreset mode.
+    returns the new episode's, which the world has begun by itself. Beside `observation` there are `success` (of this
+    state) and `episode` (r, l, success so far). `stagger`: shortened first episodes (docs/clients.md), which TorchRL's
+    transforms count. Raises BidexError for a world in another autoreset mode than SAME_STEP.
     """
 
     def __init__(self, world: VectorWorld, stagger: bool = False) -> None:
@@ -47,10 +41,8 @@ class TorchRLEnv(EnvBase):
         self.done_spec = Composite({name: flag.clone() for name in ("done", "terminated", "truncated")}, shape=(rows,))
         self.action_spec = Bounded(-1.0, 1.0, torch.Size(world.action_space.shape), device=device)
         self.reward_spec = Unbounded(column, device=device)
-        self._obs, self._begun = (
-            torch.zeros_like(low, device=device),
-            torch.zeros(rows, dtype=torch.bool, device=device),
-        )
+        self._obs = torch.zeros_like(low, device=device)
+        self._begun = torch.zeros(rows, dtype=torch.bool, device=device)
 
     def _set_seed(self, seed: int | None) -> None:
         self._world_seed = seed

@@ -19,13 +19,13 @@ from bidex_meta.data.dataset import Dataset
 from bidex_meta.data.episode import Episode
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.references import Reference
-from bidex_meta.points.depth_sensor import POINT_ENTRIES, privileged_columns
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.layout import CLIP, Block
 from bidex_meta.tasks.scene import compile_scene
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.utils.plugins import name_without_object
+from bidex_meta.world.depth_sensor import POINT_ENTRIES, privileged_columns
 
 _TOLERANCE = 1e-5
 """Of a reward, beside the same share of its size: observations and, on a GPU, the formula are float32. Measured on the

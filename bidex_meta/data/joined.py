@@ -14,9 +14,9 @@ from torch import Tensor
 from bidex_meta.data.dataset import Dataset
 from bidex_meta.data.episode import Episode
 from bidex_meta.errors import BidexError, unknown_name
-from bidex_meta.points.depth_sensor import POINT_ENTRIES
 from bidex_meta.utils.memory import check_memory
 from bidex_meta.world.contract import VectorWorld
+from bidex_meta.world.depth_sensor import POINT_ENTRIES
 
 
 @dataclass(frozen=True)

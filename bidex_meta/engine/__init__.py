@@ -1,1 +1,1 @@
-"""The one door to physics. Tasks and learners never import an engine."""
+"""Physics engines behind one protocol. Tasks and learners never import an engine."""

@@ -14,15 +14,10 @@ _MOST_THREADS = 1024
 def choose_engine(
     device: str | torch.device, engine: str = "auto", threads: int | None = None
 ) -> tuple[torch.device, EngineMaker]:
-    """The device and what makes engines there.
+    """The device and what makes engines there; ``threads`` are C MuJoCo's, None takes all CPUs.
 
-    Args:
-        device: "auto" (CUDA where there is one), "cpu" or a CUDA device.
-        engine: "c", "warp" or "auto": C MuJoCo on the CPU, mujoco_warp on a GPU.
-        threads: Threads of C MuJoCo; None takes all CPUs.
-
-    Raises:
-        BidexError: Unknown engine, a device that is not there, C MuJoCo on a GPU, or an impossible number of threads.
+    ``engine`` "auto" is C MuJoCo on the CPU, mujoco_warp on a GPU. Raises BidexError for an unknown engine, a missing
+    device, C MuJoCo on a GPU, or an impossible number of threads.
     """
     if threads is not None:
         threads = whole_number("threads", threads, 1, _MOST_THREADS)

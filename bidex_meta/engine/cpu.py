@@ -12,15 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bidex_meta.engine.health import LARGEST, LONGEST, SHORTEST, checked_state, outside, quaternion_columns
+from bidex_meta.engine.health import LARGEST, LONGEST, SHORTEST, STATE, checked_state, outside, quaternion_columns
 from bidex_meta.errors import BidexError
 from bidex_meta.utils.memory import usable_cores
 
-# What a simulation carries from one step to the next; the fields that a model has none of are skipped.
-_STATE_FIELDS = (
-    "time qpos qvel act history qacc_warmstart ctrl qfrc_applied xfrc_applied eq_active mocap_pos mocap_quat userdata"
-)
-_STATE = tuple(_STATE_FIELDS.split())
 # A full arena drops contacts or constraints in silence: as broken as a bad number.
 _BAD_NAMES = ("BADQPOS", "BADQVEL", "BADQACC", "CONTACTFULL", "CNSTRFULL")
 _BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_{name}")) for name in _BAD_NAMES]
@@ -33,8 +28,8 @@ class CpuEngine:
     positions and velocities those of the new state; a persistent batch takes its next step from there. Without
     ``refresh`` it is left out, as by ``mj_step``: what is no part of the state is then that before the last substep.
 
-    A row with a number out of bounds is told by ``unstable`` and put at rest at the model's reference pose, before a
-    step by ``_quarantine``, within it by MuJoCo's autoreset: all geoms of a row with NaN would touch, and solving for
+    A row with a number out of bounds is reported by ``unstable`` and put at rest at the model's reference pose, before
+    a step by ``_quarantine``, within it by MuJoCo's autoreset: all geoms of a row with NaN would touch, and solving for
     their contacts takes up to thousands of times a normal step, for which all rows wait.
     """
 
@@ -44,18 +39,14 @@ class CpuEngine:
     def __init__(
         self, models: Sequence[mujoco.MjModel], rows: Sequence[int], threads: int | None = None, refresh: bool = True
     ) -> None:
-        """Builds the batch.
+        """Builds the batch: the distinct models, and for each simulation the index of its model.
 
-        Args:
-            models: The distinct models, of equal structure.
-            rows: For each simulation the index of its model.
-            threads: Engine threads; None takes all CPUs. Results do not depend on it.
-            refresh: Whether a step ends with sensors, positions and velocities of the new state.
+        Results do not depend on ``threads``; None takes all CPUs.
         """
         self.num = len(rows)
         self._after_step = mujoco.mjtStage.mjSTAGE_VEL if refresh else mujoco.mjtStage.mjSTAGE_NONE
-        # MuJoCo would print each broken row to stderr and to a log file in the working folder; unstable() tells it.
-        mujoco.set_mju_user_warning(_silent)
+        # MuJoCo would print each broken row to stderr and to a log file in the working folder; unstable() reports it.
+        mujoco.set_mju_user_warning(lambda message: None)
         threads = usable_cores() if threads is None else threads
         self._batch = mujoco.batch.Batch(models[0], self.num, nthread=threads, persistent=True)
         self._forked = False
@@ -63,25 +54,25 @@ class CpuEngine:
             _WITH_THREADS.add(self)
         if len(models) > 1:
             self._batch.set_models([models[i] for i in rows])
-        self._state = {name: self._bind(name) for name in _STATE if 0 not in self._batch.bind(name).shape}
+        self._state = {name: self._bind(name) for name in STATE if 0 not in self._batch.bind(name).shape}
         self.qpos, self.qvel, self.ctrl = (self._state[n] for n in ("qpos", "qvel", "ctrl"))
         self.xfrc_applied = self._state["xfrc_applied"]
         self.sensordata = self._bind("sensordata")
         self._mocap = [self._state[name] for name in ("mocap_pos", "mocap_quat") if name in self._state]
         self._failed = torch.zeros(self.num, dtype=torch.bool)
         self._numbers = torch.from_numpy(self._batch.state)
-        self._quaternions = self._quaternion_columns(models[0])
+        columns = [self._column("qpos") + quaternion_columns(models[0])]
+        if self._mocap:
+            columns.append(self._column("mocap_quat") + np.arange(4 * models[0].nmocap))
+        self._quaternions = torch.from_numpy(np.concatenate(columns))
+        """Columns of ``_numbers`` that hold quaternions, four for each, shape (4 k,)."""
         self._models, self._model_of = list(models), list(rows)
         self._probe: mujoco.MjData | None = None
         self._poses: tuple[Tensor, Tensor] | None = None
 
     @property
     def batch(self) -> mujoco.batch.Batch:
-        """The simulations.
-
-        Raises:
-            BidexError: Its threads stayed in the process that made it.
-        """
+        """The simulations; BidexError where their threads stayed in the process that made it."""
         if self._forked:
             raise BidexError(
                 "Expected a world in the process that made it, got one with engine threads in a forked child, where "
@@ -89,15 +80,7 @@ class CpuEngine:
             )
         return self._batch
 
-    def _quaternion_columns(self, model: mujoco.MjModel) -> Tensor:
-        """Columns of the batch's numbers that hold quaternions, four for each, shape (4 k,)."""
-        found = [self._column("qpos") + quaternion_columns(model)]
-        if self._mocap:
-            found.append(self._column("mocap_quat") + np.arange(4 * model.nmocap))
-        return torch.from_numpy(np.concatenate(found))
-
     def _column(self, name: str) -> int:
-        """First column of a field of the state."""
         return (self._state[name].data_ptr() - self._numbers.data_ptr()) // self._numbers.element_size()
 
     def _bind(self, name: str) -> Tensor:
@@ -106,7 +89,7 @@ class CpuEngine:
             return torch.from_numpy(self._batch.bind(name))
 
     def step(self, substeps: int, active: Tensor | None = None) -> None:
-        """Advances all simulations, or those of the mask ``active``."""
+        """See ``Engine``."""
         self._quarantine()
         ids = None if active is None else active.numpy()
         try:
@@ -132,33 +115,30 @@ class CpuEngine:
             self._failed |= broken
 
     def unstable(self) -> Tensor:
-        """Which simulations broke since their last reset. Shape (num,), bool."""
-        told = self._batch.warning[:, :, 1]
-        bad = told.take(_BAD, axis=1).any(axis=1) if told.any() else np.zeros(self.num, dtype=bool)
+        """See ``Engine``."""
+        counts = self._batch.warning[:, :, 1]
+        bad = counts.take(_BAD, axis=1).any(axis=1) if counts.any() else np.zeros(self.num, dtype=bool)
         # One non-finite addend makes the sum non-finite.
         return torch.from_numpy(bad) | self._failed | ~self.sensordata.sum(dim=1).isfinite()
 
     def warnings(self) -> Tensor:
-        """How many of MuJoCo's warnings each simulation has told since its last reset. Shape (num,), int64."""
+        """See ``Engine``."""
         return torch.from_numpy((self._batch.warning[:, :, 1] > 0).sum(axis=1)) + self._failed
 
     def placement(self) -> Tensor:
-        """What ``reset`` takes, of every simulation as it stands, a copy. Shape (num, nq + 7 nmocap)."""
+        """See ``Engine``."""
         if not self._mocap:
             return self.qpos.clone()
         return torch.cat((self.qpos, torch.cat(self._mocap, dim=2).flatten(1)), dim=1)
 
     def body_poses(self) -> tuple[Tensor, Tensor]:
-        """Where all bodies stand: positions (num, nbody, 3) and rotation matrices (num, nbody, 3, 3)."""
+        """See ``Engine``."""
         if self._poses is None:  # each field that is bound is copied out after every step
             self._poses = self._bind("xpos"), self._bind("xmat").unflatten(2, (3, 3))
         return self._poses
 
     def reset(self, mask: Tensor, start: Tensor) -> None:
-        """Starts the simulations of a mask anew, at rest, at given positions (one row per true entry).
-
-        A start with a number out of bounds is not written: its row stands at the reference pose and is unstable.
-        """
+        """See ``Engine``. A row whose start is out of bounds stands at the reference pose and is unstable."""
         ids = mask.numpy()
         self.batch.reset(ids=ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         start, nq = start.to(self.qpos.dtype), self.qpos.shape[1]
@@ -173,11 +153,11 @@ class CpuEngine:
         self.batch.forward(ids=ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Everything that decides the future of the simulations, copied."""
+        """See ``Engine``."""
         return {name: value.clone() for name, value in self._state.items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Puts back what ``state_dict`` gave and refreshes position and velocity sensors."""
+        """See ``Engine``; refreshes position and velocity sensors."""
         state = checked_state(state, self._state)
         self.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
         self._failed[:] = False
@@ -186,17 +166,17 @@ class CpuEngine:
         self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
 
     def model(self, row: int) -> mujoco.MjModel:
-        """The model of a simulation, for pictures and checks."""
+        """See ``Engine``."""
         return self._batch.get_model(row)
 
     def data(self, row: int) -> mujoco.MjData:
-        """A copy of a simulation's data, forwarded, for pictures and checks."""
+        """See ``Engine``."""
         model, data = self._batch.get_model(row), self._batch.get_data(row)
         mujoco.mj_forward(model, data)
         return data
 
     def contact_depth(self, row: int) -> float:
-        """Deepest penetration among a simulation's contacts, metres, 0 without contact."""
+        """See ``Engine``."""
         model = self._models[self._model_of[row]]
         # The batch's copies of model and data would take forty times as long.
         data = self._probe = self._probe or mujoco.MjData(model)
@@ -221,7 +201,3 @@ def _after_fork() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_after_fork)
-
-
-def _silent(message: str) -> None:
-    """Swallows MuJoCo's warnings: the counters that ``unstable`` reads hold the same facts."""

@@ -15,6 +15,11 @@ LARGEST = 1e6
 else (forces, accelerations, controls, time) is bounded by MuJoCo's own 1e10."""
 SHORTEST, LONGEST = 1e-3, 1e3
 """Bounds of a quaternion's length; MuJoCo would take a shorter one for "not turned" without a word."""
+_STATE = (
+    "time qpos qvel act history qacc_warmstart ctrl qfrc_applied xfrc_applied eq_active mocap_pos mocap_quat userdata"
+)
+STATE = tuple(_STATE.split())
+"""What a simulation carries from one step to the next; the fields that a model has none of are skipped."""
 _POSES = ("qpos", "qvel", "mocap_pos", "mocap_quat")
 
 
@@ -32,14 +37,9 @@ def limit_of(field: str) -> float:
 
 
 def checked_state(state: object, views: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The saved state of an engine with the views' shapes and types.
+    """The saved state of either engine with the shapes and types of the fields (``views``) of the one that takes it.
 
-    Args:
-        state: What ``Engine.state_dict`` gave, here or of the other engine.
-        views: The fields of the engine that takes it, by name.
-
-    Raises:
-        BidexError: Another model's or number of rows' state, or one with numbers that are not finite.
+    Raises BidexError for another model's or number of rows' state, or one with numbers that are not finite.
     """
     if not isinstance(state, Mapping) or set(state) != set(views):
         got = sorted(map(str, state)) if isinstance(state, Mapping) else type(state).__name__
@@ -48,18 +48,15 @@ def checked_state(state: object, views: Mapping[str, Tensor]) -> dict[str, Tenso
 
 
 def dense(given: object, device: torch.device, dtype: torch.dtype | None = None) -> Tensor | None:
-    """What was given as a dense tensor on a device, without a gradient; None if it is no array of real numbers.
+    """A tensor, array or nested lists as a dense tensor on a device, without a gradient; ``dtype`` None keeps its own.
 
-    Args:
-        given: A tensor, an array or nested lists, of numbers or truth values.
-        device: Where it shall be.
-        dtype: What type it shall have; None keeps its own.
+    None where it is no array of real numbers.
     """
     try:
         # In C's order: torch takes no array that is read backwards.
-        made = given.detach() if isinstance(given, Tensor) else torch.as_tensor(np.asarray(given, order="C"))
-        usable = made.layout == torch.strided and not made.is_complex()
-        return made.to(device=device, dtype=dtype) if usable else None
+        tensor = given.detach() if isinstance(given, Tensor) else torch.as_tensor(np.asarray(given, order="C"))
+        usable = tensor.layout == torch.strided and not tensor.is_complex()
+        return tensor.to(device=device, dtype=dtype) if usable else None
     except (TypeError, ValueError, RuntimeError, OverflowError, NotImplementedError):
         return None
 
@@ -71,12 +68,12 @@ def _checked_field(name: str, value: Any, view: Tensor) -> Tensor:
             f"Expected {name} of an engine's state of shape {tuple(view.shape)}, got {got}; build the world with the "
             "same suite and num_envs."
         )
-    made = dense(value, view.device, view.dtype)
-    if made is None or value.is_floating_point() != view.is_floating_point():
+    tensor = dense(value, view.device, view.dtype)
+    if tensor is None or value.is_floating_point() != view.is_floating_point():
         raise BidexError(
             f"Expected {name} of an engine's state as {view.dtype}, got {value.dtype}; take another state."
         )
-    value = made.reshape(view.shape)
+    value = tensor.reshape(view.shape)
     if view.is_floating_point() and not bool(value.isfinite().all()):
         row = int((~value.reshape(len(value), -1).isfinite().all(dim=1)).nonzero()[0])
         raise BidexError(
@@ -86,14 +83,8 @@ def _checked_field(name: str, value: Any, view: Tensor) -> Tensor:
 
 
 def outside(fields: Mapping[str, Tensor], rows: Tensor) -> Tensor:
-    """Which of some rows hold a number that is not finite or out of bounds, shape (k,), bool.
-
-    Args:
-        fields: The fields of a state, each (num, ...).
-        rows: Row indices, shape (k,).
-    """
-    found = torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
-    for name, value in fields.items():
-        # A comparison with NaN is false.
-        found |= ~(value[rows].unsqueeze(-1).flatten(1).abs() <= limit_of(name)).all(dim=1)
-    return found
+    """Which of some rows (indices, (k,)) hold a number that is not finite or out of bounds, bool (k,)."""
+    bad = torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
+    for name, value in fields.items():  # a comparison with NaN is false
+        bad |= ~(value[rows].unsqueeze(-1).flatten(1).abs() <= limit_of(name)).all(dim=1)
+    return bad

@@ -163,17 +163,17 @@ def place(
 
 
 class Guard:
-    """Finds broken worlds and keeps them from harm. Nothing here waits for the device.
-
-    Attributes:
-        failed: Which worlds broke since their last reset, shape (num,), bool.
-    """
+    """Finds broken worlds and keeps them from harm. Nothing here waits for the device."""
 
     def __init__(self, model: mujoco.MjModel, data: mjw.Data) -> None:
         """Allocates on the current device; ``keep`` must follow before the first step."""
         self.failed = wp.zeros(data.nworld, dtype=bool)
+        """Which worlds broke since their last reset, shape (num,), bool."""
         self._quaternions = wp.array(quaternion_columns(model)[::4].astype(np.int32), dtype=int)
         self._fixtures = [wp.clone(data.mocap_pos), wp.clone(data.mocap_quat)]
+
+    def _launch(self, kernel: wp.Kernel, dim: tuple[int, ...], inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.failed.device)
 
     def keep(self, data: mjw.Data) -> None:
         """Remembers where the fixtures of all worlds stand; broken worlds get theirs back there."""
@@ -183,45 +183,15 @@ class Guard:
     def examine(self, d: mjw.Data) -> None:
         """Before a control step: marks worlds that were broken by hand where no substep would, and disarms them."""
         applied = [d.ctrl, d.qfrc_applied, d.xfrc_applied]
-        width = max(array.shape[1] for array in applied)
-        fixtures = d.mocap_pos.shape[1]
-        wp.launch(
-            examine,
-            dim=(d.nworld, width),
-            inputs=[d.time, d.qacc_warmstart, *applied, float(mujoco.mjMAXVAL)],
-            outputs=[self.failed],
-            device=self.failed.device,
-        )
-        wp.launch(
-            examine_poses,
-            dim=(d.nworld, max(self._quaternions.shape[0], fixtures)),
-            inputs=[d.qpos, self._quaternions, d.mocap_pos, d.mocap_quat, LARGEST, SHORTEST, LONGEST],
-            outputs=[self.failed],
-            device=self.failed.device,
-        )
-        wp.launch(
-            disarm,
-            dim=(d.nworld, max(width, fixtures)),
-            inputs=[self.failed, *self._fixtures],
-            outputs=[d.time, *applied, d.mocap_pos, d.mocap_quat],
-            device=self.failed.device,
-        )
+        width, fixtures = max(array.shape[1] for array in applied), d.mocap_pos.shape[1]
+        limit = float(mujoco.mjMAXVAL)
+        self._launch(examine, (d.nworld, width), [d.time, d.qacc_warmstart, *applied, limit], [self.failed])
+        poses = [d.qpos, self._quaternions, d.mocap_pos, d.mocap_quat, LARGEST, SHORTEST, LONGEST]
+        self._launch(examine_poses, (d.nworld, max(self._quaternions.shape[0], fixtures)), poses, [self.failed])
+        outputs = [d.time, *applied, d.mocap_pos, d.mocap_quat]
+        self._launch(disarm, (d.nworld, max(width, fixtures)), [self.failed, *self._fixtures], outputs)
 
     def watch(self, m: mjw.Model, d: mjw.Data) -> None:
-        """Marks worlds with a bad number (mj_checkPos, mj_checkVel, mj_checkAcc) and puts all marked ones at rest at
-        the reference pose.
-        """  # noqa: D205
-        wp.launch(
-            watch,
-            dim=d.qpos.shape,
-            inputs=[d.qpos, d.qvel, d.qacc, LARGEST, float(mujoco.mjMAXVAL)],
-            outputs=[self.failed],
-            device=self.failed.device,
-        )
-        wp.launch(
-            quarantine,
-            dim=d.qpos.shape,
-            inputs=[self.failed, m.qpos0],
-            outputs=[d.qpos, d.qvel, d.qacc_warmstart],
-            device=self.failed.device,
-        )
+        """Marks worlds with a bad number (mj_checkPos, Vel, Acc); puts marked ones at rest at the reference pose."""
+        self._launch(watch, d.qpos.shape, [d.qpos, d.qvel, d.qacc, LARGEST, float(mujoco.mjMAXVAL)], [self.failed])
+        self._launch(quarantine, d.qpos.shape, [self.failed, m.qpos0], [d.qpos, d.qvel, d.qacc_warmstart])

@@ -16,11 +16,8 @@ _DIGITS = 6
 def model_identity(model: mujoco.MjModel) -> str:
     """Twelve hexadecimal digits of all options of the solver and all numbers of bodies, joints, geoms and actuators.
 
-    Names and looks do not enter, nor does MuJoCo's version. Numbers enter with six digits, so that a processor that
-    rounds the compiler's sums otherwise gives the same.
-
-    Args:
-        model: A compiled scene.
+    Names, looks and MuJoCo's version do not enter. Numbers enter with six digits, so that a processor that rounds the
+    compiler's sums otherwise gives the same.
     """
     digest = hashlib.sha256()
     for owner, names in ((model.opt, dir(model.opt)), (model, _names(model))):
@@ -72,12 +69,8 @@ _FREE = frozenset(["names", "paths", "dof_M0", "dof_length", "stat"])
 
 def differing_fields(a: mujoco.MjModel, b: mujoco.MjModel) -> list[str]:
     """Names of the array fields in which two models differ."""
-    found = []
-    for name in dir(a):
-        x = None if name.startswith("_") else getattr(a, name, None)
-        if isinstance(x, np.ndarray) and not np.array_equal(x, getattr(b, name), equal_nan=x.dtype.kind == "f"):
-            found.append(name)
-    return found
+    arrays = {n: x for n in dir(a) if not n.startswith("_") and isinstance(x := getattr(a, n, None), np.ndarray)}
+    return [n for n, x in arrays.items() if not np.array_equal(x, getattr(b, n), equal_nan=x.dtype.kind == "f")]
 
 
 def same_structure(a: mujoco.MjModel, b: mujoco.MjModel) -> bool:
@@ -87,10 +80,10 @@ def same_structure(a: mujoco.MjModel, b: mujoco.MjModel) -> bool:
     )
 
 
-def _sizes(model: mujoco.MjModel) -> dict[str, object]:
-    counts = {n: getattr(model, n) for n in dir(model) if n.startswith("n") and isinstance(getattr(model, n), int)}
+def _sizes(model: mujoco.MjModel) -> Mapping[str, object]:
     # Lengths of text and of picture assets are no part of the dynamics.
-    for name in [n for n in counts if n.startswith(("nname", "ntex", "npath", "nmat", "nlight", "ncam", "nbuffer"))]:
-        del counts[name]
+    free = ("nname", "ntex", "npath", "nmat", "nlight", "ncam", "nbuffer")
+    names = [name for name in dir(model) if name.startswith("n") and not name.startswith(free)]
+    counts = {name: value for name in names if isinstance(value := getattr(model, name), int)}
     options = {n: getattr(model.opt, n) for n in dir(model.opt) if not n.startswith("_")}
     return counts | {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in options.items() if not callable(v)}

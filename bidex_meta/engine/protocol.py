@@ -14,29 +14,25 @@ class Engine(Protocol):
     """A batch of simulations of equal structure.
 
     The views are created once and stay; the world writes ``qpos``, ``qvel``, ``ctrl`` and ``xfrc_applied`` in place.
-    Whatever it writes, a step costs a broken row no more than others: it is looked for before each step
-    (``health.py``) and goes on from the model's reference pose until its reset.
-
-    Attributes:
-        num: Number of simulations.
-        device: Where the views live.
-        masked: Whether the engine is of an accelerator's kind: resets are masked writes of full size, and nothing in
-            a step may wait for a value or have a shape that depends on one.
-        qpos: Positions, shape (num, nq).
-        qvel: Velocities, shape (num, nv).
-        ctrl: Position targets, shape (num, nu).
-        xfrc_applied: World-frame force and torque at bodies' centres of mass, shape (num, nbody, 6).
-        sensordata: Sensor values, shape (num, nsensordata).
+    Whatever it writes, a step costs a broken row no more than others: it is looked for before each step (``health.py``)
+    and continues from the model's reference pose until its reset.
     """
 
     num: int
     device: torch.device
     masked: bool
+    """Whether the engine is of an accelerator's kind: resets are masked writes of full size, and nothing in a step may
+    wait for a value or have a shape that depends on one."""
     qpos: Tensor
+    """Shape (num, nq)."""
     qvel: Tensor
+    """Shape (num, nv)."""
     ctrl: Tensor
+    """Position targets, shape (num, nu)."""
     xfrc_applied: Tensor
+    """World-frame force and torque at bodies' centres of mass, shape (num, nbody, 6)."""
     sensordata: Tensor
+    """Shape (num, nsensordata)."""
 
     def step(self, substeps: int, active: Tensor | None = None) -> None:
         """Advances all simulations, or those of the mask ``active`` (num,), and refreshes their sensors.
@@ -50,33 +46,29 @@ class Engine(Protocol):
         ...
 
     def body_poses(self) -> tuple[Tensor, Tensor]:
-        """Where all bodies stand, of the state that sensors describe: views that each step writes anew.
+        """Positions (num, nbody, 3), metres, and rotation matrices (num, nbody, 3, 3) of all bodies, world frame.
 
-        Returns:
-            Positions (num, nbody, 3), metres, and rotation matrices (num, nbody, 3, 3), world frame.
+        Of the state that sensors describe: views that each step writes anew.
         """
         ...
 
     def unstable(self) -> Tensor:
-        """Which simulations broke (numbers out of bounds or not finite, no room for contacts) since their last reset.
+        """Which simulations broke since their last reset, bool (num,).
 
-        Shape (num,), bool.
+        Numbers out of bounds or not finite, or no room for contacts.
         """
         ...
 
     def warnings(self) -> Tensor:
-        """How many kinds of trouble each simulation has told since its last reset. Shape (num,), int64."""
+        """How many kinds of trouble each simulation has reported since its last reset. Shape (num,), int64."""
         ...
 
     def reset(self, mask: Tensor, start: Tensor) -> None:
-        """Starts the simulations of a mask (num,) anew.
+        """Starts the simulations of a mask (num,), bool, anew.
 
-        Args:
-            mask: Which simulations, shape (num,), bool.
-            start: Start positions: ``qpos``, then position and quaternion (w, x, y, z) of each fixture that may stand
-                elsewhere from task to task. One row for each true entry, shape (k, nq + 7 nmocap); where the engine is
-                ``masked`` and must not count them one for every simulation, shape (num, nq + 7 nmocap), of which those
-                outside the mask are ignored.
+        ``start``: ``qpos``, then position and quaternion (w, x, y, z) of each fixture that may stand elsewhere from
+        task to task. One row for each true entry, (k, nq + 7 nmocap); where the engine is ``masked`` and must not count
+        them one for every simulation, of which those outside the mask are ignored.
         """
         ...
 
@@ -85,10 +77,9 @@ class Engine(Protocol):
         ...
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Puts back what ``state_dict`` gave.
+        """Restores a ``state_dict``.
 
-        Raises:
-            BidexError: A state of another model or number of rows, or one with numbers that are not finite.
+        Raises BidexError for a state of another model or number of rows, or with non-finite numbers.
         """
         ...
 

@@ -1,8 +1,7 @@
 """MuJoCo on an accelerator: mujoco_warp, all substeps of a control step in one captured graph.
 
-The same code runs on the Warp CPU device, where tests compare it with C MuJoCo. What differs from the C engine on
-purpose: single precision, sparse constraint Jacobians (mujoco_warp refuses dense ones above 60 degrees of freedom), a
-solver tolerance of 1e-6 (its least), and fixed room for contacts (``capacity.py``).
+Different from C on purpose: single precision, sparse constraint Jacobians (it refuses dense ones above 60 degrees of
+freedom), a solver tolerance of 1e-6 (its least), fixed room for contacts. Tests run it on the Warp CPU device.
 """
 
 import copy
@@ -21,15 +20,10 @@ from torch import Tensor
 
 from bidex_meta.engine import kernels
 from bidex_meta.engine.capacity import Capacity
-from bidex_meta.engine.health import LARGEST, checked_state
+from bidex_meta.engine.health import LARGEST, STATE, checked_state
 from bidex_meta.engine.kernels import Guard
 from bidex_meta.errors import BidexError
 
-# What a simulation carries from one step to the next; the fields that a model has none of are skipped.
-_STATE_FIELDS = (
-    "time qpos qvel act history qacc_warmstart ctrl qfrc_applied xfrc_applied eq_active mocap_pos mocap_quat userdata"
-)
-_STATE = tuple(_STATE_FIELDS.split())
 # What a step changes and later steps or readers see.
 _STEPPED = ("time", "qpos", "qvel", "act", "history", "qacc_warmstart", "sensordata", "overflow")
 # Bits of a world whose contacts or constraints were dropped. Meeting an iteration limit is no fault: C stops there too.
@@ -51,12 +45,11 @@ class WarpEngine:
     """Simulations of models of equal structure, in single precision. See ``Engine`` for the views.
 
     ``step`` and ``reset`` replay graphs and never wait for the device. Graphs hold pointers: write into arrays in
-    place, and call ``recapture`` after changing the model otherwise.
+    place, and call ``recapture`` after changing the model otherwise. On CUDA the graphs run on a stream of the engine's
+    own, between what was given to torch's current stream before and after the call: engines under different torch
+    streams overlap.
 
-    On CUDA the graphs run on a stream of the engine's own, between what was given to torch's current stream before and
-    after the call: engines that are stepped under different torch streams overlap.
-
-    A world with a bad number is told by ``unstable`` and stands at the model's reference pose until its reset: left
+    A world with a bad number is reported by ``unstable`` and stands at the model's reference pose until its reset: left
     alone, its NaNs would pass every broadphase test and take the room that its neighbours' contacts need.
     """
 
@@ -69,14 +62,7 @@ class WarpEngine:
         capacity: Capacity,
         device: str | torch.device = "cpu",
     ) -> None:
-        """Puts the models on the device and compiles the kernels.
-
-        Args:
-            models: The distinct models, of equal structure.
-            rows: For each simulation the index of its model.
-            capacity: Room for contacts and constraints.
-            device: "cpu" or a CUDA device.
-        """
+        """Puts the distinct models on the device and compiles the kernels; ``rows``: each simulation's model."""
         wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # no banner and no line for each kernel
         self.num, self.device = len(rows), torch.device(device)
         self._models, self._rows = list(models), list(rows)
@@ -97,30 +83,24 @@ class WarpEngine:
         self._failed_view.zero_()
 
     def _put(self, capacity: Capacity) -> None:
-        """Allocates model and data on the device."""
-        _check_sensors(self._models[0])
+        kinds = {mujoco.mjtSensor(kind).name for kind in self._models[0].sensor_type if kind not in _SENSORS}
+        if kinds:
+            raise BidexError(f"Expected sensors among {_SENSOR_NAMES}, got {', '.join(sorted(kinds))}.")
         self._m = _put_models([_adapted(model) for model in self._models], self._rows)
-        self._m.opt.warn_overflow = 0  # unstable() tells it; printing from kernels wrecks the speed
+        self._m.opt.warn_overflow = 0  # unstable() reports it; printing from kernels wrecks the speed
         self._m.opt.ccd_tolerance.fill_(_CCD_TOLERANCE)
         self._m.opt.graph_conditional = not self._device.is_cuda or wp.is_conditional_graph_supported()
-        self._d = mjw.make_data(
-            _adapted(self._models[0]),
-            nworld=self.num,
-            nconmax=capacity.contacts,
-            nccdmax=capacity.convex,
-            njmax=capacity.rows,
-        )
-        _put_static_frames(self._d, self._models, self._rows)
-        d = self._d
+        room = {"nconmax": capacity.contacts, "nccdmax": capacity.convex, "njmax": capacity.rows}
+        d = self._d = mjw.make_data(_adapted(self._models[0]), nworld=self.num, **room)
+        _put_static_frames(d, self._models, self._rows)
         self._guard = Guard(self._models[0], d)
         self._mask = wp.zeros(self.num, dtype=bool)
         self._start = wp.zeros((self.num, d.qpos.shape[1] + 7 * d.mocap_pos.shape[1]), dtype=float)
 
     def _bind(self) -> None:
-        """Makes the torch views, once and for all."""
-        arrays = {name: getattr(self._d, name) for name in {*_STATE, *_STEPPED}}
+        arrays = {name: getattr(self._d, name) for name in {*STATE, *_STEPPED}}
         views = {name: wp.to_torch(array) for name, array in arrays.items() if 0 not in array.shape}
-        self._state = {name: views[name] for name in _STATE if name in views}
+        self._state = {name: views[name] for name in STATE if name in views}
         self.qpos, self.qvel, self.ctrl = (views[name] for name in ("qpos", "qvel", "ctrl"))
         self.xfrc_applied, self.sensordata = views["xfrc_applied"], views["sensordata"]
         self._overflow, self._failed_view = views["overflow"], wp.to_torch(self._guard.failed)
@@ -129,7 +109,7 @@ class WarpEngine:
         self._mask_view, self._start_view = wp.to_torch(self._mask), wp.to_torch(self._start)
 
     def step(self, substeps: int, active: Tensor | None = None) -> None:
-        """Advances all simulations, or those of the mask ``active``; the others take the time but keep their state."""
+        """See ``Engine``; simulations outside the mask take the time but keep their state."""
         kept = [] if active is None else [value.clone() for value in self._stepped]
         self._substeps = substeps
         self._play(f"step {substeps}", self._advance)
@@ -138,37 +118,32 @@ class WarpEngine:
                 value.copy_(torch.where(active.view(-1, *[1] * (value.dim() - 1)), value, old))
 
     def unstable(self) -> Tensor:
-        """Which simulations broke or lost contacts since their last reset. Shape (num,), bool.
+        """See ``Engine``: broke or lost contacts.
 
-        All worlds share one pool of contacts; when it is full, whose contacts were lost is unknown and all are told.
+        All worlds share one pool of contacts; when it is full, whose were lost is unknown and all are unstable.
         """
         lost = (self._overflow & _LOST) != 0
         return lost | self._failed_view | ~self.sensordata.sum(dim=1).isfinite()
 
     def warnings(self) -> Tensor:
-        """How many kinds of trouble each simulation has told since its last reset. Shape (num,), int64."""
+        """See ``Engine``."""
         return self.unstable().long()
 
     def placement(self) -> Tensor:
-        """What ``reset`` takes, of every simulation as it stands, a copy. Shape (num, nq + 7 nmocap)."""
+        """See ``Engine``."""
         if not self._mocap:
             return self.qpos.clone()
         return torch.cat((self.qpos, torch.cat(self._mocap, dim=2).flatten(1)), dim=1)
 
     def body_poses(self) -> tuple[Tensor, Tensor]:
-        """Where all bodies stand: positions (num, nbody, 3) and rotation matrices (num, nbody, 3, 3)."""
+        """See ``Engine``."""
         return wp.to_torch(self._d.xpos), wp.to_torch(self._d.xmat)
 
     def reset(self, mask: Tensor, start: Tensor) -> None:
-        """Starts the simulations of a mask anew, at rest, at given positions.
+        """See ``Engine``. A start with a non-finite number makes its simulation unstable.
 
-        Position and velocity sensors of all simulations are refreshed, which changes only those whose state was
-        written by hand since their last step.
-
-        Args:
-            mask: Which simulations, shape (num,), bool.
-            start: Shape (num, nq + 7 nmocap); rows outside the mask are ignored. A start with a non-finite number
-                makes its simulation unstable.
+        Position and velocity sensors of all simulations are refreshed, which changes only those whose state was written
+        by hand since their last step.
         """
         self._mask_view.copy_(mask)
         self._start_view.copy_(start)
@@ -179,11 +154,11 @@ class WarpEngine:
         self._graphs.clear()
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Everything that decides the future of the simulations, copied."""
+        """See ``Engine``."""
         return {name: value.clone() for name, value in self._state.items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Puts back what ``state_dict`` gave, here or of the C engine, and refreshes position and velocity sensors."""
+        """See ``Engine``; the state may be of the C engine. Refreshes position and velocity sensors."""
         state = checked_state(state, self._state)
         self._mask_view.fill_(True)
         self._play("reset", self._begin)
@@ -193,24 +168,22 @@ class WarpEngine:
         self._play("refresh", self._refresh)
 
     def model(self, row: int) -> mujoco.MjModel:
-        """The model of a simulation, for pictures and checks."""
+        """See ``Engine``."""
         return self._models[self._rows[row]]
 
     def data(self, row: int) -> mujoco.MjData:
-        """A simulation's state in C MuJoCo, forwarded there, for pictures and checks."""
+        """See ``Engine``."""
         model = self.model(row)
         data = mujoco.MjData(model)
-        for name, value in self._state.items():
-            target = np.asarray(getattr(data, name))
-            if name == "time":
-                data.time = float(value[row])
-            else:
-                target[...] = value[row].cpu().numpy().reshape(target.shape)
+        data.time = float(self._state["time"][row])
+        for name in self._state.keys() - {"time"}:
+            target = getattr(data, name)
+            target[...] = self._state[name][row].cpu().numpy().reshape(target.shape)
         mujoco.mj_forward(model, data)
         return data
 
     def contact_depth(self, row: int) -> float:
-        """Deepest penetration among a simulation's contacts, metres, 0 without contact."""
+        """See ``Engine``."""
         distances = self.data(row).contact.dist
         return float(max(0.0, -np.min(distances))) if len(distances) else 0.0
 
@@ -223,8 +196,6 @@ class WarpEngine:
         round_ones = (mujoco.mjtGeom.mjGEOM_ELLIPSOID, mujoco.mjtGeom.mjGEOM_CYLINDER)
         convex = np.isin(kinds, round_ones).any(axis=1) & (kinds != mujoco.mjtGeom.mjGEOM_PLANE).all(axis=1)
         return int(candidates[0]), int(convex.sum())
-
-    # What the graphs hold.
 
     def _advance(self) -> None:
         """The substeps of a control step, then position and velocity sensors of the new state."""
@@ -247,19 +218,11 @@ class WarpEngine:
         mjw.sensor_vel(self._m, self._d)
 
     def _begin(self) -> None:
-        """Starts the masked worlds and refreshes sensors."""
         d = self._d
         mjw.reset_data(self._m, d, reset=self._mask)
-        wp.launch(
-            kernels.place,
-            dim=self.num,
-            inputs=[self._mask, self._start, LARGEST],
-            outputs=[d.qpos, d.mocap_pos, d.mocap_quat, self._guard.failed],
-            device=self._device,
-        )
+        inputs, outputs = [self._mask, self._start, LARGEST], [d.qpos, d.mocap_pos, d.mocap_quat, self._guard.failed]
+        wp.launch(kernels.place, dim=self.num, inputs=inputs, outputs=outputs, device=self._device)
         self._refresh()
-
-    # How they are run.
 
     def _play(self, name: str, work: Callable[[], None]) -> None:
         """Runs recorded work on the engine's stream, between what torch did before and will do after."""
@@ -335,16 +298,9 @@ def _put_models(models: Sequence[mujoco.MjModel], rows: Sequence[int]) -> mjw.Mo
 
 def _put_static_frames(data: mjw.Data, models: Sequence[mujoco.MjModel], rows: Sequence[int]) -> None:
     """Frames of the geoms that never move are computed nowhere in a step; here each world gets its own model's."""
-    found = []
-    for model in models:
-        found.append(mujoco.MjData(model))
-        mujoco.mj_kinematics(model, found[-1])
+    frames = [mujoco.MjData(model) for model in models]
+    for model, one in zip(models, frames, strict=True):
+        mujoco.mj_kinematics(model, one)
     for name in ("xquat", "xmat", "ximat", "geom_xpos", "geom_xmat"):
         array = getattr(data, name)
-        array.assign(np.stack([getattr(x, name) for x in found])[rows].reshape(array.numpy().shape))
-
-
-def _check_sensors(model: mujoco.MjModel) -> None:
-    unknown = sorted({mujoco.mjtSensor(kind).name for kind in model.sensor_type if kind not in _SENSORS})
-    if unknown:
-        raise BidexError(f"Expected sensors among {_SENSOR_NAMES}, got {', '.join(unknown)}.")
+        array.assign(np.stack([getattr(x, name) for x in frames])[rows].reshape(array.numpy().shape))

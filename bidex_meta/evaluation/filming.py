@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from bidex_meta.agents import Agent
-from bidex_meta.points.cloud import Cloud, beside, camera_of, draw
-from bidex_meta.points.depth_sensor import CANDIDATES
-from bidex_meta.points.surfaces import sample
 from bidex_meta.runs.video import tiled
+from bidex_meta.world.cloud import Cloud, beside, camera_of, draw
+from bidex_meta.world.depth_sensor import CANDIDATES
+from bidex_meta.world.surfaces import sample
 
 
 def film_row(

@@ -1,4 +1,4 @@
-"""One hand, its joint tables read from its MJCF so that no figure stands twice, and the pair of hands in a scene."""
+"""The hand's joint tables, read from its MJCF, and the pair of hands in a scene."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -29,15 +29,9 @@ DISTAL_PER_MIDDLE = 0.00805 / 0.00705
 
 @dataclass(frozen=True)
 class Hand:
-    """Joint tables of the hand, each in the order of Table 7 (24 joints) or of the actions (20 actuated ones).
+    """Joint tables of the hand in the order of Table 7: names and limits (rad) of 24 joints.
 
-    Attributes:
-        joints: Joint names, 24.
-        low: Lower joint limits, rad, shape (24,).
-        high: Upper joint limits, rad, shape (24,).
-        actuated: Indices of the 20 actuated joints.
-        control_low: Lower end of the position targets, rad, shape (20,).
-        control_high: Upper end of the position targets, rad, shape (20,).
+    Of the 20 actuated ones their indices and the ends of their position targets, rad.
     """
 
     joints: tuple[str, ...]
@@ -63,12 +57,11 @@ def hand() -> Hand:
     model = hand_spec().compile()
     low, high = model.jnt_range.T
     return Hand(
-        joints=tuple(model.joint(j).name for j in range(model.njnt)),
-        low=low.copy(),
-        high=high.copy(),
-        actuated=model.actuator_trnid[:, 0].copy(),
-        control_low=model.actuator_ctrlrange[:, 0].copy(),
-        control_high=model.actuator_ctrlrange[:, 1].copy(),
+        tuple(model.joint(j).name for j in range(model.njnt)),
+        low.copy(),
+        high.copy(),
+        model.actuator_trnid[:, 0].copy(),
+        *model.actuator_ctrlrange.T.copy(),
     )
 
 
@@ -79,33 +72,23 @@ RIGHT, LEFT, OBJECT, FIXTURE, INNER = 1, 2, 4, 8, 16
 """Contact bits. Geoms of one hand never meet by bits (its 18 listed pairs do); every other two kinds do,
 save fixtures among themselves. INNER is what an object's file calls a geom that no table can meet before another of the
 object does, so that tables need not look for it."""
-_COLLIDES = {
-    RIGHT: 0,
-    LEFT: RIGHT,
-    OBJECT: RIGHT | LEFT | OBJECT,
-    FIXTURE: RIGHT | LEFT | OBJECT,
-    INNER: RIGHT | LEFT | OBJECT | INNER,
-}
+_ALL = RIGHT | LEFT | OBJECT
+_COLLIDES = {RIGHT: 0, LEFT: RIGHT, OBJECT: _ALL, FIXTURE: _ALL, INNER: _ALL | INNER}
 _TIP_COLOUR = {"right": (0.20, 0.45, 0.75, 1.0), "left": (0.80, 0.32, 0.22, 1.0)}
 
 
 def set_contact_bits(geoms: "list[mujoco.MjsGeom]", kind: int) -> None:
     """Gives geoms the bits of RIGHT, LEFT, OBJECT or FIXTURE; INNER ones stay what they are."""
     for geom in geoms:
-        if geom.contype == 0:  # there to be seen only
-            continue
-        own = INNER if geom.contype == INNER else kind
-        geom.contype, geom.conaffinity = own, _COLLIDES[own]
+        if geom.contype:  # others are visual only
+            own = INNER if geom.contype == INNER else kind
+            geom.contype, geom.conaffinity = own, _COLLIDES[own]
 
 
 def add_hands(scene: mujoco.MjSpec, right: HandPose, left: HandPose, moving: bool) -> None:
-    """Adds both hands to a scene.
+    """Adds both hands with the start poses of their mounts; names get the prefixes ``right/`` and ``left/``.
 
-    Args:
-        scene: The scene; bodies, joints and sensors get the prefixes ``right/`` and ``left/``.
-        right: Start pose of the right hand's mount.
-        left: Start pose of the left hand's mount.
-        moving: Whether the base is a free joint at the centre of mass (damped by ``damp_bases``) or welded.
+    Moving bases are free joints at the centre of mass (damped by ``damp_bases``); others are welded.
     """
     for side, pose, bit in zip(SIDES, (right, left), (RIGHT, LEFT), strict=True):
         part = hand_spec()

@@ -27,11 +27,9 @@ PALM_DOWN_BACK = (math.pi, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class HandPose:
-    """Start pose of one hand.
+    """Start pose of one hand: the mount's origin in the world, metres, and roll, pitch, yaw of the actor, radians.
 
-    Attributes:
-        position: Mount origin in the world, metres.
-        rpy: Roll, pitch, yaw of the actor, radians; R = Rz(yaw) Ry(pitch) Rx(roll), before the mount's own turn.
+    R = Rz(yaw) Ry(pitch) Rx(roll), before the mount's own turn.
     """
 
     position: tuple[float, float, float]

@@ -44,8 +44,6 @@ _Support = Callable[[Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True)
 class _Indices:
-    """Positions of joints among the 24, four fingers each (index to little)."""
-
     side: Tensor
     base: Tensor
     middle: Tensor
@@ -60,17 +58,10 @@ def _indices(device: torch.device) -> _Indices:
     return _Indices(*(torch.tensor(group, device=device) for group in groups), cup=find("LFJ4")[0])
 
 
-@lru_cache(maxsize=1)
-def _thumb() -> list[int]:
-    return list(hand().index(*(f"THJ{k}" for k in range(5))))
-
-
 def noisy_joints(draws: Tensor, scale: float) -> Tensor:
     """Joint angles (n, 24), rad: clip(scale * range * u, limits), distal joints coupled, neighbours uncrossed.
 
-    Args:
-        draws: u in [-1, 1], shape (n, 24).
-        scale: Joint noise of the class, a share of each joint's range.
+    Draws u in [-1, 1], shape (n, 24); the scale is a share of each joint's range.
     """
     low, high = (constant(tuple(x.tolist()), draws) for x in (hand().low, hand().high))
     where = _indices(draws.device)
@@ -88,15 +79,8 @@ def make_room(joints: Tensor, position: Tensor, axis: Tensor, radius: float, hal
     The egg is a spheroid; its distance to the palm's plane and to the capsules of the four fingers is bounded from
     below by its support in the direction of its centre.
 
-    Args:
-        joints: Joint angles, rad, shape (n, 24).
-        position: Centre of the egg in the mount frame, metres, shape (n, 3).
-        axis: Its long axis in the mount frame, unit, shape (n, 3).
-        radius: Short semi-axis, metres.
-        half: Long semi-axis, metres.
-
-    Returns:
-        The joints with opened fingers, shape (n, 24), and the egg's shift in the mount frame, metres, shape (n, 3).
+    Joint angles, rad, (n, 24); the egg's centre and long axis (unit) in the mount frame, (n, 3); its short and long
+    semi-axis. Returns the joints with opened fingers and the egg's shift in the mount frame, (n, 3). Lengths in metres.
     """
     axes = _palm_axes(joints)
     centre = _in_palm(position, joints, axes)
@@ -112,19 +96,13 @@ def make_room(joints: Tensor, position: Tensor, axis: Tensor, radius: float, hal
 
 
 def make_room_for(joints: Tensor, position: Tensor, points: Tensor, radii: Tensor) -> tuple[Tensor, Tensor]:
-    """As ``make_room`` for whatever is the convex hull of some balls; the thumb is laid flat and cleared too.
+    """As ``make_room`` for the convex hull of some balls; the thumb is laid flat and cleared too.
 
-    Args:
-        joints: Joint angles, rad, shape (n, 24).
-        position: The object's origin in the mount frame, metres, shape (n, 3).
-        points: The balls' centres relative to it, turned as the object is, mount frame, metres, shape (n, k, 3).
-        radii: Their radii, metres, shape (k,); 0 for corners.
-
-    Returns:
-        As of ``make_room``.
+    The object's origin (n, 3) in the mount frame, the balls' centres relative to it (n, k, 3), turned as the object
+    is, and their radii (k,), 0 for corners; metres.
     """
     joints = joints.clone()
-    joints[:, _thumb()] = 0.0
+    joints[:, hand().index(*(f"THJ{k}" for k in range(5)))] = 0.0
     axes = _palm_axes(joints)
     centre = _in_palm(position, joints, axes)
     points = torch.stack([dot(points, a[:, None]) for a in axes], dim=2)
@@ -145,7 +123,6 @@ def make_room_for(joints: Tensor, position: Tensor, points: Tensor, radii: Tenso
 
 
 def _in_palm(position: Tensor, joints: Tensor, axes: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-    """A place in the mount frame, seen from the palm, each (n, 3)."""
     relative = position - constant(_WRIST, position) - _PALM_OFFSET * _wrist_z(joints)
     return torch.stack([dot(relative, a) for a in axes], dim=1)
 
@@ -154,7 +131,6 @@ def _clear(joints: Tensor, centre: Tensor, y_axis: Tensor, reach: Tensor, suppor
     """Joints with opened fingers and the shift off the palm; ``reach`` is the support towards it, (n,)."""
     lift = (reach + _PALM_HALF_THICKNESS - _SLACK + centre[:, 1]).clamp(min=0.0)
     centre = torch.stack((centre[:, 0], centre[:, 1] - lift, centre[:, 2]), dim=1)
-
     start, along, length = _finger_segments(joints)
     gap = _gap(centre[:, None, None], support, start, along, length)
     touched = (gap - constant(_RADII, gap) < -_SLACK).any(dim=2)
@@ -177,7 +153,7 @@ def _gap(centre: Tensor, support: _Support, start: Tensor, along: Tensor, length
 
 
 def _meets_metacarpal(cup: Tensor, centre: Tensor, support: _Support) -> Tensor:
-    """Whether LFJ4, shape (n,), lifts the little finger's metacarpal into an egg. Shape (n,), bool."""
+    """Whether LFJ4 (n,) lifts the little finger's metacarpal into an egg, (n,)."""
     low, high = (
         torch.stack((torch.full_like(cup, x), -rise * cup, torch.full_like(cup, z)), dim=1)
         for x, rise, z in _METACARPAL
@@ -188,13 +164,11 @@ def _meets_metacarpal(cup: Tensor, centre: Tensor, support: _Support) -> Tensor:
 
 
 def _wrist_z(joints: Tensor) -> Tensor:
-    """The wrist's z axis after the first wrist joint, mount frame. Shape (n, 3)."""
     a = joints[:, 0]
     return torch.stack((a.sin(), torch.zeros_like(a), a.cos()), dim=1)
 
 
 def _palm_axes(joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The palm's x, y, z axes in the mount frame after both wrist joints, each (n, 3)."""
     sa, ca, sb, cb = joints[:, 0].sin(), joints[:, 0].cos(), joints[:, 1].sin(), joints[:, 1].cos()
     zero = torch.zeros_like(sa)
     return (
@@ -205,11 +179,7 @@ def _palm_axes(joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _finger_segments(joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Centre lines of the four fingers' capsules in the palm frame.
-
-    Returns:
-        Starts (n, 4, 3, 3), unit directions (n, 4, 3, 3) and lengths (3,): finger, link, coordinate.
-    """
+    """Centre lines of the four fingers' capsules in the palm frame: starts, directions (n, 4, 3, 3), lengths (3,)."""
     where = _indices(joints.device)
     side = joints[:, where.side]
     bend = torch.stack([joints[:, g] for g in (where.base, where.middle, where.distal)], dim=2)

@@ -1,10 +1,7 @@
-"""Fingers and palms as agents: partitions of the hands' units as a user writes them (appendix A.2). Imports no torch.
+"""Fingers and palms as agents (appendix A.2): a partition of the hands' units is one line of text. Imports no torch.
 
-A partition is one line of text, which a run's config and its checkpoints hold:
-
-* ``single``: one agent is both hands; ``hands``: one agent a hand; ``fingers``: each unit by itself, twelve agents;
-* ``thrower=right/palm+right/thumb;helper=...``: agents by name, with the units that each has;
-* the path of a TOML file with a table ``[agents]`` of the same: ``thrower = ["right/palm", "right/thumb"]``.
+``single``, ``hands``, ``fingers`` (twelve agents), ``thrower=right/palm+right/thumb;helper=...``, or the path of a TOML
+file with a table ``[agents]``: ``thrower = ["right/palm", "right/thumb"]``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,18 +29,13 @@ Agents = str | Path | Mapping[str, Sequence[str]]
 
 @dataclass(frozen=True)
 class _Partition:
-    """Units by the agent's name."""
-
     agents: Annotated[dict[Text, Annotated[list[Text], Meta(min_length=1)]], Meta(min_length=1)]
 
 
 def partition_line(agents: Agents) -> str:
-    """A partition as one line: a name of :data:`NAMED`, or agents with their units.
+    """A partition as one line: a name of :data:`NAMED`, or agents with their units, which ``agent_views`` checks.
 
-    Whether all units are there, and each once, is checked where the world is known (``agent_views``).
-
-    Raises:
-        BidexError: A file that cannot be read, or no agents in it.
+    Raises BidexError for a file that cannot be read or has no agents.
     """
     if isinstance(agents, Mapping):
         return _line({"agents": dict(agents)}, "partition")
@@ -56,11 +48,7 @@ def partition_line(agents: Agents) -> str:
 
 
 def units_by_agent(line: str) -> dict[str, list[str]]:
-    """The units of each agent in a line ``name=unit+unit;name=unit``.
-
-    Raises:
-        BidexError: Another text, or an agent twice.
-    """
+    """The units of each agent in a line ``name=unit+unit;name=unit``, each agent once, or BidexError."""
     found: dict[str, list[str]] = {}
     for part in line.split(";"):
         name, equals, units = (each.strip() for each in part.partition("="))

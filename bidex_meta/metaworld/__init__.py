@@ -1,14 +1,6 @@
 """Meta-World's interface on the classes of this benchmark: change the import and the names, keep the code.
 
-    import bidex_meta.metaworld as metaworld
-
-    ml20 = metaworld.ML20(seed=0)
-    for name, env_cls in ml20.train_classes.items():
-        env = env_cls()
-        env.set_task(next(task for task in ml20.train_tasks if task.env_name == name))
-        obs, info = env.reset()
-
-docs/metaworld.md lists what is the same, what is not, and what is faster. Importing it mends Meta-World's own
+docs/metaworld.md lists what is the same, what is not, and what is faster. Importing it fixes Meta-World's own
 environments in this process, which MuJoCo 4 breaks (``library.mended``), and makes `Benchmark` one of Meta-World's.
 """
 
@@ -24,39 +16,20 @@ with suppress(ModuleNotFoundError):
     mended().Benchmark.register(Benchmark)
 
 __all__ = [
-    "ML1",
-    "ML4",
-    "ML20",
-    "MT1",
-    "MT4",
-    "MT20",
-    "Benchmark",
-    "CustomML",
-    "CustomMT",
-    "Task",
-    "make_ml_envs",
-    "make_ml_envs_test",
-    "make_ml_envs_train",
-    "make_mt_envs",
-]
+    "ML1", "ML4", "ML20", "MT1", "MT4", "MT20", "Benchmark", "CustomML", "CustomMT", "Task",
+    "make_ml_envs", "make_ml_envs_test", "make_ml_envs_train", "make_mt_envs",
+]  # fmt: skip
 
-_NOT_HERE = {
-    "MT10": "MT4 or MT20",
-    "MT25": "MT20",
-    "MT50": "MT20",
-    "ML10": "ML4 or ML20",
-    "ML25": "ML20",
-    "ML45": "ML20",
-}
+_ABSENT = {"MT10": "MT4 or MT20", "MT25": "MT20", "MT50": "MT20", "ML10": "ML4 or ML20", "ML25": "ML20", "ML45": "ML20"}
 _CLASSES = "ALL_V3_ENVIRONMENTS"
 
 
 def __getattr__(name: str) -> Any:
-    """Meta-World's other names: its wrappers as they are; of its suites and classes what is here instead."""
+    """Meta-World's other names: its wrappers; an error that names the alternative for its suites and classes."""
     if name == _CLASSES:
         return {task: MT1(task).train_classes[task] for task in MT1.ENV_NAMES}
-    if name in _NOT_HERE:
-        raise AttributeError(f"{name} has Meta-World's own classes. Here there is {_NOT_HERE[name]}.")
+    if name in _ABSENT:
+        raise AttributeError(f"{name} has Meta-World's own classes. Here there is {_ABSENT[name]}.")
     if name.startswith(_CLASSES):
         raise AttributeError(f"{name} is not here: MT1(name) shows the goal and ML1(name) hides it.")
     from metaworld import wrappers

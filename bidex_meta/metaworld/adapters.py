@@ -1,13 +1,7 @@
-"""Between here and Meta-World's evaluation: our agents and worlds play in it, agents written for it in ours.
-
-    from bidex_meta.metaworld.evaluation import metalearning_evaluation
-    envs = MetaWorldEnvs(Benchmark("ML1").make_world("test", 4, autoreset_mode="DISABLED"))
-    metalearning_evaluation(ForMetaWorld(agent), envs, num_evals=1, adaptation_episodes=10)
+"""Adapters between here and Meta-World's evaluation, for agents and worlds in both directions (docs/metaworld.md).
 
 The agents' protocols have the same names and order of calls (``bidex_meta/agents.py``); Meta-World uses NumPy arrays,
-does not say which environments share a task, and calls ``reset`` before and during evaluation alone. Its score is not
-ours: with several environments of a class it counts the first episodes that finish, and success ends them, so easy
-tasks crowd out hard ones. ``bidex_meta.evaluation.meta_test`` plays each task equally often.
+does not say which environments share a task, and calls ``reset`` before and during evaluation alone.
 """
 
 from collections import namedtuple
@@ -29,10 +23,8 @@ MetaWorldTimestep = namedtuple("MetaWorldTimestep", Timestep._fields[:6])
 class ForMetaWorld:
     """One of our agents as ``metaworld.evaluation`` takes it: NumPy arrays in and out.
 
-    Args:
-        agent: An Agent, for ``evaluation``; a MetaLearningAgent, for ``metalearning_evaluation``.
-        device: Where the agent is.
-        task_of_row: Which environments play the same task, numbers from 0 on; None: each has one of its own.
+    ``agent`` is an Agent for ``evaluation``, a MetaLearningAgent for ``metalearning_evaluation``; ``task_of_row``
+    numbers the task of each environment from 0 on, None: each has its own.
     """
 
     def __init__(self, agent: Agent, device: str | torch.device = "cpu", task_of_row: Any = None):
@@ -51,7 +43,7 @@ class ForMetaWorld:
             self._agent.reset(self._tensor(env_mask))
 
     def init(self) -> None:
-        """Back to what was meta-learned."""
+        """Resets to what was meta-learned."""
         if hasattr(self._agent, "assign"):
             self._agent.assign(self._task_of_row)
         self._agent.init()
@@ -79,7 +71,6 @@ class ForMetaWorld:
         self._begins = True
 
     def _tensor(self, value: Any) -> Any:
-        """An array as a tensor, numbers with a fraction as float32; anything else as it is."""
         if not isinstance(value, np.ndarray):
             return value
         tensor = torch.from_numpy(value.copy())  # an environment may write into its array again
@@ -87,13 +78,10 @@ class ForMetaWorld:
 
 
 class FromMetaWorld:
-    """An agent written for Meta-World's ``metalearning_evaluation`` as ``meta_evaluate`` takes it.
+    """An agent with NumPy arrays for Meta-World's ``metalearning_evaluation`` as ``meta_evaluate`` takes it.
 
     Where Meta-World starts an environment's next episode, ours leaves it frozen until all have ended. The agent sees it
     go on without reward and without an end.
-
-    Args:
-        agent: Takes and returns NumPy arrays.
     """
 
     def __init__(self, agent: Any):
@@ -109,16 +97,15 @@ class FromMetaWorld:
         return torch.as_tensor(self._agent.eval_action(_array(obs)), device=obs.device)
 
     def reset(self, env_mask: Tensor) -> None:
-        """New episodes in the environments of a bool mask (num_envs,); passed on to the agent in evaluation alone."""
-        self._begun = env_mask
-        self._over = ~env_mask
+        """New episodes where a bool mask (num_envs,) is set; passed on to the agent in evaluation alone."""
+        self._begun, self._over = env_mask, ~env_mask
 
     def init(self) -> None:
-        """Back to what was meta-learned."""
+        """Resets to what was meta-learned."""
         self._agent.init()
 
     def adapt_action(self, obs: Tensor) -> tuple[Tensor, Info]:
-        """Exploring actions (num_envs, a), and the agent's other outputs as it gave them."""
+        """Exploring actions (num_envs, a), and the agent's other outputs unchanged."""
         self._begun = None
         action, outputs = self._agent.adapt_action(_array(obs))
         return torch.as_tensor(action, device=obs.device), outputs
@@ -142,12 +129,8 @@ class FromMetaWorld:
 class MetaWorldEnvs(VectorEnv):
     """A world in NumPy arrays, with resets in the same step and the attributes and methods that Meta-World calls.
 
-    Args:
-        world: In autoreset mode DISABLED: episodes are started here, since success may end them, and a SAME_STEP world
-            would begin with shortened ones.
-
-    Raises:
-        BidexError: A world that resets by itself.
+    Raises BidexError for a world in another autoreset mode than DISABLED: episodes are started here, since success may
+    end them.
     """
 
     def __init__(self, world: PooledWorld):
@@ -172,14 +155,10 @@ class MetaWorldEnvs(VectorEnv):
         return obs.cpu().numpy(), {}
 
     def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
-        """Advances every environment.
+        """Advances every environment by actions (num_envs, a) in [-1, 1].
 
-        Args:
-            actions: Shape (num_envs, a), in [-1, 1].
-
-        Returns:
-            Observations (num_envs, d), of ended ones those of the next episode; rewards, terminated, truncated, and
-            info with ``success``, ``final_obs`` and ``final_info`` (``episode``: r, l; ``success``).
+        Returns observations (num_envs, d), of ended ones those of the next episode; rewards, terminated, truncated, and
+        info with ``success``, ``final_obs`` and ``final_info`` (``episode``: r, l; ``success``).
         """
         obs, reward, terminated, truncated, info = self.world.step(torch.as_tensor(np.asarray(actions)))
         success = info["success"]
@@ -189,12 +168,10 @@ class MetaWorldEnvs(VectorEnv):
         ended = terminated | truncated
         self._returns += reward.double()
         self._lengths += 1
-        final = {
-            "episode": {"r": self._returns.cpu().numpy().copy(), "l": self._lengths.cpu().numpy().copy()},
-            "success": success.cpu().numpy(),
-        }
-        ended_info: dict[str, Any] = {"success": final["success"], "final_obs": obs.cpu().numpy().copy()}
-        ended_info |= {"final_info": final, "_final_info": ended.cpu().numpy(), "_final_obs": ended.cpu().numpy()}
+        episode = {"r": self._returns.cpu().numpy().copy(), "l": self._lengths.cpu().numpy().copy()}
+        ended_info: dict[str, Any] = {"success": success.cpu().numpy(), "final_obs": obs.cpu().numpy().copy()}
+        ended_info["final_info"] = {"episode": episode, "success": ended_info["success"]}
+        ended_info |= {"_final_info": ended.cpu().numpy(), "_final_obs": ended.cpu().numpy()}
         if bool(ended.any()):
             obs, _ = self.world.reset(options={"reset_mask": ended})
             self._returns.masked_fill_(ended, 0.0)
@@ -207,16 +184,12 @@ class MetaWorldEnvs(VectorEnv):
         self.terminate_on_success = bool(on)
 
     def toggle_sample_tasks_on_reset(self, on: bool) -> None:
-        """Environments keep their tasks until ``sample_tasks``.
-
-        Raises:
-            BidexError: Asked to draw tasks at each reset.
-        """
+        """Environments keep their tasks until ``sample_tasks``: raises BidexError when switched on."""
         if on:
             raise BidexError("Environments keep their tasks until sample_tasks(), as Meta-World's evaluation has it.")
 
     def sample_tasks(self) -> None:
-        """The next tasks of each pool, one for each environment, round and round; they hold from the next reset on."""
+        """Takes the next tasks of each pool, one for each environment, in turn; they hold from the next reset on."""
         chosen = {}
         for name, pool, rows in zip(self.world.task_names, self._pools, self.world.slot_rows, strict=True):
             count = rows.stop - rows.start
@@ -230,7 +203,7 @@ class MetaWorldEnvs(VectorEnv):
         return tuple(value) if name == "task_name" else (value,) * self.num_envs
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Calls a method (or reads an attribute) once, and returns the result for each environment."""
+        """Calls a method (or reads an attribute) once; its result for each environment."""
         value = getattr(self, name)
         return (value(*args, **kwargs),) * self.num_envs if callable(value) else self.get_attr(name)
 

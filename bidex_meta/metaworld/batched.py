@@ -1,7 +1,6 @@
-"""Meta-World's MT suites as a world: single environments of another library behind ``BatchedWorld``.
+"""Meta-World's MT suites as a world, for checks on tasks, rewards and physics that no one here wrote.
 
-Our learners, evaluation and checkpoints run on it unchanged: a cross-check on tasks, rewards and physics that no one
-here wrote. Environments are stepped one after the other; it is not fast.
+Our learners, evaluation and checkpoints run on it unchanged. Environments are stepped one after the other.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,11 +31,14 @@ from bidex_meta.world.foreign_world import ForeignWorld, Sizes
 
 
 class MetaWorldWorld(ForeignWorld):
-    """A suite of Meta-World's on the CPU: a ``contract.PooledWorld`` whose slots are the classes.
+    """A suite of Meta-World's on the CPU, a key of ``suite.METAWORLD_SUITES``: a world whose slots are the classes.
 
     Observations are Meta-World's 39 numbers (goal visible) with the class's one-hot behind them; rewards its "v2" in
     [0, 10]; an episode is 500 steps, ended by the time limit alone. Starts are part of Meta-World's tasks: an episode
-    depends on its task and actions alone. A task's variation is its number among the class's fifty.
+    depends on its task and actions alone. A task's variation is its number among the class's fifty. ``seed`` chooses
+    Meta-World's tasks, and the draws of tasks until ``reset(seed=...)``; other keywords as of ``bidex_meta.World``.
+    Raises BidexError for an unknown suite or mode, fewer environments than classes, or where Meta-World is not
+    installed.
     """
 
     def __init__(
@@ -48,18 +50,6 @@ class MetaWorldWorld(ForeignWorld):
         autoreset_mode: str | AutoresetMode | None = None,
         stagger: bool = True,
     ) -> None:
-        """Makes the environments; none is started before ``reset``.
-
-        Args:
-            suite: A key of ``suite.METAWORLD_SUITES``.
-            num_envs: Environments over all classes, at least one for each.
-            seed: Chooses Meta-World's tasks, and the draws of tasks until ``reset(seed=...)`` gives another.
-            autoreset_mode: SAME_STEP (training) or DISABLED (evaluation), as a member or its name.
-            stagger: As in ``bidex_meta.World``.
-
-        Raises:
-            BidexError: Unknown suite or mode, too few environments, or Meta-World is not installed.
-        """
         self.suite = suite
         sizes = Sizes(OBSERVATION_SIZE, ACTION_SIZE, EPISODE_STEPS)
         super().__init__(metaworld_classes(suite), num_envs, sizes, seed, autoreset_mode, stagger)
@@ -70,13 +60,9 @@ class MetaWorldWorld(ForeignWorld):
         self.set_tasks({name: range(TASKS_PER_CLASS) for name in self.task_names})
 
     def set_tasks(self, pools: Mapping[str, Sequence[int] | np.ndarray]) -> None:
-        """Replaces the pools of tasks of some classes; they hold from the next full reset on.
+        """Replaces the pools of some classes by numbers of tasks, (n,) or (n, 1), from the next full reset on.
 
-        Args:
-            pools: Class name to numbers of tasks among its fifty, shape (n,) or (n, 1).
-
-        Raises:
-            BidexError: Unknown class, an empty pool, a wrong shape or a number out of range.
+        Raises BidexError for an unknown class, an empty pool, a wrong shape or a number out of range.
         """
         chosen = dict(self._pools)
         for name, pool in pools.items():
@@ -120,7 +106,7 @@ class MetaWorldWorld(ForeignWorld):
         return Transition(obs, reward, success, torch.zeros_like(unstable), unstable, {})
 
     def state_dict(self) -> State:
-        """Everything that decides the future of the world: tensors and plain values, copied."""
+        """All that decides the world's future: tensors and plain values, copied."""
         return {
             **super().state_dict(),
             "suite": self.suite,
@@ -130,13 +116,10 @@ class MetaWorldWorld(ForeignWorld):
         }
 
     def load_state_dict(self, state: State) -> None:
-        """Puts back what ``state_dict`` gave, on a world of the same suite, seed and size.
+        """Restores a ``state_dict``; raises BidexError for one of another suite, seed or size.
 
         Meta-World's environments keep part of their state in Python attributes and in the model, so each running
         episode is played again from its start: exact, and a fraction of a second for each.
-
-        Raises:
-            BidexError: The state is of another suite, seed or size.
         """
         fits(state, self.state_dict())
         here, there = (self.suite, self._task_seed), (state["suite"], state["task_seed"])
@@ -165,14 +148,9 @@ def evaluate_all_tasks(
 ) -> Evaluation:
     """``evaluate`` over all tasks of all classes, as many at a time as the world has environments.
 
-    An environment takes some 10 MB: one for each of MT10's five hundred tasks would fill a laptop. Starts are
-    part of the tasks: a policy without noise plays every episode of a task alike, and one is enough.
-
-    Args:
-        agent: The policy.
-        world: A ``MetaWorldWorld`` in autoreset mode DISABLED; it is left with other pools of tasks.
-        episodes_per_task: Episodes of each task.
-        seed: Passed to the world's resets.
+    An environment takes some 10 MB, so there is not one for each of MT10's five hundred tasks. Without noise a policy
+    plays every episode of a task alike, and one is enough. ``world`` is a ``MetaWorldWorld`` in autoreset mode
+    DISABLED; it is left with other pools.
     """
     check_world(world, episodes_per_task)
     at_once = min(rows.stop - rows.start for rows in world.slot_rows)

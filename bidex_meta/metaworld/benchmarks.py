@@ -1,7 +1,7 @@
 """Meta-World's constructors of benchmarks: `MT1(env_name, seed)`, `ML20(seed)`, `CustomML(train_envs, test_envs)`.
 
-As there, `MT1` and `ML1` are of any one class; the suites of these names (CatchUnderarm with listed goals, the paper's)
-are `bidex_meta.Benchmark("MT1")` and `Benchmark("ML1")`. Hands move, as in every suite.
+As there, `MT1` and `ML1` are of any one class; the suites of these names are `bidex_meta.Benchmark("MT1")` and
+`("ML1")`. Hands move, as in every suite; `seed` chooses the tasks, None: 0.
 """
 
 from collections.abc import Sequence
@@ -13,16 +13,9 @@ from bidex_meta.errors import BidexError, known_name
 from bidex_meta.suite import Split, Suite, SuiteClass
 from bidex_meta.tasks import registry
 
-_TASKS = 50
-
 
 class MT1(Benchmark):
-    """One class with its goal visible, 50 tasks.
-
-    Args:
-        env_name: The class, e.g. `"CatchUnderarm"`.
-        seed: Chooses the tasks; None: 0.
-    """
+    """One class with its goal visible, 50 tasks."""
 
     ENV_NAMES: ClassVar[list[str]] = registry.names()
 
@@ -31,12 +24,7 @@ class MT1(Benchmark):
 
 
 class ML1(Benchmark):
-    """One class with its goal hidden: 50 tasks to train on, 50 others to be tested on.
-
-    Args:
-        env_name: The class, e.g. `"CatchUnderarm"`.
-        seed: Chooses the tasks; None: 0.
-    """
+    """One class with its goal hidden: 50 tasks to train on, 50 others to be tested on."""
 
     ENV_NAMES: ClassVar[list[str]] = registry.names()
 
@@ -45,28 +33,14 @@ class ML1(Benchmark):
 
 
 class CustomMT(Benchmark):
-    """Some classes with their goals visible, 50 tasks each.
-
-    Args:
-        envs: The classes.
-        seed: Chooses the tasks; None: 0.
-    """
+    """Some classes with their goals visible, 50 tasks each."""
 
     def __init__(self, envs: Sequence[str], seed: int | None = None) -> None:
         super().__init__(_suite("CustomMT", "one-hot", {"train": envs}), seed or 0)
 
 
 class CustomML(Benchmark):
-    """Some classes to train on and others to be tested on, goals hidden, 50 tasks each.
-
-    Args:
-        train_envs: The former.
-        test_envs: The latter.
-        seed: Chooses the tasks; None: 0.
-
-    Raises:
-        BidexError: A class is in both.
-    """
+    """Other classes to train on than to be tested on (else BidexError), goals hidden, 50 tasks each."""
 
     def __init__(self, train_envs: Sequence[str], test_envs: Sequence[str], seed: int | None = None) -> None:
         both = sorted(set(_named(train_envs)) & set(_named(test_envs)))
@@ -81,27 +55,25 @@ class _Shipped(Benchmark):
 
 
 class MT4(_Shipped):
-    """The suite MT4; `seed` chooses the tasks, None: 0."""
+    """The suite MT4."""
 
 
 class MT20(_Shipped):
-    """The suite MT20: all classes; `seed` chooses the tasks, None: 0."""
+    """The suite MT20: all classes."""
 
 
 class ML4(_Shipped):
-    """The suite ML4: three classes, tested on a fourth; `seed` chooses the tasks, None: 0."""
+    """The suite ML4: three classes, tested on a fourth."""
 
 
 class ML20(_Shipped):
-    """The suite ML20: fifteen classes, tested on five others; `seed` chooses the tasks, None: 0."""
+    """The suite ML20: fifteen classes, tested on five others."""
 
 
 def _suite(name: str, observation: Literal["plain", "one-hot", "masked"], classes: dict[Split, Sequence[str]]) -> Suite:
-    """A suite without a file, of the given classes by split."""
     splits: dict[str, tuple[Split, ...]] = {}
     for split, given in classes.items():
-        for entry in _named(given):
-            splits[entry] = (*splits.get(entry, ()), split)
+        splits |= {entry: (*splits.get(entry, ()), split) for entry in _named(given)}
     if not all(classes.values()):
         raise BidexError(f"{name}: expected at least one class in each list, got an empty one.")
     return Suite(
@@ -113,7 +85,7 @@ def _suite(name: str, observation: Literal["plain", "one-hot", "masked"], classe
         task_id="class",
         reward="paper",
         base="moving",
-        tasks_per_class=_TASKS,
+        tasks_per_class=50,
         classes=tuple(SuiteClass(entry, entry, where, 1.0, None, (), {}) for entry, where in splits.items()),
         file=Path(f"metaworld.{name}"),
     )

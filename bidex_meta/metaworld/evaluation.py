@@ -1,4 +1,4 @@
-"""`metaworld.evaluation` on environments of this benchmark: its own functions, which are told the names of our classes.
+"""`metaworld.evaluation` on environments of this benchmark: its own functions, given the names of our classes.
 
 With several environments of a class they count the first episodes that finish, and success ends an episode, so that
 easy tasks crowd out hard ones. `bidex_meta.evaluation` plays each task equally often.
@@ -28,13 +28,9 @@ def metalearning_evaluation(agent: MetaLearningAgent, eval_envs: Any, *args: Any
 
 @contextmanager
 def known_to_metaworld(envs: Any) -> Iterator[None]:
-    """While it lasts, `metaworld.evaluation` finds the names of our classes.
+    """Adds the classes in `envs.get_attr("task_name")` to the names that `metaworld.evaluation` looks up.
 
-    Its functions look up each row's `task_name` among the class names of their module's `ALL_V3_ENVIRONMENTS`, and
-    would raise KeyError. The module's attribute is replaced, not the dict, which other modules of Meta-World's share.
-
-    Args:
-        envs: Whose names they are; its `get_attr("task_name")` tells them.
+    Replaces its module's attribute, not the dict, which other modules of Meta-World's share.
     """
     module: Any = library
     before = module.ALL_V3_ENVIRONMENTS

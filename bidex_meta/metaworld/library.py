@@ -1,4 +1,4 @@
-"""Meta-World's library, mended for MuJoCo 4: its tasks and its environments, one at a time."""
+"""Meta-World's library, fixed for MuJoCo 4: its tasks and its environments, one at a time."""
 
 import functools
 from typing import Any
@@ -15,21 +15,16 @@ ACTION_SIZE = 4
 EPISODE_STEPS = 500
 
 _WELD = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 5.0)
-_BROKEN = [
-    int(getattr(mujoco.mjtWarning, f"mjWARN_{kind}"))
-    for kind in ("BADQPOS", "BADQVEL", "BADQACC", "CONTACTFULL", "CNSTRFULL")
-]
+_WARNINGS = ("BADQPOS", "BADQVEL", "BADQACC", "CONTACTFULL", "CNSTRFULL")
+_BROKEN = [int(getattr(mujoco.mjtWarning, f"mjWARN_{kind}")) for kind in _WARNINGS]
 
 
 def mended() -> Any:
-    """Meta-World's module, its environments mended in this process.
+    """Meta-World's module, its environments fixed in this process; raises ModuleNotFoundError without it.
 
     Meta-World 3.0.0 (its newest release without an upper bound on MuJoCo) sets the hand's weld by eleven numbers for
     the whole row of ``eq_data``; since MuJoCo 3.17 that row is twelve wide, so no environment could be made. Here the
-    eleven go to the first eleven entries, as they were meant; the twelfth keeps what the model was compiled with.
-
-    Raises:
-        ModuleNotFoundError: It, or what it needs, is not installed.
+    eleven go to the first eleven entries, as they were meant; the twelfth stays as the model was compiled.
     """
     import metaworld
     from metaworld.sawyer_xyz_env import SawyerMocapBase
@@ -59,17 +54,10 @@ def _library() -> Any:
 
 @functools.lru_cache(maxsize=8)  # drawing them resets each class fifty times: seconds
 def make_tasks(suite: str, seed: int) -> dict[str, tuple[Any, ...]]:
-    """Meta-World's own fifty tasks of each class of a suite, goal visible.
+    """Meta-World's own fifty tasks of each class of a suite, e.g. ``"metaworld/MT3"``, goal visible.
 
-    Those of MT10 are ``metaworld.MT10(seed)``'s, those of MT3 ``metaworld.MT1(name, seed)``'s. Meta-World puts NumPy's
-    global generator back to where it was.
-
-    Args:
-        suite: E.g. ``"metaworld/MT3"``.
-        seed: A whole number from 0 on.
-
-    Raises:
-        BidexError: Unknown suite, or Meta-World is not installed.
+    Those of MT10 are ``metaworld.MT10(seed)``'s, those of MT3 ``metaworld.MT1(name, seed)``'s. Meta-World restores
+    NumPy's global generator. Raises BidexError for an unknown suite, or where Meta-World is not installed.
     """
     names, library, seed = metaworld_classes(suite), _library(), seed % 2**32  # the range of NumPy's old generator
     whole = suite == "metaworld/MT10"
@@ -79,24 +67,20 @@ def make_tasks(suite: str, seed: int) -> dict[str, tuple[Any, ...]]:
 
 
 class Single:
-    """One environment of Meta-World's class ``name``; an episode is a function of its task and actions alone."""
+    """One environment of Meta-World's class ``name``."""
 
     def __init__(self, name: str) -> None:
         self._env = _library().ALL_V3_ENVIRONMENTS[name]()
 
     def start(self, task: Any) -> np.ndarray:
-        """Begins an episode of a task; the observation, shape (39,), float64: the goal in the last three entries."""
+        """Begins an episode of a task; the observation, (39,), float64, with the goal in the last three entries."""
         self._env.set_task(task)
         return self._env.reset()[0]
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
-        """One control step of 1/80 s.
+        """Advances 1/80 s by an action (4,), float32, in [-1, 1]: displacement of the hand (× 0.01 m), gripper.
 
-        Args:
-            action: Shape (4,), float32, in [-1, 1]: displacement of the hand (× 0.01 m), gripper.
-
-        Returns:
-            Observation (39,), reward in [0, 10] by the formula "v2", success, and whether the physics broke.
+        Returns observation (39,), reward in [0, 10] by the formula "v2", success, and whether the physics broke.
         """
         obs, reward, _, _, info = self._env.step(action)
         # MuJoCo goes on from its default state after a bad number; only its counters tell.

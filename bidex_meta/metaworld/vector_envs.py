@@ -1,13 +1,13 @@
 """Meta-World's functions that make environments: `make_mt_envs`, `make_ml_envs`, and what its Gymnasium ids take.
 
-Single environments in Meta-World's own wrappers, side by side in Gymnasium's vector environments; what each keyword
-does is Meta-World's.
+Single environments in Meta-World's own wrappers, side by side in Gymnasium's vector environments; each keyword does
+what it does there.
 """
 
 import warnings
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import gymnasium
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
@@ -22,26 +22,14 @@ from bidex_meta.world.single_env import AnyTask, EnvRecipe
 _STRATEGIES = {"sync": SyncVectorEnv, "async": AsyncVectorEnv}
 
 
-class Place(NamedTuple):
-    """One environment of a vector: its class and the tasks it draws from."""
-
-    recipe: EnvRecipe
-    tasks: list[Any]
-
-
 def make_mt_envs(
     name: str, seed: int | None = None, num_tasks: int | None = None, **options: Any
 ) -> gymnasium.Env | VectorEnv:
-    """Environments that show their goals and draw a task at each reset.
+    """Environments that show their goals and draw a task at each reset: one of a class, or one of each of a suite's.
 
-    Args:
-        name: A class, for a single environment; or a suite, for a vector with one environment of each class.
-        seed: Chooses the tasks (None: 0), the starts and the task draws (None: others each time).
-        num_tasks: Entries of the one-hot that `use_one_hot=True` appends; by default the number of classes.
-        **options: `vector_strategy`, `autoreset_mode` and those of `make_env`.
-
-    Raises:
-        BidexError: Neither class nor suite, or a suite that hides its goals.
+    `seed` chooses the tasks (None: 0), the starts and the task draws (None: others each time); `num_tasks` is the size
+    of the one-hot that `use_one_hot=True` appends, by default the number of classes. Options: `vector_strategy`,
+    `autoreset_mode` and those of `make_env`. Raises BidexError for an unknown name, or a suite that hides its goals.
     """
     if _is_class(name):
         benchmark = MT1(name, seed)
@@ -59,18 +47,11 @@ def make_ml_envs(
     split: str = "train",
     **options: Any,
 ) -> VectorEnv:
-    """Environments that hide their goals, each with an equal share of its class's tasks.
+    """Environments of a class or meta suite that hide their goals, each with an equal share of its class's tasks.
 
-    Args:
-        name: A class, or a meta suite.
-        seed: Chooses the tasks (None: 0), the starts and the task draws (None: others each time).
-        meta_batch_size: How many, evenly over the classes of the split; None: one of each.
-        total_tasks_per_cls: How many of the tasks of each class; None: all.
-        split: `"train"` or `"test"`.
-        **options: `vector_strategy`, `autoreset_mode` and those of `make_env`.
-
-    Raises:
-        BidexError: Neither class nor suite, a suite that shows its goals, or a size that does not divide evenly.
+    `meta_batch_size` is how many, evenly over the classes of the split, by default one of each; `total_tasks_per_cls`
+    is how many of each class's tasks they share, by default all. `seed` and options as in `make_mt_envs`. Raises
+    BidexError for an unknown name, a suite that shows its goals, or a size that does not divide evenly.
     """
     benchmark = ML1(name, seed) if _is_class(name) else Benchmark(name, seed or 0)
     return _meta(benchmark, seed, meta_batch_size, total_tasks_per_cls, split, **options)
@@ -81,17 +62,10 @@ make_ml_envs_test = partial(make_ml_envs, terminate_on_success=True, task_select
 
 
 def make_split(suite: str, split: str, seed: int, env_name: str | None = None, **options: Any) -> VectorEnv:
-    """What `gymnasium.make_vec("bidex-meta/ML20-train-v1", vector_strategy=...)` gives.
+    """The environments of `gymnasium.make_vec("bidex-meta/ML20-train-v1", vector_strategy=...)`.
 
-    Args:
-        suite: The suite of the id.
-        split: The split of the id.
-        seed: Chooses tasks, starts and task draws.
-        env_name: For the ids of ML1: this class, as in Meta-World, in place of the suite.
-        **options: Those of `make_mt_envs` or `make_ml_envs`.
-
-    Raises:
-        BidexError: `env_name` with another suite.
+    For the ids of ML1 `env_name` replaces the suite, as in Meta-World; with another suite it raises BidexError. Options
+    are those of `make_mt_envs` or `make_ml_envs`.
     """
     if env_name is not None and suite != "ML1":
         raise BidexError(f"env_name goes with the ids of ML1, got it with {suite}. For one class: make_mt_envs(name).")
@@ -110,15 +84,10 @@ def make_custom(
     num_envs: int | None = None,
     **options: Any,
 ) -> VectorEnv:
-    """What the ids `bidex-meta/custom-mt-envs` (`envs_list`) and `custom-ml-envs` (`train_envs`, `test_envs`) give.
+    """The environments of the ids `custom-mt-envs` (`envs_list`) and `custom-ml-envs` (`train_envs`, `test_envs`).
 
-    Args:
-        seed: As in `make_mt_envs`.
-        envs_list: Classes that show their goals.
-        train_envs: Classes that hide them; these are played.
-        test_envs: Classes that are not; `split="test"` plays them instead.
-        num_envs: Ignored, as there: the other arguments say how many.
-        **options: Those of `make_mt_envs` or `make_ml_envs`.
+    Classes of `envs_list` show their goals; others hide them, those of `train_envs` play, or with `split="test"` those
+    of `test_envs`. `num_envs` is ignored, as there. Options are those of `make_mt_envs` or `make_ml_envs`.
     """
     if envs_list is not None:
         return _multi_task(CustomMT(envs_list, seed), seed, **options)
@@ -133,7 +102,7 @@ def _multi_task(benchmark: Benchmark, seed: int | None, num_tasks: int | None = 
     if "meta_batch_size" in options or "total_tasks_per_cls" in options:
         raise BidexError(f"meta_batch_size and total_tasks_per_cls are of meta suites; {benchmark.name} is none.")
     classes = benchmark.train_classes
-    places = [Place(env_class.recipe, _tasks(benchmark, "train", name)) for name, env_class in classes.items()]
+    places = [(env_class.recipe, _tasks(benchmark, "train", name)) for name, env_class in classes.items()]
     return _make_vector(places, seed, num_tasks=num_tasks or len(places), **options)
 
 
@@ -157,7 +126,7 @@ def _meta(
             f"got {size}."
         )
     places = [
-        Place(env_class.recipe, share)
+        (env_class.recipe, share)
         for name, env_class in classes.items()
         for share in _split_tasks(_tasks(benchmark, split, name)[:total_tasks_per_cls], size // len(classes))
     ]
@@ -181,24 +150,12 @@ def make_env(
     reward_alpha: float = 0.001,
     **options: Any,
 ) -> gymnasium.Env:
-    """One environment in Meta-World's wrappers: it draws its tasks itself.
+    """One environment in Meta-World's wrappers, by Meta-World's keywords: it draws its tasks itself.
 
-    Args:
-        recipe: The class, as a suite has it.
-        tasks: Tasks of that class.
-        seed: Of starts and task draws; None: another one each time.
-        max_episode_steps: A shorter time limit.
-        terminate_on_success: Whether an episode ends at its first success; `toggle_terminate_on_success` changes it.
-        use_one_hot: Append the one-hot of `env_id` among `num_tasks`.
-        env_id: Which of them it is.
-        num_tasks: Entries of the one-hot.
-        recurrent_info_in_obs: Append the last action, the last reward and whether the episode ended.
-        normalize_reward_in_recurrent_info: That reward divided by 10.
-        task_select: `"random"`: a task drawn at each reset; `"pseudorandom"`: round and round, at `sample_tasks()`.
-        reward_normalization_method: Gymnasium's `NormalizeReward`, or Meta-World's exponential average.
-        normalize_observations: Gymnasium's `NormalizeObservation`.
-        reward_alpha: Of the exponential average.
-        **options: Those of `SuiteEnv`.
+    `seed` is of starts and task draws (None: another one each time); `use_one_hot` appends the one-hot of `env_id`
+    among `num_tasks`, `recurrent_info_in_obs` the last action, the last reward (divided by 10 if normalised) and
+    whether the episode ended. `task_select`: `"random"` draws a task at each reset, `"pseudorandom"` takes them in
+    turn, at `sample_tasks()`. Other options are those of `SuiteEnv`.
     """
     from metaworld import wrappers  # not needed by the package's other names
 
@@ -222,47 +179,28 @@ def make_env(
     if normalize_observations:
         env = gymnasium.wrappers.NormalizeObservation(env)
     env = gymnasium.wrappers.RecordEpisodeStatistics(env)
-    select: Any = (
-        wrappers.RandomTaskSelectWrapper if task_select == "random" else wrappers.PseudoRandomTaskSelectWrapper
-    )
+    random = task_select == "random"
+    select: Any = wrappers.RandomTaskSelectWrapper if random else wrappers.PseudoRandomTaskSelectWrapper
     return wrappers.CheckpointWrapper(select(env, list(tasks)), f"{recipe.name}_{env_id}")
 
 
 def _make_vector(
-    places: Sequence[Place],
+    places: Sequence[tuple[EnvRecipe, list[Any]]],
     seed: int | None = None,
     vector_strategy: str = "sync",
     autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
     **options: Any,
 ) -> SyncVectorEnv | AsyncVectorEnv:
-    """Environments side by side: `"sync"` in this process, `"async"` in a process each.
-
-    Args:
-        places: One for each environment.
-        seed: Environment i gets `seed + i`; None: another one each time.
-        vector_strategy: `"sync"` or `"async"`.
-        autoreset_mode: Gymnasium's; Meta-World's evaluation needs SAME_STEP.
-        **options: Those of `make_env`.
-
-    Raises:
-        BidexError: Another strategy.
-    """
     make = _STRATEGIES[known_name("vector_strategy", vector_strategy, _STRATEGIES)]
     makers = [
-        partial(
-            make_env, place.recipe, place.tasks, seed=None if seed is None else seed + i, **{"env_id": i, **options}
-        )
-        for i, place in enumerate(places)
+        partial(make_env, recipe, tasks, seed=None if seed is None else seed + i, **{"env_id": i, **options})
+        for i, (recipe, tasks) in enumerate(places)
     ]
     return make(makers, autoreset_mode=autoreset_mode)
 
 
 def _split_tasks(tasks: Sequence[Any], envs: int) -> list[list[Any]]:
-    """The tasks of a class over its environments, as many for each.
-
-    Raises:
-        BidexError: They do not divide evenly.
-    """
+    """The tasks of a class over its environments; raises BidexError where they do not divide evenly."""
     if len(tasks) % envs:
         fitting = len(tasks) - len(tasks) % envs
         raise BidexError(
@@ -278,11 +216,7 @@ def _tasks(benchmark: Benchmark, split: str, name: str) -> list[Any]:
 
 
 def _is_class(name: str) -> bool:
-    """Whether it names a class.
-
-    Raises:
-        BidexError: It names no suite either.
-    """
+    """Whether it names a class; raises BidexError where it names no suite either."""
     folded = {known.casefold() for known in registry.names()}
     if name.casefold() not in folded and not name.endswith(".toml"):
         known_name("class or suite", name, [*registry.names(), *suite_names()])

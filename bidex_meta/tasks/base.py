@@ -19,21 +19,25 @@ from bidex_meta.utils.validation import true_or_false
 
 @dataclass(frozen=True)
 class Solver:
-    """What a class asks of the contact solver beyond the common profile (bidex_meta/hands/README.md)."""
+    """What a class asks of the contact solver beyond the common profile (bidex_meta/hands/README.md).
+
+    Attributes:
+        iterations: Newton iterations at most.
+        line_search: Steps of a line search at most.
+        integrator: MuJoCo's integrator.
+        cone: Friction cones: an elliptic one is exact, a pyramid costs a quarter to a third less and slips a little.
+        impratio: How much stiffer friction is than the normal force: a held object creeps the less.
+        time_step: Seconds: a whole number to a control step. Contacts and limits are as stiff as it allows.
+        most_condim: Dimensions of a contact at most: 4 with torsional friction (eggs and fingertips), 3 without.
+    """
 
     iterations: int = 10
-    """Newton iterations at most."""
     line_search: int = 20
-    """Steps of a line search at most."""
     integrator: mujoco.mjtIntegrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     cone: mujoco.mjtCone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    """Friction cones: an elliptic one is the truth, a pyramid costs a quarter to a third less and slips a little."""
     impratio: float = 10.0
-    """How much stiffer friction is than the normal force: what is held creeps the less."""
     time_step: float = 1.0 / 120.0
-    """Seconds: a whole number to a control step. Contacts and limits are as stiff as it allows."""
     most_condim: int = 4
-    """Dimensions of a contact at most: 4 with torsional friction (of the files' eggs and fingertips), 3 without."""
 
 
 LIGHT = Solver(cone=mujoco.mjtCone.mjCONE_PYRAMIDAL, impratio=3.0, time_step=1.0 / 180.0, most_condim=3)
@@ -51,10 +55,9 @@ CONTROL_RATE = 60
 
 
 class TaskClass(ABC):
-    """One of the manipulation tasks, batched over environments.
+    """One of the manipulation tasks, batched over environments: the first axis of all tensors, in engine precision.
 
-    The first axis of all tensors counts environments, in the engine's precision. A class has no loops over them and no
-    state: what a task freezes is in ``frozen``, what an episode draws is in ``draws``.
+    A class has no state: what a task freezes is in ``frozen``, what an episode draws is in ``draws``.
 
     Attributes:
         name: Name of the class, e.g. ``CatchUnderarm``.
@@ -63,21 +66,17 @@ class TaskClass(ABC):
         solved: When it counts as solved, one line.
         deviations: What differs from the appendix on purpose, a line each.
         episode_steps: Time limit, control steps.
-        right: Start pose of the right hand.
-        left: Start pose of the left hand.
-        transition_scale: Scale of the base forces (docs/figures.md, base).
-        orientation_scale: Scale of the base torques.
+        right: Start pose of the right hand; ``left`` of the left one.
+        transition_scale: Scale of the base forces (docs/figures.md, base); ``orientation_scale`` of the torques.
         start_draws: How many uniform numbers the start of an episode takes.
         variation_space: What a task of this class freezes; an attribute or a property.
         blocks: The observation behind both hands' blocks.
-        moving_base: Whether the hands' bases are driven (52 actions) or fixed (40).
+        moving_base: Whether the hands' bases are driven (52 actions) or fixed (40); None in the constructor: as the
+            class says (fixed for HandOver alone).
         solver: What the class asks of the contact solver.
-        needs: Most contacts and constraint rows that were seen, for mujoco_warp's fixed room: from
-            ``python -m tools.bench capacity --steps 30000``; contacts and rows of 30,208 states under rough actions
-            (half uniform, half held at +-1), candidate and convex pairs in 3,776 of them. Medians of rows lie between
-            9 and 56. A class that was not measured has the largest of all.
-        camera_target: Point that pictures look at, world, metres.
-        camera_distance: Distance of the camera from it, metres.
+        needs: Most contacts and constraint rows in 30,208 states under rough actions, for mujoco_warp's fixed room,
+            by ``python -m tools.bench capacity --steps 30000``. A class that was not measured has the largest of all.
+        camera_target: Point that pictures look at, world, metres, from ``camera_distance``.
         depth_camera: Where the camera of point clouds stands and what it looks at, world, metres; None: it looks down
             at ``camera_target`` from the front.
     """
@@ -103,9 +102,8 @@ class TaskClass(ABC):
     depth_camera: ClassVar[tuple[tuple[float, float, float], tuple[float, float, float]] | None] = None
 
     def __init__(self, moving_base: bool | None = None) -> None:
-        """Drives the bases or fixes them; None takes the class's own (fixed for HandOver alone)."""
-        chosen = self.moves_by_default if moving_base is None else moving_base
-        self.moving_base = true_or_false("moving_base", chosen)
+        default = self.moves_by_default if moving_base is None else moving_base
+        self.moving_base = true_or_false("moving_base", default)
 
     @property
     def scene_key(self) -> tuple[Hashable, ...]:
@@ -137,13 +135,10 @@ class TaskClass(ABC):
 
     @abstractmethod
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        """Writes the start of an episode.
+        """Writes the start of an episode, from uniform numbers in [-1, 1], (n, start_draws), and frozen ones.
 
-        Args:
-            draws: Uniform numbers in [-1, 1], shape (n, start_draws).
-            frozen: Frozen numbers, each (n, k).
-            qpos: Part name (``right/joints``, an object, ...) to its positions, views of shape (n, k) that hold the
-                nominal start and are written in place; MuJoCo's quaternion order (w, x, y, z).
+        ``qpos`` maps a part (``right/joints``, an object, ...) to views (n, k) of its positions that hold the nominal
+        start and are written in place; MuJoCo's quaternion order (w, x, y, z).
         """
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
@@ -168,5 +163,4 @@ class TaskClass(ABC):
         return []
 
     def __repr__(self) -> str:
-        """The class's name and base."""
         return f"{self.name}({'moving' if self.moving_base else 'fixed'} base)"

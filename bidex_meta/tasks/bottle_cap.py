@@ -2,8 +2,6 @@
 
 import math
 
-import mujoco
-import torch
 from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
@@ -13,8 +11,8 @@ from bidex_meta.tasks.base import FIRM
 from bidex_meta.tasks.layout import object_blocks, point_block
 from bidex_meta.tasks.objects.pointed import OwnObjectClass
 from bidex_meta.tasks.placement import DRAWS, SHIFT, TURN, place
-from bidex_meta.tasks.reach import apart, reach
-from bidex_meta.tasks.scene import SceneObject, add_table
+from bidex_meta.tasks.reach import apart
+from bidex_meta.tasks.scene import SceneObject, Table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace
 from bidex_meta.utils.maths import constant, dot, indices
@@ -25,9 +23,6 @@ _PALM_NORMAL = (math.sin(_TILT), 0.0, math.cos(_TILT))
 _LIFT, _AHEAD = 0.006, 0.015
 """How far the bottle starts from the original's place, metres: along the palm's normal, since there it is in the hand,
 and along the fingers, so that it can be turned without meeting the thumb."""
-_BOTTLE = SceneObject(
-    "bottle", "bottle", (_LIFT * _PALM_NORMAL[0], -0.6 - _AHEAD, 0.5 + _LIFT * _PALM_NORMAL[2]), (0.0, -0.7, 0.0)
-)
 _AHEAD_RANGE = 0.01
 _OPENED = 0.03
 _THUMB = {"THJ4": -1.04, "THJ3": 1.2, "THJ0": -1.57}
@@ -39,7 +34,8 @@ class BottleCap(OwnObjectClass):
 
     Observation: Table 24 (414). Reward: equation 11, left hand to cap and right hand to bottle as printed. The cap's
     point is its centre; the original measures from a link frame near the bottle's origin. Tasks shift the bottle in the
-    palm's plane: 3 cm either way along its axis, and 1 cm to the fingers only, since the thumb is behind it.
+    palm's plane: 3 cm either way along its axis (``bottle_x``), and 1 cm to the fingers only (``bottle_y``), since the
+    thumb is behind it.
     """
 
     needs = Capacity(47, 4, 65)
@@ -55,31 +51,29 @@ class BottleCap(OwnObjectClass):
     episode_steps = 125
     right = HandPose((0.0, -0.25, 0.45), (0.0, _TILT, 0.0))
     left = HandPose((0.0, -1.05, 0.5), (0.5, math.pi, math.pi))
-    transition_scale = 0.1
-    orientation_scale = 0.1
+    transition_scale, orientation_scale = 0.1, 0.1
     start_draws = DRAWS
     solver = FIRM
-    usual = _BOTTLE
+    table = Table((0.3, 0.3, 0.1), (0.0, -0.6, 0.05))
+    objects = (
+        SceneObject(
+            "bottle",
+            "bottle",
+            (_LIFT * _PALM_NORMAL[0], -0.6 - _AHEAD, 0.5 + _LIFT * _PALM_NORMAL[2]),
+            (0.0, -0.7, 0.0),
+        ),
+    )
     usual_stands = False
+    points = ("bottle/cap_position", "bottle/position")
+    constant = 0.2
     camera_target = (0.0, -0.62, 0.52)
-
     variation_space = VariationSpace(
         ("bottle_x", "bottle_y", "bottle_yaw"), (-SHIFT, -_AHEAD_RANGE, -TURN), (SHIFT, 0.0, TURN)
     )
-    """The bottle's place: ``bottle_x`` along its axis, ``bottle_y`` along the fingers (metres), ``bottle_yaw``."""
-
     blocks = (
-        *object_blocks("bottle", "bottle"),
+        *object_blocks("bottle"),
         point_block("bottle_cap_position", "bottle/cap_position", "centre of the cap"),
     )
-
-    def add_objects(self, scene: mujoco.MjSpec) -> None:
-        add_table(scene, (0.3, 0.3, 0.1), (0.0, -0.6, 0.05))
-        self.own.add_to(scene)
-
-    def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """``bottle``: place (n, 3)."""
-        return {"bottle": variation}
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
         for side in ("right", "left"):
@@ -90,11 +84,8 @@ class BottleCap(OwnObjectClass):
         place(bottle, frozen["bottle"], draws)
         bottle[:, :3] -= dot(bottle[:, :3] - nominal, normal)[:, None] * normal
 
-    def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
-        """Equation 11: ``left`` -d_left, ``right`` -d_right, ``target`` 30 d_target, ``constant`` 0.2."""
-        left, right = reach(state, "left", "bottle/cap_position"), reach(state, "right", "bottle/position")
-        target = 30.0 * apart(state, "bottle/position", "bottle/cap_position")
-        return {"left": -left, "right": -right, "target": target, "constant": torch.full_like(left, 0.2)}
+    def target(self, state: TaskState) -> Tensor:
+        return 30.0 * apart(state, "bottle/position", "bottle/cap_position")
 
     def success(self, state: TaskState) -> Tensor:
         return state["bottle/slide"][:, 0] > _OPENED

@@ -1,4 +1,4 @@
-"""The bucket that GraspAndPlace and PourWater fill: what lies inside it, and whether it stands."""
+"""The bucket of GraspAndPlace and PourWater: what lies inside it, and whether it stands."""
 
 import math
 
@@ -17,15 +17,9 @@ _FLOOR_RADIUS, _RIM_RADIUS = 0.0255, 0.053
 
 
 def inside_bucket(points: Tensor, bucket: Tensor, quaternion: Tensor) -> Tensor:
-    """Which points are in a bucket: between floor and rim, and within the wall's radius there.
+    """Which points (n, k, 3) are in a bucket: between floor and rim, and within the wall's radius there. (n, k), bool.
 
-    Args:
-        points: World positions, metres, shape (n, k, 3).
-        bucket: World positions of the buckets' origins, shape (n, 3).
-        quaternion: Their orientations (x, y, z, w), shape (n, 4).
-
-    Returns:
-        Shape (n, k), bool.
+    Points and buckets' origins (n, 3) in the world, metres; the buckets' orientations (x, y, z, w), (n, 4).
     """
     x, y, z = rotate(conjugate(quaternion)[:, None], points - bucket[:, None]).unbind(-1)
     share = (z - FLOOR) / (RIM - FLOOR)

@@ -1,21 +1,16 @@
 """CatchAbreast: appendix A.2.5; docs/figures.md, classes."""
 
 import math
-
-from torch import Tensor
+from typing import ClassVar
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import HandPose
-from bidex_meta.tasks.eggs import OneEgg
-from bidex_meta.tasks.state import TaskState
-from bidex_meta.utils.maths import constant, norm
+from bidex_meta.tasks.eggs import EggTask
 
-_ANCHORS = {"right": (-0.3, -0.55, 0.5), "left": (-0.3, -1.15, 0.5)}
-_ANCHOR_RADIUS = 0.1
 _TILT = 0.3925
 
 
-class CatchAbreast(OneEgg):
+class CatchAbreast(EggTask):
     """Throw an egg sideways between two palms that lie side by side, tilted to each other.
 
     Observation: Table 16 (422). Reward: equation 5. The episode also fails when a palm is 0.1 m off its anchor.
@@ -27,20 +22,10 @@ class CatchAbreast(OneEgg):
     episode_steps = 150
     right = HandPose((0.0, -0.55, 0.5), (0.0, _TILT, -0.5 * math.pi))
     left = HandPose((0.0, -1.15, 0.5), (0.0, -_TILT, -0.5 * math.pi))
-    transition_scale = 0.5
-    orientation_scale = 1.0
-    egg_start = (-0.39, -0.55, 0.54)
-    goal_centre = (-0.39, -1.15, 0.54)
-    position_noise = 0.0
-    joint_noise = 0.0
+    transition_scale, orientation_scale = 0.5, 1.0
+    starts = ((-0.39, -0.55, 0.54),)
+    goals = ((-0.39, -1.15, 0.54),)
+    position_noise, joint_noise = 0.0, 0.0
     floor = 0.2
-    camera_target = (-0.25, -0.85, 0.5)
-    camera_distance = 1.4
-
-    def failed(self, state: TaskState) -> Tensor:
-        """The egg dropped, or a palm has left its anchor."""
-        dropped = super().failed(state)
-        for side, anchor in _ANCHORS.items():
-            palm = state[f"{side}/palm_position"]
-            dropped = dropped | (norm(palm - constant(anchor, palm)) >= _ANCHOR_RADIUS)
-        return dropped
+    anchors: ClassVar = {"right/palm_position": (-0.3, -0.55, 0.5), "left/palm_position": (-0.3, -1.15, 0.5)}
+    camera_target, camera_distance = (-0.25, -0.85, 0.5), 1.4

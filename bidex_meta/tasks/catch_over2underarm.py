@@ -1,19 +1,14 @@
 """CatchOver2Underarm: appendix A.2.3; docs/figures.md, classes."""
 
 import math
-
-from torch import Tensor
+from typing import ClassVar
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_UP_BACK, HandPose
-from bidex_meta.tasks.eggs import OneEgg
-from bidex_meta.tasks.state import TaskState
-from bidex_meta.utils.maths import constant, norm
-
-_ANCHOR_RADIUS = 0.1
+from bidex_meta.tasks.eggs import EggTask
 
 
-class CatchOver2Underarm(OneEgg):
+class CatchOver2Underarm(EggTask):
     """Throw an egg from an upright hand down to an upturned palm.
 
     Observation: Table 12 (422). Reward: equation 3 with alpha 20. The episode also fails when a mount is 0.1 m off its
@@ -28,22 +23,12 @@ class CatchOver2Underarm(OneEgg):
     episode_steps = 75
     right = HandPose((0.0, 0.0, 0.5), (1.67, math.pi, 0.0))
     left = HandPose((0.0, -0.8, 0.5), PALM_UP_BACK)
-    transition_scale = 0.1
-    orientation_scale = 2.0
-    egg_start = (0.0, 0.05, 1.03)
-    goal_centre = (0.0, -0.40, 0.55)
-    position_noise = 0.0
-    joint_noise = 0.0
-    lies_on_right_hand = False
+    transition_scale, orientation_scale = 0.1, 2.0
+    starts = ((0.0, 0.05, 1.03),)
+    goals = ((0.0, -0.40, 0.55),)
+    position_noise, joint_noise = 0.0, 0.0
+    lies_on_hand = False
     alpha = 20.0
     floor = 0.3
-    camera_target = (0.0, -0.3, 0.7)
-    camera_distance = 1.6
-
-    def failed(self, state: TaskState) -> Tensor:
-        """The egg dropped, or a mount has left its anchor."""
-        dropped = super().failed(state)
-        for side, pose in (("right", self.right), ("left", self.left)):
-            mount = state[f"{side}/mount_position"]
-            dropped = dropped | (norm(mount - constant(pose.position, mount)) >= _ANCHOR_RADIUS)
-        return dropped
+    anchors: ClassVar = {"right/mount_position": right.position, "left/mount_position": left.position}
+    camera_target, camera_distance = (0.0, -0.3, 0.7), 1.6

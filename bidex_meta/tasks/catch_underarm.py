@@ -2,10 +2,10 @@
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
-from bidex_meta.tasks.eggs import OneEgg
+from bidex_meta.tasks.eggs import EggTask
 
 
-class CatchUnderarm(OneEgg):
+class CatchUnderarm(EggTask):
     """Throw an egg underarm from one upturned palm to the other, with moving bases.
 
     Observation: Table 10 (422). Reward: equation 2.
@@ -17,10 +17,8 @@ class CatchUnderarm(OneEgg):
     episode_steps = 75
     right = HandPose((0.0, 0.0, 0.5), PALM_UP_AWAY)
     left = HandPose((0.0, -1.15, 0.5), PALM_UP_BACK)
-    transition_scale = 0.05
-    orientation_scale = 0.5
-    egg_start = (0.0, -0.39, 0.54)
-    goal_centre = (0.0, -0.79, 0.54)
-    position_noise = 0.01
-    joint_noise = 0.2
+    transition_scale, orientation_scale = 0.05, 0.5
+    starts = ((0.0, -0.39, 0.54),)
+    goals = ((0.0, -0.79, 0.54),)
+    position_noise, joint_noise = 0.01, 0.2
     floor = 0.1

@@ -9,20 +9,17 @@ from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
-from bidex_meta.tasks.base import FAST, TaskClass
-from bidex_meta.tasks.goals import frozen_goal, observe_goal
-from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
-from bidex_meta.tasks.reach import apart, reach
+from bidex_meta.tasks.base import FAST
+from bidex_meta.tasks.goals import frozen_goal
+from bidex_meta.tasks.layout import goal_blocks, handle_blocks, object_blocks
+from bidex_meta.tasks.reach import ReachTask, apart
 from bidex_meta.tasks.scene import SceneObject
 from bidex_meta.tasks.state import TaskState
-from bidex_meta.tasks.variation import VariationSpace, component, join
+from bidex_meta.tasks.variation import component, join
 from bidex_meta.utils.maths import quaternion_from_rpy, xyzw
 
 _BASE = (0.0, 0.0, 0.7)
-_SHIFT = 0.05
 _TRAVEL = 0.5 * math.pi
-_NEARLY_OPEN = (1.3, 1.57)
-_NEARLY_SHUT = (0.0, 0.15)
 _OPEN_DISTANCE = 0.5
 """Of the two handles along y, metres."""
 _LEAST_SHARE = 0.1
@@ -31,55 +28,41 @@ pushed against its stop, which yields, more than 0.5 m."""
 _SHUT_ANGLE = 0.1 * _TRAVEL
 _HANDLE_DEPTH = 0.04
 _DAMPED = "The hinges are damped by 10 N m s/rad, the original's by 1: so a door does not fly open at a bump."
-_APART = "Success asks both leaves to open; the original's, handles 0.5 m apart along y, a leaf against its stop meets."
-_SHUT = (
-    "Success asks for shut leaves; the original's, handles less than 0.5 m apart, accepts them 60 degrees open.",
-    _DAMPED,
-)
 
 
-class _Door(TaskClass):
+class _Door(ReachTask):
     """A double swing door that two hands open or close.
 
     Leaf and handle of the right hand are those at +y. Success of the classes that open is measured along y, since a
     leaf alone makes a full distance of 0.5 m at 1.26 rad. A task freezes the door's place along y and one start angle
-    for both leaves, which start at rest; an episode draws nothing. The goal block holds the base pose, which is also
-    the object's. d_target is the full distance of the two handle points. The Inward classes have the same door turned
-    upside down, so that it swings towards the hands; their handle points lie behind the pulls that then face the hands.
-
-    Attributes:
-        opens: Whether the class opens the door or closes it.
-        inward: Whether the leaves swing towards the hands.
+    for both leaves; an episode draws nothing. The goal block holds the base pose, also the object's. The Inward classes
+    have the same door upside down, so that it swings towards the hands; their handle points lie behind the pulls that
+    then face the hands.
     """
 
-    opens: ClassVar[bool]
     inward: ClassVar[bool]
     episode_steps = 250
     right = HandPose((0.55, 0.2, 0.6), PALM_LEFT_AHEAD)
     left = HandPose((0.55, -0.2, 0.6), PALM_RIGHT_AHEAD)
-    transition_scale = 0.5
-    orientation_scale = 0.5
+    transition_scale, orientation_scale = 0.5, 0.5
     start_draws = 0
-    deviations = (_APART, _DAMPED)
     solver = FAST
-    camera_target = (0.05, 0.0, 0.68)
-    camera_distance = 2.0
-
-    @property
-    def variation_space(self) -> VariationSpace:
-        """The base's shift along y, metres; the start angle of both leaves, radians."""
-        angles = _NEARLY_SHUT if self.opens else _NEARLY_OPEN
-        return join(component("base_y", -_SHIFT, _SHIFT), component("start_angle", *angles))
-
+    points = ("object/left_handle_position", "object/right_handle_position")
+    constant = 0.2
+    camera_target, camera_distance = (0.05, 0.0, 0.68), 2.0
     blocks = (
-        *object_blocks("object", "object"),
+        *object_blocks("object"),
         *goal_blocks("goal"),
-        point_block("right_handle_position", "object/right_handle_position", "behind the right leaf's pull"),
-        point_block("left_handle_position", "object/left_handle_position", "behind the left leaf's pull"),
+        *handle_blocks("object", "behind the right leaf's pull", "behind the left leaf's pull"),
     )
 
+    def __init__(self, moving_base: bool | None = None) -> None:
+        super().__init__(moving_base)
+        # Upright, or upside down about y.
+        self.objects = (SceneObject("object", "door", _BASE, (0.0, math.pi if self.inward else 0.0, 0.0)),)
+
     def add_objects(self, scene: mujoco.MjSpec) -> None:
-        SceneObject("object", "door", _BASE, self._base_rpy).add_to(scene)
+        self.objects[0].add_to(scene)
         if self.inward:
             for side in ("right", "left"):
                 handle = scene.site(f"object/{side}_handle")
@@ -89,7 +72,7 @@ class _Door(TaskClass):
         """``goal``: the base pose (n, 7); ``goal_inverse``: inverse rotation (n, 4); ``angle``: both leaves' (n, 1)."""
         position = variation.new_tensor(_BASE).repeat(len(variation), 1)
         position[:, 1] += variation[:, 0]
-        turn = xyzw(variation.new_tensor(quaternion_from_rpy(self._base_rpy))).expand(len(variation), 4)
+        turn = xyzw(variation.new_tensor(quaternion_from_rpy(self.objects[0].rpy))).expand(len(variation), 4)
         return {**frozen_goal(torch.cat((position, turn), dim=1)), "angle": variation[:, 1:]}
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
@@ -97,100 +80,80 @@ class _Door(TaskClass):
         for leaf in (1, 2):
             qpos[f"object/hinge{leaf}"].copy_(frozen["angle"])
 
-    def observe(self, state: TaskState) -> dict[str, Tensor]:
-        return observe_goal(state, "object/quaternion")
 
-    def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
-        """0.2 - d_left - d_right + 2 d_target (open) or 2 (1 - d_target) (close)."""
-        target = self._distance(state)
-        return {
-            "left": -reach(state, "left", "object/left_handle_position"),
-            "right": -reach(state, "right", "object/right_handle_position"),
-            "target": 2.0 * target if self.opens else 2.0 * (1.0 - target),
-            "constant": torch.full_like(target, 0.2),
-        }
+class _Open(_Door):
+    formula = "0.2 - d_left - d_right + 2 d, d between the two handles"
+    solved = "handles more than 0.5 m apart along y, each at least 10 cm from the middle"
+    deviations = (
+        "Success asks both leaves to open; the original's, handles 0.5 m apart along y, a leaf against its stop meets.",
+        _DAMPED,
+    )
+    variation_space = join(component("base_y", -0.05, 0.05), component("start_angle", 0.0, 0.15))
+
+    def target(self, state: TaskState) -> Tensor:
+        return 2.0 * apart(state, *self.points)
 
     def success(self, state: TaskState) -> Tensor:
-        if self.opens:
-            middle = state["object/position"][:, 1]
-            right = state["object/right_handle_position"][:, 1] - middle
-            left = middle - state["object/left_handle_position"][:, 1]
-            return (right + left > _OPEN_DISTANCE) & (right > _LEAST_SHARE) & (left > _LEAST_SHARE)
+        middle = state["object/position"][:, 1]
+        right = state["object/right_handle_position"][:, 1] - middle
+        left = middle - state["object/left_handle_position"][:, 1]
+        return (right + left > _OPEN_DISTANCE) & (right > _LEAST_SHARE) & (left > _LEAST_SHARE)
+
+
+class _Close(_Door):
+    formula = "0.2 - d_left - d_right + 2 (1 - d), d between the two handles"
+    solved = "both leaves within a tenth of their travel of shut"
+    deviations = (
+        "Success asks for shut leaves; the original's, handles less than 0.5 m apart, accepts them 60 degrees open.",
+        _DAMPED,
+    )
+    variation_space = join(component("base_y", -0.05, 0.05), component("start_angle", 1.3, 1.57))
+
+    def target(self, state: TaskState) -> Tensor:
+        return 2.0 * (1.0 - apart(state, *self.points))
+
+    def success(self, state: TaskState) -> Tensor:
         first, second = (state[f"object/hinge{leaf}_angle"][:, 0] for leaf in (1, 2))
         return (first < _SHUT_ANGLE) & (second < _SHUT_ANGLE)
 
-    @property
-    def _base_rpy(self) -> tuple[float, float, float]:
-        """Orientation of the door's base: upright, or upside down about y."""
-        return (0.0, math.pi, 0.0) if self.inward else (0.0, 0.0, 0.0)
 
-    def _distance(self, state: TaskState) -> Tensor:
-        """Distance (m) between the two handle points, shape (n,)."""
-        return apart(state, "object/left_handle_position", "object/right_handle_position")
-
-
-class DoorOpenOutward(_Door):
-    """Push a double door open.
-
-    Observation: Table 20 (428). Reward: equation 7.
-    """
+class DoorOpenOutward(_Open):
+    """Push a double door open. Observation: Table 20 (428). Reward: equation 7."""
 
     needs = Capacity(44, 0, 96)
     name = "DoorOpenOutward"
     summary = "Push a double door open"
-    formula = "0.2 - d_left - d_right + 2 d, d between the two handles"
-    solved = "handles more than 0.5 m apart along y, each at least 10 cm from the middle"
-    opens = True
     inward = False
 
 
-class DoorCloseInward(_Door):
-    """Push a double door shut that stands open towards the hands.
+class DoorCloseInward(_Close):
+    """Push a double door shut that stands open towards the hands. Observation: Table 20 (428). Reward: equation 8.
 
-    Observation: Table 20 (428). Reward: equation 8. The hands start
-    farther out than in the other door classes, beside the open leaves.
+    The hands start farther out than in the other door classes, beside the open leaves.
     """
 
     needs = Capacity(38, 0, 77)
     name = "DoorCloseInward"
     summary = "Push a double door shut that stands open towards the hands"
-    formula = "0.2 - d_left - d_right + 2 (1 - d), d between the two handles"
-    solved = "both leaves within a tenth of their travel of shut"
-    deviations = _SHUT
-    opens = False
     inward = True
     right = HandPose((0.9, 0.5, 0.6), PALM_LEFT_AHEAD)
     left = HandPose((0.9, -0.5, 0.6), PALM_RIGHT_AHEAD)
-    camera_target = (0.3, 0.0, 0.65)
-    camera_distance = 2.3
+    camera_target, camera_distance = (0.3, 0.0, 0.65), 2.3
 
 
-class DoorOpenInward(_Door):
-    """Pull a double door open by its handles.
-
-    Observation: Table 22 (428). Reward: equation 9.
-    """
+class DoorOpenInward(_Open):
+    """Pull a double door open by its handles. Observation: Table 22 (428). Reward: equation 9."""
 
     needs = Capacity(40, 0, 88)
     name = "DoorOpenInward"
     summary = "Pull a double door open by its handles"
-    formula = "0.2 - d_left - d_right + 2 d, d between the two handles"
-    solved = "handles more than 0.5 m apart along y, each at least 10 cm from the middle"
-    opens = True
     inward = True
 
 
-class DoorCloseOutward(_Door):
-    """Pull a double door shut by its handles that stands open away from the hands.
-
-    Observation: Table 22 (428). Reward: equation 10.
-    """
+class DoorCloseOutward(_Close):
+    """Pull a door shut by its handles that stands open away from the hands. Table 22 (428), equation 10."""
 
     needs = Capacity(37, 0, 98)
     name = "DoorCloseOutward"
     summary = "Pull a double door shut by its handles"
-    formula = "0.2 - d_left - d_right + 2 (1 - d), d between the two handles"
-    solved = "both leaves within a tenth of their travel of shut"
-    deviations = _SHUT
-    opens = False
     inward = False

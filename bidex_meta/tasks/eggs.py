@@ -1,22 +1,21 @@
-"""What the throwing and catching classes share: an egg, its goal pose, the exponential reward of equations 1 to 5.
+"""What the throwing and catching classes share: eggs, their goal poses, the exponential reward of equations 1 to 5."""
 
-``OneEgg`` is the part that the four classes with one egg have in common; their files hold the figures.
-"""
-
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable, Mapping
+from types import MappingProxyType
 from typing import ClassVar
 
 import mujoco
 import torch
 from torch import Tensor
 
+from bidex_meta.hands.hand import SIDES
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.hands.starts import make_room, noisy_joints
 from bidex_meta.tasks.base import LIGHT, TaskClass
 from bidex_meta.tasks.goals import frozen_goal, observe_goal, rotation_difference
-from bidex_meta.tasks.layout import goal_blocks, object_blocks
+from bidex_meta.tasks.layout import Block, goal_blocks, object_blocks
 from bidex_meta.tasks.objects.held import EGG, HeldObject, held_object
-from bidex_meta.tasks.scene import SceneObject
+from bidex_meta.tasks.scene import Point, SceneObject
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace, box, join, orientation
 from bidex_meta.utils.maths import conjugate, constant, norm, random_orientation, rotate, rotation_angle, wxyz, xyzw
@@ -29,6 +28,21 @@ SUCCESS_DISTANCE = 0.03
 """Object within this distance of its goal, metres."""
 GOAL_RANGE = 0.03
 """Half width of the goals' box, metres."""
+_ANCHOR_RADIUS = 0.1
+_GREEN = (0.45, 0.62, 0.30, 1.0)
+
+
+def goal_object_blocks(numbers: Iterable[str]) -> tuple[Block, ...]:
+    """For ``""``, or ``"1"`` and ``"2"``, the blocks of ``object`` or ``object1``, ... and its goal."""
+    return tuple(block for i in numbers for block in (*object_blocks(f"object{i}"), *goal_blocks(f"goal{i}")))
+
+
+def observe_goals(state: TaskState, numbers: Iterable[str]) -> dict[str, Tensor]:
+    """The goal blocks of ``goal_object_blocks``."""
+    found = {}
+    for i in numbers:
+        found |= observe_goal(state, f"object{i}/quaternion", f"goal{i}")
+    return found
 
 
 def goal_pose(position: Tensor, draws: Tensor) -> Tensor:
@@ -44,12 +58,9 @@ def start_hands(draws: Tensor, noise: float, qpos: dict[str, Tensor]) -> None:
 
 
 def start_egg(qpos: Tensor, draws: Tensor, noise: float) -> None:
-    """Shifts an egg from its nominal start and turns it at random.
+    """Shifts an egg (n, 7), in place, by up to ``noise`` (m) from its nominal start and turns it at random.
 
-    Args:
-        qpos: The egg's positions (n, 7), written in place.
-        draws: Numbers in [-1, 1], shape (n, 5): three of position, two of orientation.
-        noise: Half width of the position noise, metres.
+    Draws in [-1, 1], shape (n, 5): three of position, two of orientation.
     """
     qpos[:, :3] += noise * draws[:, :3]
     qpos[:, 3:] = wxyz(random_orientation(draws[:, 3], draws[:, 4]))
@@ -60,12 +71,8 @@ def lay_egg_on_hand(
 ) -> None:
     """Lifts an egg, or what a spheroid bounds, off the palm it lies on and opens the fingers that would stick in it.
 
-    Args:
-        egg: The egg's positions (n, 7), written in place.
-        joints: That hand's joint angles (n, 24), written in place.
-        pose: Start pose of that hand.
-        radius: Short semi-axis, metres.
-        half: Long semi-axis, metres.
+    Positions of the egg (n, 7) and joint angles of the hand (n, 24), which starts at ``pose``, are written in place.
+    ``radius`` and ``half`` are the short and the long semi-axis, metres.
     """
     quaternion = xyzw(constant(pose.quaternion, egg))
     inverse = conjugate(quaternion)
@@ -79,16 +86,11 @@ def lay_egg_on_hand(
 def put_down(
     place: Tensor, held: HeldObject | None, draws: Tensor, noise: float, joints: Tensor | None, pose: HandPose
 ) -> None:
-    """The start of an egg, in any orientation, or of what takes its place, on a broad side; clear of the hand.
+    """The start of an egg, in any orientation, or of an object in its place, on a broad side; clear of the hand.
 
-    Args:
-        place: Its positions (n, 7), written in place.
-        held: What it is; None: an egg.
-        draws: As of ``start_egg``.
-        noise: Half width of the position noise, metres.
-        joints: Joint angles (n, 24) of the hand that it lies on, written in place; None where it lies on none: what
-            reaches further down than an egg then starts so much higher.
-        pose: Start pose of that hand.
+    Its positions (n, 7) and the joint angles (n, 24) of the hand that it lies on are written in place. Without joints
+    it lies on none: an object that reaches further down than an egg then starts so much higher. Draws and noise as of
+    ``start_egg``.
     """
     if held is None:
         start_egg(place, draws, noise)
@@ -111,47 +113,45 @@ def distances(state: TaskState, egg: str, goal: str) -> tuple[Tensor, Tensor]:
     return translation, state.once(("angle", egg), lambda: rotation_angle(difference))
 
 
-def pose_reward(state: TaskState, egg: str, goal: str, alpha: float) -> Tensor:
-    """exp(-0.2 (alpha d_t + d_r)), shape (n,)."""
-    translation, rotation = distances(state, egg, goal)
-    return torch.exp(-0.2 * (alpha * translation + rotation))
-
-
-class OneEgg(TaskClass):
-    """Throw an egg to a goal pose at the other hand.
+class EggTask(TaskClass):
+    """Throw each egg to a goal pose at the other hand; all goals share an orientation, all eggs a start noise.
 
     Attributes:
-        egg_start: Nominal start of the egg, world, metres.
-        goal_centre: Centre of the goals' box, world, metres.
-        position_noise: Half width of the egg's position noise at a start, metres.
+        starts: Nominal start of each egg, world, metres: of one that lies on the right hand, and of one on the left.
+        goals: Centre of the box of each egg's goals, world, metres.
+        position_noise: Half width of the eggs' position noise at a start, metres.
         joint_noise: Joint noise at a start, a share of each joint's range.
-        lies_on_right_hand: Whether the egg starts on the right palm, so that room is made for it.
+        lies_on_hand: Whether an egg starts on a palm, so that room is cleared for it.
         alpha: Weight of the distance in the reward, per metre.
-        floor: The episode fails when the egg's height falls to this, metres.
+        floor: The episode fails when an egg's height falls to this, metres.
+        anchors: The episode fails when a point is 0.1 m off its anchor (world, metres); by the point's sensor.
+        numbers: Ends of the names of eggs and goals.
     """
 
     formula = "exp(-0.2 (50 d + r)), d and r the distance and the angle between egg and goal"
     solved = "egg within 3 cm of its goal"
-    egg_start: ClassVar[tuple[float, float, float]]
-    goal_centre: ClassVar[tuple[float, float, float]]
+    starts: ClassVar[tuple[Point, ...]]
+    goals: ClassVar[tuple[Point, ...]]
     position_noise: ClassVar[float]
     joint_noise: ClassVar[float]
-    lies_on_right_hand: ClassVar[bool] = True
+    lies_on_hand: ClassVar[bool] = True
     alpha: ClassVar[float] = 50.0
     floor: ClassVar[float]
+    anchors: ClassVar[Mapping[str, Point]] = MappingProxyType({})
     start_draws: ClassVar[int] = JOINT_DRAWS + 5
+    numbers: ClassVar[tuple[str, ...]] = ("",)
+    blocks = goal_object_blocks(("",))
     solver = LIGHT
 
     def __init__(self, moving_base: bool | None = None, object: str = EGG) -> None:
         """Chooses the base and the object: ``"egg"``, a name of the shelf, or an MJCF file (docs/objects.md).
 
-        Raises:
-            BidexError: There is no such object, or its file holds none for a hand.
+        Raises BidexError where there is no such object, or its file holds none for a hand.
         """
         super().__init__(moving_base)
         self.held = held_object(object)
         if self.held is not None:
-            self.needs = self.held.needs(self.needs)
+            self.needs = self.held.needs(self.needs, len(self.starts))
 
     @property
     def scene_key(self) -> tuple[Hashable, ...]:
@@ -159,39 +159,53 @@ class OneEgg(TaskClass):
 
     @property
     def variation_space(self) -> VariationSpace:
-        """Goal position (world, metres) and the two draws of its orientation."""
-        return join(box("goal", self.goal_centre, GOAL_RANGE), orientation("goal"))
-
-    blocks = (*object_blocks("object", "object"), *goal_blocks("goal"))
+        """Goal positions (world, metres) and the two draws of the goals' orientation."""
+        boxes = (box(f"goal{i}", centre, GOAL_RANGE) for i, centre in zip(self.numbers, self.goals, strict=True))
+        return join(*boxes, orientation("goal"))
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
-        if self.held is None:
-            SceneObject("object", "egg", self.egg_start).add_to(scene)
-        else:
-            self.held.add_to(scene, "object", self.egg_start)
+        for i, position, colour in zip(self.numbers, self.starts, (None, _GREEN), strict=False):
+            if self.held is None:
+                SceneObject(f"object{i}", "egg", position, colour=colour).add_to(scene)
+            else:
+                self.held.add_to(scene, f"object{i}", position, colour)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """``goal``: the goal pose, (n, 7); ``goal_inverse``: the inverse of its rotation, (n, 4)."""
-        return frozen_goal(goal_pose(variation[:, :3], variation[:, 3:]))
+        """``goal``, or ``goal1`` and ``goal2``: poses (n, 7); ``..._inverse``: inverses of their rotations (n, 4)."""
+        frozen = {}
+        for k, i in enumerate(self.numbers):
+            frozen |= frozen_goal(goal_pose(variation[:, 3 * k : 3 * k + 3], variation[:, -2:]), f"goal{i}")
+        return frozen
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
         start_hands(draws[:, :JOINT_DRAWS], self.joint_noise, qpos)
-        joints = qpos["right/joints"] if self.lies_on_right_hand else None
-        put_down(qpos["object"], self.held, draws[:, JOINT_DRAWS:], self.position_noise, joints, self.right)
+        for i, side, pose in zip(self.numbers, SIDES, (self.right, self.left), strict=False):
+            joints = qpos[f"{side}/joints"] if self.lies_on_hand else None
+            put_down(qpos[f"object{i}"], self.held, draws[:, JOINT_DRAWS:], self.position_noise, joints, pose)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        return observe_goal(state, "object/quaternion")
+        return observe_goals(state, self.numbers)
 
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
-        """``pose``: exp(-0.2 (alpha d_t + d_r))."""
-        return {"pose": pose_reward(state, "object", "goal", self.alpha)}
+        """``pose``, or ``pose1`` and ``pose2``: exp(-0.2 (alpha d_t + d_r))."""
+        terms = {}
+        for i in self.numbers:
+            translation, rotation = distances(state, f"object{i}", f"goal{i}")
+            terms[f"pose{i}"] = torch.exp(-0.2 * (self.alpha * translation + rotation))
+        return terms
 
     def success(self, state: TaskState) -> Tensor:
-        return distances(state, "object", "goal")[0] < SUCCESS_DISTANCE
+        off = torch.stack([distances(state, f"object{i}", f"goal{i}")[0] for i in self.numbers])
+        return (off < SUCCESS_DISTANCE).all(dim=0)
 
     def failed(self, state: TaskState) -> Tensor:
-        """The egg dropped: the reward is positive throughout, so an early end is never worth seeking."""
-        return state["object/position"][:, 2] <= self.floor
+        """An egg dropped or a hand left: the reward is positive throughout, so an early end is never worth seeking."""
+        ends = [state[f"object{i}/position"][:, 2] <= self.floor for i in self.numbers]
+        for name, anchor in self.anchors.items():
+            point = state[name]
+            ends.append(norm(point - constant(anchor, point)) >= _ANCHOR_RADIUS)
+        return torch.stack(ends).any(dim=0)
 
-    def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
-        return [(frozen["goal"], SEMI_AXES if self.held is None else self.held.half_extents)]
+    def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, Point]]:
+        size = SEMI_AXES if self.held is None else self.held.half_extents
+        return [(frozen[f"goal{i}"], size) for i in self.numbers]

@@ -12,20 +12,12 @@ def frozen_goal(pose: Tensor, goal: str = "goal") -> dict[str, Tensor]:
 
 
 def rotation_difference(state: TaskState, sensor: str, goal: str = "goal") -> Tensor:
-    """A body's quaternion times the inverse of its goal's, (x, y, z, w), shape (n, 4).
-
-    Args:
-        state: A transition.
-        sensor: Sensor of the body's orientation.
-        goal: Name of the frozen goal.
-    """
+    """A body's quaternion, by its sensor, times the inverse of its frozen goal's, (x, y, z, w), shape (n, 4)."""
     inverse = state.frozen[f"{goal}_inverse"]
     return state.once(("difference", sensor, goal), lambda: multiply(state.quaternion(sensor), inverse))
 
 
 def observe_goal(state: TaskState, sensor: str, goal: str = "goal") -> dict[str, Tensor]:
     """The two goal blocks of a body whose orientation that sensor gives."""
-    return {
-        f"{goal}_pose": state.frozen[goal],
-        f"{goal}_rotation_difference": rotation_difference(state, sensor, goal),
-    }
+    difference = rotation_difference(state, sensor, goal)
+    return {f"{goal}_pose": state.frozen[goal], f"{goal}_rotation_difference": difference}

@@ -1,24 +1,23 @@
 """GraspAndPlace: docs/figures.md, classes (the appendix has a picture of it and no section)."""
 
-import mujoco
 import torch
 from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
-from bidex_meta.tasks.base import FAST, TaskClass
+from bidex_meta.tasks.base import FAST
 from bidex_meta.tasks.bucket import inside_bucket, stands
 from bidex_meta.tasks.layout import Block, object_blocks, point_block
-from bidex_meta.tasks.placement import DRAWS, place_all, placed
-from bidex_meta.tasks.reach import apart, reach
-from bidex_meta.tasks.scene import SceneObject, add_table
+from bidex_meta.tasks.placement import DRAWS, placed
+from bidex_meta.tasks.reach import ReachTask, apart
+from bidex_meta.tasks.scene import SceneObject, Table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import join
 
 _TURN = "quaternion (x, y, z, w), world frame"
 
 
-class GraspAndPlace(TaskClass):
+class GraspAndPlace(ReachTask):
     """Put a block into a bucket: the left hand takes the block, the right hand the bucket.
 
     Table 1 x 1 m, 60 cm high. Observation: the original's (425; docs/figures.md, observation). Reward: its formula with
@@ -38,43 +37,29 @@ class GraspAndPlace(TaskClass):
     episode_steps = 500
     right = HandPose((0.55, 0.2, 0.8), PALM_DOWN_AHEAD)
     left = HandPose((0.55, -0.2, 0.8), PALM_DOWN_AHEAD)
-    transition_scale = 0.5
-    orientation_scale = 0.1
+    transition_scale, orientation_scale = 0.5, 0.1
     start_draws = 2 * DRAWS
     solver = FAST
-    camera_target = (0.1, 0.0, 0.68)
-    camera_distance = 1.7
-
+    table = Table((1.0, 1.0, 0.6), (0.0, 0.0, 0.3))
+    objects = (
+        SceneObject("bucket", "bucket", (0.0, 0.2, 0.657)),
+        SceneObject("block", "cube", (0.0, -0.2, 0.625), colour=(0.85, 0.43, 0.30, 1.0)),
+    )
+    points = ("block/position", "bucket/position")
+    exponential = True
+    terms = ("left", "right", "target")
+    camera_target, camera_distance = (0.1, 0.0, 0.68), 1.7
     variation_space = join(placed("bucket"), placed("block"))
-    """Shift and turn of bucket and block."""
-
     blocks = (
-        *object_blocks("bucket", "bucket"),
+        *object_blocks("bucket"),
         point_block("bucket_position", "bucket/position", "origin of the bucket"),
         Block("bucket_link_quaternion", 4, ("bucket/quaternion",), description=_TURN),
         point_block("block_position", "block/position", "centre of the block"),
         Block("block_quaternion", 4, ("block/quaternion",), description=_TURN),
     )
 
-    def add_objects(self, scene: mujoco.MjSpec) -> None:
-        add_table(scene, (1.0, 1.0, 0.6), (0.0, 0.0, 0.3))
-        SceneObject("bucket", "bucket", (0.0, 0.2, 0.657)).add_to(scene)
-        SceneObject("block", "cube", (0.0, -0.2, 0.625), colour=(0.85, 0.43, 0.30, 1.0)).add_to(scene)
-
-    def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """``bucket``, ``block``: shifts and turns, each (n, 3)."""
-        return {"bucket": variation[:, :3], "block": variation[:, 3:]}
-
-    def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        place_all(("bucket", "block"), qpos, frozen, draws)
-
-    def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
-        """``left`` exp(-10 d_left), ``right`` exp(-10 d_right), ``target`` 2 exp(-10 d)."""
-        return {
-            "left": torch.exp(-10.0 * reach(state, "left", "block/position")),
-            "right": torch.exp(-10.0 * reach(state, "right", "bucket/position")),
-            "target": 2.0 * torch.exp(-10.0 * apart(state, "bucket/position", "block/position")),
-        }
+    def target(self, state: TaskState) -> Tensor:
+        return 2.0 * torch.exp(-10.0 * apart(state, "bucket/position", "block/position"))
 
     def success(self, state: TaskState) -> Tensor:
         block, turn = state["block/position"][:, None], state.quaternion("bucket/quaternion")

@@ -3,10 +3,10 @@
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
 from bidex_meta.tasks.base import GENTLE
-from bidex_meta.tasks.eggs import OneEgg
+from bidex_meta.tasks.eggs import EggTask
 
 
-class HandOver(OneEgg):
+class HandOver(EggTask):
     """Pass an egg from one upturned palm to the other across a gap of 4 cm.
 
     Observation: Table 8 (398) with the fixed base, 422 with the moving one that the suites use. Reward: equation 1.
@@ -21,11 +21,9 @@ class HandOver(OneEgg):
     right = HandPose((0.0, 0.0, 0.5), PALM_UP_AWAY)
     left = HandPose((0.0, -1.0, 0.5), PALM_UP_BACK)
     # With a moving base the figures of CatchUnderarm hold (docs/figures.md, decisions); the original gives none.
-    transition_scale = 0.05
-    orientation_scale = 0.5
-    egg_start = (0.0, -0.39, 0.54)
-    goal_centre = (0.0, -0.64, 0.54)
-    position_noise = 0.01
-    joint_noise = 0.2
+    transition_scale, orientation_scale = 0.05, 0.5
+    starts = ((0.0, -0.39, 0.54),)
+    goals = ((0.0, -0.64, 0.54),)
+    position_noise, joint_noise = 0.01, 0.2
     floor = 0.2
     solver = GENTLE

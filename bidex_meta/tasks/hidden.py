@@ -1,7 +1,6 @@
 """Task variables that affect reward or success but are hidden in ML suites (only masked entries show them).
 
-They are computed: each frozen number of a task is replaced by NaN in turn, and what becomes NaN depends on it. So no
-state near a goal is needed, and a class cannot declare one thing and do another.
+Each frozen number of a task is replaced by NaN in turn, and what becomes NaN depends on it.
 """
 
 from collections.abc import Callable, Iterable
@@ -24,20 +23,26 @@ Frozen = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class Hidden:
-    """Components of a variation that only masked entries show, in the order of the variation space."""
+    """Components of a variation that only masked entries show, in the order of the variation space.
+
+    ``reward``: those that affect the reward of a given state; ``success``: those that affect its success alone.
+    """
 
     reward: tuple[str, ...]
-    """Those that affect the reward of a given state."""
     success: tuple[str, ...]
-    """Those that affect its success alone."""
 
 
 def hidden(task: TaskClass) -> Hidden:
     """The task variables that meta suites hide; a fixture's pose is not among them, since other entries show it."""
-    scene = compile_scene(task)
-    sensors = _sensors(scene)
-    names, variations = task.variation_space.names, _one_changed_at_a_time(task)
-    frozen = task.freeze(variations)
+    scene, space = compile_scene(task), task.variation_space
+    data = mujoco.MjData(scene.model)
+    data.qpos[:] = scene.start_qpos[: scene.model.nq]
+    mujoco.mj_forward(scene.model, data)
+    sensors, names = torch.from_numpy(data.sensordata.copy())[None], space.names
+    low, high = (torch.tensor(ends, dtype=torch.float64) for ends in (space.low, space.high))
+    # A variation, and for each of its components one that differs in this alone, (1 + size, size).
+    base = low + 0.2 * (high - low)
+    frozen = task.freeze(torch.cat((base[None], base + 0.35 * torch.diag(high - low))))
     goal = [block.name for block in task.layout.blocks if block.goal]
 
     def moved(judge: Callable[[TaskState], Iterable[Tensor]]) -> set[str]:
@@ -48,26 +53,15 @@ def hidden(task: TaskClass) -> Hidden:
             found |= {name for name, other in zip(names, values[1:].tolist(), strict=True) if other != values[0]}
         return found
 
+    def compared(state: TaskState) -> list[Tensor]:
+        with _Comparisons() as comparisons:
+            task.success(state)
+        return comparisons.operands
+
     shown = moved(lambda state: [task.observe(state)[name] for name in goal]) - _fixtures(task, scene, frozen)
     of_reward = moved(lambda state: task.reward_terms(state).values()) & shown
-    of_success = (moved(lambda state: _compared(task, state)) & shown) - of_reward
+    of_success = (moved(compared) & shown) - of_reward
     return Hidden(*(tuple(name for name in names if name in chosen) for chosen in (of_reward, of_success)))
-
-
-def _one_changed_at_a_time(task: TaskClass) -> Tensor:
-    """A variation, and for each of its components one that differs in this alone, (1 + size, size)."""
-    low, high = (
-        torch.tensor(ends, dtype=torch.float64) for ends in (task.variation_space.low, task.variation_space.high)
-    )
-    return torch.cat(((low + 0.2 * (high - low))[None], low + 0.2 * (high - low) + 0.35 * torch.diag(high - low)))
-
-
-def _sensors(scene: Scene) -> Tensor:
-    """Sensor values at the nominal start, (1, nsensordata)."""
-    data = mujoco.MjData(scene.model)
-    data.qpos[:] = scene.start_qpos[: scene.model.nq]
-    mujoco.mj_forward(scene.model, data)
-    return torch.from_numpy(data.sensordata.copy())[None]
 
 
 def _used(
@@ -90,19 +84,12 @@ class _Comparisons(TorchFunctionMode):
 
     def __init__(self) -> None:
         super().__init__()
-        self.seen: list[Tensor] = []
+        self.operands: list[Tensor] = []
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if getattr(func, "__name__", "") in _COMPARISONS:
-            self.seen += [each for each in args if isinstance(each, Tensor)]
+            self.operands += [each for each in args if isinstance(each, Tensor)]
         return func(*args, **(kwargs or {}))
-
-
-def _compared(task: TaskClass, state: TaskState) -> list[Tensor]:
-    """All tensors that success compares."""
-    with _Comparisons() as comparisons:
-        task.success(state)
-    return comparisons.seen
 
 
 def _fixtures(task: TaskClass, scene: Scene, frozen: Frozen) -> set[str]:

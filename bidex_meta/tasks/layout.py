@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 
 from bidex_meta.hands.hand import FINGERS, SIDES, hand
 
@@ -12,6 +11,13 @@ FORCE_SCALE = 10.0
 """Scale of joint forces and of fingertip forces and torques (docs/figures.md, observation)."""
 CLIP = 5.0
 """Every entry is clipped to +-5 after its scale (docs/figures.md, control)."""
+_JOINT_POSITION = "joint angles, mapped from the joint's range to [-1, 1]"
+_JOINT_VELOCITY = "joint velocities, 0.2 rad/s"
+_JOINT_FORCE = "actuator force at the joint, 10 N m; 0 for the coupled distal joints"
+_TIP_STATE = "per distal body: origin (m), quaternion (x, y, z, w), velocities (m/s, rad/s), world frame"
+_TIP_WRENCH = "per distal body: force (10 N), torque (10 N m) at its origin, body frame, no weight"
+_POSE = "position (m) and quaternion (x, y, z, w), world frame"
+_DIFFERENCE = "object times inverse goal quaternion, (x, y, z, w)"
 
 
 @dataclass(frozen=True)
@@ -19,11 +25,9 @@ class Block:
     """Consecutive entries of an observation.
 
     Attributes:
-        name: What it is, e.g. ``right_joint_position``.
-        size: Number of entries.
         sensors: Names of the sensors it is read from, in order; empty if the entries are computed.
         scale: Factor on the sensors' values.
-        goal: Whether it tells the goal, so that meta suites zero it.
+        goal: Whether it shows the goal, so that meta suites zero it.
         description: One line for documentation, with unit and frame.
     """
 
@@ -55,58 +59,32 @@ class Layout:
 
     def range(self, name: str) -> slice:
         """Index range of the named block; KeyError if there is none."""
-        if name not in self._ranges:
-            raise KeyError(f"No block {name!r}; there are {', '.join(self._ranges)}")
-        return self._ranges[name]
-
-    @cached_property
-    def _ranges(self) -> dict[str, slice]:
-        return {block.name: where for block, where in self}
+        ranges = {block.name: where for block, where in self}
+        if name not in ranges:
+            raise KeyError(f"No block {name!r}; there are {', '.join(ranges)}")
+        return ranges[name]
 
     def goal_indices(self) -> list[int]:
-        """Indices of all entries that tell the goal."""
+        """Indices of all entries that show the goal."""
         return [i for block, where in self if block.goal for i in range(where.start, where.stop)]
 
 
 def hand_blocks(side: str, moving: bool) -> tuple[Block, ...]:
     """One hand's share of Table 7 (199 entries; 187 with a fixed base: no base entries, 20 actions)."""
-    joints = hand().joints
+    joints = [f"{side}/{joint}" for joint in hand().joints]
     tips = [f"{side}/{finger}distal" for finger in FINGERS]
     kinds = ("position", "quaternion", "linear_velocity", "angular_velocity")
+    states = [f"{tip}_{kind}" for tip in tips for kind in kinds]
+    wrenches = [f"{tip}_{kind}" for tip in tips for kind in ("force", "torque")]
     blocks = [
-        Block(
-            f"{side}_joint_position",
-            len(joints),
-            tuple(f"{side}/{j}_position" for j in joints),
-            description="joint angles, mapped from the joint's range to [-1, 1]",
-        ),
-        Block(
-            f"{side}_joint_velocity",
-            len(joints),
-            tuple(f"{side}/{j}_velocity" for j in joints),
-            VELOCITY_SCALE,
-            description="joint velocities, 0.2 rad/s",
-        ),
-        Block(
-            f"{side}_joint_force",
-            len(joints),
-            tuple(f"{side}/{j}_force" for j in joints),
-            FORCE_SCALE,
-            description="actuator force at the joint, 10 N m; 0 for the coupled distal joints",
-        ),
-        Block(
-            f"{side}_fingertip_state",
-            65,
-            tuple(f"{tip}_{kind}" for tip in tips for kind in kinds),
-            description="per distal body: origin (m), quaternion (x, y, z, w), velocities (m/s, rad/s), world frame",
-        ),
-        Block(
-            f"{side}_fingertip_force_torque",
-            30,
-            tuple(f"{tip}_{kind}" for tip in tips for kind in ("force", "torque")),
-            FORCE_SCALE,
-            description="per distal body: force (10 N), torque (10 N m) at its origin, body frame, no weight",
-        ),
+        Block(f"{side}_{name}", size, tuple(sensors), scale, description=text)
+        for name, size, sensors, scale, text in (
+            ("joint_position", 24, [f"{joint}_position" for joint in joints], 1.0, _JOINT_POSITION),
+            ("joint_velocity", 24, [f"{joint}_velocity" for joint in joints], VELOCITY_SCALE, _JOINT_VELOCITY),
+            ("joint_force", 24, [f"{joint}_force" for joint in joints], FORCE_SCALE, _JOINT_FORCE),
+            ("fingertip_state", 65, states, 1.0, _TIP_STATE),
+            ("fingertip_force_torque", 30, wrenches, FORCE_SCALE, _TIP_WRENCH),
+        )
     ]
     if moving:
         blocks += [
@@ -118,42 +96,35 @@ def hand_blocks(side: str, moving: bool) -> tuple[Block, ...]:
     return tuple(blocks)
 
 
-def object_blocks(sensors: str, name: str) -> tuple[Block, ...]:
-    """Pose and velocities of a free object (13 entries), read from the sensors ``<sensors>/...``."""
+def object_blocks(sensors: str, name: str | None = None) -> tuple[Block, ...]:
+    """Pose and velocities of a free object (13 entries), ``<name>_...``, read from the sensors ``<sensors>/...``."""
+    name, spin = name or sensors, f"{sensors}/angular_velocity"
     return (
-        Block(
-            f"{name}_pose",
-            7,
-            (f"{sensors}/position", f"{sensors}/quaternion"),
-            description="position (m) and quaternion (x, y, z, w), world frame",
-        ),
+        Block(f"{name}_pose", 7, (f"{sensors}/position", f"{sensors}/quaternion"), description=_POSE),
         Block(f"{name}_linear_velocity", 3, (f"{sensors}/linear_velocity",), description="world frame, m/s"),
-        Block(
-            f"{name}_angular_velocity",
-            3,
-            (f"{sensors}/angular_velocity",),
-            VELOCITY_SCALE,
-            description="world frame, 0.2 rad/s",
-        ),
+        Block(f"{name}_angular_velocity", 3, (spin,), VELOCITY_SCALE, description="world frame, 0.2 rad/s"),
     )
 
 
 def goal_blocks(name: str) -> tuple[Block, ...]:
     """Goal pose and the rotation from goal to object (11 entries), zeroed in meta suites."""
     return (
-        Block(f"{name}_pose", 7, goal=True, description="position (m) and quaternion (x, y, z, w), world frame"),
-        Block(
-            f"{name}_rotation_difference",
-            4,
-            goal=True,
-            description="object times inverse goal quaternion, (x, y, z, w)",
-        ),
+        Block(f"{name}_pose", 7, goal=True, description=_POSE),
+        Block(f"{name}_rotation_difference", 4, goal=True, description=_DIFFERENCE),
     )
 
 
 def point_block(name: str, sensor: str, description: str) -> Block:
     """A point that moves with an object: its position (3 entries), read from one sensor."""
     return Block(name, 3, (sensor,), description=f"{description}, world frame, m")
+
+
+def handle_blocks(sensors: str, right: str, left: str) -> tuple[Block, Block]:
+    """The points ``<sensors>/<side>_handle_position`` with their descriptions (6 entries)."""
+    return (
+        point_block("right_handle_position", f"{sensors}/right_handle_position", right),
+        point_block("left_handle_position", f"{sensors}/left_handle_position", left),
+    )
 
 
 def both_hands(moving: bool) -> tuple[Block, ...]:

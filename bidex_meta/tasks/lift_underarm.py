@@ -2,19 +2,17 @@
 
 import math
 
-import mujoco
 import torch
 from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
 from bidex_meta.tasks.base import FAST
-from bidex_meta.tasks.goals import frozen_goal, observe_goal
-from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
+from bidex_meta.tasks.goals import frozen_goal
+from bidex_meta.tasks.layout import goal_blocks, handle_blocks, object_blocks
 from bidex_meta.tasks.objects.pointed import OwnObjectClass
-from bidex_meta.tasks.placement import DRAWS, place, placed, yaw_quaternion
-from bidex_meta.tasks.reach import reach
-from bidex_meta.tasks.scene import SceneObject, add_table
+from bidex_meta.tasks.placement import DRAWS, placed, yaw_quaternion
+from bidex_meta.tasks.scene import SceneObject, Table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import component, join
 from bidex_meta.utils.maths import norm, uprightness
@@ -24,7 +22,6 @@ _GOAL_SHIFT = 0.05
 _GOAL_HEIGHT = (0.25, 0.45)
 _SUCCESS_DISTANCE = 0.05
 _SUCCESS_TILT = math.radians(30.0)
-_SEMI_AXES = (0.12, 0.12, 0.06)
 
 
 class LiftUnderarm(OwnObjectClass):
@@ -47,62 +44,39 @@ class LiftUnderarm(OwnObjectClass):
     episode_steps = 500
     right = HandPose((0.0, 0.05, 0.45), PALM_UP_AWAY)
     left = HandPose((0.0, -1.25, 0.45), PALM_UP_BACK)
-    transition_scale = 0.25
-    orientation_scale = 1.0
+    transition_scale, orientation_scale = 0.25, 1.0
     start_draws = DRAWS
     solver = FAST
-    usual = SceneObject("object", "pot", _START)
-    camera_target = (0.0, -0.6, 0.55)
-    camera_distance = 1.5
-
+    table = Table((0.3, 0.3, 0.4), (0.0, -0.6, 0.2), friction=3.0)
+    objects = (SceneObject("object", "pot", _START),)
+    points = ("object/left_handle_position", "object/right_handle_position")
+    constant = 0.2
+    ghost = (0.12, 0.12, 0.06)
+    camera_target, camera_distance = (0.0, -0.6, 0.55), 1.5
     variation_space = join(
         placed("object"),
         *(component(f"goal_{axis}", -_GOAL_SHIFT, _GOAL_SHIFT) for axis in "xy"),
         component("goal_height", *_GOAL_HEIGHT),
     )
-    """The pot's shift and turn; the goal relative to the start, metres."""
     blocks = (
-        *object_blocks("object", "object"),
+        *object_blocks("object"),
         *goal_blocks("goal"),
-        point_block("right_handle_position", "object/right_handle_position", "beside the grip at +y"),
-        point_block("left_handle_position", "object/left_handle_position", "beside the grip at -y"),
+        *handle_blocks("object", "beside the grip at +y", "beside the grip at -y"),
     )
-
-    def add_objects(self, scene: mujoco.MjSpec) -> None:
-        add_table(scene, (0.3, 0.3, 0.4), (0.0, -0.6, 0.2), friction=3.0)
-        self.own.add_to(scene)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """``object``: the pot's placement (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse rotation (n, 4)."""
         placement = variation[:, :3]
         start = torch.cat((placement[:, :2], torch.zeros_like(placement[:, :1])), dim=1) + placement.new_tensor(_START)
-        turn = yaw_quaternion(placement[:, 2])
-        goal = torch.cat((start + variation[:, 3:], turn), dim=1)
+        goal = torch.cat((start + variation[:, 3:], yaw_quaternion(placement[:, 2])), dim=1)
         return {"object": placement, **frozen_goal(goal)}
 
-    def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        place(qpos["object"], frozen["object"], draws)
-
-    def observe(self, state: TaskState) -> dict[str, Tensor]:
-        return observe_goal(state, "object/quaternion")
-
-    def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
-        """0.2 - d_left - d_right + 3 (0.985 - d_target)."""
-        target = self._distance(state)
-        return {
-            "left": -reach(state, "left", "object/left_handle_position"),
-            "right": -reach(state, "right", "object/right_handle_position"),
-            "target": 3.0 * (0.985 - target),
-            "constant": torch.full_like(target, 0.2),
-        }
+    def target(self, state: TaskState) -> Tensor:
+        return 3.0 * (0.985 - self._distance(state))
 
     def success(self, state: TaskState) -> Tensor:
         upright = uprightness(state.quaternion("object/quaternion")) > math.cos(_SUCCESS_TILT)
         return (self._distance(state) < _SUCCESS_DISTANCE) & upright
 
-    def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
-        return [(frozen["goal"], _SEMI_AXES)]
-
     def _distance(self, state: TaskState) -> Tensor:
-        """Distance (m) from the pot's origin to the goal, shape (n,)."""
         return state.once("distance", lambda: norm(state["object/position"] - state.frozen["goal"][:, :3]))

@@ -9,12 +9,12 @@ from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
-from bidex_meta.tasks.base import THIN, TaskClass
-from bidex_meta.tasks.goals import frozen_goal, observe_goal
+from bidex_meta.tasks.base import THIN
+from bidex_meta.tasks.goals import frozen_goal
 from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import DRAWS, place, placed
-from bidex_meta.tasks.reach import apart, reach
-from bidex_meta.tasks.scene import SceneObject, add_table
+from bidex_meta.tasks.reach import ReachTask, apart
+from bidex_meta.tasks.scene import SceneObject, Table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.utils.maths import rotate, xyzw
 
@@ -22,10 +22,9 @@ _PEN = SceneObject("pen", "pen", (0.0, 0.0, 0.612), (0.5 * math.pi, 0.5 * math.p
 _OPEN = 0.3
 _BODY_POINT = 0.07
 """Where the body point lies on the pen's axis, metres; the cap's point lies towards the other end."""
-_GHOST = (0.012, 0.012, 0.012)
 
 
-class OpenPenCap(TaskClass):
+class OpenPenCap(ReachTask):
     """Pull the cap off a pen that lies on a table: the left hand at its body, the right hand at its cap.
 
     Observation: Table 34 (428). Reward: equation 16. Success is a cap pulled 13 cm, its own length. Goal position is
@@ -42,25 +41,23 @@ class OpenPenCap(TaskClass):
     episode_steps = 125
     right = HandPose((0.55, 0.2, 0.8), PALM_DOWN_AHEAD)
     left = HandPose((0.55, -0.2, 0.8), PALM_DOWN_AHEAD)
-    transition_scale = 0.5
-    orientation_scale = 0.1
+    transition_scale, orientation_scale = 0.5, 0.1
     start_draws = DRAWS
     solver = replace(THIN, integrator=mujoco.mjtIntegrator.mjINT_IMPLICIT)
+    table = Table((0.5, 1.0, 0.6), (0.0, 0.0, 0.3))
+    objects = (_PEN,)
+    points = ("pen/body_position", "pen/cap_position")
+    constant = -0.8
+    exponential = True
+    ghost = (0.012, 0.012, 0.012)
     camera_target = (0.12, 0.0, 0.66)
-
     variation_space = placed("pen")
-    """The pen's place."""
-
     blocks = (
-        *object_blocks("pen", "pen"),
+        *object_blocks("pen"),
         *goal_blocks("goal"),
         point_block("pen_body_position", "pen/body_position", "point on the pen's body for the left hand"),
         point_block("pen_cap_position", "pen/cap_position", "point on the pen's cap for the right hand"),
     )
-
-    def add_objects(self, scene: mujoco.MjSpec) -> None:
-        add_table(scene, (0.5, 1.0, 0.6), (0.0, 0.0, 0.3))
-        _PEN.add_to(scene)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """``pen``: place (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse of its rotation (n, 4)."""
@@ -70,25 +67,8 @@ class OpenPenCap(TaskClass):
         cap = pen[:, :3] + rotate(rotation, pen.new_tensor((0.0, 0.0, _BODY_POINT - _OPEN)))
         return {"pen": variation, **frozen_goal(torch.cat((cap, rotation), dim=1))}
 
-    def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        place(qpos["pen"], frozen["pen"], draws)
-
-    def observe(self, state: TaskState) -> dict[str, Tensor]:
-        return observe_goal(state, "pen/quaternion")
-
-    def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
-        """Equation 16: exp(-10 d_left), exp(-10 d_right), ``target`` 5 d_target, ``constant`` -0.8."""
-        left = torch.exp(-10.0 * reach(state, "left", "pen/body_position"))
-        right = torch.exp(-10.0 * reach(state, "right", "pen/cap_position"))
-        return {"left": left, "right": right, "target": 5.0 * _gap(state), "constant": torch.full_like(left, -0.8)}
+    def target(self, state: TaskState) -> Tensor:
+        return 5.0 * apart(state, *self.points)
 
     def success(self, state: TaskState) -> Tensor:
-        return _gap(state) > _OPEN
-
-    def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
-        return [(frozen["goal"], _GHOST)]
-
-
-def _gap(state: TaskState) -> Tensor:
-    """Distance (m) of the points on body and cap, shape (n,)."""
-    return apart(state, "pen/body_position", "pen/cap_position")
+        return apart(state, *self.points) > _OPEN

@@ -2,17 +2,16 @@
 
 import math
 
-import mujoco
 import torch
 from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
-from bidex_meta.tasks.base import THIN, TaskClass
-from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
+from bidex_meta.tasks.base import THIN
+from bidex_meta.tasks.layout import goal_blocks, handle_blocks, object_blocks
 from bidex_meta.tasks.placement import DRAWS, place, placed, yaw_quaternion
-from bidex_meta.tasks.reach import reach
-from bidex_meta.tasks.scene import SceneObject, add_table
+from bidex_meta.tasks.reach import ReachTask
+from bidex_meta.tasks.scene import SceneObject, Table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import component, join
 from bidex_meta.utils.maths import conjugate, constant, multiply, rotate, xyzw
@@ -24,17 +23,15 @@ _TOLERANCE = 0.1
 _PIVOT, _RIGHT_HANDLE = (-0.0034, 0.0698, 0.0), (0.1, -0.2, 0.0)
 """The pivot on the left hand's half, and the right handle's point from there on the other half, metres
 (docs/figures.md, objects)."""
-_GHOST = (0.02, 0.02, 0.01)
 
 
-class OpenScissors(TaskClass):
+class OpenScissors(ReachTask):
     """Open shears that lie on a table by a task's angle, each hand at its loop.
 
     Observation: Table 30 (428). Reward: equation 14. The formula leaves the target angle open: a task freezes it (0 is
     34 degrees open; shut, where episodes start, is -0.59). The object pose is that of the left hand's half. The goal
     block is of the half that moves: its handle's point and its orientation at the target angle, with the other half
-    where it is now; the rotation difference is that half's too, so that it shows the missing angle. Were the other half
-    taken at the task's start, tasks with different angles would share a block.
+    where it is now; the rotation difference is that half's too, so that it shows the missing angle.
     """
 
     needs = Capacity(57, 0, 131)
@@ -49,25 +46,20 @@ class OpenScissors(TaskClass):
     episode_steps = 150
     right = HandPose((0.55, 0.2, 0.8), PALM_DOWN_AHEAD)
     left = HandPose((0.55, -0.2, 0.8), PALM_DOWN_AHEAD)
-    transition_scale = 0.5
-    orientation_scale = 0.1
+    transition_scale, orientation_scale = 0.5, 0.1
     start_draws = DRAWS
     solver = THIN
+    table = Table((0.5, 1.0, 0.6), (0.0, 0.0, 0.3))
+    objects = (_SCISSORS,)
+    points = ("scissors/left_handle_position", "scissors/right_handle_position")
+    constant = 2.0
     camera_target = (0.08, 0.0, 0.66)
-
     variation_space = join(placed("scissors"), component("target_angle", -0.15, 0.3))
-    """The scissors' place and ``target_angle`` of the hinge, radians."""
-
     blocks = (
-        *object_blocks("scissors", "scissors"),
+        *object_blocks("scissors"),
         *goal_blocks("goal"),
-        point_block("right_handle_position", "scissors/right_handle_position", "in the right hand's loop"),
-        point_block("left_handle_position", "scissors/left_handle_position", "in the left hand's loop"),
+        *handle_blocks("scissors", "in the right hand's loop", "in the left hand's loop"),
     )
-
-    def add_objects(self, scene: mujoco.MjSpec) -> None:
-        add_table(scene, (0.5, 1.0, 0.6), (0.0, 0.0, 0.3))
-        _SCISSORS.add_to(scene)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """``scissors``: place (n, 3); ``target``: angle (n, 1); ``turn``: quaternion (n, 4); ``ghost``: pose (n, 7)."""
@@ -78,7 +70,7 @@ class OpenScissors(TaskClass):
         return {"scissors": variation[:, :3], "target": variation[:, 3:], "turn": turn, "ghost": ghost}
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        place(qpos["scissors"], frozen["scissors"], draws)
+        super().start(draws, frozen, qpos)
         qpos["scissors/hinge"].fill_(_SHUT)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
@@ -87,18 +79,14 @@ class OpenScissors(TaskClass):
         missing = multiply(state.quaternion("scissors/half_quaternion"), conjugate(goal[:, 3:]))
         return {"goal_pose": goal, "goal_rotation_difference": missing}
 
-    def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
-        """Equation 14: ``left`` -d_left, ``right`` -d_right, ``target`` 5 (0.59 - d_target), ``constant`` 2."""
-        left = reach(state, "left", "scissors/left_handle_position")
-        right = reach(state, "right", "scissors/right_handle_position")
-        target = 5.0 * (0.59 - _missing(state))
-        return {"left": -left, "right": -right, "target": target, "constant": torch.full_like(left, 2.0)}
+    def target(self, state: TaskState) -> Tensor:
+        return 5.0 * (0.59 - _missing(state))
 
     def success(self, state: TaskState) -> Tensor:
         return _missing(state) < _TOLERANCE
 
     def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
-        return [(frozen["ghost"], _GHOST)]
+        return [(frozen["ghost"], (0.02, 0.02, 0.01))]
 
 
 def _opened(position: Tensor, rotation: Tensor, turn: Tensor) -> Tensor:
@@ -109,5 +97,4 @@ def _opened(position: Tensor, rotation: Tensor, turn: Tensor) -> Tensor:
 
 
 def _missing(state: TaskState) -> Tensor:
-    """Distance (rad) of the hinge from the target angle, shape (n,)."""
     return state.once("missing", lambda: (state["scissors/angle"] - state.frozen["target"]).abs()[:, 0])

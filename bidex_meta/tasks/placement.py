@@ -1,7 +1,6 @@
-"""Where objects stand at the start: what a task freezes and what an episode adds.
+"""Where objects stand at the start: a task freezes shifts from the nominal place, an episode adds a small jitter.
 
-A task freezes the shift of each table object or fixture from its nominal place; an episode adds a small jitter. Turns
-are about the world's vertical through the object's own origin.
+Turns are about the world's vertical through the object's own origin.
 """
 
 from collections.abc import Iterable
@@ -41,12 +40,9 @@ def yaw_quaternion(yaw: Tensor) -> Tensor:
 
 
 def place(pose: Tensor, frozen: Tensor, draws: Tensor | None = None) -> None:
-    """Shifts and turns objects from their nominal place.
+    """Shifts and turns nominal poses (n, 7), quaternion (w, x, y, z), in place, by x, y (metres) and yaw (n, 3).
 
-    Args:
-        pose: Positions and quaternions (w, x, y, z) of a start, shape (n, 7), nominal; written in place.
-        frozen: The tasks' x, y (metres) and yaw (radians), shape (n, 3).
-        draws: Uniform numbers in [-1, 1] for the episodes' jitter, shape (n, 3); None for a fixture, which has none.
+    ``draws`` in [-1, 1], (n, 3), are of the episodes' jitter; None for a fixture, which has none.
     """
     shift = frozen
     if draws is not None:

@@ -8,12 +8,12 @@ from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
-from bidex_meta.tasks.base import THIN, TaskClass
+from bidex_meta.tasks.base import THIN
 from bidex_meta.tasks.bucket import FLOOR, MOUTH, inside_bucket, stands
 from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
-from bidex_meta.tasks.placement import DRAWS, place_all, placed, yaw_quaternion
-from bidex_meta.tasks.reach import reach
-from bidex_meta.tasks.scene import SceneObject, add_table
+from bidex_meta.tasks.placement import DRAWS, placed, yaw_quaternion
+from bidex_meta.tasks.reach import ReachTask
+from bidex_meta.tasks.scene import SceneObject, Table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import join
 from bidex_meta.utils.maths import conjugate, multiply, norm, quaternion_from_rpy, rotate, xyzw
@@ -36,25 +36,22 @@ _MOST_WATER = 125
 """Five layers fit under the lid."""
 
 
-class PourWater(TaskClass):
+class PourWater(ReachTask):
     """Pour water from a kettle, held by the right hand, into a bucket, held by the left.
 
     Table 0.5 x 1 m, 40 cm high. Observation: Table 40 (428). Reward: equation 19; the kettle's point is its handle, the
     bucket's its origin.
 
     The goal of a bucket that stands on the table is the point on its axis 1 cm below the rim. It moves with the bucket,
-    but sinks by 5 cm for each that the bucket's floor is lifted, to 20 cm below its height on the table at most. A goal
-    fixed to the bucket would not ask for pouring: spout and goal meet as well when the kettle stands upright and the
-    bucket is lifted and tipped under it, since a distance does not tell which of the two is tilted. This goal is never
-    higher than the standing bucket's, 5.6 cm below the spout of an upright kettle on the table, and a bucket that is
-    lifted or tipped takes it under the table. What is left is to tilt the kettle over the bucket's rim: below 30
-    degrees, where no water leaves, the spout stays 3 cm off, at 40 degrees 2 cm; from 60 degrees on it gets there. The
-    goal's orientation is the kettle's at the task's start, tilted by 40 degrees towards the spout.
+    but sinks by 5 cm for each that the bucket's floor is lifted, to 20 cm below its height on the table at most: with a
+    goal fixed to the bucket, spout and goal would meet as well where the bucket is lifted and tipped under an upright
+    kettle. So only a kettle tilted over the rim gets near: below 30 degrees, where no water leaves, the spout stays 3
+    cm off, at 40 degrees 2 cm; from 60 degrees on it gets there. The goal's orientation is the kettle's at the task's
+    start, tilted by 40 degrees towards the spout.
 
     A task shifts and turns kettle and bucket, and the water with the kettle. Water is drops of 5 mm radius without
     friction, which no observation shows: twelve by default, 1.4 times the physics of HandOver; the paper's 30 take 2.4
-    times. The kettle has about the original's outline, a high floor and an open trough as spout, so that drops run out
-    at less than the goal's tilt. It weighs 1.5 kg; the original's 2.46 kg are those of the full body.
+    times. The kettle has about the original's outline and weighs 1.5 kg; the original's 2.46 kg are of the full body.
     """
 
     name = "PourWater"
@@ -73,36 +70,33 @@ class PourWater(TaskClass):
     episode_steps = 125
     right = HandPose((0.55, 0.2, 0.6), PALM_LEFT_AHEAD)
     left = HandPose((0.55, -0.2, 0.6), PALM_RIGHT_AHEAD)
-    transition_scale = 0.5
-    orientation_scale = 0.1
+    transition_scale, orientation_scale = 0.5, 0.1
     start_draws = 2 * DRAWS
     solver = THIN
-    camera_target = (0.1, -0.05, 0.5)
-    camera_distance = 1.4
-
-    def __init__(self, moving_base: bool | None = None, water: int = _WATER) -> None:
-        """Chooses the base and the number of drops, 1 to 125."""
-        super().__init__(moving_base)
-        self.water = whole_number("water", water, 1, _MOST_WATER)
-        # Most seen in 600 states each of 12 drops, 30 and 125: contacts 41, 73, 246; convex 16, 34, 129; rows 103, 124,
-        # 282. So a drop adds 1.8, 1 and 1.6 at most.
-        more = max(0, water - 12)
-        self.needs = Capacity(71 + 3 * more, 20 + more, 134 + 3 * more)
-
+    table = Table((0.5, 1.0, 0.4), (0.0, 0.0, 0.2))
+    objects = (_KETTLE, _BUCKET)
+    points = ("bucket/position", "kettle/handle_position")
+    constant = 1.0
+    terms = ("constant", "left", "right", "target")
+    camera_target, camera_distance = (0.1, -0.05, 0.5), 1.4
     variation_space = join(placed("kettle"), placed("bucket"))
-    """Shift and turn of kettle and bucket."""
-
     blocks = (
-        *object_blocks("kettle", "kettle"),
+        *object_blocks("kettle"),
         *goal_blocks("goal"),
         point_block("kettle_handle_position", "kettle/handle_position", "grip of the kettle's handle"),
         point_block("bucket_position", "bucket/position", "origin of the bucket"),
     )
 
+    def __init__(self, moving_base: bool | None = None, water: int = _WATER) -> None:
+        """Chooses the base and the number of drops, 1 to 125."""
+        super().__init__(moving_base)
+        self.water = whole_number("water", water, 1, _MOST_WATER)
+        # Measured for 12, 30 and 125 drops: a drop adds 1.8 contacts, 1 convex pair and 1.6 rows at most.
+        more = max(0, water - 12)
+        self.needs = Capacity(71 + 3 * more, 20 + more, 134 + 3 * more)
+
     def add_objects(self, scene: mujoco.MjSpec) -> None:
-        add_table(scene, (0.5, 1.0, 0.4), (0.0, 0.0, 0.2))
-        _KETTLE.add_to(scene)
-        _BUCKET.add_to(scene)
+        super().add_objects(scene)
         for i in range(self.water):
             SceneObject(f"water{i}", "water", (0.0, 0.0, 0.0)).add_to(scene)
 
@@ -111,15 +105,10 @@ class PourWater(TaskClass):
         nominal = xyzw(variation.new_tensor(_KETTLE.quaternion))
         tilt = xyzw(variation.new_tensor(quaternion_from_rpy((0.0, -_POUR_TILT, 0.0))))
         goal = multiply(multiply(yaw_quaternion(variation[:, 2]), nominal), tilt)
-        return {
-            "kettle": variation[:, :3],
-            "bucket": variation[:, 3:],
-            "goal_rotation": goal,
-            "goal_rotation_inverse": conjugate(goal),
-        }
+        return super().freeze(variation) | {"goal_rotation": goal, "goal_rotation_inverse": conjugate(goal)}
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        place_all(("kettle", "bucket"), qpos, frozen, draws)
+        super().start(draws, frozen, qpos)
         kettle = qpos["kettle"]
         drops = rotate(xyzw(kettle[:, 3:])[:, None], self._fill(kettle)).float() + kettle[:, None, :3]
         for i in range(self.water):
@@ -127,7 +116,7 @@ class PourWater(TaskClass):
                 qpos[f"water{i}/{axis}"][:, 0] = drops[:, i, k]
 
     def _fill(self, like: Tensor) -> Tensor:
-        """The drops' places in the kettle's frame, metres, shape (water, 3)."""
+        """Positions of the drops in the kettle's frame, metres, (water, 3)."""
         i = torch.arange(self.water, device=like.device)
         middle = 0.5 * (_SIDE - 1)
         x, y = (i % _SIDE - middle) * _SPACING, (i // _SIDE % _SIDE - middle) * _SPACING
@@ -136,22 +125,12 @@ class PourWater(TaskClass):
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         frozen = state.frozen
-        return {
-            "goal_pose": torch.cat((_goal(state), frozen["goal_rotation"]), dim=1),
-            "goal_rotation_difference": multiply(
-                state.quaternion("kettle/quaternion"), frozen["goal_rotation_inverse"]
-            ),
-        }
+        difference = multiply(state.quaternion("kettle/quaternion"), frozen["goal_rotation_inverse"])
+        pose = torch.cat((_goal(state), frozen["goal_rotation"]), dim=1)
+        return {"goal_pose": pose, "goal_rotation_difference": difference}
 
-    def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
-        """``constant`` 1, ``left`` -d_left, ``right`` -d_right, ``target`` 2 (0.5 - d_target)."""
-        left, right = reach(state, "left", "bucket/position"), reach(state, "right", "kettle/handle_position")
-        return {
-            "constant": torch.ones_like(left),
-            "left": -left,
-            "right": -right,
-            "target": 2.0 * (0.5 - norm(state["kettle/spout_position"] - _goal(state))),
-        }
+    def target(self, state: TaskState) -> Tensor:
+        return 2.0 * (0.5 - norm(state["kettle/spout_position"] - _goal(state)))
 
     def success(self, state: TaskState) -> Tensor:
         drops = torch.stack([state[f"water{i}/position"] for i in range(self.water)], dim=1)
@@ -161,13 +140,12 @@ class PourWater(TaskClass):
 
 
 def _goal(state: TaskState) -> Tensor:
-    """Where the spout shall be, world, metres, shape (n, 3): the class's docstring says why it sinks."""
-    return state.once("goal", lambda: _sunk(state["bucket/position"], state["bucket/mouth_position"]))
+    """Where the spout shall be, world, metres, (n, 3)."""
 
+    def sunk() -> Tensor:
+        x, y, height = state["bucket/mouth_position"].unbind(1)
+        origin = state["bucket/position"][:, 2]
+        lift = (origin + FLOOR / MOUTH * (height - origin) - (_BUCKET.position[2] + FLOOR)).clamp(min=0.0)
+        return torch.stack((x, y, height - torch.minimum(_SINK * lift, lift + _DEEPEST)), dim=1)
 
-def _sunk(bucket: Tensor, mouth: Tensor) -> Tensor:
-    """The goal from the bucket's origin and the point of its axis just below its rim, each (n, 3), world, metres."""
-    x, y, height = mouth.unbind(1)
-    floor = bucket[:, 2] + FLOOR / MOUTH * (height - bucket[:, 2])
-    lift = (floor - (_BUCKET.position[2] + FLOOR)).clamp(min=0.0)
-    return torch.stack((x, y, height - torch.minimum(_SINK * lift, lift + _DEEPEST)), dim=1)
+    return state.once("goal", sunk)

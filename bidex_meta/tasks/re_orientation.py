@@ -8,8 +8,7 @@ from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_UP_AWAY, PALM_UP_BACK, HandPose
 from bidex_meta.tasks import eggs
 from bidex_meta.tasks.base import FIRM, TaskClass
-from bidex_meta.tasks.goals import frozen_goal, observe_goal
-from bidex_meta.tasks.layout import goal_blocks, object_blocks
+from bidex_meta.tasks.goals import frozen_goal
 from bidex_meta.tasks.scene import SceneObject
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import orientation
@@ -18,8 +17,8 @@ from bidex_meta.utils.maths import constant, multiply, rotation_angle, wxyz, xyz
 _BOUNDING_RADIUS = 0.0434
 """Half the space diagonal of a cube with an edge of 5 cm, metres."""
 _POSITION_NOISE, _JOINT_NOISE = 0.01, 0.2
-_GOALS = {"object1": (0.0, -0.76, 0.56), "object2": (0.0, -0.39, 0.56)}
-_GOAL_OF = {"object1": "goal1", "object2": "goal2"}
+_GOALS = ((0.0, -0.76, 0.56), (0.0, -0.39, 0.56))
+_HALF = (0.025, 0.025, 0.025)
 _START_ANGLE = 0.5
 """No cube starts within this of its goal's orientation, rad."""
 _SUCCESS_ANGLE = 0.2
@@ -53,20 +52,11 @@ class ReOrientation(TaskClass):
     episode_steps = 600
     right = HandPose((0.0, 0.0, 0.5), PALM_UP_AWAY)
     left = HandPose((0.0, -1.15, 0.5), PALM_UP_BACK)
-    transition_scale = 0.05
-    orientation_scale = 0.5
+    transition_scale, orientation_scale = 0.05, 0.5
     start_draws = eggs.JOINT_DRAWS + 5
     solver = FIRM
-
     variation_space = orientation("goal")
-    """The two draws of the goals' common orientation."""
-
-    blocks = (
-        *object_blocks("object1", "object1"),
-        *goal_blocks("goal1"),
-        *object_blocks("object2", "object2"),
-        *goal_blocks("goal2"),
-    )
+    blocks = eggs.goal_object_blocks("12")
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
         SceneObject("object1", "cube", (0.0, -0.76, 0.60), colour=(0.85, 0.43, 0.30, 1.0)).add_to(scene)
@@ -75,24 +65,23 @@ class ReOrientation(TaskClass):
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """``goal1``, ``goal2``: poses (n, 7); ``..._inverse``: inverses of their rotations (n, 4)."""
         frozen = {}
-        for i, centre in enumerate(_GOALS.values(), start=1):
+        for i, centre in enumerate(_GOALS, start=1):
             position = variation.new_tensor(centre).expand(len(variation), 3)
             frozen |= frozen_goal(eggs.goal_pose(position, variation), f"goal{i}")
         return frozen
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
         eggs.start_hands(draws[:, : eggs.JOINT_DRAWS], _JOINT_NOISE, qpos)
-        for name, side, pose in (("object1", "left", self.left), ("object2", "right", self.right)):
-            eggs.start_egg(qpos[name], draws[:, eggs.JOINT_DRAWS :], _POSITION_NOISE)
-            _turn_away(qpos[name], frozen[f"{_GOAL_OF[name]}_inverse"])
-            eggs.lay_egg_on_hand(qpos[name], qpos[f"{side}/joints"], pose, _BOUNDING_RADIUS, _BOUNDING_RADIUS)
+        for i, side, pose in ((1, "left", self.left), (2, "right", self.right)):
+            cube = qpos[f"object{i}"]
+            eggs.start_egg(cube, draws[:, eggs.JOINT_DRAWS :], _POSITION_NOISE)
+            _turn_away(cube, frozen[f"goal{i}_inverse"])
+            eggs.lay_egg_on_hand(cube, qpos[f"{side}/joints"], pose, _BOUNDING_RADIUS, _BOUNDING_RADIUS)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        first = observe_goal(state, "object1/quaternion", "goal1")
-        return first | observe_goal(state, "object2/quaternion", "goal2")
+        return eggs.observe_goals(state, "12")
 
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
-        """``left`` -10 d_1, ``right`` -10 d_2, ``target`` -1.5 (r_1 + r_2)."""
         (first, first_angle), (second, second_angle) = self._distances(state)
         return {"left": -10.0 * first, "right": -10.0 * second, "target": -1.5 * (first_angle + second_angle)}
 
@@ -106,7 +95,7 @@ class ReOrientation(TaskClass):
         return [eggs.distances(state, f"object{i}", f"goal{i}") for i in (1, 2)]
 
     def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
-        return [(frozen[name], (0.025, 0.025, 0.025)) for name in ("goal1", "goal2")]
+        return [(frozen[f"goal{i}"], _HALF) for i in (1, 2)]
 
 
 def _turn_away(cube: Tensor, goal_inverse: Tensor) -> None:

@@ -1,20 +1,24 @@
-"""What the tasks with tables, doors and tools share: the distance from a hand to the point it shall be at."""
+"""What the classes with tables, doors and tools share: a point that each hand shall reach, and the linear reward."""
 
+from abc import abstractmethod
+from typing import ClassVar
+
+import mujoco
+import torch
 from torch import Tensor
 
+from bidex_meta.tasks.base import TaskClass
+from bidex_meta.tasks.goals import observe_goal
+from bidex_meta.tasks.placement import place_all
+from bidex_meta.tasks.scene import SceneObject, Table, add_table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.utils.maths import norm
 
 
 def reach(state: TaskState, side: str, point: str) -> Tensor:
-    """Distance (m) from a hand to a point, shape (n,).
+    """Distance (m) from the hand of a side to a point, given by the sensor of its position. Shape (n,).
 
     The hand's point is the palm's origin + 8 cm along the fingers + 2 cm out of the palm (docs/figures.md, hand point).
-
-    Args:
-        state: A transition.
-        side: ``right`` or ``left``.
-        point: Sensor of the point's position.
     """
     return state.once(("reach", side, point), lambda: norm(state[f"{side}/hand_point_position"] - state[point]))
 
@@ -22,3 +26,55 @@ def reach(state: TaskState, side: str, point: str) -> Tensor:
 def apart(state: TaskState, a: str, b: str) -> Tensor:
     """Distance (m) between the positions that two sensors give, shape (n,)."""
     return state.once(("apart", a, b), lambda: norm(state[a] - state[b]))
+
+
+class ReachTask(TaskClass):
+    """A class with the reward ``left`` -d_left + ``right`` -d_right + ``target`` + ``constant``.
+
+    Attributes:
+        table: Its table.
+        objects: Objects that a task shifts and turns and an episode jitters, in the order of variation and draws.
+        points: Sensors of the points that the left and the right hand shall reach.
+        constant: Constant of the reward.
+        exponential: Whether ``left`` and ``right`` are exp(-10 d_left) and exp(-10 d_right) instead.
+        terms: Order in which the reward's terms are summed.
+        ghost: Semi-axes of the ellipsoid that is the goal in pictures, metres; None: no goal is drawn.
+    """
+
+    table: ClassVar[Table]
+    objects: tuple[SceneObject, ...]
+    points: ClassVar[tuple[str, str]]
+    constant: ClassVar[float] = 0.0
+    exponential: ClassVar[bool] = False
+    terms: ClassVar[tuple[str, ...]] = ("left", "right", "target", "constant")
+    ghost: ClassVar[tuple[float, float, float] | None] = None
+
+    def add_objects(self, scene: mujoco.MjSpec) -> None:
+        add_table(scene, *self.table)
+        for each in self.objects:
+            each.add_to(scene)
+
+    def freeze(self, variation: Tensor) -> dict[str, Tensor]:
+        """Each object's shift and turn by its name, (n, 3)."""
+        return {each.name: variation[:, 3 * i : 3 * i + 3] for i, each in enumerate(self.objects)}
+
+    def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
+        place_all((each.name for each in self.objects), qpos, frozen, draws)
+
+    def observe(self, state: TaskState) -> dict[str, Tensor]:
+        return observe_goal(state, f"{self.objects[0].name}/quaternion") if "goal" in state.frozen else {}
+
+    @abstractmethod
+    def target(self, state: TaskState) -> Tensor:
+        """The reward's target term, (n,)."""
+
+    def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
+        target = self.target(state)
+        values = {"target": target, "constant": torch.full_like(target, self.constant)}
+        for side, point in zip(("left", "right"), self.points, strict=True):
+            distance = reach(state, side, point)
+            values[side] = torch.exp(-10.0 * distance) if self.exponential else -distance
+        return {term: values[term] for term in self.terms}
+
+    def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
+        return [(frozen["goal"], self.ghost)] if self.ghost else []

@@ -1,4 +1,4 @@
-"""The task classes by name: one dict; ``package.module:Class`` names one of the user's own."""
+"""The task classes by name; ``package.module:Class`` names one of the user's own."""
 
 import importlib
 import inspect
@@ -12,27 +12,13 @@ if TYPE_CHECKING:
 
 # Modules by name, imported at first use: listing names must not import torch and mujoco.
 _MODULES = {
-    "HandOver": "hand_over",
-    "CatchUnderarm": "catch_underarm",
-    "CatchOver2Underarm": "catch_over2underarm",
-    "TwoCatchUnderarm": "two_catch_underarm",
-    "CatchAbreast": "catch_abreast",
-    "LiftUnderarm": "lift_underarm",
-    "DoorOpenOutward": "doors",
-    "DoorOpenInward": "doors",
-    "DoorCloseOutward": "doors",
-    "DoorCloseInward": "doors",
-    "BottleCap": "bottle_cap",
-    "PushBlock": "push_block",
-    "SwingCup": "swing_cup",
-    "OpenScissors": "open_scissors",
-    "ReOrientation": "re_orientation",
-    "OpenPenCap": "open_pen_cap",
-    "Switch": "switch",
-    "StackBlock": "stack_block",
-    "PourWater": "pour_water",
-    "GraspAndPlace": "grasp_and_place",
-}
+    "HandOver": "hand_over", "CatchUnderarm": "catch_underarm", "CatchOver2Underarm": "catch_over2underarm",
+    "TwoCatchUnderarm": "two_catch_underarm", "CatchAbreast": "catch_abreast", "LiftUnderarm": "lift_underarm",
+    "DoorOpenOutward": "doors", "DoorOpenInward": "doors", "DoorCloseOutward": "doors", "DoorCloseInward": "doors",
+    "BottleCap": "bottle_cap", "PushBlock": "push_block", "SwingCup": "swing_cup", "OpenScissors": "open_scissors",
+    "ReOrientation": "re_orientation", "OpenPenCap": "open_pen_cap", "Switch": "switch", "StackBlock": "stack_block",
+    "PourWater": "pour_water", "GraspAndPlace": "grasp_and_place",
+}  # fmt: skip
 
 
 def names() -> list[str]:
@@ -41,10 +27,9 @@ def names() -> list[str]:
 
 
 def resolve(name: str, kind: str = "task class") -> str:
-    """The name by which ``get`` knows a class, in any case; ``package.module:Class`` stays as it is.
+    """The name by which ``get`` knows a class, given in any case; ``package.module:Class`` stays as it is.
 
-    Raises:
-        BidexError: There is no such class; the message calls it a ``kind``.
+    Raises BidexError where there is no such class; the message calls it a ``kind``.
     """
     if not is_outside(name):
         return known_name(kind, name, names())
@@ -58,29 +43,24 @@ def with_object(name: str | None) -> dict[str, str]:
 
 
 def get(name: str, moving_base: bool | None = None, **options: float | str) -> "TaskClass":
-    """A task class.
+    """A task class, e.g. ``CatchUnderarm``, or ``package.module:Class`` (docs/own-task.md).
 
-    Args:
-        name: Its name, e.g. ``CatchUnderarm``, or ``package.module:Class`` (docs/own-task.md).
-        moving_base: Drive the hands' bases (52 actions) or fix them (40); None takes the class's own.
-        options: What else the class lets one choose, e.g. ``water=30`` for PourWater, ``object="block"`` for
-            CatchUnderarm.
+    ``moving_base`` drives the hands' bases (52 actions) or fixes them (40); None takes the class's own. Options are
+    those of the class, e.g. ``water=30`` for PourWater, ``object="block"`` for CatchUnderarm.
 
-    Raises:
-        BidexError: There is no such class or option; the message gives the nearest name and the list.
+    Raises BidexError where there is no such class or option; the message gives the nearest name and the list.
     """
-    task_class = _outside(name) if is_outside(name) else _shipped(name)
+    if is_outside(name):
+        task_class = _outside(name)
+    elif name in _MODULES:
+        task_class = getattr(importlib.import_module(f"bidex_meta.tasks.{_MODULES[name]}"), name)
+    else:
+        raise unknown_name("task class", name, _MODULES)
     known = list(inspect.signature(task_class).parameters)[1:]
     for option in options:
         if option not in known:
             raise unknown_name(f"option of {name}", option, known)
     return task_class(moving_base, **options)
-
-
-def _shipped(name: str) -> "type[TaskClass]":
-    if name not in _MODULES:
-        raise unknown_name("task class", name, _MODULES)
-    return getattr(importlib.import_module(f"bidex_meta.tasks.{_MODULES[name]}"), name)
 
 
 def _outside(name: str) -> "type[TaskClass]":
@@ -89,9 +69,7 @@ def _outside(name: str) -> "type[TaskClass]":
     found, _ = outside_class(name, "task")
     if not issubclass(found, TaskClass):
         raise BidexError(f"task {name}: expected a subclass of bidex_meta.tasks.base.TaskClass, got {found!r}.")
-    missing = sorted(found.__abstractmethods__) + [
-        each for each in TaskClass.__annotations__ if not hasattr(found, each)
-    ]
+    missing = [*sorted(found.__abstractmethods__), *(x for x in TaskClass.__annotations__ if not hasattr(found, x))]
     if missing:
         raise BidexError(f"task {name}: expected the class to have {', '.join(missing)}. See docs/own-task.md.")
     return found

@@ -1,8 +1,9 @@
 """From a task class to a compiled model, and the addresses in it that the world reads and writes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import mujoco
 import numpy as np
@@ -15,6 +16,8 @@ from bidex_meta.utils.maths import quaternion_from_rpy
 if TYPE_CHECKING:
     from bidex_meta.tasks.base import TaskClass
 
+Point = tuple[float, float, float]
+Colour = tuple[float, float, float, float]
 _STATED_TIME_STEP, _STATED_SOLREF = 1.0 / 240.0, 0.0084
 """Time step and contact time constant of the files under assets/, seconds."""
 _FALL = 1.0 + 1e6
@@ -29,16 +32,15 @@ class SceneObject:
         name: Prefix of its sensors and joints in the scene.
         asset: File under assets/objects/, or an absolute path, without its ending. Its body is called ``object``; the
             joint of a free one is called ``free``.
-        position: Nominal start in the world, metres.
-        rpy: Nominal roll, pitch, yaw, radians; R = Rz(yaw) Ry(pitch) Rx(roll).
+        position: Nominal start in the world, metres, with ``rpy``, radians; R = Rz(yaw) Ry(pitch) Rx(roll).
         colour: Red, green, blue, alpha of its materials, or None to keep the asset's.
     """
 
     name: str
     asset: str
-    position: tuple[float, float, float]
-    rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    colour: tuple[float, float, float, float] | None = None
+    position: Point
+    rpy: Point = (0.0, 0.0, 0.0)
+    colour: Colour | None = None
 
     @property
     def quaternion(self) -> tuple[float, float, float, float]:
@@ -47,7 +49,6 @@ class SceneObject:
 
     def add_to(self, scene: mujoco.MjSpec) -> None:
         """Puts the object into a scene at its nominal start."""
-        # An absolute path takes the place of what stands before it.
         part = mujoco.MjSpec.from_file(str(paths.assets_dir() / "objects" / f"{self.asset}.xml"))
         attach(scene, part, self.name, self.position, self.quaternion, self.colour)
 
@@ -56,19 +57,14 @@ def attach(
     scene: mujoco.MjSpec,
     part: mujoco.MjSpec,
     name: str,
-    position: tuple[float, float, float],
-    quaternion: tuple[float, float, float, float],
-    colour: tuple[float, float, float, float] | None = None,
+    position: Point,
+    quaternion: Sequence[float],
+    colour: Colour | None,
 ) -> None:
-    """Puts an object into a scene.
+    """Puts a part with a body called ``object`` into a scene, sensors and joints under the prefix ``name``.
 
-    Args:
-        scene: The scene.
-        part: The object: a body called ``object``.
-        name: Prefix of its sensors and joints.
-        position: Nominal start in the world, metres.
-        quaternion: Nominal orientation (w, x, y, z).
-        colour: Red, green, blue, alpha of its materials, or None to keep its own.
+    Nominal start in the world: position, metres, and quaternion (w, x, y, z). Without a colour (red, green, blue,
+    alpha) it keeps its own.
     """
     set_contact_bits(part.geoms, OBJECT)
     if colour is not None:
@@ -78,22 +74,24 @@ def attach(
     scene.attach(part, prefix=f"{name}/", frame=scene.worldbody.add_frame())
 
 
-def add_table(
-    scene: mujoco.MjSpec,
-    size: tuple[float, float, float],
-    centre: tuple[float, float, float],
-    friction: float = 1.0,
-    priority: int = 0,
-) -> None:
-    """Adds a fixed box, the table of a task.
+class Table(NamedTuple):
+    """The table of a task.
 
-    Args:
-        scene: The scene.
+    Attributes:
         size: Full edge lengths, metres.
         centre: Its centre in the world, metres.
         friction: Sliding friction.
         priority: Above 0 the table's friction rules every contact with it; else the larger friction of a pair does.
     """
+
+    size: Point
+    centre: Point
+    friction: float = 1.0
+    priority: int = 0
+
+
+def add_table(scene: mujoco.MjSpec, size: Point, centre: Point, friction: float = 1.0, priority: int = 0) -> None:
+    """Adds a fixed box, the table of a task; see ``Table``."""
     floor = scene.geom("floor")
     scene.worldbody.add_geom(
         name="table",
@@ -103,11 +101,7 @@ def add_table(
         material="table",
         friction=[friction, 0.005, 0.001],
         priority=priority,
-        contype=floor.contype,
-        conaffinity=floor.conaffinity,
-        margin=floor.margin,
-        solref=floor.solref,
-        solimp=floor.solimp,
+        **{name: getattr(floor, name) for name in ("contype", "conaffinity", "margin", "solref", "solimp")},
     )
 
 
@@ -130,25 +124,17 @@ class Scene:
 
     @cached_property
     def sensors(self) -> dict[str, slice]:
-        """Sensor name to its slice of ``sensordata``."""
         m = self.model
-        return {
-            m.sensor(i).name: slice(a, a + n) for i, (a, n) in enumerate(zip(m.sensor_adr, m.sensor_dim, strict=True))
-        }
+        return {m.sensor(i).name: slice(a := m.sensor_adr[i], a + m.sensor_dim[i]) for i in range(m.nsensor)}
 
     def sensor(self, name: str) -> slice:
-        """Its slice of ``sensordata``.
-
-        Raises:
-            BidexError: The scene has no such sensor.
-        """
+        """Its slice of ``sensordata``; raises BidexError where the scene has no such sensor."""
         if name not in self.sensors:
             raise unknown_sensor(name, self.sensors)
         return self.sensors[name]
 
     @cached_property
     def qpos(self) -> dict[str, slice]:
-        """Name of a part to its slice of a start."""
         found: dict[str, slice] = {}
         for side in SIDES:
             first = self.model.joint(f"{side}/{hand().joints[0]}").qposadr[0]
@@ -174,7 +160,6 @@ class Scene:
 
     @cached_property
     def base_bodies(self) -> tuple[int, int]:
-        """Body ids of the two bases, right and left."""
         right, left = (self.model.body(f"{side}/base").id for side in SIDES)
         return right, left
 
@@ -186,7 +171,7 @@ class Scene:
 
 
 def build_spec(task: "TaskClass") -> mujoco.MjSpec:
-    """The editable scene of a task class: floor, hands, objects."""
+    """The editable scene of a task class: floor, hands, objects. Objects alone have weight, as in the original."""
     spec = mujoco.MjSpec.from_file(str(paths.assets_dir() / "scene" / "scene.xml"))
     spec.modelname = task.name
     spec.option.iterations, spec.option.ls_iterations = task.solver.iterations, task.solver.line_search
@@ -195,31 +180,22 @@ def build_spec(task: "TaskClass") -> mujoco.MjSpec:
     set_contact_bits(spec.geoms, FIXTURE)
     add_hands(spec, task.right, task.left, task.moving_base)
     task.add_objects(spec)
-    _let_objects_fall(spec)
-    for geom in spec.geoms:
-        geom.condim = min(geom.condim, task.solver.most_condim)
-    return spec
-
-
-def _let_objects_fall(spec: mujoco.MjSpec) -> None:
-    """Gives weight to objects alone; the hands float, as in the original."""
     # Compensating gravity on the hands' 52 bodies costs 8 % of a step. Hardly any gravity, with a compensation a
     # million times as large on a few objects, costs nothing.
     for body in spec.bodies:
-        if body.name != "world" and not body.name.startswith(tuple(f"{side}/" for side in SIDES)):
+        if body.name != "world" and not body.name.startswith(("right/", "left/")):
             body.gravcomp = _FALL
+    for geom in spec.geoms:
+        geom.condim = min(geom.condim, task.solver.most_condim)
+    return spec
 
 
 def compile_scene(task: "TaskClass") -> Scene:
     """The compiled scene of a task class."""
     model = build_spec(task).compile()
     damp_bases(model)
-    _stiffen(model)
-    return Scene(task, model)
-
-
-def _stiffen(model: mujoco.MjModel) -> None:
-    """The assets state the stiffest contacts and limits that 1/240 s allows; a longer step allows softer ones alone."""
+    # The assets state the stiffest contacts and limits that 1/240 s allows; a longer step allows softer ones alone.
     factor = model.opt.timestep / _STATED_TIME_STEP
     for solref in (model.geom_solref, model.pair_solref, model.jnt_solref, model.dof_solref, model.tendon_solref_lim):
         solref[np.isclose(solref[:, 0], _STATED_SOLREF), 0] *= factor
+    return Scene(task, model)

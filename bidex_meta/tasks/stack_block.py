@@ -6,18 +6,17 @@ from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_DOWN_AWAY, PALM_DOWN_BACK, HandPose
-from bidex_meta.tasks.base import FIRM, TaskClass
+from bidex_meta.tasks.base import FIRM
 from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
-from bidex_meta.tasks.placement import DRAWS, place_all, placed
-from bidex_meta.tasks.reach import reach
-from bidex_meta.tasks.scene import SceneObject, add_table
+from bidex_meta.tasks.placement import DRAWS, placed
+from bidex_meta.tasks.reach import ReachTask
+from bidex_meta.tasks.scene import SceneObject, Table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import component, join
 from bidex_meta.utils.maths import norm
 
 _EDGE = 0.05
 """Edge of a block, metres."""
-_STARTS = {"block1": (0.0, -0.1, 0.625), "block2": (0.0, 0.1, 0.625)}
 _BOTTOM = (0.0, 0.0, 0.625)
 """Middle of the places where the bottom block shall stand, world, metres."""
 _TARGET_RANGE = 0.03
@@ -30,7 +29,7 @@ _TABLE_FRICTION = 0.225
 """Mean of the original's 0.25 for blocks and 0.2 for the table."""
 
 
-class StackBlock(TaskClass):
+class StackBlock(ReachTask):
     """Stack two blocks: the left hand's block 1 on the right hand's block 2.
 
     Table 0.5 x 1 m, 60 cm high. Observation: Table 38 (428); its goal is the top block's: target 1, upright and
@@ -51,33 +50,34 @@ class StackBlock(TaskClass):
     episode_steps = 250
     right = HandPose((0.0, 0.6, 0.7), PALM_DOWN_AWAY)
     left = HandPose((0.0, -0.6, 0.7), PALM_DOWN_BACK)
-    transition_scale = 0.2
-    orientation_scale = 0.02
+    transition_scale, orientation_scale = 0.2, 0.02
     start_draws = 2 * DRAWS
     solver = FIRM
-    camera_target = (0.0, 0.0, 0.66)
-    camera_distance = 1.5
-
+    table = Table((0.5, 1.0, 0.6), (0.0, 0.0, 0.3), _TABLE_FRICTION, priority=2)
+    objects = (
+        SceneObject("block1", "cube", (0.0, -0.1, 0.625), colour=(0.85, 0.43, 0.30, 1.0)),
+        SceneObject("block2", "cube", (0.0, 0.1, 0.625)),
+    )
+    points = ("block1/position", "block2/position")
+    constant = 1.5
+    terms = ("constant", "left", "right", "target")
+    camera_target, camera_distance = (0.0, 0.0, 0.66), 1.5
     variation_space = join(
         placed("block1"),
         placed("block2"),
         *(component(f"target_{axis}", -_TARGET_RANGE, _TARGET_RANGE) for axis in "xy"),
     )
-    """Shift and turn of both blocks, shift of the targets."""
-
     blocks = (
-        *object_blocks("block1", "block1"),
+        *object_blocks("block1"),
         *goal_blocks("goal"),
         point_block("block1_position", "block1/position", "centre of block 1"),
         point_block("block2_position", "block2/position", "centre of block 2"),
     )
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
-        add_table(scene, (0.5, 1.0, 0.6), (0.0, 0.0, 0.3), friction=_TABLE_FRICTION, priority=2)
-        SceneObject("block1", "cube", _STARTS["block1"], colour=(0.85, 0.43, 0.30, 1.0)).add_to(scene)
-        SceneObject("block2", "cube", _STARTS["block2"]).add_to(scene)
-        for name in _STARTS:
-            cube = scene.geom(f"{name}/cube")
+        super().add_objects(scene)
+        for block in self.objects:
+            cube = scene.geom(f"{block.name}/cube")
             cube.friction[0], cube.priority = _BLOCK_FRICTION, 1
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
@@ -86,29 +86,14 @@ class StackBlock(TaskClass):
         bottom = shift + shift.new_tensor(_BOTTOM)
         top = bottom + shift.new_tensor((0.0, 0.0, _EDGE))
         turn = shift.new_tensor((0.0, 0.0, 0.0, 1.0)).expand(len(shift), 4)
-        return {
-            "block1": variation[:, :3],
-            "block2": variation[:, 3:6],
-            "goal": torch.cat((top, turn), dim=1),
-            "target2": bottom,
-        }
-
-    def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        place_all(_STARTS, qpos, frozen, draws)
+        return super().freeze(variation) | {"goal": torch.cat((top, turn), dim=1), "target2": bottom}
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         return {"goal_pose": state.frozen["goal"], "goal_rotation_difference": state.quaternion("block1/quaternion")}
 
-    def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
-        """``constant`` 1.5, ``left`` -d_left, ``right`` -d_right, ``target`` 2 (0.24 - d_target)."""
-        left, right = reach(state, "left", "block1/position"), reach(state, "right", "block2/position")
+    def target(self, state: TaskState) -> Tensor:
         first, second = self._distances(state)
-        return {
-            "constant": torch.full_like(left, 1.5),
-            "left": -left,
-            "right": -right,
-            "target": 2.0 * (0.24 - (first + second)),
-        }
+        return 2.0 * (0.24 - (first + second))
 
     def success(self, state: TaskState) -> Tensor:
         first, second = self._distances(state)
@@ -117,7 +102,6 @@ class StackBlock(TaskClass):
         return (first < _SUCCESS_DISTANCE) & (second < _SUCCESS_DISTANCE) & stacked
 
     def _distances(self, state: TaskState) -> tuple[Tensor, Tensor]:
-        """Distance (m) of each block from its target, each (n,)."""
         first = state["block1/position"] - state.frozen["goal"][:, :3]
         return norm(first), norm(state["block2/position"] - state.frozen["target2"])
 

@@ -1,4 +1,4 @@
-"""What a task class may look at: one transition of its rows."""
+"""The state that a task class reads: one transition of its environments."""
 
 from collections.abc import Callable, Iterable
 
@@ -11,21 +11,19 @@ from bidex_meta.utils.maths import xyzw
 def unknown_sensor(name: str, known: Iterable[str]) -> BidexError:
     """An error for a sensor that does not exist, with those of the same object where there is one."""
     names = list(known)
-    same = [each for each in names if each.partition("/")[0] == name.partition("/")[0]]
-    return unknown_name("sensor", name, same or names)
+    return unknown_name("sensor", name, [each for each in names if each.split("/")[0] == name.split("/")[0]] or names)
 
 
 class TaskState:
-    """The state of a class's rows after a step: sensors by name and the frozen numbers of their tasks."""
+    """The state of a class's environments after a step.
+
+    Args:
+        sensors: Sensor values, shape (n, nsensordata), in the engine's precision; not copied.
+        addresses: Sensor name to its slice.
+        frozen: What ``TaskClass.freeze`` computed from each environment's variation, each (n, k).
+    """
 
     def __init__(self, sensors: Tensor, addresses: dict[str, slice], frozen: dict[str, Tensor]) -> None:
-        """Wraps tensors; nothing is copied.
-
-        Args:
-            sensors: Sensor values of the rows, shape (n, nsensordata), in the engine's precision.
-            addresses: Sensor name to its slice.
-            frozen: What the class computed from each row's variation (``TaskClass.freeze``), each (n, k).
-        """
         self._sensors, self._addresses, self._known = sensors, addresses, {}
         self.frozen = frozen
 

@@ -2,19 +2,17 @@
 
 import math
 
-import mujoco
 import torch
 from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
 from bidex_meta.tasks.base import FIRM
-from bidex_meta.tasks.goals import frozen_goal, observe_goal, rotation_difference
-from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
+from bidex_meta.tasks.goals import frozen_goal, rotation_difference
+from bidex_meta.tasks.layout import goal_blocks, handle_blocks, object_blocks
 from bidex_meta.tasks.objects.pointed import OwnObjectClass
-from bidex_meta.tasks.placement import DRAWS, place, placed, yaw_quaternion
-from bidex_meta.tasks.reach import reach
-from bidex_meta.tasks.scene import SceneObject, add_table
+from bidex_meta.tasks.placement import DRAWS, placed, yaw_quaternion
+from bidex_meta.tasks.scene import SceneObject, Table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import component, join
 from bidex_meta.utils.maths import multiply, norm, rotation_angle, xyzw
@@ -23,7 +21,6 @@ _CUP = SceneObject("cup", "cup", (0.0, 0.0, 0.6845), (0.0, 0.0, 0.5 * math.pi))
 _SUCCESS_ANGLE = 0.25 * math.pi
 _SUCCESS_DISTANCE = 0.2
 """The cup stays within this of where the task puts it, metres."""
-_GHOST = (0.1, 0.012, 0.012)
 
 
 class SwingCup(OwnObjectClass):
@@ -47,56 +44,36 @@ class SwingCup(OwnObjectClass):
     episode_steps = 300
     right = HandPose((0.35, 0.2, 0.8), PALM_LEFT_AHEAD)
     left = HandPose((0.35, -0.2, 0.8), PALM_RIGHT_AHEAD)
-    transition_scale = 0.1
-    orientation_scale = 0.1
+    transition_scale, orientation_scale = 0.1, 0.1
     start_draws = DRAWS
     solver = FIRM
-    usual = _CUP
+    table = Table((0.3, 0.3, 0.6), (0.0, 0.0, 0.3))
+    objects = (_CUP,)
+    points = ("cup/left_handle_position", "cup/right_handle_position")
+    constant = -1.0
+    ghost = (0.1, 0.012, 0.012)
     camera_target = (0.08, 0.0, 0.68)
-
     variation_space = join(placed("cup"), component("yaw_change", 0.5 * math.pi, math.pi))
-    """The cup's place and ``yaw_change``, the goal's turn from the nominal start, radians."""
-
     blocks = (
-        *object_blocks("cup", "cup"),
+        *object_blocks("cup"),
         *goal_blocks("goal"),
-        point_block("right_handle_position", "cup/right_handle_position", "middle of the right hand's ear"),
-        point_block("left_handle_position", "cup/left_handle_position", "middle of the left hand's ear"),
+        *handle_blocks("cup", "middle of the right hand's ear", "middle of the left hand's ear"),
     )
-
-    def add_objects(self, scene: mujoco.MjSpec) -> None:
-        add_table(scene, (0.3, 0.3, 0.6), (0.0, 0.0, 0.3))
-        self.own.add_to(scene)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """``cup``: place (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse of its rotation (n, 4)."""
         position = variation.new_tensor(_CUP.position).repeat(len(variation), 1)
         position[:, :2] += variation[:, :2]
         rotation = multiply(yaw_quaternion(variation[:, 3]), xyzw(variation.new_tensor(_CUP.quaternion)))
-        goal = torch.cat((position, rotation), dim=1)
-        return {"cup": variation[:, :3], **frozen_goal(goal)}
+        return super().freeze(variation) | frozen_goal(torch.cat((position, rotation), dim=1))
 
-    def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        place(qpos["cup"], frozen["cup"], draws)
-
-    def observe(self, state: TaskState) -> dict[str, Tensor]:
-        return observe_goal(state, "cup/quaternion")
-
-    def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
-        """Equation 13: ``left`` -d_left, ``right`` -d_right, ``target`` 5 / (d_target + 0.1), ``constant`` -1."""
-        left = reach(state, "left", "cup/left_handle_position")
-        right = reach(state, "right", "cup/right_handle_position")
-        target = 5.0 / (_angle(state) + 0.1)
-        return {"left": -left, "right": -right, "target": target, "constant": torch.full_like(left, -1.0)}
+    def target(self, state: TaskState) -> Tensor:
+        return 5.0 / (_angle(state) + 0.1)
 
     def success(self, state: TaskState) -> Tensor:
         moved = norm(state["cup/position"] - state.frozen["goal"][:, :3])
         return (_angle(state) < _SUCCESS_ANGLE) & (moved < _SUCCESS_DISTANCE)
 
-    def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
-        return [(frozen["goal"], _GHOST)]
-
 
 def _angle(state: TaskState) -> Tensor:
-    """Rotation from cup to goal, rad in [0, pi], shape (n,)."""
     return state.once("angle", lambda: rotation_angle(rotation_difference(state, "cup/quaternion")))

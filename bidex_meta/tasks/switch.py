@@ -2,23 +2,22 @@
 
 import math
 
-import mujoco
 import torch
 from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
-from bidex_meta.tasks.base import FAST, TaskClass
-from bidex_meta.tasks.goals import frozen_goal, observe_goal
+from bidex_meta.tasks.base import FAST
+from bidex_meta.tasks.goals import frozen_goal
 from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
 from bidex_meta.tasks.placement import SHIFT
-from bidex_meta.tasks.reach import reach
-from bidex_meta.tasks.scene import SceneObject, add_table
+from bidex_meta.tasks.reach import ReachTask
+from bidex_meta.tasks.scene import SceneObject, Table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import component, join
 from bidex_meta.utils.maths import norm, quaternion_from_rpy, quaternion_product, xyzw
 
-_BASES = {"switch1": (0.0, -0.2, 0.65), "switch2": (0.0, 0.2, 0.65)}
+_NAMES = ("switch1", "switch2")
 _FACE_UP = (math.pi, 0.5 * math.pi, 0.0)
 _TRAVEL = 0.5585
 _PRESSED = (-0.0241, -0.001, 0.0427)
@@ -28,7 +27,7 @@ _PRESSED_QUATERNION = quaternion_product(quaternion_from_rpy(_FACE_UP), quaterni
 _SUCCESS_ANGLE = 0.8 * _TRAVEL
 
 
-class Switch(TaskClass):
+class Switch(ReachTask):
     """Press the buttons of two rocker switches.
 
     Table 0.5 x 1 x 0.55 m. Observation: Table 36 (428). Reward: equation 17. The half of each rocker that stands proud
@@ -50,62 +49,43 @@ class Switch(TaskClass):
     episode_steps = 125
     right = HandPose((0.55, 0.2, 0.8), PALM_DOWN_AHEAD)
     left = HandPose((0.55, -0.2, 0.8), PALM_DOWN_AHEAD)
-    transition_scale = 0.5
-    orientation_scale = 0.1
+    transition_scale, orientation_scale = 0.5, 0.1
     start_draws = 0
     solver = FAST
-    camera_target = (0.08, 0.0, 0.70)
-    camera_distance = 1.1
-
-    variation_space = join(*(component(f"{name}_{axis}", -SHIFT, SHIFT) for name in _BASES for axis in "xy"))
-    """Both housings' shifts along x and y, metres."""
-
+    table = Table((0.5, 1.0, 0.55), (0.0, 0.0, 0.275))
+    objects = (
+        SceneObject("switch1", "switch", (0.0, -0.2, 0.65), _FACE_UP),
+        SceneObject("switch2", "switch", (0.0, 0.2, 0.65), _FACE_UP),
+    )
+    points = ("switch1/button_position", "switch2/button_position")
+    constant = 2.0
+    camera_target, camera_distance = (0.08, 0.0, 0.70), 1.1
+    variation_space = join(*(component(f"switch{i}_{axis}", -SHIFT, SHIFT) for i in (1, 2) for axis in "xy"))
     blocks = (
-        *object_blocks("switch1", "switch1"),
+        *object_blocks("switch1"),
         *goal_blocks("goal"),
-        *(
-            point_block(f"{name}_position", f"{name}/button_position", "point on the rocker's proud half")
-            for name in _BASES
-        ),
+        point_block("switch1_position", "switch1/button_position", "point on the rocker's proud half"),
+        point_block("switch2_position", "switch2/button_position", "point on the rocker's proud half"),
     )
 
-    def add_objects(self, scene: mujoco.MjSpec) -> None:
-        add_table(scene, (0.5, 1.0, 0.55), (0.0, 0.0, 0.275))
-        for name, base in _BASES.items():
-            SceneObject(name, "switch", base, _FACE_UP).add_to(scene)
-
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
-        """Places and targets.
-
-        Returns:
-            ``switch1``, ``switch2``: base positions (n, 3); ``goal1``, ``goal2``: targets of the button points (n, 3);
-            ``goal``: target pose of switch 1 (n, 7); ``goal_inverse``: the inverse of its rotation (n, 4).
-        """
+        """Base positions, targets of the button points ``goal1``, ``goal2`` (n, 3); ``goal``: switch 1's pose."""
         frozen = {}
-        for i, (name, base) in enumerate(_BASES.items(), start=1):
-            position = variation.new_tensor(base).repeat(len(variation), 1)
+        for i, switch in enumerate(self.objects, start=1):
+            position = variation.new_tensor(switch.position).repeat(len(variation), 1)
             position[:, :2] += variation[:, 2 * i - 2 : 2 * i]
-            frozen |= {name: position, f"goal{i}": position + variation.new_tensor(_PRESSED)}
+            frozen |= {switch.name: position, f"goal{i}": position + variation.new_tensor(_PRESSED)}
         turn = xyzw(variation.new_tensor(_PRESSED_QUATERNION)).expand(len(variation), 4)
         return frozen | frozen_goal(torch.cat((frozen["goal1"], turn), dim=1))
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        for name in _BASES:
+        for name in _NAMES:
             qpos[name][:, :3] = frozen[name]
 
-    def observe(self, state: TaskState) -> dict[str, Tensor]:
-        return observe_goal(state, "switch1/quaternion")
-
-    def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
-        """2 - d_left - d_right + 50 (1.4 - d_target), d_target the sum over both buttons."""
+    def target(self, state: TaskState) -> Tensor:
         first, second = (norm(state[f"switch{i}/button_position"] - state.frozen[f"goal{i}"]) for i in (1, 2))
-        return {
-            "left": -reach(state, "left", "switch1/button_position"),
-            "right": -reach(state, "right", "switch2/button_position"),
-            "target": 50.0 * (1.4 - (first + second)),
-            "constant": torch.full_like(first, 2.0),
-        }
+        return 50.0 * (1.4 - (first + second))
 
     def success(self, state: TaskState) -> Tensor:
-        first, second = (state[f"{name}/angle"][:, 0] for name in _BASES)
+        first, second = (state[f"{name}/angle"][:, 0] for name in _NAMES)
         return (first > _SUCCESS_ANGLE) & (second > _SUCCESS_ANGLE)

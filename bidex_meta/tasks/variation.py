@@ -9,10 +9,7 @@ import numpy as np
 class VariationSpace:
     """The box from which a class's variations are drawn uniformly.
 
-    Attributes:
-        names: Component names, e.g. ``goal_x``; in metres, radians, or a draw in [-1, 1].
-        low: Lower ends.
-        high: Upper ends.
+    Component names, e.g. ``goal_x``, with their lower and upper ends; in metres, radians, or a draw in [-1, 1].
     """
 
     names: tuple[str, ...]
@@ -54,11 +51,8 @@ def component(name: str, low: float, high: float) -> VariationSpace:
 
 def box(prefix: str, centre: tuple[float, float, float], half: float) -> VariationSpace:
     """A cube of positions around a centre: components ``<prefix>_x``, ``_y``, ``_z`` in metres."""
-    return VariationSpace(
-        names=tuple(f"{prefix}_{axis}" for axis in "xyz"),
-        low=tuple(c - half for c in centre),
-        high=tuple(c + half for c in centre),
-    )
+    names = tuple(f"{prefix}_{axis}" for axis in "xyz")
+    return VariationSpace(names, tuple(c - half for c in centre), tuple(c + half for c in centre))
 
 
 def orientation(prefix: str) -> VariationSpace:

@@ -23,15 +23,8 @@ class Attendance(threading.Thread):
     """Counts up in the store twice a second, so that the others see that this process lives, whatever it is doing.
 
     It may wait, deep inside a collective operation, for one that does not live. So if a signal asked it to end, it has
-    not done so for 12 seconds and somebody is missing, the thread ends the process.
-
-    Args:
-        store: The store the processes met at. torchrun keeps it, so that it outlives each of them.
-        rank: Number of this process.
-        count: Number of processes.
-
-    Attributes:
-        on_loss: Called before the thread ends the process.
+    not done so for 12 seconds and another is missing, the thread calls ``on_loss`` and ends the process. torchrun keeps
+    the ``store``, so that it outlives each of the ``count`` processes.
     """
 
     def __init__(self, store: Any, rank: int, count: int):
@@ -49,11 +42,9 @@ class Attendance(threading.Thread):
         self.start()
 
     def report(self) -> list[int] | None:
-        """Tells the others that this process ends because one is lost, and finds out which.
+        """Reports to the others that this process ends because one is lost, and returns the missing ones' numbers.
 
-        Returns:
-            Numbers of the missing processes, as far as can be told; None where another process was quicker to report
-            and will say it.
+        None where another process was quicker and will report it.
         """
         self._closed.set()
         try:
@@ -63,7 +54,7 @@ class Attendance(threading.Thread):
             return []  # the store is gone too
 
     def close(self) -> None:
-        """No longer takes part; returns when the thread has ended (or waits for a store that no longer answers)."""
+        """No longer takes part; returns when the thread has ended, or waits for a store that no longer answers."""
         self._closed.set()
         self.join(_JOIN_SECONDS)
         if threading.current_thread() is threading.main_thread():

@@ -1,7 +1,7 @@
-"""One run in several processes: what they sum, share and agree on. torchrun starts them, torch.distributed joins them.
+"""One run in several processes, started by torchrun and joined by torch.distributed: sums, broadcasts, agreement.
 
-Each process steps a world of its own. In a process on its own every function here gives back what it was given, bit
-for bit, and nothing is sent.
+Each process steps a world of its own. In a single process every function here returns its input unchanged, and nothing
+is sent.
 """
 
 import atexit
@@ -58,12 +58,9 @@ def own_seed(seed: int) -> int:
 
 
 def init_from_environment() -> None:
-    """Joins the processes that torchrun announces in the environment; does nothing in a process on its own.
+    """Joins the processes that torchrun announces in the environment; does nothing in a single process.
 
-    Tensors on the CPU travel by gloo, those on CUDA devices by NCCL.
-
-    Raises:
-        LostProcess: Some of them did not come.
+    Tensors on the CPU travel by gloo, those on CUDA devices by NCCL. Raises LostProcess where some did not come.
     """
     global _attendance
     if "MASTER_ADDR" not in os.environ or int(os.environ.get("WORLD_SIZE", "1")) == 1 or _joined():
@@ -100,8 +97,7 @@ def _leave() -> None:
     """Ends what still runs beside the main thread, in a process that ends without :func:`shut_down`.
 
     A thread that asks for the interpreter when it has gone (the attendance, back from the store; gloo's own, dropping
-    its last tensor) is unwound through C++ that may not throw, and the whole process aborts: "terminate called without
-    an active exception".
+    its last tensor) is unwound through C++ that may not throw: "terminate called without an active exception".
     """
     _end_threads()
     # With NCCL this might wait for a process that is lost.
@@ -110,7 +106,7 @@ def _leave() -> None:
 
 
 def report_loss() -> list[int] | None:
-    """Which processes are missing, after a :class:`LostProcess`; None where another process says so."""
+    """Which processes are missing, after a :class:`LostProcess`; None where another process reports it."""
     return [] if _attendance is None else _attendance.report()
 
 
@@ -205,11 +201,9 @@ def gather(state: dict[str, Any]) -> list[dict[str, Any]] | None:
 
 
 def together(function: Callable[[], Value]) -> Value:
-    """``function()``, where bad input in any process ends all of them and only the first of those concerned says so.
+    """``function()``, where bad input in any process ends all of them and only the first of those concerned reports it.
 
-    Raises:
-        BidexError: In the first process that met one.
-        SystemExit: In the others.
+    The first process with a BidexError raises it, the others SystemExit.
     """
     error, value = None, None
     try:

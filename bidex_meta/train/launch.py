@@ -1,4 +1,4 @@
-"""How this process was started: on its own, or by torchrun as one of several that share a run."""
+"""How this process was started: alone, or by torchrun as one of several that share a run."""
 
 import os
 import signal
@@ -8,16 +8,12 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Launch:
-    """The place of this process among those of the run, as torchrun says in the environment."""
+    """This process among those of the run, as torchrun describes it in the environment."""
 
-    rank: int = 0
-    """Number of this process, from 0; process 0 alone writes and speaks."""
-    count: int = 1
-    """Number of processes on all machines."""
-    local_rank: int = 0
-    """Number of this process on its machine."""
-    local_count: int = 1
-    """Number of processes on its machine."""
+    rank: int = 0  # process 0 alone writes and prints
+    count: int = 1  # on all machines
+    local_rank: int = 0  # on its machine
+    local_count: int = 1  # on its machine
 
     def own_device(self, device: str) -> str:
         """The device of this process: of several on one machine, each takes the GPU of its number."""
@@ -25,13 +21,12 @@ class Launch:
 
 
 def launch() -> Launch:
-    """What the environment says; read anew each time, since it is a few look-ups."""
+    """The environment's description, read anew each time."""
     # A batch system may set WORLD_SIZE for other reasons; torchrun also says where to meet.
     if "MASTER_ADDR" not in os.environ:
         return Launch()
-    names = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
-    defaults = (0, 1, 0, 1)
-    return Launch(*(int(os.environ.get(name, default)) for name, default in zip(names, defaults, strict=True)))
+    defaults = {"RANK": 0, "WORLD_SIZE": 1, "LOCAL_RANK": 0, "LOCAL_WORLD_SIZE": 1}
+    return Launch(*(int(os.environ.get(name, default)) for name, default in defaults.items()))
 
 
 def hangup() -> tuple[signal.Signals, ...]:

@@ -1,4 +1,4 @@
-"""What a learner is to the commands and to the training loop; knows no particular one."""
+"""Interface of a learner to the commands and to the training loop."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     import torch
 
     from bidex_meta.agents import Agent
-    from bidex_meta.data.joined import Joined
     from bidex_meta.world.contract import VectorWorld
 
 AutoresetMode = Literal["SAME_STEP", "DISABLED"]
@@ -32,25 +31,15 @@ class LearnerConfig(Checked):
         return type(self).__name__.removesuffix("Config").lower()
 
     def bytes_held(self, num_envs: int, width: int) -> int:
-        """About how much memory a learner takes.
-
-        Args:
-            num_envs: Environments of its world.
-            width: Numbers stored of a step of an environment.
-        """
+        """Approximate memory of a learner, where a step of an environment stores ``width`` numbers."""
         return 0
 
 
 class Learner(ABC):
-    """Base of all learners.
+    """Base of all learners, made on a world in the mode that :meth:`autoreset_mode` returns.
 
-    Args:
-        world: A world in the mode that :meth:`autoreset_mode` returns.
-        config: An instance of the dataclass of its presets.
-        seed: Of all that is random, the world's first reset among it.
-
-    Attributes:
-        env_steps: Environment steps so far, over all environments of all processes; offline: updates.
+    ``config`` is an instance of the dataclass of its presets; ``seed`` is of all that is random, the world's first
+    reset among it.
     """
 
     name: ClassVar[str] = "learner"
@@ -73,6 +62,7 @@ class Learner(ABC):
     per_process: tuple[str, ...] = ()
     """Entries of ``state_dict`` that differ from process to process; the others are equal in all."""
     env_steps: int
+    """Environment steps so far, over all environments of all processes; offline: updates."""
 
     @abstractmethod
     def __init__(self, world: "VectorWorld", config: Any, seed: int):
@@ -85,7 +75,7 @@ class Learner(ABC):
 
     @classmethod
     def bytes_held(cls, config: Any, num_envs: int, width: int) -> int:
-        """About how much memory it takes; see :meth:`LearnerConfig.bytes_held`."""
+        """Approximate memory; see :meth:`LearnerConfig.bytes_held`."""
         return config.bytes_held(num_envs, width) if isinstance(config, LearnerConfig) else 0
 
     @abstractmethod
@@ -109,12 +99,12 @@ class Learner(ABC):
     def load_policy(cls, state: State, device: "str | torch.device" = "cpu") -> "Agent":
         """The agent of a checkpoint (its entry ``learner.policy``), for a world of any number of environments."""
 
-    def learn_from(self, data: "Joined") -> None:
-        """Takes the transitions to learn from, before the first iteration and before a checkpoint is loaded."""
+    def learn_from(self, data: Any) -> None:
+        """Takes the transitions to learn from (``bidex_meta.data.joined.Joined``), before anything else."""
         raise BidexError(f"{self.name}: learns by playing, not from data sets.")
 
-    def learn_from_demonstrations(self, data: "Joined") -> None:
-        """Takes transitions to imitate, before the first iteration and before a checkpoint is loaded."""
+    def learn_from_demonstrations(self, data: Any) -> None:
+        """Takes transitions to imitate (likewise), before the first iteration and before a checkpoint is loaded."""
         raise BidexError(f"{self.name}: imitates no demonstrations.")
 
     def start_from(self, policy: State) -> None:

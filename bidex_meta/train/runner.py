@@ -1,4 +1,4 @@
-"""The training loop every learner runs in: iterate, report, save; and stop cleanly when asked to.
+"""The training loop of every learner: iterate, log, save; and stop cleanly at a signal.
 
 In a run of several processes (:mod:`bidex_meta.train.distributed`) all make the same iterations and stop together;
 process 0 writes for all.
@@ -50,36 +50,30 @@ def train(
 ) -> int:
     """Trains until ``total_steps`` environment steps are done or ``total_seconds`` are up, whichever comes first.
 
-    Both count what a resumed run had done before. The time is that from the first world step to the end of an
-    iteration, checkpoints included: the iteration in which it is up is the last one, and there is at least one.
-    Metrics get it as ``Perf/training_time``.
+    Both include those of a run that is resumed (``spent_seconds``). Time counts from the first world step to the end of
+    an iteration, with checkpoints: the iteration in which it is up is the last one, and there is at least one. Metrics
+    get it as ``Perf/training_time``.
 
-    SIGINT, SIGTERM or SIGHUP, in any process, finishes the current iteration, saves and returns; so does the end of
-    whatever reads what is printed (BrokenPipeError of ``record``, ``watch`` or ``enough``). A second SIGINT or SIGTERM
-    acts at once. SIGHUP stays ignored where it was.
+    SIGINT, SIGTERM or SIGHUP, in any process, finishes the current iteration, saves and returns; so does the end of the
+    printed output's reader (BrokenPipeError of ``record``, ``watch`` or ``enough``). A second SIGINT or SIGTERM acts at
+    once. SIGHUP stays ignored where it was.
 
     Args:
-        learner: The learner, already made on ``world``.
-        world: The world, whose state is saved beside the learner's.
+        learner: Made on ``world``.
+        world: Its state is saved beside the learner's.
         total_steps: Environment steps in all.
-        record: Where metrics and checkpoints go; None in processes other than 0.
+        record: Where metrics and checkpoints go; in process 0 only, as ``watch`` and ``last``.
         total_seconds: Training time in all.
         spent_seconds: Training time of a resumed run before.
         checkpoint_seconds: Least time between two checkpoints, and never less than 50 times what the last one took to
             save: a replay makes them large. 0 saves after every iteration. One more is always saved at the end.
-        watch: Looks at the learner after each iteration and changes nothing of it; what it returns joins the metrics,
-            and its time is no time of training. None in processes other than 0.
-        enough: Whether metrics of an iteration, the watch's too, end the training; process 0's decide. None in no
-            process or in all.
-        last: Metrics of the iteration that a resumed run goes on from: where they were enough, nothing is trained. None
-            in processes other than 0.
+        watch: Evaluates the learner after each iteration without changing it; adds metrics, and no training time.
+        enough: Whether metrics of an iteration end the training, by process 0's; None in no process or in all.
+        last: Metrics of the iteration before a resumed run: where they were enough, nothing is trained.
 
-    Returns:
-        Number of the signal that ended the training early, SIGPIPE's where nobody reads what is printed, 0 if none did;
-        where another process got it, SIGTERM's.
-
-    Raises:
-        LostProcess: Another process is gone. What was saved stays as it is.
+    Returns the number of the signal that ended the training early, SIGPIPE's where nobody reads what is printed, 0 if
+    none did; where another process got it, SIGTERM's. Raises LostProcess where another process is gone; what was saved
+    stays as it is.
     """
     if enough is not None and any_process(is_main() and last is not None and enough(last)):
         return 0  # it was stopped between its last iteration and the end of its evaluation
@@ -130,10 +124,9 @@ def _save(learner: Learner, world: VectorWorld, record: Record | None) -> None:
 
 
 def checkpoint(learner: Learner, world: VectorWorld) -> dict[str, Any] | None:
-    """The state of a run: ``{"learner": ..., "env": ...}``, tensors and plain values only.
+    """The state of a run: ``{"learner": ..., "env": ...}``, tensors and plain values only; all processes must call it.
 
-    Of several processes all must call it. Process 0 gets its own state with, under ``others``, what differs in each of
-    the others; they get None.
+    Process 0 gets its own state with, under ``others``, what differs in each of the others; they get None.
     """
     state = {"learner": learner.state_dict(), "env": world.state_dict()}
     if world_size() == 1:
@@ -144,10 +137,9 @@ def checkpoint(learner: Learner, world: VectorWorld) -> dict[str, Any] | None:
 
 
 def resume(learner: Learner, world: VectorWorld, state: dict[str, Any]) -> None:
-    """Restores what :func:`checkpoint` gave; training then continues bit for bit (CPU, same number of threads).
+    """Restores a :func:`checkpoint`; training then continues bit for bit (CPU, same number of threads).
 
-    Raises:
-        BidexError: The checkpoint is of another number of processes.
+    Raises BidexError for one of another number of processes.
     """
     parts = [state, *state.get("others", [])]
     if len(parts) != world_size():
@@ -163,7 +155,7 @@ class _Stop(threading.Event):
     number: int = signal.SIGTERM
 
     def ask(self, number: int) -> None:
-        """Only the first says why."""
+        """Stores the first number only."""
         if not self.is_set():
             self.number = number
             self.set()
@@ -171,10 +163,10 @@ class _Stop(threading.Event):
 
 @contextmanager
 def _stop_requests() -> Iterator["_Stop"]:
-    """Turns the first SIGINT, SIGTERM or SIGHUP into a set event, then puts the first two's old handlers back.
+    """Turns the first SIGINT, SIGTERM or SIGHUP into a set event, then restores the first two's old handlers.
 
-    A terminal that closes may send SIGHUP twice, its shell's and its own: what comes later of it is ignored. On leaving
-    all old handlers are back.
+    A terminal that closes may send SIGHUP twice, its shell's and its own: later ones are ignored. On leaving all are
+    restored.
     """
     stop = _Stop()
     if threading.current_thread() is not threading.main_thread():

@@ -1,8 +1,6 @@
-"""The one door for files that somebody else may have written or damaged: opened, bounded, parsed and checked here.
+"""Reads files that others may have written or damaged: opened, bounded, parsed and checked, errors on one line.
 
-Whatever is wrong with a file is one line: it is a folder, a pipe, a loop of links, too large, not UTF-8, cut off,
-nested too deep, or its numbers cannot be. Nothing is read that is larger than its kind can be, and nothing waits for a
-writer.
+Nothing is read that is larger than its kind can be, and nothing waits for a writer.
 """
 
 import json
@@ -24,11 +22,7 @@ _LARGEST = 2**63 - 1
 
 
 def expanded(path: str | Path) -> Path:
-    """A path with ``~`` and ``~name`` replaced.
-
-    Raises:
-        BidexError: There is no such user, or nobody knows the home folder.
-    """
+    """A path with ``~`` and ``~name`` replaced; raises BidexError without such a user or home folder."""
     try:
         return Path(path).expanduser()
     except RuntimeError as error:
@@ -36,11 +30,7 @@ def expanded(path: str | Path) -> Path:
 
 
 def absolute(path: str | Path) -> Path:
-    """A path from the root on, ``~`` replaced and links followed.
-
-    Raises:
-        BidexError: As :func:`expanded`, or its links lead in a circle.
-    """
+    """A path from the root on, ``~`` replaced and links followed; raises BidexError where they lead in a circle."""
     try:
         return expanded(path).resolve()
     except (RuntimeError, OSError) as error:
@@ -64,15 +54,9 @@ def exists(path: Path) -> bool:
 
 
 def open_regular(path: Path, what: str, most: int | None = None) -> IO[bytes]:
-    """Opens a regular file for reading.
+    """Opens a regular file of at most ``most`` bytes for reading; messages call it ``what``: ``"a run's config"``.
 
-    Args:
-        path: The file.
-        what: What it should be, for messages: ``"a run's config"``.
-        most: Bytes that it may have at most.
-
-    Raises:
-        BidexError: There is none, it cannot be read, it is something else than a file, or it is too large.
+    Raises BidexError where there is none, it cannot be read, is something else than a file, or is too large.
     """
     try:
         # Opening a pipe would wait for somebody to write into it.
@@ -103,11 +87,7 @@ def read_bytes(path: Path, what: str, most: int = MOST_TEXT) -> bytes:
 
 
 def read_text(path: Path, what: str) -> str:
-    """A file's content in UTF-8.
-
-    Raises:
-        BidexError: As :func:`open_regular`, or it is not UTF-8.
-    """
+    """A file's content in UTF-8; raises BidexError as :func:`open_regular`, or where it is not UTF-8."""
     try:
         return read_bytes(path, what).decode()
     except UnicodeDecodeError as error:
@@ -115,16 +95,15 @@ def read_text(path: Path, what: str) -> str:
 
 
 def read_json(path: Path, what: str) -> Any:
-    """What a file of JSON holds.
+    """The content of a JSON file.
 
-    Raises:
-        BidexError: As :func:`read_text`, or it is not JSON, is nested too deep or holds a number that cannot be.
+    Raises BidexError as :func:`read_text`, or where it is not JSON, is nested too deep or has a number beyond 64 bits.
     """
     return _parsed(path, what, "JSON", json.loads)
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:
-    """What a file of TOML holds; errors as of :func:`read_json`."""
+    """The content of a TOML file; errors as of :func:`read_json`."""
     return _parsed(path, what, "TOML", tomllib.loads)
 
 
@@ -139,11 +118,7 @@ def _parsed(path: Path, what: str, language: str, parse: Callable[[str], Any]) -
 
 
 def bounded(content: Any) -> Any:
-    """The same content.
-
-    Raises:
-        ValueError: It is nested too deep, or holds a whole number beyond 64 bits.
-    """
+    """The same content; raises ValueError where it is nested too deep, or has a whole number beyond 64 bits."""
     level = [content]
     for _ in range(_DEEPEST):
         if not level:
@@ -158,12 +133,10 @@ def bounded(content: Any) -> Any:
 
 @dataclass(frozen=True)
 class Rule:
-    """What a value in a file must be."""
+    """A condition on a value in a file, and its words after "expected" in messages."""
 
     told: str
-    """In words, after "expected"."""
     fits: Callable[[Any], bool]
-    """Whether a value is so."""
 
     def or_none(self) -> "Rule":
         """The same, or null."""
@@ -171,10 +144,8 @@ class Rule:
 
     def each(self) -> "Rule":
         """A table whose values are all so."""
-        return Rule(
-            f"a table of which each value is {self.told}",
-            lambda value: isinstance(value, dict) and all(map(self.fits, value.values())),
-        )
+        words = f"a table of which each value is {self.told}"
+        return Rule(words, lambda value: isinstance(value, dict) and all(map(self.fits, value.values())))
 
 
 def whole(least: int, most: int = _LARGEST) -> Rule:
@@ -184,8 +155,8 @@ def whole(least: int, most: int = _LARGEST) -> Rule:
 
 def number(low: float = -float("inf"), high: float = float("inf")) -> Rule:
     """A number within bounds, finite where they are."""
-    told = "a number" if low == -high == -float("inf") else f"a number from {low:g} to {high:g}"
-    return Rule(told, lambda value: type(value) in (int, float) and low <= value <= high)
+    words = "a number" if low == -high == -float("inf") else f"a number from {low:g} to {high:g}"
+    return Rule(words, lambda value: type(value) in (int, float) and low <= value <= high)
 
 
 def choice(*choices: str) -> Rule:
@@ -198,17 +169,9 @@ TABLE = Rule("a table", lambda value: isinstance(value, dict))
 
 
 def check(content: Any, rules: Mapping[str, Rule], path: Path, needed: tuple[str, ...] = (), place: str = "") -> None:
-    """Refuses content whose entries are not what they must be.
+    """Raises BidexError for the first entry of a table that breaks its rule, and for missing ``needed`` ones.
 
-    Args:
-        content: A table as it was read.
-        rules: What its entries must be, where they are there.
-        path: Its file, for messages.
-        needed: Entries that must be there.
-        place: Where in the file the table stands, ending in a dot, for messages.
-
-    Raises:
-        BidexError: Told of the first that is not so.
+    ``path`` and ``place`` (of the table in the file, ending in a dot) are for messages.
     """
     if not isinstance(content, dict):
         raise BidexError(f"{path}: {place.rstrip('.') or 'content'}: expected a table, got {shortened(content)}.")

@@ -1,7 +1,7 @@
-"""How MuJoCo draws on this machine: a screen, else EGL, else OSMesa, found when the first picture is asked for.
+"""How MuJoCo draws on this machine: a screen, else EGL, else OSMesa, chosen when the first picture is drawn.
 
-MuJoCo decides when it is imported, by ``MUJOCO_GL`` alone, and cannot be imported at all where that names what is not
-there. Most runs draw nothing: they shall not fail on it.
+MuJoCo decides when it is imported, by ``MUJOCO_GL`` alone, and its import fails where that names what is missing; most
+runs draw nothing and shall not fail on it.
 """
 
 import os
@@ -15,18 +15,15 @@ from typing import Any
 from bidex_meta.errors import BidexError
 
 _VARIABLE = "MUJOCO_GL"
+# Backends that need no screen, in the order they are tried, and the library of each; other values that MuJoCo knows.
 _LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
-"""Backends that need no screen, in the order they are tried, and the library of each."""
 _OTHERS = {"enable", "enabled", "on", "true", "1", "glfw", "glx", "disable", "disabled", "off", "false", "0"}
-"""Other values that MuJoCo knows on Linux."""
-_INSTALL = "Install one (Debian, Ubuntu: apt-get install libegl1 libosmesa6)"
-
-_impossible: str | None = None
-"""What ``MUJOCO_GL`` asked for and this machine does not have."""
+_INSTALL = "(Debian, Ubuntu: apt-get install libegl1 libosmesa6)"
+_impossible: str | None = None  # what ``MUJOCO_GL`` asked for and this machine does not have
 
 
 def set_aside_what_is_missing() -> None:
-    """Takes ``MUJOCO_GL`` out of the environment where MuJoCo could not be imported with it; drawing then tells."""
+    """Takes ``MUJOCO_GL`` out of the environment where MuJoCo's import would fail with it; drawing then raises."""
     global _impossible
     asked = _asked()
     if not sys.platform.startswith("linux") or "mujoco" in sys.modules or asked in {"", *_OTHERS}:
@@ -36,21 +33,17 @@ def set_aside_what_is_missing() -> None:
 
 
 def has_screen() -> bool:
-    """Whether windows can be opened here, as far as the environment tells."""
+    """Whether windows can be opened here, as far as the environment shows."""
     return not sys.platform.startswith("linux") or any(os.environ.get(n) for n in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 @cache
 def prepare() -> None:
-    """Makes sure that ``mujoco.Renderer`` works; costs some time once, and nothing later.
-
-    Raises:
-        BidexError: There is no way to draw, or not the one that ``MUJOCO_GL`` names.
-    """
+    """Makes sure that ``mujoco.Renderer`` works; raises BidexError where nothing, or not ``MUJOCO_GL``, can draw."""
     if _impossible is not None:
         raise BidexError(
             f"{_VARIABLE}={_impossible} cannot be used here: expected egl, osmesa or glfw, and its library. "
-            "Unset it to take what there is, or install it (Debian, Ubuntu: apt-get install libegl1 libosmesa6)."
+            f"Unset it to take what there is, or install it {_INSTALL}."
         )
     from mujoco.rendering.classic import gl_context
 
@@ -66,7 +59,9 @@ def prepare() -> None:
         if reason is None:
             return
         reasons.append(f"{backend}: {reason}")
-    raise BidexError(f"Expected a screen, EGL or OSMesa to draw with, found none ({'; '.join(reasons)}). {_INSTALL}.")
+    raise BidexError(
+        f"Expected a screen, EGL or OSMesa to draw with, found none ({'; '.join(reasons)}). Install one {_INSTALL}."
+    )
 
 
 def _asked() -> str:

@@ -1,8 +1,7 @@
-"""Batched rotations on torch tensors.
+"""Batched rotations on torch tensors, quaternions (x, y, z, w).
 
-Quaternions here are (x, y, z, w), the convention outside the engine. Sums over the three or four components are written
-out term by term: a library reduction may add in another order for another batch size, and a row's numbers must not
-depend on how many rows there are.
+Sums over the three or four components are written out term by term: a library reduction may add in another order for
+another batch size, and the numbers of an environment must not depend on how many there are.
 """
 
 import math
@@ -17,11 +16,7 @@ from bidex_meta.errors import BidexError
 
 
 def check_precision() -> None:
-    """Refuses another default precision than single: observations, networks and replays are made in it.
-
-    Raises:
-        BidexError: ``torch.set_default_dtype`` has set another.
-    """
+    """Raises BidexError where torch's default dtype is not float32, in which observations and networks are made."""
     kind = torch.get_default_dtype()
     if kind != torch.float32:
         raise BidexError(
@@ -103,7 +98,7 @@ def rotate(q: Tensor, v: Tensor) -> Tensor:
 def rotation_angle(q: Tensor) -> Tensor:
     """Angle of a unit quaternion (x, y, z, w) in [0, pi]: 2 atan2(|v|, |w|).
 
-    The same value as the printed 2 arcsin(min(|v|, 1)), but its slope stays finite near pi.
+    Equals the paper's 2 arcsin(min(|v|, 1)), but its slope stays finite near pi.
     """
     return 2.0 * torch.atan2(norm(q[..., :3]), q[..., 3].abs())
 
@@ -129,15 +124,10 @@ def roll_pitch_yaw(q: Tensor) -> Tensor:
 
 
 def random_orientation(u0: Tensor, u1: Tensor) -> Tensor:
-    """A random orientation: a turn by pi u0 about x times a turn by pi u1 about y (docs/figures.md, start noise).
+    """A turn by pi u0 about x times a turn by pi u1 about y (docs/figures.md, start noise), from draws (n,) in [-1, 1].
 
-    Args:
-        u0: Draws in [-1, 1], shape (n,).
-        u1: Draws in [-1, 1], shape (n,).
-
-    Returns:
-        Quaternions (x, y, z, w), shape (n, 4), rounded to single precision: sines of a vector unit and of its scalar
-        tail may differ in the last bit of double precision, and a row's start must not depend on its place in a batch.
+    Returns quaternions (x, y, z, w), (n, 4), rounded to single precision: sines of a vector unit and of its scalar tail
+    may differ in the last bit of double precision, and a start must not depend on its place in a batch.
     """
     a, b = 0.5 * math.pi * u0, 0.5 * math.pi * u1
     sa, ca, sb, cb = a.sin(), a.cos(), b.sin(), b.cos()

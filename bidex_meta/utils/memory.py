@@ -1,4 +1,4 @@
-"""What a world, a replay or a network will take, told before it is taken: a system out of memory ends others' work."""
+"""Memory of a world, a replay or a network, checked before it is allocated: running out ends others' work."""
 
 import os
 import sys
@@ -7,10 +7,9 @@ from pathlib import Path
 from bidex_meta.errors import BidexError
 
 ROW_BYTES = 500_000
-"""Of a row of a world on the CPU: measured 0.39 MB on MT4 and 0.48 on MT20, with 1000 rows each."""
-
+"""Of an environment on the CPU: measured 0.39 MB on MT4 and 0.48 on MT20, with 1000 each."""
 POINT_BYTES = 100
-"""Of a point of a row's cloud: calculated, in the observation, its copies in a step's info and what makes them."""
+"""Of a point of an environment's cloud: calculated, in the observation, its copies in a step's info and sources."""
 
 
 def usable_cores() -> int:
@@ -19,21 +18,15 @@ def usable_cores() -> int:
 
 
 def available() -> int | None:
-    """Bytes that can still be had, by the system and by the container's limit; None where neither is told."""
+    """Free bytes, by the system and by the container's limit; None where neither is known."""
     found = [amount for amount in (_of_system(), _of_container()) if amount is not None]
     return min(found, default=None)
 
 
 def check_memory(needed: float, what: str, mend: str) -> None:
-    """Refuses what does not fit.
+    """Raises BidexError where fewer than ``needed`` bytes are free.
 
-    Args:
-        needed: Bytes, estimated.
-        what: What takes them: ``"1,000 rows"``.
-        mend: What to ask for instead, after the error's sentence.
-
-    Raises:
-        BidexError: There are fewer.
+    ``what`` takes them (``"1,000 rows"``); ``mend`` is the advice after the error's sentence.
     """
     there = available()
     if there is not None and needed > there:

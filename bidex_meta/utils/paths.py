@@ -1,7 +1,4 @@
-"""Where the folders of data are: `suites/` and `assets/`. Nothing else builds such a path.
-
-In an installed wheel they are packed beside this file; in a checkout they stand beside the package.
-"""
+"""The folders of data, `suites/` and `assets/`: inside the package in a wheel, beside it in a checkout."""
 
 from pathlib import Path
 
@@ -11,20 +8,12 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def suites_dir() -> Path:
-    """The folder of the suite files that this installation ships.
-
-    Raises:
-        BidexError: The folder is missing, which only a damaged installation shows.
-    """
+    """The folder of the shipped suite files."""
     return _room("suites")
 
 
 def assets_dir() -> Path:
-    """The folder of the models (MJCF) of hands, objects and scene.
-
-    Raises:
-        BidexError: The folder is missing, which only a damaged installation shows.
-    """
+    """The folder of the models (MJCF) of hands, objects and scene."""
     return _room("assets")
 
 

@@ -25,7 +25,7 @@ def short_name(name: str) -> str:
 
 
 def name_with_object(name: str, thing: str | None) -> str:
-    """What a task class with another object is called: ``CatchUnderarm-block``; of a file its name without ``.xml``."""
+    """The name of a task class with another object: ``CatchUnderarm-block``; of a file without ``.xml``."""
     # Names of the shelf are taken in any case, and written in one.
     return name if thing is None else f"{name}-{Path(thing).stem if thing.endswith('.xml') else thing.lower()}"
 
@@ -36,14 +36,9 @@ def name_without_object(name: str) -> str:
 
 
 def outside_class(name: str, role: str) -> tuple[type[Any], Any]:
-    """A class of the user's own, and the module it stands in.
+    """A class of the user's own, ``package.module:Class``, and its module; ``role`` is for messages, e.g. ``--algo``.
 
-    Args:
-        name: ``package.module:Class``.
-        role: What was named, for messages, e.g. ``--algo``.
-
-    Raises:
-        BidexError: There is no such module or class, or the module raises where it is imported.
+    Raises BidexError where there is no such module or class, or its import raises.
     """
     module_name, _, class_name = name.partition(":")
     if os.getcwd() not in sys.path:
@@ -70,7 +65,7 @@ def outside_class(name: str, role: str) -> tuple[type[Any], Any]:
 
 
 def own_fault(error: BaseException) -> str | None:
-    """What an error says that was raised in a class of the user's own or below it, and where; None for any other."""
+    """Message and location of an error that was raised in a class of the user's own or below it; None for any other."""
     at = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
     if isinstance(error, SyntaxError):
         at.append((error.filename or "", error.lineno))

@@ -1,4 +1,4 @@
-"""The standard streams of the command line: ones that are closed, and ones that nobody reads any more."""
+"""The standard streams of the command line: closed ones, and ones without a reader."""
 
 import contextlib
 import os
@@ -10,8 +10,7 @@ from typing import IO, Any
 def open_missing() -> None:
     """Opens the null device for each standard stream that this process was started without (``2>&-``).
 
-    Python leaves None in its place, and the next file that is opened would get its number: what a library prints to
-    stderr would then be written into a checkpoint.
+    The next file that is opened would get its number, and a library's messages would be written into a checkpoint.
     """
     for number in range(3):
         try:
@@ -24,7 +23,7 @@ def open_missing() -> None:
 
 
 def silence(stream: IO[Any]) -> None:
-    """Sends to the null device what is printed from now on, and what could not be written before."""
+    """Sends later output, and what could not be written before, to the null device."""
     with contextlib.suppress(OSError, ValueError):  # a stream within Python has no number
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, stream.fileno())
@@ -32,7 +31,7 @@ def silence(stream: IO[Any]) -> None:
 
 
 def unread(stream: IO[Any]) -> bool:
-    """Whether whatever read a stream has ended (``| head``)."""
+    """Whether a stream's reader has ended (``| head``)."""
     with contextlib.suppress(OSError, ValueError, AttributeError):  # Windows has no poll
         poll = select.poll()
         poll.register(stream.fileno(), 0)

@@ -1,8 +1,7 @@
-"""What comes from outside, checked by the annotations of dataclasses: settings, flags and files alike.
+"""Settings, flags and files, checked by msgspec against the annotations of dataclasses.
 
-msgspec does the checking. A dataclass says in its annotations what its fields may be (the types below have the usual
-bounds); :func:`check_fields` checks an instance, :func:`parse` makes one of what was read from a file. Whatever is
-wrong is one line that names the field, what was expected and what came.
+:func:`check_fields` checks an instance, :func:`parse` makes one of what was read from a file. An error is one line with
+the field, what was expected and the value.
 """
 
 import dataclasses
@@ -21,72 +20,44 @@ from bidex_meta.errors import BidexError, nearest, shortened
 
 Kind = TypeVar("Kind")
 
-MOST = 10**12
-"""No count of anything is larger."""
+MOST = 10**12  # no count of anything is larger
 _LARGE = 1e300
 
 Whole = Annotated[int, Meta(ge=0, le=MOST)]
-"""A count that may be zero."""
 Count = Annotated[int, Meta(ge=1, le=MOST)]
-"""A count of at least one."""
-Few = Annotated[int, Meta(ge=1, le=1_000_000)]
-"""Episodes, tasks, trials, images: what is done so many times."""
-Shots = Annotated[int, Meta(ge=0, le=1000)]
-"""Adaptations one after the other."""
+Few = Annotated[int, Meta(ge=1, le=1_000_000)]  # repetitions: episodes, tasks, trials, images
+Shots = Annotated[int, Meta(ge=0, le=1000)]  # adaptations one after the other
 Environments = Annotated[int, Meta(ge=1, le=10_000_000)]
-"""Environments stepped together."""
-Threads = Annotated[int, Meta(ge=1, le=4096)]
-"""Threads; a resumed run may have more than there are cores."""
+Threads = Annotated[int, Meta(ge=1, le=4096)]  # a resumed run may have more than there are cores
 Pixels = Annotated[int, Meta(ge=1, le=16_384)]
-"""Width or height of an image."""
 Port = Annotated[int, Meta(ge=1, le=65_535)]
-"""A port of this machine."""
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-"""A seed."""
-Width = Annotated[int, Meta(ge=1, le=65_536)]
-"""Width of a network's layer; so wide a one alone holds 17 GB."""
+Width = Annotated[int, Meta(ge=1, le=65_536)]  # of a network's layer; so wide a one alone holds 17 GB
 Widths = Annotated[tuple[Width, ...], Meta(min_length=1, max_length=64)]
-"""Widths of a network's hidden layers, at least one."""
 Finite = Annotated[float, Meta(ge=-_LARGE, le=_LARGE)]
-"""A finite number."""
 Positive = Annotated[float, Meta(gt=0.0, le=_LARGE)]
-"""A finite number above 0."""
 NonNegative = Annotated[float, Meta(ge=0.0, le=_LARGE)]
-"""A finite number, 0 or more."""
 Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
-"""A number from 0 to 1."""
 Share = Annotated[float, Meta(gt=0.0, le=1.0)]
-"""A number above 0, to 1."""
 BelowOne = Annotated[float, Meta(ge=0.0, lt=1.0)]
-"""A number from 0 to below 1."""
 Text = Annotated[str, Meta(min_length=1, max_length=4096, pattern=r"^[^\0]*$")]
-"""A text that is not empty."""
 
 
 class Checked:
-    """Base of a dataclass of settings: its fields are checked by their annotations when an instance is made.
+    """Base of a dataclass of settings: raises BidexError for fields that do not fit their annotations.
 
     A class with conditions between fields checks them in its own ``__post_init__``, after this one.
-
-    Raises:
-        BidexError: A field is not of its type or out of its bounds.
     """
 
     def __post_init__(self) -> None:
-        """Checks all fields."""
         check_fields(self, getattr(self, "algo", type(self).__name__))
 
 
 def check_fields(settings: Any, name: str, as_flags: bool = False) -> None:
-    """Refuses an instance of a dataclass with a field that is not of its annotation.
+    """Raises BidexError for the first field of a dataclass's instance that does not fit its annotation.
 
-    Args:
-        settings: The instance; fields whose annotation is no plain type (a path, a function) are left alone.
-        name: What messages call it.
-        as_flags: Whether messages name the field as a flag of the command line.
-
-    Raises:
-        BidexError: Names the first such field.
+    Fields whose annotation is no plain type (a path, a function) are left alone. ``name`` is the instance in messages,
+    which name the field as a flag of the command line if ``as_flags``.
     """
     for field, hint in _hints(type(settings)).items():
         value = getattr(settings, field)
@@ -98,11 +69,7 @@ def check_fields(settings: Any, name: str, as_flags: bool = False) -> None:
 
 
 def check_rising(settings: Any, name: str, *fields: str) -> None:
-    """Refuses pairs of numbers of which the second is smaller than the first.
-
-    Raises:
-        BidexError: Names the first such field.
-    """
+    """Raises BidexError for the first pair of numbers of which the second is smaller than the first."""
     for field in fields:
         low, high = getattr(settings, field)
         if low > high:
@@ -110,16 +77,10 @@ def check_rising(settings: Any, name: str, *fields: str) -> None:
 
 
 def parse(content: object, kind: type[Kind], where: str, exact: bool = False) -> Kind:
-    """What was read from a file as an instance of a type.
+    """The content of a file (JSON's or TOML's) as an instance of a dataclass or another type.
 
-    Args:
-        content: Dicts, lists, texts, numbers, as JSON or TOML give them.
-        kind: A dataclass, or another type that msgspec knows; fields without a default must be there.
-        where: File and place in it, for messages.
-        exact: Whether names that no field has are refused.
-
-    Raises:
-        BidexError: Names the first entry that is not what it must be.
+    Raises BidexError for the first entry that does not fit, with ``exact`` also for unknown names; ``where`` is the
+    file and the place in it.
     """
     try:
         if exact:
@@ -130,16 +91,9 @@ def parse(content: object, kind: type[Kind], where: str, exact: bool = False) ->
 
 
 def whole_number(name: str, value: object, least: int, most: int | None = None) -> int:
-    """A whole number within bounds, of whatever integer type; for arguments of functions.
+    """An argument as a whole number within bounds, of whatever integer type.
 
-    Args:
-        name: What it is, for the message.
-        value: What was given.
-        least: Lower bound.
-        most: Upper bound, or None.
-
-    Raises:
-        BidexError: Not a whole number (1.0, True and "1" are none), or out of bounds.
+    Raises BidexError for no whole number (1.0, True and "1" are none), or one out of bounds.
     """
     try:
         number = None if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]
@@ -152,11 +106,7 @@ def whole_number(name: str, value: object, least: int, most: int | None = None) 
 
 
 def true_or_false(name: str, value: object) -> bool:
-    """A truth value, Python's or NumPy's; for arguments of functions.
-
-    Raises:
-        BidexError: Neither true nor false; no other value stands for one.
-    """
+    """An argument as a truth value, Python's or NumPy's; raises BidexError for any other value."""
     if not isinstance(value, bool | np.bool_):
         raise BidexError(f"{name}: expected True or False, got {shortened(value)}.")
     return bool(value)
@@ -180,7 +130,7 @@ def _plain(hint: Any) -> bool:
 
 
 def _refuse_unknown(content: object, kind: Any, where: str, place: str = "") -> None:
-    """Refuses names in tables that no field of their dataclass has, with the nearest one."""
+    """Raises BidexError for names in tables that no field of their dataclass has, with the nearest one."""
     if get_origin(kind) is Annotated:
         _refuse_unknown(content, get_args(kind)[0], where, place)
     elif dataclasses.is_dataclass(kind) and isinstance(content, dict):
@@ -227,15 +177,9 @@ def _message(error: msgspec.ValidationError, content: object, kind: Any, field: 
     return f"{place or 'content'}: {expected}{got}."
 
 
-_WORDS = {
-    "a table": "object",
-    "a list": "array",
-    "a whole number": "int",
-    "a number": "float",
-    "a text": "str",
-    "true or false": "bool",
-}
-"""Our words for msgspec's."""
+# Our words for msgspec's.
+_WORDS = {"a table": "object", "a list": "array", "a whole number": "int", "a number": "float", "a text": "str"}
+_WORDS["true or false"] = "bool"
 
 
 def _choices(hint: Any) -> list[Any]:
@@ -245,8 +189,8 @@ def _choices(hint: Any) -> list[Any]:
     return [value for part in get_args(hint) if not isinstance(part, Meta) for value in _choices(part)]
 
 
+# A part of msgspec's path, such as ``.runs[0].name``; ``[...]`` where it does not say which.
 _STEP = re.compile(r"\.([^.\[]+)|\[([^\]]*)\]")
-"""A part of msgspec's path, such as ``.runs[0].name``; ``[...]`` where it does not say which."""
 
 
 def _at(content: object, path: str) -> object:

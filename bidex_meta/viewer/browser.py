@@ -34,51 +34,40 @@ def colour(model: mujoco.MjModel, geom: int) -> tuple[float, float, float, float
 
 
 def shape(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3), metres, in the geom's frame, and triangles (m, 3) of a geom.
-
-    Raises:
-        BidexError: A height field or the like.
-    """
+    """Points (n, 3), metres, in the geom's frame, and triangles (m, 3) of a geom; BidexError for height fields."""
     make = import_module("trimesh.creation")  # of viser's packages
     kind, size = model.geom_type[geom], model.geom_size[geom]
     if kind == _TYPE.mjGEOM_MESH:
-        mesh = int(model.geom_dataid[geom])
-        points, faces = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
+        index = int(model.geom_dataid[geom])
+        points, faces = model.mesh_vertadr[index], model.mesh_faceadr[index]
         return (
-            model.mesh_vert[points : points + model.mesh_vertnum[mesh]].astype(float),
-            model.mesh_face[faces : faces + model.mesh_facenum[mesh]].astype(int),
+            model.mesh_vert[points : points + model.mesh_vertnum[index]].astype(float),
+            model.mesh_face[faces : faces + model.mesh_facenum[index]].astype(int),
         )
     if kind == _TYPE.mjGEOM_SPHERE:
-        made = make.icosphere(subdivisions=3, radius=size[0])
+        mesh = make.icosphere(subdivisions=3, radius=size[0])
     elif kind == _TYPE.mjGEOM_ELLIPSOID:
-        made = make.icosphere(subdivisions=3, radius=1.0)
-        made.apply_scale(size)
+        mesh = make.icosphere(subdivisions=3, radius=1.0)
+        mesh.apply_scale(size)
     elif kind == _TYPE.mjGEOM_CAPSULE:
-        made = make.capsule(height=2.0 * size[1], radius=size[0], count=(16, 16))
-        made.apply_translation((0.0, 0.0, -made.bounds.mean(axis=0)[2]))  # from one end on in some versions
+        mesh = make.capsule(height=2.0 * size[1], radius=size[0], count=(16, 16))
+        mesh.apply_translation((0.0, 0.0, -mesh.bounds.mean(axis=0)[2]))  # from one end on in some versions
     elif kind == _TYPE.mjGEOM_CYLINDER:
-        made = make.cylinder(radius=size[0], height=2.0 * size[1], sections=32)
+        mesh = make.cylinder(radius=size[0], height=2.0 * size[1], sections=32)
     elif kind == _TYPE.mjGEOM_BOX:
-        made = make.box(extents=2.0 * size)
+        mesh = make.box(extents=2.0 * size)
     else:
         raise BidexError(
             f"Expected geoms that the browser can show (primitives, meshes), got {model.geom(geom).name!r} of type "
             f"{_TYPE(int(kind)).name}. Make a film of it: bidex-meta render."
         )
-    return np.asarray(made.vertices), np.asarray(made.faces)
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
 class Browser:
-    """A ``Screen`` as a web server.
+    """A ``Screen`` as a web server; raises BidexError where viser is missing.
 
-    Args:
-        stage: The episodes.
-        host: Address it listens at; 0.0.0.0 lets other machines in.
-        port: Port; if it is in use, the next free one.
-        speed: Of the clock.
-
-    Raises:
-        BidexError: viser is missing.
+    ``host`` 0.0.0.0 lets other machines in; if ``port`` is in use, the next free one is taken.
     """
 
     def __init__(self, stage: Stage, host: str = "127.0.0.1", port: int = 8080, speed: float = 1.0) -> None:
@@ -123,7 +112,6 @@ class Browser:
             stage.restart() if self._asked.pop(0) == "Another episode" else stage.next_task()
 
     def _set_the_scene(self, stage: Stage) -> None:
-        """Shapes and camera of the shown class."""
         scene, self._model = self._server.scene, stage.model()
         for handle in (*self._shapes.values(), *self._ghosts):
             handle.remove()

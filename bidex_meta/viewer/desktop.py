@@ -17,11 +17,7 @@ class Desktop:
     """A ``Screen`` as a window; its keys are ``KEYS``."""
 
     def __init__(self, stage: Stage, speed: float = 1.0) -> None:
-        """Opens it.
-
-        Raises:
-            BidexError: No window can be opened.
-        """
+        """Opens the window, or raises BidexError."""
         self.paused, self.speed = False, speed
         self._asked: list[int] = []
         self._model = stage.model()

@@ -14,17 +14,9 @@ from bidex_meta.world.rendering import Ghost, ghosts, simulation
 
 
 class Stage:
-    """Episodes one after the other, in all environments.
+    """Episodes one after the other, in all environments of a world in autoreset mode DISABLED, one of each slot.
 
-    Args:
-        world: In autoreset mode DISABLED, one environment of each slot.
-        agent: The policy.
-        row: The environment that is shown first.
-        seed: Of the starts.
-
-    Attributes:
-        names: Class of each environment.
-        row: The environment that is shown; may be set.
+    ``row`` is the environment that is shown, may be set; ``names`` has the class of each.
     """
 
     def __init__(self, world: World, agent: Agent, row: int = 0, seed: int = 0) -> None:
@@ -41,8 +33,8 @@ class Stage:
 
     def _start(self, mask: torch.Tensor) -> None:
         self._agent.reset(mask)
-        chosen = mask.cpu().numpy()
-        self._steps[chosen], self._returns[chosen], self._success[chosen] = 0, 0.0, False
+        where = mask.cpu().numpy()
+        self._steps[where], self._returns[where], self._success[where] = 0, 0.0, False
 
     @torch.no_grad()
     def step(self) -> None:
@@ -112,12 +104,7 @@ _PICTURES = 30
 
 
 class Screen(Protocol):
-    """A viewer.
-
-    Attributes:
-        paused: Whether time stands still.
-        speed: Of the clock, 1 in real time.
-    """
+    """A viewer; ``speed`` of the clock is 1 in real time."""
 
     paused: bool
     speed: float
@@ -128,15 +115,12 @@ class Screen(Protocol):
 
     def obey(self, stage: Stage) -> None:
         """Applies the user's requests since the last call to the stage."""
-        ...
 
     def show(self, stage: Stage) -> None:
         """Shows its present state."""
-        ...
 
     def close(self) -> None:
         """Ends the view."""
-        ...
 
 
 def play(stage: Stage, screen: Screen, seconds: float | None = None) -> None:

@@ -1,7 +1,7 @@
 """Hand controller: moves both hands to points in closed loop, for scripted policies.
 
-A script reads the mean of each sensor over all copies of the start and acts alike in each of them, so that it depends
-on no single copy. The recorded actions replay without the script.
+A script reads the mean of each sensor over all copies of the start and acts alike in each of them. The recorded actions
+replay without the script.
 """
 
 import torch
@@ -28,18 +28,10 @@ def rest_action(size: int) -> Tensor:
 
 
 class HandController:
-    """Moves both hands of a class to points, from the present state of a simulator.
+    """Moves both hands of a class to points, from the present state of a simulator of copies of one start.
 
-    Args:
-        simulator: Its environments are copies of one start; each gets the same actions.
-        noise: Standard deviation of Gaussian noise on each action, to which the script reacts.
-        generator: Of the noise.
-
-    Attributes:
-        actions: Actions so far, each (action_size,).
-        rewards: Their rewards in the first copy, whose start is not shifted.
-        success: Which of them succeeded there.
-        episode_steps: Time limit, control steps.
+    ``noise`` is the standard deviation of Gaussian noise on each action, to which the script reacts. ``actions`` (each
+    (action_size,)), ``rewards`` and ``success`` are of the first copy's steps so far.
     """
 
     def __init__(self, simulator: Simulator, noise: float = 0.0, generator: torch.Generator | None = None):
@@ -47,23 +39,18 @@ class HandController:
         self.actions: list[Tensor] = []
         self.rewards: list[float] = []
         self.success: list[bool] = []
-        self.episode_steps = self._simulator.episode_steps
-        self._rest = rest_action(self._simulator.action_size)
-        self._full_speed = FORCE_PER_SCALE * self._simulator.task.transition_scale / LINEAR_DAMPING[0]
-        self._full_torque = TORQUE_PER_SCALE * self._simulator.task.orientation_scale
+        self.episode_steps = simulator.episode_steps
+        self._rest = rest_action(simulator.action_size)
+        self._full_speed = FORCE_PER_SCALE * simulator.task.transition_scale / LINEAR_DAMPING[0]
+        self._full_torque = TORQUE_PER_SCALE * simulator.task.orientation_scale
         self._held: dict[str, Tensor] = {}
         self._first = {side: self.where(f"{side}/mount_quaternion") for side in SIDES}
-        half = self._simulator.action_size // 2
-        self._joints = len(hand().control_low)
+        half, self._joints = simulator.action_size // 2, len(hand().control_low)
         self._fingers = {side: self._rest[i * half :][: self._joints] for i, side in enumerate(SIDES)}
-
-    def everywhere(self, sensor: str) -> Tensor:
-        """A sensor's values in all copies, (copies, k)."""
-        return self._simulator.sensor(sensor)
 
     def where(self, sensor: str) -> Tensor:
         """A sensor's mean over the copies, (k,)."""
-        return self.everywhere(sensor).mean(0)
+        return self._simulator.sensor(sensor).mean(0)
 
     def orientation(self, sensor: str) -> Tensor:
         """The mean over the copies of a sensor's quaternion, (x, y, z, w), (4,)."""
@@ -79,7 +66,7 @@ class HandController:
         return self.where(f"{side}/hand_point_position")
 
     def bend(self, side: str, knuckles: float, middles: float, **others: float) -> None:
-        """Bends the four fingers of a hand, and sets other joints by their names (the rest is 0), rad."""
+        """Bends the four fingers of a hand, and sets other joints by their names (the rest to 0), rad."""
         low, high = (torch.as_tensor(x).float() for x in (hand().control_low, hand().control_high))
         angles = torch.zeros(self._joints)
         names = [hand().joints[i] for i in hand().actuated]

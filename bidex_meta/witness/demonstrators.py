@@ -16,18 +16,16 @@ from bidex_meta.world.wrapper import PooledWorldWrapper
 
 
 class ActionSequences:
-    """Plays a sequence in each environment from the start of an episode on; after its end the last action is repeated.
+    """Plays a sequence of ``sequences`` (n, steps, action) in each environment from the start of an episode on.
 
-    Args:
-        sequences: Actions ``(n, steps, action)``.
-        which: The sequence of each environment, int64 ``(num_envs,)``.
+    After its end the last action is repeated. ``which`` is the sequence of each environment, int64 (num_envs,).
     """
 
     def __init__(self, sequences: Tensor, which: Tensor):
         self._sequences, self._which, self._step = sequences, which, torch.zeros_like(which)
 
     def eval_action(self, obs: Tensor) -> Tensor:
-        """The next actions ``(num_envs, action)``."""
+        """The next actions (num_envs, action)."""
         action = self._sequences[self._which, self._step.clamp_max(self._sequences.shape[1] - 1)]
         self._step += 1
         return action
@@ -43,15 +41,11 @@ class ActionSequences:
 
 
 class OpenLoopReplay(ActionSequences):
-    """Plays the witness of each environment's class, without observations.
+    """Plays the witness of each environment's class, without observations; a class without one gets zero actions.
 
-    Args:
-        witnesses: By class; a class without one gets zero actions.
-        task_names: Classes of the world's slots.
-        task_id: The slot of each environment, int64 ``(num_envs,)``.
-        actions: Size of the world's actions, which may be padded.
-        noise: Standard deviation of Gaussian noise on them.
-        seed: Of the noise.
+    ``task_names`` are the classes of the world's slots, ``task_id`` the slot of each environment, int64 (num_envs,),
+    ``actions`` the size of the world's actions, which may be padded; ``noise`` is the standard deviation of Gaussian
+    noise on them.
     """
 
     def __init__(
@@ -71,26 +65,20 @@ class OpenLoopReplay(ActionSequences):
         self._noise, self._generator = noise, torch.Generator(task_id.device).manual_seed(seed)
 
     def eval_action(self, obs: Tensor) -> Tensor:
-        """The next actions ``(num_envs, action)``."""
+        """The next actions (num_envs, action)."""
         action = super().eval_action(obs)
-        if not self._noise:
-            return action
-        noise = torch.randn(action.shape, generator=self._generator, device=action.device)
-        return (action + self._noise * noise).clamp(-1.0, 1.0)
+        if self._noise:
+            noise = torch.randn(action.shape, generator=self._generator, device=action.device)
+            action = (action + self._noise * noise).clamp(-1.0, 1.0)
+        return action
 
 
 class Scripted(ActionSequences):
     """Plays a class's script, computed at the start of each episode in a copy of the environment with full state.
 
-    The copy has the world's physics, so its actions have the same effect here; about a second for 500 steps.
-
-    Args:
-        world: Of one class with moving bases, on C MuJoCo, in autoreset mode DISABLED.
-        noise: Standard deviation of Gaussian noise on its actions, to which the script reacts.
-        seed: Of the noise.
-
-    Raises:
-        BidexError: The class has no script.
+    The copy has the world's physics, so its actions have the same effect here; about a second for 500 steps. ``world``
+    is of one class with moving bases, on C MuJoCo, in autoreset mode DISABLED; ``noise`` is the standard deviation of
+    Gaussian noise on its actions, to which the script reacts. Raises BidexError for a class without a script.
     """
 
     def __init__(self, world: World, noise: float = 0.0, seed: int = 0):
@@ -115,16 +103,7 @@ class Scripted(ActionSequences):
 class ShiftedStarts(PooledWorldWrapper):
     """A world of one class's task 0 whose environments all begin at its witness's start.
 
-    Each object and fixture is shifted in the plane by up to ``shift``, evenly over the disc.
-
-    Args:
-        name: The class.
-        rows: Number of environments.
-        shift: Largest shift, metres.
-        threads: Engine threads; None takes all CPUs.
-
-    Raises:
-        BidexError: There is no such class.
+    Each object and fixture is shifted in the plane by up to ``shift`` metres, evenly over the disc.
     """
 
     world: World
@@ -134,11 +113,7 @@ class ShiftedStarts(PooledWorldWrapper):
         self._shift = shift
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
-        """Starts episodes of all environments, shifted by the seed.
-
-        Raises:
-            BidexError: A mask: all begin together.
-        """
+        """Starts episodes of all environments, shifted by the seed; raises BidexError for options."""
         if options:
             raise BidexError("Shifted starts begin all environments together. Leave options out.")
         self.world.reset(seed=SEED)

@@ -19,8 +19,6 @@ SHIFT = 1e-4
 """How far the objects' start is shifted to see whether a witness succeeds by more than luck, metres."""
 SHIFTED = 10
 """Shifted starts of a replay."""
-NEEDED = 8
-"""Of these so many must succeed."""
 
 State = dict[str, Tensor]
 
@@ -29,22 +27,14 @@ State = dict[str, Tensor]
 class Trace:
     """Results of T steps of N environments."""
 
-    rewards: Tensor
-    """Unscaled reward (T, N), float64; 0 from the step after an end on."""
-    least: Tensor
-    """The least of the reward's terms, times their number; else as ``rewards``."""
-    success: Tensor
-    """Bool (T, N), counted until the end of the episode."""
-    alive: Tensor
-    """Bool (N,): the episode has not failed nor its physics broken."""
+    rewards: Tensor  # unscaled, (T, N), float64; 0 from the step after an end on
+    least: Tensor  # the least of the reward's terms, times their number; else as ``rewards``
+    success: Tensor  # bool (T, N), until the end of the episode
+    alive: Tensor  # bool (N,): the episode has not failed nor its physics broken
 
 
 def task_slot(name: str) -> Slot:
-    """The slot of a class with the one task that witnesses are about.
-
-    Raises:
-        BidexError: The suite has no such class.
-    """
+    """The slot of a class with the one task that witnesses are about; raises BidexError for another class."""
     benchmark = Benchmark(SUITE, seed=SEED)
     classes = benchmark.task_classes()
     if name not in classes:
@@ -54,22 +44,12 @@ def task_slot(name: str) -> Slot:
 
 
 class Simulator:
-    """N environments in a class's task 0, all at the same start: the world's physics and reward without its episodes.
-
-    Args:
-        name: The class.
-        num: Environments, N.
-        threads: Engine threads; None takes all CPUs.
-
-    Attributes:
-        action_size: Actions of an environment.
-        episode_steps: Time limit, control steps.
-    """
+    """``num`` environments in a class's task 0, all at the same start: the world's physics and reward, no episodes."""
 
     def __init__(self, name: str, num: int, threads: int | None = None):
         slot = task_slot(name)
         self._name, self.num, self.task = name, num, slot.task_class
-        self.action_size, self.episode_steps = slot.task_class.action_size, slot.task_class.episode_steps
+        self.action_size, self.episode_steps = self.task.action_size, self.task.episode_steps
         self._world = World([slot], num, autoreset_mode="DISABLED", seed=SEED, threads=threads)
         self._world.reset(seed=SEED)
         self._part = self._world.parts[0]
@@ -98,21 +78,19 @@ class Simulator:
         return {name: value[row].clone() for name, value in self._engine.state_dict().items()}
 
     def load(self, states: list[State]) -> None:
-        """Puts equal consecutive shares of the environments into these states; their number must divide N."""
+        """Puts equal consecutive shares of the environments into these states, whose number must divide theirs."""
+        stacked = {name: torch.stack([state[name] for state in states]) for name in states[0]}
         share = self.num // len(states)
-        names = states[0]
-        self._engine.load_state_dict(
-            {name: torch.stack([s[name] for s in states]).repeat_interleave(share, dim=0) for name in names}
-        )
+        self._engine.load_state_dict({name: each.repeat_interleave(share, dim=0) for name, each in stacked.items()})
 
     def take(self, task: np.ndarray, start: State) -> None:
-        """Puts all environments into another task of the class, variation (variation_space.size,), and its start."""
+        """Puts all environments into another task, its variation (variation_space.size,), and a start of it."""
         self._world.set_tasks({self._name: task[None]})
         self._world.reset(seed=SEED)
         self.load([start])
 
     def play(self, actions: Tensor, each_step: Callable[[], None] | None = None) -> Trace:
-        """Plays actions (T, N, action_size) in [-1, 1] from the present state, and calls back after each step."""
+        """Plays actions (T, N, action_size) in [-1, 1] from the present state, with a callback after each step."""
         alive = torch.ones(self.num, dtype=torch.bool)
         rewards, least, success = [], [], []
         for action in actions:
@@ -154,14 +132,10 @@ class Simulator:
 class Replay:
     """Result of a replay."""
 
-    total: float
-    """Return from the unshifted start."""
-    first_success: int | None
-    """Index of its first successful step."""
-    succeeded: int
-    """Shifted starts that succeed."""
-    depths: torch.Tensor
-    """Deepest contact after each step from each start, metres, shape (steps, 1 + shifted starts)."""
+    total: float  # return from the unshifted start
+    first_success: int | None  # index of its first successful step
+    succeeded: int  # shifted starts that succeed
+    depths: Tensor  # deepest contact after each step from each start, metres, (steps, 1 + shifted starts)
 
     @property
     def deepest(self) -> float:
@@ -171,13 +145,13 @@ class Replay:
     @property
     def found(self) -> bool:
         """Whether this counts as a witness: it succeeds, and so do eight of ten shifted starts."""
-        return self.first_success is not None and self.succeeded >= NEEDED
+        return self.first_success is not None and self.succeeded >= 8
 
 
 def frames(
     name: str, witness: Witness, at: Collection[int] | None = None, camera: str | None = None, **size: int
 ) -> Iterator[np.ndarray]:
-    """Pictures of a witness, (height, width, 3) uint8, after these numbers of steps, from 0 on; None: after each."""
+    """Pictures (height, width, 3) uint8 of a witness after these numbers of steps, from 0 on; None: after each."""
     simulator = Simulator(name, 1, threads=1)
     for played in range(len(witness.actions) + 1):
         if at is None or played in at:
@@ -191,13 +165,10 @@ def replay(name: str, witness: Witness, threads: int | None = None) -> Replay:
     """Plays a witness of a class from its start and from ten shifted ones."""
     simulator = Simulator(name, 1 + SHIFTED, threads)
     simulator.load(simulator.starts(SHIFTED))
-    actions = torch.from_numpy(witness.actions)
+    actions = torch.from_numpy(witness.actions)[:, None].expand(-1, simulator.num, -1)
     depths: list[list[float]] = []
-    everyone = range(simulator.num)
-    repeated = actions[:, None].expand(-1, simulator.num, -1)
-    trace = simulator.play(repeated, lambda: depths.append([simulator.contact_depth(i) for i in everyone]))
+    trace = simulator.play(actions, lambda: depths.append([simulator.contact_depth(i) for i in range(simulator.num)]))
     simulator.close()
     steps = trace.success[:, 0].nonzero().flatten().tolist()
-    won = trace.success.any(dim=0)
-    first = steps[0] if steps else None
-    return Replay(float(trace.rewards[:, 0].sum()), first, int(won[1:].sum()), torch.tensor(depths))
+    succeeded = int(trace.success.any(dim=0)[1:].sum())
+    return Replay(float(trace.rewards[:, 0].sum()), steps[0] if steps else None, succeeded, torch.tensor(depths))

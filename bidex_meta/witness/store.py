@@ -23,12 +23,11 @@ LEVELS = 127
 """Actions are whole multiples of 1/127, so that a byte holds one exactly."""
 _MOST_BYTES, _MOST_STEPS = 50_000_000, 100_000
 _Made = TypedDict("_Made", {"return": Finite, "first_success": Whole | None, "rival": Finite | None}, total=False)
-"""What is read again of how a witness was found."""
 
 
 @dataclass(frozen=True)
 class Witness:
-    """Recorded actions that solve a task, and how they were found."""
+    """Recorded actions that solve a task, and their record."""
 
     actions: np.ndarray
     """Actions (T, action_size), float32, multiples of 1/127."""
@@ -42,15 +41,14 @@ def quantised(actions: "Tensor") -> "Tensor":
 
 
 def witness_path(name: str) -> Path:
-    """Where the installation's witness of a class lies. Nothing is written there by default."""
+    """Path of the installation's witness of a class; nothing is written there by default."""
     return paths.assets_dir() / "witnesses" / f"{name}.npz"
 
 
 def load_witness(name: str, path: Path | None = None) -> Witness:
     """The witness of a class, or the one in a file.
 
-    Raises:
-        BidexError: There is none, it is damaged, or of another number of actions than the class has.
+    Raises BidexError where there is none, it is damaged, or its actions are not of the class's size.
     """
     if path is None:
         path = witness_path(name)

@@ -1,6 +1,6 @@
 """The batched world: groups of equal structure, actions, observations, resets, episodes, random numbers."""
 
-from bidex_meta.points.depth_sensor import PointsRule
+from bidex_meta.world.depth_sensor import PointsRule
 from bidex_meta.world.groups import Slot
 from bidex_meta.world.world import World
 

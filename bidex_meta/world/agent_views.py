@@ -1,9 +1,7 @@
-"""What each of several agents sees of a world and which actions are its own (appendix A.2).
+"""What each of several agents observes of a world and which actions are its own (appendix A.2).
 
-The smallest agents are a hand's fingers and its palm, which has the wrist and the base; any of them together are one.
-An agent sees the whole block of each hand it has a unit of, and everything that is of no hand: object, goal, task id.
-Its actions stand in ascending order of the world's, whatever the order of its units. All share the reward; a critic of
-all sees the full observation.
+The smallest agents are a hand's fingers and its palm (with wrist and base). An agent observes the whole block of each
+hand it has a unit of, and all that is of no hand: object, goal, task id. All share the reward.
 """
 
 from collections.abc import Iterable, Sequence
@@ -18,17 +16,13 @@ from bidex_meta.world.contract import ObservationGroup
 
 @dataclass(frozen=True)
 class AgentView:
-    """One agent of a world.
-
-    Attributes:
-        name: E.g. ``right`` or ``right/thumb``.
-        groups: The groups of the world's observation that it sees, as they stand there.
-        actions: Its entries of the world's action, ascending.
-    """
+    """One agent of a world, e.g. ``right`` or ``right/thumb``."""
 
     name: str
     groups: tuple[ObservationGroup, ...]
+    """The groups of the world's observation that it sees, as they stand there."""
     actions: tuple[int, ...]
+    """Its entries of the world's action, ascending, whatever the order of its units."""
 
     @property
     def columns(self) -> tuple[int, ...]:
@@ -37,41 +31,27 @@ class AgentView:
 
     def own_groups(self) -> tuple[ObservationGroup, ...]:
         """The groups as they stand in its own observation, which is :attr:`columns` side by side."""
-        place = {column: i for i, column in enumerate(self.columns)}
-        found = []
-        for group in self.groups:
-            where = (slice(place[part.start], place[part.stop - 1] + 1) for part in group.where)
-            found.append(ObservationGroup(group.name, _joined(where)))
-        return tuple(found)
+        index = {column: i for i, column in enumerate(self.columns)}
+        parts = [(slice(index[part.start], index[part.stop - 1] + 1) for part in group.where) for group in self.groups]
+        return tuple(ObservationGroup(g.name, _joined(where)) for g, where in zip(self.groups, parts, strict=True))
 
 
 def agent_views(groups: Sequence[ObservationGroup], num_actions: int, agents: Agents) -> tuple[AgentView, ...]:
-    """The agents of a world.
+    """The agents of a world, in the order of the partition; ``hands`` and ``fingers`` begin with the right hand.
 
-    Args:
-        groups: The world's ``observation_groups``.
-        num_actions: Entries of its action.
-        agents: The partition: ``single``, ``hands``, ``fingers``, a TOML file, or units by agent. A world without hands
-            has a unit for each action, ``action/0``, ``action/1``, ..., and shows every agent everything.
-
-    Returns:
-        In the order of the partition; ``hands`` and ``fingers`` begin with the right hand.
-
-    Raises:
-        BidexError: A unit that is unknown, missing, or there twice; hands of which some bases move and some do not.
+    ``agents`` is ``single``, ``hands``, ``fingers``, a TOML file, or units by agent; a world without hands has the
+    units ``action/0``, ``action/1``, ..., and shows every agent everything. Raises BidexError for a unit that is
+    unknown, missing or there twice, and where only some bases move.
     """
-    units = _units(groups, num_actions)
-    views = []
+    units, views = _units(groups, num_actions), []
     for name, own in _units_of_agents(units, partition_line(agents)).items():
-        hands = {f"{unit.partition('/')[0]}_hand" for unit in own}
-        others = {f"{side}_hand" for side in SIDES} - hands
-        seen = tuple(group for group in groups if group.name not in others or not _has_hands(groups))
-        views.append(AgentView(name, seen, tuple(sorted(action for unit in own for action in units[unit]))))
+        others = {f"{side}_hand" for side in SIDES} - {f"{unit.partition('/')[0]}_hand" for unit in own}
+        visible = tuple(group for group in groups if group.name not in others or not _has_hands(groups))
+        views.append(AgentView(name, visible, tuple(sorted(action for unit in own for action in units[unit]))))
     return tuple(views)
 
 
 def _joined(parts: Iterable[slice]) -> tuple[slice, ...]:
-    """Ascending ranges, those side by side as one."""
     found: list[slice] = []
     for part in parts:
         if found and found[-1].stop == part.start:
@@ -86,7 +66,6 @@ def _has_hands(groups: Sequence[ObservationGroup]) -> bool:
 
 
 def _units(groups: Sequence[ObservationGroup], num_actions: int) -> dict[str, list[int]]:
-    """The actions of each unit of a world."""
     if not _has_hands(groups):
         return {f"action/{i}": [i] for i in range(num_actions)}
     share, found = num_actions // len(SIDES), dict[str, list[int]]()
@@ -107,7 +86,6 @@ def _units(groups: Sequence[ObservationGroup], num_actions: int) -> dict[str, li
 
 
 def _units_of_agents(units: dict[str, list[int]], line: str) -> dict[str, list[str]]:
-    """The units that each agent has, each of the world's once."""
     if line == "single":
         return {"single": list(units)}
     if line in ("hands", "fingers") and not any(unit.startswith(SIDES) for unit in units):

@@ -25,7 +25,7 @@ from bidex_meta.world.wrapper import NumpyWorld
 
 
 class Slots(NamedTuple):
-    """The slots of a world: one entry of each list for each."""
+    """The slots of a world, one list entry each."""
 
     names: list[str]
     episode_steps: list[int]
@@ -34,18 +34,15 @@ class Slots(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """A step of all environments, before rewards are scaled and broken environments cleaned."""
+    """A step of n environments, before rewards are scaled and broken ones cleaned: (n, d), float32 and bool (n,)."""
 
     obs: Tensor
-    """Shape (n, d)."""
     reward: Tensor
-    """Shape (n,)."""
     success: Tensor
-    """Shape (n,), bool."""
     failed: Tensor
-    """The episode came to a true end. Shape (n,), bool."""
+    """The episode came to a true end."""
     unstable: Tensor
-    """The physics broke. Shape (n,), bool."""
+    """The physics broke."""
     terms: dict[str, Tensor]
     """Reward terms by name, each (n,), 0 in environments of classes without the term."""
 
@@ -53,8 +50,8 @@ class Transition(NamedTuple):
 class BatchedWorld(VectorEnv, ABC):
     """Environments of some slots, split evenly and contiguously over them: a ``contract.TaskWorld``.
 
-    Worlds pickle and copy: a copy is built anew and goes on bit for bit. Attributes set from outside stay behind,
-    ``stagger`` alone does not.
+    Worlds pickle and copy: a copy is built anew and continues bit for bit. Of attributes set from outside only
+    ``stagger`` is copied.
     """
 
     single_observation_space: Box
@@ -67,8 +64,7 @@ class BatchedWorld(VectorEnv, ABC):
     """Whether nothing in a step may look at a number (accelerators)."""
     _arguments: tuple[tuple[Any, ...], dict[str, Any]]
 
-    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Keeps the constructor's arguments for copies."""
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:  # noqa: D102
         world = super().__new__(cls)
         world._arguments = args, kwargs
         return world
@@ -86,15 +82,8 @@ class BatchedWorld(VectorEnv, ABC):
     ) -> None:
         """Splits the environments over the slots; a subclass sets spaces, pools and the seed.
 
-        Args:
-            slots: Name, time limit, reward scale and discount of each.
-            num_envs: Environments over all slots; the first slots take the remainder.
-            device: Of all tensors.
-            autoreset_mode: SAME_STEP (training) or DISABLED (evaluation), as a member or its name.
-            stagger: Whether first episodes begin at a random elapsed step (SAME_STEP only).
-
-        Raises:
-            BidexError: Fewer environments than slots, or an unknown mode.
+        ``autoreset_mode`` is SAME_STEP (training) or DISABLED (evaluation); with ``stagger`` first episodes begin at a
+        random elapsed step (SAME_STEP only). Raises BidexError for fewer environments than slots, or an unknown mode.
         """
         self.num_envs, self.device = checked.num_envs(num_envs, slots.names), device
         self.autoreset_mode = checked_mode(autoreset_mode)
@@ -112,7 +101,6 @@ class BatchedWorld(VectorEnv, ABC):
         self._ready = False
 
     def _by_slot(self, values: Sequence[float]) -> Tensor:
-        """A number of each slot as one of each environment, shape (num_envs,)."""
         return torch.tensor(values, device=self.device)[self.task_id]
 
     def _set_spaces(self, single_observation: Box, action_size: int) -> None:
@@ -124,14 +112,13 @@ class BatchedWorld(VectorEnv, ABC):
         self._action = torch.zeros(self.num_envs, action_size, device=self.device)
 
     def _set_pool_sizes(self, sizes: list[int]) -> None:
-        """Each slot has so many tasks now; the next reset must be of all environments."""
+        """The next reset must be of all environments."""
         self.num_slot_tasks = sizes
         self._pool_size = self._by_slot(sizes)
         self.task_index = self._index_in_slot % self._pool_size
         self._ready = False
 
     def _set_seed(self, seed: object) -> None:
-        """Starts all draws anew."""
         self.seed = checked.seed(seed)
         pairs = zip(self.task_names, self.slot_rows, strict=True)
         self._keys = torch.cat([row_keys(self.seed, name, r.stop - r.start, self.device) for name, r in pairs])
@@ -150,17 +137,10 @@ class BatchedWorld(VectorEnv, ABC):
         return self._obs.clone(), {}
 
     def step(self, action: Tensor | np.ndarray) -> Step:
-        """Advances every environment by one control step.
+        """Advances every environment by one control step; see ``VectorWorld.step``.
 
-        Args:
-            action: Shape (num_envs, a), clipped to [-1, 1]; an environment with a non-finite number ends as unstable.
-
-        Returns:
-            Observations (num_envs, d), rewards, terminated and truncated (num_envs,), and info as in the contract,
-            with Gymnasium's ``episode`` and ``final_info`` where an environment ended.
-
-        Raises:
-            BidexError: No real numbers, a wrong shape, or no reset since the world was made or got other tasks.
+        ``action`` (num_envs, a) may be a NumPy array. Raises BidexError where it is not real numbers of that shape, and
+        before the first reset.
         """
         if not self._ready:
             raise BidexError("Expected reset() before step(): the environments have no episode yet.")
@@ -175,7 +155,7 @@ class BatchedWorld(VectorEnv, ABC):
             return self._obs.clone(), reward, terminated, truncated, info
 
     def _run(self, name: str, work: Callable[..., Any], *inputs: Tensor) -> Any:
-        """A stretch of a step that looks at no number; where a graph of it is kept, that is replayed."""
+        """A stretch of a step that reads no number on the host; a recorded graph of it is replayed."""
         return work(*inputs)
 
     def _begin(self, mask: Tensor, stagger: bool) -> None:
@@ -209,22 +189,20 @@ class BatchedWorld(VectorEnv, ABC):
 
     @abstractmethod
     def _advance(self, active: Tensor, broken: Tensor) -> Transition:
-        """Steps the active environments under ``_action``.
+        """Steps the ``active`` environments under ``_action``; of others only success is read.
 
-        Args:
-            active: Environments whose episode runs; of others success alone is read.
-            broken: Those of them whose action was not finite; of these nothing is read.
+        ``broken``: those of them whose action was not finite; of these nothing is read.
         """
 
-    def _finish(self, active: Tensor, broken: Tensor, made: Transition) -> tuple[Tensor, Tensor, Tensor, Info]:
-        obs, unstable = made.obs, made.unstable | broken
+    def _finish(self, active: Tensor, broken: Tensor, transition: Transition) -> tuple[Tensor, Tensor, Tensor, Info]:
+        obs, unstable = transition.obs, transition.unstable | broken
         valid = active & ~unstable
-        success = made.success & ~unstable
-        unscaled = torch.where(valid, made.reward, 0.0)
+        success = transition.success & ~unstable
+        unscaled = torch.where(valid, transition.reward, 0.0)
         reward = unscaled * self._scale
         episodes = self.episodes
         episodes.add(active, reward, unscaled, success)
-        terminated = made.failed & valid | episodes.terminated
+        terminated = transition.failed & valid | episodes.terminated
         late = (episodes.elapsed >= self.max_episode_steps) & ~terminated
         truncated = (late | unstable) & active | episodes.truncated
         ended = (terminated | truncated) & active
@@ -239,8 +217,8 @@ class BatchedWorld(VectorEnv, ABC):
             "so_far": episodes.statistics(),
             "counted": ended & episodes.counts,
         }
-        if made.terms:
-            info["reward_terms"] = {name: torch.where(valid, term, 0.0) for name, term in made.terms.items()}
+        if transition.terms:
+            info["reward_terms"] = {name: torch.where(valid, term, 0.0) for name, term in transition.terms.items()}
         if self._masked or ended.any():
             info |= ended_info(info)
         self._obs = obs.clone()
@@ -250,20 +228,15 @@ class BatchedWorld(VectorEnv, ABC):
         return reward, terminated, truncated, info
 
     def state_dict(self) -> State:
-        """Everything that decides the future of the world: tensors and plain values, copied."""
-        return {
-            "seed": self.seed,
-            "episodes": self.episodes.state_dict(),
-            "task_index": self.task_index.clone(),
-            "observation": self._obs.clone(),
-        }
+        """Tensors and plain values, copied, from which the world continues bit for bit."""
+        state = {"seed": self.seed, "episodes": self.episodes.state_dict()}
+        return state | {"task_index": self.task_index.clone(), "observation": self._obs.clone()}
 
     @abstractmethod
     def load_state_dict(self, state: State) -> None:
-        """Puts back what ``state_dict`` gave, on a world made alike; all of it or nothing."""
+        """Restores a ``state_dict`` of a world built alike; all of it or nothing."""
 
     def _restore(self, state: State) -> None:
-        """Puts back what every world has, from a state that was checked."""
         self._set_seed(int(state["seed"]))
         self.episodes.load_state_dict(state["episodes"])
         # Checkpoints are loaded to the CPU, wherever the world lives.
@@ -276,7 +249,7 @@ class BatchedWorld(VectorEnv, ABC):
         return [self.task_names[i] for i in self.task_id.tolist()]
 
     def to_numpy(self, stagger: bool = False) -> NumpyWorld:
-        """This world in NumPy arrays, as Gymnasium's vector wrappers expect one; ``stagger`` as there."""
+        """This world with NumPy arrays, as Gymnasium's vector wrappers expect."""
         return NumpyWorld(self, stagger)
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
@@ -318,12 +291,7 @@ def split_rows(num_envs: int, slots: int) -> list[slice]:
 
 
 def _recreate(
-    kind: type[BatchedWorld],
-    args: tuple[Any, ...],
-    kwargs: dict[str, Any],
-    state: State,
-    ready: bool,
-    stagger: bool,
+    kind: type[BatchedWorld], args: tuple[Any, ...], kwargs: dict[str, Any], state: State, ready: bool, stagger: bool
 ) -> BatchedWorld:
     world = kind(*args, **kwargs)
     world.load_state_dict(state)

@@ -9,11 +9,11 @@ from torch import Tensor
 
 from bidex_meta.engine.health import checked_state, dense
 from bidex_meta.errors import BidexError, shortened, unknown_name
-from bidex_meta.points.depth_sensor import PointsRule
 from bidex_meta.tasks.scene import Scene
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.utils.maths import check_precision
 from bidex_meta.utils.validation import whole_number
+from bidex_meta.world.depth_sensor import PointsRule
 from bidex_meta.world.groups import Slot, with_pool
 from bidex_meta.world.observations import Rule
 
@@ -28,11 +28,7 @@ _ROWS = 11
 
 
 def num_envs(given: object, slots: Sequence[str]) -> int:
-    """The number of environments of a world with these slots.
-
-    Raises:
-        BidexError: No whole number, or fewer than slots.
-    """
+    """The number of environments; BidexError where it is no whole number or less than the slots."""
     number = whole_number("num_envs", given, 1, _MOST_ENVIRONMENTS)
     if number < len(slots):
         raise BidexError(f"num_envs: expected at least {len(slots)}, one each for {', '.join(slots)}; got {number}.")
@@ -40,20 +36,12 @@ def num_envs(given: object, slots: Sequence[str]) -> int:
 
 
 def seed(given: object) -> int:
-    """The seed of a world.
-
-    Raises:
-        BidexError: No whole number from 0 on.
-    """
+    """The seed of a world; BidexError where it is no whole number from 0 on."""
     return whole_number("seed", given, 0, _LARGEST_SEED)
 
 
 def choices(task_sampling: object, observation: object, points: object) -> None:
-    """Refuses what is none of the names, and points that are no rule of them.
-
-    Raises:
-        BidexError: An unknown name, or something else than a ``PointsRule`` or None.
-    """
+    """Raises BidexError for unknown names, and for points that are neither a ``PointsRule`` nor None."""
     for name, given, known in (
         ("task_sampling", task_sampling, ("uniform", "fixed")),
         ("observation", observation, get_args(Rule)),
@@ -65,10 +53,9 @@ def choices(task_sampling: object, observation: object, points: object) -> None:
 
 
 def action(given: Tensor | np.ndarray, shape: tuple[int, int], device: torch.device) -> Tensor:
-    """Actions as a tensor on the device, float32, without a gradient; non-finite ones are left to :func:`clean`.
+    """Actions as a float32 tensor on the device, without a gradient; non-finite ones are left to :func:`clean`.
 
-    Raises:
-        BidexError: No real numbers, or another shape; or torch's default precision is not single.
+    Raises BidexError where they are not real numbers of this shape, or torch's default precision is not single.
     """
     check_precision()
     wanted = f"Expected actions of shape {shape}"
@@ -81,27 +68,16 @@ def action(given: Tensor | np.ndarray, shape: tuple[int, int], device: torch.dev
 
 
 def clean(action: Tensor) -> tuple[Tensor, Tensor]:
-    """Clips actions to [-1, 1].
-
-    Returns:
-        The actions with non-finite numbers replaced by 0, shape (n, a), and which rows held one, shape (n,), bool.
-    """
+    """Actions (n, a) clipped to [-1, 1] with 0 for non-finite numbers, and which environments had one, bool (n,)."""
     # Zero times a number is zero unless it is infinite or none.
     broken = (0.0 * action).sum(dim=1) != 0.0
     return action.nan_to_num(0.0, 0.0, 0.0).clamp_(-1.0, 1.0), broken
 
 
 def state(given: Any, own: Mapping[str, Any], slots: Sequence[Slot], task_id: Tensor) -> list[Slot]:
-    """The slots with a saved state's pools of tasks.
+    """The slots with the pools of a saved state, checked against the world's own state and slots (task_id: (n,)).
 
-    Args:
-        given: The saved state of a world made alike.
-        own: The state of the world that takes it.
-        slots: Its slots.
-        task_id: Slot of each of its environments, shape (n,).
-
-    Raises:
-        BidexError: Another world's state, or a damaged one.
+    Raises BidexError for another world's state, or a damaged one.
     """
     fits(given, own)
     if given["slots"] != own["slots"]:
@@ -120,15 +96,9 @@ def state(given: Any, own: Mapping[str, Any], slots: Sequence[Slot], task_id: Te
 
 
 def fits(given: Any, own: Mapping[str, Any], inside: str = "") -> None:
-    """Refuses a saved state with other names, types or shapes than a world's own, or numbers that are not finite.
+    """Raises BidexError where a saved state has other names, types or shapes than the own one, or non-finite numbers.
 
-    Args:
-        given: The saved state.
-        own: That of the world that takes it: tensors, plain values, and mappings of such.
-        inside: Where in a larger state both stand.
-
-    Raises:
-        BidexError: The first difference.
+    ``inside``: where in a larger state both stand.
     """
     if not isinstance(given, Mapping) or not own.keys() <= given.keys():
         got = sorted(map(str, given)) if isinstance(given, Mapping) else type(given).__name__
@@ -163,14 +133,8 @@ def _check_tensor(name: str, given: object, own: Tensor) -> None:
 def formulas(scene: Scene, tasks: np.ndarray, sensors: Tensor, observed: bool) -> None:
     """Calls a class's methods once, for a few rows of its first task and sensors that all read 0.
 
-    Args:
-        scene: Its scene.
-        tasks: Its pool of variations, shape (n, variation_space.size).
-        sensors: Any tensor of the engine's precision and device.
-        observed: Whether ``observe`` is called too.
-
-    Raises:
-        BidexError: A method gives something else than it shall; it names class, method, the expected and the received.
+    ``sensors`` has the engine's precision and device; ``observed``: whether ``observe`` is called too. Raises
+    BidexError with class, method, the expected and the returned where a method returns something else.
     """
     task = scene.task
     name = type(task).__name__
@@ -201,7 +165,6 @@ def _named(where: str, given: object) -> dict[str, Tensor]:
 
 
 def _check_shape(where: str, value: object, *sizes: int | None, kind: torch.dtype | None = None) -> None:
-    """Refuses what is no tensor of ``_ROWS`` times ``sizes`` (None: any); ``kind`` None: of any numbers."""
     expected = (_ROWS, *sizes)
     if isinstance(value, Tensor):
         pairs = zip(expected, value.shape, strict=False)

@@ -1,9 +1,8 @@
 """What a batched world is to learners, evaluation and clients: the one page that says what they may rely on.
 
-``tests/test_contract.py`` holds every world to it: ``World`` in both modes on MT and ML suites, Meta-World's, and
-the small worlds of the tests. N rows ("environments"), each of one slot (a task class of the suite; MT1: a task of its
-class). All tensors are on ``device``. What a reset or step returns is the caller's: no later step changes it, and
-changing it, or the action that was given, changes nothing in the world.
+``tests/test_contract.py`` holds every world to it. N environments (rows), each of one slot (a task class of the suite;
+MT1: a task of its class). All tensors are on ``device``. What a reset or step returns is the caller's: no later step
+changes it, and changing it, or the action that was given, changes nothing in the world.
 
 Modes (``metadata["autoreset_mode"]``): in SAME_STEP (training) a row that ends starts its next episode within the step;
 the observation returned is already that of the new episode, ``info["final_obs"]`` has the last one. In DISABLED
@@ -28,9 +27,9 @@ so_far                 dict of (N,)          r (return, float32), l (length, int
 counted                (N,), bool            rows whose episode ended and counts (shortened first ones do not)
 =====================  ====================  ===========================================================================
 
-For users of Gymnasium our worlds add its ``episode``, ``_episode``, ``final_info`` and ``_final_info`` (``ends.py``)
-where a row ended, and on the warp engine, which would have to wait for the answer, in every step: zero outside their
-masks. A world may add keys like these and ``reward_terms``; learners may not rely on them.
+For users of Gymnasium our worlds add its ``episode``, ``_episode``, ``final_info`` and ``_final_info``
+(``episodes.py``) where a row ended, and on the warp engine, which would have to wait for the answer, in every step:
+zero outside their masks. A world may add keys like these and ``reward_terms``; learners may not rely on them.
 
 Shortened first episodes: in SAME_STEP mode the first episode of each row, after the first reset and after each with a
 seed, may begin at a random elapsed step, so that rows do not end together; the time limit counts from there. A world
@@ -57,19 +56,14 @@ Step = tuple[Tensor, Tensor, Tensor, Tensor, Info]
 
 @dataclass(frozen=True)
 class ObservationGroup:
-    """Entries of an observation that are of one kind in every row of a world.
-
-    Attributes:
-        name: ``right_hand``, ``left_hand``, ``object`` (what is left beside the others), ``goal`` (zeros where a suite
-            hides it), ``padding``, or ``task`` where the kind is not the same in all slots: in MT4 the entries that are
-            padding to three classes and the second egg to one. ``task_id`` is the one-hot of the slot. Worlds that know
-            no such parts call everything before the task id ``state``. A world of other
-            classes may have other groups: the test split of ML4 has a second egg where the train split has padding.
-        where: Index ranges in ascending order, none next to another.
-    """
+    """Entries of an observation that are of one kind in every environment of a world."""
 
     name: str
+    """``right_hand``, ``left_hand``, ``object`` (the rest), ``goal`` (zeros where a suite hides it), ``padding``,
+    ``task`` where slots differ (in MT4: padding to three classes, the second egg to one), or ``task_id`` (one-hot).
+    Worlds without such parts have ``state``. Other classes may have other groups: in ML4 the two splits differ."""
     where: tuple[slice, ...]
+    """Index ranges in ascending order, none next to another."""
 
     @property
     def size(self) -> int:
@@ -78,75 +72,53 @@ class ObservationGroup:
 
 
 def plain_groups(size: int, num_id_columns: int) -> tuple[ObservationGroup, ...]:
-    """The groups of a world that knows no parts: ``state``, and behind it the task id where there is one.
-
-    Args:
-        size: Entries of an observation, d.
-        num_id_columns: How many of them, the last ones, are the one-hot.
-    """
+    """The groups of a world without parts: ``state``, and the task id if the last ``num_id_columns`` are one-hot."""
     groups = (("state", slice(0, size - num_id_columns)), ("task_id", slice(size - num_id_columns, size)))
     return tuple(ObservationGroup(name, (where,)) for name, where in groups if where.stop > where.start)
 
 
 @runtime_checkable
 class VectorWorld(Protocol):
-    """Rows that are stepped together.
-
-    Attributes:
-        single_observation_space: Box of shape (d,), float32.
-        single_action_space: Box of shape (a,), within [-1, 1].
-        observation_space: The same of all rows, Box of shape (N, d).
-        action_space: The same of all rows, Box of shape (N, a).
-        num_envs: Rows, N.
-        device: Of all tensors.
-        num_tasks: Slots.
-        task_id: Slot of each row, ascending, int64 (N,).
-        task_names: Names of the slots.
-        gammas: Discount per step that learners shall take for each slot, None where their own holds.
-        num_id_columns: Trailing entries of an observation that are the one-hot of the slot: ``num_tasks``, or 0 where
-            the observation has none.
-        observation_groups: The named parts of an observation, in the order of their first entries: each entry is in
-            one. ``task_id`` is there if ``num_id_columns`` is not 0.
-        metadata: Holds ``autoreset_mode``, gymnasium's SAME_STEP or DISABLED.
-    """
+    """N environments stepped together, each of one of ``num_tasks`` slots."""
 
     single_observation_space: Box
+    """Shape (d,), float32; ``observation_space`` (N, d)."""
     single_action_space: Box
+    """Shape (a,), within [-1, 1]; ``action_space`` (N, a)."""
     observation_space: Box
     action_space: Box
     num_envs: int
     device: torch.device
     num_tasks: int
     task_id: Tensor
+    """Slot of each environment, ascending, int64 (N,)."""
     task_names: list[str]
+    """Names of the slots."""
     gammas: tuple[float | None, ...]
+    """Discount per step that learners shall take for each slot; None: their own."""
     num_id_columns: int
+    """Trailing entries of an observation that are the one-hot of the slot: ``num_tasks`` or 0."""
     observation_groups: tuple[ObservationGroup, ...]
+    """The named parts of an observation, in the order of their first entries; each entry is in one."""
     metadata: dict[str, Any]
+    """Holds ``autoreset_mode``, gymnasium's SAME_STEP or DISABLED."""
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
-        """Starts episodes.
+        """Starts episodes; observations (N, d), float32, and an empty info.
 
         Args:
-            seed: Starts all draws anew: equal seeds and actions give equal trajectories. None goes on with the old
+            seed: Starts all draws anew: equal seeds and actions give equal trajectories. None continues with the old
                 seed's next episodes.
-            options: ``reset_mask``: which rows to start, bool (N,); the others stay as they are. All by default. There
-                are no other options.
+            options: ``reset_mask``: which environments to start, bool (N,); others stay as they are. All by default.
 
-        Returns:
-            Observations (N, d), float32, and an empty info.
-
-        Raises:
-            BidexError: Another option, a seed that is no whole number from 0 on, or one with a mask that leaves rows
-                out.
+        Raises BidexError for another option, a seed below 0, or a seed with a partial mask.
         """
         ...
 
     def step(self, action: Tensor, /) -> Step:
-        """Takes actions (N, a), clipped to [-1, 1]; a row with a non-finite number ends as unstable.
+        """Takes actions (N, a), clipped to [-1, 1]; an environment with a non-finite number ends as unstable.
 
-        Returns:
-            Observations (N, d) and rewards (N,), float32; terminated and truncated (N,), bool, never both; info.
+        Returns observations (N, d), rewards (N,), float32; terminated and truncated (N,), bool, never both; info.
         """
         ...
 
@@ -165,20 +137,17 @@ class VectorWorld(Protocol):
 
 @runtime_checkable
 class TaskWorld(VectorWorld, Protocol):
-    """A world whose rows play known tasks of their slot's pool: for evaluation and meta-learning.
-
-    Attributes:
-        slot_rows: Rows of each slot, contiguous.
-        num_slot_tasks: Tasks in the pool of each slot.
-        task_index: Task of its slot's pool that each row plays, int64 (N,). In DISABLED mode, and in ML suites, tasks
-            are fixed: row j of a slot plays task j mod n. Elsewhere each episode may draw one.
-        max_episode_steps: Time limit of each row, int64 (N,).
-    """
+    """A world whose environments play known tasks of their slot's pool: for evaluation and meta-learning."""
 
     slot_rows: list[slice]
+    """Environments of each slot, contiguous."""
     num_slot_tasks: list[int]
+    """Tasks in the pool of each slot."""
     task_index: Tensor
+    """Task of its slot's pool that each environment plays, int64 (N,). In DISABLED mode and in ML suites environment j
+    of a slot keeps task j mod n; elsewhere each episode may draw one."""
     max_episode_steps: Tensor
+    """Time limit of each environment, int64 (N,)."""
 
 
 @runtime_checkable
@@ -191,11 +160,9 @@ class PooledWorld(TaskWorld, Protocol):
         ...
 
     def set_tasks(self, pools: dict[str, np.ndarray], /) -> None:
-        """Gives slots, by name, other pools; they hold from the next reset on, which must be of all rows.
+        """Gives slots, by name, other pools; they hold from the next reset on, which must be of all environments.
 
-        Row j of a slot plays task j mod n where tasks are fixed.
-
-        Raises:
-            BidexError: Unknown slot, a wrong shape, or numbers that are not finite.
+        Environment j of a slot plays task j mod n where tasks are fixed. Raises BidexError for an unknown slot, a
+        wrong shape, or non-finite numbers.
         """
         ...

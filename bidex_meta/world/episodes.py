@@ -21,44 +21,32 @@ _FINAL = ("success", "unstable", "reward_unscaled")
 
 @dataclass
 class Episodes:
-    """Counters of the running episodes.
-
-    Attributes:
-        number: Index of the running episode, counted from the last seeding, shape (n,), int64; -1 before the first.
-        elapsed: Control steps since its start, shape (n,), int64.
-        counts: Whether it enters statistics (a shortened first episode does not), shape (n,), bool.
-        finished: Whether it has ended and waits for a reset (DISABLED autoreset only), shape (n,), bool.
-        terminated: Flag of a finished episode, shape (n,), bool.
-        truncated: Flag of a finished episode, shape (n,), bool.
-        success: Whether it succeeded at any step, shape (n,), bool.
-        reward: Sum of the rewards that the world returned, shape (n,).
-        unscaled: Sum of the rewards by the printed formula, shape (n,).
-        length: Steps counted in these sums, shape (n,), int64.
-    """
+    """Counters of the running episodes, each (n,): bool, int64, or float32 for sums of rewards."""
 
     number: Tensor
+    """Index of the running episode, counted from the last seeding; -1 before the first."""
     elapsed: Tensor
+    """Control steps since its start."""
     counts: Tensor
+    """Whether it enters statistics (a shortened first episode does not)."""
     finished: Tensor
+    """Whether it has ended and waits for a reset (DISABLED autoreset only); its flags are the next two."""
     terminated: Tensor
     truncated: Tensor
     success: Tensor
+    """Whether it succeeded at any step."""
     reward: Tensor
     unscaled: Tensor
+    """Sum of the rewards by the printed formula."""
     length: Tensor
+    """Steps counted in these sums."""
 
     @classmethod
     def fresh(cls, num: int, device: torch.device) -> "Episodes":
         """Counters of n environments none of which has begun."""
-
-        def zeros(dtype: torch.dtype) -> Tensor:
-            return torch.zeros(num, dtype=dtype, device=device)
-
-        flags = [zeros(torch.bool) for _ in range(5)]
-        return cls(
-            zeros(torch.int64) - 1, zeros(torch.int64), flags[0], flags[1], flags[2], flags[3], flags[4],
-            zeros(torch.float32), zeros(torch.float32), zeros(torch.int64),
-        )  # fmt: skip
+        kinds = [torch.int64] * 2 + [torch.bool] * 5 + [torch.float32] * 2 + [torch.int64]
+        number, *rest = (torch.zeros(num, dtype=kind, device=device) for kind in kinds)
+        return cls(number - 1, *rest)
 
     def begin(self, mask: Tensor, elapsed: Tensor) -> None:
         """Starts episodes in the environments of a mask at a given number of elapsed steps, shape (n,)."""
@@ -78,13 +66,9 @@ class Episodes:
         self.unscaled = self.unscaled + unscaled * active
 
     def statistics(self) -> dict[str, Tensor]:
-        """Return, length, success and unscaled return so far, as ``info["so_far"]`` carries them."""
-        return {
-            "r": self.reward.clone(),
-            "l": self.length.clone(),
-            "success": self.success.clone(),
-            "unscaled": self.unscaled.clone(),
-        }
+        """Statistics of the running episodes, as ``info["so_far"]`` carries them."""
+        values = {"r": self.reward, "l": self.length, "success": self.success, "unscaled": self.unscaled}
+        return {name: value.clone() for name, value in values.items()}
 
     def state_dict(self) -> dict[str, Tensor]:
         """All counters, copied."""
@@ -97,14 +81,10 @@ class Episodes:
 
 
 def ended_info(info: Info) -> dict[str, Any]:
-    """Gymnasium's keys for what ended in a step; environments outside a mask are zero, as theirs.
+    """Gymnasium's keys for what ended in a step, from the contract's keys; environments outside a mask are zero.
 
-    Args:
-        info: The contract's keys of the step.
-
-    Returns:
-        ``episode`` (r, l, success, unscaled of (N,)) and its mask ``_episode``: ended, and counts. ``final_info`` with
-        the last step's values, ``episode`` once more, and a mask each; its own mask ``_final_info``: ended.
+    ``episode`` (r, l, success, unscaled of (N,)) and ``_episode``: ended, and counts. ``final_info`` with the last
+    step's values, ``episode`` once more and a mask each; ``_final_info``: ended.
     """
     ended, counted = info["_final_obs"], info["counted"]
     episode = {name: value.masked_fill(~counted, 0) for name, value in info["so_far"].items()}
@@ -131,10 +111,9 @@ class Clock:
 
 
 def checked_mode(mode: AutoresetMode | str | None) -> AutoresetMode:
-    """The autoreset mode as a member; None: SAME_STEP.
+    """The autoreset mode as a member, from any spelling; None: SAME_STEP.
 
-    Raises:
-        BidexError: Neither SAME_STEP nor DISABLED, in whatever spelling; or torch's default precision is not single.
+    Raises BidexError for other modes, and where torch's default precision is not single.
     """
     check_precision()
     if mode is None:
@@ -150,10 +129,7 @@ def set_stagger(world: VectorWorld, stagger: bool) -> None:
     """Whether first episodes begin at random elapsed steps, from the world's next first reset on.
 
     Other libraries sum rewards from the first step to the first end, so what is made for them begins at 0 by default.
-
-    Args:
-        world: With wrappers of ours or Gymnasium's around it or none; one without ``stagger`` is left as it is.
-        stagger: What its ``stagger`` shall be.
+    The world may be wrapped; one without ``stagger`` is left as it is.
     """
     inner: Any = getattr(world, "unwrapped", world)
     if hasattr(inner, "stagger"):
@@ -161,11 +137,10 @@ def set_stagger(world: VectorWorld, stagger: bool) -> None:
 
 
 def reset_mask(options: Options | None, num_envs: int, device: torch.device, ready: bool) -> Tensor:
-    """The environments that ``reset`` is asked to start, shape (num_envs,), bool: those of ``reset_mask``, else all.
+    """The environments that ``reset`` shall start, bool (num_envs,): those of ``reset_mask``, else all.
 
-    Raises:
-        BidexError: Another option, a mask of another shape or dtype, or one with false entries before the first full
-            reset; or torch's default precision is not single.
+    Raises BidexError for another option, another shape or dtype, false entries before the first full reset, and where
+    torch's default precision is not single.
     """
     check_precision()
     if options is not None and not isinstance(options, Mapping):
@@ -188,11 +163,7 @@ def reset_mask(options: Options | None, num_envs: int, device: torch.device, rea
 
 
 def checked_seed(seed: object, mask: Tensor) -> int:
-    """The seed of a reset.
-
-    Raises:
-        BidexError: No whole number from 0 on, or a seed together with a mask that leaves environments out.
-    """
+    """The seed of a reset; BidexError where it is no whole number from 0 on, or comes with a partial mask."""
     number = whole_number("seed", seed, 0)
     if not mask.all():
         raise BidexError("Expected a seed with a full reset, got it with a reset_mask; a seed starts all anew.")

@@ -29,7 +29,7 @@ class Sizes(NamedTuple):
 
 
 class ForeignWorld(BatchedWorld):
-    """Environments of foreign classes.
+    """Environments of foreign classes, the slots; ``sizes`` holds for all of them.
 
     Observations are the class's own numbers, with its one-hot behind them where there are several. In SAME_STEP mode
     each episode draws one of its class's tasks; in DISABLED mode environment j of a class keeps task j modulo their
@@ -45,19 +45,7 @@ class ForeignWorld(BatchedWorld):
         autoreset_mode: str | AutoresetMode | None = None,
         stagger: bool = True,
     ) -> None:
-        """Sets up spaces and episodes; a subclass makes what it steps.
-
-        Args:
-            names: Of the classes, its slots.
-            num_envs: Environments over all classes, at least one for each.
-            sizes: Of states, actions and episodes.
-            seed: Of the draws until ``reset(seed=...)`` gives another.
-            autoreset_mode: SAME_STEP (training) or DISABLED (evaluation), as a member or its name.
-            stagger: As in ``BatchedWorld``.
-
-        Raises:
-            BidexError: Unknown mode, or too few environments.
-        """
+        """Sets up spaces and episodes; a subclass makes what it steps. Raises as ``BatchedWorld``."""
         count = len(names)
         slots = Slots(list(names), [sizes.episode] * count, [1.0] * count, [None] * count)
         super().__init__(slots, num_envs, torch.device("cpu"), autoreset_mode, stagger)
@@ -87,15 +75,15 @@ class ForeignWorld(BatchedWorld):
 
     @abstractmethod
     def _place(self, mask: Tensor) -> None:
-        """Puts the environments of a mask at the start of ``task_index`` and writes their states into ``_obs``."""
+        """Starts ``task_index`` in the environments of a mask and writes their states into ``_obs``."""
 
-    def _finish(self, active: Tensor, broken: Tensor, made: Transition) -> tuple[Tensor, Tensor, Tensor, Info]:
-        step = super()._finish(active, broken, made)
+    def _finish(self, active: Tensor, broken: Tensor, transition: Transition) -> tuple[Tensor, Tensor, Tensor, Info]:
+        step = super()._finish(active, broken, transition)
         self._success = step[3]["success"].clone()
         return step
 
     def state_dict(self) -> State:
-        """Everything that decides the future of the world: tensors and plain values, copied."""
+        """As in ``BatchedWorld``."""
         return super().state_dict() | {"success": self._success.clone()}
 
     def _restore(self, state: State) -> None:

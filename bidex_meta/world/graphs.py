@@ -40,13 +40,7 @@ class GraphCache:
     def __init__(
         self, get: Callable[[], dict[str, Tensor]], put: Callable[[dict[str, Tensor]], None], record: Record
     ) -> None:
-        """Nothing is recorded yet.
-
-        Args:
-            get: The state's tensors by name, as they are bound now.
-            put: Binds the state to given tensors.
-            record: How to record, e.g. ``cuda_graph``.
-        """
+        """``get`` and ``put`` read and bind the state's tensors by name; ``record`` is e.g. ``cuda_graph``."""
         self._get, self._put, self._record = get, put, record
         self._state: dict[str, Tensor] = {}
         self._runs: dict[str, int] = {}
@@ -57,15 +51,9 @@ class GraphCache:
         self._state, self._runs, self._recorded = {}, {}, {}
 
     def run(self, name: str, work: Work, *inputs: Tensor) -> Any:
-        """What the work gives for the inputs, plainly run or replayed.
+        """What the work returns for the inputs, run or replayed; the next replay of this stretch overwrites it.
 
-        Args:
-            name: The stretch; it must always come with the same work and inputs of the same shapes.
-            work: Done with the inputs.
-            inputs: Tensors that change from run to run.
-
-        Returns:
-            What the work returned; overwritten by the next replay of this stretch.
+        A name must always come with the same work and inputs of the same shapes.
         """
         self._runs[name] = self._runs.get(name, 0) + 1
         if self._runs[name] <= _BEFORE:
@@ -113,17 +101,12 @@ class SideBySide:
     """Runs jobs one after the other on a CPU, at the same time on a GPU."""
 
     def __init__(self, jobs: int, device: torch.device) -> None:
-        """Makes the streams.
-
-        Args:
-            jobs: The most jobs at a time.
-            device: Where they run.
-        """
+        """``jobs``: the most at a time."""
         several = device.type == "cuda" and jobs > 1
         self._streams = [torch.cuda.Stream(device) for _ in range(jobs)] if several else []
 
     def run(self, jobs: Sequence[Callable[[], None]]) -> Iterator[int]:
-        """Does the jobs; gives their numbers, in order, as each is done. To be used up.
+        """Does the jobs and yields their numbers, in order, as each is done. To be used up.
 
         On CUDA what comes after in the caller's stream waits for them all, and they for what came before. What they
         read must live until this ends.

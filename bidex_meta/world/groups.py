@@ -11,9 +11,9 @@ from bidex_meta.engine.capacity import room_for
 from bidex_meta.engine.models import same_structure
 from bidex_meta.engine.protocol import Engine, EngineMaker
 from bidex_meta.errors import BidexError
-from bidex_meta.points.depth_sensor import DepthSensor, PointsRule
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.scene import Scene, compile_scene
+from bidex_meta.world.depth_sensor import DepthSensor, PointsRule
 
 _LARGEST = 1e6
 """Bound of a variation's numbers (metres, radians, draws): single precision keeps the square of a distance finite."""
@@ -21,26 +21,21 @@ _LARGEST = 1e6
 
 @dataclass(frozen=True)
 class Slot:
-    """A task class with its pool of tasks and its share of a world.
-
-    Attributes:
-        name: Name in reports, e.g. ``CatchUnderarm`` or ``CatchUnderarm/left``.
-        task_class: The class.
-        tasks: The pool of variations, shape (n, variation_space.size), float64.
-        reward_scale: Factor on the reward that the world returns.
-        gamma: Discount that learners shall take for it; None: their own.
-    """
+    """A task class with its pool of tasks and its share of a world."""
 
     name: str
+    """E.g. ``CatchUnderarm`` or ``CatchUnderarm/left``."""
     task_class: TaskClass
     tasks: np.ndarray
+    """Variations, shape (n, variation_space.size), float64."""
     reward_scale: float = 1.0
     gamma: float | None = None
+    """Discount that learners shall take for it; None: their own."""
 
 
 @dataclass(frozen=True)
 class Member:
-    """A slot's place: its rows in the world and in its group's engine, both contiguous."""
+    """A slot's rows in the world and in its group's engine, both contiguous."""
 
     slot: int
     scene: Scene
@@ -50,19 +45,14 @@ class Member:
 
 @dataclass(frozen=True)
 class Group:
-    """Slots whose models have the same structure, on one engine.
-
-    Attributes:
-        engine: The batch.
-        members: Its slots.
-        rows: World row of each simulation, shape (num,), int64.
-        span: The same as a slice of the world's rows if they are contiguous, else None.
-    """
+    """Slots whose models have the same structure, on one engine."""
 
     engine: Engine
     members: tuple[Member, ...]
     rows: Tensor
+    """World row of each simulation, shape (num,), int64."""
     span: slice | None
+    """The same as a slice if they are contiguous, else None."""
 
     def take(self, values: Tensor) -> Tensor:
         """This group's rows of a tensor over the world's rows (a view where the rows are contiguous)."""
@@ -70,14 +60,9 @@ class Group:
 
 
 def with_pools(slots: list[Slot], pools: dict[str, np.ndarray]) -> list[Slot]:
-    """The slots, those named with other pools of tasks.
+    """The slots, those named with other pools of tasks; see :func:`with_pool`.
 
-    Args:
-        slots: All of them.
-        pools: Slot name to variations, shape (n, variation_space.size).
-
-    Raises:
-        BidexError: Unknown slot, a wrong shape, or numbers that are not finite.
+    Raises BidexError for an unknown slot.
     """
     if not isinstance(pools, Mapping):
         raise BidexError(f"Expected tasks as a dict from slot to variations, got {type(pools).__name__}.")
@@ -93,8 +78,7 @@ def with_pools(slots: list[Slot], pools: dict[str, np.ndarray]) -> list[Slot]:
 def with_pool(slot: Slot, tasks: np.ndarray) -> Slot:
     """The slot with another pool of tasks, shape (n, variation_space.size), of which it keeps a copy.
 
-    Raises:
-        BidexError: A wrong shape, or numbers that are not finite.
+    Raises BidexError for a wrong shape, or numbers that are not finite.
     """
     space = slot.task_class.variation_space
     wanted = f"Expected tasks of {slot.name} with shape (n, {space.size})"
@@ -119,38 +103,26 @@ def with_pool(slot: Slot, tasks: np.ndarray) -> Slot:
 
 def build_groups(slots: list[Slot], rows: list[slice], make_engine: EngineMaker) -> list[Group]:
     """Compiles the slots' scenes and puts those of equal structure together, in the slots' order."""
-    scenes: dict[tuple[Hashable, ...], Scene] = {}
+    scenes: dict[Hashable, Scene] = {}
+    pools: list[list[int]] = []
     for slot in slots:
         if slot.task_class.scene_key not in scenes:
             scenes[slot.task_class.scene_key] = compile_scene(slot.task_class)
-    pools: list[list[int]] = []
     by_slot = [scenes[slot.task_class.scene_key] for slot in slots]
     for i, scene in enumerate(by_slot):
         home = next((pool for pool in pools if _alike(by_slot[pool[0]], scene)), None)
         if home is None:
-            pools.append([i])
-        else:
-            home.append(i)
+            pools.append(home := [])
+        home.append(i)
     return [_build_group([(i, by_slot[i], rows[i]) for i in pool], make_engine) for pool in pools]
 
 
 def sights(groups: list[Group], rule: PointsRule, first: int) -> list[DepthSensor]:
-    """What rows of each slot see, in the slots' order; slots of one scene share it.
-
-    Args:
-        groups: All slots.
-        rule: What is seen.
-        first: Where in an observation the clouds begin.
-    """
-    made: dict[int, DepthSensor] = {}
-    by_slot: dict[int, DepthSensor] = {}
-    for group in groups:
-        for member in group.members:
-            key = id(member.scene)
-            if key not in made:
-                made[key] = DepthSensor(member.scene, rule, first, group.engine.device)
-            by_slot[member.slot] = made[key]
-    return [by_slot[slot] for slot in sorted(by_slot)]
+    """The depth sensor of each slot, in the slots' order; ``first``: where in an observation the clouds begin."""
+    scenes = {m.slot: (m.scene, group.engine.device) for group in groups for m in group.members}
+    unique = {id(scene): (scene, device) for scene, device in scenes.values()}
+    sensors = {key: DepthSensor(scene, rule, first, device) for key, (scene, device) in unique.items()}
+    return [sensors[id(scenes[slot][0])] for slot in sorted(scenes)]
 
 
 def _alike(a: Scene, b: Scene) -> bool:

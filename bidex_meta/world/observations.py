@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.hand import SIDES, hand
-from bidex_meta.tasks.layout import CLIP, Layout, hand_blocks
+from bidex_meta.tasks.layout import Layout, hand_blocks
 from bidex_meta.tasks.scene import Scene
 from bidex_meta.utils.maths import conjugate, multiply, roll_pitch_yaw, xyzw
 from bidex_meta.world.contract import ObservationGroup
@@ -22,17 +22,15 @@ _HAND_OF = {block.name: f"{side}_hand" for side in SIDES for block in hand_block
 class Observer:
     """Builds the observations of rows of one layout: a gather of sensors, then actions and base rotations.
 
-    The blocks that only a task can compute (goal pose and its like) are left at zero, which is also how a masked goal
-    looks, and so is the padding; ``Part`` fills in the former.
+    Blocks that only a task can compute (goal pose and the like) are left at zero, as a masked goal and padding are;
+    ``Part`` fills in the former.
     """
 
     def __init__(self, scene: Scene, start_mounts: Tensor, width: int) -> None:
-        """Finds for every entry its sensor, factor and offset.
+        """Looks up sensor, factor and offset of every entry; ``scene`` is any whose task has the layout.
 
-        Args:
-            scene: A scene whose task has the layout.
-            start_mounts: Start orientation (x, y, z, w) of both mounts of each row, shape (num, 2, 4).
-            width: Entries of the observation with padding and task id.
+        ``start_mounts``: start orientation (x, y, z, w) of both mounts of each row, (num, 2, 4). ``width``: entries of
+        the observation with padding and task id.
         """
         self.layout: Layout = scene.task.layout
         device = start_mounts.device
@@ -56,16 +54,9 @@ class Observer:
         self._rotations = [self.layout.range(f"{side}_base_rotation") for side in SIDES] if moving else []
 
     def __call__(self, sensors: Tensor, action: Tensor, rows: Tensor | slice, out: Tensor | None = None) -> Tensor:
-        """Observations without the tasks' own blocks, not yet clipped.
+        """Observations of some rows (n, width), float32, without the tasks' own blocks, not yet clipped.
 
-        Args:
-            sensors: Sensor values of the rows, shape (n, nsensordata).
-            action: Their last actions, shape (n, a).
-            rows: Which of all rows these are.
-            out: Where to write them, shape (n, width), or None for a new tensor.
-
-        Returns:
-            Shape (n, width), float32.
+        From sensors (n, nsensordata) and last actions (n, a); written into ``out`` where it is given.
         """
         floats = self._sensors[: len(sensors)].copy_(sensors)
         values = torch.index_select(floats, 1, self._source, out=out).mul_(self._scale).add_(self._offset)
@@ -80,13 +71,8 @@ class Observer:
         return values
 
 
-def clip(values: Tensor) -> Tensor:
-    """Clips entries to +-5, in place."""
-    return values.clamp_(-CLIP, CLIP)
-
-
 def _indices(scene: Scene, name: str) -> Tensor:
-    """Indices of a sensor in ``sensordata``; quaternions come out as (x, y, z, w)."""
+    """Indices of a sensor in ``sensordata``; quaternions as (x, y, z, w)."""
     where = scene.sensors[name]
     indices = torch.arange(int(where.start), int(where.stop))
     return xyzw(indices) if name.endswith("quaternion") else indices
@@ -99,18 +85,10 @@ def observation_groups(
     hidden: Sequence[Sequence[int]] | None = None,
     points: tuple[str, int] | None = None,
 ) -> tuple[ObservationGroup, ...]:
-    """Groups that hold for rows of all these classes.
+    """Groups that hold for all of a world's classes; entries of different kinds are in ``task``.
 
-    Args:
-        layouts: Of the world's slots.
-        width: Entries of an observation before the task id, at least those of each layout.
-        num_id_columns: Entries of the task id.
-        hidden: Entries of each layout that are zero, as padding is.
-        points: Name and entries of the cloud between the padded observation and the task id.
-
-    Returns:
-        In the order of their first entries. An entry that is of one kind in some classes and of another one in others
-        is in ``task``.
+    ``width``: entries before the task id, at least those of each layout; ``hidden``: entries of each layout that are
+    zero, as padding is; ``points``: name and entries of the cloud between the padded observation and the task id.
     """
     hidden = [()] * len(layouts) if hidden is None else hidden
     by_class = zip(*(_kinds(layout, width, zero) for layout, zero in zip(layouts, hidden, strict=True)), strict=True)
@@ -126,7 +104,6 @@ def observation_groups(
 
 
 def _kinds(layout: Layout, width: int, hidden: Sequence[int]) -> list[str]:
-    """The group of each entry of one class's padded observation; hidden ones are padding."""
     kinds = ["padding"] * width
     for block, where in layout:
         kinds[where] = [_HAND_OF.get(block.name, "goal" if block.goal else "object")] * block.size

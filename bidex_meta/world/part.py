@@ -7,21 +7,21 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.hand import FORCE_PER_SCALE, SIDES, TORQUE_PER_SCALE, hand
-from bidex_meta.points.depth_sensor import DepthSensor
 from bidex_meta.tasks.base import CONTROL_RATE, TaskClass
+from bidex_meta.tasks.layout import CLIP
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.utils.maths import xyzw
 from bidex_meta.world import checked
 from bidex_meta.world.base import Transition
+from bidex_meta.world.depth_sensor import DepthSensor
 from bidex_meta.world.groups import Group, Member, Slot
-from bidex_meta.world.observations import Observer, Rule, clip
+from bidex_meta.world.observations import Observer, Rule
 
 
 class Controls:
     """Writes actions into a group's engine: position targets and base forces.
 
-    The action order is the appendix's: per hand 20 joints, 3 base translations, 3 base rotations; the right hand first
-    (Tables 9 and 11).
+    Order (Tables 9 and 11): right hand first, per hand 20 joints, 3 base translations, 3 base rotations.
     """
 
     def __init__(self, group: Group) -> None:
@@ -29,8 +29,7 @@ class Controls:
         self._engine, self._moving = engine, scene.task.moving_base
         low, high = (engine.ctrl.new_tensor(x) for x in (hand().control_low, hand().control_high))
         self._middle, self._half = 0.5 * (high + low), 0.5 * (high - low)
-        self._joints = len(low)
-        self._bodies = scene.base_bodies
+        self._joints, self._bodies = len(low), scene.base_bodies
         self._wrench = engine.ctrl.new_empty(engine.num, 6)
         for member in group.members:
             task = member.scene.task
@@ -40,8 +39,7 @@ class Controls:
     def write(self, action: Tensor) -> None:
         """Sets targets lo + (a + 1)/2 (hi - lo), and force (N) and torque (N m) at the bases, in the world frame.
 
-        Args:
-            action: Clean actions of the group's environments, shape (num, 52 or 40).
+        ``action``: clean, shape (num, 52 or 40).
         """
         action = action.to(self._engine.ctrl.dtype)
         share = action.shape[1] // len(SIDES)
@@ -55,14 +53,7 @@ class Controls:
 
 
 class Part:
-    """A group of environments with everything that turns engine numbers into transitions and back.
-
-    Attributes:
-        group: The environments and their engine.
-        substeps: Engine steps per control step.
-        engine_rows: Engine row of each environment of the world, -1 where it is not of this part, shape (num_envs,).
-        start_size: Numbers of a start: ``qpos`` and the poses of movable fixtures.
-    """
+    """A group of environments with everything that turns engine numbers into transitions and back."""
 
     def __init__(
         self,
@@ -73,33 +64,26 @@ class Part:
         num_envs: int,
         sights: list[DepthSensor] | None = None,
     ) -> None:
-        """Prepares controls and observers.
+        """``slots``, ``rule``, ``width`` (with padding and task id) and ``num_envs`` are the world's.
 
-        Args:
-            group: The environments and their engine.
-            slots: The world's slots.
-            rule: What observations show.
-            width: Entries of an observation with padding and task id.
-            num_envs: Environments of the world.
-            sights: What environments of each of the world's slots see of objects; None: their state.
+        ``sights``: depth sensor of each of its slots; None: observations show objects' states.
         """
-        device = group.engine.device
-        self.engine_rows = torch.full((num_envs,), -1, device=device)
-        self.engine_rows[group.rows] = torch.arange(group.engine.num, device=device)
-        self.group, self._rule = group, rule
+        self.group, self._engine, self._rule, self._sights = group, group.engine, rule, sights
+        self.engine_rows = torch.full((num_envs,), -1, device=self._engine.device)
+        """Engine row of each environment of the world, -1 where it is not of this part, shape (num_envs,)."""
+        self.engine_rows[group.rows] = torch.arange(self._engine.num, device=self._engine.device)
         self.substeps = round(1.0 / (CONTROL_RATE * group.members[0].scene.model.opt.timestep))
-        self._engine = group.engine
+        """Engine steps per control step."""
         self._controls = Controls(group)
-        self._start = torch.stack([torch.from_numpy(m.scene.start_qpos) for m in group.members]).to(group.engine.qpos)
+        self._start = torch.stack([torch.from_numpy(m.scene.start_qpos) for m in group.members]).to(self._engine.qpos)
         self.start_size = self._start.shape[1]
+        """Numbers of a start: ``qpos`` and the poses of movable fixtures."""
         for member in group.members:
             tasks = slots[member.slot].tasks
             checked.formulas(member.scene, tasks, self._engine.sensordata, observed=rule != "masked")
         self._observer = Observer(group.members[0].scene, self._start_mounts(), width)
-        self._sights = sights
         if sights is not None:
-            group.engine.body_poses()  # from now on the engine gives them
-        self._pools: list[dict[str, Tensor]] = []
+            self._engine.body_poses()  # from now on the engine gives them
         self.set_pools(slots)
 
     def _start_mounts(self) -> Tensor:
@@ -109,15 +93,14 @@ class Part:
             mounts[member.engine_rows] = xyzw(mounts.new_tensor([task.right.quaternion, task.left.quaternion]))
         return mounts
 
-    def set_pools(self, slots: list[Slot]) -> None:
-        """Takes over the slots' pools of tasks."""
+    def set_pools(self, slots: list[Slot]) -> None:  # noqa: D102
         self._pools = [
             m.scene.task.freeze(torch.as_tensor(slots[m.slot].tasks).to(self._engine.sensordata))
             for m in self.group.members
         ]
 
     def frozen(self, member: int, task_index: Tensor) -> dict[str, Tensor]:
-        """Frozen numbers of environments of a member, by their tasks' indices in the pool."""
+        """Frozen numbers of a member's environments, by their tasks' indices in the pool."""
         return {name: values[task_index] for name, values in self._pools[member].items()}
 
     def control(self, action: Tensor) -> None:
@@ -138,11 +121,9 @@ class Part:
         return self._engine.unstable()
 
     def states(self, task_index: Tensor, rows: Tensor | None = None) -> Iterator[tuple[Member, slice, TaskState]]:
-        """The members among the chosen rows, the slice of their rows, and their state.
+        """The members among some rows, the slice of their rows, and their state.
 
-        Args:
-            task_index: Task of each of the part's environments, shape (num,).
-            rows: Chosen engine rows in ascending order, or None for all.
+        ``task_index``: task of each of the part's environments, (num,); ``rows``: engine rows, ascending, None for all.
         """
         for i, member, where, chosen in self._members(rows):
             frozen = self.frozen(i, task_index[chosen])
@@ -166,13 +147,10 @@ class Part:
         rows: Tensor | None = None,
         out: Tensor | None = None,
     ) -> Tensor:
-        """Observations of rows (None: all) without the task id, shape (n, width), float32.
+        """Observations of engine rows (ascending; None: all) without the task id, shape (n, width), float32.
 
-        Args:
-            states: What ``states`` gave for these rows.
-            action: Last actions of these rows, shape (n, a).
-            rows: Engine rows in ascending order.
-            out: Where to write them, shape (n, width), or None for a new tensor.
+        ``states`` is what ``states()`` returned for these rows, ``action`` their last actions (n, a); ``out`` (n,
+        width) is written into where it is given.
         """
         chosen = slice(None) if rows is None else rows
         values = self._observer(self._engine.sensordata[chosen], action, chosen, out)
@@ -185,15 +163,13 @@ class Part:
             for member, where, _ in states:
                 own = member.engine_rows if rows is None else rows[where]
                 self._sights[member.slot].show(values[where], position[own], rotation[own])
-        return clip(values)
+        return values.clamp_(-CLIP, CLIP)
 
     def starts(self, rows: Tensor | None, draws: Tensor, task_index: Tensor) -> Tensor:
         """Start positions of episodes, shape (n, start_size): a pure function of the draws and the tasks.
 
-        Args:
-            rows: Engine rows in ascending order, shape (n,); None: every row equally often, one after the other.
-            draws: Their uniform numbers in [-1, 1], shape (n, at least the classes' start_draws).
-            task_index: Their tasks, shape (n,).
+        ``rows``: engine rows (n,), ascending; None: every row equally often, one after the other. ``draws``: uniform
+        numbers in [-1, 1], (n, at least the classes' start_draws). ``task_index``: (n,).
         """
         qpos = self._engine.qpos.new_empty(len(draws), self.start_size)
         each = len(draws) // self._engine.num if rows is None else 1
@@ -226,14 +202,10 @@ def judge(task: TaskClass, state: TaskState) -> Judgement:
 def collect(
     parts: Iterable[Part], task_index: Tensor, action: Tensor, width: int, with_id: Callable[[Tensor, Tensor], Tensor]
 ) -> Transition:
-    """Judges and observes all environments after a step.
+    """Judges and observes all environments after a step; each part is taken when its turn comes.
 
-    Args:
-        parts: The world's parts; each is taken when its turn comes.
-        task_index: Task of each environment, shape (n,).
-        action: Actions of the step, shape (n, a).
-        width: Entries of an observation.
-        with_id: Writes the task id into observations (k, d) of environments (k,) and returns them.
+    ``task_index`` (n,) and ``action`` (n, a) are of the step, ``width`` of observations; ``with_id`` writes the task id
+    into observations (k, d) of environments (k,) and returns them.
     """
     n, device = len(action), action.device
     reward, obs = torch.empty(n, device=device), torch.empty(n, width, device=device)

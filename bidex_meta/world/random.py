@@ -15,15 +15,7 @@ _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 
 
 def threefry(key: tuple[Tensor, Tensor], counter: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Two 32-bit words per counter.
-
-    Args:
-        key: Two words of the key.
-        counter: Two words of the counter.
-
-    Returns:
-        Two words. All tensors int64 with values below 2^32, broadcast together.
-    """
+    """Two 32-bit words per counter, from two words of key and of counter: int64 below 2^32, broadcast together."""
     k0, k1 = key
     keys = (k0, k1, k0 ^ k1 ^ _PARITY)
     x0, x1 = torch.broadcast_tensors((counter[0] + k0) & _MASK, (counter[1] + k1) & _MASK)
@@ -37,11 +29,7 @@ def threefry(key: tuple[Tensor, Tensor], counter: tuple[Tensor, Tensor]) -> tupl
 
 
 def row_keys(seed: int, name: str, count: int, device: torch.device) -> Tensor:
-    """One key per row of a class, from seed, class name and index in the class alone.
-
-    Returns:
-        Words, shape (count, 2), int64.
-    """
+    """One key (two words) per row of a class, from seed, class name and index in it alone, int64 (count, 2)."""
     digest = hashlib.sha256(f"{seed}/{name}".encode()).digest()
     words = [torch.tensor(int.from_bytes(digest[i : i + 4], "little"), device=device) for i in (0, 4)]
     index = torch.arange(count, device=device)
@@ -49,15 +37,9 @@ def row_keys(seed: int, name: str, count: int, device: torch.device) -> Tensor:
 
 
 def uniform(keys: Tensor, episode: Tensor, draws: int) -> Tensor:
-    """Uniform numbers in [0, 1) that depend on key, episode and draw alone.
+    """Uniform numbers in [0, 1), float64 (n, draws), that depend on key (n, 2), episode (n,) and draw alone.
 
-    Args:
-        keys: Row keys, shape (n, 2).
-        episode: Episode counter of each row, shape (n,), int64.
-        draws: How many numbers each row takes.
-
-    Returns:
-        Multiples of 2^-24, so exact in single precision. Shape (n, draws), float64.
+    They are multiples of 2^-24, so exact in single precision.
     """
     pairs = torch.arange((draws + 1) // 2, device=keys.device)
     words = threefry((keys[:, :1], keys[:, 1:]), (episode[:, None], pairs[None]))

@@ -28,10 +28,7 @@ Ghost = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 class Painter:
-    """Draws rows of a world; renderers are kept, since making one takes longer than a picture.
-
-    Another painter in copies: what holds a place in a drawing library cannot be copied.
-    """
+    """Draws rows of a world; renderers are cached. A copy starts without any: they cannot be copied."""
 
     def __init__(self) -> None:
         self._renderers: dict[tuple[int, int, int], mujoco.Renderer] = {}
@@ -42,9 +39,7 @@ class Painter:
     def picture(self, world: "World", row: int, width: int, height: int, camera: str | None) -> np.ndarray:
         """A picture of a row, shape (height, width, 3), uint8.
 
-        Raises:
-            BidexError: Unknown camera, a row that does not exist, too large a picture, or no way to draw on this
-                machine.
+        Raises BidexError for an unknown camera or row, too large a picture, or a machine that cannot draw.
         """
         name = "front" if camera is None else camera
         if not isinstance(name, str) or name not in CAMERAS:

@@ -14,10 +14,10 @@ import torch
 from gymnasium.spaces import Box
 
 from bidex_meta.errors import BidexError
-from bidex_meta.points.depth_sensor import PointsRule
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import CONTROL_RATE, TaskClass
 from bidex_meta.world.contract import Info, Options
+from bidex_meta.world.depth_sensor import PointsRule
 from bidex_meta.world.groups import Slot
 from bidex_meta.world.rendering import CAMERAS
 from bidex_meta.world.world import World
@@ -44,17 +44,13 @@ class EnvRecipe:
     """A task class as a suite has it: what decides observations and rewards."""
 
     name: str
-    """What it is called in the suite."""
     moving_base: bool | None
     """Whether the hands' bases are driven; None: as the class has it alone."""
     options: tuple[tuple[str, float | str], ...]
-    """What else the suite chose of the class."""
     padded_size: int
     """Entries of an observation, without a point cloud."""
     hides_goal: bool
-    """Whether the goal entries are zero."""
     reward_scale: float
-    """Factor on the reward."""
     class_name: str | None = None
     """The task class, where it is called otherwise: with an object."""
     points: tuple[int, bool] = (0, False)
@@ -79,23 +75,16 @@ copyreg.pickle(_Remade, _reduced)
 class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
     """A task class as an environment that plays the task it is given; its subclasses stand in `train_classes`.
 
-    Classes and environments pickle and copy: a copy has the same task and goes on bit for bit.
+    Classes and environments pickle and copy: a copy has the same task and continues bit for bit.
 
     Observations are those of the suite's worlds before a one-hot: padded to the suite's widest class, goal entries zero
     where the suite hides goals; where it shows point clouds, one behind them in the place of objects' states. `info`
     has `success` (1.0 or 0.0 in this state), `unscaled_reward` and `unstable` (physics broke: the episode is
     truncated).
 
-    Args:
-        render_mode: None or `"rgb_array"`.
-        camera_name: `"front"`, `"side"`, `"top"` or `"back"`; the first by default.
-        camera_id: Its place in that list, instead.
-        width: Of pictures, pixels.
-        height: Of pictures, pixels.
-        reward_function_version: There is one reward, the paper's; `"v2"`, Meta-World's default, is taken for it.
-
-    Raises:
-        BidexError: Another render mode, camera or reward.
+    `render_mode` is None or `"rgb_array"`; `camera_name` is `"front"` (default), `"side"`, `"top"` or `"back"`, or
+    `camera_id` its index in that list; pictures have `width` x `height` pixels. There is one reward, the paper's:
+    `reward_function_version="v2"`, Meta-World's default, stands for it. Raises BidexError for another of these.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_RATE}  # noqa: RUF012  (Gymnasium's own convention)
@@ -159,13 +148,9 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
         return [seed]
 
     def set_task(self, task: AnyTask) -> None:
-        """Plays this task from the next reset on.
+        """Plays one of the benchmark's tasks of this class from the next reset on.
 
-        Args:
-            task: One of the benchmark's, of this class.
-
-        Raises:
-            BidexError: A task of another class, or with a variation of another size.
+        Raises BidexError for a task of another class, or with a variation of another size.
         """
         if task.env_name != self.recipe.name:
             raise BidexError(f"Expected a task of {self.recipe.name}, got one of {task.env_name}.")
@@ -175,13 +160,9 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
         self._given = task
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[np.ndarray, Info]:
-        """Starts an episode; with a seed, the same one every time.
+        """Starts an episode, with a seed the same one every time; observation (d,), float32, and an empty info.
 
-        Returns:
-            The observation, shape (d,), float32, and an empty info.
-
-        Raises:
-            BidexError: No task was set, or there are options, of which there are none.
+        Raises BidexError where no task was set, and for options, of which there are none.
         """
         super().reset(seed=seed)
         if options:
@@ -196,17 +177,10 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
         return _array(obs), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
-        """One control step of 1/60 s.
+        """One control step of 1/60 s under an action (a,) in [-1, 1].
 
-        Args:
-            action: Shape (a,), in [-1, 1].
-
-        Returns:
-            Observation (d,) float32, reward, terminated (what was to be held is lost; with `terminate_on_success` also
-            success), truncated (time is up, or physics broke), and info.
-
-        Raises:
-            BidexError: No episode runs, or a wrong shape.
+        Returns observation (d,), float32, reward, terminated (what was to be held is lost; with `terminate_on_success`
+        also success), truncated (time is up, or physics broke), and info. Raises BidexError where no episode runs.
         """
         if self._over:
             raise BidexError(f"{self.recipe.name}: expected set_task(task) and reset() before step().")

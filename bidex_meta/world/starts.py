@@ -1,8 +1,7 @@
 """Where episodes start, computed ahead for many rows at once.
 
-A start depends on the row's key and the number of its episode alone, so it need not wait for the episode before to end.
-A vectorised draw for a thousand rows takes hardly longer than one for ten; drawn row by row as episodes end, starts
-would be a tenth of a step's time.
+A start depends on the row's key and the number of its episode alone. A vectorised draw for a thousand rows takes hardly
+longer than one for ten; drawn row by row as episodes end, starts would be a tenth of a step's time.
 """
 
 import torch
@@ -13,8 +12,6 @@ from bidex_meta.world.random import uniform
 
 # Draws of an episode that are the world's own: the task, and the elapsed time of a training world's first episode.
 _TASK_DRAW, _ELAPSED_DRAW, _OWN_DRAWS = 0, 1, 2
-
-
 _AHEAD = 8
 """Episodes drawn ahead for a row: some classes fail within ten steps, so one would run out at almost every step."""
 
@@ -23,13 +20,9 @@ class Starts:
     """The coming episodes of every row: their tasks, elapsed shares and positions."""
 
     def __init__(self, parts: list[Part], keys: Tensor, start_draws: int, pool_size: Tensor | None) -> None:
-        """Nothing is drawn yet.
+        """``keys``: random keys of the world's rows, (n, 2); ``start_draws``: the most draws of any class.
 
-        Args:
-            parts: The world's parts.
-            keys: Random keys of the world's rows, shape (n, 2).
-            start_draws: The largest number of draws of any class.
-            pool_size: Tasks of each row's slot, shape (n,), where episodes draw them; None where rows keep theirs.
+        ``pool_size``: tasks of each row's slot, (n,), where episodes draw them; None where rows keep theirs.
         """
         self._parts, self._keys, self._pool_size = parts, keys, pool_size
         self._draws = _OWN_DRAWS + start_draws
@@ -38,24 +31,18 @@ class Starts:
         self._first = torch.full((num,), -_AHEAD, device=device)
         self._task_index = torch.zeros(num, _AHEAD, dtype=torch.int64, device=device)
         self._elapsed_share = torch.zeros(num, _AHEAD, dtype=torch.float64, device=device)
-        self._qpos = [
-            torch.zeros(p.group.engine.num, _AHEAD, p.start_size, dtype=torch.float64, device=device) for p in parts
-        ]
+        shapes = [(part.group.engine.num, _AHEAD, part.start_size) for part in parts]
+        self._qpos = [torch.zeros(shape, dtype=torch.float64, device=device) for shape in shapes]
         self._masked = parts[0].group.engine.masked
         self._takes = 0
 
     def take(self, mask: Tensor, number: Tensor, task_index: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """The starts of the mask's rows.
+        """The starts of the rows in ``mask``, bool (n,).
 
-        Args:
-            mask: Rows whose episodes begin, shape (n,), bool.
-            number: Number of the episode that begins, or would begin next, of every row, shape (n,).
-            task_index: Task that every row keeps where none is drawn, shape (n,).
-
-        Returns:
-            Task of every row (n,), elapsed share in [0, 1) of every row (n,), and for each part the starts
-            (k, start_size) of its k rows in the mask, or of all its rows where the engine is masked; all of them valid
-            where the mask is true.
+        ``number``: of the episode that begins, or would begin next, of every row, (n,); ``task_index``: task that a row
+        keeps where none is drawn. Returns task and elapsed share in [0, 1) of every row, (n,), and for each part the
+        starts (k, start_size) of its k rows in the mask, or of all where the engine is masked; all valid where the mask
+        is true.
         """
         if self._masked:
             return self._take_masked(number, task_index)
@@ -106,7 +93,6 @@ class Starts:
                 qpos[engine_row[mine], ahead[mine]] = start.to(qpos.dtype)
 
     def _draw_all(self, number: Tensor, task_index: Tensor) -> None:
-        """Fills the bank of all rows."""
         self._first.copy_(number)
         rows = torch.arange(len(number), device=number.device)
         for part, qpos in zip(self._parts, self._qpos, strict=True):

@@ -30,8 +30,8 @@ def set_up_torch(threads: int) -> None:
 def keep_freed_memory() -> None:
     """Lets glibc keep up to 64 MB that were freed, for the next tensors; without effect where there is no glibc.
 
-    It returns to the system what is free beyond twice the largest block it has seen freed, blocks above 32 MB apart.
-    Where tensors are small that is little, and every step then waits for pages to come back: an inner step of the
-    meta-learners took up to twice as long, an update of MT-PPO 3 % longer.
+    It returns what is free beyond twice the largest block it has freed, blocks above 32 MB apart. With small tensors
+    every step then waits for pages: an inner step of the meta-learners took up to twice as long, an MT-PPO update 3 %
+    longer.
     """
     torch.empty(8_000_000)

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from bidex_meta.engine.choice import choose_engine
 from bidex_meta.errors import BidexError
-from bidex_meta.points.depth_sensor import PointsRule
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.tasks.layout import CLIP
 from bidex_meta.utils.memory import POINT_BYTES, ROW_BYTES, check_memory
@@ -25,6 +24,7 @@ from bidex_meta.utils.validation import whole_number
 from bidex_meta.world import checked
 from bidex_meta.world.base import BatchedWorld, Slots, Transition
 from bidex_meta.world.contract import Info, State
+from bidex_meta.world.depth_sensor import PointsRule
 from bidex_meta.world.graphs import GraphCache, SideBySide, Work, cuda_graph, fresh
 from bidex_meta.world.groups import Group, Slot, build_groups, sights, with_pool, with_pools
 from bidex_meta.world.observations import Rule, observation_groups
@@ -67,24 +67,21 @@ class World(BatchedWorld):
 
         Args:
             slots: Task classes with their pools of tasks.
-            num_envs: Environments over all slots, split evenly; the first slots take the remainder. None: 1024 on the
-                CPU and 8192 on an accelerator.
-            device: Where tensors live: "cpu", "auto" (CUDA where there is one) or a CUDA device, e.g. "cuda:0".
-            engine: "c" (C MuJoCo, on the CPU), "warp" (mujoco_warp, on either) or "auto", which takes the one that is
-                fast on the device.
+            num_envs: Environments, split evenly over the slots; None: 1024 on the CPU and 8192 on an accelerator.
+            device: "cpu", "auto" (CUDA where there is one) or a CUDA device, e.g. "cuda:0".
+            engine: "c" (C MuJoCo, on the CPU), "warp" (mujoco_warp, on either) or "auto": what is fast there.
             seed: Decides every draw.
             autoreset_mode: SAME_STEP (training) or DISABLED (evaluation), as a member or its name.
             observation: "plain", "one-hot" (task id appended) or "masked" (goal entries zero).
             pad_to: Observation entries before the task id; None takes the widest class.
-            task_sampling: "uniform": each autoreset draws a task of the slot's pool; "fixed": environment j
-                keeps task j mod n.
+            task_sampling: "uniform": each autoreset draws a task; "fixed": environment j keeps task j mod n.
             threads: Engine threads; None takes all CPUs. Trajectories do not depend on it.
             stagger: In SAME_STEP mode the first episodes begin at random elapsed steps, so that they do not end
-                together; these shortened ones do not count in ``episode``. False: they begin at 0.
+                together, and do not count in ``episode``. False: they begin at 0.
             points: Show a point cloud before the task id, and of objects nothing else; None: their state.
 
-        Raises:
-            BidexError: Fewer environments than slots, unknown device, engine, mode or sampling, too narrow a padding.
+        Raises BidexError for fewer environments than slots, unknown device, engine, mode or sampling, too narrow a
+        padding.
         """
         place, make_engine = choose_engine(device, engine, threads)
         checked.choices(task_sampling, observation, points)
@@ -143,16 +140,7 @@ class World(BatchedWorld):
             self._graphs.forget()
 
     def set_tasks(self, pools: dict[str, np.ndarray]) -> None:
-        """Replaces the pools of tasks of some slots, from the next full reset on.
-
-        Environment j of a slot plays task j mod n.
-
-        Args:
-            pools: Slot name to variations, shape (n, variation_space.size).
-
-        Raises:
-            BidexError: Unknown slot, a wrong shape, or numbers that are not finite.
-        """
+        """Replaces the pools of tasks of some slots, from the next full reset on; see ``PooledWorld``."""
         self._set_pools(with_pools(self.slots, pools))
 
     def _set_pools(self, slots: list[Slot]) -> None:
@@ -199,13 +187,12 @@ class World(BatchedWorld):
         return starts
 
     def _refresh(self, part: Part, rows: Tensor) -> None:
-        """Writes the observations of some engine rows of a part."""
         world_rows = part.group.rows[rows]
         states = list(part.states(part.group.take(self.task_index), rows))
         self._obs[world_rows] = self._with_id(part.observe(states, self._action[world_rows], rows), world_rows)
 
     def _refresh_masked(self, mask: Tensor) -> None:
-        """The same of a mask of environments, with shapes that do not depend on the mask."""
+        """With shapes that do not depend on the mask."""
         new = torch.empty_like(self._obs)
         for part in self.parts:
             group = part.group
@@ -214,7 +201,6 @@ class World(BatchedWorld):
         self._obs = torch.where(mask[:, None], new, self._obs)
 
     def _with_id(self, obs: Tensor, world_rows: Tensor) -> Tensor:
-        """Writes the one-hot task id into observations of the given environments."""
         if self.num_id_columns:
             obs[:, -self.num_id_columns :] = self._one_hot[world_rows]
         return obs
@@ -245,14 +231,14 @@ class World(BatchedWorld):
     def step_engines(self, active: Tensor | None = None) -> Iterator[Part]:
         """Physics alone: a control step of all environments, or those of a mask (num_envs,), under their controls.
 
-        Gives the parts as they are done; to be used up.
+        Yields the parts as they are done; to be used up.
         """
         rows = [None if active is None else part.group.take(active) for part in self.parts]
         jobs = [partial(part.advance, of) for part, of in zip(self.parts, rows, strict=True)]
         return (self.parts[i] for i in self._side_by_side.run(jobs))
 
     def state_dict(self) -> State:
-        """Everything that decides the future of the world: tensors and numbers, copied."""
+        """As in ``BatchedWorld``."""
         return super().state_dict() | {
             "slots": list(self.task_names),
             "tasks": [torch.tensor(slot.tasks) for slot in self.slots],
@@ -261,7 +247,7 @@ class World(BatchedWorld):
         }
 
     def load_state_dict(self, state: State) -> None:
-        """Puts back what ``state_dict`` gave, on a world of the same suite and size; all of it or nothing."""
+        """As in ``BatchedWorld``, on a world of the same suite and size."""
         self._set_pools(checked.state(state, self.state_dict(), self.slots, self.task_id))
         self._restore(state)
         self._action = state["action"].to(self.device, copy=True)

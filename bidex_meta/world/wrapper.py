@@ -25,11 +25,7 @@ _OF_THE_CONTRACT = ("so_far", "counted", "final_obs", "_final_obs", "episode", "
 
 
 class WorldWrapper(VectorWorld):
-    """A ``VectorWorld`` that passes everything on to another one.
-
-    Args:
-        world: What is wrapped; attributes are read from it each time, its own ones too.
-    """
+    """A ``VectorWorld`` that passes everything on to another one; attributes are read from it each time."""
 
     def __init__(self, world: VectorWorld) -> None:
         self.world = world
@@ -45,11 +41,11 @@ class WorldWrapper(VectorWorld):
         return getattr(self.world, "unwrapped", self.world)
 
     def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
-        """Starts episodes; see ``VectorWorld``."""
+        """See ``VectorWorld``."""
         return self.world.reset(seed=seed, options=options)
 
     def step(self, action: Tensor, /) -> Step:
-        """Takes actions (N, a); see ``VectorWorld``."""
+        """See ``VectorWorld``."""
         return self.world.step(action)
 
     def state_dict(self) -> State:
@@ -57,7 +53,7 @@ class WorldWrapper(VectorWorld):
         return self.world.state_dict()
 
     def load_state_dict(self, state: State, /) -> None:
-        """Puts back what ``state_dict`` gave."""
+        """See ``VectorWorld``."""
         self.world.load_state_dict(state)
 
     def close(self) -> None:
@@ -70,17 +66,11 @@ class TaskWorldWrapper(WorldWrapper, TaskWorld):
 
     world: TaskWorld
 
-    def __init__(self, world: TaskWorld) -> None:
-        super().__init__(world)
-
 
 class PooledWorldWrapper(TaskWorldWrapper, PooledWorld):
     """The same around a ``PooledWorld``."""
 
     world: PooledWorld
-
-    def __init__(self, world: PooledWorld) -> None:
-        super().__init__(world)
 
     @property
     def pools(self) -> list[np.ndarray]:
@@ -93,16 +83,12 @@ class PooledWorldWrapper(TaskWorldWrapper, PooledWorld):
 
 
 class NumpyWorld(VectorEnv):
-    """What ``world.to_numpy()`` gives: NumPy arrays, for Gymnasium's vector wrappers.
+    """What ``world.to_numpy()`` returns: NumPy arrays, for Gymnasium's vector wrappers.
 
     ``info`` has ``success``, ``unstable``, ... of every environment, and where one ended ``final_obs`` (an array of
-    objects: observations, None in the others) and ``final_info`` with the ``episode`` (r, l, t, success, unscaled)
-    within. ``episode`` itself is left to ``RecordEpisodeStatistics``, as Gymnasium leaves it.
-
-    Args:
-        world: The world to step.
-        stagger: Whether a training world's first episodes begin at random elapsed steps, so that wrappers which count
-            for themselves count them too short; left out, at 0.
+    objects: observations, None in the others) and ``final_info``, whose ``episode`` has r, l, t, success, unscaled.
+    ``episode`` itself is left to ``RecordEpisodeStatistics``. With ``stagger`` a training world's first episodes begin
+    at random elapsed steps, and wrappers that count for themselves count them too short.
     """
 
     def __init__(self, world: VectorWorld, stagger: bool = False) -> None:
@@ -121,8 +107,7 @@ class NumpyWorld(VectorEnv):
     def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
         """Takes actions (num_envs, a).
 
-        Returns:
-            Observations (num_envs, d), rewards (num_envs,), float32; terminated, truncated (num_envs,), bool; info.
+        Returns observations (num_envs, d), rewards (num_envs,), float32; terminated, truncated (num_envs,), bool; info.
         """
         *flags, step_info = self.world.step(torch.as_tensor(actions, dtype=torch.float32, device=self.world.device))
         info = {name: _arrays(value) for name, value in step_info.items() if name not in _OF_THE_CONTRACT}

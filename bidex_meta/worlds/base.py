@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from bidex_meta.errors import known_name
-from bidex_meta.suite import METAWORLD_SUITES, Suite, load_suite, suite_names
+from bidex_meta.suite import METAWORLD_SUITES, SPLITS, Suite, load_suite, suite_names
 from bidex_meta.tasks import registry
 
 if TYPE_CHECKING:
@@ -27,28 +27,21 @@ _ADAPTING_SIZE_AND_STEPS = (300, 20_000_000)
 
 @dataclass(frozen=True)
 class WorldConfig:
-    """Which worlds, and how they are made. One of ``suite`` and ``task`` names them."""
+    """Which worlds (one of ``suite`` and ``task``; ``base`` and ``object`` are of a single class) and how they run."""
 
     suite: str | None = None
-    """Name or path of a suite."""
     task: str | None = None
-    """A task class on its own, where there is no suite."""
     base: Base = "own"
-    """Whether the bases of a single class move."""
     points: int = 0
     """Points of the cloud in place of objects' states; 0: as the suite has it."""
     object: str | None = None
-    """The object of a single class; None: its own."""
     seed: int = 0
     """Of starts, and of tasks without ``task_seed``."""
     task_seed: int | None = None
     """Of tasks and starts instead."""
     device: str = "cpu"
-    """Of this process."""
     threads: int | None = None
-    """Of the engine; None: one per core."""
     engine: str = "auto"
-    """auto, c or warp."""
 
     @staticmethod
     def of(config: "Mapping[str, Any] | WorldConfig") -> "WorldConfig":
@@ -59,21 +52,14 @@ class WorldConfig:
 
 
 class Worlds(ABC):
-    """The worlds that a config names, and what holds for all of them.
-
-    Args:
-        name: How the user calls it: a suite's name or path, or a task class.
-        config: How they are made.
-    """
+    """The worlds that a config names, and what holds for all of them; ``name`` is as the user wrote it."""
 
     hides_goals: bool = False
     """Whether it is a meta suite, whose goals have to be found out."""
     suite: Suite | None = None
-    """The suite's file, where there is one."""
     class_name: str | None = None
     """The class, where it is a single one."""
     object: str | None = None
-    """The object of a single class, where it is not its own."""
     moving_base: bool | None = None
     """Whether the bases of a single class move; None: as it has them."""
     on_gpu: ClassVar[bool] = True
@@ -93,8 +79,7 @@ class Worlds(ABC):
     def open(config: Mapping[str, Any] | WorldConfig) -> "Worlds":
         """Those of a config: its ``suite``, or without one the class ``task`` on its own, in any case.
 
-        Raises:
-            BidexError: Unknown suite or task, with the nearest name; or a faulty suite file.
+        Raises BidexError for an unknown suite or task, with the nearest name; or a faulty suite file.
         """
         from bidex_meta.worlds import external, own
 
@@ -111,15 +96,14 @@ class Worlds(ABC):
 
     @abstractmethod
     def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> "PooledWorld":
-        """A fresh world of one split.
+        """A fresh world of one split, ``train`` or ``test``.
 
         Args:
-            split: ``train`` or ``test``.
+            split: Which.
             rows: Environments over all tasks; one per task by default (a few per class where it is Meta-World's).
             mode: Autoreset mode: SAME_STEP to train in, DISABLED to evaluate in.
 
-        Raises:
-            BidexError: There is no such split, too few environments, or a device or an engine that it does not run on.
+        Raises BidexError for a missing split, too few environments, or a device or engine that it does not run on.
         """
 
     @abstractmethod
@@ -128,11 +112,7 @@ class Worlds(ABC):
 
     @abstractmethod
     def task_classes(self) -> "dict[str, TaskClass]":
-        """The classes of its train split by name.
-
-        Raises:
-            BidexError: They are of another library; nothing is drawn or measured of them here.
-        """
+        """The classes of its train split by name; BidexError where they are of another library."""
 
     @property
     def splits(self) -> list[str]:
@@ -142,9 +122,7 @@ class Worlds(ABC):
     def rows_and_steps(self, device: str, adapts: bool) -> tuple[int, int]:
         """Environments of a training world, and steps of a run over all of them, where none are given.
 
-        Args:
-            device: ``cpu``, ``cuda``, ``cuda:0``, ...
-            adapts: Whether the learner adapts to tasks.
+        ``adapts``: whether the learner adapts to tasks.
         """
         if not device.startswith("cpu"):
             return _SIZES_AND_STEPS["gpu"]
@@ -156,11 +134,10 @@ class Worlds(ABC):
         return all(task_class.moving_base for task_class in self.task_classes().values())
 
     def identity(self) -> dict[str, Any]:
-        """What tells its worlds from others of the same name, ready for JSON.
+        """What distinguishes its worlds from others of the same name, ready for JSON.
 
-        Returns:
-            ``physics``: twelve letters of the classes' physics (``bidex_meta.engine.models``), None where they are
-            not ours; ``suite_version``: of the suite's file, None without one.
+        ``physics``: twelve letters of the classes' physics (``bidex_meta.engine.models``), None where they are not
+        ours; ``suite_version``: of the suite's file, None without one.
         """
         return {"physics": physics_of(self.task_classes()), "suite_version": None}
 
@@ -171,13 +148,9 @@ class Worlds(ABC):
         return references() if self.moving_bases else {}
 
     def judge(self, agent: "Agent", world: "PooledWorld", episodes: int | None, seed: int) -> "Evaluation":
-        """Evaluates a policy on all tasks of a split, beside the references.
+        """Evaluates a policy on all tasks of a split, beside the references, with a seed for the starts.
 
-        Args:
-            agent: The policy.
-            world: What ``world`` made in mode DISABLED.
-            episodes: Episodes of each task; None takes ``default_episodes``.
-            seed: Of the starts.
+        ``world`` is in mode DISABLED; ``episodes`` of each task, None takes ``default_episodes``.
         """
         from bidex_meta.evaluation.play import evaluate
 
@@ -201,18 +174,8 @@ def suites_to_run() -> list[str]:
 def listed() -> list[dict[str, Any]]:
     """A row of ``bidex-meta list suites`` for each suite, shipped or Meta-World's."""
     suites = [load_suite(name) for name in suite_names()]
-    rows = [
-        {
-            "name": suite.name,
-            "kind": suite.kind,
-            "train_classes": [entry.name for entry in suite.split_classes("train")],
-            "test_classes": [entry.name for entry in suite.split_classes("test")],
-            "summary": suite.description,
-        }
-        for suite in suites
-    ]
+    classes = [[[entry.name for entry in s.split_classes(split)] for split in SPLITS] for s in suites]
+    rows: list[Any] = [(s.name, s.kind, *names, s.description) for s, names in zip(suites, classes, strict=True)]
     summary = "Meta-World's own environments, to run our learners on (only run and evaluate know them)"
-    return rows + [
-        {"name": name, "kind": "multi-task", "train_classes": list(classes), "test_classes": [], "summary": summary}
-        for name, classes in METAWORLD_SUITES.items()
-    ]
+    rows += [(name, "multi-task", list(classes), [], summary) for name, classes in METAWORLD_SUITES.items()]
+    return [dict(zip(("name", "kind", "train_classes", "test_classes", "summary"), row, strict=True)) for row in rows]

@@ -106,7 +106,7 @@ class HumanoidTask(Foreign):
         """As in ``Worlds``."""
         rows = rows or _HUMANOIDS
         self._check(split, rows)
-        from bidex_meta.clients.humanoid_world import HumanoidWorld
+        from bidex_meta.worlds.humanoid import HumanoidWorld
 
         return HumanoidWorld(rows, seed=self.seed, autoreset_mode=mode, threads=self.threads)
 

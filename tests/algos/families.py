@@ -40,34 +40,22 @@ class PointGoals(FakePools):
     of the goal. As in the real world a finished row is frozen in mode DISABLED, keeps its flags and earns 0 until it
     is reset.
 
-    The best policy goes to the goal in each coordinate at once (:meth:`best`). One that cannot know the goal does
-    best to stay where it is: about -1 a step.
-
-    Args:
-        rows: Rows over all classes, split evenly.
-        goal_visible: Whether the observation shows the goal.
-        classes: The task classes.
-        seed: Of the starts.
-        autoreset_mode: DISABLED or SAME_STEP.
-        end_at_goal: Whether reaching the goal ends an episode truly.
-        unstable: (step, row) pairs where physics breaks, steps of the world counted from its making.
-        garbage: What the reward holds there, against the contract.
+    The best policy goes to the goal in each coordinate at once (:meth:`best`). One that cannot know the goal does best
+    to stay where it is: about -1 a step. ``rows``: rows over all classes, split evenly; ``goal_visible``: whether the
+    observation shows the goal; ``classes``: the task classes; ``seed``: of the starts; ``autoreset_mode``: DISABLED or
+    SAME_STEP; ``end_at_goal``: whether reaching the goal ends an episode truly; ``unstable``: (step, row) pairs where
+    physics breaks, steps of the world counted from its making; ``garbage``: what the reward holds there, against the
+    contract.
     """
 
     speed = 0.2
     kept = ("position",)
 
     def __init__(
-        self,
-        rows: int = 40,
-        goal_visible: bool = False,
-        classes: Sequence[PointClass] = (PointClass(),),
-        seed: int = 0,
-        autoreset_mode: str = "DISABLED",
-        end_at_goal: bool = False,
-        unstable: tuple[tuple[int, int], ...] = (),
-        garbage: float = 0.0,
-    ):
+        self, rows: int = 40, goal_visible: bool = False, classes: Sequence[PointClass] = (PointClass(),),
+        seed: int = 0, autoreset_mode: str = "DISABLED", end_at_goal: bool = False,
+        unstable: tuple[tuple[int, int], ...] = (), garbage: float = 0.0
+    ):  # fmt: skip
         self.goal_visible, self.end_at_goal, self.garbage = goal_visible, end_at_goal, garbage
         pools, limits = {c.name: circle(c.count) for c in classes}, tuple(c.steps for c in classes)
         super().__init__(pools, rows, (4, 2), limits, autoreset_mode, seed=seed, unstable=unstable)
@@ -111,11 +99,8 @@ class Recall(FakePools):
     """Two tasks, 1 and -1. The first reward of an episode is the task, the last one is paid for an action of its sign.
 
     Between them nothing is earned. Observations show the last step, (N, 1). Success: the last action had that sign.
-    Without memory of the first reward half of the episodes succeed, with it all of them.
-
-    Args:
-        rows: Rows.
-        steps: Steps per episode.
+    Without memory of the first reward half of the episodes succeed, with it all of them. ``rows``: rows; ``steps``:
+    steps per episode.
     """
 
     def __init__(self, rows: int = 32, steps: int = 60):

@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -90,12 +91,8 @@ class PointMass(_TimedWorld):
     """A point in the plane moves by 0.1 times the action; reward minus its distance to the goal, drawn for the episode.
 
     Position and goal are uniform in [-0.5, 0.5]. The best action goes towards the goal in each coordinate at once, as
-    far as it can, whatever the discount. Success: within 0.05 at the end.
-
-    Args:
-        rows: Rows.
-        horizon: Steps per episode.
-        goal_visible: Whether the observation (position, goal) shows the goal or zeros.
+    far as it can, whatever the discount. Success: within 0.05 at the end. ``rows``: rows; ``horizon``: steps per
+    episode; ``goal_visible``: whether the observation (position, goal) shows the goal or zeros.
     """
 
     speed = 0.1
@@ -135,3 +132,17 @@ def discounted_return(world: LQR | PointMass, policy: Callable[[Tensor], Tensor]
         obs, reward, *_ = world.step(policy(obs))
         total += gamma**t * reward
     return float(total.mean())
+
+
+def trained(kind: Any, world: Any, config: Any, iterations: int) -> Any:
+    learner = kind(world, config, seed=0)
+    for _ in range(iterations):
+        learner.iterate()
+    return learner
+
+
+def errors(learner: Any, *targets: float) -> list[float]:
+    """Mean distance of the action from each task's target."""
+    obs, _ = learner.world.reset(seed=1)
+    action = learner.eval_action(obs)
+    return [float((action[learner.world.task_id == k] - target).abs().mean()) for k, target in enumerate(targets)]

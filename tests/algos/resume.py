@@ -12,12 +12,8 @@ from tests.algos.ranks import same
 def resumed(make: Callable[[int], Any], iterations: int = 3) -> tuple[Any, Any]:
     """Two learners after twice as many iterations: one without a break, one saved and loaded half-way.
 
-    Args:
-        make: A learner of a seed, with its world as ``learner.world``.
-        iterations: Before the break, and after it.
-
-    Raises:
-        AssertionError: Their metrics differ after the break, or their states at the end.
+    ``make``: A learner of a seed, with its world as ``learner.world``; ``iterations``: before the break, and after it.
+    Raises AssertionError: their metrics differ after the break, or their states at the end.
     """
     unbroken = make(0)
     for _ in range(iterations):

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import hypothesis.strategies as st
 import numpy as np
@@ -14,7 +13,6 @@ from torch.testing import assert_close
 
 from bidex_algos.balancing import (
     Famo,
-    balance_of,
     conflict_averse,
     per_task_gradients,
     project_conflicting,
@@ -23,8 +21,6 @@ from bidex_algos.balancing import (
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.rollout import collect
 from tests.algos.problems import opposite_bandits
-from tests.algos.resume import resumed
-from tests.algos.toy import ToyWorld, nearness
 
 SMALL = MTPPOConfig(
     hidden=(32, 32), rollout_steps=8, learning_rate=1e-3, learning_rate_range=(1e-5, 2e-3), std_range=(0.05, 1.0),
@@ -147,20 +143,6 @@ def test_famo_lets_losses_of_very_different_size_fall_at_one_rate():
     assert shares.max() < 0.6 and shares.max() / shares.min() < 1.1
 
 
-# In MT-PPO.
-
-
-@pytest.mark.parametrize("way", ["cagrad", "famo"])
-def test_two_tasks_at_odds_are_learned(way: Any):
-    world = ToyWorld([nearness(0.4), nearness(-0.4, scale=1000.0)], rows=16)
-    learner = MTPPO(world, replace(SMALL, gradient_surgery=way), seed=0)
-    metrics = [learner.iterate() for _ in range(30)]
-    obs, _ = world.reset(seed=1)
-    action = learner.eval_action(obs)
-    assert [float(action[world.task_id == k].mean()) for k in range(2)] == pytest.approx([0.4, -0.4], abs=0.2)
-    assert {"cagrad": "Policy/conflicts", "famo": "Policy/largest_weight"}[way] in metrics[0]
-
-
 def test_famo_begins_as_the_plain_sum_where_tasks_have_as_much_to_gain():
     found = []
     for way in ("none", "famo"):
@@ -188,19 +170,6 @@ def test_no_ratio_earns_more_than_the_least_loss_says():
                 weight.add_(0.3 * torch.randn(weight.shape, generator=learner.generator))
             above = learner._above_least(batch, batch.weights.sum(), old)
             assert (above >= 0).all()
-
-
-@pytest.mark.parametrize("way", ["cagrad", "famo"])
-def test_save_load_resume_is_bit_equal(way: Any):
-    config = replace(SMALL, gradient_surgery=way)
-    _, again = resumed(lambda seed: MTPPO(opposite_bandits(rows=8), config, seed), iterations=2)
-    assert ("famo_logits" in again.state_dict()) == (way == "famo")
-    if way == "famo":
-        assert again.balance.logits.abs().max() > 0
-
-
-def test_nothing_is_balanced_by_default():
-    assert balance_of(SMALL, 2, torch.device("cpu")) is None
 
 
 def in_a_loop(gradients: Tensor) -> Tensor:

@@ -18,8 +18,6 @@ from bidex_algos.offpolicy.return_scale import ReturnBound
 from bidex_algos.replay import Replay, Stretches
 from tests.algos.toy import ToyWorld, nearness
 
-# The projection.
-
 
 def test_a_distribution_is_projected_as_by_hand() -> None:
     atoms = Atoms(-2.0, 2.0, 5)  # -2 -1 0 1 2
@@ -138,9 +136,6 @@ def test_a_stretch_that_begins_with_broken_physics_has_no_weight() -> None:
     assert broken and diary.replay.weights(stretches.last).eq(0).all()
 
 
-# The bound of returns.
-
-
 def bound_after(gamma: float, rewards: list[list[float]], **ends: list[list[bool]]) -> ReturnBound:
     """What one row of each of two tasks leaves; ``ends`` names terminated, truncated, broken."""
     bound = ReturnBound(ToyWorld([nearness(0.0), nearness(0.0)], rows=1), gamma, 1e9)
@@ -186,9 +181,6 @@ def test_reward_that_comes_late_is_bounded_as_if_it_never_ended(
 def test_broken_physics_moves_no_bound(garbage: float) -> None:
     bound = bound_after(0.5, [[1.0, 1.0], [garbage, 1.0], [1.0, 1.0]], broken=[[False] * 2, [True, False], [False] * 2])
     assert_close(bound.bound, torch.tensor([1.0, 1.75]))
-
-
-# Networks.
 
 
 def test_a_residual_network_adds_normalised_layers() -> None:

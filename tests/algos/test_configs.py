@@ -14,7 +14,7 @@ WRONG: dict[str, dict[str, Any]] = {
         "demonstration_cloning": -1, "critic_first": -1, "points_read": -1, "task_embedding": -1,
         "point_widths": (8, 0),
     },
-    "mttrpo": {"max_kl": 0.0, "backtrack_factor": 1.5, "fisher_stride": 0},
+    "mttrpo": {"max_kl": 0.0, "backtrack_factor": 1.5, "fisher_stride": 0, "cg_iterations": 0, "damping": -1.0},
     "mtsac": {
         "updates_per_step": 0, "batch_per_task": 0, "warmup_steps": -1, "gamma": 1.0, "tau": 0.0, "cut_share": 2.0,
         "replay_memory": 0.0, "init_alpha": 0.0, "std_range": (1.0, 0.5), "init_std": 3.0, "point_widths": (),

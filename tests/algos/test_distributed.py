@@ -10,16 +10,21 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from bidex_algos import learner as base
+from bidex_algos.meta.rl2 import RL2, RL2Config
 from bidex_algos.multiagent.happo import HAPPO, HAPPOConfig
 from bidex_algos.multiagent.hatrpo import HATRPO, HATRPOConfig
 from bidex_algos.multiagent.ippo import IPPO, IPPOConfig
 from bidex_algos.multiagent.mappo import MAPPO, MAPPOConfig
+from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig
 from bidex_algos.rollout import collect
 from bidex_meta.errors import BidexError
 from bidex_meta.train import attendance, distributed
 from bidex_meta.train.runner import checkpoint, resume, train
+from tests.algos.families import PointClass, PointGoals
+from tests.algos.problems import opposite_bandits
 from tests.algos.ranks import exit_codes, in_two_processes, same
 from tests.algos.toy import ToyWorld, nearness
 
@@ -35,6 +40,14 @@ TEAMS: dict[Any, Any] = {
     HAPPOConfig(**PAIR, autocast="off"): HAPPO,
     HATRPOConfig(**PAIR, fisher_stride=1): HATRPO,
 }
+SAC = MTSACConfig(
+    hidden=(16,), replay_steps=60, cut_share=0.3, warmup_steps=3, updates_per_step=2, batch_size=32, autocast="off"
+)
+# Steps in proportion to the gradient: Adam as such would not see a sum in the place of a mean.
+PLAIN_SAC = replace(
+    SAC, adam_eps=10.0, max_grad_norm=1e9, learning_rate=0.5, critic_learning_rate=0.5, alpha_learning_rate=0.5
+)
+RECURRENT = RL2Config(hidden=(8,), memory=8, episodes_per_trial=2, chunk=5, num_minibatches=2, epochs=2)
 Learner = MTPPO | MTTRPO
 ROWS = 16
 ITERATION = 2 * 2 * ROWS * 8  # processes, tasks, rows, steps
@@ -166,15 +179,71 @@ def bad_input(rank: int) -> str:
         return repr(error)
 
 
+def mtsac(config: MTSACConfig = SAC) -> MTSAC:
+    return MTSAC(opposite_bandits(rows=4, scale=10.0), config, seed=0)
+
+
+def rl2(goals: int = 8) -> RL2:
+    classes = (PointClass("Short", steps=4, count=3), PointClass("Long", steps=7, count=goals))
+    return RL2(PointGoals(6, classes=classes), RECURRENT, seed=0)
+
+
+def mtsac_moves() -> torch.Tensor:
+    """How an iteration moves all weights."""
+    learner, moved = mtsac(PLAIN_SAC), []
+    for _ in range(2):
+        weights = [*learner.policy.parameters(), *learner.critic.parameters(), learner.log_alpha]
+        moved.append(torch.cat([p.detach().flatten() for p in weights]))
+        if len(moved) == 1:
+            learner.iterate()
+    return moved[1] - moved[0]
+
+
+def rl2_tells() -> torch.Tensor:
+    """What the third iteration measures."""
+    learner = rl2(goals=3)
+    told = [learner.iterate() for _ in range(3)][-1]
+    names = ("Loss/surrogate", "Loss/value", "Policy/kl", "Policy/clip_fraction", "Policy/std")
+    return torch.tensor([told[name] for name in names])
+
+
+OTHERS: dict[str, tuple[Callable[[], torch.Tensor], Callable[[], Any]]] = {
+    "mtsac": (mtsac_moves, mtsac),
+    "rl2": (rl2_tells, rl2),
+}
+STEPS = {"mtppo": 4 * ITERATION, "mtsac": 2 * 3 * SAC.steps_per_iteration * 8, "rl2": 2 * 3 * 2 * (3 * 4 + 3 * 7)}
+
+
+def three_iterations(make: Callable[[], Any]) -> dict[str, Any]:
+    """At a stretch, and two and one with a checkpoint between."""
+    one, again = make(), make()
+    metrics = [one.iterate() for _ in range(2)]
+    state = distributed.share(checkpoint(one, one.world))[0]
+    metrics += [one.iterate()]
+    assert state is not None
+    resume(again, again.world, state)
+    again.iterate()
+    ends = [{"learner": each.state_dict()} for each in (one, again)]
+    return {"metrics": metrics, "whole": ends[0], "parts": ends[1], "world": one.world}
+
+
 def everything(rank: int) -> dict[str, Any]:
     """One start of two processes for all tests, since importing torch takes longer than the rest."""
     updates = {dtype: one_update(rank, dtype, ONE_BATCH) for dtype in (torch.float64, torch.float32)}
     updates |= {
         c: one_update(rank, torch.float64, c) for c in (SURGERY, CONFLICT_AVERSE, LOSS_WEIGHTS, TRUST_REGION, *TEAMS)
     }
+    alone = {name: facts() for name, (facts, _) in OTHERS.items()}
     distributed.init_from_environment()
     found: dict[Any, Any] = {name: in_two() for name, in_two in updates.items()}
-    found |= {"training": training(rank), "stopping": stopping(rank), "bad_input": bad_input(rank)}
+    # Twins: the same draws and noise in both. Sums over both must then be the means that one finds.
+    original, base.own_seed = base.own_seed, lambda seed: seed
+    found["twins"] = {name: (facts(), alone[name]) for name, (facts, _) in OTHERS.items()}
+    base.own_seed = original
+    found |= {name: three_iterations(make) for name, (_, make) in OTHERS.items()}
+    worlds = {name: found[name].pop("world") for name in OTHERS}
+    found["goals"] = worlds["rl2"].goal
+    found |= {"mtppo": training(rank), "stopping": stopping(rank), "bad_input": bad_input(rank)}
     found |= {"late": out_of_time(rank), "seed": distributed.own_seed(7)}
     found["together"] = distributed.together(lambda: rank + 10)
     return found
@@ -220,29 +289,35 @@ def test_statistics_and_losses_are_those_of_one_and_the_same_in_both(found):
     assert_close(a["half"]["explained"], a["whole"]["explained"])
 
 
-def test_networks_stay_bit_equal_and_noise_differs(found):
-    a, b = (here["training"]["whole"]["learner"] for here in found)
-    own = MTPPO.per_process
-    assert same({k: v for k, v in a.items() if k not in own}, {k: v for k, v in b.items() if k not in own})
-    assert all(not same(a[name], b[name]) for name in own)
-    assert a["env_steps"] == 4 * ITERATION
-
-
-def test_metrics_are_those_of_all_processes(found):
-    a, b = (here["training"]["metrics"] for here in found)
-    assert [{k: v for k, v in m.items() if "Perf" not in k} for m in a] == [
-        {k: v for k, v in m.items() if "Perf" not in k} for m in b
-    ]
-    assert a[0]["Train/unstable"] == 3
-
-
-def test_a_resumed_run_equals_an_unbroken_one_in_each_process(found):
+@pytest.mark.parametrize("name", OTHERS)
+def test_an_update_of_twins_is_that_of_one(found, name):
     for here in found:
-        assert same(here["training"]["whole"], here["training"]["parts"])
+        twin, alone = here["twins"][name]
+        assert alone.norm() > 0.01
+        tolerance = 1e-3 * float(alone.norm()) if name == "mtsac" else 1e-6
+        assert_close(twin, alone, rtol=1e-3, atol=tolerance)
+
+
+@pytest.mark.parametrize(("name", "make"), [("mtppo", MTPPO), ("mtsac", MTSAC), ("rl2", RL2)])
+def test_networks_and_metrics_are_those_of_all_noise_differs_and_a_run_is_resumed(found, name, make):
+    a, b = (here[name]["whole"]["learner"] for here in found)
+    own = make.per_process
+    assert same({k: v for k, v in a.items() if k not in own}, {k: v for k, v in b.items() if k not in own})
+    assert all(not same(a[part], b[part]) for part in own)
+    assert a["env_steps"] == STEPS[name]
+    told = [[{k: v for k, v in m.items() if "Perf" not in k} for m in here[name]["metrics"]] for here in found]
+    assert told[0] == told[1] and any(tag.startswith("Loss/") for tag in told[0][-1])
+    assert name != "mtppo" or told[0][0]["Train/unstable"] == 3
+    for here in found:
+        assert same(here[name]["whole"], here[name]["parts"])
+
+
+def test_tasks_of_two_processes_differ(found):
+    assert not torch.equal(found[0]["goals"], found[1]["goals"])
 
 
 def test_the_first_iteration_and_the_last_are_saved_by_process_0_alone(found):
-    assert [here["training"]["saved"] for here in found] == [[ITERATION, 4 * ITERATION], []]
+    assert [here["mtppo"]["saved"] for here in found] == [[ITERATION, 4 * ITERATION], []]
 
 
 def test_a_signal_to_one_stops_both_after_the_same_iteration(found):

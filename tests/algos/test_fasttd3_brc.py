@@ -13,12 +13,8 @@ from torch.testing import assert_close
 from bidex_algos.offpolicy.brc import BRC, BRCConfig
 from bidex_algos.offpolicy.fasttd3 import FastTD3, FastTD3Config
 from bidex_algos.replay import Transitions
-from bidex_meta.cli.learners import learner_kind
-from bidex_meta.errors import BidexError
 from bidex_meta.train import distributed
-from bidex_meta.world.contract import plain_groups
-from tests.algos.off_policy import trained
-from tests.algos.problems import LQR, opposite_bandits
+from tests.algos.problems import LQR, opposite_bandits, trained
 from tests.algos.ranks import in_two_processes, same
 from tests.algos.test_categorical import slow_projection
 from tests.algos.toy import ToyWorld, nearness
@@ -31,9 +27,6 @@ SHARED: dict[str, Any] = {
 FAST = FastTD3Config(**SHARED | {"updates_per_step": 4}, critic_layer_norm=False, n_steps=1, squash_price=0.0)
 SMALL = BRCConfig(**SHARED, n_steps=1, task_embedding=4, init_alpha=0.01, target_entropy_per_action=-2.0)
 both = pytest.mark.parametrize(("kind", "config"), [(FastTD3, FAST), (BRC, SMALL)], ids=["fasttd3", "brc"])
-
-
-# One update, against an independent computation.
 
 
 def a_draw() -> Transitions:
@@ -185,9 +178,6 @@ def test_weights_decay_but_no_temperature(kind: Any, config: Any) -> None:
         assert_close(p.detach(), was * (1.0 - 0.5 * 5e-3))
 
 
-# Several processes, checkpoints, metrics, errors.
-
-
 def _bounds(rank: int) -> Tensor:
     distributed.init_from_environment()
     learner = BRC(opposite_bandits(rows=3 + rank, scale=10.0), replace(SMALL, batch_size=16), seed=0)
@@ -208,20 +198,6 @@ def test_wide_critics_are_counted_as_memory(kind: Any, config: Any) -> None:
     assert wide.bytes_held(64, 500) - config.bytes_held(64, 500) > 2 * 2 * 4096**2 * 4 * 4
 
 
-def test_one_task_needs_no_embedding_and_several_need_their_one_hot() -> None:
+def test_one_task_needs_no_embedding() -> None:
     assert LQR().num_id_columns == 0
     trained(BRC, LQR(rows=4), SMALL, 1)
-    world = opposite_bandits()
-    world.num_id_columns, world.observation_groups = 0, plain_groups(3, 0)
-    with pytest.raises(BidexError, match="brc: task_embedding needs the one-hot of 2 tasks"):
-        BRC(world, SMALL, seed=0)
-
-
-@pytest.mark.parametrize("name", ["fasttd3", "brc"])
-@pytest.mark.parametrize("preset", ["paper", "laptop"])
-def test_they_are_found_by_name_and_every_preset_runs(name: str, preset: str) -> None:
-    kind = learner_kind(name)
-    assert kind.make is {"fasttd3": FastTD3, "brc": BRC}[name] and list(kind.presets)[:2] == ["paper", "laptop"]
-    small: dict[str, Any] = {"hidden": (16, 16), "critic_hidden": (16, 16), "replay_steps": 50, "batch_size": 64}
-    config = replace(kind.presets[preset], **small, warmup_steps=1, steps_per_iteration=3)
-    assert "Loss/critic" in kind.make(opposite_bandits(), config, seed=0).iterate()

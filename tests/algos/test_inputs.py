@@ -25,7 +25,6 @@ from bidex_meta.errors import BidexError
 from bidex_meta.world.contract import ObservationGroup, plain_groups
 from tests.algos.families import PointGoals
 from tests.algos.problems import opposite_bandits
-from tests.algos.resume import resumed
 from tests.algos.toy import ToyWorld
 
 PPO = MTPPOConfig(hidden=(16, 16), learning_rate=3e-3, autocast="off")
@@ -183,23 +182,6 @@ def test_an_embedding_tells_tasks_apart_and_is_learned(make: Callable[..., Any])
         learner.iterate()
     for table, was in zip(tables, before, strict=True):
         assert (table != was).any(1).all()
-
-
-@LEARNERS
-def test_with_an_embedding_runs_resume_and_policies_load(make: Callable[..., Any]) -> None:
-    resumed(lambda seed: make(opposite_bandits(rows=8), seed, task_embedding=4))
-    learner = make(opposite_bandits(), task_embedding=4)
-    obs, _ = learner.world.reset(seed=1)
-    policy = type(learner).load_policy(learner.policy_state_dict())
-    assert torch.equal(policy.eval_action(obs), learner.eval_action(obs))
-
-
-@LEARNERS
-def test_an_embedding_needs_a_task_id(make: Callable[..., Any]) -> None:
-    world = opposite_bandits()
-    world.observation_groups = plain_groups(3, 0)
-    with pytest.raises(BidexError, match="task_embedding needs the one-hot of 2 tasks"):
-        make(world, task_embedding=4)
 
 
 def test_in_bfloat16_the_rollout_and_the_update_embed_alike() -> None:

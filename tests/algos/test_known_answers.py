@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from bidex_algos.meta.rl2 import RL2, RL2Config
+from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig
 from tests.algos.families import Recall
-from tests.algos.problems import LQR, PointMass, discounted_return, one_step_bandit, opposite_bandits
+from tests.algos.problems import LQR, PointMass, discounted_return, one_step_bandit, opposite_bandits, trained
 from tests.algos.toy import ToyWorld, nearness
 
 GAMMA = 0.8
@@ -18,13 +19,6 @@ SHARED: dict[str, Any] = {"hidden": (32, 32), "rollout_steps": 16, "gamma": GAMM
 PPO = MTPPOConfig(**SHARED, learning_rate=3e-3, learning_rate_range=(1e-4, 5e-3), critic_learning_rate=3e-3)
 TRPO = MTTRPOConfig(**SHARED, fisher_stride=1, max_kl=0.03, damping=0.01, critic_learning_rate=3e-3)
 both = pytest.mark.parametrize(("learner_type", "config"), [(MTPPO, PPO), (MTTRPO, TRPO)], ids=["ppo", "trpo"])
-
-
-def trained(learner_type: Any, world: Any, config: Any, iterations: int) -> Any:
-    learner = learner_type(world, config, seed=0)
-    for _ in range(iterations):
-        learner.iterate()
-    return learner
 
 
 def mean_actions(learner: Any) -> list[float]:
@@ -60,11 +54,31 @@ def test_a_point_mass_reaches_its_goal(learner_type: Any, config: Any):
     assert info["success"].float().mean() > 0.9
 
 
-@both
-def test_two_tasks_that_only_the_one_hot_tells_apart(learner_type: Any, config: Any):
-    assert mean_actions(trained(learner_type, opposite_bandits(0.5), config, 30)) == pytest.approx(
-        [0.5, -0.5], abs=0.15
-    )
+PAID_ALIKE = MTPPOConfig(
+    hidden=(32, 32), rollout_steps=8, learning_rate=1e-3, learning_rate_range=(1e-4, 4e-3), std_range=(0.05, 1.0),
+    autocast="off",
+)  # fmt: skip
+SAC = MTSACConfig(
+    hidden=(32, 32), replay_steps=200, cut_share=0.3, warmup_steps=4, batch_size=128, gamma=0.8, tau=0.05,
+    learning_rate=3e-3, critic_learning_rate=5e-3, init_alpha=0.01, autocast="off",
+)  # fmt: skip
+WAYS: list[tuple[Any, Any, dict[str, Any], int, float]] = [
+    (MTPPO, PAID_ALIKE, {"value_heads": False}, 40, 1000.0),
+    (MTPPO, PAID_ALIKE, {"policy_heads": True}, 40, 1000.0),
+    *((MTPPO, PAID_ALIKE, {"gradient_surgery": way}, 40, 1000.0) for way in ("pcgrad", "cagrad", "famo")),
+    *((MTPPO, PAID_ALIKE, {"architecture": name, "modules": 2}, 40, 1.0) for name in ("soft_modules", "paco", "moore")),
+    *((MTSAC, SAC, {"architecture": name, "modules": 2}, 12, 1.0) for name in ("soft_modules", "paco", "moore")),
+    (MTPPO, PPO, {}, 30, 1.0), (MTTRPO, TRPO, {}, 30, 1.0),
+    *((MTTRPO, TRPO, {"policy_heads": heads}, 30, 1000.0) for heads in (False, True)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("learner_type", "config", "options", "iterations", "scale"), WAYS)
+def test_two_tasks_that_only_the_one_hot_tells_apart(
+    learner_type: Any, config: Any, options: dict[str, Any], iterations: int, scale: float
+):
+    learner = trained(learner_type, opposite_bandits(0.5, scale), replace(config, **options), iterations)
+    assert mean_actions(learner) == pytest.approx([0.5, -0.5], abs=0.2)
 
 
 @both

@@ -10,7 +10,6 @@ from bidex_algos.multiagent.maddpg import MADDPG, MADDPGConfig
 from bidex_algos.offpolicy.ddpg import DDPG, DDPGConfig
 from bidex_algos.replay import Transitions
 from tests.algos.problems import opposite_bandits
-from tests.algos.resume import resumed
 from tests.algos.toy import ToyWorld
 
 PAIR = "a=action/1;b=action/0"
@@ -66,11 +65,3 @@ def test_an_agent_climbs_beside_what_the_others_did() -> None:
     counts = torch.full((2,), count / 2)
     learner._policy_step(obs, draw, torch.ones(count), counts)
     torch.testing.assert_close(seen[0], expected, rtol=1e-3, atol=1e-5)
-
-
-def test_a_saved_learner_goes_on_bit_for_bit() -> None:
-    config = MADDPGConfig(agents=PAIR, **SMALL)
-    unbroken, again = resumed(lambda seed: MADDPG(opposite_bandits(), config, seed=seed))
-    loaded = MADDPG.load_policy(again.policy_state_dict())
-    obs, _ = unbroken.world.reset(seed=2)
-    assert torch.equal(loaded.eval_action(obs), unbroken.eval_action(obs))

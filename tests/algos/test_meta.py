@@ -21,8 +21,6 @@ from bidex_meta.agents import Timestep
 from bidex_meta.errors import BidexError
 from bidex_meta.world.contract import plain_groups
 from tests.algos.families import PointClass, PointGoals, circle
-from tests.algos.ranks import same
-from tests.algos.resume import resumed
 from tests.algos.test_meta_parts import problem
 from tests.tasks.test_mask import twins
 
@@ -222,30 +220,6 @@ def test_a_step_size_below_zero_comes_back_to_it():
         factors[0, :2] = torch.tensor([-0.5, 0.5])
     learner.policy.adapter.project()
     assert factors[0, :2].tolist() == [0.0, 0.5] and float(learner.policy.step_sizes.mean()) < 1.0
-
-
-@pytest.mark.parametrize(("slice_steps", "sizes"), [(None, "fixed"), (7, "fixed"), (None, "layer")])
-@both
-def test_save_load_resume_is_bit_equal(kind: Any, config: Any, slice_steps: int | None, sizes: Any):
-    config = replace(
-        config, slice_steps=slice_steps, tasks_per_class=3, max_adapt_steps=30, normalise_observations=True,
-        step_sizes=sizes,
-    )  # fmt: skip
-    mode = kind.autoreset_mode(replace(config, slice_steps=slice_steps))
-    assert mode == ("DISABLED" if slice_steps is None else "SAME_STEP")
-    resumed(lambda seed: kind(PointGoals(rows=12, autoreset_mode=mode), config, seed))
-
-
-@both
-def test_broken_physics_and_frozen_rows_teach_nothing(kind: Any, config: Any):
-    states = []
-    for garbage in (0.0, 1e8, float("nan")):
-        classes = (PointClass("Long", steps=20), PointClass("Short", steps=9))
-        world = PointGoals(rows=32, classes=classes, unstable=((2, 5), (30, 20)), garbage=garbage)
-        learner = kind(world, replace(config, tasks_per_class=4, normalise_observations=True), seed=0)
-        learner.iterate()
-        states.append(learner.policy.state_dict())
-    assert same(states[0], states[1]) and same(states[0], states[2])
 
 
 def test_steps_and_statistics_of_observations_are_those_of_what_rows_played():

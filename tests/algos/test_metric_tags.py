@@ -23,7 +23,7 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
     "bcq": [{"batch_size": 16, "updates_per_iteration": 4, "vae_hidden": (8,)}],
     "td3bc": [{"batch_size": 16, "updates_per_iteration": 4}], "iql": [{"batch_size": 16, "updates_per_iteration": 4}],
 }  # fmt: skip
-PLAYING = [algo for algo in VARIANTS if not learner_kind(algo).offline]
+PLAYING = [algo for algo in VARIANTS if not learner_kind(algo).make.offline]
 TEAM = {"agents": "a=action/0;b=action/1"}
 OF_AGENTS = {"ippo": "mtppo", "mappo": "mtppo", "happo": "mtppo", "hatrpo": "mttrpo", "maddpg": "ddpg"}
 """Learners of several agents, and those whose tags they have."""
@@ -36,13 +36,13 @@ def told(algo: str, variants: list[dict[str, Any]]) -> set[str]:
         config = kind.presets["laptop"]
         known = {**SMALL, **options}
         config = replace(config, **{name: value for name, value in known.items() if hasattr(config, name)})
-        world = PointGoals(rows=16) if kind.adapts else ToyWorld([nearness(0.5), nearness(-0.5)], rows=8)
+        world = PointGoals(rows=16) if kind.make.adapts else ToyWorld([nearness(0.5), nearness(-0.5)], rows=8)
         learner = kind.make(world, config, seed=0)
         if known.get("demonstration_weight"):
             learner.learn_from_demonstrations(
                 as_data(played(world, noisy(lambda obs: torch.zeros(len(obs), 2), 0.5), 9))
             )
-        if kind.offline:
+        if kind.make.offline:
             learner.learn_from(as_data(played(world, noisy(lambda obs: torch.zeros(len(obs), 2), 0.5), 9)))
         for _ in range(3):
             found = learner.iterate()

@@ -8,8 +8,6 @@ from bidex_algos.nets.networks import gaussian_log_prob
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.rollout import collect
 from bidex_meta.errors import BidexError
-from bidex_meta.world.contract import plain_groups
-from tests.algos.resume import resumed
 from tests.algos.toy import ToyWorld, nearness
 
 SMALL = MTPPOConfig(
@@ -17,53 +15,11 @@ SMALL = MTPPOConfig(
 )
 
 
-def equal(a: object, b: object) -> bool:
-    """Whether two nested states are bit-equal."""
-    if isinstance(a, dict) and isinstance(b, dict):
-        return a.keys() == b.keys() and all(equal(a[k], b[k]) for k in a)
-    if isinstance(a, list | tuple) and isinstance(b, list | tuple):
-        return len(a) == len(b) and all(map(equal, a, b))
-    if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
-        return torch.equal(a, b)
-    return a == b
-
-
 def mean_errors(learner: MTPPO, world: ToyWorld, targets: list[float]) -> list[float]:
     """Distance of the mean action from each task's target."""
     obs, _ = world.reset(seed=1)
     action = learner.eval_action(obs)
     return [float((action[world.task_id == k] - t).abs().max()) for k, t in enumerate(targets)]
-
-
-def test_a_bandit_is_learned():
-    world = ToyWorld([nearness(0.6)])
-    learner = MTPPO(world, SMALL, seed=0)
-    metrics = [learner.iterate() for _ in range(60)]
-    assert mean_errors(learner, world, [0.6])[0] < 0.15
-    assert metrics[-1]["Train/success_rate"] > 0.5 > metrics[0]["Train/success_rate"]
-    assert metrics[-1]["Policy/std"] < 0.8
-    assert learner.env_steps == 60 * 8 * 32
-
-
-@pytest.mark.parametrize("heads", [True, False])
-def test_two_tasks_at_odds_are_learned_though_one_pays_a_thousandfold(heads: bool):
-    world = ToyWorld([nearness(0.4), nearness(-0.4, scale=1000.0)])
-    learner = MTPPO(world, replace(SMALL, value_heads=heads), seed=0)
-    for _ in range(60):
-        learner.iterate()
-    assert max(mean_errors(learner, world, [0.4, -0.4])) < 0.2
-
-
-@pytest.mark.parametrize("options", [{"policy_heads": True}, {"gradient_surgery": "pcgrad"}])
-def test_options_for_many_tasks_learn_them_too(options: dict[str, object]):
-    world = ToyWorld([nearness(0.4), nearness(-0.4, scale=1000.0)])
-    learner = MTPPO(world, replace(SMALL, **options), seed=0)
-    metrics = [learner.iterate() for _ in range(60)]
-    assert max(mean_errors(learner, world, [0.4, -0.4])) < 0.2
-    assert ("Policy/conflicts" in metrics[0]) == ("gradient_surgery" in options)
-    policy = MTPPO.load_policy(learner.state_dict()["policy"])
-    obs, _ = world.reset(seed=2)
-    assert torch.equal(policy.eval_action(obs), learner.eval_action(obs))
 
 
 def test_surgery_between_tasks_that_agree_changes_nothing_but_rounding():
@@ -79,13 +35,6 @@ def test_surgery_between_tasks_that_agree_changes_nothing_but_rounding():
         gradients.append(torch.cat([p.grad.flatten() for p in learner.policy.actor.parameters()]))
     assert gradients[0].norm() > 0
     assert_close(*gradients)
-
-
-def test_policy_heads_need_a_world_that_shows_the_task():
-    world = ToyWorld([nearness(0.4), nearness(-0.4)])
-    world.num_id_columns, world.observation_groups = 0, plain_groups(3, 0)
-    with pytest.raises(BidexError, match="policy_heads"):
-        MTPPO(world, replace(SMALL, policy_heads=True), seed=0)
 
 
 def test_without_normalisation_per_task_the_small_task_is_lost():
@@ -106,16 +55,6 @@ def test_a_time_limit_is_bootstrapped_and_a_true_end_is_not(terminal: bool, valu
         learner.iterate()
     obs, _ = world.reset(seed=1)
     assert_close(learner._final_value(obs, world.task_id), torch.full((32,), value), rtol=0.05, atol=0)
-
-
-def test_a_transition_that_broke_physics_teaches_nothing():
-    states = []
-    for garbage in (0.0, 1e8, float("nan")):
-        world = ToyWorld([nearness(0.6), nearness(0.0)], unstable=((2, 5), (3, 40), (7, 0)), garbage=garbage)
-        learner = MTPPO(world, SMALL, seed=0)
-        assert learner.iterate()["Train/unstable"] == 3
-        states.append(learner.state_dict())
-    assert equal(states[0], states[1]) and equal(states[0], states[2])
 
 
 def test_a_broken_transition_cuts_the_trace_but_keeps_the_value_before_it():
@@ -174,39 +113,6 @@ def test_the_standard_deviation_keeps_its_bounds():
     std = learner.policy.actor.log_std.exp()
     assert std.min() > 0.789
     assert std.max() < 0.811
-
-
-@pytest.mark.parametrize("config", [SMALL, replace(SMALL, autocast="on", critic_learning_rate=1e-3)])
-def test_save_load_resume_is_bit_equal(config: MTPPOConfig):
-    _, again = resumed(lambda seed: MTPPO(ToyWorld([nearness(0.6), nearness(0.0)]), config, seed))
-    assert float(again.adams.rate) != config.learning_rate
-
-
-def test_a_saved_state_does_not_change_with_the_learner():
-    learner = MTPPO(ToyWorld([nearness(0.6)]), SMALL, seed=0)
-    learner.iterate()
-    state, again = learner.state_dict(), learner.state_dict()
-    learner.iterate()
-    assert equal(state, again) and not equal(state, learner.state_dict())
-
-
-def test_the_policy_alone_loads_for_a_world_of_another_size():
-    world = ToyWorld([nearness(0.6), nearness(0.0)])
-    learner = MTPPO(world, SMALL, seed=0)
-    for _ in range(3):
-        learner.iterate()
-    policy = MTPPO.load_policy(learner.state_dict()["policy"])
-    obs = torch.randn(5, 3)
-    assert torch.equal(policy.eval_action(obs), learner.eval_action(obs))
-    assert policy.eval_action(1e3 * obs).abs().max() <= 1.0
-    policy.reset(torch.ones(5, dtype=torch.bool))
-
-
-def test_a_checkpoint_of_another_world_size_is_refused():
-    learner = MTPPO(ToyWorld([nearness(0.6)], rows=8), SMALL, seed=0)
-    learner.iterate()
-    with pytest.raises(BidexError, match=r"num_envs.*\(8, 2\).*\(9, 2\)"):
-        MTPPO(ToyWorld([nearness(0.6)], rows=9), SMALL, seed=0).load_state_dict(learner.state_dict())
 
 
 def test_fewer_samples_than_mini_batches_are_refused():

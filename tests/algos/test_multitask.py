@@ -19,17 +19,12 @@ from bidex_algos.offpolicy.td3 import TD3, TD3Config
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig
 from bidex_meta.errors import BidexError
-from bidex_meta.world.contract import ObservationGroup, plain_groups
+from bidex_meta.world.contract import ObservationGroup
 from tests.algos.problems import opposite_bandits
-from tests.algos.resume import resumed
-from tests.algos.toy import ToyWorld, nearness
 
 TRUNKS = {"soft_modules": SoftModules, "paco": PaCo, "moore": Moore}
 # The task id stands in the middle: nothing may assume that it is last.
-GROUPS = (
-    ObservationGroup("state", (slice(0, 3), slice(6, 9))),
-    ObservationGroup("task_id", (slice(3, 6),)),
-)
+GROUPS = (ObservationGroup("state", (slice(0, 3), slice(6, 9))), ObservationGroup("task_id", (slice(3, 6),)))
 TASKS = torch.arange(8) % 3
 
 
@@ -169,34 +164,6 @@ KINDS: dict[str, tuple[Any, Any]] = {
     "sac": (MTSAC, MTSACConfig(**OFF, init_alpha=0.01)),
     "td3": (TD3, TD3Config(**OFF)),
 }
-ITERATIONS = {"ppo": 30, "sac": 9}
-learners = pytest.mark.parametrize("kind", KINDS)
-
-
-@pytest.mark.parametrize("kind", ["ppo", "sac"])
-@pytest.mark.parametrize("architecture", TRUNKS)
-def test_two_tasks_at_odds_are_learned(kind: str, architecture: str):
-    make, config = KINDS[kind]
-    world = opposite_bandits(0.5, rows=16)
-    learner = make(world, replace(config, architecture=architecture, modules=2), seed=0)
-    for _ in range(ITERATIONS[kind]):
-        learner.iterate()
-    obs, _ = world.reset(seed=1)
-    action = learner.eval_action(obs)
-    means = [float(action[world.task_id == k].mean()) for k in range(2)]
-    assert means == pytest.approx([0.5, -0.5], abs=0.2)
-    policy = make.load_policy(learner.state_dict()["policy"])
-    assert torch.equal(policy.eval_action(obs), action)
-
-
-@learners
-@pytest.mark.parametrize("architecture", TRUNKS)
-def test_save_load_resume_is_bit_equal(kind: str, architecture: str):
-    make, config = KINDS[kind]
-    if kind in ("sac", "td3"):
-        config = replace(config, steps_per_iteration=3, warmup_steps=2, updates_per_step=2, batch_size=32)
-    config = replace(config, architecture=architecture, policy_heads=True, modules=2)
-    resumed(lambda seed: make(opposite_bandits(rows=4), config, seed), iterations=1)
 
 
 @pytest.mark.parametrize("architecture", TRUNKS)
@@ -225,15 +192,6 @@ def test_a_checkpoint_from_before_there_were_architectures_loads():
     obs, _ = learner.world.reset(seed=1)
     assert torch.equal(policy.eval_action(obs), learner.eval_action(obs))
     assert isinstance(network_of(PPO)(4, (8,), 1, 1.0, generator()), MLP)
-
-
-@learners
-def test_an_architecture_needs_the_one_hot(kind: str):
-    make, config = KINDS[kind]
-    world = ToyWorld([nearness(0.4), nearness(-0.4)])
-    world.num_id_columns, world.observation_groups = 0, plain_groups(3, 0)
-    with pytest.raises(BidexError, match="architecture paco needs the one-hot of 2 tasks"):
-        make(world, replace(config, architecture="paco"), seed=0)
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,7 @@ from bidex_algos.offpolicy.ddpg import DDPG, DDPGConfig
 from bidex_algos.offpolicy.fasttd3 import FastTD3, FastTD3Config
 from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_algos.offpolicy.td3 import TD3, TD3Config
-from tests.algos.off_policy import errors, trained
-from tests.algos.problems import LQR, PointMass, discounted_return, one_step_bandit, opposite_bandits
-from tests.algos.resume import resumed
+from tests.algos.problems import LQR, PointMass, discounted_return, errors, opposite_bandits, trained
 from tests.algos.toy import ToyWorld
 
 SHARED: dict[str, Any] = {
@@ -79,33 +77,3 @@ def test_a_time_limit_is_bootstrapped_and_a_true_end_is_not(name: str, terminal:
     learner = trained(kind, world, config, 14)
     values = learner.critic(learner.policy.observations(learner.replay.obs), torch.zeros(32, 2), world.task_id)
     assert_close(values.detach(), torch.full_like(values, value), rtol=0.05, atol=0)
-
-
-@pytest.mark.parametrize(
-    ("name", "more"),
-    [*((name, {}) for name in CASES), ("mtsac", {"autocast": "on", "policy_heads": True, "critic_layer_norm": True})],
-)
-def test_save_load_resume_is_bit_equal(name: str, more: dict[str, Any]) -> None:
-    kind, config = CASES[name]
-    config = replace(config, updates_per_step=3, n_steps=2, replay_steps=20, steps_per_iteration=5, **more)
-    resumed(lambda seed: kind(opposite_bandits(rows=8), config, seed), iterations=2)
-
-
-@each
-def test_the_policy_alone_loads_for_a_world_of_another_size(name: str) -> None:
-    kind, config = CASES[name]
-    learner = trained(kind, opposite_bandits(), replace(config, policy_heads=True), 2)
-    policy, obs = kind.load_policy(learner.policy_state_dict()), torch.randn(5, 3)
-    assert torch.equal(policy.eval_action(obs), learner.eval_action(obs))
-    assert policy.eval_action(1e3 * obs).abs().max() <= 1.0
-
-
-@each
-def test_metrics_and_errors_carry_its_name(name: str) -> None:
-    kind, config = CASES[name]
-    learner = trained(kind, one_step_bandit(), config, 1)
-    assert {"Loss/critic", "Loss/actor", "Value/q/task0", "Train/weightless"} <= learner.iterate().keys()
-    with torch.no_grad():
-        next(learner.critic.parameters()).fill_(float("nan"))
-    with pytest.raises(FloatingPointError, match=rf"{name}: the loss is not finite after \d+ steps; lower "):
-        learner.iterate()

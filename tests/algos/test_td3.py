@@ -12,8 +12,7 @@ from torch.testing import assert_close
 from bidex_algos.offpolicy.ddpg import DDPG, DDPGConfig, spread
 from bidex_algos.offpolicy.td3 import TD3, TD3Config
 from bidex_algos.replay import Transitions
-from tests.algos.off_policy import trained
-from tests.algos.problems import opposite_bandits
+from tests.algos.problems import opposite_bandits, trained
 from tests.algos.toy import ToyWorld, nearness
 
 SHARED: dict[str, Any] = {
@@ -23,9 +22,6 @@ SHARED: dict[str, Any] = {
 }  # fmt: skip
 SMALL = TD3Config(**SHARED)
 both = pytest.mark.parametrize(("kind", "config"), [(DDPG, DDPGConfig(**SHARED)), (TD3, SMALL)], ids=["ddpg", "td3"])
-
-
-# One update, against an independent computation.
 
 
 def a_draw() -> Transitions:

@@ -17,28 +17,17 @@ def nearness(target: float, scale: float = 1.0) -> Callable[[Tensor], Tensor]:
 class ToyWorld(FakeWorld):
     """Rows of several bandits; observations are a noise column and the one-hot.
 
-    The clock is not observed, so the last state of an episode looks like any other.
-
-    Args:
-        rewards: One function a task, of the clamped actions (rows, a) to rewards (rows,).
-        rows: Rows per task.
-        horizon: Steps per episode.
-        terminal: Whether the end of an episode is a true end instead of a time limit.
-        actions: Number of actions.
-        unstable: (step, row) pairs where physics breaks, counted from the first step.
-        garbage: What reward and final observation hold there, against the contract.
+    The clock is not observed, so the last state of an episode looks like any other. ``rewards``: one function a task,
+    of the clamped actions (rows, a) to rewards (rows,); ``rows``: rows per task; ``horizon``: steps per episode;
+    ``terminal``: whether the end of an episode is a true end instead of a time limit; ``unstable``: (step, row) pairs
+    where physics breaks, counted from the first step; ``garbage``: what reward and final observation hold there,
+    against the contract.
     """
 
     def __init__(
-        self,
-        rewards: list[Callable[[Tensor], Tensor]],
-        rows: int = 32,
-        horizon: int = 4,
-        terminal: bool = False,
-        actions: int = 2,
-        unstable: tuple[tuple[int, int], ...] = (),
-        garbage: float = 0.0,
-    ):
+        self, rewards: list[Callable[[Tensor], Tensor]], rows: int = 32, horizon: int = 4, terminal: bool = False,
+        actions: int = 2, unstable: tuple[tuple[int, int], ...] = (), garbage: float = 0.0
+    ):  # fmt: skip
         self.rewards, self.terminal, self.garbage = rewards, terminal, garbage
         names, rows = {f"task{i}": 1 for i in range(len(rewards))}, rows * len(rewards)
         sizes, limits = (1 + len(rewards), actions), (horizon,) * len(rewards)

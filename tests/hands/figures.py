@@ -7,23 +7,18 @@ from scipy.spatial.transform import Rotation
 JOINTS = [
     ("WRJ1", -0.489, 0.14, 0.5, 0.005, True, 5.0, 4.785),
     ("WRJ0", -0.698, 0.489, 0.5, 0.005, True, 5.0, 2.175),
-    ("FFJ3", -0.349, 0.349, 0.1, 0.001, True, 1.0, 0.9),
-    ("FFJ2", 0.0, 1.571, 0.1, 0.001, True, 1.0, 0.9),
-    ("FFJ1", 0.0, 1.571, 0.1, 0.001, True, 1.0, 0.7245),
-    ("FFJ0", 0.0, 1.571, 0.1, 0.001, False, 0.0, 0.0),
-    ("MFJ3", -0.349, 0.349, 0.1, 0.001, True, 1.0, 0.9),
-    ("MFJ2", 0.0, 1.571, 0.1, 0.001, True, 1.0, 0.9),
-    ("MFJ1", 0.0, 1.571, 0.1, 0.001, True, 1.0, 0.7245),
-    ("MFJ0", 0.0, 1.571, 0.1, 0.001, False, 0.0, 0.0),
-    ("RFJ3", -0.349, 0.349, 0.1, 0.001, True, 1.0, 0.9),
-    ("RFJ2", 0.0, 1.571, 0.1, 0.001, True, 1.0, 0.9),
-    ("RFJ1", 0.0, 1.571, 0.1, 0.001, True, 1.0, 0.7245),
-    ("RFJ0", 0.0, 1.571, 0.1, 0.001, False, 0.0, 0.0),
-    ("LFJ4", 0.0, 0.785, 0.1, 0.001, True, 1.0, 0.9),
-    ("LFJ3", -0.349, 0.349, 0.1, 0.001, True, 1.0, 0.9),
-    ("LFJ2", 0.0, 1.571, 0.1, 0.001, True, 1.0, 0.9),
-    ("LFJ1", 0.0, 1.571, 0.1, 0.001, True, 1.0, 0.7245),
-    ("LFJ0", 0.0, 1.571, 0.1, 0.001, False, 0.0, 0.0),
+    *(
+        (f"{finger}J{i}", *figures)
+        for finger in ("FF", "MF", "RF", "LF")
+        for i, figures in (
+            (4, (0.0, 0.785, 0.1, 0.001, True, 1.0, 0.9)),
+            (3, (-0.349, 0.349, 0.1, 0.001, True, 1.0, 0.9)),
+            (2, (0.0, 1.571, 0.1, 0.001, True, 1.0, 0.9)),
+            (1, (0.0, 1.571, 0.1, 0.001, True, 1.0, 0.7245)),
+            (0, (0.0, 1.571, 0.1, 0.001, False, 0.0, 0.0)),
+        )
+        if i < 4 or finger == "LF"
+    ),
     ("THJ4", -1.047, 1.047, 0.1, 0.001, True, 1.0, 2.3722),
     ("THJ3", 0.0, 1.222, 0.1, 0.001, True, 1.0, 1.45),
     ("THJ2", -0.209, 0.209, 0.1, 0.001, True, 1.0, 0.99),
@@ -36,29 +31,12 @@ HIGH = np.array([joint[2] for joint in JOINTS])
 ACTUATED = [0, 1, 2, 3, 4, 6, 7, 8, 10, 11, 12, 14, 15, 16, 17, 19, 20, 21, 22, 23]
 
 # Geoms of one hand that may meet; all others of the same hand pass through each other.
-PAIRS = {
-    frozenset(pair.split("-"))
-    for pair in (
-        "thdistal-ffdistal",
-        "thdistal-ffmiddle",
-        "thdistal-ffproximal",
-        "thdistal-mfproximal",
-        "thdistal-mfdistal",
-        "thdistal-rfdistal",
-        "thdistal-lfdistal",
-        "thdistal-palm0",
-        "mfdistal-ffdistal",
-        "rfdistal-mfdistal",
-        "lfdistal-rfdistal",
-        "mfproximal-ffproximal",
-        "rfproximal-mfproximal",
-        "lfproximal-rfproximal",
-        "lfdistal-mfdistal",
-        "lfdistal-rfmiddle",
-        "lfmiddle-rfdistal",
-        "lfmiddle-rfmiddle",
-    )
-}
+_PAIRS = """
+thdistal-ffdistal thdistal-ffmiddle thdistal-ffproximal thdistal-mfproximal thdistal-mfdistal thdistal-rfdistal
+thdistal-lfdistal thdistal-palm0 mfdistal-ffdistal rfdistal-mfdistal lfdistal-rfdistal mfproximal-ffproximal
+rfproximal-mfproximal lfproximal-rfproximal lfdistal-mfdistal lfdistal-rfmiddle lfmiddle-rfdistal lfmiddle-rfmiddle
+"""
+PAIRS = {frozenset(pair.split("-")) for pair in _PAIRS.split()}
 
 # Collision geoms but the forearm's, a mesh there: position in the body, size, condim; capsules (radius, half length)
 # along the body's z (the wrist's along its y), boxes by half sizes.
@@ -142,27 +120,11 @@ CLASS_MOUNTS = {
     "GraspAndPlace": _PALMS_DOWN,
 }
 # class: transition and orientation scale.
-SCALES = {
-    "HandOver": (0.05, 0.5),
-    "CatchUnderarm": (0.05, 0.5),
-    "CatchOver2Underarm": (0.1, 2.0),
-    "TwoCatchUnderarm": (0.05, 0.5),
-    "CatchAbreast": (0.5, 1.0),
-    "LiftUnderarm": (0.25, 1.0),
-    "DoorOpenOutward": (0.5, 0.5),
-    "DoorOpenInward": (0.5, 0.5),
-    "DoorCloseOutward": (0.5, 0.5),
-    "DoorCloseInward": (0.5, 0.5),
-    "BottleCap": (0.1, 0.1),
-    "PushBlock": (0.5, 0.1),
-    "SwingCup": (0.1, 0.1),
-    "OpenScissors": (0.5, 0.1),
-    "ReOrientation": (0.05, 0.5),
-    "OpenPenCap": (0.5, 0.1),
-    "Switch": (0.5, 0.1),
-    "StackBlock": (0.2, 0.02),
-    "PourWater": (0.5, 0.1),
-    "GraspAndPlace": (0.5, 0.1),
+SCALES = dict.fromkeys(CLASS_MOUNTS, (0.5, 0.1)) | {
+    **dict.fromkeys(("HandOver", "CatchUnderarm", "TwoCatchUnderarm", "ReOrientation"), (0.05, 0.5)),
+    **dict.fromkeys((name for name in CLASS_MOUNTS if name.startswith("Door")), (0.5, 0.5)),
+    **{"CatchOver2Underarm": (0.1, 2.0), "CatchAbreast": (0.5, 1.0), "LiftUnderarm": (0.25, 1.0)},
+    **{"BottleCap": (0.1, 0.1), "SwingCup": (0.1, 0.1), "StackBlock": (0.2, 0.02)},
 }
 # class: start angles of the joints that do not start at zero, both hands.
 DEFAULT_JOINTS = {"BottleCap": {"THJ4": -1.04, "THJ3": 1.2, "THJ0": -1.57}}

@@ -248,26 +248,3 @@ def test_contacts_of_random_hands_are_among_the_pairs() -> None:
                 met.add(frozenset(n.split("/C_")[1] for n in (a, b)))
                 assert contact.dim == 1, (a, b)
     assert met and met <= figures.PAIRS
-
-
-def test_the_three_kinds_really_meet() -> None:
-    """Egg put into a palm, a hand put into the other, the egg put on the floor: MuJoCo finds the contacts."""
-    model = compile_scene(registry.get("HandOver", True)).model
-    data = mujoco.MjData(model)
-
-    def meetings(**places: tuple[float, float, float]) -> set[frozenset[str]]:
-        mujoco.mj_resetData(model, data)
-        for joint, place in places.items():
-            first = model.joint(f"{joint}/free").qposadr[0]
-            data.qpos[first : first + 3] = place
-        mujoco.mj_fwdPosition(model, data)
-        return {frozenset(kind(model.geom(int(g)).name) for g in contact.geom) for contact in data.contact}
-
-    away = (3.0, 0.0, 2.0)
-    right = data.qpos[model.joint("right/free").qposadr[0] :][:3].copy()
-    palm = (right[0], -0.34, 0.52)
-    assert meetings(object=away) == set()
-    assert frozenset({"right", "object"}) in meetings(object=palm)
-    assert frozenset({"right", "left"}) in meetings(object=away, left=(right[0] + 0.01, right[1] - 0.3, right[2]))
-    assert frozenset({"object", "floor"}) in meetings(object=(3.0, 0.0, 0.02))
-    assert frozenset({"right", "floor"}) in meetings(object=away, right=(right[0], right[1], 0.02))

@@ -30,8 +30,7 @@ class Native:
         self.rows, self.calls, self.reset_masks = rows, [], []
 
     def _called(self, name: str) -> None:
-        if not self.calls or self.calls[-1] != name:
-            self.calls.append(name)
+        self.calls += [name] if self.calls[-1:] != [name] else []
 
     def init(self) -> None:
         self._called("init")
@@ -89,8 +88,7 @@ def test_adaptation_in_their_evaluation(agent):
 
     adapted = success(adaptation_steps=3, adaptation_episodes=2, evaluation_episodes=8)
     plain = success(adaptation_steps=0, evaluation_episodes=8)
-    assert plain[0] == 0
-    assert adapted[1] > plain[1]  # their mean return
+    assert plain[0] == 0 and adapted[1] > plain[1]  # their mean return
     assert not envs.terminate_on_success
 
 
@@ -142,38 +140,6 @@ def test_a_real_world_in_their_evaluation_gives_our_numbers():
     assert mean == pytest.approx(ours.mean_return, rel=1e-5)
 
 
-def test_adaptation_on_a_real_world_in_their_evaluation():
-    place = Benchmark("ML1").make_world("test", 2, device="cpu", autoreset_mode="DISABLED", threads=1)
-
-    class Drifter:
-        """Adapts to what it was rewarded for most."""
-
-        def init(self):
-            self.sums, self.action = torch.zeros(2), torch.zeros(52)
-
-        def reset(self, env_mask):
-            assert env_mask.dtype == torch.bool
-
-        def eval_action(self, obs):
-            return self.action.expand(len(obs), 52)
-
-        def adapt_action(self, obs):
-            return torch.linspace(-0.5, 0.5, len(obs))[:, None].expand(len(obs), 52), {}
-
-        def step(self, timestep):
-            self.sums += timestep.reward
-
-        def adapt(self):
-            self.action = torch.full((52,), float(torch.linspace(-0.5, 0.5, 2)[self.sums.argmax()]))
-
-    agent, envs = Drifter(), MetaWorldEnvs(place)
-    with known_to_metaworld(envs):
-        keywords: dict[str, Any] = {"num_evals": 1, "adaptation_episodes": 1, "evaluation_episodes": 2}
-        found = theirs.metalearning_evaluation(ForMetaWorld(agent), envs, **keywords)  # type: ignore[arg-type]
-    assert list(found[2]) == ["CatchUnderarm"] and np.isfinite(found[1])
-    assert agent.action.abs().max() == 0.5
-
-
 def test_tasks_are_sampled_in_turns():
     place = points(6)
     envs = MetaWorldEnvs(place)
@@ -193,9 +159,8 @@ def test_refusals_name_the_mend():
 @pytest.mark.parametrize("algo", ["maml", "promp", "rl2"])
 def test_our_learners_in_both_evaluations(algo):
     kind = learner_kind(algo)
-    small = {"hidden": (8,), "max_adapt_steps": 20}
-    config = replace(kind.presets["laptop"], **small)
-    place = Benchmark("ML1").make_world("train", 12, device="cpu", autoreset_mode="DISABLED", threads=1)
+    config = replace(kind.presets["laptop"], hidden=(8,), max_adapt_steps=20)
+    place = Benchmark("ML1").make_world("test", 12, device="cpu", autoreset_mode="DISABLED", threads=1)
     state = kind.make(place, config, seed=0).policy_state_dict()
     found = meta_evaluate(kind.make.load_policy(state, "cpu"), place, 1, episodes_per_task=1, max_adapt_steps=20)
     changed = found.after.classes["CatchUnderarm"].returns != found.before.classes["CatchUnderarm"].returns

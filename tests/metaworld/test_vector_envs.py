@@ -28,10 +28,7 @@ from bidex_meta.world.single_env import SuiteEnv
 BOTH = pytest.mark.parametrize(
     ("metaworld", "name"), [(original, "reach-v3"), (ours, "HandOver")], ids=["metaworld", "bidex-meta"]
 )
-SHORT: dict[str, Any] = {"max_episode_steps": 8}
-"""Of episodes where a test is about their ends."""
-
-
+SHORT: dict[str, Any] = {"max_episode_steps": 8}  # where a test is about the end of episodes
 ITS_OWN_CODE = """
 import metaworld
 env = metaworld.make_mt_envs("reach-v3", seed=0)
@@ -52,7 +49,8 @@ def test_meta_worlds_own_code_runs_beside_ours(ours: str) -> None:
 # Meta-World's examples, word for word but for the benchmark, which is an argument.
 
 
-def single_task(metaworld: Any, name: str) -> None:
+@BOTH
+def test_a_single_task(metaworld: Any, name: str) -> None:
     """Its README: a benchmark with a single environment."""
     assert name in metaworld.ML1.ENV_NAMES
     ml1 = metaworld.ML1(name, 42)  # Construct the benchmark, sampling tasks
@@ -68,8 +66,15 @@ def single_task(metaworld: Any, name: str) -> None:
     env.close()
 
 
-def many_tasks(ml10: Any) -> None:
+MANY = {"ML4": lambda: ours.ML4(), "ML20": lambda: ours.ML20(), "any": lambda: Benchmark("ML4", 1)}
+MANY |= {"ML1": lambda: ours.ML1("Switch"), "custom": lambda: ours.CustomML(["HandOver"], ["Switch"], seed=1)}
+MANY["original"] = lambda: original.CustomML(["reach-v3"], ["drawer-close-v3"], seed=1)
+
+
+@pytest.mark.parametrize("name", MANY)
+def test_many_tasks(name: str) -> None:
     """Its README: a benchmark with several environments."""
+    ml10: Any = MANY[name]()
     training_envs = []
     for name, env_cls in ml10.train_classes.items():
         env = env_cls()
@@ -95,7 +100,8 @@ def many_tasks(ml10: Any) -> None:
             obs, reward, terminate, truncate, info = env.step(env.action_space.sample())
 
 
-def whole_episode(metaworld: Any, name: str) -> int:
+@BOTH
+def test_an_episode_to_its_end(metaworld: Any, name: str) -> None:
     """Its documentation: a scripted policy until the time is up."""
     mt1 = metaworld.MT1(name, seed=1)
     env = mt1.train_classes[name](render_mode=None)
@@ -108,14 +114,14 @@ def whole_episode(metaworld: Any, name: str) -> int:
     assert steps <= env.max_path_length
     with pytest.raises(ValueError):
         env.step(np.zeros(env.action_space.shape, np.float32))
-    return steps
+    assert metaworld is ours or steps == 500
 
 
 class Agent:
     """Both protocols of its evaluation; counts the calls."""
 
     def __init__(self, envs: Any) -> None:
-        self.space, self.calls = envs.action_space, {"init": 0, "step": 0, "adapt": 0, "reset": 0}
+        self.space, self.calls = envs.action_space, dict.fromkeys(("init", "step", "adapt", "reset"), 0)
 
     def eval_action(self, observations: np.ndarray) -> np.ndarray:
         return np.zeros(self.space.shape, np.float32)
@@ -135,27 +141,6 @@ class Agent:
 
     def adapt(self) -> None:
         self.calls["adapt"] += 1
-
-
-@BOTH
-def test_a_single_task(metaworld: Any, name: str) -> None:
-    single_task(metaworld, name)
-
-
-@pytest.mark.parametrize("make", [ours.ML4, ours.ML20, lambda: Benchmark("ML4", 1), lambda: ours.ML1("Switch")])
-def test_many_tasks(make: Callable[[], Any]) -> None:
-    many_tasks(make())
-
-
-def test_the_example_is_meta_worlds() -> None:
-    many_tasks(original.CustomML(["reach-v3"], ["drawer-close-v3"], seed=1))
-    many_tasks(ours.CustomML(["HandOver"], ["Switch"], seed=1))
-
-
-@BOTH
-def test_an_episode_to_its_end(metaworld: Any, name: str) -> None:
-    steps = whole_episode(metaworld, name)
-    assert steps == (500 if metaworld is original else steps)
 
 
 @BOTH

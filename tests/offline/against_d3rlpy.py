@@ -48,37 +48,23 @@ class Scripted:
 
 
 def against(
-    data: Joined,
-    world: Any,
-    judge: Callable[[Any], float],
-    python: str,
-    updates: int,
-    seeds: int = 3,
-    algos: Sequence[str] = ALGOS,
-) -> dict[str, Any]:
+    data: Joined, world: Any, judge: Callable[[Any], float], python: str, updates: int, seeds: int = 3,
+    algos: Sequence[str] = ALGOS
+) -> dict[str, Any]:  # fmt: skip
     """What both reach: per algo ``ours`` and ``theirs`` (a number a seed), means, intervals, ``overlap``.
 
-    Args:
-        data: The transitions.
-        world: What they were recorded of.
-        judge: The score of an agent.
-        python: Interpreter that has d3rlpy.
-        updates: Gradient steps.
-        seeds: Runs of each.
-        algos: Which learners.
+    ``data``: the transitions; ``world``: what they were recorded of; ``judge``: the score of an agent; ``python``:
+    interpreter that has d3rlpy; ``updates``: Gradient steps; ``seeds``: runs of each; ``algos``: which learners.
     """
     found = {}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "data.npz"
         ends = data.left.numpy() == 0
         np.savez(
-            path,
-            observations=data.observations[data.at].numpy(),
-            actions=data.actions.numpy(),
-            rewards=data.rewards.numpy()[:, None],
-            terminals=data.terminated.float().numpy(),
-            timeouts=(ends & ~data.terminated.numpy()).astype(np.float32),
-        )
+            path, observations=data.observations[data.at].numpy(), actions=data.actions.numpy(),
+            rewards=data.rewards.numpy()[:, None], terminals=data.terminated.float().numpy(),
+            timeouts=(ends & ~data.terminated.numpy()).astype(np.float32)
+        )  # fmt: skip
         for algo in algos:
             ours, theirs = [], []
             for seed in range(seeds):
@@ -102,13 +88,9 @@ def _train(command: Sequence[Any]) -> None:
     """Runs d3rlpy on one thread, in an environment that does not know ours."""
     others = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     done = subprocess.run(
-        [*map(str, command)],
-        env=others | {"OMP_NUM_THREADS": "1"},
-        stderr=subprocess.STDOUT,
-        stdout=subprocess.PIPE,
-        text=True,
-        check=False,
-    )
+        [*map(str, command)], env=others | {"OMP_NUM_THREADS": "1"}, stderr=subprocess.STDOUT, stdout=subprocess.PIPE,
+        text=True, check=False
+    )  # fmt: skip
     if done.returncode:
         raise RuntimeError(f"{command} ended with {done.returncode}: {done.stdout[-2000:]}")
 

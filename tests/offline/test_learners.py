@@ -18,7 +18,6 @@ from bidex_algos.offline.td3bc import TD3BC, TD3BCConfig
 from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
 from tests.algos.problems import PointMass, discounted_return, one_step_bandit, opposite_bandits
-from tests.algos.resume import resumed
 from tests.offline.stored import as_data, noisy, played
 
 PLAIN: dict[str, Any] = {
@@ -60,9 +59,6 @@ def point() -> tuple[Joined, float]:
     return as_data(played(world, behaviour, 200)), discounted_return(PointMass(256), noisy(world.best, 0, 0.4), 0.8, 20)
 
 
-# Problems with a known answer.
-
-
 def test_bc_does_on_the_bandit_what_the_data_did() -> None:
     world, data = bad_bandit()
     action = learned("bc", world, data, 2).eval_action(world.reset(seed=1)[0])
@@ -97,9 +93,6 @@ def test_one_policy_of_two_tasks_at_odds_tells_them_apart() -> None:
     first, second = (float(action[world.task_id == task].mean()) for task in (0, 1))
     assert first > 0.25 and second < -0.25
     assert 500 < float(learner.reward_scale[1] / learner.reward_scale[0]) < 2000
-
-
-# Parts against independent computations.
 
 
 def test_without_a_value_td3bc_is_bc() -> None:
@@ -226,27 +219,6 @@ def rows_of(episodes: list[Any]) -> list[tuple[Tensor, ...]]:
         return tuple(torch.from_numpy(np.atleast_1d(each)) for each in told)
 
     return [row(episode, t) for episode in episodes for t in range(len(episode))]
-
-
-# Checkpoints, configs.
-
-
-@each
-def test_two_halves_are_one_whole(name: str) -> None:
-    world, data = bad_bandit()
-    kind, config = SMALL[name]
-
-    def make(seed: int) -> Any:
-        learner = kind(one_step_bandit(0.6), replace(config, updates_per_iteration=5), seed)
-        learner.world.reset(seed=0)
-        learner.learn_from(data)
-        return learner
-
-    whole, again = resumed(make)
-    obs, _ = world.reset(seed=1)
-    loaded = kind.load_policy(again.policy_state_dict())
-    assert torch.equal(whole.eval_action(obs), loaded.eval_action(obs))
-    assert whole.env_steps == 30
 
 
 def test_a_checkpoint_of_other_data_is_refused() -> None:

@@ -19,12 +19,9 @@ def test_the_intervals_of_three_seeds_overlap() -> None:
     world = PointMass()
     data = as_data(played(world, noisy(world.best, 0.5, 0.4), 200))
     found = against(
-        data,
-        world,
-        lambda agent: discounted_return(PointMass(rows=1024), agent.eval_action, 0.99, 20),
-        str(PYTHON),
-        updates=3000,
-    )
+        data, world, lambda agent: discounted_return(PointMass(rows=1024), agent.eval_action, 0.99, 20), str(PYTHON),
+        updates=3000
+    )  # fmt: skip
     behaviour = discounted_return(PointMass(rows=1024), noisy(world.best, 0.0, 0.4), 0.99, 20)
     print(found, behaviour, torch.get_num_threads())
     for algo, told in found.items():

@@ -91,19 +91,9 @@ def test_gymnasiums_humanoid_is_learned_without_being_named(folder: Path, capsys
     about = open_dataset(name).metadata
     assert (about["suite"], about["task"], about["base"]) == (None, HUMANOID, "own")
     printed(
-        capsys,
-        "run",
-        "--dataset",
-        name,
-        "--algo",
-        "bc",
-        *SMALL,
-        "--steps",
-        10,
-        "--no-evaluate",
-        "--run-dir",
-        folder / "a",
-    )
+        capsys, "run", "--dataset", name, "--algo", "bc", *SMALL, "--steps", 10, "--no-evaluate", "--run-dir",
+        folder / "a"
+    )  # fmt: skip
     assert RunFolder.open(folder / "a").config().task == HUMANOID
 
 

@@ -1,6 +1,6 @@
-"""What the printed formulas are told with: MuJoCo's own frames and joints, in float64 with NumPy and SciPy.
+"""What the printed formulas are written with: MuJoCo's own frames and joints, in float64 with NumPy and SciPy.
 
-Nothing here or in the ``formulas_*`` modules imports the project. ``data`` is MuJoCo's own; a task is the dict of the
+Nothing here or in ``formulas`` imports the project. ``data`` is MuJoCo's own; a task is the dict of the
 numbers that it froze, by component name. Points on objects stand where the original puts them in the frame of the
 object's root body (docs/figures.md, classes and objects).
 """
@@ -27,14 +27,14 @@ class Judgement:
     margin: float
 
 
-class Oracle:
-    """A class's formulas.
+def within(terms: dict[str, float], *edges: float) -> Judgement:
+    """Solved where all edges are below zero; never failed."""
+    return Judgement(terms, max(edges) < 0, False, float(min(abs(edge) for edge in edges)))
 
-    Attributes:
-        body_of_goal: Goal, as the tables name it, to the body whose orientation is compared with it.
-        entering: Components of a variation that enter the reward of a given state (None: all of them).
-        deciding: Components that enter its success alone.
-    """
+
+class Oracle:
+    """A class's formulas: goals, as the tables name them, to the bodies whose orientation is compared with them, and
+    the components of a variation that enter the reward of a given state (None: all of them), or its success alone."""
 
     body_of_goal: Mapping[str, str] = MappingProxyType({})
     entering: frozenset[str] | set[str] | None = frozenset()
@@ -58,17 +58,14 @@ class Oracle:
 
 
 def frame(data: mujoco.MjData, body: str) -> Goal:
-    """Origin and orientation of a body."""
     return data.body(body).xpos.copy(), Rotation.from_quat(data.body(body).xquat, scalar_first=True)
 
 
 def at(data: mujoco.MjData, body: str, offset: tuple[float, float, float]) -> np.ndarray:
-    """World position of a point given in a body's frame."""
     return data.body(body).xpos + data.body(body).xmat.reshape(3, 3) @ np.array(offset)
 
 
 def angle(data: mujoco.MjData, joint: str) -> float:
-    """Position of a joint, m or rad."""
     return float(data.joint(joint).qpos[0])
 
 
@@ -85,7 +82,6 @@ def start(data: mujoco.MjData, name: str, task: Task) -> Goal:
 
 
 def about_z(yaw: float) -> Rotation:
-    """A turn about the vertical."""
     return Rotation.from_rotvec([0.0, 0.0, yaw])
 
 
@@ -106,7 +102,6 @@ def hand_point(data: mujoco.MjData, side: str) -> np.ndarray:
 
 
 def shifted(position: np.ndarray, x: float, y: float, z: float) -> np.ndarray:
-    """A position moved along the world's axes."""
     return position + np.array((x, y, z))
 
 
@@ -122,7 +117,6 @@ def some_tilt(rng: np.random.Generator, widest: float) -> Rotation:
 
 
 def length(vector: np.ndarray) -> float:
-    """Euclidean length."""
     return float(np.linalg.norm(vector))
 
 
@@ -132,12 +126,11 @@ def reach(data: mujoco.MjData, left: np.ndarray, right: np.ndarray) -> tuple[flo
 
 
 def linear(
-    data: mujoco.MjData, left: np.ndarray, right: np.ndarray, target: float, constant: float | None
+    data: mujoco.MjData, left: np.ndarray, right: np.ndarray, target: float, constant: float
 ) -> dict[str, float]:
     """Terms of the formulas of the form constant - d_left - d_right + target."""
     d_left, d_right = reach(data, left, right)
-    terms = {"left": -d_left, "right": -d_right, "target": target}
-    return terms if constant is None else terms | {"constant": constant}
+    return {"left": -d_left, "right": -d_right, "target": target, "constant": constant}
 
 
 def pose(position: np.ndarray, turn: Rotation) -> np.ndarray:

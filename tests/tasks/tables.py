@@ -1,179 +1,92 @@
 """Observation tables of the appendix, typed as they are printed: first index, last index, what stands there."""
 
+import re
 from math import pi
 
 Row = tuple[int, int, str]
 
-TABLE_7: list[Row] = [
-    (0, 23, "right dof position"),
-    (24, 47, "right dof velocity"),
-    (48, 71, "right dof force"),
-    (72, 136, "right fingertip pose, linear velocity, angle velocity"),
-    (137, 166, "right fingertip force, torque"),
-    (167, 169, "right base position"),
-    (170, 172, "right base rotation"),
-    (173, 198, "right actions"),
-    (199, 222, "left dof position"),
-    (223, 246, "left dof velocity"),
-    (247, 270, "left dof force"),
-    (271, 335, "left fingertip pose, linear velocity, angle velocity"),
-    (336, 365, "left fingertip force, torque"),
-    (366, 368, "left base position"),
-    (369, 371, "left base rotation"),
-    (372, 397, "left actions"),
-]
+
+def rows(text: str) -> list[Row]:
+    """Rows of a table, ``first-last words; ...``."""
+    return [(int(a), int(b), words) for a, b, words in re.findall(r"(\d+)-(\d+) ([^;]+)", text)]
+
+
+TABLE_7 = rows(
+    "0-23 right dof position; 24-47 right dof velocity; 48-71 right dof force; "
+    "72-136 right fingertip pose, linear velocity, angle velocity; 137-166 right fingertip force, torque; "
+    "167-169 right base position; 170-172 right base rotation; 173-198 right actions; 199-222 left dof position; "
+    "223-246 left dof velocity; 247-270 left dof force; "
+    "271-335 left fingertip pose, linear velocity, angle velocity; 336-365 left fingertip force, torque; "
+    "366-368 left base position; 369-371 left base rotation; 372-397 left actions"
+)
 # "The observation of the dual hands is compared to Table 7 of reduced 24 dimensions": no base, 20 actions (A.2.1).
-TABLE_7_FIXED: list[Row] = [
-    (0, 23, "right dof position"),
-    (24, 47, "right dof velocity"),
-    (48, 71, "right dof force"),
-    (72, 136, "right fingertip pose, linear velocity, angle velocity"),
-    (137, 166, "right fingertip force, torque"),
-    (167, 186, "right actions"),
-    (187, 210, "left dof position"),
-    (211, 234, "left dof velocity"),
-    (235, 258, "left dof force"),
-    (259, 323, "left fingertip pose, linear velocity, angle velocity"),
-    (324, 353, "left fingertip force, torque"),
-    (354, 373, "left actions"),
-]
-TABLE_8: list[Row] = [
-    *TABLE_7_FIXED,
-    (374, 380, "object pose"),
-    (381, 383, "object linear velocity"),
-    (384, 386, "object angle velocity"),
-    (387, 393, "goal pose"),
-    (394, 397, "goal rot - object rot"),
-]
-TABLE_10: list[Row] = [
-    *TABLE_7,
-    (398, 404, "object pose"),
-    (405, 407, "object linear velocity"),
-    (408, 410, "object angle velocity"),
-    (411, 417, "goal pose"),
-    (418, 421, "goal rot - object rot"),
-]
+TABLE_7_FIXED = rows(
+    "0-23 right dof position; 24-47 right dof velocity; 48-71 right dof force; "
+    "72-136 right fingertip pose, linear velocity, angle velocity; 137-166 right fingertip force, torque; "
+    "167-186 right actions; 187-210 left dof position; 211-234 left dof velocity; 235-258 left dof force; "
+    "259-323 left fingertip pose, linear velocity, angle velocity; 324-353 left fingertip force, torque; "
+    "354-373 left actions"
+)
+TABLE_8 = TABLE_7_FIXED + rows(
+    "374-380 object pose; 381-383 object linear velocity; 384-386 object angle velocity; 387-393 goal pose; "
+    "394-397 goal rot - object rot"
+)
+TABLE_10 = TABLE_7 + rows(
+    "398-404 object pose; 405-407 object linear velocity; 408-410 object angle velocity; 411-417 goal pose; "
+    "418-421 goal rot - object rot"
+)
 # Table 32 prints the rows of Table 14.
-TABLE_14: list[Row] = [
-    *TABLE_7,
-    (398, 404, "object1 pose"),
-    (405, 407, "object1 linear velocity"),
-    (408, 410, "object1 angle velocity"),
-    (411, 417, "goal1 pose"),
-    (418, 421, "goal1 rot - object rot"),
-    (422, 428, "object2 pose"),
-    (429, 431, "object2 linear velocity"),
-    (432, 434, "object2 angle velocity"),
-    (435, 441, "goal2 pose"),
-    (442, 445, "goal2 rot - object2 rot"),
-]
-TABLE_18: list[Row] = [
-    *TABLE_7,
-    (398, 404, "object pose"),
-    (405, 407, "object linear velocity"),
-    (408, 410, "object angle velocity"),
-    (411, 417, "goal pose"),
-    (418, 421, "goal rot - object rot"),
-    (422, 424, "object right handle position"),
-    (425, 427, "object left handle position"),
-]
+TABLE_14 = TABLE_7 + rows(
+    "398-404 object1 pose; 405-407 object1 linear velocity; 408-410 object1 angle velocity; 411-417 goal1 pose; "
+    "418-421 goal1 rot - object rot; 422-428 object2 pose; 429-431 object2 linear velocity; "
+    "432-434 object2 angle velocity; 435-441 goal2 pose; 442-445 goal2 rot - object2 rot"
+)
+TABLE_18 = TABLE_7 + rows(
+    "398-404 object pose; 405-407 object linear velocity; 408-410 object angle velocity; 411-417 goal pose; "
+    "418-421 goal rot - object rot; 422-424 object right handle position; 425-427 object left handle position"
+)
 # Table 22 prints the same rows.
-TABLE_20: list[Row] = [
-    *TABLE_7,
-    (398, 404, "object pose"),
-    (405, 407, "object linear velocity"),
-    (408, 410, "object angle velocity"),
-    (411, 417, "goal pose"),
-    (418, 421, "goal rot - object rot"),
-    (422, 424, "door right handle position"),
-    (425, 427, "door left handle position"),
-]
-TABLE_24: list[Row] = [
-    *TABLE_7,
-    (398, 404, "bottle pose"),
-    (405, 407, "bottle linear velocity"),
-    (408, 410, "bottle angle velocity"),
-    (411, 413, "bottle cap position"),
-]
-TABLE_26: list[Row] = [
-    *TABLE_7,
-    (398, 404, "block1 pose"),
-    (405, 407, "block1 linear velocity"),
-    (408, 410, "block1 angle velocity"),
-    (411, 413, "block1 position"),
-    (414, 416, "block2 position"),
-]
-TABLE_28: list[Row] = [
-    *TABLE_7,
-    (398, 404, "cup pose"),
-    (405, 407, "cup linear velocity"),
-    (408, 410, "cup angle velocity"),
-    (411, 417, "goal pose"),
-    (418, 421, "goal rot - object rot"),
-    (422, 424, "cup right handle position"),
-    (425, 427, "cup left handle position"),
-]
-TABLE_30: list[Row] = [
-    *TABLE_7,
-    (398, 404, "scissors pose"),
-    (405, 407, "scissors linear velocity"),
-    (408, 410, "scissors angle velocity"),
-    (411, 417, "goal pose"),
-    (418, 421, "goal rot - object rot"),
-    (422, 424, "scissors right handle position"),
-    (425, 427, "scissors left handle position"),
-]
-TABLE_34: list[Row] = [
-    *TABLE_7,
-    (398, 404, "pen pose"),
-    (405, 407, "pen linear velocity"),
-    (408, 410, "pen angle velocity"),
-    (411, 417, "goal pose"),
-    (418, 421, "goal rot - object rot"),
-    (422, 424, "pen body position"),
-    (425, 427, "pen cap position"),
-]
-TABLE_36: list[Row] = [
-    *TABLE_7,
-    (398, 404, "switch1 pose"),
-    (405, 407, "switch1 linear velocity"),
-    (408, 410, "switch1 angle velocity"),
-    (411, 417, "goal pose"),
-    (418, 421, "goal rot - object rot"),
-    (422, 424, "switch1 position"),
-    (425, 427, "switch2 position"),
-]
-TABLE_38: list[Row] = [
-    *TABLE_7,
-    (398, 404, "block1 pose"),
-    (405, 407, "block1 linear velocity"),
-    (408, 410, "block1 angle velocity"),
-    (411, 417, "goal pose"),
-    (418, 421, "goal rot - object rot"),
-    (422, 424, "block1 position"),
-    (425, 427, "block2 position"),
-]
-TABLE_40: list[Row] = [
-    *TABLE_7,
-    (398, 404, "kettle pose"),
-    (405, 407, "kettle linear velocity"),
-    (408, 410, "kettle angle velocity"),
-    (411, 417, "goal pose"),
-    (418, 421, "goal rot - object rot"),
-    (422, 424, "kettle handle position"),
-    (425, 427, "bucket position"),
-]
+TABLE_20 = TABLE_7 + rows(
+    "398-404 object pose; 405-407 object linear velocity; 408-410 object angle velocity; 411-417 goal pose; "
+    "418-421 goal rot - object rot; 422-424 door right handle position; 425-427 door left handle position"
+)
+TABLE_24 = TABLE_7 + rows(
+    "398-404 bottle pose; 405-407 bottle linear velocity; 408-410 bottle angle velocity; 411-413 bottle cap position"
+)
+TABLE_26 = TABLE_7 + rows(
+    "398-404 block1 pose; 405-407 block1 linear velocity; 408-410 block1 angle velocity; "
+    "411-413 block1 position; 414-416 block2 position"
+)
+TABLE_28 = TABLE_7 + rows(
+    "398-404 cup pose; 405-407 cup linear velocity; 408-410 cup angle velocity; 411-417 goal pose; "
+    "418-421 goal rot - object rot; 422-424 cup right handle position; 425-427 cup left handle position"
+)
+TABLE_30 = TABLE_7 + rows(
+    "398-404 scissors pose; 405-407 scissors linear velocity; 408-410 scissors angle velocity; "
+    "411-417 goal pose; 418-421 goal rot - object rot; 422-424 scissors right handle position; "
+    "425-427 scissors left handle position"
+)
+TABLE_34 = TABLE_7 + rows(
+    "398-404 pen pose; 405-407 pen linear velocity; 408-410 pen angle velocity; 411-417 goal pose; "
+    "418-421 goal rot - object rot; 422-424 pen body position; 425-427 pen cap position"
+)
+TABLE_36 = TABLE_7 + rows(
+    "398-404 switch1 pose; 405-407 switch1 linear velocity; 408-410 switch1 angle velocity; 411-417 goal pose; "
+    "418-421 goal rot - object rot; 422-424 switch1 position; 425-427 switch2 position"
+)
+TABLE_38 = TABLE_7 + rows(
+    "398-404 block1 pose; 405-407 block1 linear velocity; 408-410 block1 angle velocity; 411-417 goal pose; "
+    "418-421 goal rot - object rot; 422-424 block1 position; 425-427 block2 position"
+)
+TABLE_40 = TABLE_7 + rows(
+    "398-404 kettle pose; 405-407 kettle linear velocity; 408-410 kettle angle velocity; 411-417 goal pose; "
+    "418-421 goal rot - object rot; 422-424 kettle handle position; 425-427 bucket position"
+)
 # The appendix has no table for GraspAndPlace; these are the rows of the original's code.
-GRASP_AND_PLACE: list[Row] = [
-    *TABLE_7,
-    (398, 404, "bucket pose"),
-    (405, 407, "bucket linear velocity"),
-    (408, 410, "bucket angle velocity"),
-    (411, 413, "bucket position"),
-    (414, 417, "bucket link quaternion"),
-    (418, 420, "block position"),
-    (421, 424, "block quaternion"),
-]
+GRASP_AND_PLACE = TABLE_7 + rows(
+    "398-404 bucket pose; 405-407 bucket linear velocity; 408-410 bucket angle velocity; "
+    "411-413 bucket position; 414-417 bucket link quaternion; 418-420 block position; 421-424 block quaternion"
+)
 # Tables 12 and 16 print the rows of Table 10; with a moving base HandOver has them too (docs/figures.md, decisions).
 TABLES: dict[tuple[str, bool], list[Row]] = {
     ("HandOver", False): TABLE_8,
@@ -198,52 +111,13 @@ TABLES: dict[tuple[str, bool], list[Row]] = {
     ("PourWater", True): TABLE_40,
     ("GraspAndPlace", True): GRASP_AND_PLACE,
 }
-SIZES = {
-    ("HandOver", False): (398, 40),
-    ("HandOver", True): (422, 52),
-    ("CatchUnderarm", True): (422, 52),
-    ("CatchOver2Underarm", True): (422, 52),
-    ("TwoCatchUnderarm", True): (446, 52),
-    ("CatchAbreast", True): (422, 52),
-    ("LiftUnderarm", True): (428, 52),
-    ("DoorOpenOutward", True): (428, 52),
-    ("DoorOpenInward", True): (428, 52),
-    ("DoorCloseOutward", True): (428, 52),
-    ("DoorCloseInward", True): (428, 52),
-    ("BottleCap", True): (414, 52),
-    ("PushBlock", True): (417, 52),
-    ("SwingCup", True): (428, 52),
-    ("OpenScissors", True): (428, 52),
-    ("ReOrientation", True): (446, 52),
-    ("OpenPenCap", True): (428, 52),
-    ("Switch", True): (428, 52),
-    ("StackBlock", True): (428, 52),
-    ("PourWater", True): (428, 52),
-    ("GraspAndPlace", True): (425, 52),
-}
+SIZES = {case: (table[-1][1] + 1, 52 if case[1] else 40) for case, table in TABLES.items()}
 """Observations and actions of each class and base."""
-
-EPISODE_STEPS = {
-    "HandOver": 75,
-    "CatchUnderarm": 75,
-    "CatchOver2Underarm": 75,
-    "TwoCatchUnderarm": 75,
-    "CatchAbreast": 150,
-    "LiftUnderarm": 500,
-    "DoorOpenOutward": 250,
-    "DoorOpenInward": 250,
-    "DoorCloseOutward": 250,
-    "DoorCloseInward": 250,
-    "BottleCap": 125,
-    "PushBlock": 125,
-    "SwingCup": 300,
-    "OpenScissors": 150,
-    "ReOrientation": 600,
-    "OpenPenCap": 125,
-    "Switch": 125,
-    "StackBlock": 250,
-    "PourWater": 125,
-    "GraspAndPlace": 500,
+EPISODE_STEPS = {name: 125 for name, _ in TABLES} | {
+    **dict.fromkeys(("HandOver", "CatchUnderarm", "CatchOver2Underarm", "TwoCatchUnderarm"), 75),
+    **dict.fromkeys((name for name, _ in TABLES if name.startswith("Door")), 250),
+    **{"CatchAbreast": 150, "LiftUnderarm": 500, "SwingCup": 300, "OpenScissors": 150, "ReOrientation": 600},
+    **{"StackBlock": 250, "GraspAndPlace": 500},
 }
 """Time limits in control steps, the original's."""
 

@@ -32,15 +32,7 @@ def held() -> np.ndarray:
 
 
 def free_bases(name: str, actions: np.ndarray) -> tuple[World, np.ndarray, np.ndarray]:
-    """Drives both bases alike for half a second, far from the floor, each other and the objects.
-
-    Args:
-        name: The class.
-        actions: Base actions, shape (rows, 6).
-
-    Returns:
-        The world, and both bases' positions and quaternions (w, x, y, z), shape (rows, 2, 7), before and after.
-    """
+    """Drives both bases by actions (n, 6) for half a second, far from all else; their poses (n, 2, 7) before, after."""
     world = world_of(name, True, len(actions))
     world.reset(seed=0)
     engine, scene = engine_of(world), scene_of(world)
@@ -62,7 +54,6 @@ def free_bases(name: str, actions: np.ndarray) -> tuple[World, np.ndarray, np.nd
 
 
 def turned(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Angle between the orientations of all rows and hands, rad."""
     return (
         figures.rotation(after[..., 3:].reshape(-1, 4)) * figures.rotation(before[..., 3:].reshape(-1, 4)).inv()
     ).magnitude()

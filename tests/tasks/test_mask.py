@@ -1,4 +1,4 @@
-"""The mask means something: goals are told in multi-task worlds, hidden in meta ones (docs/figures.md, decisions)."""
+"""The mask: goals are shown in multi-task worlds and hidden in meta ones (docs/figures.md, decisions)."""
 
 import numpy as np
 import pytest
@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.tasks import registry
+from bidex_meta.tasks.hidden import hidden
 from bidex_meta.world import World
 from tests.tasks.formulas import FORMULAS
 from tests.tasks.worlds import each_case, engine_of, mixed_world, world_of
@@ -69,14 +70,6 @@ def test_shears_show_the_angle_that_is_missing() -> None:
     assert reward[0] != reward[1] and (obs[0] - obs[1]).abs().max() > 0.05
 
 
-@each_case
-def test_what_differs_are_goal_entries(name: str, moving: bool) -> None:
-    _, obs, _ = twins(name, moving, "plain")
-    goal = registry.get(name, moving).layout.goal_indices()
-    rest = [i for i in range(obs.shape[1]) if i not in set(goal)]
-    assert torch.equal(obs[1:, rest], obs[:1, rest].expand(len(obs) - 1, -1))
-
-
 def played(world: World) -> list[Tensor]:
     """Observations of a short run, its resets included."""
     generator = torch.Generator().manual_seed(9)
@@ -94,11 +87,11 @@ def played(world: World) -> list[Tensor]:
 def test_the_mask_zeroes_the_goal_and_nothing_else(name: str, moving: bool) -> None:
     goal = registry.get(name, moving).layout.goal_indices()
     plain, masked = (played(world_of(name, moving, 4, observation=rule)) for rule in ("plain", "masked"))
-    for seen, hidden in zip(plain, masked, strict=True):
+    for seen, zeroed in zip(plain, masked, strict=True):
         assert not goal or seen[:, goal].any(dim=1).all()
         wanted = seen.clone()
         wanted[:, goal] = 0.0
-        assert torch.equal(hidden, wanted)
+        assert torch.equal(zeroed, wanted)
 
 
 def test_the_mask_in_a_mixed_world() -> None:
@@ -107,14 +100,30 @@ def test_the_mask_in_a_mixed_world() -> None:
         played(mixed_world(2, observation=rule, pad_to=450)) for rule in ("plain", "masked", "one-hot")
     )
     world = mixed_world(2)
-    for seen, hidden, named in zip(plain, masked, told, strict=True):
+    for seen, zeroed, named in zip(plain, masked, told, strict=True):
         assert torch.equal(named[:, :450], seen)
         assert torch.equal(named[:, 450:], torch.eye(world.num_tasks).repeat_interleave(2, dim=0))
         for slot, rows in zip(world.slots, world.slot_rows, strict=True):
             layout = slot.task_class.layout
             wanted = seen[rows].clone()
             wanted[:, layout.goal_indices()] = 0.0
-            assert torch.equal(hidden[rows], wanted)
+            assert torch.equal(zeroed[rows], wanted)
             assert (seen[rows, layout.size :] == 0).all()
             goal = layout.goal_indices()
             assert not goal or (seen[rows][:, goal] != 0).any(dim=1).all()
+
+
+OPEN = {name for name in FORMULAS if name.startswith("Door")} | set(
+    ("BottleCap", "PushBlock", "OpenPenCap", "Switch", "PourWater", "GraspAndPlace")
+)
+"""The ten classes whose tasks are told apart by nothing that reward or success depends on, or by a fixture's place."""
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_what_the_mask_hides_is_what_the_formulas_use(name: str) -> None:
+    task, oracle = registry.get(name, True), FORMULAS[name]
+    entering = set(task.variation_space.names) if oracle.entering is None else oracle.entering
+    found = hidden(task)
+    assert set(found.reward) == entering - FIXTURES.get(name, set())
+    assert set(found.success) == set(oracle.deciding)
+    assert (not found.reward and not found.success) == (name in OPEN)

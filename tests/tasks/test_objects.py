@@ -13,8 +13,7 @@ from bidex_meta.tasks.scene import Scene, compile_scene
 from bidex_meta.world import World
 from tests.hands import figures
 from tests.tasks.formulas import FORMULAS
-from tests.tasks.formulas_fixtures import TRAVEL
-from tests.tasks.oracle import at, frame, pose, shifted
+from tests.tasks.oracle import frame, pose, shifted
 from tests.tasks.tables import PLACES
 from tests.tasks.worlds import (
     Lens,
@@ -30,7 +29,6 @@ from tests.tasks.worlds import (
     send_hands_away,
     set_pose,
     slot,
-    task_of,
     world_of,
 )
 
@@ -60,14 +58,12 @@ def test_contacts_and_limits_are_as_stiff_as_the_time_step_allows(name: str) -> 
 
 
 def wait(world: World, steps: int) -> None:
-    """Lets time pass, bases unmoved."""
     for _ in range(steps):
         world.parts[0].step(torch.zeros(world.num_envs, world.action_size).double(), None)
     assert not engine_of(world).unstable().any()
 
 
 def joints_of(scene: Scene) -> list[str]:
-    """Joints of objects, but of water."""
     return [joint for joint in object_joints_of(scene) if not joint.startswith("water")]
 
 
@@ -119,42 +115,6 @@ def test_the_bottle_stays_in_the_hand_that_closes() -> None:
     shift = engine.qpos.numpy() - before
     assert np.abs(shift[:, scene.qpos["bottle"]][:, :3]).max() < 0.12, shift[:, scene.qpos["bottle"]]
     assert np.abs(shift[:, scene.qpos["bottle/slide"]]).max() < 0.002
-
-
-# ------------------------------------------------------------------------------------------------- switches
-
-
-def test_switch_targets_are_the_buttons_at_full_travel() -> None:
-    """Goal entries and reward against the engine's kinematics with both hinges at the end of their travel."""
-    world = alone("Switch", 4)
-    engine, scene = engine_of(world), scene_of(world)
-    up = engine.sensordata[:, scene.sensors["switch1/button_position"]].numpy().copy()
-    for i in (1, 2):
-        assert scene.model.joint(f"switch{i}/hinge").range.tolist() == [0.0, TRAVEL]
-        engine.qpos[:, scene.qpos[f"switch{i}/hinge"]] = TRAVEL
-    obs, task = observe(world), world.slots[0].task_class
-    pressed = obs[:, task.layout.range("switch1_position")]
-    np.testing.assert_allclose(obs[:, task.layout.range("goal_pose")][:, :3], pressed, atol=1e-6)
-    difference = obs[:, task.layout.range("goal_rotation_difference")]
-    np.testing.assert_allclose(np.abs(difference), np.tile((0, 0, 0, 1.0), (4, 1)), atol=1e-6)
-    assert (up[:, 2] - pressed[:, 2] > 0.01).all(), "pressing lowers the button"
-    (_, _, state), *_ = world.parts[0].states(world.task_index)
-    np.testing.assert_allclose(task.reward_terms(state)["target"].numpy(), 50 * 1.4, atol=1e-4)
-    assert task.success(state).all()
-
-
-# ------------------------------------------------------------------------------------------- water and bucket
-
-
-def test_an_upright_kettle_cannot_reach_the_bucket() -> None:
-    """However kettle and bucket stand on the table: only heights count, and they do not depend on place or yaw."""
-    world = alone("PourWater", 4)
-    wait(world, SECOND // 2)
-    lens, oracle = Lens(scene_of(world).model), FORMULAS["PourWater"]
-    for row in range(4):
-        data = lens.look(engine_of(world).placement()[row])
-        goal, _ = oracle.goals(data, task_of(world, row))["goal"]
-        assert at(data, "kettle/object", oracle.spout)[2] - goal[2] >= 0.03
 
 
 def with_water(count: int, rows: int) -> World:

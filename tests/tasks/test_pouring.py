@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.tasks.formulas import FORMULAS
-from tests.tasks.formulas_blocks import BOTTOM, MOUTH
+from tests.tasks.formulas import BOTTOM, FORMULAS, MOUTH
 from tests.tasks.oracle import about_z, at, length, pose, shifted
 from tests.tasks.worlds import Lens, observe, scene_of, set_pose, task_of, world_of
 
@@ -46,11 +45,9 @@ class Scene:
         )
 
     def root(self, data: mujoco.MjData, geom: int) -> str:
-        """Name of the free body that a geom moves with."""
         return data.model.body(data.model.body_rootid[data.model.geom_bodyid[geom]]).name
 
     def target(self, data: mujoco.MjData) -> float:
-        """The reward's target term."""
         return FORMULAS["PourWater"].judge(data, self.task).terms["target"]
 
 
@@ -60,7 +57,6 @@ def scene() -> Scene:
 
 
 def upright_kettle() -> np.ndarray:
-    """Pose of a kettle on the table, spout to -y."""
     return pose(np.array((0.0, 0.0, KETTLE)), about_z(np.pi / 2))
 
 

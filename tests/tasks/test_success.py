@@ -1,44 +1,29 @@
-"""What counts as solved: for every class a state that does and some that do not.
-
-Of the classes whose definition was once looser, at least two of the latter satisfied the old one (``OLD``).
-"""
+"""What counts as solved: for every class a state that does and some that do not."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
 from bidex_meta.tasks import registry
-from bidex_meta.tasks.bucket import inside_bucket
-from bidex_meta.tasks.eggs import distances
-from bidex_meta.tasks.goals import rotation_difference
-from bidex_meta.tasks.state import TaskState
-from bidex_meta.utils.maths import norm
-from tests.tasks.formulas import FORMULAS
-from tests.tasks.formulas_blocks import StackBlock
-from tests.tasks.formulas_fixtures import TRAVEL
+from tests.tasks.formulas import FORMULAS, TRAVEL, StackBlock
 from tests.tasks.oracle import Goal, Task, about_z, pose, shifted, start
 from tests.tasks.worlds import Lens, engine_of, observe, scene_of, set_pose, task_of, world_of
 
 Parts = dict[str, np.ndarray]
 
 
-@dataclass(frozen=True)
-class State:
-    """Where some parts are, whether that is solved, and whether it used to be, where that differs."""
+class State(NamedTuple):
+    """Where some parts are, and whether that is solved."""
 
     what: str
     parts: Parts
     solved: bool = False
-    once: bool | None = None
 
 
-@dataclass(frozen=True)
-class Start:
+class Start(NamedTuple):
     """What the builders of states need: the class's goals, its task and where the task puts objects."""
 
     goals: dict[str, Goal]
@@ -47,7 +32,6 @@ class Start:
 
 
 def tip(degrees: float) -> Rotation:
-    """A turn about the world's x axis."""
     return Rotation.from_rotvec([np.deg2rad(degrees), 0.0, 0.0])
 
 
@@ -76,30 +60,28 @@ def pot(at: Start) -> list[State]:
     return [
         State("4 cm off, tipped a little", put(0.04, 20), True),
         State("6 cm off", put(0.06, 0)),
-        State("upside down at the goal", put(0.0, 180), once=True),
-        State("tipped by 40 degrees at the goal", put(0.0, 40), once=True),
+        State("upside down at the goal", put(0.0, 180)),
+        State("tipped by 40 degrees at the goal", put(0.0, 40)),
     ]
 
 
-def doors_open(at: Start) -> list[State]:
-    def leaves(first: float, second: float) -> Parts:
-        return {f"object/hinge{i}": np.array([angle]) for i, angle in ((1, first), (2, second))}
+def leaves(first: float, second: float) -> Parts:
+    return {f"object/hinge{i}": np.array([angle]) for i, angle in ((1, first), (2, second))}
 
+
+def doors_open(at: Start) -> list[State]:
     return [
         State("both open", leaves(1.4, 1.4), True),
         State("one wide, one less", leaves(1.57, 1.0), True),
         State("both ajar", leaves(0.3, 0.3)),
-        State("the first leaf alone", leaves(1.3, 0.0), once=True),
-        State("the second leaf alone", leaves(0.0, 1.3), once=True),
-        State("the first leaf beyond its stop", leaves(1.65, 0.0), once=True),
-        State("the second leaf beyond its stop", leaves(0.0, 1.65), once=True),
+        State("the first leaf alone", leaves(1.3, 0.0)),
+        State("the second leaf alone", leaves(0.0, 1.3)),
+        State("the first leaf beyond its stop", leaves(1.65, 0.0)),
+        State("the second leaf beyond its stop", leaves(0.0, 1.65)),
     ]
 
 
 def doors_close(at: Start) -> list[State]:
-    def leaves(first: float, second: float) -> Parts:
-        return {f"object/hinge{i}": np.array([angle]) for i, angle in ((1, first), (2, second))}
-
     return [
         State("both nearly shut", leaves(0.14, 0.1), True),
         State("one shut", leaves(0.0, 0.5)),
@@ -108,7 +90,6 @@ def doors_close(at: Start) -> list[State]:
 
 
 def joint(name: str, good: float, *bad: float) -> Callable[[Start], list[State]]:
-    """States of one joint."""
 
     def states(at: Start) -> list[State]:
         return [State(f"{name} {q}", {name: np.array([q])}, q == good) for q in (good, *bad)]
@@ -159,8 +140,8 @@ def cup(at: Start) -> list[State]:
         State("40 degrees and 15 cm off", put(0.15, 0.0, 40), True),
         State("50 degrees off", put(0.0, 0.0, 50)),
         State("unturned", {"cup": pose(*at.placed("cup"))}),
-        State("turned, on the floor metres away", put(2.0, -0.6, 0), once=True),
-        State("turned, 25 cm away", put(0.25, 0.0, 0), once=True),
+        State("turned, on the floor metres away", put(2.0, -0.6, 0)),
+        State("turned, 25 cm away", put(0.25, 0.0, 0)),
     ]
 
 
@@ -175,8 +156,8 @@ def cubes_turned(at: Start) -> list[State]:
         State("both 8 cm and 0.15 rad off", put((0.08, 0.15), (0.08, -0.15)), True),
         State("the first turned too little", put((0.0, 0.25), (0.0, 0.0))),
         State("the second turned too little", put((0.0, 0.0), (0.0, 0.25))),
-        State("both turned, one 15 cm away", put((0.0, 0.0), (0.15, 0.0)), once=True),
-        State("both turned, far away", put((2.0, 0.1), (-2.0, 0.1)), once=True),
+        State("both turned, one 15 cm away", put((0.0, 0.0), (0.15, 0.0))),
+        State("both turned, far away", put((2.0, 0.1), (-2.0, 0.1))),
     ]
 
 
@@ -210,9 +191,9 @@ def water(at: Start) -> list[State]:
         State("a third, bucket tipped by 30 degrees", put(30, third), True),
         State("less than a third", put(0, third - 1)),
         State("all of it under the bucket", put(0, drops, depth=-0.08)),
-        State("all of it in a bucket that lies", put(90, drops), once=True),
-        State("all of it in a bucket tipped by 60 degrees", put(60, drops), once=True),
-        State("all of it under a bucket put over it", put(180, drops), once=True),
+        State("all of it in a bucket that lies", put(90, drops)),
+        State("all of it in a bucket tipped by 60 degrees", put(60, drops)),
+        State("all of it under a bucket put over it", put(180, drops)),
     ]
 
 
@@ -228,8 +209,8 @@ def block(at: Start) -> list[State]:
         State("beside it", put(0, 0.1, 0.0, -0.028)),
         State("under it", put(0, 0.0, 0.0, -0.075)),
         State("over its rim", put(0, 0.0, 0.0, 0.07)),
-        State("in a bucket that lies", put(90, 0.0, 0.0, 0.02), once=True),
-        State("under a bucket put over it", put(180, 0.0, 0.0, 0.02), once=True),
+        State("in a bucket that lies", put(90, 0.0, 0.0, 0.02)),
+        State("under a bucket put over it", put(180, 0.0, 0.0, 0.02)),
     ]
 
 
@@ -253,38 +234,6 @@ STATES: dict[str, Callable[[Start], list[State]]] = {
 }
 
 
-def _apart(state: TaskState) -> Tensor:
-    return norm(state["object/left_handle_position"] - state["object/right_handle_position"])
-
-
-def _third(state: TaskState) -> Tensor:
-    drops = torch.stack([state[f"water{i}/position"] for i in range(12)], dim=1)
-    return 3 * inside_bucket(drops, state["bucket/position"], state.quaternion("bucket/quaternion")).sum(dim=1) >= 12
-
-
-def _in_bucket(state: TaskState) -> Tensor:
-    where = state["bucket/position"], state.quaternion("bucket/quaternion")
-    return inside_bucket(state["block/position"][:, None], *where)[:, 0]
-
-
-def _turned(state: TaskState, sensor: str, goal: str, limit: float) -> Tensor:
-    return rotation_difference(state, sensor, goal)[:, 3].abs().clamp(max=1.0).acos() < 0.5 * limit
-
-
-OLD: dict[str, Callable[[TaskState], Tensor]] = {
-    "LiftUnderarm": lambda state: norm(state["object/position"] - state.frozen["goal"][:, :3]) < 0.05,
-    "DoorOpenOutward": lambda state: _apart(state) > 0.5,
-    "DoorOpenInward": lambda state: _apart(state) > 0.5,
-    "SwingCup": lambda state: _turned(state, "cup/quaternion", "goal", np.pi / 4),
-    "ReOrientation": lambda state: torch.stack(
-        [distances(state, f"object{i}", f"goal{i}")[1] < 0.2 for i in (1, 2)]
-    ).all(dim=0),
-    "PourWater": _third,
-    "GraspAndPlace": _in_bucket,
-}
-"""What was once solved: distances and turns alone."""
-
-
 @pytest.mark.parametrize("name", registry.names())
 def test_good_states_are_solved_and_bad_ones_are_not(name: str) -> None:
     first = world_of(name, True, 1, tasks=1)
@@ -303,7 +252,3 @@ def test_good_states_are_solved_and_bad_ones_are_not(name: str) -> None:
     ((_, _, seen),) = world.parts[0].states(world.task_index)
     found = world.slots[0].task_class.success(seen).tolist()
     assert {s.what: solved for s, solved in zip(states, found, strict=True)} == {s.what: s.solved for s in states}
-    if name in OLD:
-        once = OLD[name](seen).tolist()
-        assert [s.solved if s.once is None else s.once for s in states] == once, once
-        assert sum(was and not now for was, now in zip(once, found, strict=True)) >= 2

@@ -59,13 +59,8 @@ _LIFT = 0.03
 
 @dataclass(frozen=True)
 class Started:
-    """A thousand rows right after their resets, each with its own task.
-
-    Attributes:
-        placement: Positions and poses of fixtures, shape (1000, nq + 7 nmocap).
-        tasks: What each row's task froze.
-        solved: What the class says of success, shape (1000,).
-    """
+    """A thousand environments right after their resets, each with its own task: positions and poses of fixtures
+    (1000, nq + 7 nmocap), tasks, and success (1000,)."""
 
     placement: np.ndarray
     tasks: list[Task]
@@ -95,7 +90,6 @@ def started(known: dict[tuple[str, bool], Started], name: str, moving: bool) -> 
 
 @pytest.fixture
 def qpos(started: Started) -> np.ndarray:
-    """Positions of the thousand rows and poses of their fixtures, shape (1000, nq + 7 nmocap)."""
     return started.placement
 
 

@@ -1,21 +1,16 @@
 """Variation spaces, the registry and what a class freezes."""
 
-import mujoco
 import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from bidex_meta.errors import BidexError
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
-from bidex_meta.tasks.scene import compile_scene
-from bidex_meta.tasks.variation import VariationSpace, box, join, orientation
-from tests.tasks.formulas import FORMULAS
-from tests.tasks.formulas_throws import Eggs
-from tests.tasks.worlds import CASES, each_case
+from bidex_meta.tasks.variation import VariationSpace
+from tests.tasks.worlds import each_case
 
 TURN = np.deg2rad(15)
 
@@ -105,28 +100,6 @@ def test_what_is_frozen_is_one_row_a_task(name: str, moving: bool) -> None:
     for pose, size in task.ghosts(frozen):
         assert pose.shape == (7, 7) and len(size) == 3
         np.testing.assert_allclose(pose[:, 3:].norm(dim=1).numpy(), 1.0, atol=1e-6)
-
-
-@pytest.mark.parametrize("name, moving", [case for case in CASES if isinstance(FORMULAS[case[0]], Eggs)])
-def test_goals_of_eggs(name: str, moving: bool) -> None:
-    task = registry.get(name, moving)
-    pool = task.variation_space.sample(np.random.default_rng(1), 7)
-    frozen = task.freeze(torch.from_numpy(pool))
-    data = mujoco.MjData(compile_scene(task).model)
-    for row in range(7):
-        named = dict(zip(task.variation_space.names, pool[row], strict=True))
-        for label, (position, turn) in FORMULAS[name].goals(data, named).items():
-            np.testing.assert_allclose(frozen[label][row].numpy(), (*position, *turn.as_quat()), atol=1e-7)
-            inverse = Rotation.from_quat(frozen[f"{label}_inverse"][row].numpy())
-            np.testing.assert_allclose((inverse * turn).magnitude(), 0.0, atol=1e-6)
-    assert len(task.ghosts(frozen)) == len(FORMULAS[name].body_of_goal)
-
-
-def test_joined_spaces_keep_their_order() -> None:
-    space = join(box("goal", (1.0, 2.0, 3.0), 0.5), orientation("goal"))
-    assert space.names == ("goal_x", "goal_y", "goal_z", "goal_u0", "goal_u1")
-    assert (space.low, space.high) == ((0.5, 1.5, 2.5, -1.0, -1.0), (1.5, 2.5, 3.5, 1.0, 1.0))
-    assert space.contains(np.array(space.low)) and space.contains(np.array(space.high))
 
 
 def test_a_lopsided_space_is_refused() -> None:

@@ -39,18 +39,15 @@ def world_of(
 
 
 def mixed_world(rows_a_class: int, **options: Any) -> World:
-    """All classes with moving bases in one world."""
     slots = [slot(registry.get(name, True)) for name in MOVING]
     return World(slots, rows_a_class * len(slots), **({"autoreset_mode": "DISABLED", "threads": 1} | options))
 
 
 def engine_of(world: World) -> CpuEngine:
-    """The engine of a world of one class."""
     return world.parts[0].group.engine
 
 
 def scene_of(world: World) -> Scene:
-    """The scene of a world of one class."""
     return world.parts[0].group.members[0].scene
 
 

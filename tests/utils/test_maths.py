@@ -15,9 +15,7 @@ from bidex_meta.utils import maths
 angles = st.floats(-math.pi, math.pi)
 unit = st.floats(-1.0, 1.0)
 vectors = hnp.arrays(np.float64, (4, 3), elements=st.floats(-10.0, 10.0))
-quaternions = hnp.arrays(np.float64, (4, 4), elements=unit).filter(
-    lambda q: bool((np.linalg.norm(q, axis=1) > 0.1).all())
-)
+quaternions = hnp.arrays(np.float64, (4, 4), elements=unit).filter(lambda q: (np.linalg.norm(q, axis=1) > 0.1).all())
 
 
 def normal(q: np.ndarray) -> tuple[torch.Tensor, Rotation]:
@@ -36,11 +34,9 @@ def test_multiply(a: np.ndarray, b: np.ndarray) -> None:
 @given(quaternions)
 def test_conjugate(a: np.ndarray) -> None:
     q, turn = normal(a)
-    np.testing.assert_allclose(
-        Rotation.from_quat(maths.conjugate(q).numpy()).as_matrix(), turn.inv().as_matrix(), atol=1e-12
-    )
-    one = maths.multiply(q, maths.conjugate(q)).numpy()
-    np.testing.assert_allclose(one, [[0, 0, 0, 1]] * 4, atol=1e-12)
+    inverse = maths.conjugate(q)
+    np.testing.assert_allclose(Rotation.from_quat(inverse.numpy()).as_matrix(), turn.inv().as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(maths.multiply(q, inverse).numpy(), [[0, 0, 0, 1]] * 4, atol=1e-12)
 
 
 @given(quaternions, vectors)

@@ -23,8 +23,7 @@ def test_a_hand_goes_where_it_is_led_and_the_other_stays(hands: HandController) 
     right, left = hands.at("right"), hands.at("left")
     goal = right + torch.tensor([0.03, -0.04, 0.05], dtype=right.dtype)
     hands.lead(tuple(goal.tolist()), tuple(left.tolist()), steps=40)
-    assert float((hands.at("right") - goal).norm()) < 0.005
-    assert float((hands.at("left") - left).norm()) < 0.005
+    assert float((hands.at("right") - goal).norm()) < 0.005 > float((hands.at("left") - left).norm())
     assert len(hands.actions) == len(hands.rewards) == len(hands.success) == 40
 
 
@@ -39,8 +38,7 @@ def test_bent_fingers_are_those_of_the_joint_table(hands: HandController) -> Non
 
 
 def test_a_class_without_a_script_is_refused() -> None:
-    names = "DoorOpenInward, GraspAndPlace, LiftUnderarm, PourWater, ReOrientation, StackBlock"
-    with pytest.raises(BidexError, match=names):
+    with pytest.raises(BidexError, match="DoorOpenInward, GraspAndPlace, LiftUnderarm"):
         script_of("HandOver")
 
 
@@ -82,8 +80,7 @@ def test_a_hand_turns_about_the_worlds_axes_as_fast_as_it_is_asked() -> None:
         hands.lead(tuple(hands.at("right").tolist()), here)
     turned = multiply(xyzw(hands.where("right/mount_quaternion")), conjugate(xyzw(first)))
     angle = 2.0 * float(torch.atan2(turned[2], turned[3]))
-    assert angle == pytest.approx(1.2 * 30 / CONTROL_RATE, rel=0.1)
-    assert float(turned[:2].norm()) < 0.02
+    assert angle == pytest.approx(1.2 * 30 / CONTROL_RATE, rel=0.1) and float(turned[:2].norm()) < 0.02
 
 
 @pytest.mark.parametrize("name", ["DoorCloseOutward", "DoorOpenInward", "ReOrientation"])

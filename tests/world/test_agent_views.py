@@ -121,18 +121,12 @@ def test_a_file_a_line_and_a_dict_are_the_same(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("agents", "message"),
-    [
-        ({"a": ALL, "b": ["left/palm"]}, "left/palm is of a and of b"),
-        ({"a": [*ALL, "left/palm"]}, "left/palm is of a and of a"),
-        ({"a": ALL[:-1]}, "left/thumb is of no agent"),
-        ({"a": [*ALL[:-1], "left/thum"]}, "Did you mean 'left/thumb'"),
-        ({}, "agents: expected"),
-        ({"a": "right/palm"}, "agents.*expected a list"),
-        ("hand", "expected single, hands, fingers"),
-        ("a=right/palm;a=left/palm", "a twice"),
-        ("none.toml", "none.toml"),
-    ],
-)
+    [({"a": ALL, "b": ["left/palm"]}, "left/palm is of a and of b"),
+     ({"a": [*ALL, "left/palm"]}, "left/palm is of a and of a"), ({"a": ALL[:-1]}, "left/thumb is of no agent"),
+     ({"a": [*ALL[:-1], "left/thum"]}, "Did you mean 'left/thumb'"), ({}, "agents: expected"),
+     ({"a": "right/palm"}, "agents.*expected a list"), ("hand", "expected single, hands, fingers"),
+     ("a=right/palm;a=left/palm", "a twice"), ("none.toml", "none.toml")]
+)  # fmt: skip
 def test_bad_partitions_are_one_line(agents, message: str) -> None:
     with pytest.raises(BidexError, match=message) as error:
         views_of("CatchUnderarm", agents)

@@ -106,23 +106,12 @@ def test_the_world_keeps_no_array_of_the_callers() -> None:
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     "action",
-    [
-        None,
-        "left",
-        torch.zeros(ROWS),
-        torch.zeros(ROWS, 51),
-        torch.zeros(ROWS + 1, 52),
-        torch.zeros(ROWS, 52, 1),
-        torch.zeros(ROWS, 52, dtype=torch.complex64),
-        torch.zeros(ROWS, 52).to_sparse(),
-        np.full((ROWS, 52), "0.1"),
-        np.full((ROWS, 52), None),
-        [[0.0] * 52] * 3 + [[0.0]],
-        torch.zeros(ROWS, 52, device="meta"),
-        {"action": torch.zeros(ROWS, 52)},
-    ],
-    ids=lambda value: f"{type(value).__name__} {tuple(getattr(value, 'shape', ()))}",
-)
+    [None, "left", torch.zeros(ROWS), torch.zeros(ROWS, 51), torch.zeros(ROWS + 1, 52), torch.zeros(ROWS, 52, 1),
+     torch.zeros(ROWS, 52, dtype=torch.complex64), torch.zeros(ROWS, 52).to_sparse(), np.full((ROWS, 52), "0.1"),
+     np.full((ROWS, 52), None), [[0.0] * 52] * 3 + [[0.0]], torch.zeros(ROWS, 52, device="meta"),
+     {"action": torch.zeros(ROWS, 52)}],
+    ids=lambda value: f"{type(value).__name__} {tuple(getattr(value, 'shape', ()))}"
+)  # fmt: skip
 def test_actions(world: World, action: Any) -> None:
     before = world.state_dict()
     assert "actions of shape (4, 52), got " in refused(world.step, action)
@@ -252,7 +241,7 @@ def test_masks_of_other_types_start_the_same_rows() -> None:
 
 
 def test_states_of_worlds_of_others() -> None:
-    from bidex_meta.clients.humanoid_world import HumanoidWorld
+    from bidex_meta.worlds.humanoid import HumanoidWorld
 
     world = HumanoidWorld(2, threads=1)
     world.reset(seed=0)
@@ -279,43 +268,22 @@ def test_threads(world: World, threads: Any) -> None:
 
 @pytest.mark.parametrize(
     "options",
-    [
-        {"num_envs": 3},
-        {"num_envs": 4.0},
-        {"num_envs": 10**12},
-        {"observation": "one hot"},
-        {"pad_to": 1.5},
-        {"pad_to": 10**9},
-        {"task_sampling": []},
-        {"task_sampling": np.zeros(3)},
-        {"stagger": 2},
-        {"stagger": np.zeros(3)},
-        {"points": 64},
-        {"points": (64, True)},
-        {"engine": []},
-        {"device": 3.5},
-        {"seed": -2},
-    ],
-    ids=str,
-)
+    [{"num_envs": 3}, {"num_envs": 4.0}, {"num_envs": 10**12}, {"observation": "one hot"}, {"pad_to": 1.5},
+     {"pad_to": 400}, {"pad_to": 10**9}, {"task_sampling": []}, {"task_sampling": np.zeros(3)}, {"stagger": 2},
+     {"stagger": np.zeros(3)}, {"points": 64}, {"points": (64, True)}, {"engine": []}, {"device": 3.5},
+     {"device": f"cuda:{torch.cuda.device_count()}"}, {"seed": -2}],
+    ids=str
+)  # fmt: skip
 def test_worlds(world: World, options: dict[str, Any]) -> None:
     refused(World, world.slots, **({"num_envs": ROWS, "threads": 1} | options))
 
 
 @pytest.mark.parametrize(
     "options",
-    [
-        {"width": -1},
-        {"width": 0},
-        {"height": 1.5},
-        {"row": -1},
-        {"row": 4},
-        {"row": None},
-        {"camera": ["top"]},
-        {"camera": 0},
-    ],
-    ids=str,
-)
+    [{"width": -1}, {"width": 0}, {"height": 1.5}, {"row": -1}, {"row": 4}, {"row": None}, {"camera": ["top"]},
+     {"camera": 0}],
+    ids=str
+)  # fmt: skip
 def test_pictures(world: World, options: dict[str, Any]) -> None:
     assert next(iter(options)) in refused(world.render, **options)
 

@@ -7,12 +7,12 @@ from torch import Tensor
 
 from bidex_meta.benchmark import Benchmark, make_task_world
 from bidex_meta.errors import BidexError
-from bidex_meta.points.depth_sensor import PointsRule
-from bidex_meta.points.surfaces import FIXTURE, OBJECT, body_kinds, sample
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import compile_scene
 from bidex_meta.world import World
 from bidex_meta.world.contract import ObservationGroup
+from bidex_meta.world.depth_sensor import PointsRule
+from bidex_meta.world.surfaces import FIXTURE, OBJECT, body_kinds, sample
 
 COUNT = 64
 

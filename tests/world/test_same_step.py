@@ -38,12 +38,6 @@ def test_first_episodes_start_at_random_elapsed_steps() -> None:
     assert (world.episodes.elapsed == 0).all()
 
 
-def test_evaluation_worlds_start_at_zero() -> None:
-    world = suite_world("MT4", 8, "DISABLED")
-    world.reset(seed=0)
-    assert (world.episodes.elapsed == 0).all() and world.episodes.counts.all()
-
-
 def test_episode_statistics_are_those_of_a_count_by_hand(
     played: tuple[World, Tensor, Tensor, list[dict[str, Tensor]]],
 ) -> None:
@@ -165,3 +159,17 @@ def test_staggering_leaves_the_episode_itself_alone() -> None:
     names = ("obs", "reward", "terminated", "truncated", "info/final_obs")
     assert_same([{n: s[n] for n in names} for s in a], [{n: s[n] for n in names} for s in b], going)
     assert number_of_ends(a) < ROWS
+
+
+def test_in_evaluation_worlds_masked_rows_go_through_the_same_episodes_as_all() -> None:
+    world = suite_world("MT4", ROWS, "DISABLED")
+    world.reset(seed=0)
+    assert (world.episodes.elapsed == 0).all() and world.episodes.counts.all()
+    everything = [world.reset()[0], world.reset()[0]]
+    world.reset(seed=0)
+    for number in range(2):
+        found = torch.zeros_like(everything[0])
+        for part in range(3):
+            mask = torch.arange(ROWS) % 3 == part
+            found[mask] = world.reset(options={"reset_mask": mask})[0][mask]
+        assert torch.equal(found, everything[number])

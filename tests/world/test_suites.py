@@ -1,21 +1,8 @@
 import pytest
 import torch
 
-from bidex_meta import Benchmark
 from bidex_meta.world import World
 from tests.world.play import class_world, play, random_actions, suite_world
-
-
-def goal_indices(world: World, slot: int) -> list[int]:
-    return world.slots[slot].task_class.layout.goal_indices()
-
-
-def unmasked(world: World) -> World:
-    """The same rows with the goal shown."""
-    width = world.observation_size - world.num_id_columns
-    return World(
-        world.slots, world.num_envs, seed=world.seed, pad_to=width, autoreset_mode=world.autoreset_mode, threads=1
-    )
 
 
 @pytest.mark.parametrize(
@@ -71,7 +58,7 @@ def test_goals_are_visible_in_mt() -> None:
 @pytest.mark.parametrize(("suite", "split"), [("ML4", "train"), ("ML4", "test"), ("ML1", "train"), ("ML1", "test")])
 def test_goals_are_zero_in_ml_and_nothing_else_is_touched(suite: str, split: str) -> None:
     world = suite_world(suite, 6, "SAME_STEP", split)
-    shown = unmasked(world)
+    shown = World(world.slots, 6, seed=world.seed, pad_to=world.observation_size, threads=1)
     first, second = world.reset(seed=0)[0], shown.reset(seed=0)[0]
     actions = random_actions(world, 60)
     pairs = [(first, second)]
@@ -81,7 +68,7 @@ def test_goals_are_zero_in_ml_and_nothing_else_is_touched(suite: str, split: str
             assert torch.equal(a[name], b[name])
     for masked, plain in pairs:
         for slot, rows in enumerate(world.slot_rows):
-            goal = goal_indices(world, slot)
+            goal = world.slots[slot].task_class.layout.goal_indices()
             assert len(goal) == (22 if world.task_names[slot] == "TwoCatchUnderarm" else 11)
             assert (masked[rows][:, goal] == 0).all()
             assert (plain[rows][:, goal] != 0).any(dim=1).all()
@@ -89,28 +76,14 @@ def test_goals_are_zero_in_ml_and_nothing_else_is_touched(suite: str, split: str
             assert torch.equal(masked[rows][:, rest], plain[rows][:, rest])
 
 
-def test_ml_rows_keep_task_j_mod_n() -> None:
+def test_ml_and_evaluation_rows_keep_task_j_mod_n() -> None:
     world = suite_world("ML4", 3 * 52)
     world.reset(seed=0)
-    expected = (torch.arange(52) % 50).repeat(3)
-    assert torch.equal(world.task_index, expected)
-    small = suite_world("ML1", 7)
-    small.reset(seed=0)
-    small.episodes.elapsed = small.max_episode_steps - 1  # every row ends at once and begins anew
-    assert small.step(torch.zeros(7, 52))[3].all()
-    assert small.task_index.tolist() == [0, 1, 2, 0, 1, 2, 0]
-
-
-def test_evaluation_of_mt_keeps_task_j_mod_n() -> None:
-    world = suite_world("MT4", 4 * 51, "DISABLED")
-    world.reset(seed=0)
-    for mask in (None, torch.ones(204, dtype=torch.bool)):
-        assert torch.equal(world.task_index, (torch.arange(51) % 50).repeat(4))
-        world.reset(options={"reset_mask": mask})
-    mt1 = suite_world("MT1", 8)
-    mt1.reset(seed=0)
-    assert mt1.task_names == [f"CatchUnderarm/{n}" for n in ("original", "left", "right", "back")]
-    assert mt1.task_index.tolist() == [0] * 8
+    assert torch.equal(world.task_index, (torch.arange(52) % 50).repeat(3))
+    for small, expected in ((suite_world("ML1", 7), [0, 1, 2, 0, 1, 2, 0]), (suite_world("MT1", 8), [0] * 8)):
+        small.reset(seed=0)
+        small.episodes.elapsed = small.max_episode_steps - 1  # every row ends at once and begins anew
+        assert small.step(torch.zeros(small.num_envs, 52))[3].all() and small.task_index.tolist() == expected
 
 
 def test_mt_draws_every_task_equally_often_on_autoreset() -> None:
@@ -148,20 +121,6 @@ def test_a_class_in_a_suite_moves_as_on_its_own() -> None:
                 assert torch.equal(step[key][rows], own[key]), (name, key)
             for key in ("obs", "info/final_obs"):
                 assert torch.equal(step[key][rows, :size], own[key]), (name, key)
-
-
-def test_hand_over_alone_has_a_fixed_base() -> None:
-    world = class_world("HandOver", 2)
-    assert world.reset(seed=0)[0].shape == (2, 398)
-    assert world.single_action_space.shape == (40,)
-
-
-def test_train_and_test_worlds_of_ml1_play_their_listed_tasks() -> None:
-    train, test = (suite_world("ML1", 3, split=split) for split in ("train", "test"))
-    benchmark = Benchmark("ML1")
-    assert train.slots[0].tasks.tolist() == [task.variation.tolist() for task in benchmark.train_tasks]
-    assert test.slots[0].tasks.tolist() == [task.variation.tolist() for task in benchmark.test_tasks]
-    assert test.num_slot_tasks == [1]
 
 
 def test_observations_are_those_of_the_state_after_the_step() -> None:

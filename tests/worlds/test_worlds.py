@@ -11,7 +11,7 @@ from bidex_meta.evaluation.play import ZeroAgent
 from bidex_meta.utils import paths
 from bidex_meta.worlds import WorldConfig, Worlds
 
-CORE = Path(paths.__file__).parent
+CORE = Path(paths.__file__).parents[1]
 
 
 @pytest.fixture

@@ -1,8 +1,7 @@
 """The inner loop of MAML and ProMP: one gradient step on a task's own data, for all tasks at once.
 
-Every task has parameters of its own, stacked along a first axis. Forward passes are batched over it, and one gradient
-by ``torch.func`` holds those of all tasks. Adapted parameters keep their graph back to the meta-parameters, which is
-what the outer loops differentiate.
+Every task has parameters of its own, stacked along a first axis; adapted ones keep their graph back to the
+meta-parameters, which is what the outer loops differentiate.
 """
 
 import math
@@ -79,28 +78,12 @@ class TaskBatch:
 
 
 class Adapter:
-    """Gradient steps on parameters of an actor.
-
-    Args:
-        actor: Gives the functional form; its own parameters are the meta-parameters.
-        learning_rate: Size of an inner step.
-        objective: What the inner step follows.
-        std_range: Bounds of the standard deviations, wherever they are used.
-        first_order: Whether the outer loop takes the inner gradient for a constant.
-        adapted: Which parameters the inner step moves: all of them, or those of the output layer.
-        step_sizes: Whether sizes of the inner step are learned, and of what.
-    """
+    """Gradient steps on parameters of an actor, whose own are the meta-parameters; options as in ``MetaConfig``."""
 
     def __init__(
-        self,
-        actor: GaussianActor,
-        learning_rate: float,
-        objective: Objective,
-        std_range: tuple[float, float],
-        first_order: bool = False,
-        adapted: Adapted = "all",
-        step_sizes: StepSizeKind = "fixed",
-    ):
+        self, actor: GaussianActor, learning_rate: float, objective: Objective, std_range: tuple[float, float],
+        first_order: bool = False, adapted: Adapted = "all", step_sizes: StepSizeKind = "fixed"
+    ):  # fmt: skip
         self.actor, self.learning_rate, self.objective, self.first_order = actor, learning_rate, objective, first_order
         self._prefix = "mean.head." if adapted == "head" else ""
         self.log_std_range = math.log(std_range[0]), math.log(std_range[1])

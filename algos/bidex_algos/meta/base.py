@@ -30,16 +30,7 @@ from bidex_meta.world.contract import PooledWorld
 
 
 class MetaLearner(Learner):
-    """Learns parameters from which one gradient step on a task's own data goes far.
-
-    Attributes:
-        policy: The adapting agent that evaluation uses; the learner itself never adapts it.
-        pools: The tasks of each class that meta-batches are drawn from.
-        rows: Which environments play the same task of the present meta-batch.
-
-    Raises:
-        BidexError: Several processes, or a class with fewer environments than it has tasks in a meta-batch.
-    """
+    """Learns parameters from which one gradient step on a task's own data goes far; in one process."""
 
     world: PooledWorld
     config: OuterConfig
@@ -81,8 +72,6 @@ class MetaLearner(Learner):
                     f"{self.name}: {name} has {count} environments for {tasks} tasks of a meta-batch. Use num_envs of "
                     f"at least {tasks * self.world.num_tasks}, or lower tasks_per_class."
                 )
-
-    # What a learner adds.
 
     @abstractmethod
     def _outer(self, batches: list[TaskBatch]) -> dict[str, Tensor]:
@@ -127,8 +116,6 @@ class MetaLearner(Learner):
             told["Policy/inner_learning_rate"] = self.config.inner_learning_rate * float(self.policy.step_sizes.mean())
         told["Policy/std"] = float(self.policy.actor.log_std.detach().clamp(*adapter.log_std_range).exp().mean())
         return told
-
-    # Sampling.
 
     def _draw_tasks(self) -> None:
         """New tasks for every class, without repetition, and new episodes."""
@@ -192,8 +179,6 @@ class MetaLearner(Learner):
             return self._first_observations()
         return self.world.reset()[0]
 
-    # Metrics.
-
     def _told(self, outcome: Outcome, k: int) -> dict[str, float]:
         """Return and success of a stage per class: of the last stage as such, of the first as ``before``."""
         last = k == self.config.inner_steps
@@ -208,8 +193,6 @@ class MetaLearner(Learner):
             whole = {"return": "mean_return", "success": "success_rate"}[what]
             told[f"{'Train' if last else 'Before'}/{whole}"] = sum(means) / len(means)
         return told
-
-    # Checkpoints.
 
     @classmethod
     def _make_policy(cls, config: MetaConfig, shape: Shape, init: torch.Generator, device: torch.device) -> MetaPolicy:

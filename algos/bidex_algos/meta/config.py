@@ -53,7 +53,6 @@ class MetaConfig(LearnerConfig):
     """Give observations zero mean and unit variance by running statistics."""
 
     def __post_init__(self) -> None:
-        """Checks what annotations cannot say."""
         super().__post_init__()
         check_rising(self, self.algo, "std_range")
 

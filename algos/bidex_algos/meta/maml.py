@@ -89,6 +89,6 @@ class MAML(MetaLearner):
             objective, moved = torch.stack(self._objective(batches)).tolist()
             return objective, moved
 
-        surrogate, kl = self._objective(batches)
-        stepped = trust_region_step(list(self.policy.parameters()), surrogate, kl, measure, self.config)
+        (surrogate, kl), cfg = self._objective(batches), self.config
+        stepped = trust_region_step(list(self.policy.parameters()), surrogate, kl, measure, cfg, cfg.max_kl)
         return stepped.told("Policy/outer_kl", self.device)

@@ -20,24 +20,15 @@ class MetaPolicy(nn.Module):
     """
 
     def __init__(
-        self,
-        observations: ObservationNormaliser,
-        actor: GaussianActor,
-        config: MetaConfig,
-        objective: Objective,
-        seed: int = 0,
-    ):
+        self, observations: ObservationNormaliser, actor: GaussianActor, config: MetaConfig, objective: Objective,
+        seed: int = 0
+    ):  # fmt: skip
         super().__init__()
         self.observations, self.actor, self.config = observations, actor, config
         self.adapter = Adapter(
-            actor,
-            config.inner_learning_rate,
-            objective,
-            config.std_range,
-            config.first_order,
-            config.adapted,
-            config.step_sizes,
-        )
+            actor, config.inner_learning_rate, objective, config.std_range, config.first_order, config.adapted,
+            config.step_sizes
+        )  # fmt: skip
         self.step_sizes = self.adapter.step_sizes  # among the weights of a checkpoint, where there are such
         self.seed = seed
         self.generator: torch.Generator | None = None
@@ -73,15 +64,10 @@ class MetaPolicy(nn.Module):
         elapsed = torch.zeros_like(terminated, dtype=torch.int64) if self.elapsed is None else self.elapsed
         ended = terminated | truncated | ~valid
         self.stage.add(
-            obs=self.observations(timestep.observation.float()),
-            actions=timestep.action.float(),
-            means=timestep.aux_policy_outputs["mean"],
-            rewards=timestep.reward.float().masked_fill(~valid, 0.0),
-            terminated=terminated,
-            ended=ended,
-            valid=valid,
-            elapsed=elapsed,
-        )
+            obs=self.observations(timestep.observation.float()), actions=timestep.action.float(),
+            means=timestep.aux_policy_outputs["mean"], rewards=timestep.reward.float().masked_fill(~valid, 0.0),
+            terminated=terminated, ended=ended, valid=valid, elapsed=elapsed
+        )  # fmt: skip
         self.elapsed = (elapsed + 1).masked_fill(ended, 0)
 
     def adapt(self) -> None:

@@ -46,7 +46,6 @@ class ProMPConfig(OuterConfig):
     """Meta-gradients longer than this are shortened to it."""
 
     def __post_init__(self) -> None:
-        """Checks what annotations cannot say."""
         super().__post_init__()
         check_rising(self, self.algo, "outer_learning_rate_range")
 

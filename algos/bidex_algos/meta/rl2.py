@@ -1,11 +1,7 @@
-"""RL²: learning to learn by a memory (Duan et al. 2016, Wang et al. 2016), trained by PPO.
+"""RL²: learning to learn by a memory (Duan et al. 2016, Wang et al. 2016), trained by PPO; see docs/learners/rl2.md.
 
-A trial is a few episodes of one task. The policy reads, beside the observation, its last action, the last reward and
-whether an episode ended, and keeps its memory from one episode of the trial to the next: what it finds out about the
-task in the first it may use in the next. An iteration plays one trial in every environment, makes ``epochs`` passes
-over it in shuffled mini-batches of chunks, through which gradients flow back, and starts the next trial without memory.
-The very first trial only measures what statistics are made of. ``docs/learners/rl2.md`` says what is done otherwise,
-and why.
+An iteration plays one trial, a few episodes of one task with one memory, in every environment, makes ``epochs`` passes
+over it in shuffled mini-batches of chunks, and starts the next without memory. The first only measures statistics.
 """
 
 import math
@@ -47,7 +43,6 @@ class RL2Config(PPOConfig, TrialConfig):
     """Iterations after which returns fade from the statistics that the critic's targets are normalised by."""
 
     def __post_init__(self) -> None:
-        """Checks what annotations cannot say."""
         super().__post_init__()
         check_rising(self, self.algo, "std_range")
 
@@ -79,16 +74,7 @@ PRESETS: dict[str, RL2Config] = {
 
 
 class RL2(Learner):
-    """RL² (Duan et al. 2016, arXiv 1611.02779): a policy with a memory that adapts to a task while it plays it.
-
-    Attributes:
-        policy: Network and statistics.
-        agent: The policy with a memory that is not that of the training.
-        trials: The last trial.
-
-    Raises:
-        BidexError: A world that resets by itself, or fewer environments than mini-batches.
-    """
+    """RL² (Duan et al. 2016, arXiv 1611.02779): a policy with a memory that adapts to a task while it plays it."""
 
     name, remedy = "rl2", "lower learning_rate"
     config_type, presets = RL2Config, PRESETS
@@ -108,15 +94,9 @@ class RL2(Learner):
         self.agent = RL2Agent(self.policy, own_seed(seed))
         heads = world.num_tasks if config.value_heads else 1
         self.critic = RecurrentNet(
-            self.policy.inputs,
-            config.hidden,
-            config.memory,
-            heads,
-            0.01,
-            self.initial,
-            config.activation,
-            config.trial_steps,
-        ).to(self.device)
+            self.policy.inputs, config.hidden, config.memory, heads, 0.01, self.initial, config.activation,
+            config.trial_steps
+        ).to(self.device)  # fmt: skip
         self.adams = AdaptiveAdams(self.policy.parameters(), self.critic.parameters(), config, self.device)
 
         limits = world.max_episode_steps.clamp_max(config.max_adapt_steps)
@@ -159,8 +139,6 @@ class RL2(Learner):
         self.trials_played += 1
         return self._metrics(losses, explained, filled & ~valid)
 
-    # The trial.
-
     def _begin(self) -> Tensor:
         """Starts the first episode of a trial; observations (N, d)."""
         if self.pools:
@@ -173,8 +151,6 @@ class RL2(Learner):
     def _prepare(self) -> tuple[Batch, Tensor]:
         """Turns the trial into a batch; also the explained variance per task (num_tasks,)."""
         return make_batch(self.trials, self.policy, self.critic, self.return_stats, self.world.task_id, self.config)
-
-    # The update.
 
     def _update(self, b: Batch) -> dict[str, Tensor]:
         """PPO's update: returns the means over all mini-batches of what it measured."""
@@ -201,16 +177,9 @@ class RL2(Learner):
         values, targets = of_task(out, self.world.task_id[row]), b.take(b.targets, chosen)
         value = (weights * (values - targets).square()).sum()
         loss = policy_loss(
-            b.take(b.actions, chosen),
-            means,
-            policy.log_std,
-            b.take(b.old_means, chosen),
-            old_log_std,
-            b.take(b.old_log_probs, chosen),
-            b.take(b.advantages, chosen),
-            weights=weights,
-            clip=self.config.clip,
-        )
+            b.take(b.actions, chosen), means, policy.log_std, b.take(b.old_means, chosen), old_log_std,
+            b.take(b.old_log_probs, chosen), b.take(b.advantages, chosen), weights=weights, clip=self.config.clip
+        )  # fmt: skip
         self.adams.zero_grad()
         (loss.surrogate + value - self.config.entropy_weight * loss.entropy).backward()
         return sum_gradients([*policy.parameters(), *self.critic.parameters()], torch.stack(loss.numbers(value)))
@@ -229,24 +198,14 @@ class RL2(Learner):
                 metrics[f"Train/success_{which}_episode"] = found["Train/success_rate"]
         return metrics
 
-    # Checkpoints.
-
     @classmethod
     def _make_policy(
         cls, config: RL2Config, shape: Shape, init: torch.Generator, device: torch.device
     ) -> RecurrentPolicy:
         return RecurrentPolicy(
-            cls._inputs(config, shape),
-            shape.actions,
-            config.hidden,
-            config.memory,
-            config.init_std,
-            config.reward_unit,
-            config.normalise_observations,
-            init,
-            config.activation,
-            config.trial_steps,
-        ).to(device)
+            cls._inputs(config, shape), shape.actions, config.hidden, config.memory, config.init_std,
+            config.reward_unit, config.normalise_observations, init, config.activation, config.trial_steps
+        ).to(device)  # fmt: skip
 
     @classmethod
     def load_policy(cls, state: State, device: str | torch.device = "cpu") -> RL2Agent:

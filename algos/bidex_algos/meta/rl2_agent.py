@@ -1,7 +1,6 @@
 """RL²'s agent: it adapts by what its memory has taken in, each environment by its own; no weight changes.
 
-Episodes that adapt write the memory; evaluation episodes play on a copy. So every evaluation episode after k shots
-starts from what k shots have taught, however many came before it.
+Episodes that adapt write the memory; evaluation episodes play on a copy, each after the same shots.
 """
 
 from dataclasses import replace
@@ -15,12 +14,7 @@ from bidex_meta.agents import Timestep
 
 
 class RL2Agent:
-    """A ``bidex_meta.agents.MetaLearningAgent`` made of a policy with a memory, for any number of environments.
-
-    Args:
-        policy: The policy.
-        seed: Of the actions it explores with.
-    """
+    """An adapting agent (``bidex_meta.agents``) of a policy with a memory; ``seed`` is of what it explores with."""
 
     def __init__(self, policy: RecurrentPolicy, seed: int = 0):
         self.policy = policy
@@ -39,11 +33,7 @@ class RL2Agent:
         self._wait(0)
 
     def reset(self, env_mask: Tensor) -> None:
-        """A new episode begins in the rows of ``env_mask``, bool (N,).
-
-        The memory keeps what the rows learned while adapting, and is told that an episode ended if there was one. What
-        they saw in an evaluation episode is forgotten.
-        """
+        """An episode begins where ``env_mask`` (N,): the memory learns of it, and forgets what was only evaluated."""
         learned = self._memory(self._learned, len(env_mask))
         self._over = ~env_mask
         self._learned = replace(learned, done=learned.done | (env_mask & self._begun))

@@ -14,13 +14,8 @@ from bidex_algos.meta.config import MetaConfig
 class TaskRows:
     """Rows by task, as a rectangle: tasks with fewer environments than others repeat one, without weight.
 
-    Args:
-        task_of_row: Task of each environment, numbers from 0 on without gaps, int64 (N,).
-
-    Attributes:
-        count: Number of tasks M.
-        task_of_row: As given.
-        weight: 1, or 0 where a row is repeated to fill the rectangle, (M, R) float32.
+    ``task_of_row``: task of each environment, numbers from 0 on without gaps, int64 (N,). ``count``: number of tasks M;
+    ``weight``: 1, or 0 where a row is repeated to fill the rectangle, (M, R) float32.
     """
 
     def __init__(self, task_of_row: Tensor):
@@ -73,24 +68,13 @@ def features(obs: Tensor, elapsed: Tensor) -> Tensor:
 
 
 def fitted(obs: Tensor, elapsed: Tensor, returns: Tensor, weights: Tensor, ridge: float = 1.0) -> Tensor:
-    """Predictions of the returns they are fitted to, by ridge regression in each task.
+    """Predictions (tasks, B) of the returns that they are fitted to, by ridge regression in each task.
 
-    Coefficients of observations are held back by ``ridge`` times features per sample, relative to the mean of the
-    Gram matrix's diagonal; the four of time hardly. With 1 that is the best linear prediction if features and noise
-    explain as much of the returns. A fit that is free (1e-5) remembers the returns where there are hundreds of
-    features and as many samples, and leaves advantages that are noise: of 7, 20 and 50 rollouts on ML1-wide they
-    correlated by 0.19, 0.18 and 0.47 with those of a baseline fitted to other rollouts, without any baseline by 0.71,
-    0.63 and 0.62, and with 1 by 0.78, 0.76 and 0.77.
-
-    Args:
-        obs: Normalised observations (tasks, B, d).
-        elapsed: Steps since the episode began (tasks, B).
-        returns: What to predict (tasks, B).
-        weights: 1, or 0 for what does not count (tasks, B).
-        ridge: How strongly coefficients are held back.
-
-    Returns:
-        (tasks, B), in the type of ``returns``.
+    Observations are (tasks, B, d), all else (tasks, B). Coefficients of observations are held back by ``ridge`` times
+    features per sample, relative to the mean of the Gram matrix's diagonal; the four of time hardly. With 1 that is the
+    best linear prediction if features and noise explain as much of the returns. A fit that is free (1e-5) remembers the
+    returns: of 7, 20 and 50 rollouts on ML1-wide its advantages correlated by 0.19, 0.18 and 0.47 with those of a
+    baseline fitted to other rollouts, without any baseline by 0.71, 0.63 and 0.62, and with 1 by 0.78, 0.76 and 0.77.
     """
     # Task by task: the features of all tasks at once, and their Gram matrices, take more memory and more time.
     tasks = zip(obs, elapsed, returns, weights, strict=True)
@@ -143,16 +127,9 @@ class Stage:
 
 @torch.no_grad()
 def task_batch(stage: Stage, rows: TaskRows, log_std: Tensor, config: MetaConfig) -> TaskBatch:
-    """The batch that tasks adapt on.
+    """The batch that tasks adapt on; ``log_std`` (M, a) is of the policies that sampled.
 
-    Returns count to the end of the stage and no further: what an episode that is longer than it would still earn is not
-    estimated, since a baseline fitted to these very returns knows nothing beyond.
-
-    Args:
-        stage: What was sampled.
-        rows: Which environments play the same task.
-        log_std: Logarithms of the standard deviations of the policies that sampled (M, a).
-        config: Discount, trace, scale.
+    Returns count to the end of the stage and no further: a baseline fitted to these very returns knows nothing beyond.
     """
     rewards, terminated, ended, valid = (stage.stacked(n) for n in ("rewards", "terminated", "ended", "valid"))
     obs, elapsed = stage.by_task("obs", rows), stage.by_task("elapsed", rows)
@@ -171,13 +148,9 @@ def task_batch(stage: Stage, rows: TaskRows, log_std: Tensor, config: MetaConfig
         _, variance, _ = task_moments(gained, rows.task_of_row, rows.count, valid)
         scaled = scaled / (variance.sqrt() + 1e-8)[rows.task_of_row]
     return TaskBatch(
-        obs=obs,
-        actions=stage.by_task("actions", rows),
-        old_means=stage.by_task("means", rows),
-        old_log_stds=log_std.detach(),
-        advantages=rows.steps_by_task(scaled),
-        weights=weights,
-    )
+        obs=obs, actions=stage.by_task("actions", rows), old_means=stage.by_task("means", rows),
+        old_log_stds=log_std.detach(), advantages=rows.steps_by_task(scaled), weights=weights
+    )  # fmt: skip
 
 
 class Outcome(NamedTuple):

@@ -1,8 +1,7 @@
 """Trials: a few whole episodes of one task in each environment, played with one memory.
 
-Episodes differ in length, and all environments start the next one together: an environment whose episode is over waits,
-its memory untouched. Waiting is not recorded, so that the transitions of a row follow each other without gaps: slot t
-holds what the memory saw at its t-th step.
+All environments start the next episode together; one whose episode is over waits, its memory untouched. Waiting is not
+recorded: slot t holds what the memory saw at its t-th step.
 """
 
 from dataclasses import dataclass
@@ -53,15 +52,7 @@ class TrialConfig(LearnerConfig):
 
 
 def in_chunks(steps: int, chunk: int | None) -> tuple[int, int]:
-    """How a trial is cut.
-
-    Args:
-        steps: Steps of the longest trial.
-        chunk: Steps of a chunk; None, or no fewer than ``steps``: one chunk, without padding.
-
-    Returns:
-        Number of slots, among them one for the last observation, and slots of a chunk, which they are a multiple of.
-    """
+    """Slots of a trial of at most ``steps``, with one for the last observation: a multiple of a chunk's, the second."""
     size = steps + 1 if chunk is None or chunk >= steps else chunk
     return (steps // size + 1) * size, size
 
@@ -69,24 +60,7 @@ def in_chunks(steps: int, chunk: int | None) -> tuple[int, int]:
 class Trials:
     """One trial of N environments, preallocated on the device and overwritten by each :func:`play`.
 
-    Attributes:
-        obs: Raw observations before each step; in the slot after the last step, what that step led to; (S, N, d).
-        actions: Sampled actions, not clamped, (S, N, a).
-        rewards: 0 where not valid, (S, N).
-        shown: Whether the policy was shown the reward, bool (S, N).
-        valid: False where physics broke: such a transition teaches nothing, bool (S, N).
-        ended: Whether it ended an episode, bool (S, N).
-        terminated: Whether it ended an episode truly, not by a time limit, bool (S, N).
-        left: Steps that the time limit would still have allowed, int64 (S, N).
-        lengths: Slots that each environment has filled, int64 (N,); what lies beyond is void.
-        limits: Most steps of an episode of each environment, int64 (N,).
-
-    Args:
-        episodes: Episodes in a trial.
-        limits: See above.
-        observations: Width of the observation.
-        actions: Number of actions.
-        chunk: Steps of a chunk. There are slots for as many whole chunks as the longest trial needs.
+    There are slots S for as many whole chunks as the longest trial needs; ``limits`` are most steps of an episode (N,).
     """
 
     def __init__(self, episodes: int, limits: Tensor, observations: int, actions: int, chunk: int | None):
@@ -98,6 +72,9 @@ class Trials:
             return torch.zeros(slots, rows, *shape, dtype=dtype, device=limits.device)
 
         self.longest = longest
+        # Raw observations before each step, and in the slot after the last what that led to; sampled actions, not
+        # clamped; rewards, 0 where physics broke (not valid); whether the policy was shown them; true ends; steps that
+        # the time limit would still have allowed; slots that each environment has filled (N,).
         self.obs, self.actions, self.rewards = zeros(observations), zeros(actions), zeros()
         self.shown, self.valid, self.ended, self.terminated = (zeros(dtype=torch.bool) for _ in range(4))
         self.left = zeros(dtype=torch.int64)
@@ -116,9 +93,8 @@ class Trials:
     def previous(self, slots: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """What the memory was fed beside the observation: last action, last reward, whether it was shown, end.
 
-        Returns:
-            Of the first ``slots`` slots: (slots, N, a), then (slots, N) each. The slot after the last step counts as a
-            step of the same episode: its value is what the time limit cut off.
+        Returns of the first ``slots`` slots: (slots, N, a), then (slots, N) each. The slot after the last step counts
+        as a step of the same episode: its value is what the time limit cut off.
         """
         after = [x[: slots - 1] for x in (self.actions, self.rewards, self.shown & self.valid, self.ended)]
         action, reward, known, done = (torch.cat([torch.zeros_like(x[:1]), x]) for x in after)
@@ -136,24 +112,13 @@ class Trials:
 
 @torch.no_grad()
 def play(
-    world: VectorWorld,
-    policy: RecurrentPolicy,
-    trials: Trials,
-    obs: Tensor,
-    blind_share: float,
-    generator: torch.Generator,
-    statistics: list[list[EpisodeStatistics]],
-) -> None:
-    """Fills ``trials`` from ``world``, a world in mode DISABLED that has just been reset.
+    world: VectorWorld, policy: RecurrentPolicy, trials: Trials, obs: Tensor, blind_share: float,
+    generator: torch.Generator, statistics: list[list[EpisodeStatistics]]
+) -> None:  # fmt: skip
+    """Fills ``trials`` from ``world``, a world in mode DISABLED that has just been reset to ``obs`` (N, d).
 
-    Args:
-        world: The world.
-        policy: The policy, which starts without memory.
-        trials: Where transitions go.
-        obs: What the reset gave, (N, d).
-        blind_share: Share of the episodes whose rewards the policy is not shown.
-        generator: Of the sampled actions and the blind episodes.
-        statistics: For each episode of the trial, who counts it.
+    In a ``blind_share`` of the episodes the policy is not shown rewards; ``statistics`` count, for each episode of a
+    trial.
     """
     rows, device = torch.arange(world.num_envs, device=world.device), world.device
     memory = policy.fresh_memory(world.num_envs)
@@ -239,25 +204,12 @@ def of_task(outputs: Tensor, task_id: Tensor) -> Tensor:
 
 @torch.no_grad()
 def make_batch(
-    t: Trials,
-    policy: RecurrentPolicy,
-    critic: RecurrentNet,
-    return_stats: RunningStats,
-    task_id: Tensor,
-    config: TrialConfig,
-) -> tuple[Batch, Tensor]:
+    t: Trials, policy: RecurrentPolicy, critic: RecurrentNet, return_stats: RunningStats, task_id: Tensor,
+    config: TrialConfig
+) -> tuple[Batch, Tensor]:  # fmt: skip
     """Passes a trial through the networks, chunk by chunk from empty memories, and estimates advantages.
 
-    Args:
-        t: The trial.
-        policy: The policy that played it.
-        critic: Sees what the policy sees; speaks in units of its task's running mean and deviation of returns.
-        return_stats: These (num_tasks,); they take in the trial's returns.
-        task_id: Task of each environment, int64 (N,).
-        config: Chunk, discount and trace.
-
-    Returns:
-        The batch and the explained variance per task (num_tasks,).
+    Also the explained variance per task (num_tasks,); ``return_stats`` takes in the trial's returns.
     """
     num_tasks = len(return_stats.mean)
     # The only wait for the device: how many steps the longest trial has.
@@ -284,32 +236,19 @@ def make_batch(
     next_values = torch.cat([values[1:], values[-1:]])
     # The end of an episode is none of the trial: the next one follows, and the memory with it.
     advantages = gae(
-        t.rewards[:slots],
-        values,
-        next_values,
-        terminated=t.terminated[:slots] & last,
-        ended=last,
-        gamma=t.discounts(slots, config.gamma),
-        lam=config.lam,
-        valid=valid,
-    )
+        t.rewards[:slots], values, next_values, terminated=t.terminated[:slots] & last, ended=last,
+        gamma=t.discounts(slots, config.gamma), lam=config.lam, valid=valid
+    )  # fmt: skip
     returns = advantages + values
     explained = explained_variance(values, returns, task_id, num_tasks, valid)
     return_stats.merge(*task_moments(returns, task_id, num_tasks, valid))
     actions = t.actions[:slots]
     chunk, row = filled[::size].nonzero(as_tuple=True)
     batch = Batch(
-        obs=t.obs[:slots],
-        actions=actions,
-        previous=previous,
-        old_means=old_means,
+        obs=t.obs[:slots], actions=actions, previous=previous, old_means=old_means,
         old_log_probs=gaussian_log_prob(actions, old_means, policy.log_std),
         advantages=normalise_per_task(advantages, task_id, num_tasks, valid),
-        targets=return_stats.normalise(returns, task_id),
-        weights=valid.float(),
-        actor_states=torch.stack(actor_states),
-        critic_states=torch.stack(critic_states),
-        chunk=chunk,
-        row=row,
-    )
+        targets=return_stats.normalise(returns, task_id), weights=valid.float(), actor_states=torch.stack(actor_states),
+        critic_states=torch.stack(critic_states), chunk=chunk, row=row
+    )  # fmt: skip
     return batch, explained

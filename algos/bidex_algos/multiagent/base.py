@@ -20,6 +20,7 @@ from bidex_algos.nets.policy import GaussianPolicy
 from bidex_algos.nets.shape import Shape
 from bidex_algos.onpolicy.base import Batch, OnPolicy, OnPolicyConfig, check_samples
 from bidex_algos.onpolicy.ppo import PPOConfig
+from bidex_algos.step_size import AdaptiveAdam
 from bidex_meta.errors import BidexError
 from bidex_meta.hands.units import partition_line
 from bidex_meta.train.distributed import sum_gradients
@@ -33,11 +34,7 @@ Partition = Annotated[str, tyro.conf.arg(aliases=("--agents",))]
 
 
 def keep_partition(config: Any) -> None:
-    """Puts a file's partition itself in the place of its path: a checkpoint shall know it without the file.
-
-    Raises:
-        BidexError: ``agents`` is no partition, or the agents' networks would be none of their own.
-    """
+    """Puts a file's partition in the place of its path, for checkpoints; a BidexError where it is none."""
     if config.architecture != "shared":
         raise BidexError(f"{config.algo}: each agent has a plain network; architecture must be shared.")
     object.__setattr__(config, "agents", partition_line(config.agents))
@@ -66,7 +63,6 @@ class MultiAgentConfig(OnPolicyConfig):
     """What Adam adds to its denominators."""
 
     def __post_init__(self) -> None:
-        """Checks what annotations cannot say."""
         super().__post_init__()
         keep_partition(self)
         if self.popart and not (self.per_task_values and self.value_heads):
@@ -99,7 +95,6 @@ class InTurnConfig(LearnerConfig):
     as much as it comes to."""
 
     def __post_init__(self) -> None:
-        """Checks what its annotation cannot say."""
         super().__post_init__()
         if 0 < self.max_factor < 1:
             raise BidexError(
@@ -162,17 +157,7 @@ class TeamPolicy(GaussianPolicy):
 
 
 class MultiAgent(OnPolicy):
-    """Agents that share a reward, each with a policy on what it sees.
-
-    Attributes:
-        views: The agents.
-        critic_adam: Moves the critic.
-        kl_share: Each agent's part of the KL that all may have together, which is the sum of theirs.
-
-    Raises:
-        BidexError: A partition that is none of this world's, policy heads where the world does not show the task, or
-            fewer samples in a rollout than mini-batches.
-    """
+    """Agents (``views``) that share a reward, each with a policy on what it sees and its part of the KL."""
 
     config: MultiAgentConfig
     policy: TeamPolicy
@@ -196,8 +181,6 @@ class MultiAgent(OnPolicy):
         policy: Any = TeamPolicy(observations, actor, use_bfloat16(config.autocast, device))  # type: ignore[arg-type]
         return policy.to(device)
 
-    # The critic.
-
     def _critics(self) -> list[Any]:
         """The networks of the critic: one for all, or one an agent."""
         return [self.critic]
@@ -220,10 +203,7 @@ class MultiAgent(OnPolicy):
             return self._critic(batch.obs, batch.task_id)
 
     def _value_loss(self, b: Batch, old_values: Tensor, weights: Tensor) -> Tensor:
-        """The critics' loss, a scalar: twice Huber's of the errors, so that small ones are squared; of several the sum.
-
-        With ``value_clip`` the larger of two: of the value, and of the old value moved towards it as far as that.
-        """
+        """A scalar, twice Huber's loss; with ``value_clip`` at least that of the value moved as far as that."""
         delta, reach = self.config.huber_delta, self.config.value_clip
         values = self._critic(b.obs, b.task_id)
 
@@ -258,6 +238,20 @@ class MultiAgent(OnPolicy):
         return {"critic_adam": self.critic_adam}
 
 
+class OwnAdams(MultiAgent):
+    """Agents whose networks have an optimiser each, whose step size follows their share of the KL."""
+
+    config: Any
+
+    def __init__(self, world: VectorWorld, config: Any, seed: int):
+        super().__init__(world, config, seed)
+        own, given = self.policy.actor.parameters_of, (config, self.device, config.adam_eps, self.kl_share)
+        self.adams = [AdaptiveAdam(own(k), *given) for k in range(len(self.policy.actor.nets))]
+
+    def _optimisers(self) -> Parts:
+        return super()._optimisers() | {"agents": [adam.parts() for adam in self.adams]}
+
+
 class Sequential(MultiAgent):
     """Agents that are updated one after another, in a random order (Kuba et al. 2022).
 
@@ -273,12 +267,7 @@ class Sequential(MultiAgent):
         self.order = torch.Generator().manual_seed(seed)
 
     def _in_turn(self, batch: Batch) -> Iterator[tuple[int, AgentBatch]]:
-        """Gives each agent with its share of the batch, and puts what it did with it into the gain of those after it.
-
-        Yields:
-            (agent, share), whose ``gain`` is the advantage times the product of the ratios, at most ``max_factor``; a
-            ratio is that of the policy when the next agent is asked for.
-        """
+        """(agent, share) in turn; ``gain``: the advantage times the ratios of those before, at most ``max_factor``."""
         actor, task = self.policy.actor, self.policy.actor.one_hot(batch.obs)
         old_log_std = actor.log_std_of(batch.obs).detach().expand(batch.actions.shape)
         columns = [actor.parts(x) for x in (batch.actions, batch.old_means, old_log_std)]

@@ -13,13 +13,18 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from bidex_algos.multiagent.base import LIFT, PAPER_PPO, AgentBatch, InTurnConfig, MultiAgentPPOConfig, Sequential
+from bidex_algos.multiagent.base import (
+    LIFT,
+    PAPER_PPO,
+    AgentBatch,
+    InTurnConfig,
+    MultiAgentPPOConfig,
+    OwnAdams,
+    Sequential,
+)
 from bidex_algos.onpolicy.base import Batch
 from bidex_algos.onpolicy.ppo import policy_loss
-from bidex_algos.step_size import AdaptiveAdam
 from bidex_meta.train.distributed import sum_gradients
-from bidex_meta.train.learner import Parts
-from bidex_meta.world.contract import VectorWorld
 
 
 @dataclass(frozen=True)
@@ -38,27 +43,12 @@ PRESETS: dict[str, HAPPOConfig] = {
 TASK_PRESETS = {"LiftUnderarm": {"paper": replace(PRESETS["paper"], **LIFT)}}
 
 
-class HAPPO(Sequential):
-    """HAPPO, agents in turn (Kuba et al. 2022, arXiv 2109.11251).
-
-    Attributes:
-        adams: An optimiser of each agent.
-    """
+class HAPPO(OwnAdams, Sequential):
+    """HAPPO, agents in turn (Kuba et al. 2022, arXiv 2109.11251)."""
 
     name, remedy = "happo", "lower learning_rate"
     config_type, presets, task_presets = HAPPOConfig, PRESETS, TASK_PRESETS
     config: HAPPOConfig
-
-    def __init__(self, world: VectorWorld, config: HAPPOConfig, seed: int):
-        super().__init__(world, config, seed)
-        actor = self.policy.actor
-        self.adams = [
-            AdaptiveAdam(actor.parameters_of(i), config, self.device, config.adam_eps, self.kl_share)
-            for i in range(len(self.views))
-        ]
-
-    def _optimisers(self) -> Parts:
-        return super()._optimisers() | {"agents": [adam.parts() for adam in self.adams]}
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
         """All agents in turn, then the critic; returns means over agents and mini-batches of what it measured."""
@@ -77,15 +67,9 @@ class HAPPO(Sequential):
         for first, index, count in self._mini_batches(share.weights, cfg.epochs, cfg.num_minibatches):
             part = share.select(index)
             loss = policy_loss(
-                part.actions,
-                *self._distribution(agent, part),
-                part.old_means,
-                part.old_log_std,
-                part.old_log_probs,
-                part.gain,
-                weights=part.weights / count,
-                clip=cfg.clip,
-            )
+                part.actions, *self._distribution(agent, part), part.old_means, part.old_log_std, part.old_log_probs,
+                part.gain, weights=part.weights / count, clip=cfg.clip
+            )  # fmt: skip
             adam.zero_grad()
             (loss.surrogate - cfg.entropy_weight * loss.entropy).backward(inputs=parameters)
             numbers = torch.stack([loss.surrogate.detach(), loss.kl, loss.outside])

@@ -5,19 +5,15 @@ trust region, with the advantage times the ratios of the agents before it. Then 
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from bidex_algos.multiagent.base import LIFT, PAPER, AgentBatch, InTurnConfig, MultiAgentConfig, Sequential
-from bidex_algos.nets.networks import gaussian_kl, gaussian_log_prob
 from bidex_algos.onpolicy.base import Batch
-from bidex_algos.onpolicy.mttrpo import MTTRPOConfig
-from bidex_algos.trust_region import trust_region_step
-from bidex_meta.train.distributed import all_sum
+from bidex_algos.onpolicy.mttrpo import MTTRPOConfig, gaussian_step, kl_from_itself
 from bidex_meta.utils.validation import Positive
-from bidex_meta.world.contract import VectorWorld
 
 
 @dataclass(frozen=True)
@@ -44,19 +40,11 @@ TASK_PRESETS = {
 
 
 class HATRPO(Sequential):
-    """HATRPO, agents in turn (Kuba et al. 2022, arXiv 2109.11251).
-
-    Attributes:
-        region: The config with an agent's share of ``max_kl``.
-    """
+    """HATRPO, agents in turn (Kuba et al. 2022, arXiv 2109.11251)."""
 
     name, remedy = "hatrpo", "lower max_kl or critic_learning_rate"
     config_type, presets, task_presets = HATRPOConfig, PRESETS, TASK_PRESETS
     config: HATRPOConfig  # type: ignore[assignment]
-
-    def __init__(self, world: VectorWorld, config: Any, seed: int):
-        super().__init__(world, config, seed)
-        self.region = replace(config, max_kl=self.kl_share * config.max_kl)
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
         """All agents in turn, then the critic; returns means over agents of what it measured."""
@@ -65,37 +53,13 @@ class HATRPO(Sequential):
         return told | {"Loss/value": self._critic_epochs(batch, self.config.critic_epochs, self.config.num_minibatches)}
 
     def _agent_step(self, agent: int, share: AgentBatch) -> dict[str, Tensor]:
-        cfg, actor = self.config, self.policy.actor
-        weight = share.weights / all_sum(share.weights.sum()).clamp_min(1.0)
+        actor, cfg = self.policy.actor, self.config
 
-        def surrogate_and_kl() -> tuple[Tensor, Tensor]:
-            """This process's part of the surrogate objective and of the KL from the sampling policy, scalars."""
-            mean, log_std = self._distribution(agent, share)
-            ratio = torch.exp(gaussian_log_prob(share.actions, mean, log_std) - share.old_log_probs)
-            kl = gaussian_kl(share.old_means, share.old_log_std, mean, log_std)
-            return (weight * ratio * share.gain).sum(), (weight * kl).sum()
+        def of_taken(taken: Tensor) -> tuple[Tensor, Tensor]:
+            seen = share.seen[taken].to(actor.log_stds[0].dtype)
+            return actor.distribution_of(agent, seen, share.task[taken])
 
-        @torch.no_grad()
-        def measure() -> tuple[float, float]:
-            # The bounds are part of the policy: what is measured is what will act.
-            actor.clamp_std(*cfg.std_range)
-            objective, kl = all_sum(torch.stack(surrogate_and_kl())).tolist()
-            return objective, kl
-
-        objective, _ = surrogate_and_kl()
-        kl = self._kl_from_itself(agent, share)
-        stepped = trust_region_step(
-            actor.parameters_of(agent), objective, kl, measure, self.region, accept_ratio=cfg.accept_ratio
-        )
-        return stepped.told("Policy/kl", self.device)
-
-    def _kl_from_itself(self, agent: int, share: AgentBatch) -> Tensor:
-        """The part of an agent's mean KL that its Fisher matrix is made of: 0, but with a curvature."""
-        actor, rows = self.policy.actor, self.world.num_envs
-        sample = torch.arange(len(share.seen), device=self.device)
-        # As in MT-TRPO: a later step begins at a later row, else rows between would never be taken.
-        taken = (sample + sample // rows) % self.config.fisher_stride == 0
-        seen, weight = share.seen[taken].to(actor.log_stds[0].dtype), share.weights[taken]
-        mean, log_std = actor.distribution_of(agent, seen, share.task[taken])
-        kl = gaussian_kl(mean.detach(), log_std.detach(), mean, log_std)
-        return (weight / all_sum(weight.sum()).clamp_min(1.0) * kl).sum()
+        own = kl_from_itself(of_taken, share.weights, self.world.num_envs, cfg.fisher_stride)
+        distribution, bounds = partial(self._distribution, agent, share), partial(actor.clamp_std, *cfg.std_range)
+        given = share, share.gain, share.old_log_std, own, cfg
+        return gaussian_step(actor.parameters_of(agent), distribution, bounds, *given, self.kl_share * cfg.max_kl)

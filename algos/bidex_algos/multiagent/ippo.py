@@ -23,7 +23,6 @@ class IPPOConfig(MAPPOConfig):
     """Everything that can be set about IPPO; the defaults are the preset ``laptop``."""
 
     def __post_init__(self) -> None:
-        """Checks what annotations cannot say."""
         super().__post_init__()
         if self.popart and self.share_parameters:
             raise BidexError("ippo: popart needs a critic for each agent; leave popart or share_parameters off.")

@@ -38,7 +38,6 @@ class MADDPGConfig(DDPGConfig):
     a table [agents], or name=unit+unit;name=unit (docs/learners/multiagent.md)."""
 
     def __post_init__(self) -> None:
-        """Checks what annotations cannot say."""
         super().__post_init__()
         keep_partition(self)
 
@@ -74,12 +73,7 @@ class DeterministicTeam(Team):
 
 
 class MADDPG(DDPG):
-    """MADDPG, multi-agent DDPG (Lowe et al. 2017, arXiv 1706.02275).
-
-    Attributes:
-        views: The agents.
-        owner: The agent of each action, int64 (a,).
-    """
+    """MADDPG, multi-agent DDPG (Lowe et al. 2017, arXiv 1706.02275)."""
 
     name = "maddpg"
     config_type, presets = MADDPGConfig, PRESETS

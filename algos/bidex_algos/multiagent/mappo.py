@@ -9,14 +9,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from bidex_algos.multiagent.base import LIFT, PAPER_PPO, MultiAgent, MultiAgentPPOConfig
+from bidex_algos.multiagent.base import LIFT, PAPER_PPO, MultiAgentPPOConfig, OwnAdams
 from bidex_algos.nets.networks import autocast, gaussian_log_prob
 from bidex_algos.onpolicy.base import Batch
 from bidex_algos.onpolicy.ppo import NAMES, PolicyLoss, policy_loss
-from bidex_algos.step_size import AdaptiveAdam
 from bidex_meta.train.distributed import sum_gradients
-from bidex_meta.train.learner import Parts
-from bidex_meta.world.contract import VectorWorld
 
 
 @dataclass(frozen=True)
@@ -38,27 +35,12 @@ PRESETS: dict[str, MAPPOConfig] = {
 TASK_PRESETS = {"LiftUnderarm": {"paper": replace(PRESETS["paper"], **LIFT)}}
 
 
-class MAPPO(MultiAgent):
-    """MAPPO, multi-agent PPO (Yu et al. 2022, arXiv 2103.01955).
-
-    Attributes:
-        adams: An optimiser of each network of the actors.
-    """
+class MAPPO(OwnAdams):
+    """MAPPO, multi-agent PPO (Yu et al. 2022, arXiv 2103.01955)."""
 
     name, remedy = "mappo", "lower learning_rate"
     config_type, presets, task_presets = MAPPOConfig, PRESETS, TASK_PRESETS
     config: MAPPOConfig
-
-    def __init__(self, world: VectorWorld, config: MAPPOConfig, seed: int):
-        super().__init__(world, config, seed)
-        actor = self.policy.actor
-        self.adams = [
-            AdaptiveAdam(actor.parameters_of(k), config, self.device, config.adam_eps, self.kl_share)
-            for k in range(len(actor.nets))
-        ]
-
-    def _optimisers(self) -> Parts:
-        return super()._optimisers() | {"agents": [adam.parts() for adam in self.adams]}
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
         """One pass after another: returns the means over all mini-batches and agents of what it measured."""

@@ -8,37 +8,21 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.nets.inputs import Columns, Inputs, with_task_embedding
-from bidex_algos.nets.networks import MLP, stacked_forward
+from bidex_algos.nets.networks import MLP, head_of, row_of, stacked_forward
 from bidex_algos.nets.point_net import with_point_net
 from bidex_meta.world.agent_views import AgentView
 
 
 class Team(nn.Module):
-    """One :class:`MLP` an agent; with ``share`` one for all agents of one form, which reads who acts.
+    """One :class:`MLP` an agent; with ``share`` one for all of a form (columns of each group, actions), told who acts.
 
-    Args:
-        views: The agents.
-        config: Of a learner; it has ``hidden``, ``activation`` and ``task_embedding``.
-        outputs: Outputs of each agent.
-        output_gain: Gain of the output layers.
-        generator: CPU generator of the initial weights.
-        share: Whether agents of one form (as many columns of each group, as many actions) have a network together.
-
-    Attributes:
-        nets: The networks.
-        net_of: Which of them each agent has.
-        families: The agents of each form.
+    Agent i has network ``net_of[i]``; ``families`` are the agents of each form.
     """
 
     def __init__(
-        self,
-        views: Sequence[AgentView],
-        config: Any,
-        outputs: Sequence[int],
-        output_gain: float,
-        generator: torch.Generator,
-        share: bool = False,
-    ):
+        self, views: Sequence[AgentView], config: Any, outputs: Sequence[int], output_gain: float,
+        generator: torch.Generator, share: bool = False
+    ):  # fmt: skip
         super().__init__()
         forms = [(tuple(group.size for group in view.own_groups()), len(view.actions)) for view in views]
         self.families = [[i for i, other in enumerate(forms) if other == form] for form in dict.fromkeys(forms)]
@@ -97,23 +81,13 @@ class Team(nn.Module):
 class TeamActor(Team):
     """Diagonal Gaussians of all agents, together one of the world's action: in the place of a ``GaussianActor``.
 
-    ``groups`` are those of the world's observation; ``heads`` output layers and deviations of each agent, which the
-    group ``task_id`` chooses.
-
-    Attributes:
-        own: The world's actions that are each agent's, int64 (a_i,).
-        log_stds: Of each network: logarithms of standard deviations, (a_i,) or (heads, a_i).
+    ``log_stds`` are of each network, (a_i,), or (heads, a_i), which the group ``task_id`` chooses.
     """
 
     def __init__(
-        self,
-        views: Sequence[AgentView],
-        config: Any,
-        groups: Inputs,
-        generator: torch.Generator,
-        heads: int = 1,
-        share: bool = False,
-    ):
+        self, views: Sequence[AgentView], config: Any, groups: Inputs, generator: torch.Generator, heads: int = 1,
+        share: bool = False
+    ):  # fmt: skip
         super().__init__(views, config, [heads * len(view.actions) for view in views], 0.01, generator, share)
         self.heads, self.one_hot = heads, groups.columns(*["task_id"] * (heads > 1))
         order = torch.tensor([action for view in views for action in view.actions])
@@ -144,22 +118,15 @@ class TeamActor(Team):
     def means(self, x: Tensor) -> list[Tensor]:
         """The mean action (B, a_i) of each agent."""
         task = self.one_hot(x)
-        return [self._chosen(task, out) for out in self.outputs(x)]
+        return [head_of(task, out, self.heads) for out in self.outputs(x)]
 
     def distribution_of(self, agent: int, seen: Tensor, task: Tensor) -> tuple[Tensor, Tensor]:
-        """One agent's Gaussian: mean (B, a_i) and logarithm of the deviation, (a_i,) with one head, else (B, a_i).
-
-        ``seen`` is what its network is fed (B, d_i), ``task`` the tasks' one-hot (B, heads).
-        """
-        return self._chosen(task, self.nets[self.net_of[agent]](seen)), self.own_log_std(agent, task)
+        """One agent's mean (B, a_i), and its log deviation (a_i,) or (B, a_i), of what it sees and the one-hot."""
+        return head_of(task, self.nets[self.net_of[agent]](seen), self.heads), self.own_log_std(agent, task)
 
     def own_log_std(self, agent: int, task: Tensor) -> Tensor:
         """The second of :meth:`distribution_of`."""
-        log_std = self.log_stds[self.net_of[agent]]
-        if self.heads == 1:
-            return log_std
-        with torch.autocast(task.device.type, enabled=False):
-            return task.to(log_std.dtype) @ log_std
+        return row_of(task, self.log_stds[self.net_of[agent]])
 
     def parts(self, joint: Tensor) -> tuple[Tensor, ...]:
         """Each agent's entries (..., a_i) of what the world's actions have (..., a)."""
@@ -167,11 +134,7 @@ class TeamActor(Team):
 
     def log_std_of(self, x: Tensor, log_std: Tensor | None = None) -> Tensor:
         """The joint ``log_std`` that holds for observations (B, d): (a,) with one head, else (B, a)."""
-        log_std = self.log_std if log_std is None else log_std
-        if self.heads == 1:
-            return log_std
-        with torch.autocast(x.device.type, enabled=False):
-            return self.one_hot(x).to(log_std.dtype) @ log_std
+        return row_of(self.one_hot(x), self.log_std if log_std is None else log_std)
 
     def parameters_of(self, net: int) -> list[nn.Parameter]:
         """The parameters of a network and its standard deviations."""
@@ -182,12 +145,6 @@ class TeamActor(Team):
         """Keeps all standard deviations within bounds."""
         for log_std in self.log_stds:
             log_std.clamp_(math.log(low), math.log(high))
-
-    def _chosen(self, task: Tensor, out: Tensor) -> Tensor:
-        if self.heads == 1:
-            return out
-        with torch.autocast(task.device.type, enabled=False):
-            return torch.einsum("...h,...ha->...a", task.to(out.dtype), out.unflatten(-1, (self.heads, -1)))
 
 
 class TeamCritic(Team):

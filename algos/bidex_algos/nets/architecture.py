@@ -34,7 +34,6 @@ class ArchitectureConfig(LearnerConfig):
         return self.architecture in ("shared", "multi_head")
 
     def __post_init__(self) -> None:
-        """Turns multi_head into both heads, and refuses what does not go together."""
         super().__post_init__()
         config: Any = self
         if self.architecture == "multi_head":
@@ -63,7 +62,7 @@ class ArchitectureConfig(LearnerConfig):
 
 @dataclass(frozen=True)
 class NetworkConfig(ArchitectureConfig):
-    """Networks of learners from a replay or from data."""
+    """Networks of actor and critics."""
 
     hidden: Layers = (256, 256)
     """Widths of the hidden layers, of actor and critics alike."""

@@ -13,14 +13,7 @@ from bidex_meta.world.contract import ObservationGroup, plain_groups
 
 
 class Columns(nn.Module):
-    """Reads and writes some columns of tensors (..., d). It has no weights and leaves nothing in a checkpoint.
-
-    Args:
-        ranges: The columns; they are taken in ascending order.
-
-    Attributes:
-        size: How many they are.
-    """
+    """Reads and writes some columns, in ascending order, of tensors (..., d); nothing of it is in a checkpoint."""
 
     def __init__(self, ranges: Iterable[slice]):
         super().__init__()
@@ -50,11 +43,8 @@ MakeEncoder = Callable[[int, torch.Generator], nn.Module]
 class Inputs:
     """How a network reads an observation, before it has weights. A ``BidexError`` names a group that is not there.
 
-    Attributes:
-        groups: The parts of the observation; each column is in one. A network reads the task from ``task_id``.
-        encoders: What makes the encoder of a group, by its name; a group without one enters as it is.
-        hidden: Names of groups that do not enter at all.
-        unscaled: Names of groups that running statistics leave as they are, but for the clip.
+    Groups enter as they are, by the encoder of their name, or, ``hidden``, not at all; of ``unscaled`` ones running
+    statistics change nothing but for the clip. A network reads the task from ``task_id``.
     """
 
     groups: tuple[ObservationGroup, ...]
@@ -63,7 +53,6 @@ class Inputs:
     unscaled: frozenset[str] = frozenset({"task_id"})
 
     def __post_init__(self) -> None:
-        """Refuses encoders of no group."""
         self.columns(*self.encoders)
 
     @classmethod
@@ -110,14 +99,6 @@ class GroupEncoder(nn.Module):
 
     Groups without an encoder come first, in the order of their columns, then what the encoders give, in the order of
     the groups. Without any encoder it is the identity and has no weights.
-
-    Args:
-        inputs: The groups and what makes their encoders; or a width.
-        generator: CPU generator of the initial weights.
-
-    Attributes:
-        groups: The encoders by the name of their group.
-        size: Width of what comes out.
     """
 
     def __init__(self, inputs: int | Inputs, generator: torch.Generator):

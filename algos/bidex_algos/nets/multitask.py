@@ -34,10 +34,7 @@ class StackedLinear(nn.Module):
 
 
 class TaskWeights(nn.Module):
-    """Some numbers for each task, chosen by the one-hot in the group ``task_id``; drawn as directions of length 1.
-
-    Of that length, since what they mix keeps its size then: the mixed parts are independent at first. ``count``: K.
-    """
+    """``count`` (K) numbers for each task, by its one-hot; drawn of length 1, so that mixtures keep their size."""
 
     def __init__(self, inputs: Inputs, count: int, generator: torch.Generator):
         super().__init__()
@@ -96,17 +93,9 @@ class Moore(nn.Module):
     """
 
     def __init__(
-        self,
-        inputs: int | Inputs,
-        hidden: Sequence[int],
-        outputs: int,
-        output_gain: float,
-        generator: torch.Generator,
-        activation: Activation = "elu",
-        layer_norm: bool = False,
-        *,
-        modules: int,
-    ):
+        self, inputs: int | Inputs, hidden: Sequence[int], outputs: int, output_gain: float, generator: torch.Generator,
+        activation: Activation = "elu", layer_norm: bool = False, *, modules: int
+    ):  # fmt: skip
         super().__init__()
         inputs = Inputs.of(inputs)
         self.encoder = GroupEncoder(inputs.without("task_id"), generator)
@@ -150,17 +139,9 @@ class PaCo(nn.Module):
     """
 
     def __init__(
-        self,
-        inputs: int | Inputs,
-        hidden: Sequence[int],
-        outputs: int,
-        output_gain: float,
-        generator: torch.Generator,
-        activation: Activation = "elu",
-        layer_norm: bool = False,
-        *,
-        modules: int,
-    ):
+        self, inputs: int | Inputs, hidden: Sequence[int], outputs: int, output_gain: float, generator: torch.Generator,
+        activation: Activation = "elu", layer_norm: bool = False, *, modules: int
+    ):  # fmt: skip
         super().__init__()
         inputs = Inputs.of(inputs)
         self.encoder = GroupEncoder(inputs.without("task_id"), generator)
@@ -197,17 +178,9 @@ class SoftModules(nn.Module):
     """
 
     def __init__(
-        self,
-        inputs: int | Inputs,
-        hidden: Sequence[int],
-        outputs: int,
-        output_gain: float,
-        generator: torch.Generator,
-        activation: Activation = "elu",
-        layer_norm: bool = False,
-        *,
-        modules: int,
-    ):
+        self, inputs: int | Inputs, hidden: Sequence[int], outputs: int, output_gain: float, generator: torch.Generator,
+        activation: Activation = "elu", layer_norm: bool = False, *, modules: int
+    ):  # fmt: skip
         super().__init__()
         inputs, gain, embedding = Inputs.of(inputs), math.sqrt(2.0), hidden[0]
         self.modules_of_layer = modules
@@ -228,12 +201,7 @@ class SoftModules(nn.Module):
         return self.head.bias
 
     def routes(self, x: Tensor, state: Tensor) -> list[Tensor]:
-        """Shares (batch, modules that take, modules that give) between one layer and the next; they sum to 1.
-
-        Args:
-            x: Observations (batch, inputs).
-            state: Their embeddings (batch, width).
-        """
+        """Shares (batch, modules that take, that give) between layers, sum 1; ``state`` embeds x as (batch, width)."""
         both = state * self.task(self.one_hot(x).to(state.dtype))
         logits = self.down[0](both.relu())
         found = [logits]

@@ -11,13 +11,9 @@ from bidex_meta.train.distributed import pool_moments
 
 
 class RunningStats(nn.Module):
-    """Mean and variance of a stream, merged batch by batch (Chan et al.), element by element.
+    """Mean and variance of a stream, merged batch by batch (Chan et al.), element by element, in float64.
 
-    Kept in float64: the count outgrows what float32 can add to.
-
-    Args:
-        shape: Shape of the statistics, e.g. ``(columns,)`` or ``(num_tasks,)``.
-        max_count: The count never grows beyond this, so that older batches fade; infinite = they never do.
+    Where the count never grows beyond ``max_count``, older batches fade.
     """
 
     def __init__(self, shape: tuple[int, ...], max_count: float = math.inf):
@@ -58,19 +54,10 @@ class RunningStats(nn.Module):
 
 
 class ObservationNormaliser(nn.Module):
-    """Observations to zero mean and unit variance, clipped; the task id passes unchanged.
+    """Observations to zero mean and unit variance, clipped; columns of ``inputs.unscaled`` are not ``measured``.
 
-    Statistics change only in :meth:`update`, so the observations of a rollout look the same to the sampling policy and
-    to the update.
-
-    Args:
-        inputs: The groups of the observation, or its width.
-        enabled: False makes this the identity.
-        clip: Bound of the normalised values.
-
-    Attributes:
-        measured: The columns that are normalised: of all groups but ``inputs.unscaled``.
-        settled: While true, :meth:`update` leaves the statistics as they are.
+    Statistics change only in :meth:`update` (never while ``settled``), so that a rollout looks the same to the sampling
+    policy and to the update. Not ``enabled`` it is the identity.
     """
 
     def __init__(self, inputs: int | Inputs, enabled: bool = True, clip: float = 10.0):
@@ -115,7 +102,7 @@ class ObservationNormaliser(nn.Module):
 
 def observation_normaliser(config: Any, inputs: Inputs, tasks: int) -> ObservationNormaliser:
     """What a config asks for by ``normalise_observations`` and ``normalise_per_task``, of so many tasks."""
-    if config.normalise_per_task and config.normalise_observations and tasks > 1:
+    if vars(config).get("normalise_per_task") and config.normalise_observations and tasks > 1:
         return TaskNormaliser(inputs, tasks)
     return ObservationNormaliser(inputs, config.normalise_observations)
 

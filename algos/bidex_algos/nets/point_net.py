@@ -1,7 +1,4 @@
-"""PointNet (Qi et al. 2017, arXiv 1612.00593) without its transforms: a shared network on each point, then the largest.
-
-What it gives does not depend on the order of the points, nor on how often one of them stands there.
-"""
+"""PointNet (Qi et al. 2017, arXiv 1612.00593), no transforms: a shared network on each point, then the largest."""
 
 import math
 from collections.abc import Sequence
@@ -24,17 +21,10 @@ _CACHED = 1 << 19
 
 
 class PointNet(nn.Module):
-    """Maps clouds (..., entries) to features (..., size): the largest of each over all points, and the centre.
+    """Maps clouds (..., entries) to features (..., size): the largest of each over all points, and the centre (metres).
 
-    Points enter as what they are away from the centre of their cloud, so that the first layers see shapes rather than
-    where in the room the hands are; the centre itself (metres) stands behind the features.
-
-    Args:
-        entries: Numbers of a cloud, point after point.
-        generator: CPU generator of the initial weights.
-        widths: Of the layers that all points share.
-        channels: Numbers of a point: three of position, then others.
-        read: Read so many points alone, evenly out of the cloud; 0: all of them.
+    Points of ``channels`` numbers, position first, enter relative to the centre of their cloud, so that the first
+    layers see shapes rather than where the hands are. It reads all, or ``read`` of them evenly.
     """
 
     def __init__(
@@ -89,13 +79,7 @@ def _largest_of(values: Tensor) -> Tensor:
 
 
 def with_point_net(inputs: Inputs, config: Any) -> Inputs:
-    """The same with clouds, where there are some, read by a PointNet.
-
-    Running statistics leave clouds as they are: each of their columns may be any point.
-
-    Raises:
-        BidexError: The learner's config has no ``point_widths``: it reads no clouds.
-    """
+    """The same with clouds, unscaled, read by a PointNet; a BidexError where the config has no ``point_widths``."""
     for group in inputs.groups:
         channels = POINT_GROUPS.get(group.name)
         if channels is not None:

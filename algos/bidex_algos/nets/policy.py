@@ -8,19 +8,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
+from bidex_algos.nets.architecture import network_of
 from bidex_algos.nets.inputs import Inputs
-from bidex_algos.nets.networks import MLP, Activation, GaussianActor, autocast, gaussian_log_prob
-from bidex_algos.nets.normalise import ObservationNormaliser
+from bidex_algos.nets.networks import MLP, Activation, GaussianActor, autocast, gaussian_log_prob, use_bfloat16
+from bidex_algos.nets.normalise import ObservationNormaliser, observation_normaliser
+from bidex_algos.nets.shape import Shape
 
 
 class ActorPolicy(nn.Module):
-    """An actor on raw observations; with ``eval_action`` it follows the Agent protocol of evaluation.
-
-    Args:
-        observations: Normaliser of raw observations.
-        actor: Network on normalised observations.
-        low_precision: Whether hidden layers run in bfloat16.
-    """
+    """A normaliser and an actor, on raw observations; an agent for evaluation, with ``eval_action``."""
 
     def __init__(self, observations: ObservationNormaliser, actor: nn.Module, low_precision: bool):
         super().__init__()
@@ -64,15 +60,9 @@ class DeterministicActor(nn.Module):
     """One action for each observation, squashed by tanh; arguments are those of :class:`GaussianActor`."""
 
     def __init__(
-        self,
-        inputs: int | Inputs,
-        hidden: Sequence[int],
-        actions: int,
-        heads: int,
-        generator: torch.Generator,
-        activation: Activation,
-        network: Callable[..., Any] = MLP,
-    ):
+        self, inputs: int | Inputs, hidden: Sequence[int], actions: int, heads: int, generator: torch.Generator,
+        activation: Activation, network: Callable[..., Any] = MLP
+    ):  # fmt: skip
         super().__init__()
         self.heads = heads
         self.one_hot = Inputs.of(inputs).columns(*["task_id"] * (heads > 1))
@@ -108,6 +98,27 @@ class DeterministicPolicy(ActorPolicy):
         return torch.tanh(self.raw(self.observations(obs)))
 
 
+def gaussian_policy(
+    config: Any, inputs: Inputs, shape: Shape, init: torch.Generator, device: torch.device,
+    make: type[GaussianActor] = GaussianActor
+) -> GaussianPolicy:  # fmt: skip
+    """A policy with the networks of a learner's config, drawn from ``init``, a CPU generator."""
+    heads, network = shape.num_id_columns if config.policy_heads else 1, network_of(config)
+    actor = make(inputs, config.hidden, shape.actions, config.init_std, init, config.activation, heads, network)
+    observations = observation_normaliser(config, inputs, shape.num_id_columns)
+    return GaussianPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
+
+
+def deterministic_policy(
+    config: Any, inputs: Inputs, shape: Shape, init: torch.Generator, device: torch.device
+) -> DeterministicPolicy:
+    """The same without a distribution."""
+    heads, network = shape.num_id_columns if config.policy_heads else 1, network_of(config)
+    actor = DeterministicActor(inputs, config.hidden, shape.actions, heads, init, config.activation, network)
+    observations = observation_normaliser(config, inputs, shape.num_id_columns)
+    return DeterministicPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
+
+
 def squashed_log_prob(raw: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
     """Log-density of the action tanh(raw), where raw is drawn from N(mean, exp(log_std)^2).
 
@@ -128,24 +139,14 @@ def sample_squashed(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Tenso
 class SquashedActor(nn.Module):
     """Mean and log standard deviation, before the squashing, from one network.
 
-    The log standard deviation moves between its bounds on a tanh: a hard clamp would have no gradient beyond them, so
-    that an output that went there would never return.
-
-    Arguments are those of :class:`GaussianActor`, and ``std_range``, the bounds.
+    The latter moves between its bounds on a tanh: from beyond a hard clamp, without a gradient, it would never return.
     """
 
     def __init__(
-        self,
-        inputs: int | Inputs,
-        hidden: Sequence[int],
-        actions: int,
-        heads: int,
-        init_std: float,
-        std_range: tuple[float, float],
-        generator: torch.Generator,
-        activation: Activation,
-        network: Callable[..., Any] = MLP,
-    ):
+        self, inputs: int | Inputs, hidden: Sequence[int], actions: int, heads: int, init_std: float,
+        std_range: tuple[float, float], generator: torch.Generator, activation: Activation,
+        network: Callable[..., Any] = MLP
+    ):  # fmt: skip
         super().__init__()
         self.heads = heads
         self.one_hot = Inputs.of(inputs).columns(*["task_id"] * (heads > 1))

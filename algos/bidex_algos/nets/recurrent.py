@@ -15,31 +15,14 @@ from bidex_algos.nets.normalise import ObservationNormaliser
 class RecurrentNet(nn.Module):
     """An encoder, a GRU on its features, and a linear output of both, so that a reflex need not pass the memory.
 
-    All in float32: a memory would carry the rounding of bfloat16 through hundreds of steps.
-
-    Args:
-        inputs: What it is fed: groups, or a width.
-        hidden: Widths of the encoder's layers.
-        memory: Width of the GRU's state.
-        outputs: Width of the output.
-        output_gain: Gain of the orthogonal output layer.
-        generator: CPU generator of the initial weights; the global one is left alone.
-        activation: Name of the encoder's non-linearity.
-        lasting: Steps that the memory shall last for: at the start its numbers fade over 2 to ``lasting`` + 1 steps,
-            spread evenly by their logarithms (after Tallec and Ollivier 2018, arXiv 1804.11188).
+    All in float32: a memory would carry the rounding of bfloat16 on. At the start its numbers fade over 2 to
+    ``lasting`` + 1 steps, spread evenly by their logarithms (after Tallec and Ollivier 2018, arXiv 1804.11188).
     """
 
     def __init__(
-        self,
-        inputs: int | Inputs,
-        hidden: Sequence[int],
-        memory: int,
-        outputs: int,
-        output_gain: float,
-        generator: torch.Generator,
-        activation: Activation = "elu",
-        lasting: int = 1,
-    ):
+        self, inputs: int | Inputs, hidden: Sequence[int], memory: int, outputs: int, output_gain: float,
+        generator: torch.Generator, activation: Activation = "elu", lasting: int = 1
+    ):  # fmt: skip
         super().__init__()
         last = MLP(inputs, hidden[:-1], hidden[-1], math.sqrt(2.0), generator, activation)
         self.encoder = nn.Sequential(last, ACTIVATIONS[activation]())
@@ -57,15 +40,7 @@ class RecurrentNet(nn.Module):
         self.head = MLP(hidden[-1] + memory, (), outputs, output_gain, generator)
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Steps of a sequence, one after the other.
-
-        Args:
-            x: Inputs (T, B, inputs).
-            state: The memory before the first step, (B, memory).
-
-        Returns:
-            Outputs (T, B, outputs) and the memory after the last step, (B, memory).
-        """
+        """Outputs (T, B, outputs) of steps (T, B, inputs), and the memory (B, memory) after, from that before them."""
         features = self.encoder(x)
         remembered, last = self.gru(features, state[None].contiguous())
         return self.head(torch.cat([features, remembered], dim=-1)), last[0]
@@ -73,14 +48,10 @@ class RecurrentNet(nn.Module):
 
 @dataclass
 class Memory:
-    """What each environment brings along from the step before. A fresh one is all zeros: nothing has happened yet.
+    """What each environment brings along from the step before; zeros at first. ``state`` (N, memory) is the GRU's.
 
-    Attributes:
-        state: The GRU's state, (N, memory).
-        action: The action, (N, a); what of it exceeds [-1, 1] was not done.
-        reward: The reward, (N,).
-        known: Whether the policy is shown that reward, bool (N,).
-        done: Whether that step ended an episode, bool (N,).
+    Of the action (N, a) what exceeds [-1, 1] was not done; ``known`` (N,): whether the policy is shown the reward (N,);
+    ``done`` (N,): whether the step ended an episode.
     """
 
     state: Tensor
@@ -105,29 +76,15 @@ class Memory:
 class RecurrentPolicy(nn.Module):
     """A Gaussian policy whose memory is fed with observation, last action, last reward and end of episode.
 
-    Rewards of task classes differ by orders of magnitude, and a class met in a meta-test has never been seen: no scale
-    of its own is known, nor which class is played. One rule serves all: asinh(reward / ``reward_unit``), linear below
-    the unit and showing ratios above it, normalised by the mean and deviation it had in training. Other arguments are
-    those of :class:`RecurrentNet`.
-
-    Attributes:
-        inputs: What the networks see: these groups, normalised, and ``last_step``, what the memory is fed beside them.
-        log_std: Logarithms of the standard deviations, (a,).
+    Rewards of task classes differ by orders of magnitude, and which class is played is not known. One rule serves all:
+    asinh(reward / ``reward_unit``), linear below the unit and showing ratios above it, normalised by running
+    statistics. ``inputs`` gets a group ``last_step`` of what is fed beside the observation.
     """
 
     def __init__(
-        self,
-        inputs: Inputs,
-        actions: int,
-        hidden: Sequence[int],
-        memory: int,
-        init_std: float,
-        reward_unit: float,
-        normalise_observations: bool,
-        generator: torch.Generator,
-        activation: Activation,
-        lasting: int,
-    ):
+        self, inputs: Inputs, actions: int, hidden: Sequence[int], memory: int, init_std: float, reward_unit: float,
+        normalise_observations: bool, generator: torch.Generator, activation: Activation, lasting: int
+    ):  # fmt: skip
         super().__init__()
         self.num_actions, self.memory, self.reward_unit = actions, memory, reward_unit
         self.inputs = inputs.extended("last_step", actions + 3)

@@ -11,13 +11,7 @@ from bidex_meta.world.contract import ObservationGroup, VectorWorld, plain_group
 
 @dataclass(frozen=True)
 class Shape:
-    """Sizes of a world's spaces and the parts of its observation.
-
-    Attributes:
-        observations: Entries of an observation, d.
-        actions: Entries of an action, a.
-        groups: The named parts of an observation.
-    """
+    """Sizes of a world's spaces, observations (d) and actions (a), and the named parts of its observation."""
 
     observations: int
     actions: int
@@ -41,11 +35,7 @@ class Shape:
 
     def sizes(self) -> dict[str, int]:
         """The numbers without the places of the groups."""
-        return {
-            "observations": self.observations,
-            "actions": self.actions,
-            "num_id_columns": self.num_id_columns,
-        }
+        return {"observations": self.observations, "actions": self.actions, "num_id_columns": self.num_id_columns}
 
     def state_dict(self) -> State:
         """Plain values for a checkpoint."""
@@ -64,11 +54,7 @@ _OF_SEVERAL = ("task_embedding", "normalise_per_task")
 
 
 def check_options(name: str, config: Any, world: VectorWorld, shape: Shape) -> None:
-    """Options that tell tasks apart need the one-hot of the tasks.
-
-    Raises:
-        BidexError: The world does not show one.
-    """
+    """Options that tell tasks apart need the one-hot of the tasks. Raises BidexError: the world does not show one."""
     wanted = [option for option in (*_OF_SEVERAL, "policy_heads") if vars(config).get(option)]
     if world.num_tasks == 1:
         wanted = [option for option in wanted if option not in _OF_SEVERAL]  # one task needs none; heads it cannot have
@@ -83,11 +69,7 @@ def check_options(name: str, config: Any, world: VectorWorld, shape: Shape) -> N
 
 
 def check_discounts(name: str, world: VectorWorld, by_class: bool) -> None:
-    """A suite's own discounts need a learner that takes them.
-
-    Raises:
-        BidexError: This one does not.
-    """
+    """A suite's own discounts need a learner that takes them. Raises BidexError: this one does not."""
     own = [task for task, gamma in zip(world.task_names, world.gammas, strict=True) if gamma is not None]
     if own and not by_class:
         raise BidexError(

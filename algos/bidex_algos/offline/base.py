@@ -1,7 +1,6 @@
 """What the offline learners share: batches of stored transitions, critics and targets, updates, checkpoints.
 
-An iteration is ``updates_per_iteration`` updates, each of equally many transitions of every task. The world tells sizes
-and names and is never stepped. What other learners count as environment steps are updates here.
+The world tells sizes and names and is never stepped; what other learners count as environment steps are updates here.
 """
 
 import copy
@@ -75,7 +74,6 @@ class CriticConfig(OfflineConfig):
     """Divide rewards by the standard deviation of their task's discounted returns in the data."""
 
     def __post_init__(self) -> None:
-        """Checks what annotations cannot say."""
         super().__post_init__()
         if not 0.0 <= self.gamma < 1.0:
             raise BidexError(f"{self.algo}: gamma must lie in [0, 1), got {self.gamma}.")
@@ -88,15 +86,8 @@ PAPER: dict[str, Any] = {"value_heads": False, "critic_layer_norm": False, "per_
 class Offline(Learner):
     """A learner from data. ``learn_from`` comes before the first iteration and before a checkpoint is loaded.
 
-    Attributes:
-        env_steps: Updates so far.
-        generator: Of the draws of transitions alone, so that learners of one seed see the same ones.
-        noise: Of all other draws, on the device.
-        critic: ``num_critics`` networks of observation and action, None without any; ``target_critic`` follows them.
-        adams: Optimisers by name; an algorithm may add some.
-        batch_per_task: Transitions of each task in an update; B is ``num_tasks`` times as many, task after task.
-        task_of_draw: Their tasks, int64 (B,).
-        reward_scale: What rewards of each task are divided by (num_tasks,).
+    ``generator`` draws transitions alone, so that learners of one seed see the same ones, ``noise`` all else. A batch
+    has ``batch_per_task`` of each task, task after task (``task_of_draw``).
     """
 
     offline = True
@@ -120,11 +111,7 @@ class Offline(Learner):
         self._batches: Batches | None = None
 
     def learn_from(self, data: Joined) -> None:
-        """Takes the transitions to learn from, and what they say of observations and returns.
-
-        Args:
-            data: In the form of the learner's world.
-        """
+        """Takes the transitions to learn from, in the world's form, and what they say of observations and returns."""
         tasks = self.world.num_tasks
         self._batches = Batches(data, tasks, self.batch_per_task, self.device)
         for chunk in self._batches.chunks():
@@ -133,8 +120,6 @@ class Offline(Learner):
             every = torch.arange(tasks, device=self.device)
             self.reward_scale = return_deviation(data, tasks, discounts(self.world, self.config.gamma, every))
             self.reward_scale = self.reward_scale.to(self.device)
-
-    # What a learner adds.
 
     @abstractmethod
     def _update(self, draw: Transitions) -> dict[str, Tensor]:
@@ -152,8 +137,6 @@ class Offline(Learner):
     def _own_parts(self) -> Parts:
         """Networks of its own, beside those of the base, by their names in a checkpoint."""
         return {}
-
-    # Learning.
 
     def _iterate(self) -> dict[str, float]:
         """Some updates; the means of what they measured."""
@@ -203,8 +186,6 @@ class Offline(Learner):
 
     def _normal(self, like: Tensor) -> Tensor:
         return torch.randn(like.shape, generator=self.noise, device=self.device)
-
-    # Checkpoints.
 
     def _parts(self) -> Parts:
         critics = {} if self.critic is None else {"critic": self.critic, "target_critic": self.target_critic}

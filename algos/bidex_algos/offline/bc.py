@@ -5,10 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bidex_algos.nets.architecture import network_of
-from bidex_algos.nets.networks import autocast, use_bfloat16
-from bidex_algos.nets.normalise import observation_normaliser
-from bidex_algos.nets.policy import DeterministicActor, DeterministicPolicy
+from bidex_algos.nets.networks import autocast
+from bidex_algos.nets.policy import DeterministicPolicy, deterministic_policy
 from bidex_algos.nets.shape import Shape
 from bidex_algos.offline.base import Offline, OfflineConfig
 from bidex_algos.replay import Transitions
@@ -52,8 +50,4 @@ class BC(Offline):
     def _make_policy(
         cls, config: BCConfig, shape: Shape, init: torch.Generator, device: torch.device
     ) -> DeterministicPolicy:
-        inputs, heads = cls._inputs(config, shape), shape.num_id_columns if config.policy_heads else 1
-        network = network_of(config)
-        actor = DeterministicActor(inputs, config.hidden, shape.actions, heads, init, config.activation, network)
-        observations = observation_normaliser(config, inputs, shape.num_id_columns)
-        return DeterministicPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
+        return deterministic_policy(config, cls._inputs(config, shape), shape, init, device)

@@ -70,11 +70,7 @@ PRESETS: dict[str, BCQConfig] = {
 
 
 class ActionModel(nn.Module):
-    """A conditional variational autoencoder: which actions the data hold in a state.
-
-    Attributes:
-        codes: Entries of a code, z.
-    """
+    """A conditional variational autoencoder: which actions the data hold in a state; a code has ``codes`` entries."""
 
     def __init__(self, inputs: Inputs, config: BCQConfig, actions: int, generator: torch.Generator):
         super().__init__()
@@ -99,15 +95,10 @@ def bounded(codes: Tensor) -> Tensor:
 
 
 class BCQPolicy(nn.Module):
-    """The best, by the first critic, of some proposals on raw observations.
+    """The best, by the first critic, of what ``model`` proposes and ``actor`` changes, on raw observations.
 
     The codes of the proposals are the same in every state, drawn when the policy is created: the policy is a function
     of the observation.
-
-    Attributes:
-        model: Proposes.
-        actor: Changes: a network of observation and action.
-        critic: Two networks; chooses by its first.
     """
 
     def __init__(
@@ -118,14 +109,9 @@ class BCQPolicy(nn.Module):
         self.observations = observation_normaliser(config, inputs, shape.num_id_columns)
         judged, heads = inputs.extended("action", shape.actions), shape.num_id_columns
         self.actor = DeterministicActor(
-            judged,
-            config.hidden,
-            shape.actions,
-            heads if config.policy_heads else 1,
-            generator,
-            config.activation,
-            network_of(config),
-        )
+            judged, config.hidden, shape.actions, heads if config.policy_heads else 1, generator, config.activation,
+            network_of(config)
+        )  # fmt: skip
         # A policy knows its task by the one-hot alone: without it, one value serves all.
         self.critic = Critics(judged, heads if config.value_heads and heads else 1, config, generator)  # pyright: ignore[reportArgumentType]
         self.model = ActionModel(inputs, config, shape.actions, generator)
@@ -160,11 +146,7 @@ class BCQPolicy(nn.Module):
 
 
 class BCQ(Offline):
-    """Batch-constrained deep Q-learning on data sets (Fujimoto et al. 2019, arXiv 1812.02900).
-
-    Attributes:
-        target_actor: Follows the network that changes proposals.
-    """
+    """Batch-constrained deep Q-learning on data sets (Fujimoto et al. 2019, arXiv 1812.02900)."""
 
     name, remedy = "bcq", "lower critic_learning_rate"
     config_type, presets = BCQConfig, PRESETS

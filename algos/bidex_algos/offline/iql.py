@@ -13,10 +13,8 @@ import torch
 from msgspec import Meta
 from torch import Tensor
 
-from bidex_algos.nets.architecture import network_of
-from bidex_algos.nets.networks import GaussianActor, autocast, gaussian_log_prob, use_bfloat16
-from bidex_algos.nets.normalise import observation_normaliser
-from bidex_algos.nets.policy import GaussianPolicy
+from bidex_algos.nets.networks import GaussianActor, autocast, gaussian_log_prob
+from bidex_algos.nets.policy import GaussianPolicy, gaussian_policy
 from bidex_algos.nets.shape import Shape
 from bidex_algos.offline.base import PAPER, CriticConfig, Offline
 from bidex_algos.offpolicy.critics import follow
@@ -42,7 +40,6 @@ class IQLConfig(CriticConfig):
     """Its bounds, exp(-5) and exp(2)."""
 
     def __post_init__(self) -> None:
-        """Checks what annotations cannot say."""
         super().__post_init__()
         check_rising(self, self.algo, "std_range")
 
@@ -60,11 +57,7 @@ class BoundedMean(GaussianActor):
 
 
 class IQL(Offline):
-    """Implicit Q-learning on data sets (Kostrikov et al. 2022, arXiv 2110.06169).
-
-    Attributes:
-        value: Network of the state's value.
-    """
+    """Implicit Q-learning on data sets (Kostrikov et al. 2022, arXiv 2110.06169)."""
 
     name, remedy = "iql", "lower beta"
     config_type, presets = IQLConfig, PRESETS
@@ -111,13 +104,7 @@ class IQL(Offline):
     def _make_policy(
         cls, config: IQLConfig, shape: Shape, init: torch.Generator, device: torch.device
     ) -> GaussianPolicy:
-        inputs, heads = cls._inputs(config, shape), shape.num_id_columns if config.policy_heads else 1
-        network = network_of(config)
-        actor = BoundedMean(
-            inputs, config.hidden, shape.actions, config.init_std, init, config.activation, heads, network
-        )
-        observations = observation_normaliser(config, inputs, shape.num_id_columns)
-        return GaussianPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
+        return gaussian_policy(config, cls._inputs(config, shape), shape, init, device, BoundedMean)
 
     def _own_parts(self) -> Parts:
         return {"value": self.value}

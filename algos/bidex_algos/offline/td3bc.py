@@ -42,11 +42,7 @@ PRESETS: dict[str, TD3BCConfig] = {"paper": TD3BCConfig(alpha=0.2, **PAPER), "la
 
 
 class TD3BC(BC):
-    """TD3+BC on data sets (Fujimoto and Gu 2021, arXiv 2106.06860).
-
-    Attributes:
-        target_actor: Follows the actor.
-    """
+    """TD3+BC on data sets (Fujimoto and Gu 2021, arXiv 2106.06860)."""
 
     name, remedy = "td3bc", "lower critic_learning_rate"
     config_type, presets = TD3BCConfig, PRESETS

@@ -36,10 +36,7 @@ from bidex_meta.world.contract import VectorWorld
 
 @dataclass(frozen=True)
 class OffPolicyConfig(NetworkConfig):
-    """Networks, replay, updates, statistics; the defaults are the preset ``laptop``.
-
-    A vector step is one step in every environment of the world.
-    """
+    """Networks, replay, updates, statistics; a vector step is one step in every environment of the world."""
 
     value_heads: bool = True
     """Give each critic one output per task instead of one for all."""
@@ -94,20 +91,9 @@ class OffPolicyConfig(NetworkConfig):
 class OffPolicy(Learner):
     """An actor and critics that learn from a replay; the critics from the value of the next state by their targets.
 
-    Arguments, attributes and errors are those of :class:`~bidex_algos.learner.Learner`. Several processes have a replay
-    each, and an update is of as many times more transitions.
-
-    Attributes:
-        policy: Has ``observations`` (normaliser) and ``actor`` (network), beside the methods of an agent.
-        critic: ``num_critics`` networks (:class:`Critics`); ``target_critic`` follows them.
-        returns: How large those of each task are.
-        adams: Optimisers by name; an algorithm may add some.
-        batch_per_task: Transitions of each task in an update; B is ``num_tasks`` times as many, task after task:
-            ``task_of_draw``, int64 (B,).
-        gamma_of_rows: Discount of all environments, or of each (N,); ``gamma_of_draw``: of a draw (B,).
-
-    Raises:
-        BidexError: A task without rows, or no room for a replay.
+    Several processes have a replay each, and an update is of as many times more transitions: of each process B,
+    ``batch_per_task`` of each task, task after task (``task_of_draw``). ``gamma_of_rows`` and ``gamma_of_draw`` are
+    discounts of environments and of a draw. Raises BidexError where a task has no environments, or a replay no room.
     """
 
     config: OffPolicyConfig
@@ -127,14 +113,9 @@ class OffPolicy(Learner):
             "critic": self._adam(self.critic.parameters(), config.critic_learning_rate),
         }
         self.replay = replay_within(
-            self.name,
-            world,
-            self.shape.observations,
-            self.shape.actions,
-            config.replay_steps,
-            config.replay_memory,
-            config.cut_share,
-        )
+            self.name, world, self.shape.observations, self.shape.actions, config.replay_steps, config.replay_memory,
+            config.cut_share
+        )  # fmt: skip
         self.batch_per_task = config.batch_per_task or math.ceil(config.batch_size / world.num_tasks)
         self.task_of_draw = torch.arange(world.num_tasks, device=self.device).repeat_interleave(self.batch_per_task)
         self.gamma_of_rows = discounts(world, config.gamma, world.task_id)
@@ -153,24 +134,13 @@ class OffPolicy(Learner):
         kind = torch.optim.AdamW if decay else torch.optim.Adam
         return kind(parameters, lr=rate, eps=self.config.adam_eps, weight_decay=decay, fused=True)
 
-    # What a learner adds.
-
     @abstractmethod
     def _explore(self, obs: Tensor) -> Tensor:
         """Actions (N, a) in [-1, 1] to try, for raw observations (N, d)."""
 
     @abstractmethod
     def _update(self, draw: Transitions, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
-        """One update of all networks.
-
-        Args:
-            draw: Transitions, task after task (B).
-            weights: 0 for those that teach nothing (B,).
-            counts: Sum of the weights of each task over all processes (num_tasks,).
-
-        Returns:
-            Scalars to be logged, the same ones each time; an iteration tells their means.
-        """
+        """One update by a draw (B), whose weights (B,) are 0 for what teaches nothing; ``counts``: of all processes."""
 
     def _own_parts(self) -> Parts:
         """Networks and parameters of its own, beside those of the base, by their names in a checkpoint."""
@@ -179,8 +149,6 @@ class OffPolicy(Learner):
     def _told(self) -> dict[str, Tensor]:
         """Scalars to be logged at the end of every iteration, before the first update too."""
         return {}
-
-    # Experience.
 
     def _iterate(self) -> dict[str, float]:
         """Some vector steps, each followed by its updates."""
@@ -222,8 +190,6 @@ class OffPolicy(Learner):
         scale = self.returns.deviation()
         return scale if self.config.per_task_rewards else torch.ones_like(scale)
 
-    # Learning.
-
     def _learn(self) -> list[dict[str, Tensor]]:
         """The updates that follow one vector step; what each measured."""
         updates, tasks = self.config.updates_per_step, self.world.num_tasks
@@ -244,10 +210,7 @@ class OffPolicy(Learner):
         return values.amin(0)
 
     def _bootstrapped(self, draw: Transitions, following: Tensor) -> Tensor:
-        """Targets (B,): scaled reward + gamma^steps * ``following`` (B,), the value of the state after the transition.
-
-        Nothing follows a true end. After a time limit the episode could have gone on: the replay has its last state.
-        """
+        """Targets (B,): scaled reward + gamma^steps * ``following`` (B,), the next value, 0 after a true end."""
         rewards = draw.rewards / self._reward_scale()[self.task_of_draw]
         return rewards + self.gamma_of_draw**draw.steps * following.masked_fill(draw.terminated, 0.0)
 
@@ -269,14 +232,7 @@ class OffPolicy(Learner):
         return (values - target).square(), values[0].detach()
 
     def _descend(self, loss: Tensor, numbers: Tensor, clipped: str, **parameters: list[nn.Parameter]) -> Tensor:
-        """One step of the optimisers named, down the sum of ``loss`` over all processes; no other weight gets a slope.
-
-        Args:
-            loss: A scalar.
-            numbers: What shall be summed over the processes besides (n,); the sums are returned.
-            clipped: The optimiser whose gradient is shortened to ``max_grad_norm``.
-            parameters: What each optimiser moves.
-        """
+        """One step of the optimisers named, down ``loss`` summed over processes; sums ``numbers`` (n,) too."""
         weights = [weight for each in parameters.values() for weight in each]
         for name in parameters:
             self.adams[name].zero_grad()
@@ -290,8 +246,6 @@ class OffPolicy(Learner):
     def _per_task(self, x: Tensor) -> Tensor:
         """Sums (num_tasks,) of what a draw holds (B,)."""
         return x.view(self.world.num_tasks, -1).sum(1)
-
-    # Checkpoints.
 
     def _parts(self) -> Parts:
         return {

@@ -55,15 +55,9 @@ class ResidualMLP(MLP):
     """
 
     def __init__(
-        self,
-        inputs: int | Inputs,
-        hidden: Sequence[int],
-        outputs: int,
-        output_gain: float,
-        generator: torch.Generator,
-        activation: Activation = "elu",
-        layer_norm: bool = True,
-    ):
+        self, inputs: int | Inputs, hidden: Sequence[int], outputs: int, output_gain: float, generator: torch.Generator,
+        activation: Activation = "elu", layer_norm: bool = True
+    ):  # fmt: skip
         super().__init__(inputs, hidden[:1], outputs, output_gain, generator, activation, layer_norm=True)
         self.body.extend(ResidualBlock(width, generator, activation) for width in hidden[1:])
 
@@ -96,7 +90,6 @@ class BRCConfig(CategoricalConfig, MTSACConfig):
     """One temperature for all tasks, led by their mean entropy."""
 
     def __post_init__(self) -> None:
-        """Checks what annotations cannot say."""
         super().__post_init__()
         if not self.shares_a_trunk:
             raise BidexError(f"{self.algo}: its networks are residual; architecture must be shared or multi_head.")

@@ -82,14 +82,9 @@ class CategoricalCritics(nn.Module):
     """Networks of observation and action that give distributions; arguments as those of ``Critics``."""
 
     def __init__(
-        self,
-        inputs: int | Inputs,
-        heads: int,
-        config: CategoricalConfig,
-        generator: torch.Generator,
-        count: int,
-        network: MakeNetwork,
-    ):
+        self, inputs: int | Inputs, heads: int, config: CategoricalConfig, generator: torch.Generator, count: int,
+        network: MakeNetwork
+    ):  # fmt: skip
         super().__init__()
         self.heads = heads
         self.atoms = Atoms(-config.value_bound, config.value_bound, config.atoms)

@@ -24,10 +24,8 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from bidex_algos.nets.architecture import network_of
-from bidex_algos.nets.networks import autocast, use_bfloat16
-from bidex_algos.nets.normalise import ObservationNormaliser
-from bidex_algos.nets.policy import DeterministicActor, DeterministicPolicy
+from bidex_algos.nets.networks import autocast
+from bidex_algos.nets.policy import DeterministicPolicy, deterministic_policy
 from bidex_algos.nets.shape import Shape
 from bidex_algos.offpolicy.base import OffPolicy, OffPolicyConfig
 from bidex_algos.offpolicy.critics import follow
@@ -47,7 +45,6 @@ class DDPGConfig(OffPolicyConfig):
     """Price, in the actor's loss, on the mean square of what tanh makes the actions of; 0: none."""
 
     def __post_init__(self) -> None:
-        """Checks what annotations cannot say."""
         super().__post_init__()
         check_rising(self, self.algo, "exploration_std")
 
@@ -72,12 +69,7 @@ PRESETS: dict[str, DDPGConfig] = {"paper": DDPGConfig(**of_paper()), "laptop": D
 
 
 class DDPG(OffPolicy):
-    """Multi-task DDPG (Lillicrap et al. 2016, arXiv 1509.02971) on a batched world.
-
-    Attributes:
-        target_actor: Follows the actor; only with ``delayed_targets``.
-        noise_std: Of each environment (N, 1).
-    """
+    """Multi-task DDPG (Lillicrap et al. 2016, arXiv 1509.02971) on a batched world."""
 
     name, remedy = "ddpg", "lower critic_learning_rate"
     config_type, presets = DDPGConfig, PRESETS
@@ -151,11 +143,7 @@ class DDPG(OffPolicy):
     def _make_policy(
         cls, config: DDPGConfig, shape: Shape, init: torch.Generator, device: torch.device
     ) -> DeterministicPolicy:
-        inputs, heads = cls._inputs(config, shape), shape.num_id_columns if config.policy_heads else 1
-        network = network_of(config)
-        actor = DeterministicActor(inputs, config.hidden, shape.actions, heads, init, config.activation, network)
-        observations = ObservationNormaliser(inputs, config.normalise_observations)
-        return DeterministicPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
+        return deterministic_policy(config, cls._inputs(config, shape), shape, init, device)
 
     def _own_parts(self) -> Parts:
         follows = {"target_actor": self.target_actor} if self.delayed_targets else {}

@@ -52,7 +52,6 @@ class MTSACConfig(OffPolicyConfig):
     """Entropy of the squashed policy that each temperature aims at, for each action; uniform actions have 0.69."""
 
     def __post_init__(self) -> None:
-        """Checks what annotations cannot say."""
         super().__post_init__()
         low, high = self.std_range
         if not 0.0 < low < self.init_std < high:
@@ -104,12 +103,7 @@ TASK_PRESETS: dict[str, dict[str, MTSACConfig]] = {
 
 
 class MTSAC(OffPolicy):
-    """Multi-task SAC (Haarnoja et al. 2018, arXiv 1812.05905) on a batched world.
-
-    Attributes:
-        policy: The agent that evaluation uses: squashed mean.
-        log_alpha: Logarithms of the temperatures (num_tasks,).
-    """
+    """Multi-task SAC (Haarnoja et al. 2018, arXiv 1812.05905) on a batched world."""
 
     name, remedy = "mtsac", "lower critic_learning_rate"
     config_type, presets = MTSACConfig, PRESETS

@@ -17,10 +17,7 @@ class ReturnScale:
     """Running statistics of the discounted sum of rewards since an episode began.
 
     Returns of a task fade after ``horizon`` newer ones; ``gamma`` is a discount for all, or of each environment (N,).
-
-    Attributes:
-        stats: Mean and variance of each task (num_tasks,).
-        discounted: The sum in each environment so far (N,).
+    ``stats``: mean and variance of each task (num_tasks,); ``discounted``: the sum in each environment so far (N,).
     """
 
     def __init__(self, world: VectorWorld, gamma: float | Tensor, horizon: float):
@@ -50,15 +47,11 @@ class ReturnScale:
 class ReturnBound(ReturnScale):
     """Beside the statistics the largest return of each task, without its sign: what a fixed range of values must hold.
 
-    The sum is discounted towards the episode's beginning and not, as a return is, towards its end: that one is known
-    only when the episode is over. Both weigh any stretch of rewards alike. At a time limit the episode is taken to go
-    on as it went, or as it went most recently if that is more, since that is what a critic is taught there: states that
-    pay are worth their reward for ever, though the episode reached them late.
-
-    Attributes:
-        bound: Of each task (num_tasks,); it never falls.
-        mass: The sum in each environment, had all rewards been 1 (N,).
-        recent: Sum and mass with a discount of :data:`RECENT` at most (2, N).
+    The sum is discounted towards the episode's beginning and not, as a return is, towards its end, which is known only
+    when the episode is over; both weigh any stretch of rewards alike. At a time limit the episode is taken to go on as
+    it went, or as it went most recently if that is more: a critic is taught that, though the episode reached such
+    states late. ``mass`` is the sum (N,), had all rewards been 1, ``recent`` both with a discount of at most
+    :data:`RECENT` (2, N).
     """
 
     def __init__(self, world: VectorWorld, gamma: float | Tensor, horizon: float):

@@ -43,11 +43,7 @@ PRESETS: dict[str, TD3Config] = {
 
 
 class TD3(DDPG):
-    """Multi-task TD3 (Fujimoto et al. 2018, arXiv 1802.09477) on a batched world.
-
-    Attributes:
-        updates: Of the critics so far.
-    """
+    """Multi-task TD3 (Fujimoto et al. 2018, arXiv 1802.09477) on a batched world."""
 
     name = "td3"
     config_type, presets = TD3Config, PRESETS

@@ -1,8 +1,4 @@
-"""What the on-policy learners share: rollouts, a critic per task, statistics, checkpoints. They differ in the update.
-
-An iteration collects ``rollout_steps`` steps in every environment, makes them a :class:`Batch`, and hands it to the
-learner.
-"""
+"""What the on-policy learners share: rollouts, made a :class:`Batch`, a critic per task, statistics, checkpoints."""
 
 from abc import abstractmethod
 from collections.abc import Iterator
@@ -21,47 +17,28 @@ from bidex_algos.advantages import (
     task_moments,
 )
 from bidex_algos.learner import Learner, as_numbers
-from bidex_algos.nets.architecture import ArchitectureConfig, network_bytes, network_of
-from bidex_algos.nets.networks import (
-    Activation,
-    Autocast,
-    GaussianActor,
-    Layers,
-    autocast,
-    gaussian_log_prob,
-    use_bfloat16,
-)
-from bidex_algos.nets.normalise import ObservationNormaliser, RunningStats
-from bidex_algos.nets.policy import GaussianPolicy
+from bidex_algos.nets.architecture import NetworkConfig, network_bytes, network_of
+from bidex_algos.nets.networks import Activation, Autocast, Layers, autocast, gaussian_log_prob
+from bidex_algos.nets.normalise import RunningStats
+from bidex_algos.nets.policy import GaussianPolicy, gaussian_policy
 from bidex_algos.nets.shape import Shape
 from bidex_algos.onpolicy.ppo import mini_batches
 from bidex_algos.rollout import EpisodeStatistics, Rollout, collect
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import all_sum, world_size
 from bidex_meta.train.learner import Parts, State
-from bidex_meta.utils.validation import Count, Fraction, Positive, Whole, Widths, check_rising
+from bidex_meta.utils.validation import Count, Fraction, Positive, check_rising
 from bidex_meta.world.contract import VectorWorld
 
 
 @dataclass(frozen=True)
-class OnPolicyConfig(ArchitectureConfig):
+class OnPolicyConfig(NetworkConfig):
     """Networks, rollouts, statistics; the defaults are the preset ``laptop``."""
 
     hidden: Layers = (256, 256, 128)
-    """Widths of the hidden layers, of actor and critic alike."""
     activation: Activation = "elu"
-    """Non-linearity of the hidden layers."""
     value_heads: bool = True
     """Give the critic one output per task instead of one for all."""
-    policy_heads: bool = False
-    """Give the actor an output layer and standard deviations per task instead of one for all; for MT suites, whose
-    observations show the task."""
-    task_embedding: Whole = 0
-    """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
-    point_widths: Widths = (32, 64)
-    """Widths of the layers that all points of a point cloud share (PointNet), where the world shows one."""
-    points_read: Whole = 0
-    """Points of a cloud that they read, evenly out of all; 0: all."""
     init_std: Positive = 0.8
     """Standard deviation of the actions at the start."""
     std_range: tuple[Positive, Positive] = (0.05, 1.5)
@@ -84,7 +61,6 @@ class OnPolicyConfig(ArchitectureConfig):
     """Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX or AVX-512's BF16."""
 
     def __post_init__(self) -> None:
-        """Checks what annotations cannot say."""
         super().__post_init__()
         check_rising(self, self.algo, "std_range")
 
@@ -129,14 +105,7 @@ def check_samples(name: str, config: Any, num_envs: int) -> None:
 
 
 class OnPolicy(Learner):
-    """A Gaussian policy and a critic that learn from what the policy has just done.
-
-    Attributes:
-        policy: The agent that evaluation uses: mean action, clamped.
-        critic: Values of normalised observations, in units of the task's returns.
-        gamma: Discount of all environments, or of each (N,).
-        num_critics: How many values a state has: more than one where each of several agents has a critic of its own.
-    """
+    """A Gaussian policy, and a critic (``num_critics`` values of a state), that learn from what it has just done."""
 
     config: OnPolicyConfig
     policy: GaussianPolicy
@@ -155,8 +124,6 @@ class OnPolicy(Learner):
         sizes = self.shape.observations, self.shape.actions
         self.rollout = Rollout(config.rollout_steps, world.num_envs, *sizes, self.device, self.num_critics)
         self.episodes = EpisodeStatistics(world.task_id, world.task_names)
-
-    # What a learner adds.
 
     def _make_critic(self, heads: int) -> nn.Module:
         """The critic, with one output per task or one for all."""
@@ -182,8 +149,6 @@ class OnPolicy(Learner):
         self.policy.observations.update(self.rollout.obs)
         self.env_steps += self.rollout.rewards.numel() * world_size()
         return self._metrics(losses, explained)
-
-    # The rollout.
 
     def _sample(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         mean, log_std = self.policy.distribution(obs)
@@ -254,15 +219,12 @@ class OnPolicy(Learner):
 
         actions, old_means = r.actions.flatten(0, 1), r.means.flatten(0, 1)
         batch = Batch(
-            obs=obs,
-            task_id=flat_task_id,
-            actions=actions,
-            old_means=old_means,
+            obs=obs, task_id=flat_task_id, actions=actions, old_means=old_means,
             old_log_probs=gaussian_log_prob(actions, old_means, self.policy.actor.log_std_of(obs)),
             advantages=advantages.reshape(judged.shape),
             targets=self._in_critic_units(returns.reshape(judged.shape), flat_task_id),
-            weights=r.valid.flatten().float(),
-        )
+            weights=r.valid.flatten().float()
+        )  # fmt: skip
         return batch, explained
 
     def _metrics(self, losses: dict[str, Tensor], explained: Tensor) -> dict[str, float]:
@@ -273,17 +235,11 @@ class OnPolicy(Learner):
             tensors[f"Value/explained_variance/{name}"] = value
         return self.episodes.metrics() | as_numbers(tensors)
 
-    # Checkpoints.
-
     @classmethod
     def _make_policy(
         cls, config: OnPolicyConfig, shape: Shape, init: torch.Generator, device: torch.device
     ) -> GaussianPolicy:
-        inputs, heads = cls._inputs(config, shape), shape.num_id_columns if config.policy_heads else 1
-        sizes, network = (config.hidden, shape.actions, config.init_std), network_of(config)
-        actor = GaussianActor(inputs, *sizes, init, config.activation, heads, network)
-        observations = ObservationNormaliser(inputs, config.normalise_observations)
-        return GaussianPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
+        return gaussian_policy(config, cls._inputs(config, shape), shape, init, device)
 
     def _parts(self) -> Parts:
         return {

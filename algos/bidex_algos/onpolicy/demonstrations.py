@@ -1,8 +1,7 @@
 """Demonstrations beside reinforcement: a term of behaviour cloning in the policy's loss, which fades.
 
-As in DAPG (Rajeswaran et al. 2018, arXiv 1709.10087, equation 6, and its cloning before that), with normalised
-advantages in the place of their weight by the largest one, and with standard deviations that demonstrations do not
-touch.
+As in DAPG (Rajeswaran et al. 2018, arXiv 1709.10087, equation 6), with normalised advantages in the place of their
+weight by the largest one, and with standard deviations that demonstrations do not touch.
 """
 
 from typing import Any
@@ -24,12 +23,7 @@ _CLONING_RATE = 1e-3
 
 
 class Demonstrations:
-    """Transitions to be imitated, and how much they count; some tasks may have none.
-
-    Attributes:
-        generator: Of the draws alone, another one in each process.
-        fingerprint: Numbers that other data would not share.
-    """
+    """Transitions to be imitated, and how much they count; some tasks may have none."""
 
     def __init__(self, data: Joined, config: Any, seed: int, device: torch.device):
         self._config = config
@@ -56,10 +50,7 @@ class Demonstrations:
         return self._obs[chosen], self._actions[chosen]
 
     def loss(self, policy: GaussianPolicy) -> Tensor:
-        """Mean of (a - mean)^2 / (2 std^2), summed over actions: minus their log-density but for its constant.
-
-        The standard deviations get no slope: how much is explored is for the rewards to say.
-        """
+        """Mean of (a - mean)^2 / (2 std^2), summed over actions; deviations, which rewards alone move, get no slope."""
         raw, actions = self.draw()
         obs = policy.observations(raw)
         with autocast(raw.device, policy.low_precision):
@@ -79,11 +70,7 @@ class Demonstrations:
             adam.step()
 
     def check(self, name: str, stored: State | None) -> None:
-        """Refuses a checkpoint of other demonstrations.
-
-        Raises:
-            BidexError: They are not those of ``stored``, a fingerprint.
-        """
+        """Refuses, by a BidexError, a checkpoint of other demonstrations, whose fingerprint is ``stored``."""
         if stored is not None and stored != self.fingerprint:
             raise BidexError(
                 f"{name}: the checkpoint's demonstrations are others ({stored['transitions']:,.0f} transitions, here "

@@ -96,14 +96,7 @@ TASK_PRESETS: dict[str, dict[str, MTPPOConfig]] = {
 
 
 class MTPPO(OnPolicy):
-    """Multi-task PPO (Schulman et al. 2017, arXiv 1707.06347) on a batched world.
-
-    Arguments and attributes are those of :class:`~bidex_algos.onpolicy.base.OnPolicy`. Several processes make a
-    mini-batch as many times larger.
-
-    Raises:
-        BidexError: Fewer samples in a rollout than mini-batches.
-    """
+    """Multi-task PPO (Schulman et al. 2017, arXiv 1707.06347) on a batched world."""
 
     name, remedy = "mtppo", "lower learning_rate"
     config_type, presets = MTPPOConfig, PRESETS
@@ -118,11 +111,7 @@ class MTPPO(OnPolicy):
         self.balance = balance_of(config, world.num_tasks, self.device)
 
     def learn_from_demonstrations(self, data: Joined) -> None:
-        """Takes what its policy shall also imitate; before the first iteration and before a checkpoint is loaded.
-
-        Args:
-            data: In the form of the learner's world; some of its tasks may have none.
-        """
+        """Takes what the policy shall imitate too; before the first iteration and before a checkpoint is loaded."""
         self.demonstrations = Demonstrations(data, self.config, self.seed, self.device)
         self.per_process = (*OnPolicy.per_process, "demonstrated")
 
@@ -195,16 +184,9 @@ class MTPPO(OnPolicy):
         with autocast(self.device, self.low_precision):
             means = actor(b.obs)
         return policy_loss(
-            b.actions,
-            means,
-            actor.log_std_of(b.obs),
-            b.old_means,
-            actor.log_std_of(b.obs, old_log_std),
-            b.old_log_probs,
-            b.advantages,
-            weights=b.weights / count,
-            clip=self.config.clip,
-        )
+            b.actions, means, actor.log_std_of(b.obs), b.old_means, actor.log_std_of(b.obs, old_log_std),
+            b.old_log_probs, b.advantages, weights=b.weights / count, clip=self.config.clip
+        )  # fmt: skip
 
     def _least(self, b: Batch, count: Tensor) -> Tensor:
         """The least that each sample's surrogate loss can become (B,): no ratio earns more than the clip allows."""
@@ -214,8 +196,6 @@ class MTPPO(OnPolicy):
         """How far each task's surrogate loss is above that, (num_tasks,)."""
         loss = self._loss(b, count, old_log_std)
         return self._per_task(-loss.earned - self._least(b, count), b.task_id)
-
-    # Checkpoints.
 
     def _parts(self) -> Parts:
         more = {} if self.demonstrations is None else {"demonstrated": self.demonstrations.generator}

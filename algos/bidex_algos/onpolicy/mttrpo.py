@@ -10,7 +10,9 @@ One policy reads the task's one-hot in its observation. An update, in the order 
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -68,12 +70,43 @@ PRESETS: dict[str, MTTRPOConfig] = {
 }  # fmt: skip
 
 
-class MTTRPO(OnPolicy):
-    """Multi-task TRPO (Schulman et al. 2015, arXiv 1502.05477) on a batched world.
+def gaussian_step(
+    parameters: list[nn.Parameter], distribution: Callable[[], tuple[Tensor, Tensor]], keep_bounds: Callable[[], None],
+    b: Any, gain: Tensor, old_log_std: Tensor, own_kl: Tensor, config: Any, max_kl: float
+) -> dict[str, Tensor]:  # fmt: skip
+    """A trust-region step of a Gaussian on samples ``b``, up the ratio times ``gain`` (B,); scalars to be logged."""
+    weight = b.weights / all_sum(b.weights.sum()).clamp_min(1.0)
 
-    Attributes:
-        critic_adam: Moves the critic; the actor has no optimiser.
-    """
+    def surrogate_and_kl() -> tuple[Tensor, Tensor]:
+        """This process's part of the surrogate objective and of the KL from the sampling policy, scalars."""
+        mean, log_std = distribution()
+        ratio = torch.exp(gaussian_log_prob(b.actions, mean, log_std) - b.old_log_probs)
+        return (weight * ratio * gain).sum(), (weight * gaussian_kl(b.old_means, old_log_std, mean, log_std)).sum()
+
+    @torch.no_grad()
+    def measure() -> tuple[float, float]:
+        keep_bounds()  # part of the policy: what is measured is what will act
+        objective, kl = all_sum(torch.stack(surrogate_and_kl())).tolist()
+        return objective, kl
+
+    stepped = trust_region_step(parameters, surrogate_and_kl()[0], own_kl, measure, config, max_kl, config.accept_ratio)
+    return stepped.told("Policy/kl", weight.device)
+
+
+def kl_from_itself(
+    distribution: Callable[[Tensor], tuple[Tensor, Tensor]], weights: Tensor, rows: int, stride: int
+) -> Tensor:
+    """The part of the mean KL that the Fisher matrix is made of, of every ``stride``-th sample: 0, with a curvature."""
+    sample = torch.arange(len(weights), device=weights.device)
+    # The samples are steps by rows. A later step begins at a later row, else rows between would never be taken.
+    taken = (sample + sample // rows) % stride == 0
+    mean, log_std = distribution(taken)
+    kl, weight = gaussian_kl(mean.detach(), log_std.detach(), mean, log_std), weights[taken]
+    return (weight / all_sum(weight.sum()).clamp_min(1.0) * kl).sum()
+
+
+class MTTRPO(OnPolicy):
+    """Multi-task TRPO (Schulman et al. 2015, arXiv 1502.05477) on a batched world."""
 
     name, remedy = "mttrpo", "lower max_kl or critic_learning_rate"
     config_type, presets = MTTRPOConfig, PRESETS
@@ -88,50 +121,30 @@ class MTTRPO(OnPolicy):
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
         """TRPO's update: returns what it measured, among it the KL after the step."""
-        measured = self._policy_step(batch)
-        measured["Loss/value"] = self._critic_epochs(batch)
-        return measured
+        actor, cfg = self.policy.actor, self.config
 
-    def _policy_step(self, batch: Batch) -> dict[str, Tensor]:
-        cfg, actor = self.config, self.policy.actor
-        parameters = list(actor.parameters())
-        old_log_std = actor.log_std_of(batch.obs).detach().clone()
-        weight = batch.weights / all_sum(batch.weights.sum()).clamp_min(1.0)
-        objective, _ = self._surrogate_and_kl(batch, weight, old_log_std)
+        def distribution() -> tuple[Tensor, Tensor]:
+            with autocast(self.device, self.low_precision):
+                mean = actor(batch.obs)
+            return mean, actor.log_std_of(batch.obs)
 
-        @torch.no_grad()
-        def measure() -> tuple[float, float]:
-            # The bounds are part of the policy: what is measured is what will act.
+        def keep_bounds() -> None:
             actor.log_std.clamp_(*(math.log(std) for std in cfg.std_range))
-            numbers = torch.stack(self._surrogate_and_kl(batch, weight, old_log_std))
-            objective, kl = all_sum(numbers).tolist()
-            return objective, kl
 
-        stepped = trust_region_step(
-            parameters, objective, self._kl_from_itself(batch), measure, cfg, accept_ratio=cfg.accept_ratio
-        )
-        return stepped.told("Policy/kl", self.device)
-
-    def _surrogate_and_kl(self, batch: Batch, weight: Tensor, old_log_std: Tensor) -> tuple[Tensor, Tensor]:
-        """This process's part of the surrogate objective and of the KL from the sampling policy, scalars."""
-        actor = self.policy.actor
-        with autocast(self.device, self.low_precision):
-            mean = actor(batch.obs)
-        log_std = actor.log_std_of(batch.obs)
-        ratio = torch.exp(gaussian_log_prob(batch.actions, mean, log_std) - batch.old_log_probs)
-        kl = gaussian_kl(batch.old_means, old_log_std, mean, log_std)
-        return (weight * ratio * batch.advantages).sum(), (weight * kl).sum()
+        old_log_std = actor.log_std_of(batch.obs).detach().clone()
+        given = batch, batch.advantages, old_log_std
+        own = self._kl_from_itself(batch)
+        told = gaussian_step(list(actor.parameters()), distribution, keep_bounds, *given, own, cfg, cfg.max_kl)
+        return told | {"Loss/value": self._critic_epochs(batch)}
 
     def _kl_from_itself(self, batch: Batch) -> Tensor:
-        """The part of the mean KL that the Fisher matrix is made of: 0, but with a curvature."""
-        actor, rows = self.policy.actor, self.world.num_envs
-        sample = torch.arange(len(batch.obs), device=self.device)
-        # The samples are steps by rows. A later step begins at a later row, else rows between would never be taken.
-        taken = (sample + sample // rows) % self.config.fisher_stride == 0
-        obs, weight = batch.obs[taken].to(actor.log_std.dtype), batch.weights[taken]
-        mean, log_std = actor(obs), actor.log_std_of(obs)
-        kl = gaussian_kl(mean.detach(), log_std.detach(), mean, log_std)
-        return (weight / all_sum(weight.sum()).clamp_min(1.0) * kl).sum()
+        actor = self.policy.actor
+
+        def distribution(taken: Tensor) -> tuple[Tensor, Tensor]:
+            obs = batch.obs[taken].to(actor.log_std.dtype)
+            return actor(obs), actor.log_std_of(obs)
+
+        return kl_from_itself(distribution, batch.weights, self.world.num_envs, self.config.fisher_stride)
 
     def _critic_epochs(self, batch: Batch) -> Tensor:
         """Fits the critic to its targets; the mean loss over all mini-batches, a scalar."""

@@ -35,7 +35,6 @@ class PPOConfig(LearnerConfig):
     """A fixed step size for the critic; None makes it follow the actor's."""
 
     def __post_init__(self) -> None:
-        """Checks what annotations cannot say."""
         super().__post_init__()
         check_rising(self, self.algo, "learning_rate_range")
 
@@ -49,10 +48,8 @@ def mini_batches(
 ) -> Iterator[tuple[bool, Tensor, Tensor]]:
     """Passes over shuffled samples with ``weights`` (B,), in the order of PPO's epochs.
 
-    Divided by the count, which is of all processes, losses and gradients become means by being summed over them.
-
-    Yields:
-        Whether it is the very first, the samples int64 (b,), and the sum of their weights, at least 1.
+    Divided by the count, which is of all processes, losses and gradients become means by being summed over them. Yields
+    whether it is the very first, the samples int64 (b,), and the sum of their weights, at least 1.
     """
     for epoch in range(epochs):
         parts = split(torch.randperm(len(weights), generator=generator, device=weights.device), number)
@@ -80,28 +77,13 @@ NAMES: tuple[str, ...] = ("Loss/surrogate", "Loss/value", "Policy/kl", "Policy/c
 
 
 def policy_loss(
-    actions: Tensor,
-    means: Tensor,
-    log_std: Tensor,
-    old_means: Tensor,
-    old_log_std: Tensor,
-    old_log_probs: Tensor,
-    advantages: Tensor,
-    weights: Tensor,
-    clip: float,
-) -> PolicyLoss:
-    """The loss of samples of any shape (...), summed with the weights.
+    actions: Tensor, means: Tensor, log_std: Tensor, old_means: Tensor, old_log_std: Tensor, old_log_probs: Tensor,
+    advantages: Tensor, weights: Tensor, clip: float
+) -> PolicyLoss:  # fmt: skip
+    """The loss of samples of any shape (...), summed with ``weights`` (...), 0 for those that teach nothing.
 
-    Args:
-        actions: Sampled actions (..., a).
-        means: Of the present policy (..., a), with a gradient.
-        log_std: Logarithms of its standard deviations, (a,) or (..., a), with a gradient.
-        old_means: Of the sampling policy (..., a).
-        old_log_std: Of the sampling policy, (a,) or (..., a).
-        old_log_probs: Log-density of the actions under it (...).
-        advantages: Normalised (...).
-        weights: Of each sample (...); 0 for those that teach nothing.
-        clip: How far the ratio may leave 1 before it earns nothing more.
+    Actions and means are (..., a), logarithms of deviations (a,) or (..., a), log-densities and normalised advantages
+    (...); ``old`` is the sampling policy's. A ratio beyond ``clip`` of 1 earns nothing more.
     """
     ratio = torch.exp(gaussian_log_prob(actions, means, log_std) - old_log_probs)
     clipped = ratio.clamp(1.0 - clip, 1.0 + clip)

@@ -16,7 +16,7 @@ from bidex_meta.errors import BidexError, known_name, shortened
 from bidex_meta.hands.poses import PALM_UP_AWAY, HandPose
 from bidex_meta.hands.starts import make_room_for
 from bidex_meta.tasks.objects.mjcf import check_collisions, compiled, extents, outline, read_own, set_contacts
-from bidex_meta.tasks.scene import attach
+from bidex_meta.tasks.scene import Colour, Point, attach
 from bidex_meta.utils import paths
 from bidex_meta.utils.files import expanded
 from bidex_meta.utils.maths import conjugate, constant, multiply, rotate, wxyz, xyzw
@@ -32,49 +32,31 @@ _PALM_UP = HandPose((0.0, 0.0, 0.0), PALM_UP_AWAY)
 
 @dataclass(frozen=True)
 class HeldObject:
-    """An object that lies on a hand.
+    """An object that lies on a hand; mass in kg, lengths in metres, its own frame.
 
     Attributes:
-        name: Of the shelf, or the file's name without its ending.
-        file: Its MJCF file.
-        mass: kg.
-        low: Lower corner of the box around its colliding geoms, its own frame, metres.
-        high: Upper corner.
+        low: Lower corner of the box around its colliding geoms; ``high`` is the upper one.
         geoms: Number of its geoms that collide.
-        centres: Balls whose convex hull holds these geoms: their centres, its own frame, metres, shape (k, 3).
-        radii: Their radii, shape (k,).
+        centres: Balls whose convex hull holds these geoms: their centres, (k, 3), with ``radii``, (k,).
     """
 
     name: str
     file: Path
     mass: float
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
+    low: Point
+    high: Point
     geoms: int
     centres: np.ndarray = field(repr=False, compare=False)
     radii: np.ndarray = field(repr=False, compare=False)
 
     @property
-    def half_extents(self) -> tuple[float, float, float]:
+    def half_extents(self) -> Point:
         """Extent from its origin along its axes, metres."""
         x, y, z = (max(-low, high) for low, high in zip(self.low, self.high, strict=True))
         return x, y, z
 
-    def add_to(
-        self,
-        scene: mujoco.MjSpec,
-        name: str,
-        position: tuple[float, float, float],
-        colour: tuple[float, float, float, float] | None = None,
-    ) -> None:
-        """Puts it into a scene as a free body.
-
-        Args:
-            scene: The scene.
-            name: Prefix of its joint and sensors.
-            position: Nominal start, metres.
-            colour: Of its materials, or None to keep the file's.
-        """
+    def add_to(self, scene: mujoco.MjSpec, name: str, position: Point, colour: Colour | None = None) -> None:
+        """Puts it into a scene as a free body; arguments as of ``attach``."""
         part = read_own(self.file)
         body = part.worldbody.first_body()
         body.name = "object"
@@ -97,10 +79,8 @@ class HeldObject:
     def turn(self, place: Tensor, draws: Tensor, pose: HandPose | None = None) -> None:
         """Lays it on a broad side: its shortest extent along a palm's normal, turned about it at random.
 
-        Args:
-            place: Its positions (n, 7), quaternion (w, x, y, z), written in place.
-            draws: Numbers in [-1, 1], shape (n, 2): the turn, and which of the two sides lies below.
-            pose: Start pose of the hand; None: as on a level palm.
+        Its positions (n, 7), quaternion (w, x, y, z), are written in place. Draws in [-1, 1], (n, 2): the turn, and
+        which of the two sides lies below. Without a start pose of the hand as on a level palm.
         """
         palm = xyzw(constant((pose or _PALM_UP).quaternion, place))
         half, zero = 0.5 * math.pi * draws[:, 0], torch.zeros_like(draws[:, 0])
@@ -125,10 +105,7 @@ class HeldObject:
     def lay_on_hand(self, place: Tensor, joints: Tensor, pose: HandPose) -> None:
         """Lifts it off the palm it lies on, opens the fingers that would stick in it and lays the thumb flat.
 
-        Args:
-            place: Its positions (n, 7), quaternion (w, x, y, z), written in place.
-            joints: That hand's joint angles, rad, (n, 24), written in place.
-            pose: Start pose of that hand.
+        Its positions (n, 7) and the joint angles (n, 24) of the hand, which starts at ``pose``, are written in place.
         """
         quaternion = xyzw(constant(pose.quaternion, place))
         inverse = conjugate(quaternion)
@@ -159,13 +136,9 @@ def shelf() -> list[str]:
 
 
 def held_object(name: object) -> HeldObject | None:
-    """The object of that name; None for the egg.
+    """The object of a name of the shelf, in any case, or of an MJCF file, which ends in ``.xml``; None for ``"egg"``.
 
-    Args:
-        name: ``"egg"``, a name of the shelf in any case, or the path of an MJCF file, which ends in ``.xml``.
-
-    Raises:
-        BidexError: Unknown name, or a file that holds no object for a hand.
+    Raises BidexError for an unknown name, or a file that holds no object for a hand.
     """
     if not isinstance(name, str) or not name.isprintable():
         raise BidexError(f"object: expected a name or the path of an .xml file, got {shortened(name)}.")
@@ -206,11 +179,9 @@ def _loaded(file: Path, _state: tuple[int, int]) -> HeldObject:
 
 
 def _check_figures(file: Path, model: mujoco.MjModel, low: np.ndarray, high: np.ndarray) -> None:
-    mass, longest = float(model.body_mass[1]), float((high - low).max())
-    if not _MASS[0] <= mass <= _MASS[1]:
-        raise BidexError(
-            f"{file}: expected a mass of {_MASS[0]:g} to {_MASS[1]:g} kg, got {mass:.4g}. Mend mass or density."
-        )
+    mass, longest, (least, most) = float(model.body_mass[1]), float((high - low).max()), _MASS
+    if not least <= mass <= most:
+        raise BidexError(f"{file}: expected a mass of {least:g} to {most:g} kg, got {mass:.4g}. Mend mass or density.")
     if not _SHORTEST <= longest <= _LONGEST:
         raise BidexError(
             f"{file}: expected an object of {100 * _SHORTEST:g} to {100 * _LONGEST:g} cm on its longest side, which "

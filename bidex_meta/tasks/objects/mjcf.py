@@ -1,7 +1,7 @@
 """An object's MJCF file from a user, checked before MuJoCo reads it, and the outline of what it collides with.
 
 MuJoCo opens whatever file a model names, so tags are allowed by a list: no entities, no includes, no file from another
-folder. The outline is a set of balls whose convex hull holds the colliding geoms: enough to lay an object on a hand.
+folder.
 """
 
 import math
@@ -32,15 +32,10 @@ _FOLDERS = ("meshdir", "texturedir", "assetdir")
 
 
 def read_own(path: Path, points: bool = False) -> mujoco.MjSpec:
-    """The specification in an MJCF file, with absolute paths of the files that it names.
+    """The specification in an MJCF file, with absolute paths of the files that it names; ``points`` allows sensors.
 
-    Args:
-        path: The file.
-        points: Whether it may have sensors.
-
-    Raises:
-        BidexError: It cannot be read, is no MJCF, has a tag that no object needs, or names a file that is missing or
-            outside its folder.
+    Raises BidexError where it cannot be read, is no MJCF, has a tag that no object needs, or names a file that is
+    missing or outside its folder.
     """
     content = read_bytes(path, "an object's MJCF file", _MOST_BYTES)
     _check_tags(path, content, _TAGS | _SENSOR_TAGS if points else _TAGS)
@@ -60,11 +55,7 @@ def read_own(path: Path, points: bool = False) -> mujoco.MjSpec:
 
 
 def compiled(path: Path, spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """The model of a specification.
-
-    Raises:
-        BidexError: MuJoCo refuses it (a size below zero, a mesh that is none, ...), or its numbers are not finite.
-    """
+    """The model of a specification; BidexError where MuJoCo refuses it or its numbers are not finite."""
     try:
         model = spec.copy().compile()
     except ValueError as error:
@@ -163,40 +154,47 @@ _OVER = 128
 """Directions in which an ellipsoid's and a mesh's outermost points are taken."""
 
 
-def outline(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
-    """Centres (k, 3) and radii (k,) of balls whose convex hull holds a body's geoms; body frame, metres.
+_SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 
-    Of ellipsoids and meshes a hundredth of their size may stand out. Geoms that are only seen do not count; without
-    others both are empty.
+
+def _colliding(model: mujoco.MjModel, body: int) -> list[tuple[int, np.ndarray]]:
+    """A body's geoms that collide, each with its rotation (3, 3) in the body's frame."""
+    found = []
+    for geom in np.flatnonzero(model.geom_bodyid == body):
+        if model.geom_contype[geom] or model.geom_conaffinity[geom]:
+            turn = np.zeros(9)
+            mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
+            found.append((int(geom), turn.reshape(3, 3)))
+    return found
+
+
+def outline(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (k, 3) and radii (k,) of balls whose convex hull holds a body's colliding geoms; body frame, metres.
+
+    Of ellipsoids and meshes a hundredth of their size may stand out. Without such geoms both are empty.
     """
     centres, radii = [np.zeros((0, 3))], [np.zeros(0)]
-    for geom in np.flatnonzero(model.geom_bodyid == body):
-        if model.geom_contype[geom] == 0 and model.geom_conaffinity[geom] == 0:
-            continue
-        points, radius = _own_frame(model, int(geom))
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-        centres.append(points @ turn.reshape(3, 3).T + model.geom_pos[geom])
+    for geom, turn in _colliding(model, body):
+        points, radius = _own_frame(model, geom)
+        centres.append(points @ turn.T + model.geom_pos[geom])
         radii.append(np.full(len(points), radius))
     return np.concatenate(centres), np.concatenate(radii)
 
 
 def extents(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corner of the box around what collides of a body, body frame, metres, each (3,).
+    """Lower and upper corner of the box around a body's colliding geoms, body frame, metres, each (3,).
 
     The outline's box and that of the geoms' own boxes both hold it; a cylinder stands out of neither in one of them.
     """
     centres, radii = outline(model, body)
     low, high = (centres - radii[:, None]).min(axis=0), (centres + radii[:, None]).max(axis=0)
-    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    turn, corners = np.zeros(9), []
-    for geom in np.flatnonzero(model.geom_bodyid == body):
-        if model.geom_contype[geom] or model.geom_conaffinity[geom]:
-            mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-            box = model.geom_aabb[geom, :3] + signs * model.geom_aabb[geom, 3:]
-            corners.append(box @ turn.reshape(3, 3).T + model.geom_pos[geom])
-    found = np.concatenate(corners)
-    return np.maximum(low, found.min(axis=0)), np.minimum(high, found.max(axis=0))
+    corners = np.concatenate(
+        [
+            (model.geom_aabb[geom, :3] + _SIGNS * model.geom_aabb[geom, 3:]) @ turn.T + model.geom_pos[geom]
+            for geom, turn in _colliding(model, body)
+        ]
+    )
+    return np.maximum(low, corners.min(axis=0)), np.minimum(high, corners.max(axis=0))
 
 
 def _own_frame(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
@@ -207,8 +205,7 @@ def _own_frame(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
     if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
         return np.array([[0.0, 0.0, -size[1]], [0.0, 0.0, size[1]]]), size[0]
     if kind == mujoco.mjtGeom.mjGEOM_BOX:
-        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-        return signs * size, 0.0
+        return _SIGNS * size, 0.0
     if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
         angle = 2 * np.pi * np.arange(_AROUND) / _AROUND
         radius = size[0] / np.cos(np.pi / _AROUND)

@@ -13,8 +13,8 @@ import torch
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.errors import BidexError, shortened
-from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.objects.mjcf import check_collisions, compiled, outline, read_own, set_contacts
+from bidex_meta.tasks.reach import ReachTask
 from bidex_meta.tasks.scene import SceneObject, attach, compile_scene
 from bidex_meta.utils import paths
 from bidex_meta.utils.files import absolute
@@ -29,53 +29,47 @@ _DEEPEST = 0.005
 
 @dataclass(frozen=True)
 class PointedObject(SceneObject):
-    """An object of the user's; ``asset`` is the path of its file.
-
-    Attributes:
-        digest: Of its model, so that a changed file is another object.
-    """
+    """An object of the user's; ``asset`` is the path of its file, ``digest`` changes with the file's model."""
 
     digest: str = ""
 
     def add_to(self, scene: mujoco.MjSpec) -> None:
-        """As in ``SceneObject``."""
         part = read_own(Path(self.asset), points=True)
         set_contacts(part)
         attach(scene, part, self.name, self.position, self.quaternion, self.colour)
 
 
-class OwnObjectClass(TaskClass):
-    """A class whose object may be the user's.
+class OwnObjectClass(ReachTask):
+    """A class whose object may be the user's, with the sensors and joints of the class's own.
 
-    Attributes:
-        usual: Its own object, whose sensors and joints, by name, the reward and the observation read.
-        usual_stands: Whether it stands on its foot at the start.
+    ``usual_stands``: whether the class's own object stands on its foot at the start.
     """
 
-    usual: ClassVar[SceneObject]
     usual_stands: ClassVar[bool] = True
 
     def __init__(self, moving_base: bool | None = None, object: str | None = None) -> None:
         """Chooses the base and the object: the path of an MJCF file (docs/objects.md), or None for the class's own.
 
-        Raises:
-            BidexError: The file holds no such object, or one that starts inside hands or table.
+        Raises BidexError where the file holds no such object, or one that starts inside hands or table.
         """
         super().__init__(moving_base)
-        self.own = self.usual
+        (usual,) = self.objects
+        self.own = usual
         if object is None:
             return
         if not isinstance(object, str) or not object.endswith(".xml") or not object.isprintable():
             raise BidexError(
-                f"object: expected the path of an MJCF file (.xml) that takes the place of the {self.usual.asset}, got "
-                f"{shortened(object)}."
+                f"object: expected the path of an MJCF file (.xml) that takes the place of the {usual.asset}, "
+                f"got {shortened(object)}."
             )
         file = absolute(object)
-        model, like = _checked(self.usual, file, self.usual_stands), _usual_model(self.usual)
-        self.own = PointedObject(
-            self.usual.name, str(file), self.usual.position, self.usual.rpy, self.usual.colour, _digest(model)
-        )
-        more = 4 * max(0, _colliding(model) - _colliding(like))
+        model = _checked(usual, file, self.usual_stands)
+        buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+        mujoco.mj_saveModel(model, None, buffer)
+        digest = hashlib.blake2b(buffer.tobytes(), digest_size=16).hexdigest()
+        self.own = PointedObject(usual.name, str(file), usual.position, usual.rpy, usual.colour, digest)
+        self.objects = (self.own,)
+        more = 4 * max(0, _colliding(model) - _colliding(_usual_model(usual)))
         self.needs = Capacity(self.needs.contacts + more, self.needs.convex + more, self.needs.rows + 3 * more)
         depth, other = _depth_at_start(self)
         if depth > _DEEPEST:
@@ -86,18 +80,16 @@ class OwnObjectClass(TaskClass):
 
     @property
     def scene_key(self) -> tuple[Hashable, ...]:
-        """As in ``TaskClass``, and the object."""
         return (*super().scene_key, self.own)
 
 
 def _checked(usual: SceneObject, file: Path, stands: bool) -> mujoco.MjModel:
-    """The model in a file, which must be like the usual object."""
     spec, like = read_own(file, points=True), _usual_model(usual)
     if spec.body("object") is None:
         raise BidexError(f'{file}: expected a body called "object", got none. Name the outermost one so.')
     model = compiled(file, spec)
-    for kind, names in (("joint", _joints), ("sensor", _sensors)):
-        wanted, found = names(like), names(model)
+    for kind in ("joint", "sensor"):
+        wanted, found = _named(like, kind), _named(model, kind)
         if wanted != found:
             missing = sorted(set(wanted) ^ set(found)) or list(wanted)
             raise BidexError(
@@ -144,23 +136,14 @@ def _usual_model(usual: SceneObject) -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_path(str(paths.assets_dir() / "objects" / f"{usual.asset}.xml"))
 
 
-def _digest(model: mujoco.MjModel) -> str:
-    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, buffer)
-    return hashlib.blake2b(buffer.tobytes(), digest_size=16).hexdigest()
-
-
 def _colliding(model: mujoco.MjModel) -> int:
     return int(((model.geom_contype != 0) | (model.geom_conaffinity != 0)).sum())
 
 
-def _joints(model: mujoco.MjModel) -> dict[str, int]:
-    """Names and kinds."""
-    return {model.joint(i).name: int(model.jnt_type[i]) for i in range(model.njnt)}
-
-
-def _sensors(model: mujoco.MjModel) -> dict[str, int]:
-    """Names and sizes."""
+def _named(model: mujoco.MjModel, kind: str) -> dict[str, int]:
+    """Types of joints or sizes of sensors, by name."""
+    if kind == "joint":
+        return {model.joint(i).name: int(model.jnt_type[i]) for i in range(model.njnt)}
     return {model.sensor(i).name: int(model.sensor_dim[i]) for i in range(model.nsensor)}
 
 

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from bidex_meta.cli import main, watching
-from bidex_meta.clients.humanoid_world import NAME, HumanoidWorld
 from bidex_meta.errors import BidexError
 from bidex_meta.runs import RunFolder
 from bidex_meta.worlds import Worlds
 from bidex_meta.worlds.external import HUMANOID
+from bidex_meta.worlds.humanoid import NAME, HumanoidWorld
 
 
 def test_as_gymnasiums() -> None:
@@ -38,27 +38,20 @@ def test_as_gymnasiums() -> None:
 
 
 @pytest.mark.parametrize("algo", ["ppo", "sac"])
-def test_a_run_on_it(algo: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_on_it(algo: str, tmp_path: Path) -> None:
     """In any case of the name, with the appendix's numbers for it; evaluated without references."""
     flags = ["--task", "gymnasium/humanoid-v5", "--algo", algo, "--num-envs", "4", "--steps", "140", "--threads", "1"]
     flags += ["--device", "cpu", "--logger", "none", "--learner.hidden", "8", "--episodes", "2"]
     assert main(["run", *flags, "--run-dir", str(tmp_path / "run")]) == 0
     folder = RunFolder.open(tmp_path / "run")
-    config = folder.config()
-    assert config.task == HUMANOID and config.learner["gamma"] == 0.99
-    found = folder.evaluation()["policy"]["classes"]["Humanoid-v5"]
-    assert found["score"] is None and found["success"] == 0.0
-    capsys.readouterr()
+    assert folder.config().task == HUMANOID and folder.config().learner["gamma"] == 0.99
+    result = folder.evaluation()["policy"]["classes"]["Humanoid-v5"]
+    assert result["score"] is None and result["success"] == 0.0
 
 
 def test_an_evaluation_while_training_is_of_ten_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[np.ndarray] = []
-    monkeypatch.setattr(watching, "_metrics", lambda found: {"Eval/mean_return": note(found.classes[NAME].returns)})
-
-    def note(returns: np.ndarray) -> float:
-        seen.append(returns)
-        return 0.0
-
+    monkeypatch.setattr(watching, "_metrics", lambda result: seen.append(result.classes[NAME].returns) or {})
     flags = ["--task", HUMANOID, "--algo", "ppo", "--num-envs", "4", "--steps", "8", "--learner.rollout-steps", "2"]
     flags += ["--threads", "1", "--device", "cpu", "--logger", "none", "--learner.hidden", "8", "--no-evaluate"]
     assert main(["run", *flags, "--evaluate-every", "1", "--run-dir", str(tmp_path / "run")]) == 0
@@ -67,21 +60,13 @@ def test_an_evaluation_while_training_is_of_ten_episodes(tmp_path: Path, monkeyp
 
 @pytest.mark.parametrize(
     ("flags", "told"),
-    [
-        (["--points", "8"], "--points"),
-        (["--object", "mug"], "--object"),
-        (["--base", "moving"], "--base"),
-        (["--engine", "warp"], "runs on the CPU"),
-    ],
+    [("--points 8", "--points"), ("--object mug", "--object"), ("--base moving", "--base"), ("--engine warp", "CPU")],
 )
-def test_what_is_of_hands_is_refused(
-    flags: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_of_hands_is_refused(flags: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     known = ["--task", HUMANOID, "--num-envs", "4", "--device", "cpu", "--algo", "ppo"]
-    assert main(["run", *known, *flags, "--run-dir", str(tmp_path / "run")]) == 2
-    error = capsys.readouterr().err
-    last = error.splitlines()[-1]
-    assert told in last and HUMANOID in last and "Traceback" not in error
+    assert main(["run", *known, *flags.split(), "--run-dir", str(tmp_path / "run")]) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert told in last and HUMANOID in last
 
 
 @pytest.mark.parametrize("more", [["--tiled"], []])

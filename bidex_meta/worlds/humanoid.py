@@ -1,8 +1,7 @@
-"""Gymnasium's Humanoid-v5 as a world: its model, observation and reward, many environments on ``mujoco.batch``.
+"""Gymnasium's Humanoid-v5 as a world, on ``mujoco.batch``, for the comparison of the paper's appendix C.
 
-The paper's appendix C compares PPO and SAC over numbers of environments on a humanoid. This is the one that everybody
-has (Gymnasium 1.x, ``gymnasium/envs/mujoco/humanoid_v5.py``, whose constants stand below); starts, actions and steps
-give its numbers bit for bit, to single precision (``tests/clients/test_humanoid_world.py``).
+Its constants are those of Gymnasium 1.x (``envs/mujoco/humanoid_v5.py``); starts, actions and steps give its numbers
+bit for bit, to single precision.
 """
 
 from collections.abc import Mapping
@@ -39,7 +38,7 @@ class HumanoidWorld(ForeignWorld):
     velocities, actuators' forces and contact forces. An action of [-1, 1] is its motors' range, [-0.4, 0.4]. The reward
     is 1.25 times the speed of the centre of mass along x (m/s), and 5 while it is up, less the price of control and
     contact; it falls (terminated) when the torso leaves 1 to 2 m, and an episode lasts 1,000 steps of 15 ms. There is
-    no success. All its tasks are alike: a variation has no numbers.
+    no success. All tasks are alike: a variation has no numbers. Keywords as of ``bidex_meta.World``.
     """
 
     def __init__(
@@ -51,18 +50,6 @@ class HumanoidWorld(ForeignWorld):
         threads: int | None = None,
         stagger: bool = True,
     ) -> None:
-        """Builds the engine; no episode is started before ``reset``.
-
-        Args:
-            num_envs: How many.
-            seed: Of starts, until ``reset(seed=...)`` gives another.
-            autoreset_mode: SAME_STEP (training) or DISABLED (evaluation), as a member or its name.
-            threads: Of the engine; None takes all CPUs.
-            stagger: As in ``bidex_meta.World``.
-
-        Raises:
-            BidexError: Unknown mode or no environment.
-        """
         import gymnasium.envs.mujoco as home
 
         model = mujoco.MjModel.from_xml_path(str(Path(home.__file__).parent / "assets" / "humanoid.xml"))
@@ -81,13 +68,9 @@ class HumanoidWorld(ForeignWorld):
         self.set_tasks({NAME: np.zeros((1, 0))})
 
     def set_tasks(self, pools: Mapping[str, np.ndarray]) -> None:
-        """Replaces the pool; as no task differs from another, only their number counts.
+        """Replaces the pool, ``Humanoid-v5`` to an array (n, 0), of which only n counts.
 
-        Args:
-            pools: ``Humanoid-v5`` to an array (n, 0).
-
-        Raises:
-            BidexError: Unknown class, an empty pool or a wrong shape.
+        Raises BidexError for an unknown class, an empty pool or a wrong shape.
         """
         for name, pool in pools.items():
             if name != NAME:
@@ -114,7 +97,6 @@ class HumanoidWorld(ForeignWorld):
         self._obs = torch.where(mask[:, None], self._state(), self._obs)
 
     def _centre(self) -> Tensor:
-        """Of mass, along x, shape (n,)."""
         return (self._mass * self._centres[:, :, 0]).sum(1) / self._mass.sum()
 
     def _state(self) -> Tensor:
@@ -149,7 +131,7 @@ class HumanoidWorld(ForeignWorld):
             self._contact[row] = torch.from_numpy(self._data.cfrc_ext)
 
     def state_dict(self) -> State:
-        """Everything that decides the future of the world: tensors and plain values, copied."""
+        """All that decides the world's future: tensors and plain values, copied."""
         return {
             **super().state_dict(),
             "tasks": self.num_slot_tasks[0],
@@ -159,11 +141,7 @@ class HumanoidWorld(ForeignWorld):
         }
 
     def load_state_dict(self, state: State) -> None:
-        """Puts back what ``state_dict`` gave, on a world of the same size.
-
-        Raises:
-            BidexError: The state is of another size.
-        """
+        """Restores a ``state_dict``; raises BidexError for one of another size."""
         fits(state, self.state_dict())
         self.set_tasks({NAME: np.zeros((whole_number("tasks", state["tasks"], 1), 0))})
         self._restore(state)

@@ -1,11 +1,9 @@
 """Points with normals on the visible surfaces of a scene, fixed to its bodies: the candidates of a cloud.
 
-Surfaces are of MuJoCo's primitives and meshes in a geom's own frame, sizes those of ``mjModel.geom_size`` (metres). The
-formulas are textbook geometry; even coverage comes from the additive recurrence R2 (Roberts 2018, "The Unreasonable
-Effectiveness of Quasirandom Sequences").
+Even coverage comes from the additive recurrence R2 (Roberts 2018, "The Unreasonable Effectiveness of Quasirandom
+Sequences").
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import mujoco
@@ -32,30 +30,22 @@ def even_numbers(count: int, offset: np.ndarray) -> np.ndarray:
 
 def area(model: mujoco.MjModel, geom: int) -> float:
     """Area of a geom's surface, m²; that of an ellipsoid to 1.1 % (Thomsen's formula)."""
-    a, b, c = (float(x) for x in model.geom_size[geom])
-    kind = int(model.geom_type[geom])
-    if kind == _SPHERE:
-        return 4.0 * np.pi * a * a
-    if kind == _CAPSULE:
-        return 4.0 * np.pi * a * (a + b)
-    if kind == _CYLINDER:
-        return 2.0 * np.pi * a * (a + 2.0 * b)
-    if kind == _BOX:
-        return 8.0 * (a * b + b * c + c * a)
-    if kind == _ELLIPSOID:
-        p = 1.6075
-        return 4.0 * np.pi * float((((a * b) ** p + (b * c) ** p + (c * a) ** p) / 3.0) ** (1.0 / p))
-    return float(_faces(model, geom)[1].sum())
+    (a, b, c), p, kind = (float(x) for x in model.geom_size[geom]), 1.6075, int(model.geom_type[geom])
+    if kind == _MESH:
+        return float(_faces(model, geom)[1].sum())
+    return {
+        _SPHERE: 4.0 * np.pi * a * a,
+        _CAPSULE: 4.0 * np.pi * a * (a + b),
+        _CYLINDER: 2.0 * np.pi * a * (a + 2.0 * b),
+        _BOX: 8.0 * (a * b + b * c + c * a),
+        _ELLIPSOID: 4.0 * np.pi * float((((a * b) ** p + (b * c) ** p + (c * a) ** p) / 3.0) ** (1.0 / p)),
+    }[kind]
 
 
 def surface(model: mujoco.MjModel, geom: int, count: int, offset: np.ndarray) -> Surface:
-    """Points spread over a geom's surface in proportion to area.
+    """Points spread over the surface of a geom, of a type in ``DRAWN``, in proportion to area.
 
-    Args:
-        model: The compiled model.
-        geom: A geom of a type in ``DRAWN``.
-        count: How many, n.
-        offset: Where the even numbers begin, (2,) in [0, 1).
+    ``offset``, (2,) in [0, 1), is where the even numbers begin.
     """
     size, kind = np.asarray(model.geom_size[geom], dtype=np.float64), int(model.geom_type[geom])
     if kind == _SPHERE:
@@ -85,7 +75,6 @@ def inside(model: mujoco.MjModel, geom: int, points: np.ndarray, margin: float) 
 
 
 def _sphere(u: np.ndarray) -> np.ndarray:
-    """Unit vectors (n, 3) from even numbers (n, 2)."""
     z, turn = 2.0 * u[:, 0] - 1.0, 2.0 * np.pi * u[:, 1]
     across = np.sqrt(1.0 - z * z)
     return np.stack((across * np.cos(turn), across * np.sin(turn), z), axis=1)
@@ -174,12 +163,7 @@ def _mesh(model: mujoco.MjModel, geom: int, u: np.ndarray) -> Surface:
     return (1.0 - root) * a + root * (1.0 - second) * b + root * second * c, normals[face]
 
 
-_OF_UNIT: dict[int, Callable[[np.ndarray, np.ndarray], Surface]] = {
-    _CAPSULE: _capsule,
-    _CYLINDER: _cylinder,
-    _BOX: _box,
-}
-
+_OF_UNIT = {_CAPSULE: _capsule, _CYLINDER: _cylinder, _BOX: _box}
 
 FIXTURE, HAND, OBJECT = -1.0, 0.0, 1.0
 """Kinds of points: what stands still in an episode; either hand; what physics moves."""
@@ -196,13 +180,8 @@ _BURIED = 5e-4
 class Surfaces:
     """P points fixed to bodies, those of a body side by side.
 
-    Attributes:
-        bodies: Bodies that carry points, ascending, (k,).
-        ends: Where each body's points end, (k,).
-        points: In the body's frame, metres, (P, 3).
-        normals: Outward, of length 1, in the body's frame, (P, 3).
-        kinds: FIXTURE, HAND or OBJECT, (P,).
-        geoms: The geom of each point, (P,).
+    Bodies that carry points, ascending, and where each body's points end, (k,); points, metres, and outward unit
+    normals in the body's frame, (P, 3); their kinds (FIXTURE, HAND or OBJECT) and geoms, (P,).
     """
 
     bodies: np.ndarray
@@ -233,15 +212,9 @@ def body_kinds(model: mujoco.MjModel) -> list[float]:
 
 
 def sample(model: mujoco.MjModel, count: int, seed: int = 0) -> Surfaces:
-    """Spreads points over the visible surfaces of a model, by area within hands, objects and fixtures.
+    """Spreads ``count`` points over a model's visible surfaces, by area within hands, objects and fixtures.
 
-    Args:
-        model: The compiled scene.
-        count: Points, P.
-        seed: Seed of the points.
-
-    Raises:
-        BidexError: Fewer points than visible geoms, or none visible.
+    Raises BidexError for fewer points than visible geoms, or none visible.
     """
     geoms = visible_geoms(model)
     if not 0 < len(geoms) <= count:

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from bidex_meta.errors import BidexError
-from bidex_meta.points.cloud import Camera, Cloud, beside, camera_of, draw
-from bidex_meta.points.surfaces import FIXTURE, HAND, OBJECT, area, inside, sample, surface
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import compile_scene
+from bidex_meta.world.cloud import Camera, Cloud, beside, camera_of, draw
+from bidex_meta.world.surfaces import FIXTURE, HAND, OBJECT, area, inside, sample, surface
 
 _PIXELS = 96
 _SHAPES = {

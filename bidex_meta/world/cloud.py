@@ -1,18 +1,13 @@
 """A depth camera, point clouds of what it sees, and pictures of clouds: torch operations on all environments."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from bidex_meta.tasks.base import TaskClass
-
-
 import torch
 from torch import Tensor
 
-from bidex_meta.points.surfaces import FIXTURE, HAND, OBJECT, Surfaces
+from bidex_meta.tasks.base import TaskClass
+from bidex_meta.world.surfaces import FIXTURE, HAND, OBJECT, Surfaces
 
 _DIRECTION = (0.49, 0.0, 0.75)
 """From the target to the camera, of HandOver in the original code."""
@@ -21,14 +16,12 @@ FIELD_OF_VIEW = 60.0
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera with a square image, upright.
+    """An upright pinhole camera with a square image that shows distances from ``near`` to ``far``; world, metres.
 
     Attributes:
-        eye: Its position, world, metres.
-        target: Point in the middle of its image, world, metres.
+        eye: Its position.
+        target: Point in the middle of its image.
         field_of_view: Full angle of the image, degrees.
-        near: Nearest distance that it sees, metres.
-        far: Farthest distance that it sees, metres.
     """
 
     eye: tuple[float, float, float]
@@ -52,7 +45,7 @@ class Camera:
         return float(0.5 / np.tan(np.radians(0.5 * self.field_of_view)))
 
 
-def camera_of(task: "TaskClass") -> Camera:
+def camera_of(task: TaskClass) -> Camera:
     """The depth camera of a class: its own, or one that looks down at the target of its pictures."""
     if task.depth_camera is not None:
         return Camera(*task.depth_camera)
@@ -67,13 +60,10 @@ _CHUNK = 32
 
 @dataclass(frozen=True)
 class Sharpness:
-    """Tolerances of the visibility test.
+    """Tolerances of the visibility test in a depth buffer of ``pixels`` squared.
 
-    Attributes:
-        pixels: Width and height of the depth buffer.
-        depth: How far behind the nearest depth around its pixel a visible point may lie, metres.
-        slope: Addition for slanted surfaces, as a share of the change of depth across a pixel.
-        most: Largest such addition, metres.
+    A visible point may lie ``depth`` (m) behind the nearest one around its pixel, on slanted surfaces further by
+    a share ``slope`` of the change of depth across a pixel, at most ``most`` (m).
     """
 
     pixels: int = 128
@@ -88,16 +78,7 @@ class Cloud:
     A candidate is visible if it faces the camera, lies in its frustum, and nothing nearer was drawn around its pixel of
     a coarse depth buffer. Shapes depend on no value, so that CUDA graphs can hold it.
 
-    Args:
-        surfaces: The candidates, P.
-        camera: The depth camera.
-        count: Points of a cloud.
-        kinds: Whether each point has a fourth entry, its kind (``surfaces.FIXTURE``, ...).
-        device: Where to compute.
-        sharpness: Tolerances.
-
-    Attributes:
-        shape: Of a cloud, (count, 3) or (count, 4).
+    A cloud has ``count`` points; with ``kinds`` each has a fourth entry, its kind (``surfaces.FIXTURE``, ...).
     """
 
     def __init__(
@@ -131,10 +112,7 @@ class Cloud:
         """Clouds of n environments, world frame, metres: (n, *shape), float32; zeros where nothing is visible.
 
         Fewer visible candidates than points are repeated, of more an even share is taken. Hidden ones change no bit.
-
-        Args:
-            position: Of the model's bodies, metres, (n, nbody, 3).
-            rotation: Likewise, matrices (n, nbody, 3, 3).
+        Positions (n, nbody, 3), metres, and rotation matrices (n, nbody, 3, 3) are of the model's bodies.
         """
         if position.device.type == "cpu" and len(position) > _CHUNK:
             pairs = zip(position.split(_CHUNK), rotation.split(_CHUNK), strict=True)
@@ -219,16 +197,11 @@ def beside(camera: Camera) -> Camera:
 
 
 def draw(cloud: np.ndarray, camera: Camera, width: int, height: int) -> np.ndarray:
-    """A picture (height, width, 3), uint8, of a cloud.
+    """A picture (height, width, 3), uint8, of points (n, 4): world, metres, and kinds (``surfaces.FIXTURE``, ...).
 
-    Args:
-        cloud: Points (n, 4): world, metres, and their kinds (``surfaces.FIXTURE``, ...).
-        camera: Its field of view fits the smaller side of the picture.
-        width: Pixels.
-        height: Pixels.
+    The camera's field of view fits the smaller side of the picture.
     """
-    picture = np.empty((height, width, 3), np.uint8)
-    picture[:] = _BACK
+    picture = np.full((height, width, 3), _BACK, np.uint8)
     seen = (cloud[:, :3] - camera.eye) @ camera.axes.T
     kept = (seen[:, 2] > camera.near) & np.isfinite(seen).all(axis=1)
     seen, kinds = seen[kept], cloud[kept, 3]

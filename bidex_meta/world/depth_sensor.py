@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.hand import SIDES
-from bidex_meta.points.cloud import Cloud, camera_of
-from bidex_meta.points.surfaces import sample
 from bidex_meta.suite import MOST_POINTS
 from bidex_meta.tasks.scene import Scene
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.utils.validation import true_or_false, whole_number
+from bidex_meta.world.cloud import Cloud, camera_of
+from bidex_meta.world.surfaces import sample
 
 CANDIDATES = 3072
 """Points fixed on a scene at least: fewer leave gaps through which hidden points are seen."""
@@ -22,18 +22,15 @@ POINT_ENTRIES = {"points": 3, "kind_points": 4}
 
 @dataclass(frozen=True)
 class PointsRule:
-    """Observations with a point cloud in place of the objects' state.
+    """Observations with a cloud of ``count`` points (the original: 768) in place of the objects' state.
 
-    Attributes:
-        count: Points of a cloud; the original code takes 768.
-        kinds: Whether each has a fourth entry: 1 object, 0 hand, -1 fixture.
+    ``kinds``: whether each has a fourth entry: 1 object, 0 hand, -1 fixture.
     """
 
     count: int = 768
     kinds: bool = False
 
     def __post_init__(self) -> None:
-        """Checks both."""
         object.__setattr__(self, "count", whole_number("points", self.count, 1, MOST_POINTS))
         true_or_false("kinds of points", self.kinds)
 
@@ -49,16 +46,9 @@ class PointsRule:
 
 
 class DepthSensor:
-    """Puts clouds into the observations of a class.
+    """Puts clouds into the observations of a scene's class, from index ``first`` on.
 
-    Args:
-        scene: The class's scene.
-        rule: Form of the clouds.
-        first: Index of the cloud in an observation.
-        device: Where to compute.
-
-    Attributes:
-        hidden: Entries of the class's observation that depend on objects' states, ascending.
+    ``hidden``: entries of the class's observation that depend on objects' states, ascending.
     """
 
     def __init__(self, scene: Scene, rule: PointsRule, first: int, device: torch.device) -> None:
@@ -69,13 +59,7 @@ class DepthSensor:
         self._hidden = torch.tensor(self.hidden, dtype=torch.int64, device=device)
 
     def show(self, values: Tensor, position: Tensor, rotation: Tensor) -> None:
-        """Zeroes the hidden entries and fills in clouds.
-
-        Args:
-            values: Observations (n, d), written in place.
-            position: Of the bodies, metres, (n, nbody, 3).
-            rotation: Likewise, matrices (n, nbody, 3, 3).
-        """
+        """Zeroes the hidden entries of observations (n, d) and fills in clouds, in place; bodies' poses as of Cloud."""
         values.index_fill_(1, self._hidden, 0.0)
         values[:, self._columns] = self._cloud(position, rotation).flatten(1)
 
@@ -86,8 +70,7 @@ _OF_HANDS = tuple(f"{side}/" for side in SIDES)
 def privileged_columns(scene: Scene) -> list[int]:
     """Indices, ascending, of the observation's entries from which an object's pose or motion could be read.
 
-    They are found by replacing each sensor that is not a hand's by NaN: an entry that becomes NaN, or is read from such
-    a sensor, depends on it. A hand's own sensors stay, though its fingertips feel objects.
+    Every sensor that is not a hand's is replaced by NaN; entries that become NaN depend on one.
     """
     task, layout = scene.task, scene.task.layout
     found = {
@@ -103,7 +86,7 @@ def privileged_columns(scene: Scene) -> list[int]:
 
 
 def _without_objects(scene: Scene) -> TaskState:
-    """The nominal start of a task from the middle of the variation space, objects' sensors NaN, one row."""
+    """The nominal start of the middle of the variation space, objects' sensors NaN, of one environment."""
     data = mujoco.MjData(scene.model)
     data.qpos[:] = scene.start_qpos[: scene.model.nq]
     mujoco.mj_forward(scene.model, data)

@@ -1,0 +1,166 @@
+"""What every learner must do, whatever it learns by: resume, load, refuse, shrug off broken physics."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import pytest
+import torch
+
+from bidex_meta.cli.learners import ALGOS, learner_kind
+from bidex_meta.errors import BidexError
+from bidex_meta.world.contract import plain_groups
+from tests.algos.families import PointClass, PointGoals
+from tests.algos.problems import opposite_bandits
+from tests.algos.ranks import same
+from tests.algos.resume import resumed
+from tests.algos.toy import ToyWorld, nearness
+from tests.offline.stored import as_data, noisy, played
+
+ON: dict[str, Any] = {"hidden": (16, 16), "rollout_steps": 8, "autocast": "off"}
+OFF: dict[str, Any] = {
+    "hidden": (16, 16), "replay_steps": 20, "cut_share": 0.3, "warmup_steps": 4, "batch_size": 128, "gamma": 0.8,
+    "tau": 0.05, "updates_per_step": 3, "n_steps": 2, "steps_per_iteration": 5, "autocast": "off",
+}  # fmt: skip
+ATOMS: dict[str, Any] = OFF | {"critic_hidden": (16, 16), "atoms": 51}
+META: dict[str, Any] = {"hidden": (16, 16), "tasks_per_class": 3, "max_adapt_steps": 30}
+DATA: dict[str, Any] = {"hidden": (16, 16), "batch_size": 32, "updates_per_iteration": 5, "autocast": "off"}
+PAIR = "a=action/0;b=action/1"
+
+
+@dataclass(frozen=True)
+class Case:
+    algo: str
+    options: dict[str, Any]
+
+    @property
+    def config(self) -> Any:
+        return replace(learner_kind(self.algo).presets["laptop"], **self.options)
+
+    def world(self, rows: int = 8, **broken: Any) -> Any:
+        kind = learner_kind(self.algo)
+        if not kind.make.adapts:
+            return ToyWorld([nearness(0.6), nearness(0.0)], rows=rows, **broken)
+        classes = (PointClass("Short", steps=9, count=3), PointClass("Long", steps=20, scale=100.0, count=5))
+        mode = kind.make.autoreset_mode(self.config)
+        return PointGoals(2 * rows, classes=classes, autoreset_mode=mode, **broken)
+
+    def make(self, seed: int = 0, world: Any = None) -> Any:
+        learner = learner_kind(self.algo).make(self.world() if world is None else world, self.config, seed)
+        if learner.offline:
+            learner.world.reset(seed=0)
+            still = noisy(lambda obs: torch.zeros(len(obs), 2), 0.4)
+            learner.learn_from(as_data(played(opposite_bandits(rows=4), still, 20)))
+        return learner
+
+    def trained(self, world: Any = None) -> Any:
+        learner = self.make(world=world)
+        learner.iterate()
+        return learner
+
+
+CASES = {
+    "mtppo": Case("mtppo", ON), "mtppo bf16": Case("mtppo", ON | {"autocast": "on", "policy_heads": True}),
+    "mttrpo": Case("mttrpo", ON | {"policy_heads": True}), "ippo": Case("ippo", ON | {"agents": PAIR}),
+    "mappo": Case("mappo", ON | {"agents": PAIR}), "happo": Case("happo", ON | {"agents": PAIR}),
+    "hatrpo": Case("hatrpo", ON | {"agents": PAIR}), "maddpg": Case("maddpg", OFF | {"agents": PAIR}),
+    "ddpg": Case("ddpg", OFF), "td3": Case("td3", OFF | {"policy_heads": True}), "mtsac": Case("mtsac", OFF),
+    "mtsac bf16": Case("mtsac", OFF | {"autocast": "on", "policy_heads": True}),
+    "fasttd3": Case("fasttd3", ATOMS), "brc": Case("brc", ATOMS), "maml": Case("maml", META),
+    "promp": Case("promp", META), "promp slices": Case("promp", META | {"slice_steps": 7}),
+    "maml slices": Case("maml", META | {"slice_steps": 7}),
+    "promp sizes": Case("promp", META | {"step_sizes": "layer"}),
+    "rl2": Case("rl2", {"hidden": (8,), "memory": 8, "chunk": 4, "num_minibatches": 2}), "bc": Case("bc", DATA),
+    "td3bc": Case("td3bc", DATA), "iql": Case("iql", DATA), "bcq": Case("bcq", DATA | {"vae_hidden": (16, 16)}),
+}  # fmt: skip
+SHARING = {
+    f"{algo} {name}": Case(algo, more | shared | {"hidden": (16, 8)})
+    for algo, more in (("mtppo", ON), ("mttrpo", ON), ("mtsac", OFF), ("td3", OFF))
+    for name, shared in (
+        *((trunk, {"architecture": trunk, "modules": 2}) for trunk in ("soft_modules", "paco", "moore")),
+        ("embedding", {"task_embedding": 4}),
+        *((way, {"gradient_surgery": way}) for way in ("pcgrad", "cagrad", "famo") if algo == "mtppo"),
+    )
+}
+PLAYING = {name: case for name, case in CASES.items() if not learner_kind(case.algo).make.offline}
+
+
+def each(cases: dict[str, Case]) -> Callable[..., Any]:
+    return pytest.mark.parametrize("case", cases.values(), ids=cases)
+
+
+@each(CASES | SHARING)
+def test_save_load_resume_is_bit_equal(case: Case) -> None:
+    unbroken, again = resumed(case.make, iterations=2)
+    policy = type(again).load_policy(again.policy_state_dict())
+    obs = torch.randn(5, again.shape.observations)  # of another number of environments
+    if again.shape.num_id_columns:
+        obs[:, -2:] = torch.eye(2)[[0, 1, 1, 0, 1]]
+    for each in (policy, unbroken):
+        each.reset(torch.ones(5, dtype=torch.bool))
+    found, expected = (each.eval_action(obs) for each in (policy, unbroken))
+    assert torch.equal(found, expected) and found.abs().max() <= 1.0
+
+
+@each(PLAYING)
+def test_a_transition_that_broke_physics_teaches_nothing(case: Case) -> None:
+    states = []
+    for garbage in (0.0, 1e8, float("nan")):
+        learner = case.make(world=case.world(unstable=((2, 5), (3, 10), (7, 0)), garbage=garbage))
+        told = learner.iterate()
+        assert "Train/unstable" not in told or told["Train/unstable"] > 0
+        learner.iterate()
+        states.append(learner.state_dict())
+    assert same(states[0], states[1]) and same(states[0], states[2])
+
+
+@each(CASES)
+def test_a_saved_state_does_not_change_with_the_learner(case: Case) -> None:
+    learner = case.trained()
+    state, again = learner.state_dict(), learner.state_dict()
+    learner.iterate()
+    assert same(state, again) and not same(state, learner.state_dict())
+
+
+@each({name: case for name, case in PLAYING.items() if case.algo != "rl2"})
+def test_a_checkpoint_of_another_number_of_environments_is_refused(case: Case) -> None:
+    state = case.trained().state_dict()
+    with pytest.raises(BidexError, match=r"num_envs"):
+        case.make(world=case.world(rows=9)).load_state_dict(state)
+
+
+@pytest.mark.parametrize("option", [{"policy_heads": True}, {"task_embedding": 4}, {"architecture": "paco"}])
+@pytest.mark.parametrize("algo", ["mtppo", "mttrpo", "mtsac", "td3", "brc"])
+def test_what_tells_tasks_apart_needs_their_one_hot(algo: str, option: dict[str, Any]) -> None:
+    case = Case(algo, {"hidden": (16, 16), "task_embedding": 0} | option)
+    world = case.world()
+    world.num_id_columns, world.observation_groups = 0, plain_groups(3, 0)
+    if (algo, "architecture" in option) == ("brc", True):
+        return  # its networks are residual
+    with pytest.raises(BidexError, match=rf"{algo}: {next(iter(option))}.* needs the one-hot of 2 tasks"):
+        case.make(world=world)
+
+
+@each(CASES)
+def test_a_loss_that_is_no_number_ends_the_training_by_its_name(case: Case) -> None:
+    learner = case.trained()
+    if case.algo == "rl2":
+        learner.iterate()
+    with torch.no_grad():
+        for weight in (learner.policy if case.algo in ("maml", "promp", "bc") else learner.critic).parameters():
+            weight.fill_(float("nan"))
+    with pytest.raises(FloatingPointError, match=rf"{case.algo}: the loss is not finite after \d+ steps; lower "):
+        learner.iterate()
+
+
+@pytest.mark.parametrize("algo", [name for name in ALGOS if learner_kind(name).make.discounts_by_class])
+def test_every_preset_of_those_with_tasks_side_by_side_makes_a_learner(algo: str) -> None:
+    kind = learner_kind(algo)
+    small: dict[str, Any] = {
+        "hidden": (16, 16), "critic_hidden": (16, 16), "replay_steps": 50, "batch_size": 64, "warmup_steps": 1,
+        "steps_per_iteration": 3, "vae_hidden": (16,), "agents": PAIR, "rollout_steps": 4,
+    }  # fmt: skip
+    for preset in kind.presets.values():
+        config = replace(preset, **{name: value for name, value in small.items() if name in vars(preset)})
+        learner = kind.make(opposite_bandits(), config, seed=0)
+        assert learner.offline or any(name.startswith("Loss/") for name in learner.iterate())
