@@ -66,11 +66,10 @@ def main(arguments: Sequence[str]) -> None:
 
 def _evaluate(flags: EvaluateFlags, folder: RunFolder, config: RunConfig[Any], worlds: Worlds) -> dict[str, Any]:
     """Plays, and prints the table if no JSON is wanted."""
-    for name in ("shots", "rollouts", "tasks", "trials"):
-        if getattr(flags, name) is not None:
-            raise BidexError(
-                f"{config.algo} does not adapt to tasks, got --{name} {getattr(flags, name)}. Leave it out."
-            )
+    asked = {"shots": flags.shots, "rollouts": flags.rollouts, "tasks": flags.tasks, "trials": flags.trials}
+    for name, number in asked.items():
+        if number is not None:
+            raise BidexError(f"{config.algo} does not adapt to tasks, got --{name} {number}. Leave it out.")
     if flags.split == "both":
         raise BidexError(
             f"{config.algo} does not adapt to tasks: its splits are shown one by one. Use --split train or test."

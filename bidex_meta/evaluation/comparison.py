@@ -89,7 +89,8 @@ def run_kind(config: RunConfig[Any], split: str = "train") -> dict[str, Any]:
     """What runs that are compared as one have in common: all of the config that matters but the seed."""
     kind = {"algo": config.algo, "on": config.suite or "one class at a time", "steps": config.steps}
     kind |= {"num_envs": config.num_envs, "minutes": config.minutes, "split": split}
-    kind |= {name: getattr(config, name) for name in ("stop_at_return", "stop_at_success", "stop_at_score")}
+    kind |= {"stop_at_return": config.stop_at_return, "stop_at_success": config.stop_at_success}
+    kind["stop_at_score"] = config.stop_at_score
     kind["started"] = "afresh" if config.start_from is None else "from another run"  # which: one for each seed
     kind |= {"base": config.base, "points": config.points, "object": config.object}
     kind |= {"dataset": _data(config, config.dataset), "demonstrations": _data(config, config.demonstrations)}
