@@ -251,7 +251,7 @@ def make_task_world(
         engine=engine,
         seed=seed,
         autoreset_mode=mode,
-        task_sampling=task_sampling or ("fixed" if mode.name == "DISABLED" else "uniform"),
+        task_sampling=task_sampling if task_sampling is not None else "fixed" if mode.name == "DISABLED" else "uniform",
         threads=threads,
         stagger=stagger,
         points=PointsRule(points) if whole_number("points", points, 0, MOST_POINTS) else None,

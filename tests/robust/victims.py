@@ -52,7 +52,7 @@ FLAGS = {
 """Of each learner; ``tests/robust/test_kills.py`` holds that none is missing."""
 _LOADED = ("bidex_meta.benchmark", "bidex_meta.cli", "scipy.optimize", "scipy.stats", "torch._dynamo", "typeguard")
 _LOADED += tuple(f"bidex_meta.cli.{name}" for name in ("metatest", "policies", "run", "tables", "watching"))
-_LOADED += tuple(f"bidex_meta.evaluation.{name}" for name in ("meta_test", "play", "references", "untrained"))
+_LOADED += tuple(f"bidex_meta.evaluation.{name}" for name in ("meta_test", "play", "references"))
 """What each process would load by itself, for longer than it runs."""
 ADAPTS = ("promp", "maml", "rl2")
 OFFLINE = ("bc", "bcq", "td3bc", "iql")

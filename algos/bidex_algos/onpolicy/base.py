@@ -17,7 +17,7 @@ from bidex_algos.advantages import (
     task_moments,
 )
 from bidex_algos.learner import Learner, as_numbers
-from bidex_algos.nets.architecture import NetworkConfig, network_bytes, network_of
+from bidex_algos.nets.architecture import ArchitectureConfig, network_bytes, network_of
 from bidex_algos.nets.networks import Activation, Autocast, Layers, autocast, gaussian_log_prob
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.policy import GaussianPolicy, gaussian_policy
@@ -27,18 +27,28 @@ from bidex_algos.rollout import EpisodeStatistics, Rollout, collect
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import all_sum, world_size
 from bidex_meta.train.learner import Parts, State
-from bidex_meta.utils.validation import Count, Fraction, Positive, check_rising
+from bidex_meta.utils.validation import Count, Fraction, Positive, Whole, Widths, check_rising
 from bidex_meta.world.contract import VectorWorld
 
 
 @dataclass(frozen=True)
-class OnPolicyConfig(NetworkConfig):
+class OnPolicyConfig(ArchitectureConfig):
     """Networks, rollouts, statistics; the defaults are the preset ``laptop``."""
 
     hidden: Layers = (256, 256, 128)
+    """Widths of the hidden layers, of actor and critic alike."""
     activation: Activation = "elu"
+    """Non-linearity of the hidden layers."""
     value_heads: bool = True
     """Give the critic one output per task instead of one for all."""
+    policy_heads: bool = False
+    """Give the actor an output layer per task; the world must show the task's one-hot."""
+    task_embedding: Whole = 0
+    """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
+    point_widths: Widths = (32, 64)
+    """Widths of the layers that all points of a point cloud share (PointNet), where the world shows one."""
+    points_read: Whole = 0
+    """Points of a cloud that they read, evenly out of all; 0: all."""
     init_std: Positive = 0.8
     """Standard deviation of the actions at the start."""
     std_range: tuple[Positive, Positive] = (0.05, 1.5)
