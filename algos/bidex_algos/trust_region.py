@@ -104,7 +104,7 @@ class Stepped(NamedTuple):
     kl: float  # KL from the sampling policy there
     share: float  # share of the natural step that was taken; 0: the parameters are as before
 
-    def told(self, kl_tag: str, device: torch.device) -> dict[str, Tensor]:
+    def reported(self, kl_tag: str, device: torch.device) -> dict[str, Tensor]:
         """Scalars to be logged."""
         found = {"Loss/surrogate": -self.objective, kl_tag: self.kl, "Policy/step_share": self.share}
         return {name: torch.tensor(value, device=device) for name, value in found.items()}

@@ -240,6 +240,6 @@ def _feed(value: Any, found: Any, depth: int) -> None:
             _feed(each, found, depth + 1)
     else:
         # Of floats repr gives every bit but NaN's.
-        told = value if isinstance(value, bytes) else repr(value).encode()
-        found.update(f"{type(value).__name__} {len(told)}:".encode())
-        found.update(told)
+        content = value if isinstance(value, bytes) else repr(value).encode()
+        found.update(f"{type(value).__name__} {len(content)}:".encode())
+        found.update(content)

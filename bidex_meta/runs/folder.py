@@ -186,11 +186,11 @@ class RunFolder:
                 check_writable(folder / "last.pt")
 
     @contextlib.contextmanager
-    def locked(self, told: str | None = None) -> Iterator[None]:
+    def locked(self, message: str | None = None) -> Iterator[None]:
         """Keeps other processes from training in this folder; the lock dies with its process, and leaves no file.
 
         Args:
-            told: What is said to another one; None: that a process trains here.
+            message: Error of another process that tries; None: that a process trains here.
 
         Raises:
             BidexError: Another process does.
@@ -203,8 +203,8 @@ class RunFolder:
                 try:
                     fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError:
-                    told = told or f"Another process trains in {self.path}. Wait for its end, or stop it."
-                    raise BidexError(told) from None
+                    message = message or f"Another process trains in {self.path}. Wait for its end, or stop it."
+                    raise BidexError(message) from None
                 except OSError:
                     pass  # a network's file system may lock no folders
             yield

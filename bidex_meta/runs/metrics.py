@@ -94,7 +94,7 @@ def mend(path: Path, step: int) -> list[dict[str, Any]]:
     """The lines up to ``step`` of the run that goes on from there, whatever has become of its metrics.
 
     What stands in the file's place without being one, and a file with lines that cannot be read beside a torn last one,
-    is kept as ``metrics.jsonl.damaged``, and told: a good checkpoint shall not wait for its metrics.
+    is kept as ``metrics.jsonl.damaged``, and reported: a good checkpoint shall not wait for its metrics.
     """
     if not exists(path):
         return []

@@ -236,9 +236,9 @@ def missing() -> str | None:
 
 def _figure() -> Any:
     """Matplotlib's class of figures, without its global state."""
-    told = missing()
-    if told is not None:
-        raise BidexError(told)
+    reason = missing()
+    if reason is not None:
+        raise BidexError(reason)
     from matplotlib.figure import Figure
 
     return Figure

@@ -154,7 +154,7 @@ class StoredRun:
         return config_of(self.content["config"], f"{self.path}: config")
 
     def metrics(self) -> list[dict[str, Any]]:
-        """As in :class:`Run`: means over stretches of about equal length, told at their ends."""
+        """As in :class:`Run`: means over stretches of about equal length, at their ends."""
         curves = self.content["curves"]
         return [dict(zip(curves, row, strict=True)) for row in zip(*curves.values(), strict=True)]
 

@@ -7,8 +7,7 @@ import json
 import os
 import stat
 import tomllib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
@@ -129,55 +128,3 @@ def bounded(content: Any) -> Any:
         inner = [value for value in level if isinstance(value, dict | list)]
         level = [each for value in inner for each in (value.values() if isinstance(value, dict) else value)]
     raise ValueError(f"it is nested more than {_DEEPEST} deep")
-
-
-@dataclass(frozen=True)
-class Rule:
-    """A condition on a value in a file, and its words after "expected" in messages."""
-
-    told: str
-    fits: Callable[[Any], bool]
-
-    def or_none(self) -> "Rule":
-        """The same, or null."""
-        return Rule(f"{self.told} or null", lambda value: value is None or self.fits(value))
-
-    def each(self) -> "Rule":
-        """A table whose values are all so."""
-        words = f"a table of which each value is {self.told}"
-        return Rule(words, lambda value: isinstance(value, dict) and all(map(self.fits, value.values())))
-
-
-def whole(least: int, most: int = _LARGEST) -> Rule:
-    """A whole number within bounds."""
-    return Rule(f"a whole number from {least} to {most}", lambda value: type(value) is int and least <= value <= most)
-
-
-def number(low: float = -float("inf"), high: float = float("inf")) -> Rule:
-    """A number within bounds, finite where they are."""
-    words = "a number" if low == -high == -float("inf") else f"a number from {low:g} to {high:g}"
-    return Rule(words, lambda value: type(value) in (int, float) and low <= value <= high)
-
-
-def choice(*choices: str) -> Rule:
-    """One of these texts."""
-    return Rule(" or ".join(choices), lambda value: isinstance(value, str) and value in choices)
-
-
-TEXT = Rule("a text", lambda value: isinstance(value, str) and 0 < len(value) <= 4096 and "\0" not in value)
-TABLE = Rule("a table", lambda value: isinstance(value, dict))
-
-
-def check(content: Any, rules: Mapping[str, Rule], path: Path, needed: tuple[str, ...] = (), place: str = "") -> None:
-    """Raises BidexError for the first entry of a table that breaks its rule, and for missing ``needed`` ones.
-
-    ``path`` and ``place`` (of the table in the file, ending in a dot) are for messages.
-    """
-    if not isinstance(content, dict):
-        raise BidexError(f"{path}: {place.rstrip('.') or 'content'}: expected a table, got {shortened(content)}.")
-    missing = [name for name in needed if name not in content]
-    if missing:
-        raise BidexError(f"{path}: {place}{missing[0]}: expected it to be there, found none.")
-    for name, rule in rules.items():
-        if name in content and not rule.fits(content[name]):
-            raise BidexError(f"{path}: {place}{name}: expected {rule.told}, got {shortened(content[name])}.")

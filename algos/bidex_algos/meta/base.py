@@ -98,7 +98,7 @@ class MetaLearner(Learner):
         params = detached(adapter.meta(self.rows.count))
         seen = RunningStats((self.policy.observations.measured.size,)).to(self.device)
         batches: list[TaskBatch] = []
-        told: dict[str, float] = {}
+        reported: dict[str, float] = {}
         steps = 0
         for k in range(self.config.inner_steps + 1):
             with self._collecting():
@@ -106,16 +106,18 @@ class MetaLearner(Learner):
                 steps += int(outcome.steps)
             log_std = params["log_std"].clamp(*adapter.log_std_range)
             batches.append(task_batch(stage, self.rows, log_std, self.config))
-            told |= self._told(outcome, k)
+            reported |= self._reported(outcome, k)
             if k < self.config.inner_steps:
                 params = detached(adapter.adapt(params, batches[-1]))
-        told |= as_numbers(self._outer(batches))
+        reported |= as_numbers(self._outer(batches))
         self.policy.observations.merge(seen.mean, seen.var, seen.count)
         self.env_steps += steps
         if self.policy.step_sizes is not None:
-            told["Policy/inner_learning_rate"] = self.config.inner_learning_rate * float(self.policy.step_sizes.mean())
-        told["Policy/std"] = float(self.policy.actor.log_std.detach().clamp(*adapter.log_std_range).exp().mean())
-        return told
+            reported["Policy/inner_learning_rate"] = self.config.inner_learning_rate * float(
+                self.policy.step_sizes.mean()
+            )
+        reported["Policy/std"] = float(self.policy.actor.log_std.detach().clamp(*adapter.log_std_range).exp().mean())
+        return reported
 
     def _draw_tasks(self) -> None:
         """New tasks for every class, without repetition, and new episodes."""
@@ -179,20 +181,20 @@ class MetaLearner(Learner):
             return self._first_observations()
         return self.world.reset()[0]
 
-    def _told(self, outcome: Outcome, k: int) -> dict[str, float]:
+    def _reported(self, outcome: Outcome, k: int) -> dict[str, float]:
         """Return and success of a stage per class: of the last stage as such, of the first as ``before``."""
         last = k == self.config.inner_steps
         if k > 0 and not last:
             return {}
-        told: dict[str, float] = {}
+        reported: dict[str, float] = {}
         for what, values in (("return", outcome.earned), ("success", outcome.success.float())):
             sums = torch.zeros(self.world.num_tasks, device=self.device).index_add(0, self.world.task_id, values)
             means = (sums / torch.bincount(self.world.task_id, minlength=self.world.num_tasks)).tolist()
             tag = f"Train/{what}" if last else f"Before/{what}"
-            told |= {f"{tag}/{name}": mean for name, mean in zip(self.world.task_names, means, strict=True)}
+            reported |= {f"{tag}/{name}": mean for name, mean in zip(self.world.task_names, means, strict=True)}
             whole = {"return": "mean_return", "success": "success_rate"}[what]
-            told[f"{'Train' if last else 'Before'}/{whole}"] = sum(means) / len(means)
-        return told
+            reported[f"{'Train' if last else 'Before'}/{whole}"] = sum(means) / len(means)
+        return reported
 
     @classmethod
     def _make_policy(cls, config: MetaConfig, shape: Shape, init: torch.Generator, device: torch.device) -> MetaPolicy:

@@ -91,4 +91,4 @@ class MAML(MetaLearner):
 
         (surrogate, kl), cfg = self._objective(batches), self.config
         stepped = trust_region_step(list(self.policy.parameters()), surrogate, kl, measure, cfg, cfg.max_kl)
-        return stepped.told("Policy/outer_kl", self.device)
+        return stepped.reported("Policy/outer_kl", self.device)

@@ -87,8 +87,10 @@ class ProMP(MetaLearner):
             measured.append(torch.stack([-surrogate, inner_kl, outer_kl, norm]).detach())
         means = torch.stack(measured).mean(0)
         names = ("Loss/surrogate", "Policy/inner_kl", "Policy/outer_kl", "Policy/gradient_norm")
-        told = dict(zip(names, means, strict=True))
-        return told | {"Policy/outer_learning_rate": torch.tensor(self.adam.param_groups[0]["lr"], device=self.device)}
+        reported = dict(zip(names, means, strict=True))
+        return reported | {
+            "Policy/outer_learning_rate": torch.tensor(self.adam.param_groups[0]["lr"], device=self.device)
+        }
 
     def _follow(self, kl: Tensor) -> None:
         """Adapts the step size to the KL that the steps so far have made."""

@@ -67,7 +67,7 @@ class RL2Agent:
         """Mean actions (N, a) in [-1, 1] for raw observations (N, d).
 
         The memory goes on within the episode, without rewards: nobody passes them in an evaluation. The policy is
-        told that they are not known, and has met that in training (``blind_share``).
+        shown that they are not known, and has met that in training (``blind_share``).
         """
         memory = self._memory(self._playing, len(obs))
         mean, state = self.policy.step(obs, memory)

@@ -57,8 +57,8 @@ class HAPPO(OwnAdams, Sequential):
         value = self._critic_epochs(batch, cfg.epochs, cfg.num_minibatches, cfg.value_loss_weight)
         surrogate, kl, outside = torch.stack(measured).mean(0)
         rate = torch.stack([adam.rate for adam in self.adams]).mean()
-        told = {"Loss/surrogate": surrogate, "Loss/value": value, "Policy/kl": kl, "Policy/clip_fraction": outside}
-        return told | {"Policy/lr": rate}
+        reported = {"Loss/surrogate": surrogate, "Loss/value": value, "Policy/kl": kl, "Policy/clip_fraction": outside}
+        return reported | {"Policy/lr": rate}
 
     def _agent_epochs(self, agent: int, share: AgentBatch) -> Tensor:
         """Some passes over the batch by one agent; the means of surrogate loss, KL and share of clipped ratios (3,)."""

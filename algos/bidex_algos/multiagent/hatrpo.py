@@ -49,8 +49,10 @@ class HATRPO(Sequential):
     def _update(self, batch: Batch) -> dict[str, Tensor]:
         """All agents in turn, then the critic; returns means over agents of what it measured."""
         steps = [self._agent_step(agent, share) for agent, share in self._in_turn(batch)]
-        told = {name: torch.stack([step[name] for step in steps]).mean() for name in steps[0]}
-        return told | {"Loss/value": self._critic_epochs(batch, self.config.critic_epochs, self.config.num_minibatches)}
+        reported = {name: torch.stack([step[name] for step in steps]).mean() for name in steps[0]}
+        return reported | {
+            "Loss/value": self._critic_epochs(batch, self.config.critic_epochs, self.config.num_minibatches)
+        }
 
     def _agent_step(self, agent: int, share: AgentBatch) -> dict[str, Tensor]:
         actor, cfg = self.policy.actor, self.config

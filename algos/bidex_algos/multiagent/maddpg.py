@@ -98,8 +98,8 @@ class MADDPG(DDPG):
             price = self.config.squash_price * raw[:, list(view.actions)].square().sum(1) / raw.shape[1]
             losses.append((share * (price - value)).sum())
         loss = torch.stack(losses).sum()
-        told = loss.detach()[None] / len(self.views)
-        self.actor_loss = self._descend(loss, told, "actor", actor=list(self.policy.actor.parameters()))[0]
+        reported = loss.detach()[None] / len(self.views)
+        self.actor_loss = self._descend(loss, reported, "actor", actor=list(self.policy.actor.parameters()))[0]
 
     @classmethod
     def _make_policy(

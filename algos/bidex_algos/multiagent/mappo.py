@@ -21,7 +21,7 @@ class MAPPOConfig(MultiAgentPPOConfig):
     """Everything that can be set about MAPPO; the defaults are the preset ``laptop``."""
 
     share_parameters: bool = False
-    """Give agents whose observations and actions are of one form a network together, which is told who acts."""
+    """Share one network between agents with equal observation groups and action sizes; it sees who acts."""
 
 
 PRESETS: dict[str, MAPPOConfig] = {
@@ -53,10 +53,12 @@ class MAPPO(OwnAdams):
         for first, index, count in self._mini_batches(batch.weights, cfg.epochs, cfg.num_minibatches):
             part = batch.select(index)
             part.old_log_probs = old_log_probs.index_select(0, index)
-            told = self._gradients(part, count, old_log_std.index_select(0, index), old_values.index_select(0, index))
-            measured.append(told[:4])
+            reported = self._gradients(
+                part, count, old_log_std.index_select(0, index), old_values.index_select(0, index)
+            )
+            measured.append(reported[:4])
             for k, adam in enumerate(self.adams):
-                adam.descend(None if first else told[4 + k], cfg.max_grad_norm)
+                adam.descend(None if first else reported[4 + k], cfg.max_grad_norm)
             self._critic_step()
             actor.clamp_std(*cfg.std_range)
         rate = torch.stack([adam.rate for adam in self.adams]).mean()

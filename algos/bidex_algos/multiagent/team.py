@@ -14,7 +14,7 @@ from bidex_meta.world.agent_views import AgentView
 
 
 class Team(nn.Module):
-    """One :class:`MLP` an agent; with ``share`` one for all of a form (columns of each group, actions), told who acts.
+    """One :class:`MLP` an agent; with ``share`` one for each form (columns of groups, actions); it sees who acts.
 
     Agent i has network ``net_of[i]``; ``families`` are the agents of each form.
     """

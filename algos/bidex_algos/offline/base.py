@@ -169,8 +169,8 @@ class Offline(Learner):
         loss = (values - target).square().mean(1).sum()
         self._descend(loss, "critic", self.critic)
         of_tasks = values[0].detach().view(self.world.num_tasks, -1).mean(1)
-        told = {f"Value/q/{name}": value for name, value in zip(self.world.task_names, of_tasks, strict=True)}
-        return {"Loss/critic": loss.detach()} | told
+        reported = {f"Value/q/{name}": value for name, value in zip(self.world.task_names, of_tasks, strict=True)}
+        return {"Loss/critic": loss.detach()} | reported
 
     def _descend(self, loss: Tensor, name: str, *modules: nn.Module) -> None:
         """One step of the optimiser named, down ``loss``; weights of these modules alone get a slope."""

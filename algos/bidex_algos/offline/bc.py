@@ -38,12 +38,12 @@ class BC(Offline):
         with autocast(self.device, self.low_precision):
             actions = self.policy.actor(obs)
         imitation = (actions - draw.actions).square().mean()
-        loss, told = self._actor_loss(imitation, obs, actions)
+        loss, reported = self._actor_loss(imitation, obs, actions)
         self._descend(loss, "actor", self.policy.actor)
-        return told | {"Loss/imitation": imitation.detach()}
+        return reported | {"Loss/imitation": imitation.detach()}
 
     def _actor_loss(self, imitation: Tensor, obs: Tensor, actions: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """What the actor goes down, and what more is told, for its actions (B, a) and their distance to the data's."""
+        """The actor's loss and further metrics, for its actions (B, a) and their distance to the data's."""
         return imitation, {}
 
     @classmethod

@@ -75,9 +75,9 @@ class ActionModel(nn.Module):
     def __init__(self, inputs: Inputs, config: BCQConfig, actions: int, generator: torch.Generator):
         super().__init__()
         self.codes = config.latent * actions
-        seen, told = inputs.extended("action", actions), inputs.extended("code", self.codes)
-        self.encoder = MLP(seen, config.vae_hidden, 2 * self.codes, 1.0, generator, config.activation)
-        self.decoder = MLP(told, config.vae_hidden, actions, 1.0, generator, config.activation)
+        encoded, decoded = inputs.extended("action", actions), inputs.extended("code", self.codes)
+        self.encoder = MLP(encoded, config.vae_hidden, 2 * self.codes, 1.0, generator, config.activation)
+        self.decoder = MLP(decoded, config.vae_hidden, actions, 1.0, generator, config.activation)
 
     def encode(self, obs: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and logarithm of the standard deviation of the codes of actions (B, a): (B, z) each."""
@@ -163,12 +163,12 @@ class BCQ(Offline):
 
     def _update(self, draw: Transitions) -> dict[str, Tensor]:
         obs, next_obs = self.policy.observations(draw.obs), self.policy.observations(draw.next_obs)
-        told = self._fit_model(obs, draw.actions)
-        told |= self._fit_critics(obs, draw, self._target(draw, next_obs))
-        told |= self._fit_actor(obs)
+        reported = self._fit_model(obs, draw.actions)
+        reported |= self._fit_critics(obs, draw, self._target(draw, next_obs))
+        reported |= self._fit_actor(obs)
         follow(self.target_critic, self.critic, self.config.tau)
         follow(self.target_actor, self.policy.actor, self.config.tau)
-        return told
+        return reported
 
     def _fit_model(self, obs: Tensor, actions: Tensor) -> dict[str, Tensor]:
         """One step of the model towards the data's actions (B, a)."""

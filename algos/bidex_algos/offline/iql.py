@@ -80,10 +80,10 @@ class IQL(Offline):
         with torch.no_grad():
             advantage = judged - self._worth(obs)
             target = self._bootstrapped(draw, self._worth(next_obs))
-        told = {"Loss/value": loss.detach()} | self._fit_actor(obs, draw.actions, advantage)
-        told |= self._fit_critics(obs, draw, target)
+        reported = {"Loss/value": loss.detach()} | self._fit_actor(obs, draw.actions, advantage)
+        reported |= self._fit_critics(obs, draw, target)
         follow(self.target_critic, self.critic, self.config.tau)
-        return told
+        return reported
 
     def _worth(self, obs: Tensor) -> Tensor:
         """Values of states (B,), of normalised observations (B, d)."""

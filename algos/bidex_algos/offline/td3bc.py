@@ -55,12 +55,12 @@ class TD3BC(BC):
 
     def _update(self, draw: Transitions) -> dict[str, Tensor]:
         obs, next_obs = self.policy.observations(draw.obs), self.policy.observations(draw.next_obs)
-        told = self._fit_critics(obs, draw, self._target(draw, next_obs))
+        reported = self._fit_critics(obs, draw, self._target(draw, next_obs))
         if self.env_steps % self.config.policy_delay == 0:
-            told |= self._fit_actor(obs, draw)
+            reported |= self._fit_actor(obs, draw)
             follow(self.target_actor, self.policy.actor, self.config.tau)
             follow(self.target_critic, self.critic, self.config.tau)
-        return told
+        return reported
 
     @torch.no_grad()
     def _target(self, draw: Transitions, next_obs: Tensor) -> Tensor:

@@ -146,7 +146,7 @@ class OffPolicy(Learner):
         """Networks and parameters of its own, beside those of the base, by their names in a checkpoint."""
         return {}
 
-    def _told(self) -> dict[str, Tensor]:
+    def _reported(self) -> dict[str, Tensor]:
         """Scalars to be logged at the end of every iteration, before the first update too."""
         return {}
 
@@ -167,7 +167,7 @@ class OffPolicy(Learner):
             names = sorted(measured[0], key=lambda name: name.partition("/")[0])
             means = torch.stack([torch.stack([each[name] for name in names]) for each in measured]).mean(0)
             tensors |= dict(zip(names, means, strict=True))
-        return self.episodes.metrics() | as_numbers(tensors | self._told())
+        return self.episodes.metrics() | as_numbers(tensors | self._reported())
 
     @torch.no_grad()
     def _step(self) -> Tensor:

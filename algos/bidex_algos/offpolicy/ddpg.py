@@ -97,7 +97,7 @@ class DDPG(OffPolicy):
     def _update(self, draw: Transitions, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
         """One update of the critic, of the actor when it is due, and of what follows them."""
         obs, next_obs = self.policy.observations(draw.obs), self.policy.observations(draw.next_obs)
-        told = self._fit_critics(obs, draw, self._target(draw, next_obs), weights, counts)
+        reported = self._fit_critics(obs, draw, self._target(draw, next_obs), weights, counts)
         due = self._actor_is_due()
         if due:
             self._policy_step(obs, draw, weights, counts)
@@ -105,7 +105,7 @@ class DDPG(OffPolicy):
             follow(self.target_actor, self.policy.actor, self.config.tau)
         if due or not self.delayed_targets:
             follow(self.target_critic, self.critic, self.config.tau)
-        return told
+        return reported
 
     def _actor_is_due(self) -> bool:
         """Whether the actor learns in this update."""
@@ -136,7 +136,7 @@ class DDPG(OffPolicy):
         """What the actor climbs (B,): the first critic's values."""
         return values[0]
 
-    def _told(self) -> dict[str, Tensor]:
+    def _reported(self) -> dict[str, Tensor]:
         return {"Loss/actor": self.actor_loss}
 
     @classmethod

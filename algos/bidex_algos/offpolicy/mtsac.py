@@ -123,10 +123,10 @@ class MTSAC(OffPolicy):
     def _update(self, draw: Transitions, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
         """One update of critics, actor, temperatures and target critics; losses, entropy and values."""
         obs, next_obs = self.policy.observations(draw.obs), self.policy.observations(draw.next_obs)
-        told = self._fit_critics(obs, draw, self._target(draw, next_obs), weights, counts)
-        told |= self._policy_step(obs, weights, counts)
+        reported = self._fit_critics(obs, draw, self._target(draw, next_obs), weights, counts)
+        reported |= self._policy_step(obs, weights, counts)
         follow(self.target_critic, self.critic, self.config.tau)
-        return told
+        return reported
 
     @torch.no_grad()
     def _target(self, draw: Transitions, next_obs: Tensor) -> Tensor:
@@ -153,7 +153,7 @@ class MTSAC(OffPolicy):
         """The gap in entropy that each task's temperature follows, of the tasks' own (num_tasks,)."""
         return gap
 
-    def _told(self) -> dict[str, Tensor]:
+    def _reported(self) -> dict[str, Tensor]:
         alphas = self.log_alpha.detach().exp()
         return {f"Policy/alpha/{name}": alpha for name, alpha in zip(self.world.task_names, alphas, strict=True)}
 

@@ -152,10 +152,10 @@ class MTPPO(OnPolicy):
         if self._imitated():
             names.append("Loss/demonstrations")
         means = torch.stack(measured).mean(0)
-        told = {**dict(zip(names, means, strict=True)), "Policy/lr": self.adams.rate}
+        reported = {**dict(zip(names, means, strict=True)), "Policy/lr": self.adams.rate}
         if self.demonstrations is not None:
-            told["Policy/demonstration_weight"] = means.new_tensor(self._imitated())
-        return told
+            reported["Policy/demonstration_weight"] = means.new_tensor(self._imitated())
+        return reported
 
     def _gradients(self, b: Batch, count: Tensor, old_log_std: Tensor) -> Tensor:
         """Puts the gradients of a mini-batch into the parameters; ``count`` samples are in it, over all processes."""

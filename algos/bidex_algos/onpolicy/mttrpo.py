@@ -90,7 +90,7 @@ def gaussian_step(
         return objective, kl
 
     stepped = trust_region_step(parameters, surrogate_and_kl()[0], own_kl, measure, config, max_kl, config.accept_ratio)
-    return stepped.told("Policy/kl", weight.device)
+    return stepped.reported("Policy/kl", weight.device)
 
 
 def kl_from_itself(
@@ -134,8 +134,8 @@ class MTTRPO(OnPolicy):
         old_log_std = actor.log_std_of(batch.obs).detach().clone()
         given = batch, batch.advantages, old_log_std
         own = self._kl_from_itself(batch)
-        told = gaussian_step(list(actor.parameters()), distribution, keep_bounds, *given, own, cfg, cfg.max_kl)
-        return told | {"Loss/value": self._critic_epochs(batch)}
+        reported = gaussian_step(list(actor.parameters()), distribution, keep_bounds, *given, own, cfg, cfg.max_kl)
+        return reported | {"Loss/value": self._critic_epochs(batch)}
 
     def _kl_from_itself(self, batch: Batch) -> Tensor:
         actor = self.policy.actor
