@@ -116,7 +116,7 @@ def paired_steps(full: "World", bare: "World", steps: int, generator: "torch.Gen
         for part in bare.parts:
             part.control(part.group.take(action))
         start = now()
-        list(bare.step_engines())
+        bare.step_engines()
         bare_time += now() - start
         begun = full.episodes.number != number
         for part, source in zip(bare.parts, full.parts, strict=True):

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 from bidex_meta.hands.hand import FINGERS, SIDES, hand
 
@@ -59,10 +60,13 @@ class Layout:
 
     def range(self, name: str) -> slice:
         """Index range of the named block; KeyError if there is none."""
-        ranges = {block.name: where for block, where in self}
-        if name not in ranges:
-            raise KeyError(f"No block {name!r}; there are {', '.join(ranges)}")
-        return ranges[name]
+        if name not in self._ranges:
+            raise KeyError(f"No block {name!r}; there are {', '.join(self._ranges)}")
+        return self._ranges[name]
+
+    @cached_property
+    def _ranges(self) -> dict[str, slice]:
+        return {block.name: where for block, where in self}
 
     def goal_indices(self) -> list[int]:
         """Indices of all entries that show the goal."""

@@ -12,6 +12,7 @@ from bidex_meta.witness.replay import SEED, Simulator, task_slot
 from bidex_meta.witness.scripts import script_of
 from bidex_meta.witness.store import Witness
 from bidex_meta.world import World
+from bidex_meta.world.part import base_rotations
 from bidex_meta.world.wrapper import PooledWorldWrapper
 
 
@@ -130,6 +131,6 @@ class ShiftedStarts(PooledWorldWrapper):
         engine.reset(torch.ones(rows, dtype=torch.bool), starts)
         # Loading a state makes the world return observations of these starts.
         action = torch.zeros(self.world.action_space.shape)
-        obs = part.observe(list(part.states(self.world.task_index)), action)
+        obs = part.observe(list(part.states(self.world.task_index)), action, *base_rotations([part]))
         self.world.load_state_dict(self.world.state_dict() | {"observation": obs})
         return obs.clone(), {}

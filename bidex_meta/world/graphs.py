@@ -4,7 +4,7 @@ Launched one by one, torch's kernels would take longer than the physics. The sta
 leaves behind lives in tensors at fixed addresses; so does what it returns, which its next replay overwrites.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -105,16 +105,15 @@ class SideBySide:
         several = device.type == "cuda" and jobs > 1
         self._streams = [torch.cuda.Stream(device) for _ in range(jobs)] if several else []
 
-    def run(self, jobs: Sequence[Callable[[], None]]) -> Iterator[int]:
-        """Does the jobs and yields their numbers, in order, as each is done. To be used up.
+    def run(self, jobs: Sequence[Callable[[], None]]) -> None:
+        """Does the jobs.
 
         On CUDA what comes after in the caller's stream waits for them all, and they for what came before. What they
         read must live until this ends.
         """
         if not self._streams:
-            for number, job in enumerate(jobs):
+            for job in jobs:
                 job()
-                yield number
             return
         caller = torch.cuda.current_stream()
         for stream, job in zip(self._streams, jobs, strict=True):
@@ -123,4 +122,3 @@ class SideBySide:
                 job()
         for stream in self._streams:
             caller.wait_stream(stream)
-        yield from range(len(jobs))

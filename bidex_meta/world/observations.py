@@ -1,4 +1,4 @@
-"""From sensors to observations (one gather, one scale, a few computed blocks), and the groups of their entries."""
+"""From sensors to observations (one gather, one scale, the goal's blocks), and the groups of their entries."""
 
 from collections.abc import Sequence
 from itertools import groupby
@@ -10,7 +10,7 @@ from torch import Tensor
 from bidex_meta.hands.hand import SIDES, hand
 from bidex_meta.tasks.layout import Layout, hand_blocks
 from bidex_meta.tasks.scene import Scene
-from bidex_meta.utils.maths import conjugate, multiply, roll_pitch_yaw, xyzw
+from bidex_meta.utils.maths import conjugate, xyzw
 from bidex_meta.world.contract import ObservationGroup
 
 Rule = Literal["plain", "one-hot", "masked"]
@@ -20,20 +20,25 @@ _HAND_OF = {block.name: f"{side}_hand" for side in SIDES for block in hand_block
 
 
 class Observer:
-    """Builds the observations of rows of one layout: a gather of sensors, then actions and base rotations.
+    """Builds the observations of rows of one layout: a gather of sensors, last actions and base rotations.
 
     Blocks that only a task can compute (goal pose and the like) are left at zero, as a masked goal and padding are;
     ``Part`` fills in the former.
     """
 
     def __init__(self, scene: Scene, start_mounts: Tensor, width: int) -> None:
-        """Looks up sensor, factor and offset of every entry; ``scene`` is any whose task has the layout.
+        """Looks up source, factor and offset of every entry; ``scene`` is any whose task has the layout.
 
         ``start_mounts``: start orientation (x, y, z, w) of both mounts of each row, (num, 2, 4). ``width``: entries of
         the observation with padding and task id.
         """
         self.layout: Layout = scene.task.layout
-        device = start_mounts.device
+        device, sensors = start_mounts.device, scene.model.nsensordata
+        actions = sensors + scene.task.action_size
+        turns = 3 * len(SIDES) if scene.task.moving_base else 0
+        # Columns: sensors, actions, rotations. Fresh memory for every step would cost more than what is written to it.
+        self._values = torch.empty(len(start_mounts), actions + turns, device=device)
+        self._columns = slice(0, sensors), slice(sensors, actions), slice(actions, actions + turns)
         self._source = torch.zeros(width, dtype=torch.int64, device=device)
         self._scale, self._offset = torch.zeros(2, width, device=device).unbind()
         span, middle = (
@@ -45,30 +50,36 @@ class Observer:
                 self._scale[where] = block.scale
             if block.name.endswith("joint_position"):
                 self._scale[where], self._offset[where] = 2.0 / span, -middle / span
-        # Fresh memory for every step would cost more than what is written to it.
-        self._sensors = torch.empty(len(start_mounts), scene.model.nsensordata, device=device)
+        share = scene.task.action_size // len(SIDES)
+        for i, side in enumerate(SIDES):
+            self._take(f"{side}_action", sensors + i * share)
+            if turns:
+                self._take(f"{side}_base_rotation", actions + 3 * i)
         self._start_inverse = conjugate(start_mounts)
         self._mounts = torch.cat([_indices(scene, f"{side}/mount_quaternion") for side in SIDES]).to(device)
-        self._actions = [self.layout.range(f"{side}_action") for side in SIDES]
-        moving = scene.task.moving_base
-        self._rotations = [self.layout.range(f"{side}_base_rotation") for side in SIDES] if moving else []
+        self.moving = turns > 0
 
-    def __call__(self, sensors: Tensor, action: Tensor, rows: Tensor | slice, out: Tensor | None = None) -> Tensor:
+    def _take(self, block: str, first: int) -> None:
+        where = self.layout.range(block)
+        self._source[where] = torch.arange(first, first + where.stop - where.start)
+        self._scale[where] = 1.0
+
+    def mounts(self, sensors: Tensor, rows: Tensor | slice) -> tuple[Tensor, Tensor]:
+        """Orientations of both mounts and the inverse of those at the start, (x, y, z, w), each (n, 2, 4)."""
+        return sensors.index_select(1, self._mounts).view(-1, len(SIDES), 4), self._start_inverse[rows]
+
+    def __call__(self, sensors: Tensor, action: Tensor, rotation: Tensor | None, out: Tensor | None = None) -> Tensor:
         """Observations of some rows (n, width), float32, without the tasks' own blocks, not yet clipped.
 
-        From sensors (n, nsensordata) and last actions (n, a); written into ``out`` where it is given.
+        From sensors (n, nsensordata), last actions (n, a) and base rotations (n, 2, 3; None for fixed bases); written
+        into ``out`` where it is given.
         """
-        floats = self._sensors[: len(sensors)].copy_(sensors)
-        values = torch.index_select(floats, 1, self._source, out=out).mul_(self._scale).add_(self._offset)
-        share = action.shape[1] // len(SIDES)
-        for i, where in enumerate(self._actions):
-            values[:, where] = action[:, i * share : (i + 1) * share]
-        if self._rotations:
-            mounts = sensors.index_select(1, self._mounts).view(-1, len(SIDES), 4)
-            rotation = roll_pitch_yaw(multiply(mounts, self._start_inverse[rows])).float()
-            for i, where in enumerate(self._rotations):
-                values[:, where] = rotation[:, i]
-        return values
+        values = self._values[: len(sensors)]
+        sensed, acted, turned = self._columns
+        values[:, sensed], values[:, acted] = sensors, action
+        if rotation is not None:
+            values[:, turned] = rotation.flatten(1)
+        return torch.index_select(values, 1, self._source, out=out).mul_(self._scale).add_(self._offset)
 
 
 def _indices(scene: Scene, name: str) -> Tensor:

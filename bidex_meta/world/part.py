@@ -1,6 +1,6 @@
 """The environments that one engine carries: controls, starts, observations, rewards."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -10,7 +10,7 @@ from bidex_meta.hands.hand import FORCE_PER_SCALE, SIDES, TORQUE_PER_SCALE, hand
 from bidex_meta.tasks.base import CONTROL_RATE, TaskClass
 from bidex_meta.tasks.layout import CLIP
 from bidex_meta.tasks.state import TaskState
-from bidex_meta.utils.maths import xyzw
+from bidex_meta.utils.maths import multiply, roll_pitch_yaw, xyzw
 from bidex_meta.world import checked
 from bidex_meta.world.base import Transition
 from bidex_meta.world.depth_sensor import DepthSensor
@@ -140,20 +140,26 @@ class Part:
             if last > first:
                 yield i, member, slice(first, last), rows[first:last]
 
+    def mounts(self, rows: Tensor | None) -> tuple[Tensor, Tensor] | None:
+        """See ``Observer.mounts``; of engine rows, None: all. None where the bases are fixed."""
+        chosen = slice(None) if rows is None else rows
+        return self._observer.mounts(self._engine.sensordata[chosen], chosen) if self._observer.moving else None
+
     def observe(
         self,
         states: list[tuple[Member, slice, TaskState]],
         action: Tensor,
+        rotation: Tensor | None,
         rows: Tensor | None = None,
         out: Tensor | None = None,
     ) -> Tensor:
         """Observations of engine rows (ascending; None: all) without the task id, shape (n, width), float32.
 
-        ``states`` is what ``states()`` returned for these rows, ``action`` their last actions (n, a); ``out`` (n,
-        width) is written into where it is given.
+        ``states`` is what ``states()`` returned for these rows, ``action`` their last actions (n, a), ``rotation`` what
+        ``base_rotations`` did; ``out`` (n, width) is written into where it is given.
         """
-        chosen = slice(None) if rows is None else rows
-        values = self._observer(self._engine.sensordata[chosen], action, chosen, out)
+        sensors = self._engine.sensordata
+        values = self._observer(sensors if rows is None else sensors[rows], action, rotation, out)
         if self._rule != "masked":
             for member, where, state in states:
                 for name, block in member.scene.task.observe(state).items():
@@ -182,6 +188,20 @@ class Part:
         return qpos
 
 
+def base_rotations(parts: Sequence[Part], rows: Sequence[Tensor | None] | None = None) -> Sequence[Tensor | None]:
+    """Roll, pitch and yaw (n, 2, 3) of both bases since the start, of engine rows (None: all) of each part.
+
+    All parts at once: a dozen operations on a few rows take as long as on all.
+    """
+    mounts = [part.mounts(r) for part, r in zip(parts, rows or [None] * len(parts), strict=True)]
+    moving = [each for each in mounts if each is not None]
+    if not moving:
+        return [None] * len(mounts)
+    now, inverse = (torch.cat(each) for each in zip(*moving, strict=True))
+    turned = iter(roll_pitch_yaw(multiply(now, inverse)).split([len(each) for each, _ in moving]))
+    return [None if each is None else next(turned) for each in mounts]
+
+
 class Judgement(NamedTuple):
     """A step of environments of one class by its formulas; see ``Transition``."""
 
@@ -199,23 +219,21 @@ def judge(task: TaskClass, state: TaskState) -> Judgement:
     return Judgement(terms, reward, task.success(state), task.failed(state))
 
 
-def collect(
-    parts: Iterable[Part], task_index: Tensor, action: Tensor, width: int, with_id: Callable[[Tensor, Tensor], Tensor]
-) -> Transition:
-    """Judges and observes all environments after a step; each part is taken when its turn comes.
+def collect(parts: Sequence[Part], task_index: Tensor, action: Tensor, width: int) -> Transition:
+    """Judges and observes all environments after a step.
 
-    ``task_index`` (n,) and ``action`` (n, a) are of the step, ``width`` of observations; ``with_id`` writes the task id
-    into observations (k, d) of environments (k,) and returns them.
+    ``task_index`` (n,) and ``action`` (n, a) are of the step, ``width`` of observations, whose task ids are not
+    written.
     """
     n, device = len(action), action.device
     reward, obs = torch.empty(n, device=device), torch.empty(n, width, device=device)
     success, failed, unstable = torch.zeros(3, n, dtype=torch.bool, device=device).unbind()
     terms: dict[str, Tensor] = {}
-    for part in parts:
+    for part, rotation in zip(parts, base_rotations(parts), strict=True):
         group = part.group
         states = list(part.states(group.take(task_index)))
         out = None if group.span is None else obs[group.span]
-        values = with_id(part.observe(states, group.take(action), out=out), group.rows)
+        values = part.observe(states, group.take(action), rotation, out=out)
         broke = part.unstable()
         for member, where, state in states:
             rows, judged = member.world_rows, judge(member.scene.task, state)

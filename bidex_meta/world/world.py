@@ -1,10 +1,10 @@
 """The batched world of hands: all environments of a suite, stepped together.
 
 The way of one observation: ``Part.advance`` (engine) -> ``sensordata`` -> ``Observer`` (gather, scale) ->
-``TaskClass.observe`` (goal blocks) -> ``World._with_id`` (padding, task id) -> the learner's network.
+``TaskClass.observe`` (goal blocks) -> ``World._write_ids`` (task id) -> the learner's network.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import fields
 from functools import partial
 from typing import Any
@@ -28,7 +28,7 @@ from bidex_meta.world.depth_sensor import PointsRule
 from bidex_meta.world.graphs import GraphCache, SideBySide, Work, cuda_graph, fresh
 from bidex_meta.world.groups import Group, Slot, build_groups, sights, with_pool, with_pools
 from bidex_meta.world.observations import Rule, observation_groups
-from bidex_meta.world.part import Part, collect
+from bidex_meta.world.part import Part, base_rotations, collect
 from bidex_meta.world.rendering import Painter
 from bidex_meta.world.starts import Starts
 from bidex_meta.world.threads import keep_freed_memory
@@ -170,13 +170,12 @@ class World(BatchedWorld):
         chosen = [part.group.take(mask) for part in self.parts]
         jobs = [partial(p.group.engine.reset, c, s) for p, c, s in zip(self.parts, chosen, starts, strict=True)]
         if self._masked:
-            list(self._side_by_side.run(jobs))
+            self._side_by_side.run(jobs)
             self._run("refresh", self._refresh_masked, mask)
             return
         begun = [(i, rows) for i, c in enumerate(chosen) if len(rows := c.nonzero().squeeze(1))]
-        for k in self._side_by_side.run([jobs[i] for i, _ in begun]):
-            i, rows = begun[k]
-            self._refresh(self.parts[i], rows)
+        self._side_by_side.run([jobs[i] for i, _ in begun])
+        self._refresh([self.parts[i] for i, _ in begun], [rows for _, rows in begun])
 
     def _draw(self, stagger: bool, mask: Tensor) -> list[Tensor]:
         """Counts new episodes in the environments of a mask; where they start, by part."""
@@ -186,24 +185,27 @@ class World(BatchedWorld):
         self._action = torch.where(mask[:, None], 0.0, self._action)
         return starts
 
-    def _refresh(self, part: Part, rows: Tensor) -> None:
-        world_rows = part.group.rows[rows]
-        states = list(part.states(part.group.take(self.task_index), rows))
-        self._obs[world_rows] = self._with_id(part.observe(states, self._action[world_rows], rows), world_rows)
+    def _refresh(self, parts: list[Part], engine_rows: list[Tensor]) -> None:
+        turned = base_rotations(parts, engine_rows)
+        for part, rows, rotation in zip(parts, engine_rows, turned, strict=True):
+            world_rows = part.group.rows[rows]
+            states = list(part.states(part.group.take(self.task_index), rows))
+            self._obs[world_rows] = part.observe(states, self._action[world_rows], rotation, rows)
+        self._write_ids(self._obs)
 
     def _refresh_masked(self, mask: Tensor) -> None:
         """With shapes that do not depend on the mask."""
         new = torch.empty_like(self._obs)
-        for part in self.parts:
+        for part, rotation in zip(self.parts, base_rotations(self.parts), strict=True):
             group = part.group
             states = list(part.states(group.take(self.task_index)))
-            new[group.rows] = self._with_id(part.observe(states, group.take(self._action)), group.rows)
+            new[group.rows] = part.observe(states, group.take(self._action), rotation)
+        self._write_ids(new)
         self._obs = torch.where(mask[:, None], new, self._obs)
 
-    def _with_id(self, obs: Tensor, world_rows: Tensor) -> Tensor:
+    def _write_ids(self, obs: Tensor) -> None:
         if self.num_id_columns:
-            obs[:, -self.num_id_columns :] = self._one_hot[world_rows]
-        return obs
+            obs[:, -self.num_id_columns :] = self._one_hot
 
     def _write_action(self, action: Tensor, active: Tensor) -> None:
         disabled = self.autoreset_mode == AutoresetMode.DISABLED
@@ -214,28 +216,27 @@ class World(BatchedWorld):
     def _move(self, active: Tensor, broken: Tensor) -> tuple[Tensor, Tensor, Tensor, Info]:
         if not self._masked:
             return super()._move(active, broken)
-        parts = list(self.step_engines(self._frozen_if(active)))
-        step = self._run("finish", lambda a, b: self._finish(a, b, self._collect(parts)), active, broken)
+        self.step_engines(self._frozen_if(active))
+        step = self._run("finish", lambda a, b: self._finish(a, b, self._collect()), active, broken)
         return step if self._graphs is None else fresh(step)
 
     def _advance(self, active: Tensor, broken: Tensor) -> Transition:
-        return self._collect(self.step_engines(self._frozen_if(active)))
+        self.step_engines(self._frozen_if(active))
+        return self._collect()
 
     def _frozen_if(self, active: Tensor) -> Tensor | None:
         """The mask for the engines: in SAME_STEP mode no environment is ever frozen."""
         return active if self.autoreset_mode == AutoresetMode.DISABLED else None
 
-    def _collect(self, parts: Iterable[Part]) -> Transition:
-        return collect(parts, self.task_index, self._action, self.observation_size, self._with_id)
+    def _collect(self) -> Transition:
+        transition = collect(self.parts, self.task_index, self._action, self.observation_size)
+        self._write_ids(transition.obs)
+        return transition
 
-    def step_engines(self, active: Tensor | None = None) -> Iterator[Part]:
-        """Physics alone: a control step of all environments, or those of a mask (num_envs,), under their controls.
-
-        Yields the parts as they are done; to be used up.
-        """
+    def step_engines(self, active: Tensor | None = None) -> None:
+        """Physics alone: a control step of all environments, or those of a mask (num_envs,), under their controls."""
         rows = [None if active is None else part.group.take(active) for part in self.parts]
-        jobs = [partial(part.advance, of) for part, of in zip(self.parts, rows, strict=True)]
-        return (self.parts[i] for i in self._side_by_side.run(jobs))
+        self._side_by_side.run([partial(part.advance, of) for part, of in zip(self.parts, rows, strict=True)])
 
     def state_dict(self) -> State:
         """As in ``BatchedWorld``."""

@@ -14,6 +14,7 @@ from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.scene import Scene
 from bidex_meta.world import Slot, World
+from bidex_meta.world.part import base_rotations
 from tests.tasks.oracle import Task
 from tests.tasks.tables import TABLES
 
@@ -78,7 +79,7 @@ def observe(world: World, action: Tensor | None = None) -> np.ndarray:
     part = world.parts[0]
     part.group.engine.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
     action = torch.zeros(world.num_envs, world.action_size) if action is None else action
-    return part.observe(list(part.states(world.task_index)), action).double().numpy()
+    return part.observe(list(part.states(world.task_index)), action, *base_rotations([part])).double().numpy()
 
 
 def set_pose(world: World, row: int, part: str, values: np.ndarray) -> None:

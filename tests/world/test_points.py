@@ -56,7 +56,7 @@ def banish(world: World, shift: float) -> None:
 def observed(world: World) -> Tensor:
     rows = torch.arange(world.num_envs)
     for part in world.parts:
-        world._refresh(part, torch.arange(part.group.engine.num))
+        world._refresh([part], [torch.arange(part.group.engine.num)])
     return world._obs[rows].clone()
 
 
@@ -104,7 +104,7 @@ def test_a_row_sees_the_same_in_any_company_and_a_step_gives_what_a_refresh_give
     part = world.parts[0]
     last = torch.tensor([part.group.engine.num - 1])
     before = world._obs.clone()
-    world._refresh(part, last)
+    world._refresh([part], [last])
     assert torch.equal(world._obs, before)
 
 
