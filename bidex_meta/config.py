@@ -5,7 +5,7 @@ import json
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Generic, Literal, TypeVar
+from typing import Annotated, Generic, Literal, TypeVar
 
 import msgspec
 import tyro
@@ -14,7 +14,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from bidex_meta.errors import BidexError, shortened
 from bidex_meta.suite import MOST_POINTS
-from bidex_meta.utils.files import read_json
+from bidex_meta.utils.files import Json, JsonObject, read_json
 from bidex_meta.utils.validation import (
     Count,
     Environments,
@@ -145,19 +145,19 @@ class RunConfig(Generic[LearnerSettings]):
         check_fields(self, "run", as_flags=True)
 
     @property
-    def learner_values(self) -> dict[str, Any]:
+    def learner_values(self) -> JsonObject:
         """The learner's config as plain values."""
         return json.loads(msgspec.json.encode(self.learner))
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """As ``config.json`` holds it."""
         return json.loads(msgspec.json.encode(self))
 
-    def flat(self) -> dict[str, Any]:
+    def flat(self) -> JsonObject:
         """Plain values without nesting: ``learner.gamma`` beside ``seed``."""
         return flat(self.to_json())
 
-    def differences(self, other: "RunConfig[Any]", ignored: Collection[str] = ()) -> Iterator[tuple[str, Any, Any]]:
+    def differences(self, other: "RunConfig", ignored: Collection[str] = ()) -> Iterator[tuple[str, Json, Json]]:
         """Name, value here and value there of all entries that differ, but for those that a resumed run may change."""
         free = {entry.name for entry in dataclasses.fields(self) if entry.metadata.get("may_change")}
         here, there = self.flat(), other.flat()
@@ -165,7 +165,7 @@ class RunConfig(Generic[LearnerSettings]):
             if here.get(name) != there.get(name):
                 yield name, here.get(name), there.get(name)
 
-    def early_end(self, metrics: Mapping[str, Any]) -> str | None:
+    def early_end(self, metrics: Mapping[str, Json]) -> str | None:
         """The tag of the metrics that has reached what ends the run early; None where the run goes on."""
         prefix = "Train" if self.evaluate_every is None else "Eval"
         limits = {
@@ -179,20 +179,20 @@ class RunConfig(Generic[LearnerSettings]):
                 return tag
         return None
 
-    def goal(self, last: Mapping[str, Any]) -> int:
+    def goal(self, last: Mapping[str, Json]) -> int:
         """Steps that a run trains for: those of its last metrics where time or these ended it, else ``steps``."""
         return last["step"] if self.minutes is not None or self.early_end(last) else self.steps
 
 
-def flat(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flat(content: Mapping[str, Json], prefix: str = "") -> JsonObject:
     """Tables without nesting: ``{"learner": {"gamma": 0.9}}`` becomes ``{"learner.gamma": 0.9}``."""
-    found: dict[str, Any] = {}
+    found: JsonObject = {}
     for name, value in content.items():
         found.update(flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value})
     return found
 
 
-def read_config(path: Path) -> RunConfig[dict[str, Any]]:
+def read_config(path: Path) -> RunConfig[JsonObject]:
     """A run's ``config.json``, of this version or an older one.
 
     Raises:
@@ -201,7 +201,7 @@ def read_config(path: Path) -> RunConfig[dict[str, Any]]:
     return config_of(read_json(path, "a run's config"), str(path))
 
 
-def config_of(content: object, where: str) -> RunConfig[dict[str, Any]]:
+def config_of(content: object, where: str) -> RunConfig[JsonObject]:
     """A run's config from what a file holds; ``where`` for messages.
 
     Raises:
@@ -209,18 +209,18 @@ def config_of(content: object, where: str) -> RunConfig[dict[str, Any]]:
     """
     if isinstance(content, dict):
         content = _brought_up(content)
-    config = parse(content, RunConfig[dict[str, Any]], where)
+    config = parse(content, RunConfig[JsonObject], where)
     if (config.suite is None) == (config.task is None):
         raise BidexError(f"{where}: expected either a suite or a task, the other null. Name a run.")
     return dataclasses.replace(config)  # msgspec leaves defaults to the class, and does not write those
 
 
-def _brought_up(content: dict[str, Any]) -> dict[str, Any]:
+def _brought_up(content: JsonObject) -> JsonObject:
     """What a run of 0.2.0 or before wrote, as this version writes it; what it lacks has its default."""
     given = content.get("demonstrations")
     return {**content, "demonstrations": [given] if isinstance(given, str) else [] if given is None else given}
 
 
-def printed(config: RunConfig[Any]) -> str:
+def printed(config: RunConfig) -> str:
     """The config as JSON for reading."""
     return json.dumps(config.to_json(), indent=2)

@@ -101,7 +101,8 @@ def add_table(scene: mujoco.MjSpec, size: Point, centre: Point, friction: float 
         material="table",
         friction=[friction, 0.005, 0.001],
         priority=priority,
-        **{name: getattr(floor, name) for name in ("contype", "conaffinity", "margin", "solref", "solimp")},
+        **{"contype": floor.contype, "conaffinity": floor.conaffinity},
+        **{"margin": floor.margin, "solref": floor.solref, "solimp": floor.solimp},
     )
 
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from bidex_meta.hands.hand import INNER
 from bidex_meta.tasks import registry
-from bidex_meta.tasks.pour_water import PourWater
+from bidex_meta.tasks.bucket import PourWater
 from bidex_meta.tasks.scene import Scene, compile_scene
 from bidex_meta.world import World
 from tests.hands import figures

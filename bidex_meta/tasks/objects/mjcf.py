@@ -43,13 +43,10 @@ def read_own(path: Path, points: bool = False) -> mujoco.MjSpec:
         spec = mujoco.MjSpec.from_string(content.decode())
     except (ValueError, UnicodeDecodeError) as error:
         raise BidexError(f"{path}: expected an object in MJCF, but {_reason(error)}") from None
-    folders = {name: getattr(spec, name, "") or "" for name in ("meshdir", "texturedir")}
-    for mesh in spec.meshes:
-        if mesh.file:
-            mesh.file = str(_beside(path, Path(folders["meshdir"]) / mesh.file))
-    for texture in spec.textures:
-        if texture.file:
-            texture.file = str(_beside(path, Path(folders["texturedir"]) / texture.file))
+    for folder, parts in ((spec.meshdir, spec.meshes), (spec.texturedir, spec.textures)):
+        for part in parts:
+            if part.file:
+                part.file = str(_beside(path, Path(folder) / part.file))
     spec.meshdir = spec.texturedir = ""
     return spec
 
