@@ -5,7 +5,7 @@ Names of task classes and of their variations are checked where the classes are 
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Literal
@@ -182,7 +182,7 @@ def _parse(file: Path) -> Suite:
         if not isinstance(text, str) or not text.strip() or not text.isprintable():
             raise _error(file, place, "printable text", shortened(text))
     points = content.points or _PointsEntry(0)
-    given = {name: value for name, value in vars(content).items() if name not in ("classes", "points")}
+    given = {f.name: getattr(content, f.name) for f in fields(content) if f.name not in ("classes", "points")}
     classes = tuple(each for i, entry in enumerate(content.classes) for each in _classes(file, i, entry))
     suite = Suite(**given, classes=classes, file=file, points=points.count, point_kinds=points.kinds)
     _check(suite)

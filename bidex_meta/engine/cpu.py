@@ -18,8 +18,8 @@ from bidex_meta.errors import BidexError
 from bidex_meta.utils.memory import usable_cores
 
 # A full arena drops contacts or constraints in silence: as broken as a bad number.
-_BAD_NAMES = ("BADQPOS", "BADQVEL", "BADQACC", "CONTACTFULL", "CNSTRFULL")
-_BAD = [int(mujoco.mjtWarning.__members__[f"mjWARN_{name}"]) for name in _BAD_NAMES]
+_TROUBLE = mujoco.mjtWarning.__members__
+_BAD = [int(_TROUBLE[f"mjWARN_{n}"]) for n in ("BADQPOS", "BADQVEL", "BADQACC", "CONTACTFULL", "CNSTRFULL")]
 
 
 class CpuEngine:

@@ -27,8 +27,7 @@ from bidex_meta.errors import BidexError
 # What a step changes and later steps or readers see.
 _STEPPED = ("time", "qpos", "qvel", "act", "history", "qacc_warmstart", "sensordata", "overflow")
 # Bits of a world whose contacts or constraints were dropped. Meeting an iteration limit is no fault: C stops there too.
-_LOST_NAMES = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD")
-_LOST = sum(int(mjw.OverflowType[name]) for name in _LOST_NAMES)
+_LOST = sum(int(mjw.OverflowType[name]) for name in ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD"))
 # Sensors that kinematics, body velocities or the last substep give; ``_refresh`` would leave others behind the state.
 _SENSOR_NAMES = (
     "JOINTPOS JOINTVEL JOINTACTFRC FRAMEPOS FRAMEQUAT FRAMEXAXIS FRAMEYAXIS FRAMEZAXIS FRAMELINVEL FRAMEANGVEL "
@@ -38,7 +37,6 @@ _SENSORS = [int(mujoco.mjtSensor.__members__[f"mjSENS_{name}"]) for name in _SEN
 # Normals of an egg's contacts were off those of C by 5e-3 rad (99th percentile) with C's 1e-6, by 1.5e-3 with this one;
 # with 1e-10 some contacts were lost.
 _CCD_TOLERANCE = 1e-8
-_NO_SENSORS = int(mjw.DisableBit.SENSOR)
 
 
 class WarpEngine:
@@ -74,8 +72,8 @@ class WarpEngine:
             self._put(capacity)
             self._bind()
             self._substeps = 1
-            for work in (self._advance, self._begin):  # compiles all kernels, which a capture must not do
-                work()
+            self._advance()  # compiles all kernels, which a capture must not do
+            self._begin()
         self._mask_view.fill_(True)
         with self._on_device():
             mjw.reset_data(self._m, self._d, reset=self._mask)
@@ -194,7 +192,9 @@ class WarpEngine:
         self._guard.examine(d)
         for left in reversed(range(self._substeps)):
             self._guard.watch(m, d)
-            m.opt.disableflags = wanted | _NO_SENSORS if left else wanted  # only the last substep's forces are read
+            m.opt.disableflags = (
+                wanted | int(mjw.DisableBit.SENSOR) if left else wanted
+            )  # only the last substep's forces are read
             mjw.step(m, d)
         m.opt.disableflags = wanted
         self._guard.watch(m, d)
@@ -252,13 +252,12 @@ class WarpEngine:
 @contextmanager
 def _no_garbage_collection() -> Iterator[None]:
     """An old graph collected during a capture would record its own destruction."""
-    enabled = gc.isenabled()
+    finish = gc.enable if gc.isenabled() else gc.disable
     gc.disable()
     try:
         yield
     finally:
-        if enabled:
-            gc.enable()
+        finish()
 
 
 def _adapted(model: mujoco.MjModel) -> mujoco.MjModel:

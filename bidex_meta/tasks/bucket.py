@@ -93,15 +93,11 @@ class GraspAndPlace(ReachTask):
 
 _KETTLE = SceneObject("kettle", "kettle", (0.0, 0.0, 0.478), (0.0, 0.0, 0.5 * math.pi))
 _BUCKET = SceneObject("bucket", "bucket", (0.0, -0.3, 0.457))
-_POUR_TILT = math.radians(40.0)
-"""Tilt of the goal's orientation, rad; water leaves at less (assets/objects/kettle.xml)."""
 _SINK, _DEEPEST = 5.0, 0.2
 """How far the goal sinks for each metre that the bucket is lifted, and how far below the mouth of a standing one at
 most, metres."""
 _SIDE, _SPACING, _RISE = 5, 0.012, 0.011
 """The drops start in layers of 5 x 5, 12 mm apart, each layer 11 mm above the last."""
-_FIRST_LAYER = -0.0025
-"""Height of the lowest drops' centres in the kettle's frame, metres: 0.5 mm above its floor."""
 
 
 class PourWater(ReachTask):
@@ -170,7 +166,7 @@ class PourWater(ReachTask):
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """``kettle``, ``bucket``: shifts and turns (n, 3); ``goal_rotation``: (x, y, z, w), and its inverse (n, 4)."""
         nominal = xyzw(variation.new_tensor(_KETTLE.quaternion))
-        tilt = xyzw(variation.new_tensor(quaternion_from_rpy((0.0, -_POUR_TILT, 0.0))))
+        tilt = xyzw(variation.new_tensor(quaternion_from_rpy((0.0, -math.radians(40.0), 0.0))))
         goal = multiply(multiply(yaw_quaternion(variation[:, 2]), nominal), tilt)
         return super().freeze(variation) | {"goal_rotation": goal, "goal_rotation_inverse": conjugate(goal)}
 
@@ -187,7 +183,7 @@ class PourWater(ReachTask):
         i = torch.arange(self.water, device=like.device)
         middle = 0.5 * (_SIDE - 1)
         x, y = (i % _SIDE - middle) * _SPACING, (i // _SIDE % _SIDE - middle) * _SPACING
-        z = _FIRST_LAYER + i // _SIDE**2 * _RISE
+        z = -0.0025 + i // _SIDE**2 * _RISE  # the lowest 0.5 mm above the floor
         return torch.stack((x, y, z), dim=1).to(like.dtype)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:

@@ -117,22 +117,6 @@ def depth(scene: Scene, joints: torch.Tensor, centre: torch.Tensor, quaternion: 
     return max(0.0, -min(touched, default=0.0))
 
 
-@pytest.mark.parametrize("finger", range(4), ids=["index", "middle", "ring", "little"])
-def test_a_flexed_finger_under_the_egg_is_opened(scene: Scene, finger: int) -> None:
-    joints = torch.zeros(1, 24, dtype=torch.float64)
-    others = [f for f in range(4) if f != finger]
-    joints[0, [BASE[finger], MIDDLE[finger], DISTAL[finger]]] = 1.571
-    # Over the finger's root, where a curled finger lies.
-    centre = torch.tensor([[(0.033, 0.011, -0.011, -0.034)[finger], -0.035, 0.40]], dtype=torch.float64)
-    axis = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
-    upright = np.array((0.0, 0.0, 0.0, 1.0))
-    assert depth(scene, joints[0], centre[0], upright) > 0.01
-    opened, shift = make_room(joints, centre, axis, RADIUS, HALF_LENGTH)
-    assert (opened[0, [BASE[finger], MIDDLE[finger], DISTAL[finger]]] == 0).all()
-    assert (opened[0, [BASE[f] for f in others]] == 0).all()
-    assert depth(scene, opened[0], centre[0] + shift[0], upright) < 0.005
-
-
 @settings(max_examples=300)
 @given(
     u=hnp.arrays(np.float64, 24, elements=st.floats(-1, 1)), place=hnp.arrays(np.float64, 5, elements=st.floats(-1, 1))

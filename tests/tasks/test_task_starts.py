@@ -105,16 +105,6 @@ def test_nothing_starts_deep_in_anything(qpos: np.ndarray, name: str, moving: bo
 
 
 @each_case
-def test_the_engines_own_depth_agrees(name: str, moving: bool) -> None:
-    world = world_of(name, moving, 8)
-    world.reset(seed=0)
-    engine, lens = engine_of(world), Lens(scene_of(world).model)
-    for row in range(8):
-        found = depths(lens.look(engine.placement()[row])).max()
-        assert engine.contact_depth(row) == pytest.approx(found, abs=1e-9)
-
-
-@each_case
 def test_joints_start_inside_their_limits_and_alike_in_both_hands(qpos: np.ndarray, name: str, moving: bool) -> None:
     places = scene(name, moving).qpos
     noise = NOISE.get(name, (0.0, 0.0))[1]
