@@ -65,8 +65,7 @@ Several = Annotated[tuple[Text, ...], tyro.conf.UseAppendAction]
 class RunConfig(Generic[LearnerSettings]):
     """Everything that decides what a run does. ``learner`` is the learner's own config, or as a file holds it.
 
-    Raises:
-        BidexError: A field is out of its bounds, or there is not either a suite or a task.
+    Raises BidexError for a field that is out of its bounds.
     """
 
     suite: Text | None
@@ -141,7 +140,6 @@ class RunConfig(Generic[LearnerSettings]):
     machine. A resumed run keeps its own."""
 
     def __post_init__(self) -> None:
-        """Checks all fields."""
         check_fields(self, "run", as_flags=True)
 
     @property
@@ -173,11 +171,8 @@ class RunConfig(Generic[LearnerSettings]):
             f"{prefix}/success_rate": self.stop_at_success,
             "Eval/score": self.stop_at_score,
         }
-        for tag, limit in limits.items():
-            value = metrics.get(tag)
-            if limit is not None and value is not None and value >= limit:
-                return tag
-        return None
+        told = ((tag, limit, metrics.get(tag)) for tag, limit in limits.items())
+        return next((tag for tag, limit, value in told if None not in (limit, value) and value >= limit), None)
 
     def goal(self, last: Mapping[str, Json]) -> int:
         """Steps that a run trains for: those of its last metrics where time or these ended it, else ``steps``."""
@@ -193,32 +188,19 @@ def flat(content: Mapping[str, Json], prefix: str = "") -> JsonObject:
 
 
 def read_config(path: Path) -> RunConfig[JsonObject]:
-    """A run's ``config.json``, of this version or an older one.
-
-    Raises:
-        BidexError: The file cannot be read, or is not a run's config.
-    """
+    """A run's ``config.json``, of this version or an older one; BidexError where it is none, or cannot be read."""
     return config_of(read_json(path, "a run's config"), str(path))
 
 
 def config_of(content: object, where: str) -> RunConfig[JsonObject]:
-    """A run's config from what a file holds; ``where`` for messages.
-
-    Raises:
-        BidexError: It is not a run's config.
-    """
-    if isinstance(content, dict):
-        content = _brought_up(content)
+    """A run's config from what a file holds; ``where`` for messages. Raises BidexError where it is none."""
+    if isinstance(content, dict):  # what a run of 0.2.0 or before wrote, as this version writes it
+        given = content.get("demonstrations")
+        content = {**content, "demonstrations": [given] if isinstance(given, str) else [] if given is None else given}
     config = parse(content, RunConfig[JsonObject], where)
     if (config.suite is None) == (config.task is None):
         raise BidexError(f"{where}: expected either a suite or a task, the other null. Name a run.")
     return dataclasses.replace(config)  # msgspec leaves defaults to the class, and does not write those
-
-
-def _brought_up(content: JsonObject) -> JsonObject:
-    """What a run of 0.2.0 or before wrote, as this version writes it; what it lacks has its default."""
-    given = content.get("demonstrations")
-    return {**content, "demonstrations": [given] if isinstance(given, str) else [] if given is None else given}
 
 
 def printed(config: RunConfig) -> str:

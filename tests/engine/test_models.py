@@ -11,7 +11,6 @@ from tests.tasks.worlds import CASES
 
 ONE_EGG = {(name, True) for name in ("CatchUnderarm", "CatchOver2Underarm", "CatchAbreast")}
 DOORS = {case for case in CASES if case[0].startswith("Door")}
-SUBSTEPS = 4
 
 
 @pytest.fixture(scope="module")

@@ -38,11 +38,6 @@ def started(worlds: dict[tuple[str, bool], World], name: str, moving: bool) -> W
     return world
 
 
-def places(name: str, moving: bool) -> dict[str, slice]:
-    """The printed ranges by what stands there."""
-    return {what: slice(first, last + 1) for first, last, what in TABLES[name, moving]}
-
-
 @each_case
 def test_layout_is_the_printed_table(name: str, moving: bool) -> None:
     task, table = registry.get(name, moving), TABLES[name, moving]

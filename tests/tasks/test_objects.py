@@ -10,23 +10,10 @@ from bidex_meta.tasks.bucket import PourWater
 from bidex_meta.tasks.scene import Scene
 from bidex_meta.world import World
 from tests.hands import figures
+from tests.tasks import worlds
 from tests.tasks.formulas import FORMULAS
 from tests.tasks.oracle import frame, pose, shifted
 from tests.tasks.tables import PLACES
-from tests.tasks.worlds import (
-    Lens,
-    depths,
-    dofs_of,
-    each_moving,
-    engine_of,
-    object_joints_of,
-    objects_of,
-    restart,
-    scene_of,
-    send_hands_away,
-    slot,
-    world_of,
-)
 
 SECOND = 60
 THROWN = ("HandOver", "CatchUnderarm", "CatchOver2Underarm", "TwoCatchUnderarm", "CatchAbreast", "ReOrientation")
@@ -35,17 +22,17 @@ STANDING = [name for name in PLACES if name not in THROWN and name != "BottleCap
 
 def alone(name: str, rows: int) -> World:
     """A world at the starts of its first episodes, the hands far away."""
-    world = world_of(name, True, rows, tasks=rows)
+    world = worlds.world_of(name, True, rows, tasks=rows)
     world.reset(seed=0)
-    start = engine_of(world).placement()
-    send_hands_away(scene_of(world), start)
-    restart(world, start)
+    start = worlds.engine_of(world).placement()
+    worlds.send_hands_away(worlds.scene_of(world), start)
+    worlds.restart(world, start)
     return world
 
 
-@each_moving
+@worlds.each_moving
 def test_contacts_and_limits_are_as_stiff_as_the_time_step_allows(name: str) -> None:
-    model = scene_of(world_of(name, True, 1)).model
+    model = worlds.scene_of(worlds.world_of(name, True, 1)).model
     meets = (model.geom_contype | model.geom_conaffinity) > 0
     limited = (model.jnt_limited > 0) & (model.jnt_type != mujoco.mjtJoint.mjJNT_FREE)
     for constants in (model.geom_solref[meets, 0], model.jnt_solref[limited, 0], model.tendon_solref_lim[:, 0]):
@@ -56,26 +43,26 @@ def test_contacts_and_limits_are_as_stiff_as_the_time_step_allows(name: str) -> 
 def wait(world: World, steps: int) -> None:
     for _ in range(steps):
         world.parts[0].step(torch.zeros(world.num_envs, world.action_size).double(), None)
-    assert not engine_of(world).unstable().any()
+    assert not worlds.engine_of(world).unstable().any()
 
 
 def joints_of(scene: Scene) -> list[str]:
-    return [joint for joint in object_joints_of(scene) if not joint.startswith("water")]
+    return [joint for joint in worlds.object_joints_of(scene) if not joint.startswith("water")]
 
 
 @pytest.mark.parametrize("name", STANDING)
 def test_objects_rest_where_they_start(name: str) -> None:
     """No jump, no drift, no falling over; caps and lids stay on, leaves and rockers where they are."""
     world = alone(name, 3)
-    engine, scene = engine_of(world), scene_of(world)
+    engine, scene = worlds.engine_of(world), worlds.scene_of(world)
     before = engine.qpos.numpy().copy()
     for _ in range(4):
         wait(world, SECOND // 4)
-        for body in objects_of(scene):
+        for body in worlds.objects_of(scene):
             shift = engine.qpos[:, scene.qpos[body]].numpy()[:, :3] - before[:, scene.qpos[body]][:, :3]
             assert np.abs(shift).max() < 0.005, (body, shift)
-    for body in objects_of(scene):
-        first, _ = dofs_of(scene, body)
+    for body in worlds.objects_of(scene):
+        first, _ = worlds.dofs_of(scene, body)
         assert np.abs(engine.qvel[:, first : first + 3].numpy()).max() < 0.05, body
         for old, new in zip(before[:, scene.qpos[body]], engine.qpos[:, scene.qpos[body]].numpy(), strict=True):
             turned = figures.rotation(new[3:]) * figures.rotation(old[3:]).inv()
@@ -91,7 +78,7 @@ def test_objects_rest_where_they_start(name: str) -> None:
 )
 def test_hinges_stay_where_they_are_left(name: str, angle: float) -> None:
     world = alone(name, 2)
-    engine, scene = engine_of(world), scene_of(world)
+    engine, scene = worlds.engine_of(world), worlds.scene_of(world)
     for joint in joints_of(scene):
         engine.qpos[:, scene.qpos[joint]] = angle
     wait(world, SECOND // 2)
@@ -101,11 +88,11 @@ def test_hinges_stay_where_they_are_left(name: str, angle: float) -> None:
 
 def with_water(count: int, rows: int) -> World:
     """A world of PourWater with so many drops, hands away."""
-    world = World([slot(PourWater(True, count), rows)], rows, autoreset_mode="DISABLED", threads=1)
+    world = World([worlds.slot(PourWater(True, count), rows)], rows, autoreset_mode="DISABLED", threads=1)
     world.reset(seed=0)
-    start = engine_of(world).placement()
-    send_hands_away(scene_of(world), start)
-    restart(world, start)
+    start = worlds.engine_of(world).placement()
+    worlds.send_hands_away(worlds.scene_of(world), start)
+    worlds.restart(world, start)
     return world
 
 
@@ -113,11 +100,11 @@ def with_water(count: int, rows: int) -> World:
 def test_water_stays_in_the_kettle_until_it_is_tilted(count: int) -> None:
     """None leaves the upright kettle in half a second; a tilt of 40 degrees empties it by more than a third."""
     world = with_water(count, 1)
-    scene, model = scene_of(world), scene_of(world).model
-    assert depths(Lens(model).look(engine_of(world).placement()[0])).max() < 0.005
-    assert len(FORMULAS["PourWater"].water(Lens(model).data)) == count
+    scene, model = worlds.scene_of(world), worlds.scene_of(world).model
+    assert worlds.depths(worlds.Lens(model).look(worlds.engine_of(world).placement()[0])).max() < 0.005
+    assert len(FORMULAS["PourWater"].water(worlds.Lens(model).data)) == count
     wait(world, SECOND // 2)
-    data = Lens(model).look(engine_of(world).placement()[0])
+    data = worlds.Lens(model).look(worlds.engine_of(world).placement()[0])
     assert left(data, count) == 0
     base, turn = frame(data, "kettle/object")
     tilted = turn * Rotation.from_rotvec([0, -np.deg2rad(40), 0])
@@ -126,7 +113,7 @@ def test_water_stays_in_the_kettle_until_it_is_tilted(count: int) -> None:
     for i in range(count):
         for axis, value in zip("xyz", place[:3] + tilted.apply(inside[i]), strict=True):
             data.qpos[scene.qpos[f"water{i}/{axis}"]] = value
-    first, size = dofs_of(scene, "kettle")
+    first, size = worlds.dofs_of(scene, "kettle")
     data.qvel[:] = 0.0
     for _ in range(2 * 240):
         data.qpos[scene.qpos["kettle"]], data.qvel[first : first + size] = place, 0.0

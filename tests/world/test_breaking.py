@@ -73,17 +73,3 @@ def test_a_row_that_breaks_within_the_step_does_not_drag_on(name: str) -> None:
             assert engine._numbers[ROW].isfinite().all(), kind
             assert engine.batch.get_data(ROW).ncon < MOST_CONTACTS, kind
     assert broke, "nothing of it broke the row"
-
-
-def test_a_start_that_is_not_finite_is_not_written() -> None:
-    world = class_world("DoorCloseInward", ROWS)
-    world.reset(seed=0)
-    engine = engine_of(world)
-    start = engine.placement()
-    start[1, 5] = torch.inf
-    before = start.clone()
-    engine.reset(torch.ones(ROWS, dtype=torch.bool), start)
-    assert engine.unstable().tolist() == [False, True, False]
-    assert engine.placement().isfinite().all() and torch.equal(engine.placement()[[0, 2]], before[[0, 2]])
-    engine.reset(torch.tensor([False, True, False]), before[:1])
-    assert not engine.unstable().any()

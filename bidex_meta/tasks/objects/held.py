@@ -16,7 +16,7 @@ from bidex_meta.errors import BidexError, known_name, shortened
 from bidex_meta.hands.poses import PALM_UP_AWAY, HandPose
 from bidex_meta.hands.starts import make_room_for
 from bidex_meta.tasks.objects.mjcf import check_collisions, compiled, extents, outline, read_own, set_contacts
-from bidex_meta.tasks.scene import Colour, Point, attach
+from bidex_meta.tasks.scene import Colour, Point, SceneObject
 from bidex_meta.utils import paths
 from bidex_meta.utils.files import expanded
 from bidex_meta.utils.maths import conjugate, constant, multiply, rotate, wxyz, xyzw
@@ -53,7 +53,7 @@ class HeldObject:
         return x, y, z
 
     def add_to(self, scene: mujoco.MjSpec, name: str, position: Point, colour: Colour | None = None) -> None:
-        """Puts it into a scene as a free body; arguments as of ``attach``."""
+        """Puts it into a scene as a free body; arguments as of ``SceneObject``."""
         part = read_own(self.file)
         body = part.worldbody.first_body()
         body.name = "object"
@@ -67,7 +67,7 @@ class HeldObject:
         for sensor, kind in kinds.items():
             of = mujoco.mjtSensor.__members__[f"mjSENS_FRAME{kind}"]
             part.add_sensor(name=sensor, type=of, objtype=mujoco.mjtObj.mjOBJ_XBODY, objname="object")
-        attach(scene, part, name, position, (1.0, 0.0, 0.0, 0.0), colour)
+        SceneObject(name, self.name, position, colour=colour).attach(scene, part)
 
     def needs(self, egg: Capacity, count: int = 1) -> Capacity:
         """Room for contacts of a class with so many of it, from the class's need with eggs."""

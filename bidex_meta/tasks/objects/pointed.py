@@ -15,7 +15,7 @@ from bidex_meta.engine.capacity import Capacity
 from bidex_meta.errors import BidexError, shortened
 from bidex_meta.tasks.objects.mjcf import check_collisions, colliding, compiled, outline, read_own, set_contacts
 from bidex_meta.tasks.reach import ReachTask
-from bidex_meta.tasks.scene import SceneObject, attach, compile_scene
+from bidex_meta.tasks.scene import SceneObject, compile_scene
 from bidex_meta.utils import paths
 from bidex_meta.utils.files import absolute
 
@@ -36,7 +36,7 @@ class PointedObject(SceneObject):
     def add_to(self, scene: mujoco.MjSpec) -> None:
         part = read_own(Path(self.asset), points=True)
         set_contacts(part)
-        attach(scene, part, self.name, self.position, self.quaternion, self.colour)
+        self.attach(scene, part)
 
 
 class OwnObjectClass(ReachTask):
