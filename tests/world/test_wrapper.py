@@ -9,11 +9,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-import torch
-from gymnasium.error import Error
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
-from gymnasium.wrappers import NormalizeObservation, RecordEpisodeStatistics, RecordVideo
+from gymnasium.wrappers import RecordEpisodeStatistics, RecordVideo
 from gymnasium.wrappers import vector as wrap
 
 import bidex_meta  # noqa: F401
@@ -91,12 +89,6 @@ def test_statistics_of_the_single_environment() -> None:
     assert info["episode"]["l"] == steps and "is_success" in info
 
 
-def test_normalised_observations_of_the_single_environment() -> None:
-    env = NormalizeObservation(single())
-    episode(env)
-    assert env.obs_rms.count > 10
-
-
 def test_video_of_the_single_environment(films: dict[str, list[np.ndarray]], tmp_path: Path) -> None:
     env = RecordVideo(single(render_mode="rgb_array"), str(tmp_path), episode_trigger=lambda _: True)
     steps, _ = episode(env)
@@ -110,24 +102,6 @@ def test_render_modes_of_make_vec() -> None:
         assert world.render_mode == "rgb_array"
         with pytest.raises(BidexError, match="render_mode: expected None or 'rgb_array', got 'human'"):
             gymnasium.make_vec(env_id, num_envs=4, render_mode="human")
-
-
-def test_what_a_world_of_tensors_cannot() -> None:
-    """Each says so in a line."""
-    world = suite_world("MT4", 8)
-    counted = wrap.RecordEpisodeStatistics(world)
-    counted.reset(seed=0)
-    with pytest.raises((ValueError, TypeError)):
-        for _ in range(150):
-            counted.step(torch.zeros(8, 52))
-    with pytest.raises(ValueError, match="NEXT_STEP"):
-        wrap.NormalizeObservation(world)
-
-
-def test_video_of_a_world_of_tensors_is_refused(films: dict[str, list[np.ndarray]], tmp_path: Path) -> None:
-    film = wrap.RecordVideo(class_world("CatchUnderarm", 2), str(tmp_path))
-    with pytest.raises(AssertionError, match="ndarray"):
-        film.reset()
 
 
 def test_statistics_of_the_numpy_form_are_the_worlds_own() -> None:
@@ -188,13 +162,6 @@ def test_other_wrappers_of_the_numpy_form() -> None:
     listed = wrap.DictInfoToList(suite_world("MT4", 8).to_numpy())
     listed.reset(seed=0)
     assert len(listed.step(np.zeros((8, 52), np.float32))[-1]) == 8
-
-
-def test_what_the_numpy_form_cannot() -> None:
-    with pytest.raises(ValueError, match="NEXT_STEP"):
-        wrap.NormalizeObservation(suite_world("MT4", 8).to_numpy())
-    with pytest.raises((ValueError, Error, AssertionError), match=r"SAME_STEP|autoreset"):
-        wrap.FlattenObservation(suite_world("MT4", 8).to_numpy())
 
 
 def test_gymnasiums_own_vector_of_single_environments_takes_all() -> None:
