@@ -186,7 +186,7 @@ class Benchmark:
         points, classes = (self.suite.points, self.suite.point_kinds), {}
         for entry in self.suite.split_classes(split):
             look = (moving, tuple(entry.options.items()), self.padded_size, hides)
-            recipe = EnvRecipe(entry.name, *look, entry.reward_scale, entry.class_name, points)
+            recipe = EnvRecipe(entry.name, *look, entry.reward_scale, entry.class_name, self.suite.rules, points)
             classes[entry.name] = recipe.make_class()
         return classes
 
@@ -259,6 +259,7 @@ def make_task_world(
 def _task_class(suite: Suite, entry: SuiteClass) -> TaskClass:
     try:
         task_class = registry.get(entry.class_name, True if suite.base == "moving" else None, **entry.options)
+        task_class.adopt(suite.rules)
         for task in entry.tasks:
             for component in task.fixed:
                 if component not in task_class.variation_space.names:

@@ -33,6 +33,38 @@ METAWORLD_SUITES: dict[str, tuple[str, ...]] = {
 """Suites of Meta-World's own environments, and their classes in its order."""
 
 
+HELD_STEPS = 15
+"""Control steps for which a condition must have held without a break where success counts at the end: 0.25 s."""
+
+
+@dataclass(frozen=True)
+class Rules:
+    """Four choices, each alone; the defaults are version 1, ``V2`` has all of version 2."""
+
+    reward: Literal["paper", "v2"] = "paper"
+    """The printed formula of each class, or ``aligned_terms``."""
+    variation: Literal["narrow", "wide"] = "narrow"
+    """Whether goals vary about as much as success tolerates, or several times as much, with a hidden quantity in every
+    class. Wide observations also give quaternions with w >= 0."""
+    success: Literal["once", "at-end"] = "once"
+    """Whether the condition must hold at any step of an episode, or for its last ``HELD_STEPS``."""
+    starts: Literal["plain", "jittered"] = "plain"
+    """Whether every episode of every class draws joint noise and shifts what stands or lies."""
+
+    @property
+    def wide(self) -> bool:
+        """Whether the variation is wide."""
+        return self.variation == "wide"
+
+    @property
+    def jittered(self) -> bool:
+        """Whether starts are jittered."""
+        return self.starts == "jittered"
+
+
+V1, V2 = Rules(), Rules("v2", "wide", "at-end", "jittered")
+
+
 @dataclass(frozen=True)
 class ListedTask:
     """One task that a suite file writes out, in place of drawing it."""
@@ -75,7 +107,7 @@ class Suite:
     """What is done to the padded observation: nothing, task id appended, goal entries zeroed."""
     task_id: Literal["class", "task"]
     """What one entry of the one-hot stands for: a class or a listed task."""
-    reward: Literal["paper"]
+    rules: Rules
     base: Literal["moving", "alone"]
     """Whether every class gets the moving base, or each what it has on its own."""
     tasks_per_class: int | None
@@ -159,11 +191,14 @@ class _File:
     description: _Text
     observation: Literal["plain", "one-hot", "masked"]
     task_id: Literal["class", "task"]
-    reward: Literal["paper"]
+    reward: Literal["paper", "v2"]
     base: Literal["moving", "alone"]
     classes: Annotated[list[_ClassEntry], _Tables]
     tasks_per_class: _Count | None = None
     points: _PointsEntry | None = None
+    variation: Literal["narrow", "wide"] = "narrow"
+    success: Literal["once", "at-end"] = "once"
+    starts: Literal["plain", "jittered"] = "plain"
 
     def texts(self) -> Iterator[tuple[str, object]]:
         """What comes to terminals, by its place in the file."""
@@ -182,9 +217,11 @@ def _parse(file: Path) -> Suite:
         if not isinstance(text, str) or not text.strip() or not text.isprintable():
             raise _error(file, place, "printable text", shortened(text))
     points = content.points or _PointsEntry(0)
-    given = {f.name: getattr(content, f.name) for f in fields(content) if f.name not in ("classes", "points")}
+    rules = Rules(content.reward, content.variation, content.success, content.starts)
+    given = {f.name: getattr(content, f.name) for f in fields(content) if f.name in {f.name for f in fields(Suite)}}
     classes = tuple(each for i, entry in enumerate(content.classes) for each in _classes(file, i, entry))
-    suite = Suite(**given, classes=classes, file=file, points=points.count, point_kinds=points.kinds)
+    given |= {"classes": classes, "file": file, "rules": rules}
+    suite = Suite(**given | {"points": points.count, "point_kinds": points.kinds})
     _check(suite)
     return suite
 

@@ -21,9 +21,10 @@ NAMESPACE = "bidex-meta"
 
 def suite_ids(suite: Suite) -> dict[str, str]:
     """The Gymnasium ids of a suite and the split each stands for, e.g. `{"bidex-meta/MT4-v1": "train"}`."""
+    name, version = suite.name.removesuffix("-v2"), f"v{suite.version}"
     if suite.kind == "multi-task":
-        return {f"{NAMESPACE}/{suite.name}-v{suite.version}": "train"}
-    return {f"{NAMESPACE}/{suite.name}-{split}-v{suite.version}": split for split in suite.splits}
+        return {f"{NAMESPACE}/{name}-{version}": "train"}
+    return {f"{NAMESPACE}/{name}-{split}-{version}": split for split in suite.splits}
 
 
 def task_id(task_name: str) -> str:

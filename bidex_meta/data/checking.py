@@ -167,7 +167,7 @@ class _Formulas:
         observations = torch.from_numpy(episode.observations[1:].astype(np.float64))
         state = _ShownState(shown, observations, task.freeze(variation))
         try:
-            reward = torch.stack(list(task.reward_terms(state).values())).sum(0)
+            reward = torch.stack(list(task.rewards(state).values())).sum(0)
         except _NotShown as error:
             findings.skipped[name] = f"its formula asks for {error}, which no observation shows"
             self._known[name] = None

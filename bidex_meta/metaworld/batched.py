@@ -121,6 +121,7 @@ class MetaWorldWorld(ForeignWorld):
         Meta-World's environments keep part of their state in Python attributes and in the model, so each running
         episode is played again from its start: exact, and a fraction of a second for each.
         """
+        state = self._upgraded(state)
         fits(state, self.state_dict())
         here, there = (self.suite, self._task_seed), (state["suite"], state["task_seed"])
         if here != there:

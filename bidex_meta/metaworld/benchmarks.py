@@ -10,7 +10,7 @@ from typing import ClassVar, Literal
 
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import BidexError, known_name
-from bidex_meta.suite import Split, Suite, SuiteClass
+from bidex_meta.suite import V1, Split, Suite, SuiteClass
 from bidex_meta.tasks import registry
 
 
@@ -83,7 +83,7 @@ def _suite(name: str, observation: Literal["plain", "one-hot", "masked"], classe
         description=", ".join(splits),
         observation=observation,
         task_id="class",
-        reward="paper",
+        rules=V1,
         base="moving",
         tasks_per_class=50,
         classes=tuple(SuiteClass(entry, entry, where, 1.0, None, (), {}) for entry, where in splits.items()),

@@ -10,7 +10,11 @@ import torch
 from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
+from bidex_meta.errors import BidexError
 from bidex_meta.hands.poses import HandPose
+from bidex_meta.hands.starts import noisy_joints
+from bidex_meta.suite import V1, Rules
+from bidex_meta.tasks.aligned import Error, aligned_terms
 from bidex_meta.tasks.layout import Block, Layout, both_hands
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace
@@ -50,6 +54,8 @@ FAST = Solver(100, 50, time_step=1.0 / 180.0)
 """For fast bases among things that do not yield: in 1/120 s a hand at full speed sinks 24 mm into a table."""
 THIN = Solver(100, 50, time_step=1.0 / 240.0)
 """For fast bases that press things as thin as a finger on a table."""
+JITTER, JOINT_NOISE = 0.005, 0.1
+"""Of jittered starts: half width of a fixture's shift, metres, and joint noise as a share of each joint's range."""
 CONTROL_RATE = 60
 """Control steps per second of every class (docs/figures.md, control)."""
 
@@ -70,6 +76,11 @@ class TaskClass(ABC):
         transition_scale: Scale of the base forces (docs/figures.md, base); ``orientation_scale`` of the torques.
         start_draws: How many uniform numbers the start of an episode takes.
         variation_space: What a task of this class freezes; an attribute or a property.
+        wide_space: The same with wide variation; None: a class without version 2.
+        wide_solved: ``solved`` with wide variation.
+        wide_blocks: Blocks that wide variation appends, in classes whose table has no goal block.
+        jittered_hands: Hands that jittered starts give joint noise, where ``start`` gives none.
+        jittered_fixtures: Fixtures that jittered starts shift by up to 0.5 cm along x and y.
         blocks: The observation behind both hands' blocks.
         moving_base: Whether the hands' bases are driven (52 actions) or fixed (40); None in the constructor: as the
             class says (fixed for HandOver alone).
@@ -93,6 +104,12 @@ class TaskClass(ABC):
     orientation_scale: ClassVar[float]
     start_draws: ClassVar[int]
     variation_space: VariationSpace
+    wide_space: VariationSpace | None = None
+    wide_solved: ClassVar[str] = ""
+    wide_blocks: ClassVar[tuple[Block, ...]] = ()
+    jittered_hands: ClassVar[tuple[str, ...]] = ()
+    jittered_fixtures: ClassVar[tuple[str, ...]] = ()
+    rules: Rules = V1
     blocks: ClassVar[tuple[Block, ...]] = ()
     moves_by_default: ClassVar[bool] = True
     solver: ClassVar[Solver] = Solver()
@@ -105,10 +122,24 @@ class TaskClass(ABC):
         default = self.moves_by_default if moving_base is None else moving_base
         self.moving_base = true_or_false("moving_base", default)
 
+    def adopt(self, rules: Rules) -> None:
+        """Takes a suite's rules; BidexError for wide variation, or the reward of version 2, of a class without."""
+        self.rules = rules
+        if rules.reward == "v2" and type(self).errors is TaskClass.errors:
+            raise BidexError(f'{self.name}: expected reward = "paper", got "v2", which the class does not have.')
+        if rules.wide:
+            self.widen()
+
+    def widen(self) -> None:
+        """Takes the wide variation: ``wide_space``."""
+        if self.wide_space is None:
+            raise BidexError(f'{self.name}: expected variation = "narrow", got "wide", which the class does not have.')
+        self.variation_space = self.wide_space
+
     @property
     def scene_key(self) -> tuple[Hashable, ...]:
         """What its compiled scene depends on: classes with equal keys may share it."""
-        return self.name, self.moving_base
+        return self.name, self.moving_base, self.rules
 
     @property
     def observation_size(self) -> int:
@@ -123,7 +154,8 @@ class TaskClass(ABC):
     @property
     def layout(self) -> Layout:
         """The observation as named blocks: both hands', then ``blocks``."""
-        return Layout((*both_hands(self.moving_base), *self.blocks))
+        more = self.wide_blocks if self.rules.wide else ()
+        return Layout((*both_hands(self.moving_base), *self.blocks, *more))
 
     @abstractmethod
     def add_objects(self, scene: mujoco.MjSpec) -> None:
@@ -141,6 +173,24 @@ class TaskClass(ABC):
         start and are written in place; MuJoCo's quaternion order (w, x, y, z).
         """
 
+    @property
+    def draws(self) -> int:
+        """How many uniform numbers ``begin`` takes."""
+        more = 24 * len(self.jittered_hands) + 2 * len(self.jittered_fixtures)
+        return self.start_draws + (more if self.rules.jittered else 0)
+
+    def begin(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
+        """``start`` with what the suite's rules add; ``draws`` are (n, self.draws)."""
+        self.start(draws[:, : self.start_draws], frozen, qpos)
+        if not self.rules.jittered:
+            return
+        sizes = [self.start_draws, *[24] * len(self.jittered_hands), *[2] * len(self.jittered_fixtures)]
+        _, *parts = draws.split(sizes, dim=1)
+        for side, part in zip(self.jittered_hands, parts, strict=False):
+            qpos[f"{side}/joints"].copy_(noisy_joints(part, JOINT_NOISE))
+        for name, part in zip(self.jittered_fixtures, parts[len(self.jittered_hands) :], strict=True):
+            qpos[name][:, :2] += JITTER * part
+
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         """The blocks of the layout that no sensor gives, by name, each (n, size); none by default."""
         return {}
@@ -152,6 +202,22 @@ class TaskClass(ABC):
     @abstractmethod
     def success(self, state: TaskState) -> Tensor:
         """Whether the task is solved in this state. Shape (n,), bool."""
+
+    def errors(self, state: TaskState) -> list[Error]:
+        """How far a state is from solved, for the reward of version 2: at least one error."""
+        raise NotImplementedError
+
+    def guides(self, state: TaskState) -> list[Tensor]:
+        """Distances (m), each (n,), that the reward of version 2 wants small beside the errors: hands to points."""
+        return []
+
+    def solved_in(self, state: TaskState) -> Tensor:
+        """``success``, computed once for reward and world. Shape (n,), bool."""
+        return state.once("solved", lambda: self.success(state))
+
+    def rewards(self, state: TaskState) -> dict[str, Tensor]:
+        """Named terms, each (n,), that sum to the reward by the suite's rules."""
+        return aligned_terms(self, state) if self.rules.reward == "v2" else self.reward_terms(state)
 
     def failed(self, state: TaskState) -> Tensor:
         """Whether the episode ends here other than by time. Shape (n,), bool; never by default."""

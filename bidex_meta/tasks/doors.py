@@ -1,14 +1,18 @@
 """The four door classes: appendix A.2.7 and A.2.8; docs/figures.md, classes."""
 
 import math
+from abc import abstractmethod
 from typing import ClassVar
 
 import mujoco
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from bidex_meta.engine.capacity import Capacity
+from bidex_meta.hands.hand import SIDES
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
+from bidex_meta.tasks.aligned import Error, at_least, within
 from bidex_meta.tasks.base import FAST
 from bidex_meta.tasks.goals import frozen_goal
 from bidex_meta.tasks.layout import goal_blocks, handle_blocks, object_blocks
@@ -29,6 +33,9 @@ _DAMPED = "The hinges are damped by 10 N m s/rad, the original's by 1: so a door
 class _Door(ReachTask):
     """A double swing door that two hands open or close.
 
+    With wide variation a task also freezes the angle at which each leaf shall stand, hinge 1 (right) and 2; the goal
+    block then holds both angles and both angles that are missing, instead of the base pose.
+
     Leaf and handle of the right hand are those at +y. Success of the classes that open is measured along y, since a
     leaf alone makes a full distance of 0.5 m at 1.26 rad. A task freezes the door's place along y and one start angle
     for both leaves; an episode draws nothing. The goal block holds the base pose, also the object's. The Inward classes
@@ -42,6 +49,8 @@ class _Door(ReachTask):
     left = HandPose((0.55, -0.2, 0.6), PALM_RIGHT_AHEAD)
     transition_scale, orientation_scale = 0.5, 0.5
     start_draws = 0
+    jittered_hands, jittered_fixtures = ("right", "left"), ("object",)
+    wide_solved = "each leaf within 0.15 rad of its angle"
     solver = FAST
     points = ("object/left_handle_position", "object/right_handle_position")
     constant = 0.2
@@ -69,12 +78,36 @@ class _Door(ReachTask):
         position = variation.new_tensor(_BASE).repeat(len(variation), 1)
         position[:, 1] += variation[:, 0]
         turn = xyzw(variation.new_tensor(quaternion_from_rpy(self.objects[0].rpy))).expand(len(variation), 4)
-        return {**frozen_goal(torch.cat((position, turn), dim=1)), "angle": variation[:, 1:]}
+        frozen = {**frozen_goal(torch.cat((position, turn), dim=1)), "angle": variation[:, 1:2]}
+        return frozen | ({"leaves": variation[:, 2:4]} if self.rules.wide else {})
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
         qpos["object"][:, :3] = frozen["goal"][:, :3]
         for leaf in (1, 2):
             qpos[f"object/hinge{leaf}"].copy_(frozen["angle"])
+
+    def observe(self, state: TaskState) -> dict[str, Tensor]:
+        if not self.rules.wide:
+            return super().observe(state)
+        leaves, missing = state.frozen["leaves"], _hinges(state) - state.frozen["leaves"]
+        return {"goal_pose": pad(leaves, (0, 5)), "goal_rotation_difference": pad(missing, (0, 2))}
+
+    def errors(self, state: TaskState) -> list[Error]:
+        if not self.rules.wide:
+            return self.narrow_errors(state)
+        return [Error(off, 0.15) for off in (_hinges(state) - state.frozen["leaves"]).abs().unbind(1)]
+
+    @abstractmethod
+    def narrow_errors(self, state: TaskState) -> list[Error]:
+        """``errors`` without angles of a task."""
+
+    def success(self, state: TaskState) -> Tensor:
+        return within(self.errors(state))
+
+
+def _hinges(state: TaskState) -> Tensor:
+    """Angles of both leaves, rad, (n, 2)."""
+    return torch.cat([state[f"object/hinge{leaf}_angle"] for leaf in (1, 2)], dim=1)
 
 
 class _Open(_Door):
@@ -85,14 +118,29 @@ class _Open(_Door):
         _DAMPED,
     )
     variation_space = join(component("base_y", -0.05, 0.05), component("start_angle", 0.0, 0.15))
+    wide_space = join(
+        component("base_y", -0.15, 0.15),
+        component("start_angle", 0.0, 0.15),
+        *(component(f"{side}_angle", 0.2, 1.4) for side in SIDES),
+    )
 
     def target(self, state: TaskState) -> Tensor:
         return 2.0 * apart(state, *self.points)
 
-    def success(self, state: TaskState) -> Tensor:
+    def _opening(self, state: TaskState) -> tuple[Tensor, Tensor]:
+        """Distances of the right and the left handle from the middle along y, metres, each (n,)."""
         middle = state["object/position"][:, 1]
         right = state["object/right_handle_position"][:, 1] - middle
-        left = middle - state["object/left_handle_position"][:, 1]
+        return right, middle - state["object/left_handle_position"][:, 1]
+
+    def narrow_errors(self, state: TaskState) -> list[Error]:
+        right, left = self._opening(state)
+        return [at_least(right + left, 0.5, 0.05), *(at_least(each, _LEAST_SHARE, 0.05) for each in (right, left))]
+
+    def success(self, state: TaskState) -> Tensor:
+        if self.rules.wide:
+            return super().success(state)
+        right, left = self._opening(state)
         return (right + left > 0.5) & (right > _LEAST_SHARE) & (left > _LEAST_SHARE)
 
 
@@ -104,13 +152,17 @@ class _Close(_Door):
         _DAMPED,
     )
     variation_space = join(component("base_y", -0.05, 0.05), component("start_angle", 1.3, 1.57))
+    wide_space = join(
+        component("base_y", -0.15, 0.15),
+        component("start_angle", 1.3, 1.57),
+        *(component(f"{side}_angle", 0.0, 1.0) for side in SIDES),
+    )
 
     def target(self, state: TaskState) -> Tensor:
         return 2.0 * (1.0 - apart(state, *self.points))
 
-    def success(self, state: TaskState) -> Tensor:
-        first, second = (state[f"object/hinge{leaf}_angle"][:, 0] for leaf in (1, 2))
-        return (first < _SHUT_ANGLE) & (second < _SHUT_ANGLE)
+    def narrow_errors(self, state: TaskState) -> list[Error]:
+        return [Error(angle.clamp(min=0.0), _SHUT_ANGLE) for angle in _hinges(state).unbind(1)]
 
 
 class DoorOpenOutward(_Open):

@@ -11,7 +11,8 @@ from torch import Tensor
 from bidex_meta.hands.hand import SIDES
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.hands.starts import make_room, noisy_joints
-from bidex_meta.tasks.base import LIGHT, TaskClass
+from bidex_meta.tasks.aligned import Error, within
+from bidex_meta.tasks.base import JITTER, JOINT_NOISE, LIGHT, TaskClass
 from bidex_meta.tasks.goals import frozen_goal, observe_goal, rotation_difference
 from bidex_meta.tasks.layout import Block, goal_blocks, object_blocks
 from bidex_meta.tasks.objects.held import EGG, HeldObject, held_object
@@ -152,8 +153,12 @@ class EggTask(TaskClass):
     @property
     def variation_space(self) -> VariationSpace:
         """Goal positions (world, metres) and the two draws of the goals' orientation."""
-        boxes = (box(f"goal{i}", centre, 0.03) for i, centre in zip(self.numbers, self.goals, strict=True))
+        half = 0.06 if self.rules.wide else 0.03
+        boxes = (box(f"goal{i}", centre, half) for i, centre in zip(self.numbers, self.goals, strict=True))
         return join(*boxes, orientation("goal"))
+
+    def widen(self) -> None:
+        """The goals' boxes follow the rules (``variation_space``)."""
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
         green = (0.45, 0.62, 0.30, 1.0)
@@ -171,10 +176,12 @@ class EggTask(TaskClass):
         return frozen
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
-        start_hands(draws[:, :JOINT_DRAWS], self.joint_noise, qpos)
+        jittered = self.rules.jittered
+        noise = self.position_noise or JITTER * jittered
+        start_hands(draws[:, :JOINT_DRAWS], self.joint_noise or JOINT_NOISE * jittered, qpos)
         for i, side, pose in zip(self.numbers, SIDES, (self.right, self.left), strict=False):
             joints = qpos[f"{side}/joints"] if self.lies_on_hand else None
-            put_down(qpos[f"object{i}"], self.held, draws[:, JOINT_DRAWS:], self.position_noise, joints, pose)
+            put_down(qpos[f"object{i}"], self.held, draws[:, JOINT_DRAWS:], noise, joints, pose)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         return observe_goals(state, self.numbers)
@@ -187,9 +194,11 @@ class EggTask(TaskClass):
             terms[f"pose{i}"] = torch.exp(-0.2 * (self.alpha * translation + rotation))
         return terms
 
+    def errors(self, state: TaskState) -> list[Error]:
+        return [Error(distances(state, f"object{i}", f"goal{i}")[0], 0.03) for i in self.numbers]
+
     def success(self, state: TaskState) -> Tensor:
-        off = torch.stack([distances(state, f"object{i}", f"goal{i}")[0] for i in self.numbers])
-        return (off < 0.03).all(dim=0)
+        return within(self.errors(state))
 
     def failed(self, state: TaskState) -> Tensor:
         """An egg dropped or a hand left: the reward is positive throughout, so an early end is never worth seeking."""

@@ -58,11 +58,11 @@ def hidden(task: TaskClass) -> Hidden:
 
     def compared(state: TaskState) -> list[Tensor]:
         with _Comparisons() as comparisons:
-            task.success(state)
+            task.solved_in(state)
         return comparisons.operands
 
     shown = moved(lambda state: [task.observe(state)[name] for name in goal]) - _fixtures(task, scene, frozen)
-    of_reward = moved(lambda state: task.reward_terms(state).values()) & shown
+    of_reward = moved(lambda state: task.rewards(state).values()) & shown
     of_success = (moved(compared) & shown) - of_reward
     return Hidden(*(tuple(name for name in names if name in chosen) for chosen in (of_reward, of_success)))
 

@@ -80,5 +80,8 @@ class ReachTask(TaskClass):
             values[side] = torch.exp(-10.0 * distance) if self.exponential else -distance
         return {term: values[term] for term in self.terms}
 
+    def guides(self, state: TaskState) -> list[Tensor]:
+        return [reach(state, side, point) for side, point in zip(("left", "right"), self.points, strict=True)]
+
     def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, Point]]:
         return [(frozen["goal"], self.ghost)] if self.ghost else []

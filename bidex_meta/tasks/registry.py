@@ -5,6 +5,7 @@ import inspect
 from typing import TYPE_CHECKING
 
 from bidex_meta.errors import BidexError, known_name, unknown_name
+from bidex_meta.suite import V2
 from bidex_meta.utils.plugins import is_outside, outside_class
 
 if TYPE_CHECKING:
@@ -19,6 +20,7 @@ _MODULES = {
     "ReOrientation": "cubes", "OpenPenCap": "articulated", "Switch": "articulated", "StackBlock": "cubes",
     "PourWater": "bucket", "GraspAndPlace": "bucket",
 }  # fmt: skip
+_V2 = "-v2"
 
 
 def names() -> list[str]:
@@ -29,10 +31,13 @@ def names() -> list[str]:
 def resolve(name: str, kind: str = "task class") -> str:
     """The name by which ``get`` knows a class, given in any case; ``package.module:Class`` stays as it is.
 
+    A name may end in ``-v2``.
+
     Raises BidexError where there is no such class; the message calls it a ``kind``.
     """
     if not is_outside(name):
-        return known_name(kind, name, names())
+        version = _V2 if str(name).lower().endswith(_V2) else ""
+        return known_name(kind, str(name)[: len(str(name)) - len(version)], names()) + version
     _outside(name)
     return name
 
@@ -45,22 +50,26 @@ def with_object(name: str | None) -> dict[str, str]:
 def get(name: str, moving_base: bool | None = None, **options: float | str) -> "TaskClass":
     """A task class, e.g. ``CatchUnderarm``, or ``package.module:Class`` (docs/own-task.md).
 
-    ``moving_base`` drives the hands' bases (52 actions) or fixes them (40); None takes the class's own. Options are
-    those of the class, e.g. ``water=30`` for PourWater, ``object="block"`` for CatchUnderarm.
+    ``CatchUnderarm-v2`` has the rules of version 2. ``moving_base`` drives the hands' bases (52 actions) or fixes them
+    (40); None takes the class's own. Options are those of the class, e.g. ``water=30`` for PourWater,
+    ``object="block"`` for CatchUnderarm.
 
     Raises BidexError where there is no such class or option; the message gives the nearest name and the list.
     """
     if is_outside(name):
         task_class = _outside(name)
-    elif name in _MODULES:
-        task_class = vars(importlib.import_module(f"bidex_meta.tasks.{_MODULES[name]}"))[name]
+    elif (plain := name.removesuffix(_V2)) in _MODULES:
+        task_class = vars(importlib.import_module(f"bidex_meta.tasks.{_MODULES[plain]}"))[plain]
     else:
         raise unknown_name("task class", name, _MODULES)
     known = list(inspect.signature(task_class).parameters)[1:]
     for option in options:
         if option not in known:
             raise unknown_name(f"option of {name}", option, known)
-    return task_class(moving_base, **options)
+    made = task_class(moving_base, **options)
+    if name.endswith(_V2):
+        made.adopt(V2)
+    return made
 
 
 def _outside(name: str) -> "type[TaskClass]":

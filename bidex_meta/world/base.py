@@ -4,7 +4,7 @@
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Self, cast
 
 import numpy as np
@@ -60,6 +60,8 @@ class BatchedWorld(VectorEnv, ABC):
     action_space: Box
     num_id_columns: int
     observation_groups: tuple[ObservationGroup, ...]
+    _at_end = False
+    """Whether success counts at the end of episodes."""
     _masked = False
     """Whether nothing in a step may look at a number (accelerators)."""
     _arguments: tuple[tuple[Any, ...], dict[str, Any]]
@@ -197,11 +199,11 @@ class BatchedWorld(VectorEnv, ABC):
     def _finish(self, active: Tensor, broken: Tensor, transition: Transition) -> tuple[Tensor, Tensor, Tensor, Info]:
         obs, unstable = transition.obs, transition.unstable | broken
         valid = active & ~unstable
-        success = transition.success & ~unstable
+        solved = transition.success & ~unstable
         unscaled = torch.where(valid, transition.reward, 0.0)
         reward = unscaled * self._scale
         episodes = self.episodes
-        episodes.add(active, reward, unscaled, success)
+        episodes.add(active, reward, unscaled, solved)
         terminated = transition.failed & valid | episodes.terminated
         late = (episodes.elapsed >= self.max_episode_steps) & ~terminated
         truncated = (late | unstable) & active | episodes.truncated
@@ -209,12 +211,13 @@ class BatchedWorld(VectorEnv, ABC):
         if self._masked or not valid.all():  # on the CPU looking costs less than a pass over all observations
             obs = torch.where(valid[:, None], obs, self._obs)
         info: Info = {
-            "success": success,
+            "success": episodes.solved_at_end if self._at_end else solved,
+            "solved": solved,
             "unstable": unstable & active,
             "reward_unscaled": unscaled,
             "final_obs": obs,
             "_final_obs": ended,
-            "so_far": episodes.statistics(),
+            "so_far": episodes.statistics(self._at_end),
             "counted": ended & episodes.counts,
         }
         if transition.terms:
@@ -231,6 +234,13 @@ class BatchedWorld(VectorEnv, ABC):
         """Tensors and plain values, copied, from which the world continues bit for bit."""
         state = {"seed": self.seed, "episodes": self.episodes.state_dict()}
         return state | {"task_index": self.task_index.clone(), "observation": self._obs.clone()}
+
+    def _upgraded(self, state: State) -> State:
+        """A state of version 0.2, which has no ``held``, as one of now."""
+        episodes = state.get("episodes") if isinstance(state, Mapping) else None
+        if not isinstance(episodes, Mapping) or "held" in episodes:
+            return state
+        return {**state, "episodes": {**episodes, "held": torch.zeros(self.num_envs, dtype=torch.int64)}}
 
     @abstractmethod
     def load_state_dict(self, state: State) -> None:

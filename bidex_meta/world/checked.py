@@ -147,7 +147,7 @@ def formulas(scene: Scene, tasks: np.ndarray, sensors: Tensor, observed: bool) -
     for key, value in frozen.items():
         _check_shape(f"{name}.freeze: {key!r}", value, None)
     state = TaskState(sensors.new_zeros(_ROWS, scene.model.nsensordata), scene.sensors, frozen)
-    for key, value in _named(f"{name}.reward_terms", task.reward_terms(state)).items():
+    for key, value in _named(f"{name}.reward_terms", task.rewards(state)).items():
         _check_shape(f"{name}.reward_terms: {key!r}", value)
     _check_shape(f"{name}.success", task.success(state), kind=torch.bool)
     _check_shape(f"{name}.failed", task.failed(state), kind=torch.bool)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bidex_meta.engine.health import dense
 from bidex_meta.errors import BidexError, shortened, unknown_name
+from bidex_meta.suite import HELD_STEPS
 from bidex_meta.utils.maths import check_precision
 from bidex_meta.utils.validation import whole_number
 from bidex_meta.world.contract import Info, Options, VectorWorld
@@ -34,7 +35,9 @@ class Episodes:
     terminated: Tensor
     truncated: Tensor
     success: Tensor
-    """Whether it succeeded at any step."""
+    """Whether it was solved at any step."""
+    held: Tensor
+    """Steps for which it has been solved without a break."""
     reward: Tensor
     unscaled: Tensor
     """Sum of the rewards by the printed formula."""
@@ -44,7 +47,7 @@ class Episodes:
     @classmethod
     def fresh(cls, num: int, device: torch.device) -> "Episodes":
         """Counters of n environments none of which has begun."""
-        kinds = [torch.int64] * 2 + [torch.bool] * 5 + [torch.float32] * 2 + [torch.int64]
+        kinds = [torch.int64] * 2 + [torch.bool] * 5 + [torch.int64] + [torch.float32] * 2 + [torch.int64]
         number, *rest = (torch.zeros(num, dtype=kind, device=device) for kind in kinds)
         return cls(number - 1, *rest)
 
@@ -54,20 +57,27 @@ class Episodes:
         self.counts = torch.where(mask, elapsed == 0, self.counts)
         for name in ("finished", "terminated", "truncated", "success"):
             setattr(self, name, getattr(self, name) & ~mask)
-        for name in ("reward", "unscaled", "length"):
+        for name in ("held", "reward", "unscaled", "length"):
             setattr(self, name, getattr(self, name).masked_fill(mask, 0))
 
-    def add(self, active: Tensor, reward: Tensor, unscaled: Tensor, success: Tensor) -> None:
+    def add(self, active: Tensor, reward: Tensor, unscaled: Tensor, solved: Tensor) -> None:
         """Counts one step of the active environments."""
         self.elapsed = self.elapsed + active
         self.length = self.length + active
-        self.success = self.success | (success & active)
+        self.success = self.success | (solved & active)
+        self.held = torch.where(active, (self.held + 1) * solved, self.held)
         self.reward = self.reward + reward * active
         self.unscaled = self.unscaled + unscaled * active
 
-    def statistics(self) -> dict[str, Tensor]:
-        """Statistics of the running episodes, as ``info["so_far"]`` carries them."""
-        values = {"r": self.reward, "l": self.length, "success": self.success, "unscaled": self.unscaled}
+    @property
+    def solved_at_end(self) -> Tensor:
+        """Whether an episode that ends now is a success at the end, (n,), bool."""
+        return self.held >= HELD_STEPS
+
+    def statistics(self, at_end: bool) -> dict[str, Tensor]:
+        """Statistics of the running episodes, as ``info["so_far"]`` carries them; ``success`` at the end or once."""
+        success = self.solved_at_end if at_end else self.success
+        values = {"r": self.reward, "l": self.length, "success": success, "unscaled": self.unscaled}
         return {name: value.clone() for name, value in values.items()}
 
     def state_dict(self) -> dict[str, Tensor]:

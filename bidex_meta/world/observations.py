@@ -58,11 +58,33 @@ class Observer:
         self._start_inverse = conjugate(start_mounts)
         self._mounts = torch.cat([_indices(scene, f"{side}/mount_quaternion") for side in SIDES]).to(device)
         self.moving = turns > 0
+        self._quaternions = torch.tensor(self._of_quaternions(scene), device=device)
 
     def _take(self, block: str, first: int) -> None:
         where = self.layout.range(block)
         self._source[where] = torch.arange(first, first + where.stop - where.start)
         self._scale[where] = 1.0
+
+    def _of_quaternions(self, scene: Scene) -> list[int]:
+        """First entries of the quaternions whose sign the scene's rules choose; of a pose the last four are one."""
+        if not scene.task.rules.wide:
+            return []
+        found = []
+        for block, where in self.layout:
+            if block.goal:
+                found += [where.stop - 4]
+            at = where.start
+            for name in block.sensors:
+                found += [at] if name.endswith("quaternion") else []
+                at += len(_indices(scene, name))
+        return found
+
+    def choose_signs(self, values: Tensor) -> None:
+        """Turns the sign of quaternions in observations (n, width), in place, so that w >= 0 (wide variation only)."""
+        if len(self._quaternions):
+            columns = (self._quaternions[:, None] + torch.arange(4, device=values.device)).flatten()
+            turns = values[:, columns].unflatten(1, (-1, 4))
+            values[:, columns] = torch.where(turns[..., 3:] < 0.0, -turns, turns).flatten(1)
 
     def mounts(self, sensors: Tensor, rows: Tensor | slice) -> tuple[Tensor, Tensor]:
         """Orientations of both mounts and the inverse of those at the start, (x, y, z, w), each (n, 2, 4)."""

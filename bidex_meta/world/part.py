@@ -164,6 +164,7 @@ class Part:
             for member, where, state in states:
                 for name, block in member.scene.task.observe(state).items():
                     values[where, self._observer.layout.range(name)] = block.float()
+        self._observer.choose_signs(values)
         if self._sights is not None:
             position, rotation = self._engine.body_poses()
             for member, where, _ in states:
@@ -175,7 +176,7 @@ class Part:
         """Start positions of episodes, shape (n, start_size): a pure function of the draws and the tasks.
 
         ``rows``: engine rows (n,), ascending; None: every row equally often, one after the other. ``draws``: uniform
-        numbers in [-1, 1], (n, at least the classes' start_draws). ``task_index``: (n,).
+        numbers in [-1, 1], (n, at least the classes' draws). ``task_index``: (n,).
         """
         qpos = self._engine.qpos.new_empty(len(draws), self.start_size)
         each = len(draws) // self._engine.num if rows is None else 1
@@ -184,7 +185,7 @@ class Part:
             qpos[where] = self._start[i]
             views = {name: qpos[where, columns] for name, columns in member.scene.qpos.items()}
             task = member.scene.task
-            task.start(draws[where, : task.start_draws], self.frozen(i, task_index[where]), views)
+            task.begin(draws[where, : task.draws], self.frozen(i, task_index[where]), views)
         return qpos
 
 
@@ -213,10 +214,10 @@ class Judgement(NamedTuple):
 
 def judge(task: TaskClass, state: TaskState) -> Judgement:
     """Reward, success and true ends of the step just made."""
-    terms = task.reward_terms(state)
+    terms = task.rewards(state)
     values = list(terms.values())
     reward = torch.stack(values).sum(dim=0) if len(values) > 1 else values[0]
-    return Judgement(terms, reward, task.success(state), task.failed(state))
+    return Judgement(terms, reward, task.solved_in(state), task.failed(state))
 
 
 def collect(parts: Sequence[Part], task_index: Tensor, action: Tensor, width: int) -> Transition:

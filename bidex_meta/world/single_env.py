@@ -14,6 +14,7 @@ import torch
 from gymnasium.spaces import Box
 
 from bidex_meta.errors import BidexError
+from bidex_meta.suite import V1, Rules
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import CONTROL_RATE, TaskClass
 from bidex_meta.world.contract import Info, Options
@@ -53,6 +54,8 @@ class EnvRecipe:
     reward_scale: float
     class_name: str | None = None
     """The task class, where it is called otherwise: with an object."""
+    rules: Rules = V1
+    """Those of the suite."""
     points: tuple[int, bool] = (0, False)
     """Points of the cloud in the place of objects' states, and whether each tells of what it is; 0: the states."""
 
@@ -209,6 +212,7 @@ class SuiteEnv(gymnasium.Env[np.ndarray, np.ndarray], metaclass=_Remade):
 @cache
 def _make_class(recipe: EnvRecipe) -> type[SuiteEnv]:
     task_class = registry.get(recipe.class_name or recipe.name, recipe.moving_base, **dict(recipe.options))
+    task_class.adopt(recipe.rules)
     text = f"{task_class.summary}."
     return _Remade(recipe.name, (SuiteEnv,), {"recipe": recipe, "task_class": task_class, "__doc__": text})
 

@@ -100,6 +100,7 @@ class World(BatchedWorld):
         super().__init__(Slots(names, steps, scales, gammas), num_envs, place, autoreset_mode, stagger)
         self.metadata |= {"render_modes": ["rgb_array"], "render_fps": CONTROL_RATE}
         self.render_mode = "rgb_array"
+        self._at_end = any(slot.task_class.rules.success == "at-end" for slot in self.slots)
         self._uniform_tasks = task_sampling == "uniform"
         groups = build_groups(self.slots, self.slot_rows, make_engine)
         self.points, self.hides_goals = points, observation == "masked"
@@ -134,7 +135,7 @@ class World(BatchedWorld):
 
     def _set_seed(self, seed: object) -> None:
         super()._set_seed(seed)
-        draws = max(slot.task_class.start_draws for slot in self.slots)
+        draws = max(slot.task_class.draws for slot in self.slots)
         self._starts = Starts(self.parts, self._keys, draws, self._pool_size if self._uniform_tasks else None)
         if self._graphs is not None:  # they hold the starts and the pools
             self._graphs.forget()
@@ -249,6 +250,7 @@ class World(BatchedWorld):
 
     def load_state_dict(self, state: State) -> None:
         """As in ``BatchedWorld``, on a world of the same suite and size."""
+        state = self._upgraded(state)
         self._set_pools(checked.state(state, self.state_dict(), self.slots, self.task_id))
         self._restore(state)
         self._action = state["action"].to(self.device, copy=True)

@@ -1,0 +1,54 @@
+"""The reward of version 2: one formula for all classes, from how far a state is from solved."""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from bidex_meta.tasks.base import TaskClass
+    from bidex_meta.tasks.state import TaskState
+
+
+class Error(NamedTuple):
+    """How far a state is from solved in one respect."""
+
+    value: Tensor
+    """Not negative, shape (n,), in the unit of its tolerance."""
+    tolerance: float
+    """Solved states are below it."""
+
+
+def at_least(value: Tensor, least: float, tolerance: float) -> Error:
+    """The error of a value that shall exceed ``least``, shaped over so much below it."""
+    return Error((least + tolerance - value).clamp(min=0.0), tolerance)
+
+
+def at_most(value: Tensor, most: float, tolerance: float) -> Error:
+    """The error of a value that shall stay below ``most``."""
+    return Error((value - most + tolerance).clamp(min=0.0), tolerance)
+
+
+def within(errors: list[Error]) -> Tensor:
+    """Whether every error is below its tolerance. Shape (n,), bool."""
+    return torch.stack([error.value < error.tolerance for error in errors]).all(dim=0)
+
+
+def aligned_terms(task: "TaskClass", state: "TaskState") -> dict[str, Tensor]:
+    """The reward of version 2, in [0, 1], by terms (n,): 1 where the task is solved, at most 0.9 elsewhere.
+
+    ``solved``: 1 or 0. Elsewhere ``far`` and ``near``, means over the class's errors e in units of their tolerances, of
+    1 - tanh(e / 16) and exp(-0.3 e): for an egg 1 - tanh(2 d) and exp(-10 d), d in metres. Classes with points that the
+    hands shall reach add ``reach``, the mean of 1 - tanh(3 d). Weights: far 0.25, near 0.65; with reach 0.2, 0.5, 0.2.
+    """
+    solved = task.solved_in(state)
+    errors = torch.stack([error.value / error.tolerance for error in task.errors(state)])
+    far, near = (1.0 - torch.tanh(errors / 16.0)).mean(dim=0), torch.exp(-0.3 * errors).mean(dim=0)
+    guides = task.guides(state)
+    if guides:
+        reach = (1.0 - torch.tanh(3.0 * torch.stack(guides))).mean(dim=0)
+        terms = {"reach": 0.2 * reach, "far": 0.2 * far, "near": 0.5 * near}
+    else:
+        terms = {"far": 0.25 * far, "near": 0.65 * near}
+    shaped = {name: torch.where(solved, 0.0, value) for name, value in terms.items()}
+    return {**shaped, "solved": solved.to(errors.dtype)}
