@@ -6,12 +6,14 @@ from dataclasses import replace
 import mujoco
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from bidex_meta.engine.capacity import Capacity
+from bidex_meta.tasks.aligned import Error, at_least, within
 from bidex_meta.tasks.base import FAST, THIN
 from bidex_meta.tasks.goals import frozen_goal
 from bidex_meta.tasks.layout import goal_blocks, handle_blocks, object_blocks, point_block
-from bidex_meta.tasks.placement import DRAWS, SHIFT, place, placed, yaw_quaternion
+from bidex_meta.tasks.placement import DRAWS, SHIFT, TURN, place, placed, yaw_quaternion
 from bidex_meta.tasks.reach import ReachTask, apart
 from bidex_meta.tasks.scene import Point, SceneObject, Table
 from bidex_meta.tasks.state import TaskState
@@ -57,6 +59,8 @@ class OpenScissors(ReachTask):
     constant = 2.0
     camera_target = (0.08, 0.0, 0.66)
     variation_space = join(placed("scissors"), component("target_angle", -0.15, 0.3))
+    wide_space = join(placed("scissors", 2 * SHIFT, 2 * TURN), component("target_angle", -0.15, 0.3))
+    wide_solved = "hinge within 0.04 rad of its target"
     blocks = (
         *object_blocks("scissors"),
         *goal_blocks("goal"),
@@ -84,8 +88,11 @@ class OpenScissors(ReachTask):
     def target(self, state: TaskState) -> Tensor:
         return 5.0 * (0.59 - _missing(state))
 
+    def errors(self, state: TaskState) -> list[Error]:
+        return [Error(_missing(state), 0.04 if self.rules.wide else 0.1)]
+
     def success(self, state: TaskState) -> Tensor:
-        return _missing(state) < 0.1
+        return within(self.errors(state))
 
     def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, Point]]:
         return [(frozen["ghost"], (0.02, 0.02, 0.01))]
@@ -133,6 +140,8 @@ class OpenPenCap(ReachTask):
     ghost = (0.012, 0.012, 0.012)
     camera_target = (0.12, 0.0, 0.66)
     variation_space = placed("pen")
+    wide_space = join(placed("pen", 2 * SHIFT, 2 * TURN), component("gap", 0.2, 0.45))
+    wide_solved = "points on body and cap within 2.5 cm of the gap between them"
     blocks = (
         *object_blocks("pen"),
         *goal_blocks("goal"),
@@ -143,16 +152,23 @@ class OpenPenCap(ReachTask):
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """``pen``: place (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse of its rotation (n, 4)."""
         pen = variation.new_tensor((*_PEN.position, *_PEN.quaternion)).repeat(len(variation), 1)
-        place(pen, variation)
+        place(pen, variation[:, :3])
         rotation = xyzw(pen[:, 3:])
-        cap = pen[:, :3] + rotate(rotation, pen.new_tensor((0.0, 0.0, _BODY_POINT - _OPEN)))
-        return {"pen": variation, **frozen_goal(torch.cat((cap, rotation), dim=1))}
+        gap = variation[:, 3:] if self.rules.wide else torch.full_like(variation[:, :1], _OPEN)
+        cap = pen[:, :3] + rotate(rotation, pad(_BODY_POINT - gap, (2, 0)))
+        return {"pen": variation[:, :3], "gap": gap, **frozen_goal(torch.cat((cap, rotation), dim=1))}
 
     def target(self, state: TaskState) -> Tensor:
         return 5.0 * apart(state, *self.points)
 
+    def errors(self, state: TaskState) -> list[Error]:
+        gap = apart(state, *self.points)
+        return [
+            Error((gap - state.frozen["gap"][:, 0]).abs(), 0.025) if self.rules.wide else at_least(gap, _OPEN, 0.025)
+        ]
+
     def success(self, state: TaskState) -> Tensor:
-        return apart(state, *self.points) > _OPEN
+        return within(self.errors(state)) if self.rules.wide else apart(state, *self.points) > _OPEN
 
 
 _FACE_UP = (math.pi, 0.5 * math.pi, 0.0)
@@ -194,6 +210,12 @@ class Switch(ReachTask):
     constant = 2.0
     camera_target, camera_distance = (0.08, 0.0, 0.70), 1.1
     variation_space = join(*(component(f"switch{i}_{axis}", -SHIFT, SHIFT) for i in (1, 2) for axis in "xy"))
+    wide_space = join(
+        *(component(f"switch{i}_{axis}", -3 * SHIFT, 3 * SHIFT) for i in (1, 2) for axis in "xy"),
+        *(component(f"switch{i}_angle", 0.05, _TRAVEL) for i in (1, 2)),
+    )
+    wide_solved = "each rocker within 0.08 rad of its angle"
+    jittered_fixtures = ("switch1", "switch2")
     blocks = (
         *object_blocks("switch1"),
         *goal_blocks("goal"),
@@ -209,16 +231,34 @@ class Switch(ReachTask):
             position[:, :2] += variation[:, 2 * i - 2 : 2 * i]
             frozen |= {switch.name: position, f"goal{i}": position + variation.new_tensor(_PRESSED)}
         turn = xyzw(variation.new_tensor(_PRESSED_QUATERNION)).expand(len(variation), 4)
-        return frozen | frozen_goal(torch.cat((frozen["goal1"], turn), dim=1))
+        angles = {"angles": variation[:, 4:]} if self.rules.wide else {}
+        return frozen | frozen_goal(torch.cat((frozen["goal1"], turn), dim=1)) | angles
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
         for name in ("switch1", "switch2"):
             qpos[name][:, :3] = frozen[name]
+
+    def observe(self, state: TaskState) -> dict[str, Tensor]:
+        if not self.rules.wide:
+            return super().observe(state)
+        angles = state.frozen["angles"]
+        missing = _rockers(state) - angles
+        return {"goal_pose": pad(angles, (0, 5)), "goal_rotation_difference": pad(missing, (0, 2))}
+
+    def errors(self, state: TaskState) -> list[Error]:
+        rockers = _rockers(state)
+        if self.rules.wide:
+            return [Error(off, 0.08) for off in (rockers - state.frozen["angles"]).abs().unbind(1)]
+        return [at_least(angle, 0.8 * _TRAVEL, 0.08) for angle in rockers.unbind(1)]
 
     def target(self, state: TaskState) -> Tensor:
         first, second = (norm(state[f"switch{i}/button_position"] - state.frozen[f"goal{i}"]) for i in (1, 2))
         return 50.0 * (1.4 - (first + second))
 
     def success(self, state: TaskState) -> Tensor:
-        first, second = (state[f"{name}/angle"][:, 0] for name in ("switch1", "switch2"))
-        return (first > 0.8 * _TRAVEL) & (second > 0.8 * _TRAVEL)
+        return within(self.errors(state)) if self.rules.wide else (_rockers(state) > 0.8 * _TRAVEL).all(dim=1)
+
+
+def _rockers(state: TaskState) -> Tensor:
+    """Angles of both rockers, rad, (n, 2)."""
+    return torch.cat([state["switch1/angle"], state["switch2/angle"]], dim=1)

@@ -5,16 +5,19 @@ import math
 import mujoco
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
+from bidex_meta.tasks.aligned import Error, at_least, within
 from bidex_meta.tasks.base import FAST, THIN
+from bidex_meta.tasks.goals import frozen_goal
 from bidex_meta.tasks.layout import Block, goal_blocks, object_blocks, point_block
-from bidex_meta.tasks.placement import DRAWS, placed, yaw_quaternion
+from bidex_meta.tasks.placement import DRAWS, SHIFT, TURN, placed, yaw_quaternion
 from bidex_meta.tasks.reach import ReachTask, apart
 from bidex_meta.tasks.scene import SceneObject, Table
 from bidex_meta.tasks.state import TaskState
-from bidex_meta.tasks.variation import join
+from bidex_meta.tasks.variation import component, join
 from bidex_meta.utils.maths import conjugate, multiply, norm, quaternion_from_rpy, rotate, uprightness, xyzw
 from bidex_meta.utils.validation import whole_number
 
@@ -75,6 +78,13 @@ class GraspAndPlace(ReachTask):
     terms = ("left", "right", "target")
     camera_target, camera_distance = (0.1, 0.0, 0.68), 1.7
     variation_space = join(placed("bucket"), placed("block"))
+    wide_space = join(
+        placed("bucket", 3 * SHIFT, 3 * TURN),
+        placed("block", 3 * SHIFT, 3 * TURN),
+        *(component(f"goal_{axis}", -0.12, 0.12) for axis in "xy"),
+    )
+    wide_solved = f"{solved} and within 4 cm of its goal"
+    wide_blocks = goal_blocks("goal")
     blocks = (
         *object_blocks("bucket"),
         point_block("bucket_position", "bucket/position", "origin of the bucket"),
@@ -83,12 +93,35 @@ class GraspAndPlace(ReachTask):
         Block("block_quaternion", 4, ("block/quaternion",), description=_TURN),
     )
 
+    def freeze(self, variation: Tensor) -> dict[str, Tensor]:
+        """``bucket``, ``block``: shifts and turns (n, 3); with wide variation ``goal``, of the bucket: pose (n, 7)."""
+        return super().freeze(variation) | _bucket_goal(variation[:, 6:], self.objects[0])
+
+    def errors(self, state: TaskState) -> list[Error]:
+        inside = Error(apart(state, "bucket/position", "block/position"), 0.04)
+        return [inside, *_bucket_error(state)]
+
     def target(self, state: TaskState) -> Tensor:
         return 2.0 * torch.exp(-10.0 * apart(state, "bucket/position", "block/position"))
 
     def success(self, state: TaskState) -> Tensor:
         block, turn = state["block/position"][:, None], state.quaternion("bucket/quaternion")
-        return inside_bucket(block, state["bucket/position"], turn)[:, 0] & stands(turn)
+        inside = inside_bucket(block, state["bucket/position"], turn)[:, 0] & stands(turn)
+        return inside & within(_bucket_error(state)) if self.rules.wide else inside
+
+
+def _bucket_goal(shift: Tensor, bucket: SceneObject) -> dict[str, Tensor]:
+    """``goal``: the bucket's nominal place shifted (n, 2), metres, upright; nothing without a shift (n, 0)."""
+    if not shift.shape[1]:
+        return {}
+    position = pad(shift, (0, 1)) + shift.new_tensor(bucket.position)
+    return frozen_goal(torch.cat((position, shift.new_tensor((0.0, 0.0, 0.0, 1.0)).expand(len(shift), 4)), dim=1))
+
+
+def _bucket_error(state: TaskState) -> list[Error]:
+    """How far the bucket is from its goal, where it has one."""
+    goal = state.frozen.get("goal")
+    return [] if goal is None else [Error(norm(state["bucket/position"] - goal[:, :3]), 0.04)]
 
 
 _KETTLE = SceneObject("kettle", "kettle", (0.0, 0.0, 0.478), (0.0, 0.0, 0.5 * math.pi))
@@ -143,6 +176,8 @@ class PourWater(ReachTask):
     terms = ("constant", "left", "right", "target")
     camera_target, camera_distance = (0.1, -0.05, 0.5), 1.4
     variation_space = join(placed("kettle"), placed("bucket"))
+    wide_space = join(variation_space, *(component(f"goal_{axis}", -0.12, 0.12) for axis in "xy"))
+    wide_solved = f"{solved} and within 4 cm of its goal"
     blocks = (
         *object_blocks("kettle"),
         *goal_blocks("goal"),
@@ -168,7 +203,8 @@ class PourWater(ReachTask):
         nominal = xyzw(variation.new_tensor(_KETTLE.quaternion))
         tilt = xyzw(variation.new_tensor(quaternion_from_rpy((0.0, -math.radians(40.0), 0.0))))
         goal = multiply(multiply(yaw_quaternion(variation[:, 2]), nominal), tilt)
-        return super().freeze(variation) | {"goal_rotation": goal, "goal_rotation_inverse": conjugate(goal)}
+        frozen = {"goal_rotation": goal, "goal_rotation_inverse": conjugate(goal)}
+        return super().freeze(variation) | frozen | _bucket_goal(variation[:, 6:], _BUCKET)
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
         super().start(draws, frozen, qpos)
@@ -189,17 +225,37 @@ class PourWater(ReachTask):
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         frozen = state.frozen
         difference = multiply(state.quaternion("kettle/quaternion"), frozen["goal_rotation_inverse"])
-        pose = torch.cat((_goal(state), frozen["goal_rotation"]), dim=1)
+        position = frozen["goal"][:, :3] if self.rules.wide else _goal(state)
+        pose = torch.cat((position, frozen["goal_rotation"]), dim=1)
         return {"goal_pose": pose, "goal_rotation_difference": difference}
 
     def target(self, state: TaskState) -> Tensor:
-        return 2.0 * (0.5 - norm(state["kettle/spout_position"] - _goal(state)))
+        return 2.0 * (0.5 - _spout_off(state))
+
+    def errors(self, state: TaskState) -> list[Error]:
+        return [at_least(self._inside(state) / self.water, 1.0 / 3.0, 1.0 / 12.0), *_bucket_error(state)]
+
+    def guides(self, state: TaskState) -> list[Tensor]:
+        return [*super().guides(state), _spout_off(state)]
 
     def success(self, state: TaskState) -> Tensor:
-        drops = torch.stack([state[f"water{i}/position"] for i in range(self.water)], dim=1)
-        turn = state.quaternion("bucket/quaternion")
-        inside = inside_bucket(drops, state["bucket/position"], turn)
-        return (3 * inside.sum(dim=1) >= self.water) & stands(turn)
+        poured = (3 * self._inside(state) >= self.water) & stands(state.quaternion("bucket/quaternion"))
+        return poured & within(_bucket_error(state)) if self.rules.wide else poured
+
+    def _inside(self, state: TaskState) -> Tensor:
+        """Drops in the bucket, (n,)."""
+
+        def count() -> Tensor:
+            drops = torch.stack([state[f"water{i}/position"] for i in range(self.water)], dim=1)
+            turn = state.quaternion("bucket/quaternion")
+            return inside_bucket(drops, state["bucket/position"], turn).sum(dim=1)
+
+        return state.once("inside", count)
+
+
+def _spout_off(state: TaskState) -> Tensor:
+    """Distance from the spout to its goal, metres, (n,)."""
+    return state.once("spout", lambda: norm(state["kettle/spout_position"] - _goal(state)))
 
 
 def _goal(state: TaskState) -> Tensor:

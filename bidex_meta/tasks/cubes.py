@@ -5,14 +5,16 @@ from typing import ClassVar
 import mujoco
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_DOWN_AWAY, PALM_DOWN_BACK, PALM_UP_AWAY, PALM_UP_BACK, HandPose
 from bidex_meta.tasks import eggs
+from bidex_meta.tasks.aligned import Error, within
 from bidex_meta.tasks.base import FAST, FIRM, TaskClass
 from bidex_meta.tasks.goals import frozen_goal
 from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
-from bidex_meta.tasks.placement import DRAWS, placed
+from bidex_meta.tasks.placement import DRAWS, SHIFT, TURN, placed
 from bidex_meta.tasks.reach import ReachTask
 from bidex_meta.tasks.scene import Point, SceneObject, Table
 from bidex_meta.tasks.state import TaskState
@@ -46,6 +48,10 @@ class _TwoBlocks(ReachTask):
         """Of the blocks to their goals, metres, each (n,)."""
         first, second = (norm(state[f"block{i}/position"] - state.frozen[f"goal{i}"]) for i in (1, 2))
         return first, second
+
+    def off_by(self, state: TaskState, tolerance: float) -> list[Error]:
+        """``distances`` as errors."""
+        return [Error(distance, tolerance) for distance in self.distances(state)]
 
     def target(self, state: TaskState) -> Tensor:
         first, second = self.distances(state)
@@ -82,15 +88,35 @@ class PushBlock(_TwoBlocks):
     constant, weight, widest = 2.0, 5.0, 0.8
     camera_target, camera_distance = (0.1, 0.0, 0.68), 1.7
     variation_space = join(placed("block1"), placed("block2"))
+    wide_space = join(
+        *(placed(f"block{i}", 3 * SHIFT, 3 * TURN) for i in (1, 2)),
+        *(component(f"goal{i}_{axis}", -0.15, 0.15) for i in (1, 2) for axis in "xy"),
+    )
+    wide_solved = "both blocks within 5 cm of their goals"
+    wide_blocks = goal_blocks("goal")
     blocks = (*object_blocks("block1"), *_TwoBlocks.centres)
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """``block1``, ``block2``: shifts and turns; ``goal1``, ``goal2``: goal positions; each (n, 3)."""
         goals = ((-0.2, -0.2, 0.625), (-0.2, 0.2, 0.625))
         first, second = (variation.new_tensor(goal).expand(len(variation), 3) for goal in goals)
+        if self.rules.wide:
+            first, second = first + pad(variation[:, 6:8], (0, 1)), second + pad(variation[:, 8:], (0, 1))
         return super().freeze(variation) | {"goal1": first, "goal2": second}
 
+    def observe(self, state: TaskState) -> dict[str, Tensor]:
+        """With wide variation the goals of both blocks."""
+        if not self.rules.wide:
+            return {}
+        goals = torch.cat((state.frozen["goal1"], state.frozen["goal2"]), dim=1)
+        return {"goal_pose": pad(goals, (0, 1)), "goal_rotation_difference": torch.zeros_like(goals[:, :4])}
+
+    def errors(self, state: TaskState) -> list[Error]:
+        return self.off_by(state, 0.05 if self.rules.wide else 0.1)
+
     def success(self, state: TaskState) -> Tensor:
+        if self.rules.wide:
+            return within(self.errors(state))
         first, second = self.distances(state)
         return (first <= 0.1) & (second <= 0.1)
 
@@ -126,6 +152,13 @@ class StackBlock(_TwoBlocks):
     variation_space = join(
         placed("block1"), placed("block2"), *(component(f"target_{axis}", -0.03, 0.03) for axis in "xy")
     )
+    wide_space = join(
+        placed("block1"),  # farther they would meet
+        placed("block2"),
+        *(component(f"target_{axis}", -0.09, 0.09) for axis in "xy"),
+        component("order", -1.0, 1.0),
+    )
+    wide_solved = "both blocks within 3 cm of their targets, block 1 on block 2, or the other way for a negative order"
     blocks = (*object_blocks("block1"), *goal_blocks("goal"), *_TwoBlocks.centres)
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
@@ -139,14 +172,28 @@ class StackBlock(_TwoBlocks):
         shift = torch.cat((variation[:, 6:8], torch.zeros_like(variation[:, :1])), dim=1)
         bottom = shift + shift.new_tensor((0.0, 0.0, 0.625))
         top = bottom + shift.new_tensor((0.0, 0.0, _EDGE))
-        return super().freeze(variation) | {"goal1": top, "goal2": bottom, "goal": _unturned(top)}
+        frozen = super().freeze(variation)
+        if not self.rules.wide:
+            return frozen | {"goal1": top, "goal2": bottom, "goal": _unturned(top)}
+        upper = torch.where(variation[:, 8:] < 0.0, -1.0, 1.0)
+        first, second = torch.where(upper > 0.0, top, bottom), torch.where(upper > 0.0, bottom, top)
+        return frozen | {"goal1": first, "goal2": second, "upper": upper}
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
+        """Target 1 and block 1's turn; with wide variation the targets of both blocks."""
+        if self.rules.wide:
+            goals = torch.cat((state.frozen["goal1"], state.frozen["goal2"]), dim=1)
+            return {"goal_pose": pad(goals, (0, 1)), "goal_rotation_difference": torch.zeros_like(goals[:, :4])}
         return {"goal_pose": state.frozen["goal"], "goal_rotation_difference": state.quaternion("block1/quaternion")}
+
+    def errors(self, state: TaskState) -> list[Error]:
+        return self.off_by(state, 0.03)
 
     def success(self, state: TaskState) -> Tensor:
         first, second = self.distances(state)
         x, y, z = (state["block1/position"] - state["block2/position"]).unbind(1)
+        if self.rules.wide:
+            z = z * state.frozen["upper"][:, 0]
         stacked = ((z - _EDGE).abs() < 0.01) & ((x * x + y * y).sqrt() < 0.03)
         return (first < 0.03) & (second < 0.03) & stacked
 
@@ -180,7 +227,8 @@ class ReOrientation(TaskClass):
     start_draws = eggs.JOINT_DRAWS + 5
     solver = FIRM
     objects = _cubes("object", (0.0, -0.76, 0.60), (0.0, -0.39, 0.60))
-    variation_space = orientation("goal")
+    variation_space = wide_space = orientation("goal")
+    wide_solved = solved
     blocks = eggs.goal_object_blocks("12")
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
@@ -210,6 +258,9 @@ class ReOrientation(TaskClass):
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
         (first, first_angle), (second, second_angle) = self._distances(state)
         return {"left": -10.0 * first, "right": -10.0 * second, "target": -1.5 * (first_angle + second_angle)}
+
+    def errors(self, state: TaskState) -> list[Error]:
+        return [Error(angle, 0.2) for _, angle in self._distances(state)]
 
     def success(self, state: TaskState) -> Tensor:
         (first, first_angle), (second, second_angle) = self._distances(state)

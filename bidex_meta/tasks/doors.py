@@ -19,7 +19,7 @@ from bidex_meta.tasks.layout import goal_blocks, handle_blocks, object_blocks
 from bidex_meta.tasks.reach import ReachTask, apart
 from bidex_meta.tasks.scene import SceneObject
 from bidex_meta.tasks.state import TaskState
-from bidex_meta.tasks.variation import component, join
+from bidex_meta.tasks.variation import VariationSpace, component, join
 from bidex_meta.utils.maths import quaternion_from_rpy, xyzw
 
 _BASE = (0.0, 0.0, 0.7)
@@ -49,7 +49,7 @@ class _Door(ReachTask):
     left = HandPose((0.55, -0.2, 0.6), PALM_RIGHT_AHEAD)
     transition_scale, orientation_scale = 0.5, 0.5
     start_draws = 0
-    jittered_hands, jittered_fixtures = ("right", "left"), ("object",)
+    jittered_fixtures = ("object",)
     wide_solved = "each leaf within 0.15 rad of its angle"
     solver = FAST
     points = ("object/left_handle_position", "object/right_handle_position")
@@ -144,6 +144,11 @@ class _Open(_Door):
         return (right + left > 0.5) & (right > _LEAST_SHARE) & (left > _LEAST_SHARE)
 
 
+def _closed_to(shift: float) -> VariationSpace:
+    angles = (component(f"{side}_angle", 0.0, 1.0) for side in SIDES)
+    return join(component("base_y", -shift, shift), component("start_angle", 1.3, 1.57), *angles)
+
+
 class _Close(_Door):
     formula = "0.2 - d_left - d_right + 2 (1 - d), d between the two handles"
     solved = "both leaves within a tenth of their travel of shut"
@@ -152,11 +157,7 @@ class _Close(_Door):
         _DAMPED,
     )
     variation_space = join(component("base_y", -0.05, 0.05), component("start_angle", 1.3, 1.57))
-    wide_space = join(
-        component("base_y", -0.15, 0.15),
-        component("start_angle", 1.3, 1.57),
-        *(component(f"{side}_angle", 0.0, 1.0) for side in SIDES),
-    )
+    wide_space = _closed_to(0.15)
 
     def target(self, state: TaskState) -> Tensor:
         return 2.0 * (1.0 - apart(state, *self.points))
@@ -187,6 +188,7 @@ class DoorCloseInward(_Close):
     right = HandPose((0.9, 0.5, 0.6), PALM_LEFT_AHEAD)
     left = HandPose((0.9, -0.5, 0.6), PALM_RIGHT_AHEAD)
     camera_target, camera_distance = (0.3, 0.0, 0.65), 2.3
+    wide_space = _closed_to(0.05)  # farther the leaves would start in the hands
 
 
 class DoorOpenInward(_Open):

@@ -52,6 +52,7 @@ class ReachTask(TaskClass):
     exponential: ClassVar[bool] = False
     terms: ClassVar[tuple[str, ...]] = ("left", "right", "target", "constant")
     ghost: ClassVar[Point | None] = None
+    jittered_hands = ("right", "left")
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
         add_table(scene, *self.table)

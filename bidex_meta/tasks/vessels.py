@@ -4,10 +4,12 @@ import math
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.hand import hand
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, PALM_UP_AWAY, PALM_UP_BACK, HandPose
+from bidex_meta.tasks.aligned import Error, at_least, within
 from bidex_meta.tasks.base import FAST, FIRM
 from bidex_meta.tasks.goals import frozen_goal, rotation_difference
 from bidex_meta.tasks.layout import goal_blocks, handle_blocks, object_blocks, point_block
@@ -53,6 +55,12 @@ class LiftUnderarm(OwnObjectClass):
     camera_target, camera_distance = (0.0, -0.6, 0.55), 1.5
     _goal = (*(component(f"goal_{axis}", -0.05, 0.05) for axis in "xy"), component("goal_height", 0.25, 0.45))
     variation_space = join(placed("object"), *_goal)
+    wide_space = join(
+        placed("object"),  # the table is hardly wider than the pot
+        *(component(f"goal_{axis}", -0.15, 0.15) for axis in "xy"),
+        component("goal_height", 0.2, 0.5),
+    )
+    wide_solved = solved
     blocks = (
         *object_blocks("object"),
         *goal_blocks("goal"),
@@ -68,6 +76,9 @@ class LiftUnderarm(OwnObjectClass):
 
     def target(self, state: TaskState) -> Tensor:
         return 3.0 * (0.985 - self._distance(state))
+
+    def errors(self, state: TaskState) -> list[Error]:
+        return [Error(self._distance(state), 0.05)]
 
     def success(self, state: TaskState) -> Tensor:
         upright = uprightness(state.quaternion("object/quaternion")) > math.cos(math.radians(30.0))
@@ -120,7 +131,31 @@ class BottleCap(OwnObjectClass):
     constant = 0.2
     camera_target = (0.0, -0.62, 0.52)
     variation_space = VariationSpace(("bottle_x", "bottle_y", "bottle_yaw"), (-SHIFT, -0.01, -TURN), (SHIFT, 0.0, TURN))
+    wide_space = join(variation_space, component("cap_slide", 0.01, 0.06))  # there is no room in the hand for more
+    wide_solved = "cap within 5 mm of where it shall stand out"
+    wide_blocks = goal_blocks("goal")
+    jittered_hands = ("left",)
     blocks = (*object_blocks("bottle"), point_block("bottle_cap_position", "bottle/cap_position", "centre of the cap"))
+
+    def freeze(self, variation: Tensor) -> dict[str, Tensor]:
+        """``bottle``: shift and turn (n, 3); with wide variation ``slide``: how far the cap shall stand out (n, 1)."""
+        return super().freeze(variation) | ({"slide": variation[:, 3:]} if self.rules.wide else {})
+
+    def observe(self, state: TaskState) -> dict[str, Tensor]:
+        """With wide variation how far the cap shall stand out, and how far it is from there."""
+        if not self.rules.wide:
+            return {}
+        slide = state.frozen["slide"]
+        return {
+            "goal_pose": pad(slide, (0, 6)),
+            "goal_rotation_difference": pad(state["bottle/slide"] - slide, (0, 3)),
+        }
+
+    def errors(self, state: TaskState) -> list[Error]:
+        slide = state["bottle/slide"][:, 0]
+        if self.rules.wide:
+            return [Error((slide - state.frozen["slide"][:, 0]).abs(), 0.005)]
+        return [at_least(slide, 0.03, 0.005)]
 
     def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
         for side in ("right", "left"):
@@ -135,7 +170,7 @@ class BottleCap(OwnObjectClass):
         return 30.0 * apart(state, "bottle/position", "bottle/cap_position")
 
     def success(self, state: TaskState) -> Tensor:
-        return state["bottle/slide"][:, 0] > 0.03
+        return within(self.errors(state)) if self.rules.wide else state["bottle/slide"][:, 0] > 0.03
 
 
 _CUP = SceneObject("cup", "cup", (0.0, 0.0, 0.6845), (0.0, 0.0, 0.5 * math.pi))
@@ -172,6 +207,8 @@ class SwingCup(OwnObjectClass):
     ghost = (0.1, 0.012, 0.012)
     camera_target = (0.08, 0.0, 0.68)
     variation_space = join(placed("cup"), component("yaw_change", 0.5 * math.pi, math.pi))
+    wide_space = join(placed("cup"), component("yaw_change", 0.25 * math.pi, math.pi))  # a small table
+    wide_solved = "cup within 12 degrees of its goal and within 20 cm of its start"
     blocks = (
         *object_blocks("cup"),
         *goal_blocks("goal"),
@@ -188,9 +225,12 @@ class SwingCup(OwnObjectClass):
     def target(self, state: TaskState) -> Tensor:
         return 5.0 / (_angle(state) + 0.1)
 
+    def errors(self, state: TaskState) -> list[Error]:
+        return [Error(_angle(state), math.radians(12.0) if self.rules.wide else 0.25 * math.pi)]
+
     def success(self, state: TaskState) -> Tensor:
         moved = norm(state["cup/position"] - state.frozen["goal"][:, :3])
-        return (_angle(state) < 0.25 * math.pi) & (moved < 0.2)
+        return within(self.errors(state)) & (moved < 0.2)
 
 
 def _angle(state: TaskState) -> Tensor:
