@@ -14,7 +14,6 @@ class Agent(Protocol):
 
     def reset(self, env_mask: Tensor) -> None:
         """A new episode begins in the environments of a mask, bool ``(num_envs,)``: forget what was known of them."""
-        ...
 
 
 class Timestep(NamedTuple):
@@ -50,11 +49,9 @@ class MetaLearningAgent(Agent, Protocol):
 
         None: each has a task of its own, as in Meta-World's evaluation, which does not call this.
         """
-        ...
 
     def init(self) -> None:
         """Back to what was meta-learned; all adaptation and its data are forgotten."""
-        ...
 
     def adapt_action(self, obs: Tensor) -> tuple[Tensor, dict[str, Any]]:
         """Exploring actions ``(num_envs, action)``, and what ``step`` shall be given back of the policy's outputs."""
@@ -62,8 +59,6 @@ class MetaLearningAgent(Agent, Protocol):
 
     def step(self, timestep: Timestep) -> None:
         """Takes in one transition of every environment."""
-        ...
 
     def adapt(self) -> None:
         """Learns from all transitions since the last ``adapt`` or ``init``."""
-        ...

@@ -25,7 +25,6 @@ from bidex_meta.world.single_env import EnvRecipe, SuiteEnv
 TaskSampling = Literal["uniform", "fixed"]
 
 _NUMBERS = np.dtype("<f8")
-_TASKS_ALONE = 50
 
 
 class Task(NamedTuple):
@@ -56,13 +55,10 @@ class Task(NamedTuple):
 class Benchmark:
     """A suite with its task classes, its tasks and the worlds made of them.
 
-    The same name and seed give the same tasks in every process; no global random generator is read or written. Its
-    classes make single environments as Meta-World's do; with `bidex_meta.metaworld` imported it is a
-    `metaworld.Benchmark`.
-
-    Args:
-        name_or_path: A shipped suite (`bidex_meta.suite_names()`), the path of a suite file of your own, or a `Suite`.
-        seed: Chooses the tasks; also the default seed of the worlds. A whole number from 0 on.
+    `name_or_path` is a shipped suite (`bidex_meta.suite_names()`), the path of a suite file of your own, or a `Suite`;
+    `seed`, a whole number from 0 on, chooses the tasks and is the default seed of the worlds. Both give the same tasks
+    in every process; no global random generator is read or written. Its classes make single environments as
+    Meta-World's do; with `bidex_meta.metaworld` imported it is a `metaworld.Benchmark`.
 
     Raises BidexError for an unknown suite, a faulty suite file or seed.
 
@@ -232,8 +228,7 @@ def make_task_world(
     `"package.module:Class"` of your own (docs/own-task.md). Beside the arguments of `Benchmark.make_world`:
 
     - `task_sampling`: `"uniform"`: each episode draws a task; `"fixed"`: environment j keeps task j modulo 50. Left
-    out:
-      uniform in training worlds, fixed in evaluation worlds.
+      out, uniform in training worlds, fixed in evaluation worlds.
     - `moving_base`: drive the hands' bases or fix them; left out, as the class has it on its own.
     - `points`: points of the cloud shown in the place of the object's state (docs/points.md); 0: the state.
     - `object`: in the place of its own: a name, or an MJCF file (docs/objects.md); in the slot's name behind a dash.
@@ -242,7 +237,7 @@ def make_task_world(
     """
     task_name, mode = registry.resolve(task_name), checked_mode(autoreset_mode)
     task_class = registry.get(task_name, moving_base, **registry.with_object(object))
-    tasks = _drawn(task_class.variation_space, whole_number("seed", seed, 0), task_name, "train", _TASKS_ALONE)
+    tasks = _drawn(task_class.variation_space, whole_number("seed", seed, 0), task_name, "train", 50)
     slot = Slot(name_with_object(task_name, object), task_class, tasks)
     return World(
         [slot],

@@ -5,7 +5,7 @@ import json
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Generic, Literal, TypeVar
+from typing import Annotated, Generic, Literal, TypeVar
 
 import msgspec
 import tyro
@@ -14,7 +14,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from bidex_meta.errors import BidexError, shortened
 from bidex_meta.suite import MOST_POINTS
-from bidex_meta.utils.files import read_json
+from bidex_meta.utils.files import Json, JsonObject, read_json
 from bidex_meta.utils.validation import (
     Count,
     Environments,
@@ -65,8 +65,7 @@ Several = Annotated[tuple[Text, ...], tyro.conf.UseAppendAction]
 class RunConfig(Generic[LearnerSettings]):
     """Everything that decides what a run does. ``learner`` is the learner's own config, or as a file holds it.
 
-    Raises:
-        BidexError: A field is out of its bounds, or there is not either a suite or a task.
+    Raises BidexError for a field that is out of its bounds.
     """
 
     suite: Text | None
@@ -141,23 +140,22 @@ class RunConfig(Generic[LearnerSettings]):
     machine. A resumed run keeps its own."""
 
     def __post_init__(self) -> None:
-        """Checks all fields."""
         check_fields(self, "run", as_flags=True)
 
     @property
-    def learner_values(self) -> dict[str, Any]:
+    def learner_values(self) -> JsonObject:
         """The learner's config as plain values."""
         return json.loads(msgspec.json.encode(self.learner))
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """As ``config.json`` holds it."""
         return json.loads(msgspec.json.encode(self))
 
-    def flat(self) -> dict[str, Any]:
+    def flat(self) -> JsonObject:
         """Plain values without nesting: ``learner.gamma`` beside ``seed``."""
         return flat(self.to_json())
 
-    def differences(self, other: "RunConfig[Any]", ignored: Collection[str] = ()) -> Iterator[tuple[str, Any, Any]]:
+    def differences(self, other: "RunConfig", ignored: Collection[str] = ()) -> Iterator[tuple[str, Json, Json]]:
         """Name, value here and value there of all entries that differ, but for those that a resumed run may change."""
         free = {entry.name for entry in dataclasses.fields(self) if entry.metadata.get("may_change")}
         here, there = self.flat(), other.flat()
@@ -165,7 +163,7 @@ class RunConfig(Generic[LearnerSettings]):
             if here.get(name) != there.get(name):
                 yield name, here.get(name), there.get(name)
 
-    def early_end(self, metrics: Mapping[str, Any]) -> str | None:
+    def early_end(self, metrics: Mapping[str, Json]) -> str | None:
         """The tag of the metrics that has reached what ends the run early; None where the run goes on."""
         prefix = "Train" if self.evaluate_every is None else "Eval"
         limits = {
@@ -174,53 +172,39 @@ class RunConfig(Generic[LearnerSettings]):
             "Eval/score": self.stop_at_score,
         }
         for tag, limit in limits.items():
-            value = metrics.get(tag)
-            if limit is not None and value is not None and value >= limit:
+            if limit is not None and (value := metrics.get(tag)) is not None and value >= limit:
                 return tag
         return None
 
-    def goal(self, last: Mapping[str, Any]) -> int:
+    def goal(self, last: Mapping[str, Json]) -> int:
         """Steps that a run trains for: those of its last metrics where time or these ended it, else ``steps``."""
         return last["step"] if self.minutes is not None or self.early_end(last) else self.steps
 
 
-def flat(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flat(content: Mapping[str, Json], prefix: str = "") -> JsonObject:
     """Tables without nesting: ``{"learner": {"gamma": 0.9}}`` becomes ``{"learner.gamma": 0.9}``."""
-    found: dict[str, Any] = {}
+    found: JsonObject = {}
     for name, value in content.items():
         found.update(flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value})
     return found
 
 
-def read_config(path: Path) -> RunConfig[dict[str, Any]]:
-    """A run's ``config.json``, of this version or an older one.
-
-    Raises:
-        BidexError: The file cannot be read, or is not a run's config.
-    """
+def read_config(path: Path) -> RunConfig[JsonObject]:
+    """A run's ``config.json``, of this version or an older one; BidexError where it is none, or cannot be read."""
     return config_of(read_json(path, "a run's config"), str(path))
 
 
-def config_of(content: object, where: str) -> RunConfig[dict[str, Any]]:
-    """A run's config from what a file holds; ``where`` for messages.
-
-    Raises:
-        BidexError: It is not a run's config.
-    """
-    if isinstance(content, dict):
-        content = _brought_up(content)
-    config = parse(content, RunConfig[dict[str, Any]], where)
+def config_of(content: object, where: str) -> RunConfig[JsonObject]:
+    """A run's config from what a file holds; ``where`` for messages. Raises BidexError where it is none."""
+    if isinstance(content, dict):  # what a run of 0.2.0 or before wrote, as this version writes it
+        given = content.get("demonstrations")
+        content = {**content, "demonstrations": [given] if isinstance(given, str) else [] if given is None else given}
+    config = parse(content, RunConfig[JsonObject], where)
     if (config.suite is None) == (config.task is None):
         raise BidexError(f"{where}: expected either a suite or a task, the other null. Name a run.")
     return dataclasses.replace(config)  # msgspec leaves defaults to the class, and does not write those
 
 
-def _brought_up(content: dict[str, Any]) -> dict[str, Any]:
-    """What a run of 0.2.0 or before wrote, as this version writes it; what it lacks has its default."""
-    given = content.get("demonstrations")
-    return {**content, "demonstrations": [given] if isinstance(given, str) else [] if given is None else given}
-
-
-def printed(config: RunConfig[Any]) -> str:
+def printed(config: RunConfig) -> str:
     """The config as JSON for reading."""
     return json.dumps(config.to_json(), indent=2)

@@ -20,15 +20,9 @@ class BidexError(ValueError):
 
 
 def known_name(kind: str, name: str, known: Iterable[str]) -> str:
-    """The known name that a given one is, without regard to case.
+    """The known name that a given one is, without regard to case; ``kind`` is what is looked up, e.g. ``"suite"``.
 
-    Args:
-        kind: What is looked up, e.g. ``"suite"``.
-        name: The name that was given.
-        known: All names that exist.
-
-    Raises:
-        BidexError: There is none; with the nearest name and the list.
+    Raises BidexError where there is none, with the nearest name and the list.
     """
     names = list(known)
     if isinstance(name, str) and name in names:
@@ -51,13 +45,7 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> BidexError:
-    """An error for a name that does not exist, with the nearest known name and the list.
-
-    Args:
-        kind: What was looked up, e.g. ``"suite"``.
-        name: The name that was given.
-        known: All names that exist.
-    """
+    """An error for a name of a kind, e.g. ``"suite"``, that does not exist, with the nearest known one and the list."""
     names = sorted(known)
     near = nearest(str(name), names)
     hint = f" Did you mean {near!r}?" if near else ""

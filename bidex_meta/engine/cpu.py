@@ -1,4 +1,5 @@
 """C MuJoCo on all cores of the machine: ``mujoco.batch``."""
+# ruff: noqa: D102 (``Engine`` says what the methods do)
 
 import ctypes
 import os
@@ -17,8 +18,8 @@ from bidex_meta.errors import BidexError
 from bidex_meta.utils.memory import usable_cores
 
 # A full arena drops contacts or constraints in silence: as broken as a bad number.
-_BAD_NAMES = ("BADQPOS", "BADQVEL", "BADQACC", "CONTACTFULL", "CNSTRFULL")
-_BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_{name}")) for name in _BAD_NAMES]
+_TROUBLE = mujoco.mjtWarning.__members__
+_BAD = [int(_TROUBLE[f"mjWARN_{n}"]) for n in ("BADQPOS", "BADQVEL", "BADQACC", "CONTACTFULL", "CNSTRFULL")]
 
 
 class CpuEngine:
@@ -89,7 +90,6 @@ class CpuEngine:
             return torch.from_numpy(self._batch.bind(name))
 
     def step(self, substeps: int, active: Tensor | None = None) -> None:
-        """See ``Engine``."""
         self._quarantine()
         ids = None if active is None else active.numpy()
         try:
@@ -115,30 +115,26 @@ class CpuEngine:
             self._failed |= broken
 
     def unstable(self) -> Tensor:
-        """See ``Engine``."""
         counts = self._batch.warning[:, :, 1]
         bad = counts.take(_BAD, axis=1).any(axis=1) if counts.any() else np.zeros(self.num, dtype=bool)
         # One non-finite addend makes the sum non-finite.
         return torch.from_numpy(bad) | self._failed | ~self.sensordata.sum(dim=1).isfinite()
 
     def warnings(self) -> Tensor:
-        """See ``Engine``."""
         return torch.from_numpy((self._batch.warning[:, :, 1] > 0).sum(axis=1)) + self._failed
 
     def placement(self) -> Tensor:
-        """See ``Engine``."""
         if not self._mocap:
             return self.qpos.clone()
         return torch.cat((self.qpos, torch.cat(self._mocap, dim=2).flatten(1)), dim=1)
 
     def body_poses(self) -> tuple[Tensor, Tensor]:
-        """See ``Engine``."""
         if self._poses is None:  # each field that is bound is copied out after every step
             self._poses = self._bind("xpos"), self._bind("xmat").unflatten(2, (3, 3))
         return self._poses
 
     def reset(self, mask: Tensor, start: Tensor) -> None:
-        """See ``Engine``. A row whose start is out of bounds stands at the reference pose and is unstable."""
+        """A row whose start is out of bounds stands at the reference pose and is unstable."""
         ids = mask.numpy()
         self.batch.reset(ids=ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         start, nq = start.to(self.qpos.dtype), self.qpos.shape[1]
@@ -153,11 +149,10 @@ class CpuEngine:
         self.batch.forward(ids=ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """See ``Engine``."""
         return {name: value.clone() for name, value in self._state.items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """See ``Engine``; refreshes position and velocity sensors."""
+        """Refreshes position and velocity sensors."""
         state = checked_state(state, self._state)
         self.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
         self._failed[:] = False
@@ -166,17 +161,14 @@ class CpuEngine:
         self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
 
     def model(self, row: int) -> mujoco.MjModel:
-        """See ``Engine``."""
         return self._batch.get_model(row)
 
     def data(self, row: int) -> mujoco.MjData:
-        """See ``Engine``."""
-        model, data = self._batch.get_model(row), self._batch.get_data(row)
-        mujoco.mj_forward(model, data)
+        data = self._batch.get_data(row)
+        mujoco.mj_forward(self._batch.get_model(row), data)
         return data
 
     def contact_depth(self, row: int) -> float:
-        """See ``Engine``."""
         model = self._models[self._model_of[row]]
         # The batch's copies of model and data would take forty times as long.
         data = self._probe = self._probe or mujoco.MjData(model)

@@ -1,7 +1,6 @@
 """What a simulation's numbers may be, and what a saved state must be before it is put back."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -15,12 +14,11 @@ LARGEST = 1e6
 else (forces, accelerations, controls, time) is bounded by MuJoCo's own 1e10."""
 SHORTEST, LONGEST = 1e-3, 1e3
 """Bounds of a quaternion's length; MuJoCo would take a shorter one for "not turned" without a word."""
-_STATE = (
-    "time qpos qvel act history qacc_warmstart ctrl qfrc_applied xfrc_applied eq_active mocap_pos mocap_quat userdata"
+STATE = (
+    *("time", "qpos", "qvel", "act", "history", "qacc_warmstart", "ctrl", "qfrc_applied", "xfrc_applied", "eq_active"),
+    *("mocap_pos", "mocap_quat", "userdata"),
 )
-STATE = tuple(_STATE.split())
 """What a simulation carries from one step to the next; the fields that a model has none of are skipped."""
-_POSES = ("qpos", "qvel", "mocap_pos", "mocap_quat")
 
 
 def quaternion_columns(model: mujoco.MjModel) -> np.ndarray:
@@ -31,13 +29,8 @@ def quaternion_columns(model: mujoco.MjModel) -> np.ndarray:
     return (np.sort(first)[:, None] + np.arange(4)).ravel()
 
 
-def limit_of(field: str) -> float:
-    """Largest magnitude of a healthy number of a field of the state."""
-    return LARGEST if field in _POSES else float(mujoco.mjMAXVAL)
-
-
 def checked_state(state: object, views: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The saved state of either engine with the shapes and types of the fields (``views``) of the one that takes it.
+    """The saved state of either engine, shaped as the fields (``views``) of the one that takes it.
 
     Raises BidexError for another model's or number of rows' state, or one with numbers that are not finite.
     """
@@ -61,7 +54,7 @@ def dense(given: object, device: torch.device, dtype: torch.dtype | None = None)
         return None
 
 
-def _checked_field(name: str, value: Any, view: Tensor) -> Tensor:
+def _checked_field(name: str, value: object, view: Tensor) -> Tensor:
     if not isinstance(value, Tensor) or value.shape[:1] != view.shape[:1] or value.numel() != view.numel():
         got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
         raise BidexError(
@@ -70,9 +63,7 @@ def _checked_field(name: str, value: Any, view: Tensor) -> Tensor:
         )
     tensor = dense(value, view.device, view.dtype)
     if tensor is None or value.is_floating_point() != view.is_floating_point():
-        raise BidexError(
-            f"Expected {name} of an engine's state as {view.dtype}, got {value.dtype}; take another state."
-        )
+        raise BidexError(f"Expected {name} of an engine's state as {view.dtype}, got {value.dtype}; take another.")
     value = tensor.reshape(view.shape)
     if view.is_floating_point() and not bool(value.isfinite().all()):
         row = int((~value.reshape(len(value), -1).isfinite().all(dim=1)).nonzero()[0])
@@ -86,5 +77,6 @@ def outside(fields: Mapping[str, Tensor], rows: Tensor) -> Tensor:
     """Which of some rows (indices, (k,)) hold a number that is not finite or out of bounds, bool (k,)."""
     bad = torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
     for name, value in fields.items():  # a comparison with NaN is false
-        bad |= ~(value[rows].unsqueeze(-1).flatten(1).abs() <= limit_of(name)).all(dim=1)
+        limit = LARGEST if name in ("qpos", "qvel", "mocap_pos", "mocap_quat") else float(mujoco.mjMAXVAL)
+        bad |= ~(value[rows].unsqueeze(-1).flatten(1).abs() <= limit).all(dim=1)
     return bad

@@ -1,16 +1,15 @@
 """Compiled models beside each other: which may share one batch, and whose trajectories are comparable."""
 
 import hashlib
+import inspect
 from collections.abc import Mapping
 
 import mujoco
 import numpy as np
 
-_PARTS = tuple(
-    ["qpos", "body_", "jnt_", "dof_", "geom_", "site_", "actuator_", "eq_", "tendon_", "pair_", "exclude_", "sensor_"]
-)
+_PARTS = ("qpos", "body_", "jnt_", "dof_", "geom_", "site_", "actuator_", "eq_", "tendon_", "pair_")
+_PARTS += ("exclude_", "sensor_")
 _LOOKS = ("rgba", "matid", "group", "user", "plugin", "castshadow")
-_DIGITS = 6
 
 
 def model_identity(model: mujoco.MjModel) -> str:
@@ -20,9 +19,9 @@ def model_identity(model: mujoco.MjModel) -> str:
     compiler's sums otherwise gives the same.
     """
     digest = hashlib.sha256()
-    for owner, names in ((model.opt, dir(model.opt)), (model, _names(model))):
-        for name in names:
-            value = None if name.startswith("_") else getattr(owner, name)
+    numbers = {name: value for name, value in _members(model).items() if name.startswith(_PARTS)}
+    for owner in (_members(model.opt), {n: value for n, value in numbers.items() if not n.endswith(_LOOKS)}):
+        for name, value in owner.items():
             if isinstance(value, int | float | np.ndarray | np.number):
                 digest.update(name.encode() + _rounded(np.atleast_1d(np.asarray(value, np.float64))))
     return digest.hexdigest()[:12]
@@ -34,14 +33,15 @@ def common_identity(models: Mapping[str, mujoco.MjModel]) -> str:
     return hashlib.sha256("\n".join(texts).encode()).hexdigest()[:12]
 
 
-def _names(model: mujoco.MjModel) -> list[str]:
-    return [name for name in dir(model) if name.startswith(_PARTS) and not name.endswith(_LOOKS)]
+def _members(owner: object) -> dict[str, object]:
+    """Its attributes by name, sorted."""
+    return {name: value for name, value in inspect.getmembers(owner) if not name.startswith("_")}
 
 
 def _rounded(values: np.ndarray) -> bytes:
     """The numbers with six digits, what is smaller than 1e-12 as zero."""
     size = np.floor(np.log10(np.maximum(np.abs(values), 1e-12)))
-    unit = 10.0 ** (size - _DIGITS + 1)
+    unit = 10.0 ** (size - 5)
     return (np.where(np.abs(values) < 1e-12, 0.0, np.round(values / unit)) + 0.0).tobytes() + size.tobytes()
 
 
@@ -69,8 +69,10 @@ _FREE = frozenset(["names", "paths", "dof_M0", "dof_length", "stat"])
 
 def differing_fields(a: mujoco.MjModel, b: mujoco.MjModel) -> list[str]:
     """Names of the array fields in which two models differ."""
-    arrays = {n: x for n in dir(a) if not n.startswith("_") and isinstance(x := getattr(a, n, None), np.ndarray)}
-    return [n for n, x in arrays.items() if not np.array_equal(x, getattr(b, n), equal_nan=x.dtype.kind == "f")]
+    ours, theirs = (
+        {n: value for n, value in _members(model).items() if isinstance(value, np.ndarray)} for model in (a, b)
+    )
+    return [n for n, x in ours.items() if not np.array_equal(x, theirs[n], equal_nan=x.dtype.kind == "f")]
 
 
 def same_structure(a: mujoco.MjModel, b: mujoco.MjModel) -> bool:
@@ -83,7 +85,7 @@ def same_structure(a: mujoco.MjModel, b: mujoco.MjModel) -> bool:
 def _sizes(model: mujoco.MjModel) -> Mapping[str, object]:
     # Lengths of text and of picture assets are no part of the dynamics.
     free = ("nname", "ntex", "npath", "nmat", "nlight", "ncam", "nbuffer")
-    names = [name for name in dir(model) if name.startswith("n") and not name.startswith(free)]
-    counts = {name: value for name in names if isinstance(value := getattr(model, name), int)}
-    options = {n: getattr(model.opt, n) for n in dir(model.opt) if not n.startswith("_")}
-    return counts | {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in options.items() if not callable(v)}
+    sizes = {name: value for name, value in _members(model).items() if name.startswith("n") and isinstance(value, int)}
+    counts = {name: value for name, value in sizes.items() if not name.startswith(free)}
+    options = {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in _members(model.opt).items()}
+    return counts | {name: value for name, value in options.items() if not callable(value)}

@@ -39,7 +39,6 @@ class Engine(Protocol):
 
         Sensors of positions and velocities then describe the new state; those of forces the last substep.
         """
-        ...
 
     def placement(self) -> Tensor:
         """What ``reset`` takes, of every simulation as it stands, a copy. Shape (num, nq + 7 nmocap)."""
@@ -70,7 +69,6 @@ class Engine(Protocol):
         task to task. One row for each true entry, (k, nq + 7 nmocap); where the engine is ``masked`` and must not count
         them one for every simulation, of which those outside the mask are ignored.
         """
-        ...
 
     def state_dict(self) -> dict[str, Tensor]:
         """Everything that decides the future of the simulations, copied."""
@@ -81,7 +79,6 @@ class Engine(Protocol):
 
         Raises BidexError for a state of another model or number of rows, or with non-finite numbers.
         """
-        ...
 
     def model(self, row: int) -> mujoco.MjModel:
         """The model of a simulation, for pictures and checks."""

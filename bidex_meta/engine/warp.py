@@ -3,9 +3,9 @@
 Different from C on purpose: single precision, sparse constraint Jacobians (it refuses dense ones above 60 degrees of
 freedom), a solver tolerance of 1e-6 (its least), fixed room for contacts. Tests run it on the Warp CPU device.
 """
+# ruff: noqa: D102 (``Engine`` says what the methods do)
 
 import copy
-import dataclasses
 import gc
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -27,27 +27,21 @@ from bidex_meta.errors import BidexError
 # What a step changes and later steps or readers see.
 _STEPPED = ("time", "qpos", "qvel", "act", "history", "qacc_warmstart", "sensordata", "overflow")
 # Bits of a world whose contacts or constraints were dropped. Meeting an iteration limit is no fault: C stops there too.
-_LOST_NAMES = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD")
-_LOST = sum(int(mjw.OverflowType[name]) for name in _LOST_NAMES)
+_LOST = sum(int(mjw.OverflowType[name]) for name in ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD"))
 # Sensors that kinematics, body velocities or the last substep give; ``_refresh`` would leave others behind the state.
 _SENSOR_NAMES = (
     "JOINTPOS JOINTVEL JOINTACTFRC FRAMEPOS FRAMEQUAT FRAMEXAXIS FRAMEYAXIS FRAMEZAXIS FRAMELINVEL FRAMEANGVEL "
     "FORCE TORQUE TOUCH"
 )
-_SENSORS = [int(getattr(mujoco.mjtSensor, f"mjSENS_{name}")) for name in _SENSOR_NAMES.split()]
-# Normals of an egg's contacts were off those of C by 5e-3 rad (99th percentile) with C's 1e-6, by 1.5e-3 with this one;
-# with 1e-10 some contacts were lost.
-_CCD_TOLERANCE = 1e-8
-_NO_SENSORS = int(mjw.DisableBit.SENSOR)
+_SENSORS = [int(mujoco.mjtSensor.__members__[f"mjSENS_{name}"]) for name in _SENSOR_NAMES.split()]
 
 
 class WarpEngine:
     """Simulations of models of equal structure, in single precision. See ``Engine`` for the views.
 
     ``step`` and ``reset`` replay graphs and never wait for the device. Graphs hold pointers: write into arrays in
-    place, and call ``recapture`` after changing the model otherwise. On CUDA the graphs run on a stream of the engine's
-    own, between what was given to torch's current stream before and after the call: engines under different torch
-    streams overlap.
+    place, and call ``recapture`` after changing the model otherwise. On CUDA they run on a stream of the engine's own,
+    between what torch's current stream was given before and after the call.
 
     A world with a bad number is reported by ``unstable`` and stands at the model's reference pose until its reset: left
     alone, its NaNs would pass every broadphase test and take the room that its neighbours' contacts need.
@@ -74,8 +68,8 @@ class WarpEngine:
             self._put(capacity)
             self._bind()
             self._substeps = 1
-            for work in (self._advance, self._begin):  # compiles all kernels, which a capture must not do
-                work()
+            self._advance()  # compiles all kernels, which a capture must not do
+            self._begin()
         self._mask_view.fill_(True)
         with self._on_device():
             mjw.reset_data(self._m, self._d, reset=self._mask)
@@ -88,7 +82,9 @@ class WarpEngine:
             raise BidexError(f"Expected sensors among {_SENSOR_NAMES}, got {', '.join(sorted(kinds))}.")
         self._m = _put_models([_adapted(model) for model in self._models], self._rows)
         self._m.opt.warn_overflow = 0  # unstable() reports it; printing from kernels wrecks the speed
-        self._m.opt.ccd_tolerance.fill_(_CCD_TOLERANCE)
+        # Normals of an egg's contacts were off those of C by 5e-3 rad (99th percentile) with C's 1e-6, by 1.5e-3 with
+        # this one; with 1e-10 some contacts were lost.
+        self._m.opt.ccd_tolerance.fill_(1e-8)
         self._m.opt.graph_conditional = not self._device.is_cuda or wp.is_conditional_graph_supported()
         room = {"nconmax": capacity.contacts, "nccdmax": capacity.convex, "njmax": capacity.rows}
         d = self._d = mjw.make_data(_adapted(self._models[0]), nworld=self.num, **room)
@@ -98,7 +94,7 @@ class WarpEngine:
         self._start = wp.zeros((self.num, d.qpos.shape[1] + 7 * d.mocap_pos.shape[1]), dtype=float)
 
     def _bind(self) -> None:
-        arrays = {name: getattr(self._d, name) for name in {*STATE, *_STEPPED}}
+        arrays = {name: vars(self._d)[name] for name in {*STATE, *_STEPPED}}
         views = {name: wp.to_torch(array) for name, array in arrays.items() if 0 not in array.shape}
         self._state = {name: views[name] for name in STATE if name in views}
         self.qpos, self.qvel, self.ctrl = (views[name] for name in ("qpos", "qvel", "ctrl"))
@@ -109,7 +105,7 @@ class WarpEngine:
         self._mask_view, self._start_view = wp.to_torch(self._mask), wp.to_torch(self._start)
 
     def step(self, substeps: int, active: Tensor | None = None) -> None:
-        """See ``Engine``; simulations outside the mask take the time but keep their state."""
+        """Simulations outside the mask take the time but keep their state."""
         kept = [] if active is None else [value.clone() for value in self._stepped]
         self._substeps = substeps
         self._play(f"step {substeps}", self._advance)
@@ -118,29 +114,23 @@ class WarpEngine:
                 value.copy_(torch.where(active.view(-1, *[1] * (value.dim() - 1)), value, old))
 
     def unstable(self) -> Tensor:
-        """See ``Engine``: broke or lost contacts.
-
-        All worlds share one pool of contacts; when it is full, whose were lost is unknown and all are unstable.
-        """
+        """All worlds share one pool of contacts; when it is full, whose were lost is unknown: all are unstable."""
         lost = (self._overflow & _LOST) != 0
         return lost | self._failed_view | ~self.sensordata.sum(dim=1).isfinite()
 
     def warnings(self) -> Tensor:
-        """See ``Engine``."""
         return self.unstable().long()
 
     def placement(self) -> Tensor:
-        """See ``Engine``."""
         if not self._mocap:
             return self.qpos.clone()
         return torch.cat((self.qpos, torch.cat(self._mocap, dim=2).flatten(1)), dim=1)
 
     def body_poses(self) -> tuple[Tensor, Tensor]:
-        """See ``Engine``."""
         return wp.to_torch(self._d.xpos), wp.to_torch(self._d.xmat)
 
     def reset(self, mask: Tensor, start: Tensor) -> None:
-        """See ``Engine``. A start with a non-finite number makes its simulation unstable.
+        """A start with a non-finite number makes its simulation unstable.
 
         Position and velocity sensors of all simulations are refreshed, which changes only those whose state was written
         by hand since their last step.
@@ -154,11 +144,10 @@ class WarpEngine:
         self._graphs.clear()
 
     def state_dict(self) -> dict[str, Tensor]:
-        """See ``Engine``."""
         return {name: value.clone() for name, value in self._state.items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """See ``Engine``; the state may be of the C engine. Refreshes position and velocity sensors."""
+        """The state may be of the C engine. Refreshes position and velocity sensors."""
         state = checked_state(state, self._state)
         self._mask_view.fill_(True)
         self._play("reset", self._begin)
@@ -168,11 +157,9 @@ class WarpEngine:
         self._play("refresh", self._refresh)
 
     def model(self, row: int) -> mujoco.MjModel:
-        """See ``Engine``."""
         return self._models[self._rows[row]]
 
     def data(self, row: int) -> mujoco.MjData:
-        """See ``Engine``."""
         model = self.model(row)
         data = mujoco.MjData(model)
         data.time = float(self._state["time"][row])
@@ -183,7 +170,6 @@ class WarpEngine:
         return data
 
     def contact_depth(self, row: int) -> float:
-        """See ``Engine``."""
         distances = self.data(row).contact.dist
         return float(max(0.0, -np.min(distances))) if len(distances) else 0.0
 
@@ -204,7 +190,9 @@ class WarpEngine:
         self._guard.examine(d)
         for left in reversed(range(self._substeps)):
             self._guard.watch(m, d)
-            m.opt.disableflags = wanted | _NO_SENSORS if left else wanted  # only the last substep's forces are read
+            m.opt.disableflags = (
+                wanted | int(mjw.DisableBit.SENSOR) if left else wanted
+            )  # only the last substep's forces are read
             mjw.step(m, d)
         m.opt.disableflags = wanted
         self._guard.watch(m, d)
@@ -262,13 +250,12 @@ class WarpEngine:
 @contextmanager
 def _no_garbage_collection() -> Iterator[None]:
     """An old graph collected during a capture would record its own destruction."""
-    enabled = gc.isenabled()
+    finish = gc.enable if gc.isenabled() else gc.disable
     gc.disable()
     try:
         yield
     finally:
-        if enabled:
-            gc.enable()
+        finish()
 
 
 def _adapted(model: mujoco.MjModel) -> mujoco.MjModel:
@@ -285,14 +272,14 @@ def _adapted(model: mujoco.MjModel) -> mujoco.MjModel:
 def _put_models(models: Sequence[mujoco.MjModel], rows: Sequence[int]) -> mjw.Model:
     """One model on the device, in which the fields in which the given ones differ are per world."""
     singles = [mjw.put_model(model) for model in models]
-    names = [f.name for f in dataclasses.fields(mjw.Model) if isinstance(getattr(singles[0], f.name), wp.array)]
-    values = {name: [getattr(single, name).numpy() for single in singles] for name in names}
+    names = [name for name, value in vars(singles[0]).items() if isinstance(value, wp.array)]
+    values = {name: [vars(single)[name].numpy() for single in singles] for name in names}
     differing = [n for n, v in values.items() if any(not np.array_equal(v[0], x, equal_nan=True) for x in v[1:])]
     if not differing:
         return singles[0]
     model = mjw.put_model(models[0], batch_sizes=dict.fromkeys(differing, len(rows)))
     for name in differing:
-        getattr(model, name).assign(np.concatenate(values[name])[rows])
+        vars(model)[name].assign(np.concatenate(values[name])[rows])
     return model
 
 
@@ -302,5 +289,5 @@ def _put_static_frames(data: mjw.Data, models: Sequence[mujoco.MjModel], rows: S
     for model, one in zip(models, frames, strict=True):
         mujoco.mj_kinematics(model, one)
     for name in ("xquat", "xmat", "ximat", "geom_xpos", "geom_xmat"):
-        array = getattr(data, name)
+        array = vars(data)[name]
         array.assign(np.stack([getattr(x, name) for x in frames])[rows].reshape(array.numpy().shape))

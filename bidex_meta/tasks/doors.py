@@ -19,14 +19,10 @@ from bidex_meta.tasks.variation import component, join
 from bidex_meta.utils.maths import quaternion_from_rpy, xyzw
 
 _BASE = (0.0, 0.0, 0.7)
-_TRAVEL = 0.5 * math.pi
-_OPEN_DISTANCE = 0.5
-"""Of the two handles along y, metres."""
 _LEAST_SHARE = 0.1
 """Of each handle from the door's middle along y, metres. A leaf alone makes 0.497 m of an Inward door, and as it is
 pushed against its stop, which yields, more than 0.5 m."""
-_SHUT_ANGLE = 0.1 * _TRAVEL
-_HANDLE_DEPTH = 0.04
+_SHUT_ANGLE = 0.1 * (0.5 * math.pi)
 _DAMPED = "The hinges are damped by 10 N m s/rad, the original's by 1: so a door does not fly open at a bump."
 
 
@@ -66,7 +62,7 @@ class _Door(ReachTask):
         if self.inward:
             for side in ("right", "left"):
                 handle = scene.site(f"object/{side}_handle")
-                handle.pos = (-_HANDLE_DEPTH, *handle.pos[1:])
+                handle.pos = (-0.04, *handle.pos[1:])
 
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """``goal``: the base pose (n, 7); ``goal_inverse``: inverse rotation (n, 4); ``angle``: both leaves' (n, 1)."""
@@ -97,7 +93,7 @@ class _Open(_Door):
         middle = state["object/position"][:, 1]
         right = state["object/right_handle_position"][:, 1] - middle
         left = middle - state["object/left_handle_position"][:, 1]
-        return (right + left > _OPEN_DISTANCE) & (right > _LEAST_SHARE) & (left > _LEAST_SHARE)
+        return (right + left > 0.5) & (right > _LEAST_SHARE) & (left > _LEAST_SHARE)
 
 
 class _Close(_Door):

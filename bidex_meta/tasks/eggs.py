@@ -24,12 +24,6 @@ RADIUS, HALF_LENGTH = 0.03, 0.04
 """Short and long semi-axis of the egg, metres (docs/figures.md, objects)."""
 SEMI_AXES = (RADIUS, RADIUS, HALF_LENGTH)
 JOINT_DRAWS = 24
-SUCCESS_DISTANCE = 0.03
-"""Object within this distance of its goal, metres."""
-GOAL_RANGE = 0.03
-"""Half width of the goals' box, metres."""
-_ANCHOR_RADIUS = 0.1
-_GREEN = (0.45, 0.62, 0.30, 1.0)
 
 
 def goal_object_blocks(numbers: Iterable[str]) -> tuple[Block, ...]:
@@ -39,10 +33,8 @@ def goal_object_blocks(numbers: Iterable[str]) -> tuple[Block, ...]:
 
 def observe_goals(state: TaskState, numbers: Iterable[str]) -> dict[str, Tensor]:
     """The goal blocks of ``goal_object_blocks``."""
-    found = {}
-    for i in numbers:
-        found |= observe_goal(state, f"object{i}/quaternion", f"goal{i}")
-    return found
+    goals = [observe_goal(state, f"object{i}/quaternion", f"goal{i}") for i in numbers]
+    return {name: value for goal in goals for name, value in goal.items()}
 
 
 def goal_pose(position: Tensor, draws: Tensor) -> Tensor:
@@ -71,8 +63,7 @@ def lay_egg_on_hand(
 ) -> None:
     """Lifts an egg, or what a spheroid bounds, off the palm it lies on and opens the fingers that would stick in it.
 
-    Positions of the egg (n, 7) and joint angles of the hand (n, 24), which starts at ``pose``, are written in place.
-    ``radius`` and ``half`` are the short and the long semi-axis, metres.
+    Written in place: the egg (n, 7) and joint angles (n, 24) of the hand that starts at ``pose``. Semi-axes in metres.
     """
     quaternion = xyzw(constant(pose.quaternion, egg))
     inverse = conjugate(quaternion)
@@ -119,8 +110,7 @@ class EggTask(TaskClass):
     Attributes:
         starts: Nominal start of each egg, world, metres: of one that lies on the right hand, and of one on the left.
         goals: Centre of the box of each egg's goals, world, metres.
-        position_noise: Half width of the eggs' position noise at a start, metres.
-        joint_noise: Joint noise at a start, a share of each joint's range.
+        position_noise: Half width of the eggs' noise at a start, m; ``joint_noise``: a share of each joint's range.
         lies_on_hand: Whether an egg starts on a palm, so that room is cleared for it.
         alpha: Weight of the distance in the reward, per metre.
         floor: The episode fails when an egg's height falls to this, metres.
@@ -160,11 +150,12 @@ class EggTask(TaskClass):
     @property
     def variation_space(self) -> VariationSpace:
         """Goal positions (world, metres) and the two draws of the goals' orientation."""
-        boxes = (box(f"goal{i}", centre, GOAL_RANGE) for i, centre in zip(self.numbers, self.goals, strict=True))
+        boxes = (box(f"goal{i}", centre, 0.03) for i, centre in zip(self.numbers, self.goals, strict=True))
         return join(*boxes, orientation("goal"))
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
-        for i, position, colour in zip(self.numbers, self.starts, (None, _GREEN), strict=False):
+        green = (0.45, 0.62, 0.30, 1.0)
+        for i, position, colour in zip(self.numbers, self.starts, (None, green), strict=False):
             if self.held is None:
                 SceneObject(f"object{i}", "egg", position, colour=colour).add_to(scene)
             else:
@@ -196,14 +187,14 @@ class EggTask(TaskClass):
 
     def success(self, state: TaskState) -> Tensor:
         off = torch.stack([distances(state, f"object{i}", f"goal{i}")[0] for i in self.numbers])
-        return (off < SUCCESS_DISTANCE).all(dim=0)
+        return (off < 0.03).all(dim=0)
 
     def failed(self, state: TaskState) -> Tensor:
         """An egg dropped or a hand left: the reward is positive throughout, so an early end is never worth seeking."""
         ends = [state[f"object{i}/position"][:, 2] <= self.floor for i in self.numbers]
         for name, anchor in self.anchors.items():
             point = state[name]
-            ends.append(norm(point - constant(anchor, point)) >= _ANCHOR_RADIUS)
+            ends.append(norm(point - constant(anchor, point)) >= 0.1)
         return torch.stack(ends).any(dim=0)
 
     def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, Point]]:

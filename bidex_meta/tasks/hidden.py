@@ -5,7 +5,6 @@ Each frozen number of a task is replaced by NaN in turn, and what becomes NaN de
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -18,7 +17,6 @@ from bidex_meta.tasks.scene import Scene, compile_scene
 from bidex_meta.tasks.state import TaskState
 
 _COMPARISONS = {"lt", "le", "gt", "ge", "__lt__", "__le__", "__gt__", "__ge__"}
-Frozen = dict[str, Tensor]
 
 
 @dataclass(frozen=True)
@@ -46,11 +44,16 @@ def hidden(task: TaskClass) -> Hidden:
     goal = [block.name for block in task.layout.blocks if block.goal]
 
     def moved(judge: Callable[[TaskState], Iterable[Tensor]]) -> set[str]:
-        """Components that change a frozen number on which a function's values depend."""
-        found = set()
-        for key, column in _used(judge, sensors, scene, {key: values[:1] for key, values in frozen.items()}):
-            values = frozen[key][:, column]
-            found |= {name for name, other in zip(names, values[1:].tolist(), strict=True) if other != values[0]}
+        """Components that change a frozen number without which a function gives NaN."""
+        found, first = set(), {key: values[:1] for key, values in frozen.items()}
+        for key, columns in frozen.items():
+            for column, values in enumerate(columns.unbind(1)):
+                tainted = first[key].clone()
+                tainted[:, column] = torch.nan
+                given = judge(TaskState(sensors, scene.sensors, {**first, key: tainted}))
+                if any(bool(value.isnan().any()) for value in given):
+                    changed = zip(names, (values[1:] != values[0]).tolist(), strict=True)
+                    found |= {name for name, differs in changed if differs}
         return found
 
     def compared(state: TaskState) -> list[Tensor]:
@@ -64,21 +67,6 @@ def hidden(task: TaskClass) -> Hidden:
     return Hidden(*(tuple(name for name in names if name in chosen) for chosen in (of_reward, of_success)))
 
 
-def _used(
-    judge: Callable[[TaskState], Iterable[Tensor]], sensors: Tensor, scene: Scene, frozen: Frozen
-) -> list[tuple[str, int]]:
-    """Frozen numbers, by key and column, without which a function gives NaN."""
-    found = []
-    for key, values in frozen.items():
-        for column in range(values.shape[1]):
-            tainted = values.clone()
-            tainted[:, column] = torch.nan
-            given = judge(TaskState(sensors, scene.sensors, {**frozen, key: tainted}))
-            if any(bool(value.isnan().any()) for value in given):
-                found.append((key, column))
-    return found
-
-
 class _Comparisons(TorchFunctionMode):
     """Collects all tensors that are compared: a comparison with NaN is False, and would not show it."""
 
@@ -86,13 +74,15 @@ class _Comparisons(TorchFunctionMode):
         super().__init__()
         self.operands: list[Tensor] = []
 
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_function__(
+        self, func: Callable[..., object], types: object, args: tuple = (), kwargs: dict[str, object] | None = None
+    ) -> object:
         if getattr(func, "__name__", "") in _COMPARISONS:
             self.operands += [each for each in args if isinstance(each, Tensor)]
         return func(*args, **(kwargs or {}))
 
 
-def _fixtures(task: TaskClass, scene: Scene, frozen: Frozen) -> set[str]:
+def _fixtures(task: TaskClass, scene: Scene, frozen: dict[str, Tensor]) -> set[str]:
     """Components that move a fixture."""
     names = task.variation_space.names
     starts = torch.from_numpy(np.tile(scene.start_qpos, (1 + len(names), 1)))

@@ -1,20 +1,15 @@
 """The observation of a task as named blocks: sizes, indices, goal mask and documentation derive from it."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
 from bidex_meta.hands.hand import FINGERS, SIDES, hand
 
-VELOCITY_SCALE = 0.2
-"""Scale of joint velocities and of objects' angular velocities (docs/figures.md, observation)."""
-FORCE_SCALE = 10.0
-"""Scale of joint forces and of fingertip forces and torques (docs/figures.md, observation)."""
+VELOCITY_SCALE, FORCE_SCALE = 0.2, 10.0
+"""Scales of joint and objects' angular velocities, and of forces and torques (docs/figures.md, observation)."""
 CLIP = 5.0
 """Every entry is clipped to +-5 after its scale (docs/figures.md, control)."""
-_JOINT_POSITION = "joint angles, mapped from the joint's range to [-1, 1]"
-_JOINT_VELOCITY = "joint velocities, 0.2 rad/s"
-_JOINT_FORCE = "actuator force at the joint, 10 N m; 0 for the coupled distal joints"
 _TIP_STATE = "per distal body: origin (m), quaternion (x, y, z, w), velocities (m/s, rad/s), world frame"
 _TIP_WRENCH = "per distal body: force (10 N), torque (10 N m) at its origin, body frame, no weight"
 _POSE = "position (m) and quaternion (x, y, z, w), world frame"
@@ -75,29 +70,28 @@ class Layout:
 
 def hand_blocks(side: str, moving: bool) -> tuple[Block, ...]:
     """One hand's share of Table 7 (199 entries; 187 with a fixed base: no base entries, 20 actions)."""
-    joints = [f"{side}/{joint}" for joint in hand().joints]
-    tips = [f"{side}/{finger}distal" for finger in FINGERS]
-    kinds = ("position", "quaternion", "linear_velocity", "angular_velocity")
-    states = [f"{tip}_{kind}" for tip in tips for kind in kinds]
-    wrenches = [f"{tip}_{kind}" for tip in tips for kind in ("force", "torque")]
+
+    def block(name: str, size: int, parts: Iterable[str], kinds: str, scale: float, description: str) -> Block:
+        sensors = tuple(f"{side}/{part}_{kind}" for part in parts for kind in kinds.split())
+        return Block(f"{side}_{name}", size, sensors, scale, description=description)
+
+    joints, tips = hand().joints, [f"{finger}distal" for finger in FINGERS]
+    mapped = "joint angles, mapped from the joint's range to [-1, 1]"
+    force = "actuator force at the joint, 10 N m; 0 for the coupled distal joints"
     blocks = [
-        Block(f"{side}_{name}", size, tuple(sensors), scale, description=text)
-        for name, size, sensors, scale, text in (
-            ("joint_position", 24, [f"{joint}_position" for joint in joints], 1.0, _JOINT_POSITION),
-            ("joint_velocity", 24, [f"{joint}_velocity" for joint in joints], VELOCITY_SCALE, _JOINT_VELOCITY),
-            ("joint_force", 24, [f"{joint}_force" for joint in joints], FORCE_SCALE, _JOINT_FORCE),
-            ("fingertip_state", 65, states, 1.0, _TIP_STATE),
-            ("fingertip_force_torque", 30, wrenches, FORCE_SCALE, _TIP_WRENCH),
-        )
+        block("joint_position", 24, joints, "position", 1.0, mapped),
+        block("joint_velocity", 24, joints, "velocity", VELOCITY_SCALE, "joint velocities, 0.2 rad/s"),
+        block("joint_force", 24, joints, "force", FORCE_SCALE, force),
+        block("fingertip_state", 65, tips, "position quaternion linear_velocity angular_velocity", 1.0, _TIP_STATE),
+        block("fingertip_force_torque", 30, tips, "force torque", FORCE_SCALE, _TIP_WRENCH),
     ]
     if moving:
         blocks += [
             Block(f"{side}_base_position", 3, (f"{side}/mount_position",), description="mount origin, world frame, m"),
             Block(f"{side}_base_rotation", 3, description="roll, pitch, yaw of the mount against its start, rad"),
         ]
-    actions = 26 if moving else 20
-    blocks.append(Block(f"{side}_action", actions, description="last actions of this hand, in [-1, 1]"))
-    return tuple(blocks)
+    last = Block(f"{side}_action", 26 if moving else 20, description="last actions of this hand, in [-1, 1]")
+    return (*blocks, last)
 
 
 def object_blocks(sensors: str, name: str | None = None) -> tuple[Block, ...]:
@@ -125,10 +119,8 @@ def point_block(name: str, sensor: str, description: str) -> Block:
 
 def handle_blocks(sensors: str, right: str, left: str) -> tuple[Block, Block]:
     """The points ``<sensors>/<side>_handle_position`` with their descriptions (6 entries)."""
-    return (
-        point_block("right_handle_position", f"{sensors}/right_handle_position", right),
-        point_block("left_handle_position", f"{sensors}/left_handle_position", left),
-    )
+    first, second = (f"{side}_handle_position" for side in SIDES)
+    return point_block(first, f"{sensors}/{first}", right), point_block(second, f"{sensors}/{second}", left)
 
 
 def both_hands(moving: bool) -> tuple[Block, ...]:

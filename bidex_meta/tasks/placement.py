@@ -11,14 +11,10 @@ from torch import Tensor
 from bidex_meta.tasks.variation import VariationSpace
 from bidex_meta.utils.maths import constant, multiply, wxyz, xyzw
 
-SHIFT = 0.03
-"""Half width of a task's shift along x and y, metres (docs/figures.md, decisions)."""
-TURN = 0.2617993877991494
-"""Half width of a task's turn, radians: 15 degrees."""
-JITTER = 0.005
-"""Half width of an episode's additional shift, metres."""
-JITTER_TURN = 0.05
-"""Half width of an episode's additional turn, radians."""
+SHIFT, TURN = 0.03, 0.2617993877991494
+"""Half widths of a task's shift along x and y, metres, and turn, radians: 15 degrees (docs/figures.md, decisions)."""
+JITTER, JITTER_TURN = 0.005, 0.05
+"""Half widths of an episode's additional shift, metres, and turn, radians."""
 DRAWS = 3
 """Uniform numbers that an episode draws for an object that it jitters: x, y, turn."""
 
@@ -44,9 +40,7 @@ def place(pose: Tensor, frozen: Tensor, draws: Tensor | None = None) -> None:
 
     ``draws`` in [-1, 1], (n, 3), are of the episodes' jitter; None for a fixture, which has none.
     """
-    shift = frozen
-    if draws is not None:
-        shift = frozen + draws * constant((JITTER, JITTER, JITTER_TURN), draws)
+    shift = frozen if draws is None else frozen + draws * constant((JITTER, JITTER, JITTER_TURN), draws)
     pose[:, :2] += shift[:, :2]
     pose[:, 3:] = wxyz(multiply(yaw_quaternion(shift[:, 2]), xyzw(pose[:, 3:])))
 

@@ -7,10 +7,11 @@ import mujoco
 import torch
 from torch import Tensor
 
+from bidex_meta.hands.poses import PALM_DOWN_AHEAD, HandPose
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.goals import observe_goal
 from bidex_meta.tasks.placement import place_all
-from bidex_meta.tasks.scene import SceneObject, Table, add_table
+from bidex_meta.tasks.scene import Point, SceneObject, Table, add_table
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.utils.maths import norm
 
@@ -41,13 +42,16 @@ class ReachTask(TaskClass):
         ghost: Semi-axes of the ellipsoid that is the goal in pictures, metres; None: no goal is drawn.
     """
 
+    right = HandPose((0.55, 0.2, 0.8), PALM_DOWN_AHEAD)
+    left = HandPose((0.55, -0.2, 0.8), PALM_DOWN_AHEAD)
+    transition_scale, orientation_scale = 0.5, 0.1
     table: ClassVar[Table]
     objects: tuple[SceneObject, ...]
     points: ClassVar[tuple[str, str]]
     constant: ClassVar[float] = 0.0
     exponential: ClassVar[bool] = False
     terms: ClassVar[tuple[str, ...]] = ("left", "right", "target", "constant")
-    ghost: ClassVar[tuple[float, float, float] | None] = None
+    ghost: ClassVar[Point | None] = None
 
     def add_objects(self, scene: mujoco.MjSpec) -> None:
         add_table(scene, *self.table)
@@ -76,5 +80,5 @@ class ReachTask(TaskClass):
             values[side] = torch.exp(-10.0 * distance) if self.exponential else -distance
         return {term: values[term] for term in self.terms}
 
-    def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, tuple[float, float, float]]]:
+    def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, Point]]:
         return [(frozen["goal"], self.ghost)] if self.ghost else []

@@ -12,12 +12,12 @@ if TYPE_CHECKING:
 
 # Modules by name, imported at first use: listing names must not import torch and mujoco.
 _MODULES = {
-    "HandOver": "hand_over", "CatchUnderarm": "catch_underarm", "CatchOver2Underarm": "catch_over2underarm",
-    "TwoCatchUnderarm": "two_catch_underarm", "CatchAbreast": "catch_abreast", "LiftUnderarm": "lift_underarm",
+    "HandOver": "catches", "CatchUnderarm": "catches", "CatchOver2Underarm": "catches",
+    "TwoCatchUnderarm": "catches", "CatchAbreast": "catches", "LiftUnderarm": "vessels",
     "DoorOpenOutward": "doors", "DoorOpenInward": "doors", "DoorCloseOutward": "doors", "DoorCloseInward": "doors",
-    "BottleCap": "bottle_cap", "PushBlock": "push_block", "SwingCup": "swing_cup", "OpenScissors": "open_scissors",
-    "ReOrientation": "re_orientation", "OpenPenCap": "open_pen_cap", "Switch": "switch", "StackBlock": "stack_block",
-    "PourWater": "pour_water", "GraspAndPlace": "grasp_and_place",
+    "BottleCap": "vessels", "PushBlock": "cubes", "SwingCup": "vessels", "OpenScissors": "articulated",
+    "ReOrientation": "cubes", "OpenPenCap": "articulated", "Switch": "articulated", "StackBlock": "cubes",
+    "PourWater": "bucket", "GraspAndPlace": "bucket",
 }  # fmt: skip
 
 
@@ -53,7 +53,7 @@ def get(name: str, moving_base: bool | None = None, **options: float | str) -> "
     if is_outside(name):
         task_class = _outside(name)
     elif name in _MODULES:
-        task_class = getattr(importlib.import_module(f"bidex_meta.tasks.{_MODULES[name]}"), name)
+        task_class = vars(importlib.import_module(f"bidex_meta.tasks.{_MODULES[name]}"))[name]
     else:
         raise unknown_name("task class", name, _MODULES)
     known = list(inspect.signature(task_class).parameters)[1:]

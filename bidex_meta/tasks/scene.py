@@ -1,6 +1,5 @@
 """From a task class to a compiled model, and the addresses in it that the world reads and writes."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -49,29 +48,16 @@ class SceneObject:
 
     def add_to(self, scene: mujoco.MjSpec) -> None:
         """Puts the object into a scene at its nominal start."""
-        part = mujoco.MjSpec.from_file(str(paths.assets_dir() / "objects" / f"{self.asset}.xml"))
-        attach(scene, part, self.name, self.position, self.quaternion, self.colour)
+        self.attach(scene, mujoco.MjSpec.from_file(str(paths.assets_dir() / "objects" / f"{self.asset}.xml")))
 
-
-def attach(
-    scene: mujoco.MjSpec,
-    part: mujoco.MjSpec,
-    name: str,
-    position: Point,
-    quaternion: Sequence[float],
-    colour: Colour | None,
-) -> None:
-    """Puts a part with a body called ``object`` into a scene, sensors and joints under the prefix ``name``.
-
-    Nominal start in the world: position, metres, and quaternion (w, x, y, z). Without a colour (red, green, blue,
-    alpha) it keeps its own.
-    """
-    set_contact_bits(part.geoms, OBJECT)
-    if colour is not None:
-        for material in part.materials:
-            material.rgba = colour
-    part.body("object").pos, part.body("object").quat = position, quaternion
-    scene.attach(part, prefix=f"{name}/", frame=scene.worldbody.add_frame())
+    def attach(self, scene: mujoco.MjSpec, part: mujoco.MjSpec) -> None:
+        """Puts a part with a body called ``object`` there in the place of the asset."""
+        set_contact_bits(part.geoms, OBJECT)
+        if self.colour is not None:
+            for material in part.materials:
+                material.rgba = self.colour
+        part.body("object").pos, part.body("object").quat = self.position, self.quaternion
+        scene.attach(part, prefix=f"{self.name}/", frame=scene.worldbody.add_frame())
 
 
 class Table(NamedTuple):
@@ -101,7 +87,8 @@ def add_table(scene: mujoco.MjSpec, size: Point, centre: Point, friction: float 
         material="table",
         friction=[friction, 0.005, 0.001],
         priority=priority,
-        **{name: getattr(floor, name) for name in ("contype", "conaffinity", "margin", "solref", "solimp")},
+        **{"contype": floor.contype, "conaffinity": floor.conaffinity},
+        **{"margin": floor.margin, "solref": floor.solref, "solimp": floor.solimp},
     )
 
 

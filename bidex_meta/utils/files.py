@@ -8,11 +8,15 @@ import os
 import stat
 import tomllib
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
 from bidex_meta.errors import BidexError, one_line, shortened
 
+Json = Any
+JsonObject = dict[str, Any]
+"""What a file of JSON or TOML holds."""
 MOST_TEXT = 64_000_000
 """Bytes of a file of JSON or TOML: far above the largest evaluation."""
 _DEEPEST = 64
@@ -38,18 +42,16 @@ def absolute(path: str | Path) -> Path:
 
 def is_file(path: Path) -> bool:
     """Whether there is a regular file; false, not an error, for a path that cannot be one."""
-    try:
+    with suppress(OSError, ValueError):
         return path.is_file()
-    except (OSError, ValueError):
-        return False
+    return False
 
 
 def exists(path: Path) -> bool:
     """Whether there is anything, a link that leads nowhere too; false for a path that cannot be one."""
-    try:
+    with suppress(OSError, ValueError):
         return os.path.lexists(path)
-    except (OSError, ValueError):
-        return False
+    return False
 
 
 def open_regular(path: Path, what: str, most: int | None = None) -> IO[bytes]:
@@ -61,7 +63,7 @@ def open_regular(path: Path, what: str, most: int | None = None) -> IO[bytes]:
         # Opening a pipe would wait for somebody to write into it.
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0))
     except (OSError, ValueError) as error:  # ValueError: a path with a zero byte
-        reason = getattr(error, "strerror", None) or str(error)
+        reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
         raise BidexError(f"Expected {what} at {path}, but {reason}. Mend the path or the file.") from None
     try:
         found = os.fstat(handle)
@@ -93,7 +95,7 @@ def read_text(path: Path, what: str) -> str:
         raise BidexError(f"{path}: expected {what} in UTF-8, but {error.reason} at byte {error.start}.") from None
 
 
-def read_json(path: Path, what: str) -> Any:
+def read_json(path: Path, what: str) -> Json:
     """The content of a JSON file.
 
     Raises BidexError as :func:`read_text`, or where it is not JSON, is nested too deep or has a number beyond 64 bits.
@@ -101,12 +103,12 @@ def read_json(path: Path, what: str) -> Any:
     return _parsed(path, what, "JSON", json.loads)
 
 
-def read_toml(path: Path, what: str) -> dict[str, Any]:
+def read_toml(path: Path, what: str) -> JsonObject:
     """The content of a TOML file; errors as of :func:`read_json`."""
     return _parsed(path, what, "TOML", tomllib.loads)
 
 
-def _parsed(path: Path, what: str, language: str, parse: Callable[[str], Any]) -> Any:
+def _parsed(path: Path, what: str, language: str, parse: Callable[[str], Json]) -> Json:
     text = read_text(path, what)
     try:
         return bounded(parse(text))
@@ -116,7 +118,7 @@ def _parsed(path: Path, what: str, language: str, parse: Callable[[str], Any]) -
         raise BidexError(f"{path}: expected {what} in {language}, but {one_line(error)[:200].rstrip('.')}.") from None
 
 
-def bounded(content: Any) -> Any:
+def bounded(content: Json) -> Json:
     """The same content; raises ValueError where it is nested too deep, or has a whole number beyond 64 bits."""
     level = [content]
     for _ in range(_DEEPEST):

@@ -7,6 +7,7 @@ runs draw nothing and shall not fail on it.
 import os
 import sys
 import warnings
+from collections.abc import Callable
 from ctypes.util import find_library
 from functools import cache
 from importlib import import_module
@@ -68,7 +69,7 @@ def _asked() -> str:
     return os.environ.get(_VARIABLE, "").lower().strip()
 
 
-def _reason(attempt: Any) -> str | None:
+def _reason(attempt: Callable[[], None]) -> str | None:
     """Why an attempt failed, on one line; None where it did not."""
     try:
         attempt()

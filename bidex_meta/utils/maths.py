@@ -7,7 +7,6 @@ another batch size, and the numbers of an environment must not depend on how man
 import math
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,7 +24,7 @@ def check_precision() -> None:
         )
 
 
-def constant(values: Sequence[Any], like: Tensor) -> Tensor:
+def constant(values: Sequence[float] | Sequence[Sequence[float]], like: Tensor) -> Tensor:
     """Fixed numbers, nested tuples of them, as a tensor of another one's dtype and device. Not to be written to.
 
     They are brought to the device once: copied anew in every step, each would make the host wait for it.
@@ -39,7 +38,7 @@ def indices(values: Sequence[int], like: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=1024)
-def _constant(values: Sequence[Any], dtype: torch.dtype, device: torch.device) -> Tensor:
+def _constant(values: Sequence[float] | Sequence[Sequence[float]], dtype: torch.dtype, device: torch.device) -> Tensor:
     with torch.inference_mode(False):
         return torch.tensor(values, dtype=dtype, device=device)
 

@@ -6,7 +6,7 @@ import os
 import sys
 import traceback
 from pathlib import Path
-from typing import Any
+from types import ModuleType
 
 from bidex_meta.errors import BidexError
 
@@ -35,7 +35,7 @@ def name_without_object(name: str) -> str:
     return name.partition("-")[0]
 
 
-def outside_class(name: str, role: str) -> tuple[type[Any], Any]:
+def outside_class(name: str, role: str) -> tuple[type, ModuleType]:
     """A class of the user's own, ``package.module:Class``, and its module; ``role`` is for messages, e.g. ``--algo``.
 
     Raises BidexError where there is no such module or class, or its import raises.
@@ -51,8 +51,9 @@ def outside_class(name: str, role: str) -> tuple[type[Any], Any]:
     except (Exception, SystemExit) as error:
         message = own_fault(error)
         # ValueError and TypeError: an empty or a relative name.
-        if isinstance(error, ModuleNotFoundError) or (message is None and isinstance(error, ValueError | TypeError)):
-            missing = getattr(error, "name", None) or module_name
+        absent = isinstance(error, ModuleNotFoundError)
+        if absent or (message is None and isinstance(error, ValueError | TypeError)):
+            missing = (error.name if absent else None) or module_name
             message = (
                 f"{role} {name}: expected a module that can be imported, but there is no {missing}. Install its "
                 "package, or start in the folder that holds it."
@@ -79,5 +80,5 @@ def own_fault(error: BaseException) -> str | None:
 
 
 def _said(error: BaseException) -> str:
-    words = getattr(error, "msg", None) or str(error)
+    words = (error.msg if isinstance(error, SyntaxError | ImportError) else None) or str(error)
     return f"{type(error).__name__}: {words}".rstrip(": .")

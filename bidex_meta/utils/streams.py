@@ -4,7 +4,7 @@ import contextlib
 import os
 import select
 import sys
-from typing import IO, Any
+from typing import IO
 
 
 def open_missing() -> None:
@@ -18,11 +18,11 @@ def open_missing() -> None:
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # gets the lowest number that is free
     for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:
+        if vars(sys)[name] is None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
 
 
-def silence(stream: IO[Any]) -> None:
+def silence(stream: IO[str]) -> None:
     """Sends later output, and what could not be written before, to the null device."""
     with contextlib.suppress(OSError, ValueError):  # a stream within Python has no number
         null = os.open(os.devnull, os.O_WRONLY)
@@ -30,7 +30,7 @@ def silence(stream: IO[Any]) -> None:
         os.close(null)
 
 
-def unread(stream: IO[Any]) -> bool:
+def unread(stream: IO[str]) -> bool:
     """Whether a stream's reader has ended (``| head``)."""
     with contextlib.suppress(OSError, ValueError, AttributeError):  # Windows has no poll
         poll = select.poll()

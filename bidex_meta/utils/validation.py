@@ -10,7 +10,7 @@ import math
 import operator
 import re
 import types
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints, is_typeddict
+from typing import Annotated, Literal, TypeVar, Union, get_args, get_origin, get_type_hints, is_typeddict
 
 import msgspec
 import numpy as np
@@ -53,7 +53,7 @@ class Checked:
         check_fields(self, getattr(self, "algo", type(self).__name__))
 
 
-def check_fields(settings: Any, name: str, as_flags: bool = False) -> None:
+def check_fields(settings: object, name: str, as_flags: bool = False) -> None:
     """Raises BidexError for the first field of a dataclass's instance that does not fit its annotation.
 
     Fields whose annotation is no plain type (a path, a function) are left alone. ``name`` is the instance in messages,
@@ -68,8 +68,8 @@ def check_fields(settings: Any, name: str, as_flags: bool = False) -> None:
             raise BidexError(f"{name}: {_message(error, value, hint, shown)}") from None
 
 
-def check_rising(settings: Any, name: str, *fields: str) -> None:
-    """Raises BidexError for the first pair of numbers of which the second is smaller than the first."""
+def check_rising(settings: object, name: str, *fields: str) -> None:
+    """Raises BidexError for the first pair of numbers that falls."""
     for field in fields:
         low, high = getattr(settings, field)
         if low > high:
@@ -113,13 +113,13 @@ def true_or_false(name: str, value: object) -> bool:
 
 
 @functools.cache
-def _hints(kind: type) -> dict[str, Any]:
+def _hints(kind: type) -> dict[str, object]:
     """The annotations of a dataclass's fields that msgspec can check."""
     hints = get_type_hints(kind, include_extras=True)
     return {f.name: hints[f.name] for f in dataclasses.fields(kind) if _plain(hints[f.name])}
 
 
-def _plain(hint: Any) -> bool:
+def _plain(hint: object) -> bool:
     if get_origin(hint) is Annotated:
         return _plain(get_args(hint)[0])
     if get_origin(hint) is Literal:
@@ -129,7 +129,7 @@ def _plain(hint: Any) -> bool:
     return hint in (bool, int, float, str, type(None), Ellipsis)
 
 
-def _refuse_unknown(content: object, kind: Any, where: str, place: str = "") -> None:
+def _refuse_unknown(content: object, kind: object, where: str, place: str = "") -> None:
     """Raises BidexError for names in tables that no field of their dataclass has, with the nearest one."""
     if get_origin(kind) is Annotated:
         _refuse_unknown(content, get_args(kind)[0], where, place)
@@ -153,7 +153,7 @@ def _refuse_unknown(content: object, kind: Any, where: str, place: str = "") -> 
             _refuse_unknown(value, get_args(kind)[1], where, f"{place}{name}.")
 
 
-def _message(error: msgspec.ValidationError, content: object, kind: Any, field: str = "") -> str:
+def _message(error: msgspec.ValidationError, content: object, kind: object, field: str = "") -> str:
     """Msgspec's complaint as ``place: expected ..., got ....``."""
     complaint, _, path = str(error).rpartition(" - at `$") if " - at `$" in str(error) else (str(error), "", "")
     path = path.rstrip("`")
@@ -179,10 +179,10 @@ def _message(error: msgspec.ValidationError, content: object, kind: Any, field: 
 
 # Our words for msgspec's.
 _WORDS = {"a table": "object", "a list": "array", "a whole number": "int", "a number": "float", "a text": "str"}
-_WORDS["true or false"] = "bool"
+_WORDS |= {"true or false": "bool"}
 
 
-def _choices(hint: Any) -> list[Any]:
+def _choices(hint: object) -> list[object]:
     """All values that literals within an annotation allow."""
     if get_origin(hint) is Literal:
         return list(get_args(hint))
@@ -203,7 +203,7 @@ def _at(content: object, path: str) -> object:
         return dataclasses.MISSING
 
 
-def _annotation_at(kind: Any, path: str) -> Any:
+def _annotation_at(kind: object, path: str) -> object:
     """The annotation of the value at a path."""
     for name, _ in _STEP.findall(path):
         parts = [kind]

@@ -6,10 +6,167 @@ therefore tell nothing and the bars of a free rollout hold for the 95th percenti
 sharper oracle is the second rollout, where every step starts from the state of C and no difference can grow.
 """
 
+from dataclasses import dataclass, field
+
+import mujoco
 import pytest
+import torch
 from torch import Tensor
 
-from tests.engine.parity import GROUPS, pair, rollout
+from bidex_meta.engine.capacity import room_for
+from bidex_meta.engine.cpu import CpuEngine
+from bidex_meta.engine.warp import WarpEngine
+from bidex_meta.hands.hand import SIDES
+from bidex_meta.tasks import registry
+from bidex_meta.tasks.state import TaskState
+from bidex_meta.world import World
+from bidex_meta.world.part import Part
+from tests.tasks.worlds import slot
+
+GROUPS = (
+    ("HandOver",),
+    ("CatchUnderarm", "CatchOver2Underarm", "CatchAbreast"),
+    ("TwoCatchUnderarm",),
+    ("LiftUnderarm",),
+    ("DoorOpenOutward", "DoorOpenInward", "DoorCloseOutward", "DoorCloseInward"),
+    ("BottleCap",),
+    ("PushBlock",),
+    ("SwingCup",),
+    ("OpenScissors",),
+    ("ReOrientation",),
+    ("OpenPenCap",),
+    ("Switch",),
+    ("StackBlock",),
+    ("PourWater",),
+    ("GraspAndPlace",),
+)
+"""The classes of MT20 by equal structure."""
+ROWS, STEPS = 8, 40
+_NOISE = 1e-3
+_VELOCITY_SCALE = 0.2
+_KINDS = {
+    "position": ("JOINTPOS", "FRAMEPOS"),
+    "quaternion": ("FRAMEQUAT",),
+    "velocity": ("JOINTVEL", "FRAMELINVEL", "FRAMEANGVEL"),
+    "force": ("JOINTACTFRC", "FORCE", "TORQUE"),
+}
+
+
+@dataclass
+class Pair:
+    """A group of rows on both engines.
+
+    Attributes:
+        part: The rows, on the C engine.
+        warp: The same rows on the Warp engine.
+        task_index: Task of each row.
+    """
+
+    part: Part
+    warp: WarpEngine
+    task_index: Tensor
+    kinds: dict[str, Tensor] = field(init=False)
+    start: Tensor = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.start = self.c.placement()
+        # In starts, neighbouring fingers may stand at the very margin of their contact: moved by 1e-9 rad, C itself
+        # finds the contact or not and differs by 0.19 rad/s after one step. So no start is left on that edge.
+        noise = torch.rand(self.start.shape, generator=torch.Generator().manual_seed(0), dtype=self.start.dtype)
+        for side in SIDES:
+            joints = self.part.group.members[0].scene.qpos[f"{side}/joints"]
+            self.start[:, joints] += _NOISE * noise[:, joints]
+        model = self.part.group.members[0].scene.model
+        self.kinds = {kind: torch.tensor(_addresses(model, names)) for kind, names in _KINDS.items()}
+
+    @property
+    def c(self) -> CpuEngine:
+        return self.part.group.engine
+
+    def act(self, action: Tensor) -> None:
+        """Writes actions (num, a) into both engines."""
+        self.part.control(action)
+        self.warp.ctrl.copy_(self.c.ctrl)
+        self.warp.xfrc_applied.copy_(self.c.xfrc_applied)
+
+    def step(self) -> None:
+        self.c.step(self.part.substeps)
+        self.warp.step(self.part.substeps)
+
+    def restart(self) -> None:
+        """Puts both engines where the episodes start."""
+        everyone = torch.ones(self.c.num, dtype=torch.bool)
+        self.c.reset(everyone, self.start)
+        self.warp.reset(everyone, self.start)
+
+    def apart(self) -> dict[str, Tensor]:
+        """Absolute differences by kind, each (num, k).
+
+        In metres and radians, quaternions up to their sign, velocities times 0.2, forces (N, N m) and rewards relative
+        to those above 1.
+        """
+        ours, theirs = self.warp.sensordata.double().cpu(), self.c.sensordata
+        found = {kind: (ours[:, at] - theirs[:, at]).abs() for kind, at in self.kinds.items()}
+        at = self.kinds["quaternion"]
+        found["quaternion"] = torch.minimum(found["quaternion"], (ours[:, at] + theirs[:, at]).abs())
+        found["velocity"] *= _VELOCITY_SCALE
+        found["force"] /= theirs[:, self.kinds["force"]].abs().clamp(min=1.0)
+        rewards = self._reward(theirs)
+        found["reward"] = ((self._reward(ours) - rewards).abs() / rewards.abs().clamp(min=1.0))[:, None]
+        return found
+
+    def _reward(self, sensors: Tensor) -> Tensor:
+        reward = sensors.new_empty(len(sensors))
+        for i, member in enumerate(self.part.group.members):
+            rows = member.engine_rows
+            frozen = self.part.frozen(i, self.task_index[rows])
+            terms = member.scene.task.reward_terms(TaskState(sensors[rows], member.scene.sensors, frozen))
+            reward[rows] = torch.stack(list(terms.values())).sum(dim=0)
+        return reward
+
+
+def pair(names: tuple[str, ...], rows: int = ROWS, device: str = "cpu") -> Pair:
+    """Both engines at the same fresh starts of the classes' tasks; the Warp engine on the given device."""
+    world = World([slot(registry.get(name, True)) for name in names], rows, autoreset_mode="DISABLED", threads=1)
+    world.reset(seed=0)
+    (part,) = world.parts
+    models = list({id(m.scene.model): m.scene.model for m in part.group.members}.values())
+    of_row = [i for i, m in enumerate(part.group.members) for _ in range(m.engine_rows.start, m.engine_rows.stop)]
+    room = room_for([member.scene.task.needs for member in part.group.members])
+    both = Pair(part, WarpEngine(models, of_row, room, device), part.group.take(world.task_index))
+    both.restart()
+    return both
+
+
+def actions(both: Pair, steps: int = STEPS, seed: int = 0) -> Tensor:
+    """Uniform actions, shape (steps, num, a)."""
+    generator = torch.Generator().manual_seed(seed)
+    size = both.part.group.members[0].scene.task.action_size
+    return 2.0 * torch.rand(steps, both.c.num, size, generator=generator) - 1.0
+
+
+def rollout(both: Pair, resynchronised: bool) -> dict[str, Tensor]:
+    """Differences of every step by kind, each (steps, num, k).
+
+    Args:
+        both: The engines at their starts.
+        resynchronised: Give the Warp engine the C engine's state before every step, so that no difference grows.
+    """
+    steps = []
+    for action in actions(both):
+        if resynchronised:
+            both.warp.load_state_dict(both.c.state_dict())
+        both.act(action)
+        both.step()
+        steps.append(both.apart())
+    return {kind: torch.stack([step[kind] for step in steps]) for kind in steps[0]}
+
+
+def _addresses(model: mujoco.MjModel, names: tuple[str, ...]) -> list[int]:
+    kinds = [int(getattr(mujoco.mjtSensor, f"mjSENS_{name}")) for name in names]
+    chosen = [i for i in range(model.nsensor) if model.sensor_type[i] in kinds]
+    return [int(model.sensor_adr[i]) + k for i in chosen for k in range(model.sensor_dim[i])]
+
 
 ALWAYS = ("CatchUnderarm", "BottleCap")
 """Their groups are compared in every test run: free bodies and an ellipsoid; joints and boxes."""

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from tests.tasks.formulas_of_blocks import GraspAndPlace, PourWater, PushBlock, StackBlock
 from tests.tasks.oracle import (
     Goal,
     Judgement,
@@ -27,7 +28,7 @@ from tests.tasks.oracle import (
     start,
     tilt,
     within,
-)  # fmt: skip
+)
 
 
 def _goal(task: Task, name: str) -> Goal:
@@ -45,15 +46,9 @@ class Eggs(Oracle):
 
     entering = None
 
-    def __init__(
-        self,
-        alpha: float,
-        floor: float,
-        anchors: dict[str, tuple[float, float, float]] | None = None,
-        bodies: dict[str, str] | None = None,
-    ) -> None:
+    def __init__(self, alpha: float, floor: float, anchors: dict | None = None, numbers: str = "") -> None:
         self.alpha, self.floor, self.anchors = alpha, floor, anchors or {}
-        self.body_of_goal = bodies or {"goal": "object/object"}
+        self.body_of_goal = {f"goal{i}": f"object{i}/object" for i in numbers or ("",)}
 
     def goals(self, data: mujoco.MjData, task: Task) -> dict[str, Goal]:
         return {goal: _goal(task, goal) for goal in self.body_of_goal}
@@ -77,12 +72,10 @@ class Eggs(Oracle):
         parts = {}
         for goal, body in self.body_of_goal.items():
             centre, turn = _goal(task, goal)
-            spot = (
-                (2.5, centre[1], self.floor + rng.uniform(-0.05, 0.05))
-                if low
-                else centre + rng.uniform(-0.025, 0.025, 3)
-            )
-            parts[body.removesuffix("/object")] = pose(np.array(spot), turn * Rotation.from_rotvec(rng.normal(size=3)))
+            spot = centre + rng.uniform(-0.025, 0.025, 3)
+            if low:
+                spot = np.array((2.5, centre[1], self.floor + rng.uniform(-0.05, 0.05)))
+            parts[body.removesuffix("/object")] = pose(spot, turn * Rotation.from_rotvec(rng.normal(size=3)))
         return parts
 
 
@@ -101,8 +94,7 @@ class ReOrientation(Oracle):
         goals = self.goals(data, task)
         (d_1, r_1), (d_2, r_2) = (_errors(data, body, goals[goal]) for goal, body in self.body_of_goal.items())
         terms = {"left": -10 * d_1, "right": -10 * d_2, "target": -1.5 * (r_1 + r_2)}
-        edges = (r_1 - 0.2, r_2 - 0.2, d_1 - 0.1, d_2 - 0.1)
-        return within(terms, *edges)
+        return within(terms, r_1 - 0.2, r_2 - 0.2, d_1 - 0.1, d_2 - 0.1)
 
     def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
         """Both cubes in the air, turned and moved a little off their goals."""
@@ -135,8 +127,7 @@ class LiftUnderarm(Oracle):
         position, turn = frame(data, "object/object")
         d_target = length(position - self.goals(data, task)["goal"][0])
         terms = linear(data, left, right, 3 * (0.985 - d_target), 0.2)
-        edges = (d_target - 0.05, tilt(turn) - np.pi / 6)
-        return within(terms, *edges)
+        return within(terms, d_target - 0.05, tilt(turn) - np.pi / 6)
 
     def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
         centre, turn = self.goals(data, task)["goal"]
@@ -181,8 +172,7 @@ class SwingCup(Oracle):
         (position, turn), (place, goal) = frame(data, "cup/object"), self.goals(data, task)["goal"]
         d_r = rotation_distance(turn, goal)
         terms = linear(data, left, right, 1 / (abs(d_r) + 0.1) * 5, -1.0)
-        edges = (d_r - np.pi / 4, length(position - place) - 0.2)
-        return within(terms, *edges)
+        return within(terms, d_r - np.pi / 4, length(position - place) - 0.2)
 
     def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
         centre, turn = self.goals(data, task)["goal"]
@@ -238,14 +228,9 @@ class OpenPenCap(Oracle):
 
     def judge(self, data: mujoco.MjData, task: Task) -> Judgement:
         body, cap = self.points(data).values()
-        d_left, d_right = reach(data, body, cap)
+        left, right = (float(np.exp(-10 * distance)) for distance in reach(data, body, cap))
         d_target = length(body - cap)
-        terms = {
-            "left": float(np.exp(-10 * d_left)),
-            "right": float(np.exp(-10 * d_right)),
-            "target": d_target * 5,
-            "constant": -0.8,
-        }
+        terms = {"left": left, "right": right, "target": d_target * 5, "constant": -0.8}
         return within(terms, 0.3 - d_target)
 
     def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
@@ -332,165 +317,11 @@ class Switch(Oracle):
         return {f"switch{i}/hinge": rng.uniform(0.3, TRAVEL, 1) for i in (1, 2)}
 
 
-FLOOR, RIM = -0.0529, 0.0445
-"""Heights of the bucket's lower and upper end in its frame, metres (docs/figures.md, objects)."""
-WALL = 0.004
-"""How far the middle of the bucket's wall may lie inside its outer face, metres."""
-UNSURE = 0.007
-"""Whatever lies this near to wall, floor or rim may count either way, metres: their thickness is the project's own."""
-MOUTH = (0.0, 0.0, RIM - 0.01)
-"""Where the spout shall be of a standing bucket: on its axis, 1 cm below its rim."""
-BOTTOM = (0.0, 0.0, -0.049)
-"""The middle of the bucket's floor."""
-STANDING = 0.457 + BOTTOM[2]
-"""Height of that point when the bucket stands on its table, metres."""
-
-
-def inside(data: mujoco.MjData, point: np.ndarray) -> tuple[bool, bool]:
-    """Whether a point surely lies in the bucket, and whether it may."""
-    position, turn = frame(data, "bucket/object")
-    x, y, z = turn.inv().apply(point - position)
-    radius = 0.0298 + (0.0569 - 0.0298) * (z - FLOOR) / (RIM - FLOOR) - WALL
-    depth = min(radius - np.hypot(x, y), z - FLOOR, RIM - z)
-    return depth > UNSURE, depth > -UNSURE
-
-
-def kept(data: mujoco.MjData) -> float:
-    """How far the bucket is from the tilt of 45 degrees beyond which nothing counts as in it, rad."""
-    return np.pi / 4 - tilt(frame(data, "bucket/object")[1])
-
-
-class PushBlock(Oracle):
-    """Equation 12."""
-
-    places: ClassVar = {"block1": (-0.2, -0.2, 0.625), "block2": (-0.2, 0.2, 0.625)}
-
-    def points(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
-        return {f"block{i} position": data.body(f"block{i}/object").xpos.copy() for i in (1, 2)}
-
-    def judge(self, data: mujoco.MjData, task: Task) -> Judgement:
-        first, second = self.points(data).values()
-        d_1, d_2 = length(first - np.array(self.places["block1"])), length(second - np.array(self.places["block2"]))
-        terms = linear(data, first, second, 5 * (0.8 - (d_1 + d_2)), 2.0)
-        return within(terms, d_1 - 0.1, d_2 - 0.1)
-
-    def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        return {
-            name: pose(shifted(np.array(place), *rng.uniform(-0.1, 0.1, 2), 0.005), Rotation.identity())
-            for name, place in self.places.items()
-        }
-
-
-class StackBlock(Oracle):
-    """Equation 18. Block 1 comes to lie on block 2 (docs/figures.md, decisions)."""
-
-    body_of_goal: ClassVar = {"goal": "block1/object"}
-    entering: ClassVar = {"target_x", "target_y"}
-
-    def points(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
-        return {f"block{i} position": data.body(f"block{i}/object").xpos.copy() for i in (1, 2)}
-
-    def targets(self, task: Task) -> tuple[np.ndarray, np.ndarray]:
-        bottom = np.array((task["target_x"], task["target_y"], 0.625))
-        return shifted(bottom, 0, 0, 0.05), bottom
-
-    def goals(self, data: mujoco.MjData, task: Task) -> dict[str, Goal]:
-        return {"goal": (self.targets(task)[0], Rotation.identity())}
-
-    def judge(self, data: mujoco.MjData, task: Task) -> Judgement:
-        first, second = self.points(data).values()
-        g_1, g_2 = (length(p - t) for p, t in zip((first, second), self.targets(task), strict=True))
-        terms = linear(data, first, second, (0.24 - (g_1 + g_2)) * 2, 1.5)
-        x, y, z = first - second
-        edges = [g_1 - 0.03, g_2 - 0.03, abs(z - 0.05) - 0.01, np.hypot(x, y) - 0.03]
-        return within(terms, *edges)
-
-    def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        top, bottom = self.targets(task)
-        bottom = shifted(bottom, *rng.uniform(-0.02, 0.02, 2), 0.004)
-        top = shifted(top, *rng.uniform(-0.02, 0.02, 2), rng.uniform(0.004, 0.02))
-        return {"block1": pose(top, Rotation.identity()), "block2": pose(bottom, Rotation.identity())}
-
-
-class PourWater(Oracle):
-    """Equation 19. Success: at least a third of the water in the bucket, which is upright."""
-
-    body_of_goal: ClassVar = {"goal": "kettle/object"}
-    spout, handle = (-0.2, 0.0, 0.07), (0.15, 0.0, 0.0)
-
-    def points(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
-        return {
-            "kettle handle position": at(data, "kettle/object", self.handle),
-            "bucket position": data.body("bucket/object").xpos.copy(),
-        }
-
-    def goals(self, data: mujoco.MjData, task: Task) -> dict[str, Goal]:
-        """The mouth of the standing bucket, lower if it is lifted; the kettle's start, its spout 40 degrees down."""
-        lift = max(0.0, at(data, "bucket/object", BOTTOM)[2] - STANDING)
-        mouth = at(data, "bucket/object", MOUTH)
-        down = Rotation.from_rotvec([0.0, -np.deg2rad(40.0), 0.0])
-        return {"goal": (shifted(mouth, 0, 0, -min(5 * lift, lift + 0.2)), start(data, "kettle", task)[1] * down)}
-
-    @staticmethod
-    def water(data: mujoco.MjData) -> list[str]:
-        bodies = [data.model.body(i).name for i in range(data.model.nbody)]
-        return [name.removesuffix("/object") for name in bodies if name.startswith("water")]
-
-    def judge(self, data: mujoco.MjData, task: Task) -> Judgement:
-        handle, bucket = self.points(data).values()
-        d_target = length(at(data, "kettle/object", self.spout) - self.goals(data, task)["goal"][0])
-        terms = linear(data, bucket, handle, (0.5 - d_target) * 2, 1.0)
-        drops = [inside(data, data.body(f"{drop}/object").xpos) for drop in self.water(data)]
-        surely, perhaps = (3 * sum(found) >= len(drops) for found in zip(*drops, strict=True))
-        upright = kept(data)
-        return Judgement(terms, surely and upright > 0, False, 0.0 if surely != perhaps else abs(upright))
-
-    def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """Some of the drops in the middle of the bucket, which is somewhat lifted and tipped."""
-        position, turn = start(data, "bucket", task)
-        position, turn = shifted(position, 0, 0, rng.choice((0.0, 0.06))), some_tilt(rng, 1.2) * turn
-        drops = self.water(data)
-        parts = {"bucket": pose(position, turn)}
-        for i, drop in enumerate(drops[: rng.integers(0, len(drops) + 1)]):
-            place = position + turn.apply((0.012 * (i % 3 - 1), 0, 0.012 * (i // 3) - 0.02))
-            parts |= {f"{drop}/{axis}": place[k : k + 1] for k, axis in enumerate("xyz")}
-        return parts
-
-
-class GraspAndPlace(Oracle):
-    """The original's formula with one hand point a hand (docs/figures.md, classes).
-
-    Success: the block's centre in the bucket, which is upright.
-    """
-
-    def points(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
-        return {f"{name} position": data.body(f"{name}/object").xpos.copy() for name in ("bucket", "block")}
-
-    def judge(self, data: mujoco.MjData, task: Task) -> Judgement:
-        bucket, block = self.points(data).values()
-        d_left, d_right = reach(data, block, bucket)
-        terms = {
-            "left": float(np.exp(-10 * d_left)),
-            "right": float(np.exp(-10 * d_right)),
-            "target": 2 * float(np.exp(-10 * length(bucket - block))),
-        }
-        surely, perhaps = inside(data, block)
-        upright = kept(data)
-        return Judgement(terms, surely and upright > 0, False, 0.0 if surely != perhaps else abs(upright))
-
-    def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """The block over the middle of the bucket, or beside it."""
-        position, turn = start(data, "bucket", task)
-        turn = some_tilt(rng, 1.2) * turn
-        beside = (0.12, 0, 0) if rng.random() < 0.3 else (0, 0, rng.uniform(0.01, 0.025))
-        return {"bucket": pose(position, turn), "block": pose(position + turn.apply(beside), turn)}
-
-
 FORMULAS: dict[str, Oracle] = {
     "HandOver": Eggs(50.0, 0.2),
     "CatchUnderarm": Eggs(50.0, 0.1),
     "CatchOver2Underarm": Eggs(20.0, 0.3, {"right/mount": (0, 0, 0.5), "left/mount": (0, -0.8, 0.5)}),
-    "TwoCatchUnderarm": Eggs(50.0, 0.2, bodies={"goal1": "object1/object", "goal2": "object2/object"}),
+    "TwoCatchUnderarm": Eggs(50.0, 0.2, numbers="12"),
     "CatchAbreast": Eggs(50.0, 0.2, {"right/palm": (-0.3, -0.55, 0.5), "left/palm": (-0.3, -1.15, 0.5)}),
     "LiftUnderarm": LiftUnderarm(),
     "DoorOpenOutward": Door(opens=True, side=-0.04),

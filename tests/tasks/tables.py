@@ -31,62 +31,36 @@ TABLE_8 = TABLE_7_FIXED + rows(
     "374-380 object pose; 381-383 object linear velocity; 384-386 object angle velocity; 387-393 goal pose; "
     "394-397 goal rot - object rot"
 )
-TABLE_10 = TABLE_7 + rows(
-    "398-404 object pose; 405-407 object linear velocity; 408-410 object angle velocity; 411-417 goal pose; "
-    "418-421 goal rot - object rot"
-)
+
+
+def free(name: str) -> list[Row]:
+    """The rows of a free object behind Table 7."""
+    return rows(f"398-404 {name} pose; 405-407 {name} linear velocity; 408-410 {name} angle velocity")
+
+
+GOAL = rows("411-417 goal pose; 418-421 goal rot - object rot")
+TABLE_10 = TABLE_7 + free("object") + GOAL
 # Table 32 prints the rows of Table 14.
 TABLE_14 = TABLE_7 + rows(
     "398-404 object1 pose; 405-407 object1 linear velocity; 408-410 object1 angle velocity; 411-417 goal1 pose; "
     "418-421 goal1 rot - object rot; 422-428 object2 pose; 429-431 object2 linear velocity; "
     "432-434 object2 angle velocity; 435-441 goal2 pose; 442-445 goal2 rot - object2 rot"
 )
-TABLE_18 = TABLE_7 + rows(
-    "398-404 object pose; 405-407 object linear velocity; 408-410 object angle velocity; 411-417 goal pose; "
-    "418-421 goal rot - object rot; 422-424 object right handle position; 425-427 object left handle position"
-)
+TABLE_18 = TABLE_10 + rows("422-424 object right handle position; 425-427 object left handle position")
 # Table 22 prints the same rows.
-TABLE_20 = TABLE_7 + rows(
-    "398-404 object pose; 405-407 object linear velocity; 408-410 object angle velocity; 411-417 goal pose; "
-    "418-421 goal rot - object rot; 422-424 door right handle position; 425-427 door left handle position"
-)
-TABLE_24 = TABLE_7 + rows(
-    "398-404 bottle pose; 405-407 bottle linear velocity; 408-410 bottle angle velocity; 411-413 bottle cap position"
-)
-TABLE_26 = TABLE_7 + rows(
-    "398-404 block1 pose; 405-407 block1 linear velocity; 408-410 block1 angle velocity; "
-    "411-413 block1 position; 414-416 block2 position"
-)
-TABLE_28 = TABLE_7 + rows(
-    "398-404 cup pose; 405-407 cup linear velocity; 408-410 cup angle velocity; 411-417 goal pose; "
-    "418-421 goal rot - object rot; 422-424 cup right handle position; 425-427 cup left handle position"
-)
-TABLE_30 = TABLE_7 + rows(
-    "398-404 scissors pose; 405-407 scissors linear velocity; 408-410 scissors angle velocity; "
-    "411-417 goal pose; 418-421 goal rot - object rot; 422-424 scissors right handle position; "
-    "425-427 scissors left handle position"
-)
-TABLE_34 = TABLE_7 + rows(
-    "398-404 pen pose; 405-407 pen linear velocity; 408-410 pen angle velocity; 411-417 goal pose; "
-    "418-421 goal rot - object rot; 422-424 pen body position; 425-427 pen cap position"
-)
-TABLE_36 = TABLE_7 + rows(
-    "398-404 switch1 pose; 405-407 switch1 linear velocity; 408-410 switch1 angle velocity; 411-417 goal pose; "
-    "418-421 goal rot - object rot; 422-424 switch1 position; 425-427 switch2 position"
-)
-TABLE_38 = TABLE_7 + rows(
-    "398-404 block1 pose; 405-407 block1 linear velocity; 408-410 block1 angle velocity; 411-417 goal pose; "
-    "418-421 goal rot - object rot; 422-424 block1 position; 425-427 block2 position"
-)
-TABLE_40 = TABLE_7 + rows(
-    "398-404 kettle pose; 405-407 kettle linear velocity; 408-410 kettle angle velocity; 411-417 goal pose; "
-    "418-421 goal rot - object rot; 422-424 kettle handle position; 425-427 bucket position"
-)
+TABLE_20 = TABLE_10 + rows("422-424 door right handle position; 425-427 door left handle position")
+TABLE_24 = TABLE_7 + free("bottle") + rows("411-413 bottle cap position")
+TABLE_26 = TABLE_7 + free("block1") + rows("411-413 block1 position; 414-416 block2 position")
+TABLE_28 = TABLE_7 + free("cup") + GOAL + rows("422-424 cup right handle position; 425-427 cup left handle position")
+_HANDLES = rows("422-424 scissors right handle position; 425-427 scissors left handle position")
+TABLE_30 = TABLE_7 + free("scissors") + GOAL + _HANDLES
+TABLE_34 = TABLE_7 + free("pen") + GOAL + rows("422-424 pen body position; 425-427 pen cap position")
+TABLE_36 = TABLE_7 + free("switch1") + GOAL + rows("422-424 switch1 position; 425-427 switch2 position")
+TABLE_38 = TABLE_7 + free("block1") + GOAL + rows("422-424 block1 position; 425-427 block2 position")
+TABLE_40 = TABLE_7 + free("kettle") + GOAL + rows("422-424 kettle handle position; 425-427 bucket position")
 # The appendix has no table for GraspAndPlace; these are the rows of the original's code.
-GRASP_AND_PLACE = TABLE_7 + rows(
-    "398-404 bucket pose; 405-407 bucket linear velocity; 408-410 bucket angle velocity; "
-    "411-413 bucket position; 414-417 bucket link quaternion; 418-420 block position; 421-424 block quaternion"
-)
+_BLOCK = "411-413 bucket position; 414-417 bucket link quaternion; 418-420 block position; 421-424 block quaternion"
+GRASP_AND_PLACE = TABLE_7 + free("bucket") + rows(_BLOCK)
 # Tables 12 and 16 print the rows of Table 10; with a moving base HandOver has them too (docs/figures.md, decisions).
 TABLES: dict[tuple[str, bool], list[Row]] = {
     ("HandOver", False): TABLE_8,

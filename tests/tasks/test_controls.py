@@ -1,104 +1,18 @@
-"""Actions: position targets, and forces that move a base without turning it (docs/figures.md, control, base)."""
+"""Actions: position targets, and forces and torques on the bases (docs/figures.md, control, base)."""
 
 import numpy as np
 import torch
 
 from bidex_meta.hands.hand import SIDES
-from bidex_meta.world import World
 from tests.hands import figures
 from tests.tasks.worlds import (
     MOVING,
     each_case,
-    each_moving,
     engine_of,
     mixed_world,
-    object_joints_of,
-    objects_of,
-    restart,
     scene_of,
-    send_hands_away,
     world_of,
 )
-
-FORCE, TORQUE = 1666.67, 16.667
-"""Newton and newton metre per unit of scale (docs/figures.md, base)."""
-HALF_SECOND = 30
-
-
-def held() -> np.ndarray:
-    """Joint actions whose targets are the start angles, zero. Shape (20,)."""
-    low, high = figures.LOW[figures.ACTUATED], figures.HIGH[figures.ACTUATED]
-    return -(high + low) / (high - low)
-
-
-def free_bases(name: str, actions: np.ndarray) -> tuple[World, np.ndarray, np.ndarray]:
-    """Drives both bases by actions (n, 6) for half a second, far from all else; their poses (n, 2, 7) before, after."""
-    world = world_of(name, True, len(actions))
-    world.reset(seed=0)
-    engine, scene = engine_of(world), scene_of(world)
-    qpos = torch.from_numpy(scene.start_qpos).repeat(len(actions), 1)
-    send_hands_away(scene, qpos)
-    for i, joint in enumerate(name for name in object_joints_of(scene) if name.startswith("water")):
-        qpos[:, scene.qpos[joint]] = -9.0 - i  # drops have three slides each; so no two of them meet
-    for i, body in enumerate(objects_of(scene)):
-        qpos[:, scene.qpos[body]] = torch.tensor([-9.0 - i, 0.0, 4.0, 1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
-    restart(world, qpos)
-    places = [scene.qpos[f"{side}/base"] for side in SIDES]
-    before = np.stack([engine.qpos[:, place].numpy().copy() for place in places], axis=1)
-    one_hand = np.concatenate((np.tile(held(), (len(actions), 1)), actions), axis=1)
-    whole = torch.from_numpy(np.tile(one_hand, (1, 2)))
-    for _ in range(HALF_SECOND):
-        world.parts[0].step(whole, None)
-    assert not engine.unstable().any()
-    return world, before, np.stack([engine.qpos[:, place].numpy().copy() for place in places], axis=1)
-
-
-def turned(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    return (
-        figures.rotation(after[..., 3:].reshape(-1, 4)) * figures.rotation(before[..., 3:].reshape(-1, 4)).inv()
-    ).magnitude()
-
-
-@each_moving
-def test_a_full_force_moves_a_base_and_does_not_turn_it(name: str) -> None:
-    axes = np.concatenate((np.eye(6)[:3], -np.eye(6)[:3]))
-    world, before, after = free_bases(name, axes)
-    assert turned(before, after).max() < 0.05
-    force = FORCE * figures.SCALES[name][0]
-    engine, scene = engine_of(world), scene_of(world)
-    for side in SIDES:
-        first = scene.model.joint(f"{side}/free").dofadr[0]
-        velocity = engine.qvel[:, first : first + 3].numpy()
-        np.testing.assert_allclose(velocity, axes[:, :3] * force / 501.0, atol=0.01 * force / 501.0)
-    # A time constant of mass over damping, 0.01 s, is lost at the start.
-    moved = after[..., :3] - before[..., :3]
-    expected = axes[:, None, :3] * force / 501.0 * (0.5 - 0.01)
-    np.testing.assert_allclose(moved, np.broadcast_to(expected, moved.shape), atol=0.02 * force / 501.0)
-
-
-@each_moving
-def test_a_held_base_stays(name: str) -> None:
-    _, before, after = free_bases(name, np.zeros((1, 6)))
-    assert turned(before, after).max() < 1e-3
-    assert np.abs(after[..., :3] - before[..., :3]).max() < 1e-4
-
-
-@each_moving
-def test_a_torque_turns_a_base_at_the_rate_of_its_damping(name: str) -> None:
-    """Along each of the hand's own axes, as large as the world-frame actions allow: torque / (2.60, 2.65, 1.12)."""
-    for i in range(2):
-        axes = figures.rotation(figures.CLASS_MOUNTS[name][i][1]).as_matrix().T
-        actions = axes / np.abs(axes).max(axis=1, keepdims=True)
-        world, before, after = free_bases(name, np.concatenate((np.zeros((3, 3)), actions), axis=1))
-        first = scene_of(world).model.joint(f"{SIDES[i]}/free").dofadr[0]
-        rate = engine_of(world).qvel[:, first + 3 : first + 6].numpy()
-        torque = TORQUE * figures.SCALES[name][1] * np.linalg.norm(actions, axis=1)
-        expected = np.diag(torque / np.array(figures.ANGULAR_DAMPING))
-        np.testing.assert_allclose(np.diag(rate), np.diag(expected), rtol=0.05)
-        off_axis = np.abs(rate - np.diag(np.diag(rate))).max(axis=1)
-        assert (off_axis < 0.1 * np.diag(expected)).all(), rate
-        # A pure torque leaves the point where it is applied nearly in place.
-        assert np.linalg.norm(after[:, i, :3] - before[:, i, :3], axis=1).max() < 0.02
 
 
 @each_case

@@ -4,7 +4,6 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
 from bidex_meta.hands.hand import SIDES
 from bidex_meta.tasks import registry
@@ -14,12 +13,9 @@ from tests.tasks.formulas import FORMULAS
 from tests.tasks.oracle import Goal, frame
 from tests.tasks.tables import SIZES, TABLES, block_name
 from tests.tasks.worlds import (
-    CASES,
     Lens,
     each_case,
     engine_of,
-    objects_of,
-    observe,
     scene_of,
     task_of,
     world_of,
@@ -42,11 +38,6 @@ def started(worlds: dict[tuple[str, bool], World], name: str, moving: bool) -> W
     return world
 
 
-def places(name: str, moving: bool) -> dict[str, slice]:
-    """The printed ranges by what stands there."""
-    return {what: slice(first, last + 1) for first, last, what in TABLES[name, moving]}
-
-
 @each_case
 def test_layout_is_the_printed_table(name: str, moving: bool) -> None:
     task, table = registry.get(name, moving), TABLES[name, moving]
@@ -63,78 +54,6 @@ def test_goal_indices(name: str, moving: bool) -> None:
         i for first, last, what in TABLES[name, moving] if what.startswith("goal") for i in range(first, last + 1)
     ]
     assert registry.get(name, moving).layout.goal_indices() == printed
-
-
-def test_a_wrong_block_name_is_answered_with_the_names_there_are() -> None:
-    with pytest.raises(KeyError, match="right_joint_position"):
-        registry.get("HandOver").layout.range("joint_positions")
-
-
-@each_case
-def test_velocities_are_scaled_and_everything_is_clipped(
-    worlds: dict[tuple[str, bool], World], name: str, moving: bool
-) -> None:
-    world, where = started(worlds, name, moving), places(name, moving)
-    engine, scene = engine_of(world), scene_of(world)
-    for side in SIDES:
-        first = scene.model.joint(f"{side}/WRJ1").dofadr[0]
-        engine.qvel[0, first : first + 24] = torch.linspace(-2.0, 2.0, 24)
-        engine.qvel[1, first : first + 24] = 40.0
-        engine.qvel[2, first : first + 24] = -40.0
-    body = next((name for name in objects_of(scene) if f"{name} pose" in where), None)
-    if body is not None:
-        engine.qpos[1, scene.qpos[body].start] = 7.0
-    obs = observe(world)
-    for side in SIDES:
-        found = obs[:, where[f"{side} dof velocity"]]
-        np.testing.assert_allclose(found[0], 0.2 * np.linspace(-2.0, 2.0, 24), atol=1e-6)
-        assert (found[1] == 5.0).all() and (found[2] == -5.0).all()
-    assert body is None or obs[1, where[f"{body} pose"].start] == 5.0
-    assert np.abs(obs).max() == 5.0
-
-
-@pytest.mark.parametrize("name", [name for name, moving in CASES if moving])
-def test_base_entries(worlds: dict[tuple[str, bool], World], name: str) -> None:
-    """Position of the mount's origin in the world; roll, pitch and yaw against its start, zero there."""
-    world, where = started(worlds, name, True), places(name, True)
-    engine, scene = engine_of(world), scene_of(world)
-    obs = observe(world)
-    for side, (position, _) in zip(SIDES, figures.CLASS_MOUNTS[name], strict=True):
-        np.testing.assert_allclose(obs[:, where[f"{side} base position"]], np.tile(position, (3, 1)), atol=1e-6)
-        np.testing.assert_allclose(obs[:, where[f"{side} base rotation"]], 0.0, atol=1e-6)
-    turns = np.array(
-        [[[0.3, -0.4, 0.5], [3.0, 0.2, -3.0], [0.0, -1.2, 0.0]], [[-0.7, 0.1, 2.0], [0, 0, 0], [-3.1, 1.0, 3.1]]]
-    )
-    moved = np.array((0.2, -0.1, 0.4))
-    for i, side in enumerate(SIDES):
-        place = scene.qpos[f"{side}/base"]
-        start = figures.rotation(scene.start_qpos[place][3:])
-        for row in range(3):
-            turned = Rotation.from_euler("xyz", turns[i, row]) * start
-            mount = np.array(figures.CLASS_MOUNTS[name][i][0]) + moved
-            base = mount + turned.apply(figures.CENTRE_OF_MASS)
-            engine.qpos[row, place] = torch.from_numpy(np.concatenate((base, turned.as_quat(scalar_first=True))))
-    obs = observe(world)
-    for i, side in enumerate(SIDES):
-        mount = np.array(figures.CLASS_MOUNTS[name][i][0]) + moved
-        np.testing.assert_allclose(obs[:, where[f"{side} base position"]], np.tile(mount, (3, 1)), atol=1e-6)
-        np.testing.assert_allclose(obs[:, where[f"{side} base rotation"]], turns[i], atol=1e-6)
-
-
-@each_case
-def test_last_actions(worlds: dict[tuple[str, bool], World], name: str, moving: bool) -> None:
-    world, where = started(worlds, name, moving), places(name, moving)
-    obs, _ = world.reset(seed=7)
-    for side in SIDES:
-        assert (obs[:, where[f"{side} actions"]] == 0).all()
-    action = torch.rand(3, world.action_size, generator=torch.Generator().manual_seed(3)) * 2 - 1
-    action[0, 0] = 1.5
-    obs, *_ = world.step(action)
-    found = torch.cat([obs[:, where[f"{side} actions"]] for side in SIDES], dim=1)
-    np.testing.assert_array_equal(found.numpy(), action.clamp(-1, 1).numpy())
-    obs, _ = world.reset(options={"reset_mask": np.array([True, False, False])})
-    found = torch.cat([obs[:, where[f"{side} actions"]] for side in SIDES], dim=1)
-    assert (found[0] == 0).all() and torch.equal(found[1:], action[1:])
 
 
 def replay(world: World, row: int, actions: torch.Tensor) -> tuple[mujoco.MjData, mujoco.MjData]:

@@ -6,31 +6,14 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from bidex_meta.hands.hand import INNER
-from bidex_meta.tasks import registry
-from bidex_meta.tasks.pour_water import PourWater
-from bidex_meta.tasks.scene import Scene, compile_scene
+from bidex_meta.tasks.bucket import PourWater
+from bidex_meta.tasks.scene import Scene
 from bidex_meta.world import World
 from tests.hands import figures
+from tests.tasks import worlds
 from tests.tasks.formulas import FORMULAS
 from tests.tasks.oracle import frame, pose, shifted
 from tests.tasks.tables import PLACES
-from tests.tasks.worlds import (
-    Lens,
-    depths,
-    dofs_of,
-    each_moving,
-    engine_of,
-    object_joints_of,
-    objects_of,
-    observe,
-    restart,
-    scene_of,
-    send_hands_away,
-    set_pose,
-    slot,
-    world_of,
-)
 
 SECOND = 60
 THROWN = ("HandOver", "CatchUnderarm", "CatchOver2Underarm", "TwoCatchUnderarm", "CatchAbreast", "ReOrientation")
@@ -39,17 +22,17 @@ STANDING = [name for name in PLACES if name not in THROWN and name != "BottleCap
 
 def alone(name: str, rows: int) -> World:
     """A world at the starts of its first episodes, the hands far away."""
-    world = world_of(name, True, rows, tasks=rows)
+    world = worlds.world_of(name, True, rows, tasks=rows)
     world.reset(seed=0)
-    start = engine_of(world).placement()
-    send_hands_away(scene_of(world), start)
-    restart(world, start)
+    start = worlds.engine_of(world).placement()
+    worlds.send_hands_away(worlds.scene_of(world), start)
+    worlds.restart(world, start)
     return world
 
 
-@each_moving
+@worlds.each_moving
 def test_contacts_and_limits_are_as_stiff_as_the_time_step_allows(name: str) -> None:
-    model = scene_of(world_of(name, True, 1)).model
+    model = worlds.scene_of(worlds.world_of(name, True, 1)).model
     meets = (model.geom_contype | model.geom_conaffinity) > 0
     limited = (model.jnt_limited > 0) & (model.jnt_type != mujoco.mjtJoint.mjJNT_FREE)
     for constants in (model.geom_solref[meets, 0], model.jnt_solref[limited, 0], model.tendon_solref_lim[:, 0]):
@@ -60,26 +43,26 @@ def test_contacts_and_limits_are_as_stiff_as_the_time_step_allows(name: str) -> 
 def wait(world: World, steps: int) -> None:
     for _ in range(steps):
         world.parts[0].step(torch.zeros(world.num_envs, world.action_size).double(), None)
-    assert not engine_of(world).unstable().any()
+    assert not worlds.engine_of(world).unstable().any()
 
 
 def joints_of(scene: Scene) -> list[str]:
-    return [joint for joint in object_joints_of(scene) if not joint.startswith("water")]
+    return [joint for joint in worlds.object_joints_of(scene) if not joint.startswith("water")]
 
 
 @pytest.mark.parametrize("name", STANDING)
 def test_objects_rest_where_they_start(name: str) -> None:
     """No jump, no drift, no falling over; caps and lids stay on, leaves and rockers where they are."""
     world = alone(name, 3)
-    engine, scene = engine_of(world), scene_of(world)
+    engine, scene = worlds.engine_of(world), worlds.scene_of(world)
     before = engine.qpos.numpy().copy()
     for _ in range(4):
         wait(world, SECOND // 4)
-        for body in objects_of(scene):
+        for body in worlds.objects_of(scene):
             shift = engine.qpos[:, scene.qpos[body]].numpy()[:, :3] - before[:, scene.qpos[body]][:, :3]
             assert np.abs(shift).max() < 0.005, (body, shift)
-    for body in objects_of(scene):
-        first, _ = dofs_of(scene, body)
+    for body in worlds.objects_of(scene):
+        first, _ = worlds.dofs_of(scene, body)
         assert np.abs(engine.qvel[:, first : first + 3].numpy()).max() < 0.05, body
         for old, new in zip(before[:, scene.qpos[body]], engine.qpos[:, scene.qpos[body]].numpy(), strict=True):
             turned = figures.rotation(new[3:]) * figures.rotation(old[3:]).inv()
@@ -95,7 +78,7 @@ def test_objects_rest_where_they_start(name: str) -> None:
 )
 def test_hinges_stay_where_they_are_left(name: str, angle: float) -> None:
     world = alone(name, 2)
-    engine, scene = engine_of(world), scene_of(world)
+    engine, scene = worlds.engine_of(world), worlds.scene_of(world)
     for joint in joints_of(scene):
         engine.qpos[:, scene.qpos[joint]] = angle
     wait(world, SECOND // 2)
@@ -103,27 +86,13 @@ def test_hinges_stay_where_they_are_left(name: str, angle: float) -> None:
         np.testing.assert_allclose(engine.qpos[:, scene.qpos[joint]].numpy(), angle, atol=0.01, err_msg=joint)
 
 
-def test_the_bottle_stays_in_the_hand_that_closes() -> None:
-    """At zero action the fingers close half way, which moves the bottle 6 cm; dropped, it would fall 30 cm and more."""
-    world = world_of("BottleCap", True, 4, tasks=4)
-    world.reset(seed=0)
-    engine, scene = engine_of(world), scene_of(world)
-    before = engine.qpos.numpy().copy()
-    action = torch.zeros(4, 52)
-    for _ in range(SECOND):
-        world.parts[0].step(action, None)
-    shift = engine.qpos.numpy() - before
-    assert np.abs(shift[:, scene.qpos["bottle"]][:, :3]).max() < 0.12, shift[:, scene.qpos["bottle"]]
-    assert np.abs(shift[:, scene.qpos["bottle/slide"]]).max() < 0.002
-
-
 def with_water(count: int, rows: int) -> World:
     """A world of PourWater with so many drops, hands away."""
-    world = World([slot(PourWater(True, count), rows)], rows, autoreset_mode="DISABLED", threads=1)
+    world = World([worlds.slot(PourWater(True, count), rows)], rows, autoreset_mode="DISABLED", threads=1)
     world.reset(seed=0)
-    start = engine_of(world).placement()
-    send_hands_away(scene_of(world), start)
-    restart(world, start)
+    start = worlds.engine_of(world).placement()
+    worlds.send_hands_away(worlds.scene_of(world), start)
+    worlds.restart(world, start)
     return world
 
 
@@ -131,11 +100,11 @@ def with_water(count: int, rows: int) -> World:
 def test_water_stays_in_the_kettle_until_it_is_tilted(count: int) -> None:
     """None leaves the upright kettle in half a second; a tilt of 40 degrees empties it by more than a third."""
     world = with_water(count, 1)
-    scene, model = scene_of(world), scene_of(world).model
-    assert depths(Lens(model).look(engine_of(world).placement()[0])).max() < 0.005
-    assert len(FORMULAS["PourWater"].water(Lens(model).data)) == count
+    scene, model = worlds.scene_of(world), worlds.scene_of(world).model
+    assert worlds.depths(worlds.Lens(model).look(worlds.engine_of(world).placement()[0])).max() < 0.005
+    assert len(FORMULAS["PourWater"].water(worlds.Lens(model).data)) == count
     wait(world, SECOND // 2)
-    data = Lens(model).look(engine_of(world).placement()[0])
+    data = worlds.Lens(model).look(worlds.engine_of(world).placement()[0])
     assert left(data, count) == 0
     base, turn = frame(data, "kettle/object")
     tilted = turn * Rotation.from_rotvec([0, -np.deg2rad(40), 0])
@@ -144,7 +113,7 @@ def test_water_stays_in_the_kettle_until_it_is_tilted(count: int) -> None:
     for i in range(count):
         for axis, value in zip("xyz", place[:3] + tilted.apply(inside[i]), strict=True):
             data.qpos[scene.qpos[f"water{i}/{axis}"]] = value
-    first, size = dofs_of(scene, "kettle")
+    first, size = worlds.dofs_of(scene, "kettle")
     data.qvel[:] = 0.0
     for _ in range(2 * 240):
         data.qpos[scene.qpos["kettle"]], data.qvel[first : first + size] = place, 0.0
@@ -157,51 +126,3 @@ def left(data: mujoco.MjData, count: int) -> int:
     base, turn = frame(data, "kettle/object")
     drops = [turn.inv().apply(data.body(f"water{i}/object").xpos - base) for i in range(count)]
     return sum(float(np.hypot(x, y)) > 0.205 or z < -0.08 for x, y, z in drops)
-
-
-def test_a_block_counts_as_placed_in_the_bucket_alone() -> None:
-    """It fits in, lies there quietly and is a success; beside the bucket, on its rim or above it it is none."""
-    world = alone("GraspAndPlace", 4)
-    engine, scene, lens = engine_of(world), scene_of(world), Lens(scene_of(world).model)
-    for row, offset in enumerate(((0, 0, 0.025), (0.1, 0, -0.028), (0, 0, 0.09), (-0.1, 0, -0.028))):
-        base, turn = frame(lens.look(engine.placement()[row]), "bucket/object")
-        set_pose(world, row, "block", pose(shifted(base, *offset), turn))
-    task = world.slots[0].task_class
-    observe(world)
-    (_, _, state), *_ = world.parts[0].states(world.task_index)
-    assert task.success(state).tolist() == [True, False, False, False]
-    wait(world, SECOND)
-    (_, _, state), *_ = world.parts[0].states(world.task_index)
-    solved = task.success(state).tolist()
-    assert solved[0] and not solved[1] and not solved[3]
-    first, _ = dofs_of(scene, "block")
-    assert np.abs(engine.qvel[0, first : first + 3].numpy()).max() < 0.05
-
-
-def test_inner_geoms_lie_within_the_outline_of_the_others() -> None:
-    """What tables need not look for must not be the first to meet one: no direction shows an inner geom outside."""
-    model = compile_scene(registry.get("OpenScissors")).model
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    solid = [g for g in range(model.ngeom) if model.geom(g).name.startswith("scissors/") and model.geom_contype[g]]
-    inner = [g for g in solid if model.geom_contype[g] == INNER]
-    assert inner and len(inner) < len(solid)
-    rng = np.random.default_rng(0)
-    for body in {model.geom_bodyid[g] for g in inner}:
-        own = [g for g in solid if model.geom_bodyid[g] == body]
-        for direction in rng.normal(size=(200, 3)):
-            reach = {g: _reach(model, data, g, direction / np.linalg.norm(direction)) for g in own}
-            outline = max(value for g, value in reach.items() if g not in inner)
-            # A blade's heel is 6 mm broader than the blade, and the arm's end at the pivot is the other half's too.
-            assert max(reach[g] for g in own if g in inner) < outline + 0.0075
-
-
-def _reach(model: mujoco.MjModel, data: mujoco.MjData, geom: int, direction: np.ndarray) -> float:
-    """How far a capsule or box goes in a direction, metres."""
-    local = data.geom_xmat[geom].reshape(3, 3).T @ direction
-    size = model.geom_size[geom]
-    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        extent = size[0] + size[1] * abs(local[2])
-    else:
-        extent = float(np.abs(local) @ size)
-    return float(data.geom_xpos[geom] @ direction + extent)

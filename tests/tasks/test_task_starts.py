@@ -10,25 +10,11 @@ from scipy.spatial.transform import Rotation
 from bidex_meta.hands.hand import SIDES
 from bidex_meta.tasks import registry
 from tests.hands import figures
+from tests.tasks import worlds
 from tests.tasks.formulas import FORMULAS
 from tests.tasks.oracle import Task, frame, nominal, shifted
 from tests.tasks.oracle import start as start_of
 from tests.tasks.tables import PLACES
-from tests.tasks.worlds import (
-    CASES,
-    MOVING,
-    Lens,
-    depths,
-    each_case,
-    engine_of,
-    fixtures_of,
-    object_joints_of,
-    objects_of,
-    observe,
-    scene_of,
-    task_of,
-    world_of,
-)
 
 RESETS = 1000
 # class: position noise (m) and joint noise (share of the range) of the classes whose objects start in any orientation.
@@ -75,14 +61,14 @@ def known() -> dict[tuple[str, bool], Started]:
 @pytest.fixture
 def started(known: dict[tuple[str, bool], Started], name: str, moving: bool) -> Started:
     if (name, moving) not in known:
-        world = world_of(name, moving, RESETS, tasks=RESETS)
+        world = worlds.world_of(name, moving, RESETS, tasks=RESETS)
         world.reset(seed=0)
-        engine = engine_of(world)
+        engine = worlds.engine_of(world)
         assert (engine.qvel == 0).all() and (engine.ctrl == 0).all() and (engine.xfrc_applied == 0).all()
         ((_, _, state),) = world.parts[0].states(world.task_index)
         known[name, moving] = Started(
             engine.placement().numpy().copy(),
-            [task_of(world, row) for row in range(RESETS)],
+            [worlds.task_of(world, row) for row in range(RESETS)],
             world.slots[0].task_class.success(state).numpy().copy(),
         )
     return known[name, moving]
@@ -94,27 +80,17 @@ def qpos(started: Started) -> np.ndarray:
 
 
 def scene(name: str, moving: bool):
-    return scene_of(world_of(name, moving, 1))
+    return worlds.scene_of(worlds.world_of(name, moving, 1))
 
 
-@each_case
+@worlds.each_case
 def test_nothing_starts_deep_in_anything(qpos: np.ndarray, name: str, moving: bool) -> None:
-    lens = Lens(scene(name, moving).model)
-    deepest = np.array([depths(lens.look(row)).max() for row in qpos])
+    lens = worlds.Lens(scene(name, moving).model)
+    deepest = np.array([worlds.depths(lens.look(row)).max() for row in qpos])
     assert deepest.max() < 0.005, f"{(deepest >= 0.005).sum()} of {RESETS} starts, the worst {deepest.max():.4f} m"
 
 
-@each_case
-def test_the_engines_own_depth_agrees(name: str, moving: bool) -> None:
-    world = world_of(name, moving, 8)
-    world.reset(seed=0)
-    engine, lens = engine_of(world), Lens(scene_of(world).model)
-    for row in range(8):
-        found = depths(lens.look(engine.placement()[row])).max()
-        assert engine.contact_depth(row) == pytest.approx(found, abs=1e-9)
-
-
-@each_case
+@worlds.each_case
 def test_joints_start_inside_their_limits_and_alike_in_both_hands(qpos: np.ndarray, name: str, moving: bool) -> None:
     places = scene(name, moving).qpos
     noise = NOISE.get(name, (0.0, 0.0))[1]
@@ -140,10 +116,10 @@ def test_joints_start_inside_their_limits_and_alike_in_both_hands(qpos: np.ndarr
     assert not different[:, never_opened].any()
 
 
-@pytest.mark.parametrize("name, moving", [case for case in CASES if case[0] in NOISE])
+@pytest.mark.parametrize("name, moving", [case for case in worlds.CASES if case[0] in NOISE])
 def test_thrown_objects_start_near_their_places_in_any_orientation(qpos: np.ndarray, name: str, moving: bool) -> None:
     places, noise, turns = scene(name, moving), NOISE[name][0], []
-    assert objects_of(places) == list(PLACES[name])
+    assert worlds.objects_of(places) == list(PLACES[name])
     for body, (place, _) in PLACES[name].items():
         pose = qpos[:, places.qpos[body]]
         shift = pose[:, :3] - np.array(place)
@@ -157,12 +133,12 @@ def test_thrown_objects_start_near_their_places_in_any_orientation(qpos: np.ndar
         np.testing.assert_array_equal(turns[0], other, err_msg="both objects share one orientation")
 
 
-@pytest.mark.parametrize("name", MOVING)
+@pytest.mark.parametrize("name", worlds.MOVING)
 def test_scenes_put_objects_at_their_nominal_starts(name: str) -> None:
     """Give or take the height at which contact margins hold them; BottleCap's bottle is moved off palm and thumb."""
     found = scene(name, True)
-    data = Lens(found.model).look(found.start_qpos)
-    assert {*objects_of(found), *fixtures_of(found)} == set(PLACES[name])
+    data = worlds.Lens(found.model).look(found.start_qpos)
+    assert {*worlds.objects_of(found), *worlds.fixtures_of(found)} == set(PLACES[name])
     for body, (position, rpy) in PLACES[name].items():
         place, turn = nominal(data, f"{body}/object")
         allowed = np.array((0.01, 0.02, 0.01)) if name == "BottleCap" else np.array((1e-9, 1e-9, 0.005))
@@ -173,11 +149,11 @@ def test_scenes_put_objects_at_their_nominal_starts(name: str) -> None:
 @pytest.mark.parametrize("name", PLACED)
 def test_table_objects_start_where_the_task_puts_them(name: str) -> None:
     """Shifted and turned by the task, then by the episode's small jitter about the vertical; nothing tips or sinks."""
-    world = world_of(name, True, 100, tasks=100)
+    world = worlds.world_of(name, True, 100, tasks=100)
     world.reset(seed=0)
-    lens, shifts = Lens(scene_of(world).model), []
+    lens, shifts = worlds.Lens(worlds.scene_of(world).model), []
     for row in range(world.num_envs):
-        data, task = lens.look(engine_of(world).placement()[row]), task_of(world, row)
+        data, task = lens.look(worlds.engine_of(world).placement()[row]), worlds.task_of(world, row)
         for body in PLACED[name]:
             (position, turn), (wanted, wanted_turn) = frame(data, f"{body}/object"), start_of(data, body, task)
             turned = (turn * wanted_turn.inv()).as_rotvec()
@@ -193,14 +169,14 @@ def test_table_objects_start_where_the_task_puts_them(name: str) -> None:
 )
 def test_fixtures_stand_where_the_task_puts_them(name: str) -> None:
     """Exactly there, in the engine that steps them, after each kind of reset, and still there after steps."""
-    world = world_of(name, True, 4, tasks=4, autoreset_mode="SAME_STEP", task_sampling="uniform")
+    world = worlds.world_of(name, True, 4, tasks=4, autoreset_mode="SAME_STEP", task_sampling="uniform")
     world.reset(seed=0)
-    engine, scene_, seen = engine_of(world), scene_of(world), set()
+    engine, scene_, seen = worlds.engine_of(world), worlds.scene_of(world), set()
     world.episodes.elapsed.fill_(int(world.max_episode_steps[0]) - 3)
     for _ in range(6):
         for row in range(world.num_envs):
-            task, data = task_of(world, row), engine.data(row)
-            for body in fixtures_of(scene_):
+            task, data = worlds.task_of(world, row), engine.data(row)
+            for body in worlds.fixtures_of(scene_):
                 centre, rpy = PLACES[name][body]
                 shift = (0.0, task["base_y"]) if "base_y" in task else (task[f"{body}_x"], task[f"{body}_y"])
                 position, turn = frame(data, f"{body}/object")
@@ -208,13 +184,13 @@ def test_fixtures_stand_where_the_task_puts_them(name: str) -> None:
                 assert (turn * Rotation.from_euler("xyz", rpy).inv()).magnitude() < 1e-6
                 seen.add((body, *position.tolist()))
         world.step(torch.zeros(world.num_envs, world.action_size))
-    assert len(seen) > len(fixtures_of(scene_)), "places differ from task to task"
+    assert len(seen) > len(worlds.fixtures_of(scene_)), "places differ from task to task"
 
 
-@each_case
+@worlds.each_case
 def test_joints_of_objects_start_shut(started: Started, name: str, moving: bool) -> None:
     places = scene(name, moving)
-    for joint in object_joints_of(places):
+    for joint in worlds.object_joints_of(places):
         if joint.startswith("water"):
             continue
         if name == "OpenScissors":
@@ -226,25 +202,27 @@ def test_joints_of_objects_start_shut(started: Started, name: str, moving: bool)
         np.testing.assert_allclose(started.placement[:, places.qpos[joint]][:, 0], wanted, atol=1e-7, err_msg=joint)
 
 
-@each_case
+@worlds.each_case
 def test_no_start_is_a_success(started: Started, name: str, moving: bool) -> None:
     assert not started.solved.any(), f"{int(started.solved.sum())} of {RESETS} starts"
-    lens = Lens(scene(name, moving).model)
+    lens = worlds.Lens(scene(name, moving).model)
     for row in range(0, RESETS, 50):
         judged = FORMULAS[name].judge(lens.look(started.placement[row]), started.tasks[row])
         assert not judged.success and not judged.failed
 
 
-@each_case
+@worlds.each_case
 def test_starts_differ_and_depend_on_the_seed_alone(qpos: np.ndarray, name: str, moving: bool) -> None:
     assert len(np.unique(qpos, axis=0)) == RESETS
-    world = world_of(name, moving, 5, tasks=world_tasks(name, moving)[:5])
+    world = worlds.world_of(name, moving, 5, tasks=world_tasks(name, moving)[:5])
     drawn = world.slots[0].task_class.start_draws > 0
-    assert drawn == (not fixtures_of(scene_of(world))), "an episode draws something but where there are fixtures alone"
+    assert drawn == (not worlds.fixtures_of(worlds.scene_of(world))), (
+        "an episode draws something but where there are fixtures alone"
+    )
     found = []
     for seed in (0, 1, 0, None):
         world.reset(seed=seed)
-        found.append(engine_of(world).placement().numpy())
+        found.append(worlds.engine_of(world).placement().numpy())
     np.testing.assert_array_equal(found[0], qpos[:5])
     np.testing.assert_array_equal(found[0], found[2])
     for other in (found[1], found[3]):
@@ -256,16 +234,19 @@ def world_tasks(name: str, moving: bool) -> np.ndarray:
     return registry.get(name, moving).variation_space.sample(np.random.default_rng(5), RESETS)
 
 
-@each_case
+@worlds.each_case
 def test_the_observation_after_a_reset_is_that_of_the_start(name: str, moving: bool) -> None:
-    world = world_of(name, moving, 4)
+    world = worlds.world_of(name, moving, 4)
     obs, _ = world.reset(seed=0)
-    np.testing.assert_array_equal(obs.double().numpy(), observe(world))
+    np.testing.assert_array_equal(obs.double().numpy(), worlds.observe(world))
     assert torch.equal(obs, world.reset(seed=0)[0])
 
 
 def test_an_egg_over_a_raised_metacarpal_is_not_deep_in_it() -> None:
     """The deepest of 8,000 starts before LFJ4 was looked at: 5.06 mm."""
-    world = world_of("TwoCatchUnderarm", True, 628)
+    world = worlds.world_of("TwoCatchUnderarm", True, 628)
     world.reset(seed=4)
-    assert depths(Lens(scene_of(world).model).look(engine_of(world).placement()[627])).max() < 0.005
+    assert (
+        worlds.depths(worlds.Lens(worlds.scene_of(world).model).look(worlds.engine_of(world).placement()[627])).max()
+        < 0.005
+    )

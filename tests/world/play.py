@@ -80,14 +80,6 @@ def engine_place(world: World, row: int) -> tuple[Any, int]:
     return part.group.engine, int(part.engine_rows[row])
 
 
-def put_object(world: World, row: int, height: float) -> None:
-    """Moves a row's (first) object to a height, metres."""
-    part = next(p for p in world.parts if int(p.engine_rows[row]) >= 0)
-    member = next(m for m in part.group.members if m.slot == int(world.task_id[row]))
-    place = next(where for name, where in member.scene.qpos.items() if name.startswith("object"))
-    part.group.engine.qpos[int(part.engine_rows[row]), place.start + 2] = height
-
-
 def world_at(world: World, mode: str = "DISABLED") -> World:
     """A new world of the same slots whose rows start the very episodes that ``world``'s rows are in, not staggered."""
     new = World(

@@ -73,36 +73,3 @@ def test_a_row_that_breaks_within_the_step_does_not_drag_on(name: str) -> None:
             assert engine._numbers[ROW].isfinite().all(), kind
             assert engine.batch.get_data(ROW).ncon < MOST_CONTACTS, kind
     assert broke, "nothing of it broke the row"
-
-
-@each_class
-def test_the_world_tells_the_row_and_starts_it_anew(name: str) -> None:
-    world, twin = class_world(name, ROWS), class_world(name, ROWS)
-    actions = random_actions(world, 12)
-    for made in (world, twin):
-        made.reset(seed=1)
-        made.step(actions[0])
-        made.episodes.elapsed = torch.zeros_like(made.episodes.elapsed)
-    for i, kind in enumerate(("NaN velocity", "NaN time", "quaternion of length zero")):
-        ways(engine_of(world))[kind](engine_of(world))
-        for k in range(3):
-            action = actions[1 + 3 * i + k]
-            obs, reward, _, truncated, info = world.step(action)
-            expected = twin.step(action)
-            assert info["unstable"].tolist() == [k == 0, False, False], kind
-            assert bool(truncated[ROW]) >= (k == 0) and obs.isfinite().all() and reward.isfinite().all()
-            assert torch.equal(obs[1:], expected[0][1:]) and torch.equal(reward[1:], expected[1][1:]), kind
-
-
-def test_a_start_that_is_not_finite_is_not_written() -> None:
-    world = class_world("DoorCloseInward", ROWS)
-    world.reset(seed=0)
-    engine = engine_of(world)
-    start = engine.placement()
-    start[1, 5] = torch.inf
-    before = start.clone()
-    engine.reset(torch.ones(ROWS, dtype=torch.bool), start)
-    assert engine.unstable().tolist() == [False, True, False]
-    assert engine.placement().isfinite().all() and torch.equal(engine.placement()[[0, 2]], before[[0, 2]])
-    engine.reset(torch.tensor([False, True, False]), before[:1])
-    assert not engine.unstable().any()

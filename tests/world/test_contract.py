@@ -6,7 +6,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 from bidex_meta.errors import BidexError
 from bidex_meta.world import World
-from tests.world.play import flat, play, random_actions, suite_world
+from tests.world.play import play, random_actions, suite_world
 
 ROWS = 10
 
@@ -34,29 +34,6 @@ def test_entries_are_clipped_to_five(world: World) -> None:
     world.reset(seed=0)
     biggest = max(float(step["info/final_obs"].abs().max()) for step in play(world, random_actions(world, 30)))
     assert biggest == 5.0
-
-
-def test_reward_terms_sum_to_the_reward(world: World) -> None:
-    world.reset(seed=1)
-    for action in random_actions(world, 30):
-        _, reward, *_, info = world.step(action)
-        assert torch.allclose(
-            torch.stack([*info["reward_terms"].values()]).sum(dim=0), info["reward_unscaled"], atol=1e-6
-        )
-        assert torch.equal(reward, info["reward_unscaled"])  # the suite's scale is 1
-
-
-def test_reward_scale_changes_the_reward_alone() -> None:
-    plain = suite_world("MT4", 4)
-    slots = [type(s)(s.name, s.task_class, s.tasks, 0.25) for s in plain.slots]
-    scaled = World(slots, 4, observation="one-hot", task_sampling="uniform", threads=1)
-    plain.reset(seed=0)
-    scaled.reset(seed=0)
-    for action in random_actions(plain, 20):
-        a, b = flat(plain.step(action)), flat(scaled.step(action))
-        assert torch.equal(a["reward"] * 0.25, b["reward"])
-        assert torch.equal(a["info/reward_unscaled"], b["info/reward_unscaled"])
-        assert torch.equal(a["obs"], b["obs"])
 
 
 def test_attributes_and_calls(world: World) -> None:

@@ -4,7 +4,6 @@ from typing import Any
 import pytest
 import torch
 
-from bidex_meta.errors import BidexError
 from bidex_meta.world import World
 from tests.world.play import (
     CLASSES,
@@ -121,33 +120,3 @@ def test_frozen_rows_stay_frozen_through_a_file() -> None:
     assert world.episodes.finished.any()
     other.load_state_dict(through_a_file(world.state_dict()))
     assert_same(play(world, actions[80:]), play(other, actions[80:]))
-
-
-def same(a: Any, b: Any) -> None:
-    if isinstance(a, dict):
-        assert a.keys() == b.keys()
-        for key in a:
-            same(a[key], b[key])
-    elif isinstance(a, list):
-        for x, y in zip(a, b, strict=True):
-            same(x, y)
-    else:
-        assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
-
-
-@pytest.mark.parametrize(("suite", "rows", "split"), [("MT4", 9, "train"), ("ML4", 8, "train"), ("MT1", 8, "train")])
-def test_a_state_of_another_size_is_refused(suite: str, rows: int, split: str) -> None:
-    world, other = suite_world("MT4", 8), suite_world(suite, rows, split=split)
-    world.reset(seed=0)
-    other.reset(seed=0)
-    before = other.state_dict()
-    with pytest.raises(BidexError, match=r"of a world.s state .*same suite, split and num_envs"):
-        other.load_state_dict(world.state_dict())
-    same(before, other.state_dict())
-
-
-def test_a_state_of_another_suite_with_equal_sizes_is_refused() -> None:
-    world, other = (suite_world("ML4", 6, split=split) for split in ("train", "test"))
-    world.reset(seed=0)
-    with pytest.raises(BidexError):
-        other.load_state_dict(world.state_dict())

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from torch import Tensor
 
 from bidex_meta.metaworld.batched import MetaWorldWorld
 from bidex_meta.world import World
 from tests.points import PointWorld, ring
-from tests.world.play import ENDS, class_world, random_actions, suite_world
+from tests.world.play import ENDS, random_actions, suite_world
 
 
 class Countdown(gymnasium.Env):
@@ -106,14 +105,3 @@ def test_without_stagger_first_episodes_are_whole() -> None:
         assert torch.equal(info["counted"], info["_final_obs"])
         ended |= info["_final_obs"]
     assert ended.any()
-
-
-def test_time_goes_by() -> None:
-    world = class_world("CatchUnderarm", 2)
-    world.reset(seed=0)
-    times: list[Tensor] = []
-    while len(times) < 2:
-        info = world.step(torch.ones(world.action_space.shape or ()))[-1]
-        if info["counted"].any():
-            times.append(info["episode"]["t"][info["counted"]])
-    assert all(((t > 0) & (t < 600)).all() for t in times)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from bidex_meta.benchmark import make_task_world
-from bidex_meta.errors import BidexError
 from bidex_meta.utils import gl_backend
 
 
@@ -52,14 +51,3 @@ def test_one_renderer_draws_a_film_and_closes_with_the_world(world):
     assert pickle.loads(pickle.dumps(world._painter))._renderers == {}
     world.close()
     assert FakeRenderer.open == 0
-
-
-def test_bad_pictures_are_one_line(world):
-    for asked, told in (
-        ({"camera": "frnt"}, "camera among front"),
-        ({"row": 3}, "row: expected a whole number from 0 to 2, got 3"),
-        ({"width": 4000}, "at most 1920 x 1080 pixels, got 4000 x 480"),
-        ({"height": 0}, "height: expected a whole number from 1 on, got 0"),
-    ):
-        with pytest.raises(BidexError, match=told):
-            world.render(**asked)

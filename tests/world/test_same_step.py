@@ -4,13 +4,11 @@ from torch import Tensor
 
 from bidex_meta.world import World
 from tests.world.play import (
-    THROWN,
     assert_same,
     class_world,
     flat,
     number_of_ends,
     play,
-    put_object,
     random_actions,
     suite_world,
     world_at,
@@ -96,30 +94,6 @@ def test_an_ended_row_shows_its_next_episode_as_a_fresh_world_does() -> None:
             assert torch.equal(fresh.task_index[ended], world.task_index[ended])
             ends += int(ended.sum())
     assert ends >= 15
-
-
-@pytest.mark.parametrize("name", THROWN)
-def test_time_limits_truncate_and_drops_terminate(name: str) -> None:
-    world = class_world(name, 4)
-    world.reset(seed=0)
-    limit = world.max_episode_steps[0]
-    world.episodes.elapsed = torch.stack((limit - 1, limit - 1, limit - 2, limit - 2))
-    put_object(world, 1, 0.1)
-    put_object(world, 3, 0.1)
-    step = flat(world.step(torch.zeros(4, world.action_size)))
-    assert step["truncated"].tolist() == [True, False, False, False]
-    assert step["terminated"].tolist() == [False, True, False, True]  # dropped at the time limit: dropped
-    assert step["info/_final_obs"].tolist() == [True, True, False, True]
-    z = (
-        world.slots[0].task_class.layout.range(next(b for b in ("object_pose", "object1_pose") if _has(world, b))).start
-        + 2
-    )
-    assert (step["info/final_obs"][[1, 3], z] < 0.2).all()
-    assert (step["obs"][:, z] > 0.3).all()
-
-
-def _has(world: World, block: str) -> bool:
-    return block in [b.name for b, _ in world.slots[0].task_class.layout]
 
 
 def test_success_belongs_to_the_transition_also_in_a_reset_row() -> None:

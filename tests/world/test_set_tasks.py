@@ -61,12 +61,3 @@ def test_episodes_draw_among_the_new_tasks() -> None:
         world.step(torch.zeros(32, 52))
         seen |= set(world.task_index.tolist())
     assert seen == {0, 1}
-
-
-def test_starts_go_on_with_the_next_episodes() -> None:
-    world = suite_world("MT4", 4, "DISABLED")
-    first, _ = world.reset(seed=0)
-    world.set_tasks({})
-    second, _ = world.reset()
-    assert (first != second).any(dim=1).all()
-    assert world.episodes.number.tolist() == [1] * 4

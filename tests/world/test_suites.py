@@ -1,7 +1,6 @@
 import pytest
 import torch
 
-from bidex_meta.world import World
 from tests.world.play import class_world, play, random_actions, suite_world
 
 
@@ -36,44 +35,6 @@ def test_one_world_steps_every_class_of_the_large_suites(suite: str, split: str,
     assert [len(slot.tasks) for slot in world.slots] == [50] * classes
     last = play(world, random_actions(world, 5))[-1]
     assert last["obs"].shape == obs.shape and last["obs"].isfinite().all() and (last["obs"] != obs).any(dim=1).all()
-
-
-def test_goals_are_visible_in_mt() -> None:
-    world = suite_world("MT4", 12)
-    obs, _ = world.reset(seed=0)
-    for step in [None, *random_actions(world, 40)]:
-        if step is not None:
-            obs = world.step(step)[0]
-        for slot, rows in zip(world.slots, world.slot_rows, strict=True):
-            variations = torch.as_tensor(slot.tasks)[world.task_index[rows]]
-            names, layout = slot.task_class.variation_space.names, slot.task_class.layout
-            for goal in [b.name for b, _ in layout if b.goal and b.name.endswith("_pose")]:
-                x = names.index(goal.removesuffix("_pose") + "_x")
-                block = layout.range(goal)
-                shown = obs[rows, block.start : block.start + 3]
-                assert torch.equal(shown, variations[:, x : x + 3].float())
-                assert torch.allclose(obs[rows, block.start + 3 : block.stop].norm(dim=1), torch.ones(len(shown)))
-
-
-@pytest.mark.parametrize(("suite", "split"), [("ML4", "train"), ("ML4", "test"), ("ML1", "train"), ("ML1", "test")])
-def test_goals_are_zero_in_ml_and_nothing_else_is_touched(suite: str, split: str) -> None:
-    world = suite_world(suite, 6, "SAME_STEP", split)
-    shown = World(world.slots, 6, seed=world.seed, pad_to=world.observation_size, threads=1)
-    first, second = world.reset(seed=0)[0], shown.reset(seed=0)[0]
-    actions = random_actions(world, 60)
-    pairs = [(first, second)]
-    for a, b in zip(play(world, actions), play(shown, actions), strict=True):
-        pairs += [(a["obs"], b["obs"]), (a["info/final_obs"], b["info/final_obs"])]
-        for name in ("reward", "terminated", "truncated", "info/success"):
-            assert torch.equal(a[name], b[name])
-    for masked, plain in pairs:
-        for slot, rows in enumerate(world.slot_rows):
-            goal = world.slots[slot].task_class.layout.goal_indices()
-            assert len(goal) == (22 if world.task_names[slot] == "TwoCatchUnderarm" else 11)
-            assert (masked[rows][:, goal] == 0).all()
-            assert (plain[rows][:, goal] != 0).any(dim=1).all()
-            rest = sorted(set(range(world.observation_size)) - set(goal))
-            assert torch.equal(masked[rows][:, rest], plain[rows][:, rest])
 
 
 def test_ml_and_evaluation_rows_keep_task_j_mod_n() -> None:
@@ -121,16 +82,3 @@ def test_a_class_in_a_suite_moves_as_on_its_own() -> None:
                 assert torch.equal(step[key][rows], own[key]), (name, key)
             for key in ("obs", "info/final_obs"):
                 assert torch.equal(step[key][rows, :size], own[key]), (name, key)
-
-
-def test_observations_are_those_of_the_state_after_the_step() -> None:
-    """Not of the last substep's beginning, where MuJoCo's sensors stand after a plain step."""
-    world = class_world("CatchUnderarm", 4)
-    world.reset(seed=0)
-    part, layout = world.parts[0], world.slots[0].task_class.layout
-    place, shown = part.group.members[0].scene.qpos["object"].start, layout.range("object_pose").start
-    for action in random_actions(world, 10):
-        obs = world.step(action)[-1]["final_obs"]
-        going = world.episodes.elapsed > 0
-        qpos = part.group.engine.qpos[going, place : place + 3]
-        assert torch.allclose(obs[going, shown : shown + 3].double(), qpos, atol=1e-7, rtol=0.0)

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from bidex_meta import Benchmark
-from bidex_meta.errors import BidexError
 from bidex_meta.world import World
 from tests.world.play import assert_same, flat, play, random_actions
 from tests.world.test_masked import assert_steps_look_at_nothing
@@ -130,13 +129,6 @@ def test_a_saved_world_goes_on_as_it_would_have(world: World) -> None:
     whole = play(world, actions[10:])
     world.load_state_dict(state)
     assert_same(whole, play(world, actions[10:]))
-
-
-def test_what_does_not_fit_is_refused() -> None:
-    with pytest.raises(BidexError, match="c, warp"):
-        make("gpu")
-    with pytest.raises(BidexError, match="CUDA"):
-        World(make("c").slots, ROWS, device=f"cuda:{torch.cuda.device_count()}")
 
 
 def test_a_row_broken_by_hand_stands_at_the_reference_pose_and_is_told(evaluation_world: World) -> None:

@@ -16,17 +16,14 @@ from bidex_meta.errors import BidexError, known_name, shortened
 from bidex_meta.hands.poses import PALM_UP_AWAY, HandPose
 from bidex_meta.hands.starts import make_room_for
 from bidex_meta.tasks.objects.mjcf import check_collisions, compiled, extents, outline, read_own, set_contacts
-from bidex_meta.tasks.scene import Colour, Point, attach
+from bidex_meta.tasks.scene import Colour, Point, SceneObject
 from bidex_meta.utils import paths
 from bidex_meta.utils.files import expanded
 from bidex_meta.utils.maths import conjugate, constant, multiply, rotate, wxyz, xyzw
 
 EGG = "egg"
-_MASS = (0.002, 2.0)
-"""Of an object, kg: a hand has 5."""
 _LONGEST, _SHORTEST = 0.25, 0.01
 """The longest edge of the box around an object, metres: a hand is 20 cm long from the wrist to the middle fingertip."""
-_MOST_GEOMS = 32
 _PALM_UP = HandPose((0.0, 0.0, 0.0), PALM_UP_AWAY)
 
 
@@ -56,7 +53,7 @@ class HeldObject:
         return x, y, z
 
     def add_to(self, scene: mujoco.MjSpec, name: str, position: Point, colour: Colour | None = None) -> None:
-        """Puts it into a scene as a free body; arguments as of ``attach``."""
+        """Puts it into a scene as a free body; arguments as of ``SceneObject``."""
         part = read_own(self.file)
         body = part.worldbody.first_body()
         body.name = "object"
@@ -66,9 +63,11 @@ class HeldObject:
         set_contacts(part)
         for geom in part.geoms:
             geom.condim = 3
-        for sensor, kind in _SENSORS.items():
-            part.add_sensor(name=sensor, type=kind, objtype=mujoco.mjtObj.mjOBJ_XBODY, objname="object")
-        attach(scene, part, name, position, (1.0, 0.0, 0.0, 0.0), colour)
+        kinds = {"position": "POS", "quaternion": "QUAT", "linear_velocity": "LINVEL", "angular_velocity": "ANGVEL"}
+        for sensor, kind in kinds.items():
+            of = mujoco.mjtSensor.__members__[f"mjSENS_FRAME{kind}"]
+            part.add_sensor(name=sensor, type=of, objtype=mujoco.mjtObj.mjOBJ_XBODY, objname="object")
+        SceneObject(name, self.name, position, colour=colour).attach(scene, part)
 
     def needs(self, egg: Capacity, count: int = 1) -> Capacity:
         """Room for contacts of a class with so many of it, from the class's need with eggs."""
@@ -122,14 +121,6 @@ class HeldObject:
         return (torch.as_tensor(self.radii).to(place) - points[..., 2]).amax(dim=1)
 
 
-_SENSORS = {
-    "position": mujoco.mjtSensor.mjSENS_FRAMEPOS,
-    "quaternion": mujoco.mjtSensor.mjSENS_FRAMEQUAT,
-    "linear_velocity": mujoco.mjtSensor.mjSENS_FRAMELINVEL,
-    "angular_velocity": mujoco.mjtSensor.mjSENS_FRAMEANGVEL,
-}
-
-
 def shelf() -> list[str]:
     """Names of the shelf, sorted; the egg is not among them."""
     return sorted(path.stem for path in (paths.assets_dir() / "objects" / "shelf").glob("*.xml"))
@@ -170,7 +161,7 @@ def _loaded(file: Path, _state: tuple[int, int]) -> HeldObject:
     if (spec.body("object") or bodies[0]) is not bodies[0] or not list(bodies[0].geoms):
         raise BidexError(f"{file}: expected a <body> with geoms, got none. Add its shape.")
     model = compiled(file, spec)
-    collide = check_collisions(file, model, _MOST_GEOMS)
+    collide = check_collisions(file, model, 32)
     centres, radii = outline(model, 1)
     low, high = extents(model, 1)
     _check_figures(file, model, low, high)
@@ -179,7 +170,7 @@ def _loaded(file: Path, _state: tuple[int, int]) -> HeldObject:
 
 
 def _check_figures(file: Path, model: mujoco.MjModel, low: np.ndarray, high: np.ndarray) -> None:
-    mass, longest, (least, most) = float(model.body_mass[1]), float((high - low).max()), _MASS
+    mass, longest, (least, most) = float(model.body_mass[1]), float((high - low).max()), (0.002, 2.0)  # a hand has 5
     if not least <= mass <= most:
         raise BidexError(f"{file}: expected a mass of {least:g} to {most:g} kg, got {mass:.4g}. Mend mass or density.")
     if not _SHORTEST <= longest <= _LONGEST:

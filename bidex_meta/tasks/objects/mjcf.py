@@ -17,18 +17,16 @@ from bidex_meta.errors import BidexError, one_line, shortened
 from bidex_meta.utils.files import is_file, read_bytes
 
 _MOST_BYTES, _MOST_MESH_BYTES = 1_000_000, 20_000_000
-_MOST_TAGS = 2_000
-_DEEPEST = 32
-_OUTER_TAGS = frozenset(("mujoco", "compiler", "default", "asset", "material", "texture", "mesh", "worldbody"))
-_TAGS = _OUTER_TAGS | {"body", "inertial", "geom", "joint", "freejoint", "site"}
+_MOST_TAGS, _DEEPEST = 2_000, 32
+_TAGS = {"mujoco", "compiler", "default", "asset", "material", "texture", "mesh", "worldbody"}
+_TAGS |= {"body", "inertial", "geom", "joint", "freejoint", "site"}
 """What a file may hold; sensors may stand in a file that names points (``points=True``)."""
-_SENSOR_TAGS = frozenset(["sensor", "framepos", "framequat", "framelinvel", "frameangvel", "jointpos"])
+_SENSOR_TAGS = {"sensor", "framepos", "framequat", "framelinvel", "frameangvel", "jointpos"}
 _SOLREF, _SOLIMP, _MARGIN = (0.0084, 1.0), (0.95, 0.99, 0.001), 0.002
 """As those of the files under assets/objects: as stiff as the time step allows (bidex_meta/hands/README.md)."""
 _NOT_FINITE = re.compile(r"(?:^|\s)[+-]?(?:inf(?:inity)?|nan(?:\([^)]*\))?)(?:\s|$)", re.IGNORECASE)
 """MuJoCo takes such numbers, and writes a log file into the working folder."""
 _MOST_FRICTION = 5.0
-_FOLDERS = ("meshdir", "texturedir", "assetdir")
 
 
 def read_own(path: Path, points: bool = False) -> mujoco.MjSpec:
@@ -43,13 +41,10 @@ def read_own(path: Path, points: bool = False) -> mujoco.MjSpec:
         spec = mujoco.MjSpec.from_string(content.decode())
     except (ValueError, UnicodeDecodeError) as error:
         raise BidexError(f"{path}: expected an object in MJCF, but {_reason(error)}") from None
-    folders = {name: getattr(spec, name, "") or "" for name in ("meshdir", "texturedir")}
-    for mesh in spec.meshes:
-        if mesh.file:
-            mesh.file = str(_beside(path, Path(folders["meshdir"]) / mesh.file))
-    for texture in spec.textures:
-        if texture.file:
-            texture.file = str(_beside(path, Path(folders["texturedir"]) / texture.file))
+    for folder, parts in ((spec.meshdir, spec.meshes), (spec.texturedir, spec.textures)):
+        for part in parts:
+            if part.file:
+                part.file = str(_beside(path, Path(folder) / part.file))
     spec.meshdir = spec.texturedir = ""
     return spec
 
@@ -72,13 +67,14 @@ def set_contacts(spec: mujoco.MjSpec) -> None:
         geom.margin, geom.gap = _MARGIN, 0.0
 
 
-def check_collisions(path: Path, model: mujoco.MjModel, most: int) -> int:
-    """The number of geoms that collide.
+def colliding(model: mujoco.MjModel) -> int:
+    """The number of geoms that collide."""
+    return int(((model.geom_contype != 0) | (model.geom_conaffinity != 0)).sum())
 
-    Raises:
-        BidexError: None, or more than ``most``, or one with too much friction.
-    """
-    geoms = int(((model.geom_contype != 0) | (model.geom_conaffinity != 0)).sum())
+
+def check_collisions(path: Path, model: mujoco.MjModel, most: int) -> int:
+    """The number of geoms that collide; BidexError for none, more than ``most``, or one with too much friction."""
+    geoms = colliding(model)
     if not 0 < geoms <= most:
         raise BidexError(f"{path}: expected at least one and at most {most} geoms that collide, got {geoms}. Mend it.")
     friction = float(model.geom_friction[:, 0].max())
@@ -104,7 +100,7 @@ def _beside(path: Path, name: Path) -> Path:
     return found
 
 
-def _check_tags(path: Path, content: bytes, allowed: frozenset[str]) -> None:
+def _check_tags(path: Path, content: bytes, allowed: set[str]) -> None:
     """Refuses entities, which may expand without end, and every tag that is not allowed."""
 
     def refuse(expected: str, received: str, mend: str) -> NoReturn:
@@ -126,7 +122,7 @@ def _check_tags(path: Path, content: bytes, allowed: frozenset[str]) -> None:
         for key, value in attributes.items():
             if _NOT_FINITE.search(value):
                 refuse("finite numbers", f"{key}={shortened(one_line(value))}", "Mend the file.")
-        for key in _FOLDERS:
+        for key in ("meshdir", "texturedir", "assetdir"):
             if Path(attributes.get(key, "")).is_absolute():
                 refuse("a folder beside the file", f"{key} with an absolute path", "Write a relative one.")
 
@@ -134,12 +130,10 @@ def _check_tags(path: Path, content: bytes, allowed: frozenset[str]) -> None:
         nonlocal depth
         depth -= 1
 
-    def doctype(*_: object) -> None:
-        refuse("plain MJCF", "a document type, which may define entities", "Leave it out.")
-
     parser = expat.ParserCreate()
     parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.StartDoctypeDeclHandler = doctype
+    received = "a document type, which may define entities"
+    parser.StartDoctypeDeclHandler = lambda *_: refuse("plain MJCF", received, "Leave it out.")
     try:
         parser.Parse(content, True)
     except (expat.ExpatError, ValueError) as error:
@@ -148,12 +142,9 @@ def _check_tags(path: Path, content: bytes, allowed: frozenset[str]) -> None:
         raise BidexError(f"{path}: expected MJCF, but it is no XML: {one_line(error)}.") from None
 
 
-_AROUND = 12
-"""Points around a cylinder's rim, which stand out by 3.5 % so that nothing of the rim does."""
-_OVER = 128
-"""Directions in which an ellipsoid's and a mesh's outermost points are taken."""
-
-
+_AROUND, _OVER = 12, 128
+"""Points around a cylinder's rim, which stand out by 3.5 % so that nothing of the rim does; directions in which an
+ellipsoid's and a mesh's outermost points are taken."""
 _SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 
 
@@ -188,12 +179,9 @@ def extents(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
     """
     centres, radii = outline(model, body)
     low, high = (centres - radii[:, None]).min(axis=0), (centres + radii[:, None]).max(axis=0)
-    corners = np.concatenate(
-        [
-            (model.geom_aabb[geom, :3] + _SIGNS * model.geom_aabb[geom, 3:]) @ turn.T + model.geom_pos[geom]
-            for geom, turn in _colliding(model, body)
-        ]
-    )
+    boxes, own = model.geom_aabb, _colliding(model, body)
+    ends = [(boxes[geom, :3] + _SIGNS * boxes[geom, 3:]) @ turn.T + model.geom_pos[geom] for geom, turn in own]
+    corners = np.concatenate(ends)
     return np.maximum(low, corners.min(axis=0)), np.minimum(high, corners.max(axis=0))
 
 

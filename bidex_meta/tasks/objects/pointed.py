@@ -13,9 +13,9 @@ import torch
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.errors import BidexError, shortened
-from bidex_meta.tasks.objects.mjcf import check_collisions, compiled, outline, read_own, set_contacts
+from bidex_meta.tasks.objects.mjcf import check_collisions, colliding, compiled, outline, read_own, set_contacts
 from bidex_meta.tasks.reach import ReachTask
-from bidex_meta.tasks.scene import SceneObject, attach, compile_scene
+from bidex_meta.tasks.scene import SceneObject, compile_scene
 from bidex_meta.utils import paths
 from bidex_meta.utils.files import absolute
 
@@ -36,7 +36,7 @@ class PointedObject(SceneObject):
     def add_to(self, scene: mujoco.MjSpec) -> None:
         part = read_own(Path(self.asset), points=True)
         set_contacts(part)
-        attach(scene, part, self.name, self.position, self.quaternion, self.colour)
+        self.attach(scene, part)
 
 
 class OwnObjectClass(ReachTask):
@@ -69,7 +69,7 @@ class OwnObjectClass(ReachTask):
         digest = hashlib.blake2b(buffer.tobytes(), digest_size=16).hexdigest()
         self.own = PointedObject(usual.name, str(file), usual.position, usual.rpy, usual.colour, digest)
         self.objects = (self.own,)
-        more = 4 * max(0, _colliding(model) - _colliding(_usual_model(usual)))
+        more = 4 * max(0, colliding(model) - colliding(_usual_model(usual)))
         self.needs = Capacity(self.needs.contacts + more, self.needs.convex + more, self.needs.rows + 3 * more)
         depth, other = _depth_at_start(self)
         if depth > _DEEPEST:
@@ -134,10 +134,6 @@ def _depth_at_start(task: OwnObjectClass) -> tuple[float, str]:
 @lru_cache(maxsize=8)
 def _usual_model(usual: SceneObject) -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_path(str(paths.assets_dir() / "objects" / f"{usual.asset}.xml"))
-
-
-def _colliding(model: mujoco.MjModel) -> int:
-    return int(((model.geom_contype != 0) | (model.geom_conaffinity != 0)).sum())
 
 
 def _named(model: mujoco.MjModel, kind: str) -> dict[str, int]:

@@ -1,0 +1,224 @@
+"""Jointed things on a table: appendix A.2.12, A.2.14 and A.2.15; docs/figures.md, classes."""
+
+import math
+from dataclasses import replace
+
+import mujoco
+import torch
+from torch import Tensor
+
+from bidex_meta.engine.capacity import Capacity
+from bidex_meta.tasks.base import FAST, THIN
+from bidex_meta.tasks.goals import frozen_goal
+from bidex_meta.tasks.layout import goal_blocks, handle_blocks, object_blocks, point_block
+from bidex_meta.tasks.placement import DRAWS, SHIFT, place, placed, yaw_quaternion
+from bidex_meta.tasks.reach import ReachTask, apart
+from bidex_meta.tasks.scene import Point, SceneObject, Table
+from bidex_meta.tasks.state import TaskState
+from bidex_meta.tasks.variation import component, join
+from bidex_meta.utils.maths import (
+    conjugate,
+    constant,
+    multiply,
+    norm,
+    quaternion_from_rpy,
+    quaternion_product,
+    rotate,
+    xyzw,
+)
+
+_SCISSORS = SceneObject("scissors", "scissors", (0.0, 0.0, 0.608), (0.0, 0.0, 0.5 * math.pi))
+_PIVOT, _RIGHT_HANDLE = (-0.0034, 0.0698, 0.0), (0.1, -0.2, 0.0)
+"""The pivot on the left hand's half, and the right handle's point from there on the other half, metres
+(docs/figures.md, objects)."""
+
+
+class OpenScissors(ReachTask):
+    """Open shears that lie on a table by a task's angle, each hand at its loop.
+
+    Observation: Table 30 (428). Reward: equation 14. The formula leaves the target angle open: a task freezes it (0 is
+    34 degrees open; shut, where episodes start, is -0.59). The object pose is that of the left hand's half. The goal
+    block is of the half that moves: its handle's point and its orientation at the target angle, with the other half
+    where it is now; the rotation difference is that half's too, so that it shows the missing angle.
+    """
+
+    needs = Capacity(57, 0, 131)
+    name = "OpenScissors"
+    summary = "Open shears to a given angle with both hands"
+    formula = "2 - d_left - d_right + 5 (0.59 - r), r the angle between the hinge and its target"
+    solved = "hinge within 0.1 rad of its target"
+    deviations = ("The loops are hollow; the original's are filled.", "The goal block moves with the shears.")
+    episode_steps = 150
+    start_draws = DRAWS
+    solver = THIN
+    table = Table((0.5, 1.0, 0.6), (0.0, 0.0, 0.3))
+    objects = (_SCISSORS,)
+    points = ("scissors/left_handle_position", "scissors/right_handle_position")
+    constant = 2.0
+    camera_target = (0.08, 0.0, 0.66)
+    variation_space = join(placed("scissors"), component("target_angle", -0.15, 0.3))
+    blocks = (
+        *object_blocks("scissors"),
+        *goal_blocks("goal"),
+        *handle_blocks("scissors", "in the right hand's loop", "in the left hand's loop"),
+    )
+
+    def freeze(self, variation: Tensor) -> dict[str, Tensor]:
+        """``scissors``: place (n, 3); ``target``: angle (n, 1); ``turn``: quaternion (n, 4); ``ghost``: pose (n, 7)."""
+        root = variation.new_tensor((*_SCISSORS.position, *_SCISSORS.quaternion)).repeat(len(variation), 1)
+        place(root, variation[:, :3])
+        turn = yaw_quaternion(variation[:, 3])
+        ghost = _opened(root[:, :3], xyzw(root[:, 3:]), turn)
+        return {"scissors": variation[:, :3], "target": variation[:, 3:], "turn": turn, "ghost": ghost}
+
+    def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
+        super().start(draws, frozen, qpos)
+        qpos["scissors/hinge"].fill_(-0.59)
+
+    def observe(self, state: TaskState) -> dict[str, Tensor]:
+        rotation = state.quaternion("scissors/quaternion")
+        goal = _opened(state["scissors/position"], rotation, state.frozen["turn"])
+        missing = multiply(state.quaternion("scissors/half_quaternion"), conjugate(goal[:, 3:]))
+        return {"goal_pose": goal, "goal_rotation_difference": missing}
+
+    def target(self, state: TaskState) -> Tensor:
+        return 5.0 * (0.59 - _missing(state))
+
+    def success(self, state: TaskState) -> Tensor:
+        return _missing(state) < 0.1
+
+    def ghosts(self, frozen: dict[str, Tensor]) -> list[tuple[Tensor, Point]]:
+        return [(frozen["ghost"], (0.02, 0.02, 0.01))]
+
+
+def _opened(position: Tensor, rotation: Tensor, turn: Tensor) -> Tensor:
+    """Pose (n, 7) of the right handle's point on the half that is opened by ``turn`` (n, 4) from the other half."""
+    opened = multiply(rotation, turn)
+    pivot = position + rotate(rotation, constant(_PIVOT, position))
+    return torch.cat((pivot + rotate(opened, constant(_RIGHT_HANDLE, position)), opened), dim=1)
+
+
+def _missing(state: TaskState) -> Tensor:
+    return state.once("missing", lambda: (state["scissors/angle"] - state.frozen["target"]).abs()[:, 0])
+
+
+_PEN = SceneObject("pen", "pen", (0.0, 0.0, 0.612), (0.5 * math.pi, 0.5 * math.pi, 0.0))
+_OPEN = 0.3
+_BODY_POINT = 0.07
+"""Where the body point lies on the pen's axis, metres; the cap's point lies towards the other end."""
+
+
+class OpenPenCap(ReachTask):
+    """Pull the cap off a pen that lies on a table: the left hand at its body, the right hand at its cap.
+
+    Observation: Table 34 (428). Reward: equation 16. Success is a cap pulled 13 cm, its own length. Goal position is
+    the cap's point at 0.3 m with the body at the task's start, goal orientation the pen's there; reward and success do
+    not read them.
+    """
+
+    needs = Capacity(56, 0, 121)
+    name = "OpenPenCap"
+    summary = "Pull the cap off a pen"
+    formula = "exp(-10 d_left) + exp(-10 d_right) + 5 d - 0.8, d between the points on body and cap"
+    solved = "points on body and cap more than 0.3 m apart"
+    deviations = ("The pen lies on flats; the original's rolls.",)
+    episode_steps = 125
+    start_draws = DRAWS
+    solver = replace(THIN, integrator=mujoco.mjtIntegrator.mjINT_IMPLICIT)
+    table = Table((0.5, 1.0, 0.6), (0.0, 0.0, 0.3))
+    objects = (_PEN,)
+    points = ("pen/body_position", "pen/cap_position")
+    constant = -0.8
+    exponential = True
+    ghost = (0.012, 0.012, 0.012)
+    camera_target = (0.12, 0.0, 0.66)
+    variation_space = placed("pen")
+    blocks = (
+        *object_blocks("pen"),
+        *goal_blocks("goal"),
+        point_block("pen_body_position", "pen/body_position", "point on the pen's body for the left hand"),
+        point_block("pen_cap_position", "pen/cap_position", "point on the pen's cap for the right hand"),
+    )
+
+    def freeze(self, variation: Tensor) -> dict[str, Tensor]:
+        """``pen``: place (n, 3); ``goal``: pose (n, 7); ``goal_inverse``: inverse of its rotation (n, 4)."""
+        pen = variation.new_tensor((*_PEN.position, *_PEN.quaternion)).repeat(len(variation), 1)
+        place(pen, variation)
+        rotation = xyzw(pen[:, 3:])
+        cap = pen[:, :3] + rotate(rotation, pen.new_tensor((0.0, 0.0, _BODY_POINT - _OPEN)))
+        return {"pen": variation, **frozen_goal(torch.cat((cap, rotation), dim=1))}
+
+    def target(self, state: TaskState) -> Tensor:
+        return 5.0 * apart(state, *self.points)
+
+    def success(self, state: TaskState) -> Tensor:
+        return apart(state, *self.points) > _OPEN
+
+
+_FACE_UP = (math.pi, 0.5 * math.pi, 0.0)
+_TRAVEL = 0.5585
+_PRESSED = (-0.0241, -0.001, 0.0427)
+"""The button point at full travel from the base, world axes: hinge origin and point lie flush with the face there."""
+_PRESSED_QUATERNION = quaternion_product(quaternion_from_rpy(_FACE_UP), quaternion_from_rpy((0.0, _TRAVEL, 0.0)))
+"""Orientation (w, x, y, z) of the rocker at full travel."""
+
+
+class Switch(ReachTask):
+    """Press the buttons of two rocker switches.
+
+    Table 0.5 x 1 x 0.55 m. Observation: Table 36 (428). Reward: equation 17. The half of each rocker that stands proud
+    is the button, its point 3.5 cm from the hinge on the surface, its target the same point at full travel. Switch 1 is
+    the one at -y, the left hand's. The entries of switch 1's pose and velocity are its rocker's, since the housing does
+    not move. The goal block holds switch 1's target and its rocker's orientation there. A task freezes where the
+    housings stand, 3 cm around the nominal place, unturned; an episode draws nothing.
+    """
+
+    needs = Capacity(36, 0, 90)
+    name = "Switch"
+    summary = "Press the buttons of two rocker switches"
+    formula = "2 - d_left - d_right + 50 (1.4 - d), d the sum of both buttons' distances to where they are pressed"
+    solved = "both rockers past 80 % of their travel"
+    deviations = (
+        "A button's target is its own point at full travel; the original asks for a height it cannot reach.",
+        "Tasks shift the housings, but do not turn them.",
+    )
+    episode_steps = 125
+    start_draws = 0
+    solver = FAST
+    table = Table((0.5, 1.0, 0.55), (0.0, 0.0, 0.275))
+    objects = (
+        SceneObject("switch1", "switch", (0.0, -0.2, 0.65), _FACE_UP),
+        SceneObject("switch2", "switch", (0.0, 0.2, 0.65), _FACE_UP),
+    )
+    points = ("switch1/button_position", "switch2/button_position")
+    constant = 2.0
+    camera_target, camera_distance = (0.08, 0.0, 0.70), 1.1
+    variation_space = join(*(component(f"switch{i}_{axis}", -SHIFT, SHIFT) for i in (1, 2) for axis in "xy"))
+    blocks = (
+        *object_blocks("switch1"),
+        *goal_blocks("goal"),
+        point_block("switch1_position", "switch1/button_position", "point on the rocker's proud half"),
+        point_block("switch2_position", "switch2/button_position", "point on the rocker's proud half"),
+    )
+
+    def freeze(self, variation: Tensor) -> dict[str, Tensor]:
+        """Base positions, targets of the button points ``goal1``, ``goal2`` (n, 3); ``goal``: switch 1's pose."""
+        frozen = {}
+        for i, switch in enumerate(self.objects, start=1):
+            position = variation.new_tensor(switch.position).repeat(len(variation), 1)
+            position[:, :2] += variation[:, 2 * i - 2 : 2 * i]
+            frozen |= {switch.name: position, f"goal{i}": position + variation.new_tensor(_PRESSED)}
+        turn = xyzw(variation.new_tensor(_PRESSED_QUATERNION)).expand(len(variation), 4)
+        return frozen | frozen_goal(torch.cat((frozen["goal1"], turn), dim=1))
+
+    def start(self, draws: Tensor, frozen: dict[str, Tensor], qpos: dict[str, Tensor]) -> None:
+        for name in ("switch1", "switch2"):
+            qpos[name][:, :3] = frozen[name]
+
+    def target(self, state: TaskState) -> Tensor:
+        first, second = (norm(state[f"switch{i}/button_position"] - state.frozen[f"goal{i}"]) for i in (1, 2))
+        return 50.0 * (1.4 - (first + second))
+
+    def success(self, state: TaskState) -> Tensor:
+        first, second = (state[f"{name}/angle"][:, 0] for name in ("switch1", "switch2"))
+        return (first > 0.8 * _TRAVEL) & (second > 0.8 * _TRAVEL)
