@@ -9,7 +9,6 @@ import math
 import sys
 from bisect import bisect_right
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,7 +16,7 @@ from torch import Tensor
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import is_main
 from bidex_meta.train.learner import State
-from bidex_meta.world.contract import VectorWorld
+from bidex_meta.world.contract import Info, VectorWorld
 
 
 @dataclass
@@ -86,7 +85,7 @@ class Replay:
         self.obs.copy_(obs)
 
     def add(
-        self, actions: Tensor, reward: Tensor, terminated: Tensor, truncated: Tensor, obs: Tensor, info: dict[str, Any]
+        self, actions: Tensor, reward: Tensor, terminated: Tensor, truncated: Tensor, obs: Tensor, info: Info
     ) -> None:
         """Takes one vector step from ``self.obs``: ``actions`` (N, a) and what a world's ``step`` returned for them."""
         valid = ~info["unstable"]

@@ -1,7 +1,6 @@
 """A stretch of transitions of all environments, and the loop that collects it; shared by the on-policy learners."""
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -9,7 +8,7 @@ from torch import Tensor
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import all_sum
 from bidex_meta.utils.maths import check_precision
-from bidex_meta.world.contract import VectorWorld
+from bidex_meta.world.contract import Info, VectorWorld
 
 
 class EpisodeStatistics:
@@ -26,7 +25,7 @@ class EpisodeStatistics:
         # Rows: return, length, success, count.
         self.sums = torch.zeros(4, len(task_names), device=task_id.device)
 
-    def update(self, info: dict[str, Any]) -> None:
+    def update(self, info: Info) -> None:
         """Takes in the episodes that ``info["counted"]`` says ended in this step."""
         episode, ended = info["so_far"], info["counted"]
         values = torch.stack([episode["r"].float(), episode["l"].float(), episode["success"].float(), ended.float()])
@@ -124,7 +123,6 @@ def may_look(device: torch.device) -> bool:
 
 
 def _values_where(cut: Tensor, final_obs: Tensor, task_id: Tensor, final_value: FinalValue, like: Tensor) -> Tensor:
-    """Values of ``final_obs`` in the rows ``cut``, 0 elsewhere; of the shape of ``like``."""
     values = torch.zeros_like(like)
     if not may_look(cut.device):
         # A forward of all environments is cheaper than the wait for which rows there are.

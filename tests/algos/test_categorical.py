@@ -14,7 +14,7 @@ from bidex_algos.nets.inputs import TaskEmbedding
 from bidex_algos.nets.networks import MLP
 from bidex_algos.offpolicy.brc import ResidualMLP
 from bidex_algos.offpolicy.categorical import Atoms
-from bidex_algos.offpolicy.return_scale import ReturnBound
+from bidex_algos.offpolicy.categorical import ReturnBound
 from bidex_algos.replay import Replay, Stretches
 from tests.algos.toy import ToyWorld, nearness
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.distributions import Normal
 
-from bidex_algos.onpolicy.demonstrations import Demonstrations, imitation
+from bidex_algos.onpolicy.mtppo import Demonstrations, imitation
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_meta.errors import BidexError
 from tests.algos.toy import ToyWorld, nearness

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from bidex_algos.offline.batches import Batches, return_deviation
+from bidex_algos.offline.base import Batches, return_deviation
 from bidex_algos.offline.bc import BC, BCConfig
 from bidex_algos.offline.bcq import BCQ, BCQConfig, best_of
 from bidex_algos.offline.iql import IQL, IQLConfig, expectile_loss

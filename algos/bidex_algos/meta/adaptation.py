@@ -116,11 +116,9 @@ class Adapter:
         return params | {name: params[name] - self._size(name) * slopes[name] for name in own}
 
     def _moved(self, names: list[str]) -> list[str]:
-        """Of these parameters those that an inner step moves."""
         return [name for name in names if name.startswith(self._prefix)]
 
     def _size(self, name: str) -> float | Tensor:
-        """Size of an inner step of a parameter."""
         return self.learning_rate if self.step_sizes is None else self.learning_rate * self.step_sizes[name]
 
     def _slopes(self, params: Params, batch: TaskBatch, own: list[str]) -> Params:

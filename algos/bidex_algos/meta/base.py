@@ -90,7 +90,6 @@ class MetaLearner(Learner):
         return norm
 
     def _iterate(self) -> dict[str, float]:
-        """One meta-batch: samples, adapts, learns."""
         if self.config.slice_steps is None or self.obs is None or self.steps_with_tasks >= self.config.max_adapt_steps:
             self._draw_tasks()
         adapter = self.policy.adapter
@@ -120,7 +119,6 @@ class MetaLearner(Learner):
         return reported
 
     def _draw_tasks(self) -> None:
-        """New tasks for every class, without repetition, and new episodes."""
         chosen = {}
         for name, pool in zip(self.world.task_names, self.pools, strict=True):
             order = torch.randperm(len(pool), generator=self.tasks_generator)[: self.config.tasks_per_class]
@@ -173,7 +171,6 @@ class MetaLearner(Learner):
         return stage, Outcome(earned, success, steps)
 
     def _begin(self) -> Tensor:
-        """Observations to start a stage from."""
         if self.obs is not None and self.config.slice_steps is not None:
             return self.obs
         self.elapsed = torch.zeros_like(self.elapsed)
@@ -182,7 +179,6 @@ class MetaLearner(Learner):
         return self.world.reset()[0]
 
     def _reported(self, outcome: Outcome, k: int) -> dict[str, float]:
-        """Return and success of a stage per class: of the last stage as such, of the first as ``before``."""
         last = k == self.config.inner_steps
         if k > 0 and not last:
             return {}

@@ -68,7 +68,6 @@ class MAML(MetaLearner):
         return self._trust_region(batches) if self.config.outer == "trpo" else self._adam_step(batches)
 
     def _objective(self, batches: list[TaskBatch]) -> tuple[Tensor, Tensor]:
-        """Surrogate objective and KL after adaptation: means over tasks, scalars."""
         adapter = self.policy.adapter
         params = adapter.meta(self.rows.count)
         for batch in batches[:-1]:

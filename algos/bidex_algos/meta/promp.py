@@ -20,7 +20,7 @@ from torch import Tensor
 from bidex_algos.meta.adaptation import TaskBatch, weighted_mean
 from bidex_algos.meta.base import MetaLearner
 from bidex_algos.meta.config import TABLE_48, TUNED, UNSEEN, OuterConfig
-from bidex_algos.step_size import factor_of
+from bidex_algos.onpolicy.ppo import factor_of
 from bidex_meta.utils.validation import Count, NonNegative, Positive, check_rising
 
 
@@ -54,12 +54,7 @@ PRESETS: dict[str, ProMPConfig] = {
     # Table 48 of the Bi-DexHands appendix to the letter. It names no KL weight: ProMP's own 5e-4. "Desired kl" is read
     # by the original and used nowhere; here the outer step size follows it from 3e-4 on, as in PPO's tables.
     "paper": ProMPConfig(
-        **TABLE_48,
-        outer_epochs=3,
-        outer_learning_rate=3e-4,
-        desired_kl=0.016,
-        clip=0.2,
-        kl_weight=5e-4,
+        **TABLE_48, outer_epochs=3, outer_learning_rate=3e-4, desired_kl=0.016, clip=0.2, kl_weight=5e-4,
         max_grad_norm=1.0,
     ),
     # Outer steps that learn from nothing are too large for what is learned already: of 1e-3 five made a KL of 1.1 and
@@ -67,7 +62,7 @@ PRESETS: dict[str, ProMPConfig] = {
     "tuned": ProMPConfig(**TUNED, outer_learning_rate=1e-4, desired_kl=0.0125),
     "unseen": ProMPConfig(**UNSEEN, outer_learning_rate=1e-4, desired_kl=0.0125),
     "laptop": ProMPConfig(),
-}
+}  # fmt: skip
 
 
 class ProMP(MetaLearner):
@@ -93,7 +88,6 @@ class ProMP(MetaLearner):
         }
 
     def _follow(self, kl: Tensor) -> None:
-        """Adapts the step size to the KL that the steps so far have made."""
         if self.config.desired_kl is None:
             return
         low, high = self.config.outer_learning_rate_range

@@ -17,9 +17,8 @@ from bidex_algos.nets.architecture import network_bytes
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.recurrent import RecurrentNet, RecurrentPolicy
 from bidex_algos.nets.shape import Shape
-from bidex_algos.onpolicy.ppo import NAMES, PPOConfig, mini_batches, policy_loss
+from bidex_algos.onpolicy.ppo import NAMES, AdaptiveAdams, PPOConfig, mini_batches, policy_loss
 from bidex_algos.rollout import EpisodeStatistics
-from bidex_algos.step_size import AdaptiveAdams
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import all_sum, own_seed, rank, sum_gradients, world_size
 from bidex_meta.train.learner import AutoresetMode, Parts, State
@@ -115,7 +114,6 @@ class RL2(Learner):
         return "DISABLED"
 
     def _iterate(self) -> dict[str, float]:
-        """Plays one trial in every environment and learns from it."""
         counts = [[self.episodes] for _ in range(self.config.episodes_per_trial)]
         counts[0].append(self.firsts)
         counts[-1].append(self.lasts)
@@ -140,7 +138,6 @@ class RL2(Learner):
         return self._metrics(losses, explained, filled & ~valid)
 
     def _begin(self) -> Tensor:
-        """Starts the first episode of a trial; observations (N, d)."""
         if self.pools:
             trial = self.trials_played * world_size() + rank()
             # By turns: all tasks of a class come equally often.
@@ -149,11 +146,9 @@ class RL2(Learner):
         return self._first_observations() if self.trials_played == 0 else self.world.reset()[0]
 
     def _prepare(self) -> tuple[Batch, Tensor]:
-        """Turns the trial into a batch; also the explained variance per task (num_tasks,)."""
         return make_batch(self.trials, self.policy, self.critic, self.return_stats, self.world.task_id, self.config)
 
     def _update(self, b: Batch) -> dict[str, Tensor]:
-        """PPO's update: returns the means over all mini-batches of what it measured."""
         cfg, policy = self.config, self.policy
         old_log_std = policy.log_std.detach().clone()
         low, high = (math.log(std) for std in cfg.std_range)
@@ -168,7 +163,6 @@ class RL2(Learner):
         return {**dict(zip(NAMES, torch.stack(measured).mean(0), strict=True)), "Policy/lr": self.adams.rate}
 
     def _gradients(self, b: Batch, chosen: Tensor, count: Tensor, old_log_std: Tensor) -> Tensor:
-        """Puts the gradients of some chunks, int64 (B,), into the parameters."""
         policy, chunk, row = self.policy, b.chunk[chosen], b.row[chosen]
         x = policy.see(b.take(b.obs, chosen), *(b.take(p, chosen) for p in b.previous))
         means, _ = policy.actor(x, b.actor_states[chunk, row])

@@ -4,7 +4,6 @@ Episodes that adapt write the memory; evaluation episodes play on a copy, each a
 """
 
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -39,7 +38,7 @@ class RL2Agent:
         self._learned = replace(learned, done=learned.done | (env_mask & self._begun))
         self._playing = self._memory(self._playing, len(env_mask)).replaced(env_mask, self._learned)
 
-    def adapt_action(self, obs: Tensor) -> tuple[Tensor, dict[str, Any]]:
+    def adapt_action(self, obs: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Sampled actions (N, a) in [-1, 1] for raw observations (N, d), and the Gaussian they are from."""
         self._learned = self._memory(self._learned, len(obs))
         mean, self._next_state = self.policy.step(obs, self._learned)
@@ -76,7 +75,6 @@ class RL2Agent:
         return action
 
     def _memory(self, memory: Memory | None, rows: int) -> Memory:
-        """``memory``, or a fresh one if there is none of so many environments."""
         if memory is not None and len(memory.state) == rows:
             return memory
         if self._learned is None or len(self._learned.state) != rows:
@@ -84,6 +82,5 @@ class RL2Agent:
         return self.policy.fresh_memory(rows)
 
     def _wait(self, rows: int) -> None:
-        """No environment has played yet; each waits for its ``reset``."""
         self._begun = torch.zeros(rows, dtype=torch.bool, device=self.device)
         self._over = ~self._begun

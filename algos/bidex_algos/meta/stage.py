@@ -83,7 +83,6 @@ def fitted(obs: Tensor, elapsed: Tensor, returns: Tensor, weights: Tensor, ridge
 
 
 def _one(x: Tensor, returns: Tensor, weights: Tensor, ridge: float) -> Tensor:
-    """Predictions (B,) of one task from its features (B, f), float64."""
     weighted = x * weights[:, None]
     gram = (weighted.T @ x).double()
     diagonal = gram.diagonal()

@@ -51,7 +51,6 @@ class HAPPO(OwnAdams, Sequential):
     config: HAPPOConfig
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
-        """All agents in turn, then the critic; returns means over agents and mini-batches of what it measured."""
         cfg = self.config
         measured = [self._agent_epochs(agent, share) for agent, share in self._in_turn(batch)]
         value = self._critic_epochs(batch, cfg.epochs, cfg.num_minibatches, cfg.value_loss_weight)

@@ -47,7 +47,6 @@ class HATRPO(Sequential):
     config: HATRPOConfig  # type: ignore[assignment]
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
-        """All agents in turn, then the critic; returns means over agents of what it measured."""
         steps = [self._agent_step(agent, share) for agent, share in self._in_turn(batch)]
         reported = {name: torch.stack([step[name] for step in steps]).mean() for name in steps[0]}
         return reported | {

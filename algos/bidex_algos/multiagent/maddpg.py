@@ -11,7 +11,6 @@ the same targets: there is one.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,11 +18,9 @@ from torch import Tensor
 from bidex_algos.multiagent.base import Partition, keep_partition
 from bidex_algos.multiagent.team import Team
 from bidex_algos.nets.inputs import Inputs
-from bidex_algos.nets.networks import use_bfloat16
-from bidex_algos.nets.normalise import ObservationNormaliser
 from bidex_algos.nets.policy import DeterministicPolicy
 from bidex_algos.nets.shape import Shape
-from bidex_algos.offpolicy.ddpg import DDPG, DDPGConfig, of_paper
+from bidex_algos.offpolicy.ddpg import DDPG, OF_PAPER, DDPGConfig
 from bidex_algos.replay import Transitions
 from bidex_meta.world.agent_views import AgentView, agent_views
 from bidex_meta.world.contract import VectorWorld
@@ -43,14 +40,14 @@ class MADDPGConfig(DDPGConfig):
 
 
 # There is no table for MADDPG (B.2.5 describes it): DDPG's preset of this name.
-PRESETS: dict[str, MADDPGConfig] = {"paper": MADDPGConfig(**of_paper()), "laptop": MADDPGConfig()}
+PRESETS: dict[str, MADDPGConfig] = {"paper": MADDPGConfig(**OF_PAPER), "laptop": MADDPGConfig()}
 
 
 class DeterministicTeam(Team):
     """All agents as one actor without a distribution, in the place of a ``DeterministicActor``."""
 
     def __init__(
-        self, views: tuple[AgentView, ...], config: Any, groups: Inputs, generator: torch.Generator, heads: int
+        self, views: tuple[AgentView, ...], config: MADDPGConfig, groups: Inputs, generator: torch.Generator, heads: int
     ):
         super().__init__(views, config, [heads * len(view.actions) for view in views], 0.01, generator)
         self.heads, self.one_hot = heads, groups.columns(*["task_id"] * (heads > 1))
@@ -87,7 +84,6 @@ class MADDPG(DDPG):
         self.owner = torch.tensor(owner, device=self.device)
 
     def _policy_step(self, obs: Tensor, draw: Transitions, weights: Tensor, counts: Tensor) -> None:
-        """One step of every agent up the critic, the others' actions as they were, on normalised observations."""
         raw, share = self.policy.raw(obs), weights / counts.sum().clamp_min(1.0)
         actions, losses = torch.tanh(raw), []
         for agent, view in enumerate(self.views):
@@ -108,5 +104,4 @@ class MADDPG(DDPG):
         views, inputs = agent_views(shape.groups, shape.actions, config.agents), Inputs(shape.groups)
         heads = shape.num_id_columns if config.policy_heads else 1
         actor = DeterministicTeam(views, config, inputs, init, heads)
-        observations = ObservationNormaliser(inputs, config.normalise_observations)
-        return DeterministicPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
+        return DeterministicPolicy.made_of(actor, config, inputs, shape, device).to(device)

@@ -43,7 +43,6 @@ class MAPPO(OwnAdams):
     config: MAPPOConfig
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
-        """One pass after another: returns the means over all mini-batches and agents of what it measured."""
         cfg, actor = self.config, self.policy.actor
         old_values = self._old_values(batch)
         old_log_std = actor.log_std_of(batch.obs).detach().expand(batch.actions.shape)
@@ -65,7 +64,6 @@ class MAPPO(OwnAdams):
         return {**dict(zip(NAMES, torch.stack(measured).mean(0), strict=True)), "Policy/lr": rate}
 
     def _gradients(self, b: Batch, count: Tensor, old_log_std: Tensor, old_values: Tensor) -> Tensor:
-        """Puts the gradients of a mini-batch into the parameters; ``count`` samples are in it, over all processes."""
         cfg, actor = self.config, self.policy.actor
         weights = b.weights / count
         losses = self._agent_losses(b, weights, old_log_std)

@@ -18,6 +18,8 @@ Autocast = Literal["auto", "on", "off"]
 """Whether hidden layers run in bfloat16."""
 Layers = Annotated[tuple[Width, ...], Meta(max_length=64)]
 """Widths of hidden layers; none makes a linear map."""
+MakeNetwork = Callable[..., Any]
+"""Takes the arguments of :class:`MLP`; what it makes has ``output_bias``, the biases of the output (outputs,)."""
 
 
 def use_bfloat16(setting: Autocast, device: torch.device) -> bool:
@@ -62,7 +64,7 @@ class MLP(nn.Module):
 
     @property
     def output_bias(self) -> Tensor:
-        """Biases of the output (outputs,)."""
+        """As in :data:`MakeNetwork`."""
         return self.head.bias
 
     def forward(self, x: Tensor) -> Tensor:
@@ -128,11 +130,10 @@ class GaussianActor(nn.Module):
 
     def __init__(
         self, inputs: int | Inputs, hidden: Sequence[int], actions: int, init_std: float, generator: torch.Generator,
-        activation: Activation = "elu", heads: int = 1, network: Callable[..., Any] = MLP
+        activation: Activation = "elu", heads: int = 1, network: MakeNetwork = MLP
     ):  # fmt: skip
         super().__init__()
-        self.heads = heads
-        self.one_hot = Inputs.of(inputs).columns(*["task_id"] * (heads > 1))
+        self.heads, self.one_hot = heads, Inputs.of(inputs).columns(*["task_id"] * (heads > 1))
         self.mean = network(inputs, hidden, heads * actions, 0.01, generator, activation)
         shape = (actions,) if heads == 1 else (heads, actions)
         self.log_std = nn.Parameter(torch.full(shape, math.log(init_std)))

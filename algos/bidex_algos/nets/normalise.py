@@ -1,13 +1,13 @@
 """Running statistics: of observations, and of returns per task."""
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from bidex_algos.nets.inputs import Inputs
 from bidex_meta.train.distributed import pool_moments
+from bidex_meta.train.learner import LearnerConfig
 
 
 class RunningStats(nn.Module):
@@ -100,11 +100,12 @@ class ObservationNormaliser(nn.Module):
         self.measured.write(self.scale, self.stats.std(floor=3e-3).reciprocal().float())
 
 
-def observation_normaliser(config: Any, inputs: Inputs, tasks: int) -> ObservationNormaliser:
+def observation_normaliser(config: LearnerConfig, inputs: Inputs, tasks: int) -> ObservationNormaliser:
     """What a config asks for by ``normalise_observations`` and ``normalise_per_task``, of so many tasks."""
-    if vars(config).get("normalise_per_task") and config.normalise_observations and tasks > 1:
+    options = vars(config)
+    if options.get("normalise_per_task") and options["normalise_observations"] and tasks > 1:
         return TaskNormaliser(inputs, tasks)
-    return ObservationNormaliser(inputs, config.normalise_observations)
+    return ObservationNormaliser(inputs, options["normalise_observations"])
 
 
 class TaskNormaliser(ObservationNormaliser):

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from bidex_algos.nets.architecture import follow
 from bidex_algos.nets.networks import autocast
 from bidex_algos.offline.base import PAPER, CriticConfig
 from bidex_algos.offline.bc import BC
-from bidex_algos.offpolicy.critics import follow
 from bidex_algos.replay import Transitions
 from bidex_meta.train.learner import Parts
 from bidex_meta.utils.validation import Count, NonNegative
@@ -64,7 +64,6 @@ class TD3BC(BC):
 
     @torch.no_grad()
     def _target(self, draw: Transitions, next_obs: Tensor) -> Tensor:
-        """What the critics shall say of the drawn transitions (B,); ``next_obs`` are normalised."""
         with autocast(self.device, self.low_precision):
             action = self.target_actor(next_obs)
         bound = self.config.target_bound

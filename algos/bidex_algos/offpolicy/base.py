@@ -14,18 +14,17 @@ import math
 from abc import abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.advantages import discounts
+from bidex_algos.advantages import discounts, task_moments
 from bidex_algos.learner import Learner, as_numbers
-from bidex_algos.nets.architecture import NetworkConfig, network_bytes
+from bidex_algos.nets.architecture import Critics, NetworkConfig, network_bytes
 from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import Autocast, autocast, use_bfloat16
-from bidex_algos.offpolicy.critics import Critics
-from bidex_algos.offpolicy.return_scale import ReturnScale
+from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.replay import Stretches, Transitions, replay_within
 from bidex_algos.rollout import EpisodeStatistics
 from bidex_meta.train.distributed import all_sum, sum_gradients, world_size
@@ -88,6 +87,37 @@ class OffPolicyConfig(NetworkConfig):
         return int(replay) + network_bytes(self.hidden, width, 3)
 
 
+class ReturnScale:
+    """Running statistics of the discounted sum of rewards since an episode began.
+
+    Returns of a task fade after ``horizon`` newer ones; ``gamma`` is a discount for all, or of each environment (N,).
+    ``stats``: mean and variance of each task (num_tasks,); ``discounted``: the sum in each environment so far (N,).
+    """
+
+    def __init__(self, world: VectorWorld, gamma: float | Tensor, horizon: float):
+        self.gamma, self.task_id, self.num_tasks = gamma, world.task_id, world.num_tasks
+        self.stats = RunningStats((world.num_tasks,), max_count=horizon).to(world.device)
+        self.discounted = torch.zeros(world.num_envs, device=world.device)
+
+    def note(self, reward: Tensor, terminated: Tensor, truncated: Tensor, broken: Tensor) -> None:
+        """Takes one step of all environments: rewards (N,) and how it ended, bool (N,); broken ones do not count."""
+        self.discounted = self.gamma * self.discounted + reward
+        self._take(truncated & ~terminated, ~broken)
+        self.discounted = self.discounted.masked_fill(terminated | truncated | broken, 0.0)
+
+    def _take(self, cut: Tensor, valid: Tensor) -> None:
+        self.stats.merge(*task_moments(self.discounted[None], self.task_id, self.num_tasks, valid[None]))
+
+    def deviation(self) -> Tensor:
+        """The deviation of each task's returns, at least a tenth of their mean (num_tasks,)."""
+        # Where all returns are about the same, their deviation alone would blow them up.
+        return (self.stats.std().square() + (0.1 * self.stats.mean).square()).sqrt().float()
+
+    def parts(self) -> Parts:
+        """What a checkpoint holds, by name."""
+        return {"return_stats": self.stats, "discounted": self.discounted}
+
+
 class OffPolicy(Learner):
     """An actor and critics that learn from a replay; the critics from the value of the next state by their targets.
 
@@ -125,9 +155,9 @@ class OffPolicy(Learner):
         self.returns = self.returns_type(world, self.gamma_of_rows, horizon)
         self.episodes = EpisodeStatistics(world.task_id, world.task_names)
 
-    def _make_critics(self, inputs: Inputs, heads: int) -> Any:
-        """Fresh critics of observation and action together, with so many outputs of values each."""
-        return Critics(inputs, heads, self.config, self.initial, self.num_critics)
+    def _make_critics(self, inputs: Inputs, heads: int) -> nn.Module:
+        layer_norm = self.config.critic_layer_norm
+        return Critics(inputs, heads, self.config, layer_norm, self.initial, self.num_critics)
 
     def _adam(self, parameters: Iterable[nn.Parameter], rate: float, decay: float | None = None) -> torch.optim.Adam:
         decay = self.config.weight_decay if decay is None else decay
@@ -151,7 +181,6 @@ class OffPolicy(Learner):
         return {}
 
     def _iterate(self) -> dict[str, float]:
-        """Some vector steps, each followed by its updates."""
         unstable = torch.zeros((), dtype=torch.int64, device=self.device)
         measured: list[dict[str, Tensor]] = []
         for _ in range(self.config.steps_per_iteration):
@@ -191,7 +220,6 @@ class OffPolicy(Learner):
         return scale if self.config.per_task_rewards else torch.ones_like(scale)
 
     def _learn(self) -> list[dict[str, Tensor]]:
-        """The updates that follow one vector step; what each measured."""
         updates, tasks = self.config.updates_per_step, self.world.num_tasks
         places = self.replay.draw(updates, self.batch_per_task, self.generator)
         stretches = Stretches(self.replay, places, self.config.n_steps, self.gamma_of_draw)
@@ -200,13 +228,11 @@ class OffPolicy(Learner):
         counts = all_sum(weights.view(updates, tasks, -1).sum(2))
         return [self._update(stretches.take(i), weights[i], counts[i]) for i in range(updates)]
 
-    def _values(self, critic: Any, obs: Tensor, actions: Tensor) -> Tensor:
-        """The critics' values of a draw (num_critics, B), in scaled units of reward."""
+    def _values(self, critic: nn.Module, obs: Tensor, actions: Tensor) -> Tensor:
         with autocast(self.device, self.low_precision):
             return critic(obs, actions, self.task_of_draw)
 
     def _pooled(self, values: Tensor) -> Tensor:
-        """One value (B,) of those of all critics (num_critics, B)."""
         return values.amin(0)
 
     def _bootstrapped(self, draw: Transitions, following: Tensor) -> Tensor:
@@ -244,23 +270,15 @@ class OffPolicy(Learner):
         return numbers
 
     def _per_task(self, x: Tensor) -> Tensor:
-        """Sums (num_tasks,) of what a draw holds (B,)."""
         return x.view(self.world.num_tasks, -1).sum(1)
 
     def _parts(self) -> Parts:
-        return {
-            "critic": self.critic,
-            "target_critic": self.target_critic,
-            **self._own_parts(),
-            "adams": self.adams,
-            **self.returns.parts(),
-            "generator": self.generator,
-            "episodes": self.episodes,
-        }
+        networks = {"critic": self.critic, "target_critic": self.target_critic, **self._own_parts()}
+        statistics = {**self.returns.parts(), "generator": self.generator, "episodes": self.episodes}
+        return {**networks, "adams": self.adams, **statistics}
 
     def state_dict(self) -> State:
-        """A copy of everything but the world, as tensors and plain values (``torch.load(weights_only=True)``)."""
-        # The replay makes its own copy: two of it at once may not fit.
+        """As in the base; the replay makes its own copy, since two of it at once may not fit."""
         return super().state_dict() | {"replay": self.replay.state_dict()}
 
     def load_state_dict(self, state: State) -> None:

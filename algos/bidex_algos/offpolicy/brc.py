@@ -13,15 +13,15 @@ pessimistic. All else is as in ``mtsac.py`` and ``categorical.py``; deviations s
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor, nn
 
 from bidex_algos.advantages import discounts
-from bidex_algos.nets.inputs import Inputs, with_task_embedding
+from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import ACTIVATIONS, MLP, Activation, Layers, linear
-from bidex_algos.nets.point_net import with_point_net
-from bidex_algos.nets.shape import Shape
+from bidex_algos.nets.policy import squashed_policy
 from bidex_algos.offpolicy.categorical import Categorical, CategoricalConfig
 from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_algos.replay import Transitions
@@ -34,13 +34,9 @@ class ResidualBlock(nn.Module):
 
     def __init__(self, width: int, generator: torch.Generator, activation: Activation):
         super().__init__()
-        self.layers = nn.Sequential(
-            linear(width, width, math.sqrt(2.0), generator),
-            nn.LayerNorm(width),
-            ACTIVATIONS[activation](),
-            linear(width, width, math.sqrt(2.0), generator),
-            nn.LayerNorm(width),
-        )
+        first, second = (linear(width, width, math.sqrt(2.0), generator) for _ in range(2))
+        norms = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.layers = nn.Sequential(first, norms[0], ACTIVATIONS[activation](), second, norms[1])
 
     def forward(self, x: Tensor) -> Tensor:
         """Maps (batch, width) to (batch, width)."""
@@ -123,17 +119,11 @@ class BRC(Categorical, MTSAC):
     name = "brc"
     config_type, presets = BRCConfig, PRESETS
     config: BRCConfig
-    actor_network = critic_network = ResidualMLP
-
-    @classmethod
-    def _inputs(cls, config: BRCConfig, shape: Shape) -> Inputs:
-        return with_task_embedding(
-            with_point_net(Inputs(shape.groups), config), cls._embedded(config, shape), unit=True
-        )
+    critic_network, unit_embeddings = ResidualMLP, True
+    policy_of = staticmethod(partial(squashed_policy, network=ResidualMLP))
 
     @torch.no_grad()
     def _target(self, draw: Transitions, next_obs: Tensor) -> Tensor:
-        """What the critics shall say of the drawn transitions (B, atoms); ``next_obs`` are normalised."""
         next_actions, log_prob = self.policy.sample(next_obs, self.generator)
         bonus = -self.log_alpha.exp()[self.task_of_draw] * log_prob
         return self._projected(draw, self._following(next_obs, next_actions), bonus)

@@ -10,20 +10,21 @@ what each task's rewards are divided by follows its largest return so far (``Ret
 """
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from msgspec import Meta
 from torch import Tensor, nn
 
-from bidex_algos.nets.architecture import MakeNetwork, network_bytes, network_of
+from bidex_algos.nets.architecture import network_bytes, network_of
 from bidex_algos.nets.inputs import Inputs
-from bidex_algos.nets.networks import MLP, Layers, autocast
-from bidex_algos.offpolicy.base import OffPolicy, OffPolicyConfig
-from bidex_algos.offpolicy.return_scale import ReturnBound
+from bidex_algos.nets.networks import MLP, Layers, MakeNetwork, autocast
+from bidex_algos.offpolicy.base import OffPolicy, OffPolicyConfig, ReturnScale
 from bidex_algos.replay import Transitions
-from bidex_meta.train.learner import State
+from bidex_meta.train.distributed import all_max
+from bidex_meta.train.learner import Parts, State
 from bidex_meta.utils.validation import MOST, Positive
+from bidex_meta.world.contract import VectorWorld
 
 
 class Atoms(nn.Module):
@@ -73,11 +74,6 @@ class CategoricalConfig(OffPolicyConfig):
         return super().bytes_held(num_envs, width) + network_bytes((*self.critic_hidden, self.atoms), width, 2)
 
 
-FIRST_DEVIATION = 0.1
-"""Of the distributions before the first update, as a share of the values' bound; their mean is 0. From an even
-distribution, which is much wider, means move slowly: a cross-entropy pulls at them with its inverse variance."""
-
-
 class CategoricalCritics(nn.Module):
     """Networks of observation and action that give distributions; arguments as those of ``Critics``."""
 
@@ -89,11 +85,11 @@ class CategoricalCritics(nn.Module):
         self.heads = heads
         self.atoms = Atoms(-config.value_bound, config.value_bound, config.atoms)
         outputs, norm = heads * config.atoms, config.critic_layer_norm
-        nets = [
-            network(inputs, config.critic_hidden, outputs, 0.01, generator, config.activation, norm)
-            for _ in range(count)
-        ]
-        place = self.atoms.values / (FIRST_DEVIATION * config.value_bound)
+        given = inputs, config.critic_hidden, outputs, 0.01, generator, config.activation, norm
+        nets = [network(*given) for _ in range(count)]
+        # At first the mean is 0, the deviation a tenth of the bound: from an even distribution, which is much wider,
+        # means move slowly, since a cross-entropy pulls at them with its inverse variance.
+        place = self.atoms.values / (0.1 * config.value_bound)
         with torch.no_grad():
             for net in nets:
                 net.output_bias.view(heads, -1).copy_(-0.5 * place.square())
@@ -113,10 +109,53 @@ class CategoricalCritics(nn.Module):
         return self.atoms.mean(self.log_probs(obs, actions, task_id).exp())
 
 
+RECENT = 0.9
+"""Weight of a reward in the recent ones' mean over that of the next: about the last ten steps count."""
+
+
+class ReturnBound(ReturnScale):
+    """Beside the statistics the largest return of each task, without its sign: what a fixed range of values must hold.
+
+    The sum is discounted towards the episode's beginning and not, as a return is, towards its end, which is known only
+    when the episode is over; both weigh any stretch of rewards alike. At a time limit the episode is taken to go on as
+    it went, or as it went most recently if that is more: a critic is taught that, though the episode reached such
+    states late. ``mass`` is the sum (N,), had all rewards been 1, ``recent`` both with a discount of at most
+    :data:`RECENT` (2, N).
+    """
+
+    def __init__(self, world: VectorWorld, gamma: float | Tensor, horizon: float):
+        super().__init__(world, gamma, horizon)
+        self.bound = torch.zeros(world.num_tasks, device=world.device)
+        self.mass = torch.zeros(world.num_envs, device=world.device)
+        self.recent = torch.zeros(2, world.num_envs, device=world.device)
+        self.short = torch.as_tensor(gamma, device=world.device).clamp_max(RECENT)
+
+    def note(self, reward: Tensor, terminated: Tensor, truncated: Tensor, broken: Tensor) -> None:
+        """As in the base."""
+        self.mass = self.gamma * self.mass + 1.0
+        self.recent = self.short * self.recent + torch.stack([reward, torch.ones_like(reward)])
+        super().note(reward, terminated, truncated, broken)
+        over = terminated | truncated | broken
+        self.mass, self.recent = self.mass.masked_fill(over, 0.0), self.recent.masked_fill(over, 0.0)
+
+    def _take(self, cut: Tensor, valid: Tensor) -> None:
+        super()._take(cut, valid)
+        size, (rewards, mass), rest = self.discounted.abs(), self.recent, 1.0 - self.gamma
+        size = torch.where(cut, torch.maximum(size / (rest * self.mass), rewards.abs() / (rest * mass)), size)
+        size = size.masked_fill(~valid, 0.0)
+        self.bound = all_max(self.bound.scatter_reduce(0, self.task_id, size, "amax"))
+
+    def parts(self) -> Parts:
+        """As in the base."""
+        return super().parts() | {"return_bound": self.bound, "discounted_ones": self.mass, "recent": self.recent}
+
+
 class Categorical(OffPolicy):
     """The part of a learner with such critics that knows no actor; stands before the learner whose actor it takes."""
 
-    config: Any
+    config: CategoricalConfig
+    critic: CategoricalCritics
+    target_critic: CategoricalCritics
     per_process = (*OffPolicy.per_process, "discounted_ones", "recent")
     critic_network: ClassVar[type[MLP] | None] = None
     returns_type = ReturnBound

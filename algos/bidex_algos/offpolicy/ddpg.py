@@ -19,16 +19,15 @@ original.
 
 import copy
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
+from bidex_algos.nets.architecture import Options, follow
 from bidex_algos.nets.networks import autocast
 from bidex_algos.nets.policy import DeterministicPolicy, deterministic_policy
-from bidex_algos.nets.shape import Shape
 from bidex_algos.offpolicy.base import OffPolicy, OffPolicyConfig
-from bidex_algos.offpolicy.critics import follow
 from bidex_algos.replay import Transitions
 from bidex_meta.train.learner import Parts
 from bidex_meta.utils.validation import NonNegative, check_rising
@@ -49,23 +48,17 @@ class DDPGConfig(OffPolicyConfig):
         check_rising(self, self.algo, "exploration_std")
 
 
-def of_paper() -> dict[str, Any]:
-    """What DDPG and TD3 share of the preset ``paper``, by field.
-
-    The Bi-DexHands appendix describes both (B.1.3, B.1.4) and has no table for either. Table 43 (SAC, "other tasks")
-    has layers, step size, discount, Polyak 0.99, gradient norm, 5000 steps of replay and 1 epoch of 4 mini-batches of
-    32 (here of each task); Table 49 32 steps between two reports. The noise of 0.1 is Fujimoto et al.'s (2018, section
-    6.1).
-    """
-    return {
-        "hidden": (1024, 1024, 1024), "value_heads": False, "critic_layer_norm": False, "replay_steps": 5000,
-        "warmup_steps": 32, "steps_per_iteration": 32, "updates_per_step": 4, "batch_per_task": 32, "gamma": 0.96,
-        "tau": 0.01, "learning_rate": 3e-4, "critic_learning_rate": 3e-4, "max_grad_norm": 1.0,
-        "normalise_observations": False, "per_task_rewards": False, "exploration_std": (0.1, 0.1), "squash_price": 0.0,
-    }  # fmt: skip
-
-
-PRESETS: dict[str, DDPGConfig] = {"paper": DDPGConfig(**of_paper()), "laptop": DDPGConfig()}
+OF_PAPER: Options = {
+    "hidden": (1024, 1024, 1024), "value_heads": False, "critic_layer_norm": False, "replay_steps": 5000,
+    "warmup_steps": 32, "steps_per_iteration": 32, "updates_per_step": 4, "batch_per_task": 32, "gamma": 0.96,
+    "tau": 0.01, "learning_rate": 3e-4, "critic_learning_rate": 3e-4, "max_grad_norm": 1.0,
+    "normalise_observations": False, "per_task_rewards": False, "exploration_std": (0.1, 0.1), "squash_price": 0.0,
+}  # fmt: skip
+"""What DDPG and TD3 share of the preset ``paper``. The Bi-DexHands appendix describes both (B.1.3, B.1.4) and has no
+table for either. Table 43 (SAC, "other tasks") has layers, step size, discount, Polyak 0.99, gradient norm, 5000 steps
+of replay and 1 epoch of 4 mini-batches of 32 (here of each task); Table 49 32 steps between two reports. The noise of
+0.1 is Fujimoto et al.'s (2018, section 6.1)."""
+PRESETS: dict[str, DDPGConfig] = {"paper": DDPGConfig(**OF_PAPER), "laptop": DDPGConfig()}
 
 
 class DDPG(OffPolicy):
@@ -75,6 +68,7 @@ class DDPG(OffPolicy):
     config_type, presets = DDPGConfig, PRESETS
     config: DDPGConfig
     policy: DeterministicPolicy
+    policy_of = staticmethod(deterministic_policy)
     num_critics = 1
     delayed_targets: ClassVar[bool] = True
     """Whether targets take the actions of an actor that follows the actor, and all that follow move only when the actor
@@ -95,20 +89,17 @@ class DDPG(OffPolicy):
         return torch.randn(like.shape, generator=self.generator, device=self.device)
 
     def _update(self, draw: Transitions, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
-        """One update of the critic, of the actor when it is due, and of what follows them."""
         obs, next_obs = self.policy.observations(draw.obs), self.policy.observations(draw.next_obs)
         reported = self._fit_critics(obs, draw, self._target(draw, next_obs), weights, counts)
-        due = self._actor_is_due()
-        if due:
+        if due := self._actor_is_due():
             self._policy_step(obs, draw, weights, counts)
-        if due and self.delayed_targets:
-            follow(self.target_actor, self.policy.actor, self.config.tau)
+            if self.delayed_targets:
+                follow(self.target_actor, self.policy.actor, self.config.tau)
         if due or not self.delayed_targets:
             follow(self.target_critic, self.critic, self.config.tau)
         return reported
 
     def _actor_is_due(self) -> bool:
-        """Whether the actor learns in this update."""
         return True
 
     @torch.no_grad()
@@ -124,7 +115,6 @@ class DDPG(OffPolicy):
             return actor(next_obs)
 
     def _policy_step(self, obs: Tensor, draw: Transitions, weights: Tensor, counts: Tensor) -> None:
-        """One step of the actor up the critics, on normalised observations (B, d) of ``draw``."""
         raw = self.policy.raw(obs)
         value = self._climbed(self._values(self.critic, obs, torch.tanh(raw)))
         price = self.config.squash_price * raw.square().mean(1)
@@ -138,12 +128,6 @@ class DDPG(OffPolicy):
 
     def _reported(self) -> dict[str, Tensor]:
         return {"Loss/actor": self.actor_loss}
-
-    @classmethod
-    def _make_policy(
-        cls, config: DDPGConfig, shape: Shape, init: torch.Generator, device: torch.device
-    ) -> DeterministicPolicy:
-        return deterministic_policy(config, cls._inputs(config, shape), shape, init, device)
 
     def _own_parts(self) -> Parts:
         follows = {"target_actor": self.target_actor} if self.delayed_targets else {}

@@ -69,7 +69,6 @@ class FastTD3(Categorical, TD3):
 
     @torch.no_grad()
     def _target(self, draw: Transitions, next_obs: Tensor) -> Tensor:
-        """What the critics shall say of the drawn transitions (B, atoms); ``next_obs`` are normalised."""
         following = self._following(next_obs, self._target_action(next_obs))
         return self._projected(draw, following, torch.zeros_like(draw.rewards))
 

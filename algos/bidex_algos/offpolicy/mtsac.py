@@ -17,18 +17,13 @@ gradient is the gap in entropy whatever alpha is. Deviations stand in ``docs/lea
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.nets.architecture import network_of
-from bidex_algos.nets.networks import MLP, use_bfloat16
-from bidex_algos.nets.normalise import ObservationNormaliser
-from bidex_algos.nets.policy import SquashedActor, SquashedPolicy
-from bidex_algos.nets.shape import Shape
+from bidex_algos.nets.architecture import Options, follow
+from bidex_algos.nets.policy import SquashedPolicy, squashed_policy
 from bidex_algos.offpolicy.base import OffPolicy, OffPolicyConfig
-from bidex_algos.offpolicy.critics import follow
 from bidex_algos.replay import Transitions
 from bidex_meta.errors import BidexError
 from bidex_meta.train.learner import Parts
@@ -90,7 +85,7 @@ PRESETS: dict[str, MTSACConfig] = {
 
 # Table 49; its 2 epochs of one mini-batch are made after every vector step, as in ``paper``. Its replay of 40,000
 # counts vector steps, as everywhere here, and ends where ``replay_memory`` does.
-_TABLE_49: dict[str, Any] = {
+_TABLE_49: Options = {
     "replay_steps": 40_000, "steps_per_iteration": 32, "updates_per_step": 2, "batch_per_task": 64, "gamma": 0.99,
     "tau": 0.005, "learning_rate": 3e-4, "critic_learning_rate": 3e-4, "init_alpha": 0.2, "max_grad_norm": 1.0,
 }  # fmt: skip
@@ -109,7 +104,7 @@ class MTSAC(OffPolicy):
     config_type, presets = MTSACConfig, PRESETS
     config: MTSACConfig
     policy: SquashedPolicy
-    actor_network: ClassVar[type[MLP] | None] = None
+    policy_of = staticmethod(squashed_policy)
 
     def __init__(self, world: VectorWorld, config: MTSACConfig, seed: int):
         super().__init__(world, config, seed)
@@ -121,7 +116,6 @@ class MTSAC(OffPolicy):
         return self.policy.sample(self.policy.observations(obs), self.generator)[0]
 
     def _update(self, draw: Transitions, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
-        """One update of critics, actor, temperatures and target critics; losses, entropy and values."""
         obs, next_obs = self.policy.observations(draw.obs), self.policy.observations(draw.next_obs)
         reported = self._fit_critics(obs, draw, self._target(draw, next_obs), weights, counts)
         reported |= self._policy_step(obs, weights, counts)
@@ -130,13 +124,11 @@ class MTSAC(OffPolicy):
 
     @torch.no_grad()
     def _target(self, draw: Transitions, next_obs: Tensor) -> Tensor:
-        """What the critics shall say of the drawn transitions (B,); ``next_obs`` are normalised."""
         next_actions, log_prob = self.policy.sample(next_obs, self.generator)
         following = self._pooled(self._values(self.target_critic, next_obs, next_actions))
         return self._bootstrapped(draw, following - self.log_alpha.exp()[self.task_of_draw] * log_prob)
 
     def _policy_step(self, obs: Tensor, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
-        """One step of actor and temperatures, on normalised observations (B, d)."""
         weight = weights / counts.sum().clamp_min(1.0)
         actions, log_prob = self.policy.sample(obs, self.generator)
         alpha = self.log_alpha.detach().exp()[self.task_of_draw]
@@ -156,16 +148,6 @@ class MTSAC(OffPolicy):
     def _reported(self) -> dict[str, Tensor]:
         alphas = self.log_alpha.detach().exp()
         return {f"Policy/alpha/{name}": alpha for name, alpha in zip(self.world.task_names, alphas, strict=True)}
-
-    @classmethod
-    def _make_policy(
-        cls, config: MTSACConfig, shape: Shape, init: torch.Generator, device: torch.device
-    ) -> SquashedPolicy:
-        inputs, heads = cls._inputs(config, shape), shape.num_id_columns if config.policy_heads else 1
-        sizes, network = (config.hidden, shape.actions, heads), cls.actor_network or network_of(config)
-        actor = SquashedActor(inputs, *sizes, config.init_std, config.std_range, init, config.activation, network)
-        observations = ObservationNormaliser(inputs, config.normalise_observations)
-        return SquashedPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
 
     def _own_parts(self) -> Parts:
         return {"log_alpha": self.log_alpha}

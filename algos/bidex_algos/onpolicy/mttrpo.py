@@ -120,7 +120,6 @@ class MTTRPO(OnPolicy):
         return {"critic_adam": self.critic_adam}
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
-        """TRPO's update: returns what it measured, among it the KL after the step."""
         actor, cfg = self.policy.actor, self.config
 
         def distribution() -> tuple[Tensor, Tensor]:
@@ -147,7 +146,6 @@ class MTTRPO(OnPolicy):
         return kl_from_itself(distribution, batch.weights, self.world.num_envs, self.config.fisher_stride)
 
     def _critic_epochs(self, batch: Batch) -> Tensor:
-        """Fits the critic to its targets; the mean loss over all mini-batches, a scalar."""
         cfg, parameters = self.config, list(self.critic.parameters())
         losses: list[Tensor] = []
         for _, index, count in self._mini_batches(batch.weights, cfg.critic_epochs, cfg.num_minibatches):
