@@ -19,9 +19,7 @@ class EpisodeStatistics:
     """
 
     def __init__(self, task_id: Tensor, task_names: list[str], window: float = 100.0):
-        self.task_id = task_id
-        self.task_names = task_names
-        self.window = window
+        self.task_id, self.task_names, self.window = task_id, task_names, window
         # Rows: return, length, success, count.
         self.sums = torch.zeros(4, len(task_names), device=task_id.device)
 
@@ -98,9 +96,13 @@ def collect(
         rollout.rewards[t] = reward.masked_fill(~valid, 0.0)
         rollout.terminated[t], rollout.ended[t], rollout.valid[t] = terminated, terminated | truncated | ~valid, valid
         cut = truncated & ~terminated & valid
-        rollout.final_values[t] = _values_where(
-            cut, info["final_obs"], world.task_id, final_value, rollout.final_values[t]
-        )
+        values, final_obs = rollout.final_values[t].zero_(), info["final_obs"]
+        if not may_look(cut.device):
+            # A forward of all environments is cheaper than the wait for which rows there are.
+            there = cut.view(-1, *[1] * (values.dim() - 1))
+            values.copy_(torch.where(there, final_value(final_obs, world.task_id), 0.0))
+        elif len(rows := cut.nonzero().squeeze(-1)):
+            values[rows] = final_value(final_obs[rows], world.task_id[rows])
         episodes.update(info)
     rollout.last_obs.copy_(obs)
     return obs
@@ -120,14 +122,3 @@ def check_autoreset(world: VectorWorld, learner: str, expected: str) -> None:
 def may_look(device: torch.device) -> bool:
     """Whether asking a tensor for its values costs nothing: elsewhere the host would wait for the device."""
     return device.type == "cpu"
-
-
-def _values_where(cut: Tensor, final_obs: Tensor, task_id: Tensor, final_value: FinalValue, like: Tensor) -> Tensor:
-    values = torch.zeros_like(like)
-    if not may_look(cut.device):
-        # A forward of all environments is cheaper than the wait for which rows there are.
-        return torch.where(cut.view(-1, *[1] * (like.dim() - 1)), final_value(final_obs, task_id), values)
-    rows = cut.nonzero().squeeze(-1)
-    if len(rows):
-        values[rows] = final_value(final_obs[rows], task_id[rows])
-    return values

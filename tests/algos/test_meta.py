@@ -11,7 +11,7 @@ from torch.testing import assert_close
 
 from bidex_algos.meta.adaptation import weighted_mean
 from bidex_algos.meta.maml import MAML, MAMLConfig
-from bidex_algos.meta.meta_policy import make_meta_policy
+from bidex_algos.meta.base import make_meta_policy
 from bidex_algos.meta.promp import ProMP, ProMPConfig
 from bidex_algos.meta.stage import features
 from bidex_algos.nets.inputs import Inputs

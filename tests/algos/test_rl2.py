@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from bidex_algos.meta.rl2 import RL2, RL2Config
-from bidex_algos.meta.rl2_agent import RL2Agent
+from bidex_algos.meta.rl2 import RL2Agent
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.recurrent import RecurrentNet
 from bidex_meta import Benchmark

@@ -6,7 +6,7 @@ import torch
 from torch.testing import assert_close
 
 from bidex_algos.meta.rl2 import RL2
-from bidex_algos.meta.rl2_agent import RL2Agent
+from bidex_algos.meta.rl2 import RL2Agent
 from bidex_meta.agents import Timestep
 from tests.algos.families import PointGoals
 from tests.algos.test_rl2 import SMALL, TEN, TINY, UNEVEN, adapted, everyone, state_of

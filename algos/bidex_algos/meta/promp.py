@@ -1,15 +1,8 @@
 """ProMP: proximal meta-policy search (Rothfuss et al. 2019) on a batch of tasks at once.
 
-The outer step, repeated ``outer_epochs`` times on one meta-batch with stages D_0 ... D_K::
-
-    theta_0 = theta
-    theta_k+1 = theta_k + inner_learning_rate * grad of mean over D_k of ratio(theta_k) * advantage      k < K
-    maximise over theta, the mean over tasks of
-        mean over D_K of min(ratio(theta_K) * advantage, clipped ratio * advantage)
-        - kl_weight * sum over k < K of KL(policy that sampled D_k || theta_k)
-
-The ratio, unlike the log-likelihood, has the right second derivative: it gives the policy before adaptation credit for
-the data that adaptation needs (their section 4).
+As ``maml.py``, but inner steps follow ratio * advantage, whose second derivative gives the policy before adaptation
+credit for the data that adaptation needs (their section 4), and the outer step, ``outer_epochs`` times on a meta-batch,
+raises PPO's clipped objective on D_K minus kl_weight * sum over k < K of KL(policy that sampled D_k || theta_k).
 """
 
 from dataclasses import dataclass
@@ -73,26 +66,18 @@ class ProMP(MetaLearner):
     config: ProMPConfig
 
     def _outer(self, batches: list[TaskBatch]) -> dict[str, Tensor]:
-        measured = []
-        for epoch in range(self.config.outer_epochs):
+        measured, cfg, group = [], self.config, self.adam.param_groups[0]  # not that of learned step sizes
+        for epoch in range(cfg.outer_epochs):
             surrogate, inner_kl, outer_kl = self._objective(batches)
-            if epoch > 0:  # before the first step it is 0 by construction
-                self._follow(outer_kl)
-            norm = self._descend(self.config.kl_weight * inner_kl - surrogate)
+            if epoch > 0 and cfg.desired_kl is not None:  # before the first step it is 0 by construction
+                low, high = cfg.outer_learning_rate_range
+                group["lr"] = min(max(group["lr"] * float(factor_of(outer_kl.detach(), cfg.desired_kl)), low), high)
+            norm = self._descend(cfg.kl_weight * inner_kl - surrogate)
             measured.append(torch.stack([-surrogate, inner_kl, outer_kl, norm]).detach())
         means = torch.stack(measured).mean(0)
         names = ("Loss/surrogate", "Policy/inner_kl", "Policy/outer_kl", "Policy/gradient_norm")
-        reported = dict(zip(names, means, strict=True))
-        return reported | {
-            "Policy/outer_learning_rate": torch.tensor(self.adam.param_groups[0]["lr"], device=self.device)
-        }
-
-    def _follow(self, kl: Tensor) -> None:
-        if self.config.desired_kl is None:
-            return
-        low, high = self.config.outer_learning_rate_range
-        for group in self.adam.param_groups[:1]:  # not that of learned step sizes
-            group["lr"] = min(max(group["lr"] * float(factor_of(kl.detach(), self.config.desired_kl)), low), high)
+        rate = torch.tensor(group["lr"], device=self.device)
+        return {**dict(zip(names, means, strict=True)), "Policy/outer_learning_rate": rate}
 
     def _objective(self, batches: list[TaskBatch]) -> tuple[Tensor, Tensor, Tensor]:
         """Clipped objective, summed KL before adaptation, and KL after it: means over tasks, scalars."""

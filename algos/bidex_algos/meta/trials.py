@@ -1,7 +1,6 @@
-"""Trials: a few whole episodes of one task in each environment, played with one memory.
+"""Trials: a few whole episodes of one task in each environment, played with one memory; episodes begin together.
 
-All environments start the next episode together; one whose episode is over waits, its memory untouched. Waiting is not
-recorded: slot t holds what the memory saw at its t-th step.
+A row whose episode is over waits, its memory untouched. Waiting is not recorded: slot t holds the memory's t-th step.
 """
 
 from dataclasses import dataclass

@@ -1,11 +1,7 @@
 """HAPPO: agents that take PPO's update one after another (Kuba et al. 2022; appendix B.2.3).
 
-For each agent, in an order drawn anew in each iteration::
-
-    M = A x product of the ratios, new policy over old, of the agents before it
-    PPO's clipped surrogate with M in the place of the advantage A: some epochs of mini-batches
-
-Then the critic of all. Each agent's step is to the gain of all, whatever the others did before it.
+Each agent, in an order drawn anew in each iteration, climbs PPO's clipped surrogate with the advantage times the ratios
+of the agents before it, so that its step is to the gain of all; then the critic of all learns.
 """
 
 from dataclasses import dataclass, replace

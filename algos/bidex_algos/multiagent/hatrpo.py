@@ -1,7 +1,6 @@
 """HATRPO: agents that take TRPO's step one after another (Kuba et al. 2022; appendix B.2.2).
 
-For each agent, in an order drawn anew in each iteration, MT-TRPO's step on its own parameters, within its share of the
-trust region, with the advantage times the ratios of the agents before it. Then the critic of all.
+As HAPPO, with MT-TRPO's step on each agent's own parameters, within its share of the trust region.
 """
 
 from dataclasses import dataclass, replace

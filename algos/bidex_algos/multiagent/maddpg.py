@@ -1,13 +1,7 @@
 """MADDPG: DDPG of several agents with a critic that sees everything (Lowe et al. 2017; appendix B.2.5).
 
-For each update of :class:`~bidex_algos.offpolicy.ddpg.DDPG`::
-
-    y    = r + gamma (1 - terminated) Q'(x', mu'_1(o'_1), ..., mu'_n(o'_n))
-    Q    towards y
-    mu_i up on Q(x, a_1, ..., mu_i(o_i), ..., a_n), the others' actions from the replay; for each agent i
-
-The original has a critic for each agent, since rewards may differ. Here they are shared, so that all critics would have
-the same targets: there is one.
+Each agent i climbs Q(x, a_1, ..., mu_i(o_i), ..., a_n), the others' actions from the replay; all else is DDPG's. The
+original has a critic for each agent, since rewards may differ; here they are shared, so that all would be alike.
 """
 
 from dataclasses import dataclass

@@ -1,7 +1,7 @@
 """MAPPO: PPO of several agents with one critic that sees everything (Yu et al. 2022; appendix B.2.4).
 
-An iteration is MT-PPO's, and with one agent the update is too: in each mini-batch every agent climbs its own clipped
-surrogate, the critic its targets. The advantage is of all agents together, normalised per task like the returns.
+As MT-PPO, and with one agent the same: in each mini-batch every agent climbs its own clipped surrogate. The advantage
+is of all agents together, normalised per task like the returns.
 """
 
 from dataclasses import dataclass, replace

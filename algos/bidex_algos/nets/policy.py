@@ -46,11 +46,6 @@ class GaussianPolicy(ActorPolicy):
     actor: GaussianActor
 
     @torch.no_grad()
-    def mean(self, obs: Tensor) -> Tensor:
-        """Mean action of raw observations (N, d): float32 (N, a), not clamped."""
-        return self.distribution(obs)[0]
-
-    @torch.no_grad()
     def distribution(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         """Mean action (N, a) and logarithm of the standard deviation, (a,) or (N, a), of raw observations (N, d)."""
         obs = self.observations(obs)
@@ -59,7 +54,7 @@ class GaussianPolicy(ActorPolicy):
 
     def eval_action(self, obs: Tensor) -> Tensor:
         """Mean action of raw observations (N, d), clamped to [-1, 1]: (N, a)."""
-        return self.mean(obs).clamp(-1.0, 1.0)
+        return self.distribution(obs)[0].clamp(-1.0, 1.0)
 
     def sample_action(self, obs: Tensor, generator: torch.Generator) -> Tensor:
         """Actions drawn from the distribution for raw observations (N, d), clamped to [-1, 1]: (N, a)."""
@@ -134,8 +129,7 @@ def deterministic_policy(
 def squashed_log_prob(raw: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
     """Log-density of the action tanh(raw), where raw is drawn from N(mean, exp(log_std)^2).
 
-    It takes what was squashed: in float32 tanh rounds to 1 from 9 on, and the way back from an action of 1 is infinite.
-    All are (..., a); the result is summed over the last axis, (...).
+    Of what was squashed, (..., a), to (...): in float32 tanh rounds to 1 from 9 on, whose way back is infinite.
     """
     # log(1 - tanh(u)^2), written so that no difference of almost equal numbers occurs.
     log_slope = 2.0 * (math.log(2.0) - raw - softplus(-2.0 * raw))

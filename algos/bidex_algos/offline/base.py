@@ -71,11 +71,6 @@ class CriticConfig(OfflineConfig):
     per_task_rewards: bool = True
     """Divide rewards by the standard deviation of their task's discounted returns in the data."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0.0 <= self.gamma < 1.0:
-            raise BidexError(f"{self.algo}: gamma must lie in [0, 1), got {self.gamma}.")
-
 
 PAPER: Options = {"value_heads": False, "critic_layer_norm": False, "per_task_rewards": False}
 """What the preset ``paper`` leaves out of all learners with critics: Table 46 and the methods' papers know none."""
@@ -105,12 +100,10 @@ class Batches:
         """The transitions at ``places`` (B,)."""
         at = self._at[places]
         return Transitions(
-            obs=self._observations.index_select(0, at),
-            actions=self._actions.index_select(0, places),
-            rewards=self._rewards[places],
-            next_obs=self._observations.index_select(0, at + 1),
-            terminated=self._terminated[places],
-        )
+            obs=self._observations.index_select(0, at), actions=self._actions.index_select(0, places),
+            rewards=self._rewards[places], next_obs=self._observations.index_select(0, at + 1),
+            terminated=self._terminated[places]
+        )  # fmt: skip
 
     def chunks(self) -> tuple[Tensor, ...]:
         """All states, some at a time, (n, d) each."""
@@ -120,8 +113,8 @@ class Batches:
 def return_deviation(data: Joined, num_tasks: int, gamma: Tensor | float) -> Tensor:
     """Standard deviation of each task's discounted returns, from every state to the end of its episode: (num_tasks,).
 
-    It doubles the steps that a sum spans until it spans the longest episode. An episode that was cut by time counts up
-    to there. 1 where all returns are equal. ``gamma`` is one for all, or (num_tasks,).
+    An episode that was cut by time counts up to there; 1 where all returns are equal; ``gamma`` for all or
+    (num_tasks,). The steps that a sum spans are doubled until it spans the longest episode.
     """
     returns = data.rewards.double()
     factor = torch.as_tensor(gamma, dtype=torch.float64).cpu().expand(num_tasks)[data.task]
@@ -242,8 +235,8 @@ class Offline(Learner):
 
     def _parts(self) -> Parts:
         critics = {"critic": self.critic, "target_critic": self.target_critic} if self.num_critics else {}
-        generators = {"generator": self.generator, "noise": self.noise}
-        return {**critics, **self._own_parts(), "adams": self.adams, **generators, "reward_scale": self.reward_scale}
+        rest = {"generator": self.generator, "noise": self.noise, "reward_scale": self.reward_scale}
+        return {**critics, **self._own_parts(), "adams": self.adams, **rest}
 
     def _place(self) -> State:
         return super()._place() | {"data": self._batches and dict(self._batches.fingerprint)}

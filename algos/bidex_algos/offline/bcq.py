@@ -1,11 +1,7 @@
 """BCQ: values of actions that a model of the data proposes (Fujimoto et al. 2019; appendix B.3.1).
 
-G    down on |G(s, z) - a|^2 + KL, z the code of a                     the data's actions
-a'_j = G(s', z_j) + xi'(s', G(s', z_j)),  j = 1...n, |xi'| <= Phi
-y    = r + gamma (1 - terminated) max_j [w min_i + (1 - w) max_i] Q'_i(s', a'_j)
-Q_i  towards y
-xi   up on Q_1(s, a + xi(s, a)), a = G(s, z)
-Q', xi'  a small step towards Q, xi
+G down on |G(s, z) - a|^2 + KL, z the code of a; a'_j = G(s', z_j) + xi'(s', G(s', z_j)), j = 1...n, |xi'| <= Phi;
+Q_i towards r + gamma (1 - terminated) max_j [w min_i + (1 - w) max_i] Q'_i(s', a'_j); xi up on Q_1(s, a + xi(s, a)).
 """
 
 import copy

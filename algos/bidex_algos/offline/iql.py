@@ -1,9 +1,7 @@
 """IQL: values without an action that the data do not hold (Kostrikov et al. 2022; appendix B.3.3).
 
-V   down on |t - 1(u < 0)| u^2,   u = min_i Q'_i(s, a) - V(s)        t-expectile of the data's actions
-pi  up on   min(exp(beta u), bound) log pi(a | s)
-Q_i towards r + gamma (1 - terminated) V(s')
-Q'  a small step towards Q
+V down on |t - 1(u < 0)| u^2, u = min_i Q'_i(s, a) - V(s): the t-expectile of the data's actions; pi up on
+min(exp(beta u), bound) log pi(a | s); Q_i towards r + gamma (1 - terminated) V(s').
 """
 
 from dataclasses import dataclass

@@ -1,9 +1,6 @@
 """TD3+BC: TD3 on stored transitions, with an actor that stays near the data (Fujimoto and Gu 2021; appendix B.3.2).
 
-y  = r + gamma (1 - terminated) min_i Q'_i(s', mu'(s') + clip(noise, -c, c))
-Q_i  towards y
-mu   down on (mu(s) - a)^2 - lambda Q_1(s, mu(s)),    lambda = alpha / mean |Q_1(s, mu(s))|
-mu', Q'  a small step towards mu, Q                    mu and the targets at every second update
+TD3's targets and delay; mu down on (mu(s) - a)^2 - lambda Q_1(s, mu(s)), lambda = alpha / mean |Q_1(s, mu(s))|.
 """
 
 import copy

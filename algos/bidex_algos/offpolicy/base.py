@@ -1,12 +1,8 @@
 """What the off-policy learners share: a replay per task, updates after each step, critics, targets, checkpoints.
 
-They differ in how the actor explores, in what the critics shall say, and in the actor's update. An iteration is
-``steps_per_iteration`` times::
-
-    one step in every environment, with exploration (uniform actions at first); into the replay
-    updates_per_step times: draw equally many transitions of each task; the learner's update
-
-Rewards are divided by the running deviation of their task's discounted return, so that no task outweighs another.
+They differ in how the actor explores, in what the critics shall say, and in the actor's update. An iteration is some
+times one step in every environment, then ``updates_per_step`` updates on equally many transitions of each task. Rewards
+are divided by the running deviation of their task's discounted return, so that no task outweighs another.
 """
 
 import copy

@@ -1,13 +1,8 @@
 """BRC: "bigger, regularised, categorical" (Nauman et al. 2025, arXiv 2505.23150): SAC on all tasks by one large critic.
 
-    a' = tanh(u), u ~ N(mean, std)(s')
-    y  = r + gamma (1 - terminated) (Z'(s', a') - alpha log pi(a'|s'))     Z': the mean of both critics' distributions
-    Z_i  towards y by cross-entropy: wide residual networks with layer norm, weights decay
-    pi   down on alpha log pi(a|s) - mean_i E Z_i(s, a)
-    rewards over their task's largest return, so that all tasks fill the same atoms (the paper's equation 2)
-
-The task enters by a learned vector of length 1. The critic has the capacity, the actor is small; no critic is
-pessimistic. All else is as in ``mtsac.py`` and ``categorical.py``; deviations stand in ``docs/learners/brc.md``.
+Targets are r + gamma (1 - terminated) (Z'(s', a') - alpha log pi(a'|s')), Z' the mean of both critics' distributions,
+which are wide residual networks; rewards are over their task's largest return (the paper's equation 2); the task enters
+by a learned vector of length 1. All else is as in ``mtsac.py`` and ``categorical.py``; see ``docs/learners/brc.md``.
 """
 
 import math

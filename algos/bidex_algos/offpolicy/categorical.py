@@ -1,12 +1,8 @@
 """What FastTD3 and BRC share: critics that give a distribution of the return, taught by cross-entropy.
 
-    Z      the return of (s, a), as probabilities of fixed values ("atoms"); Q = E Z
-    y = r + gamma (1 - terminated) Z'(s', a')    a distribution too, projected back on the atoms (C51)
-    Z_i    towards y, down on -sum_j y_j log p_ij
-
-Bellemare et al. 2017 (arXiv 1707.06887). A regression's gradient grows with the scale of a task's returns and its
-errors, a classification's does not. The price: the atoms span a fixed range, so that rewards must be scaled into it;
-what each task's rewards are divided by follows its largest return so far (``ReturnBound``).
+Z(s, a) has probabilities of fixed values ("atoms"); targets r + gamma (1 - terminated) Z'(s', a') are projected back on
+them (C51, Bellemare et al. 2017, arXiv 1707.06887). Unlike a regression's, its gradient does not grow with the scale of
+a task's returns; but rewards must be scaled into the atoms' range, by the task's largest return (``ReturnBound``).
 """
 
 from dataclasses import dataclass

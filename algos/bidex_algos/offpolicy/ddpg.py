@@ -1,20 +1,8 @@
 """DDPG: a deterministic actor that climbs its critic (Lillicrap et al. 2016; appendix B.1.3), on all tasks of a world.
 
-For each vector step of the world::
-
-    a = mu(s) + noise                            one step in every environment; into the replay
-    y = r + gamma (1 - terminated) Q'(s', mu'(s'))
-    Q   towards y                                on equally many transitions of each task
-    mu  up on Q(s, mu(s))
-    Q', mu'  a small step towards Q, mu
-
-A critic's slope drives actions into the corners of their box, where tanh has no slope that would bring them back: on
-two hands 86 % of all actions were beyond 0.99 after 0.4 M steps, and the policy stood still. ``squash_price`` on the
-square of what goes into tanh keeps them from there; 0 gives the original.
-
-The noise is normal and without memory. Its size differs from environment to environment of a task, so that some show
-what the policy does and others what lies far from it (the spread of Horgan et al. 2018); two equal numbers give the
-original.
+Q towards r + gamma (1 - terminated) Q'(s', mu'(s')), mu up on Q(s, mu(s)). A critic's slope drives actions into corners
+where tanh has no slope back (on two hands 86 % were beyond 0.99 after 0.4 M steps): ``squash_price`` keeps them out.
+The noise, normal, differs in size from environment to environment of a task (the spread of Horgan et al. 2018).
 """
 
 import copy

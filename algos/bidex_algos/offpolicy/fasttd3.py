@@ -1,13 +1,8 @@
 """FastTD3: TD3 with categorical critics and large batches (Seo et al. 2025, arXiv 2505.22642), on all tasks of a world.
 
-    a  = mu(s) + noise                           of another size in each environment ("mixed noise")
-    a' = mu(s') + clip(noise, -c, c)             the present actor's: none follows it
-    y  = r + gamma (1 - terminated) Z'(s', a')   of the critic with the lower mean, projected on the atoms
-    Z_i  towards y by cross-entropy; mu up on min_i E Z_i(s, mu(s)), at every second update; Z' at each
-    rewards over max(deviation, largest / bound) of their task's returns, so that values fit the atoms
-
-Few updates of many transitions follow each vector step, targets follow fast, returns may take several steps (n-step),
-weights decay. All else is as in ``td3.py`` and ``categorical.py``; deviations stand in ``docs/learners/fasttd3.md``.
+Few updates of many transitions follow each vector step; targets take the present actor's actions and follow fast, mu
+climbs min_i E Z_i, returns may take several steps, weights decay; rewards are over max(deviation, largest / bound) of
+their task's returns. All else is as in ``td3.py`` and ``categorical.py``; see ``docs/learners/fasttd3.md``.
 """
 
 from dataclasses import dataclass

@@ -1,18 +1,9 @@
 """MT-SAC: soft actor-critic (Haarnoja et al. 2018) on all tasks of a world at once, with a temperature for each.
 
-For each vector step of the world::
-
-    a = tanh(u), u ~ N(mean, std)(s)             one step in every environment; into the replay
-    y = r + gamma (1 - terminated) (min_i Q'_i(s', a') - alpha_k log pi(a'|s'))
-    Q_i  towards y                               i = 1, 2; on equally many transitions of each task k
-    pi   down on alpha_k log pi(a|s) - min_i Q_i(s, a)
-    log alpha_k  down on -log alpha_k (log pi(a|s) + H)      the mean over task k alone
-    Q'_i  a small step towards Q_i
-
-The target entropy H is ``target_entropy_per_action`` times the number of actions: Haarnoja's -dim(A) by default. One
-temperature for all would be set by their mean entropy: a task that is solved and one that still explores need
-different ones ("disentangled alphas"). The loss of log alpha is linear in log alpha rather than in alpha, so that its
-gradient is the gap in entropy whatever alpha is. Deviations stand in ``docs/learners/mtsac.md``.
+Q_i towards r + gamma (1 - terminated) (min_i Q'_i(s', a') - alpha_k log pi(a'|s')); pi down on alpha_k log pi - min_i
+Q_i; log alpha_k down on -log alpha_k (log pi + H), the mean over task k alone: one temperature for all would be set by
+their mean entropy, though a task that is solved and one that still explores need different ones. The loss is linear in
+log alpha, so that its gradient is the gap in entropy whatever alpha is. Deviations: ``docs/learners/mtsac.md``.
 """
 
 import math
@@ -156,8 +147,7 @@ class MTSAC(OffPolicy):
 class SAC(MTSAC):
     """Multi-task SAC (Haarnoja et al. 2018, arXiv 1812.05905) on a batched world.
 
-    The same learner with the presets of a single task; those of MT-SAC are made of Table 43, SAC's own, which has the
-    same numbers in all of its columns.
+    MT-SAC, whose presets are made of Table 43, SAC's own: it has the same numbers in all of its columns.
     """
 
     task_presets = TASK_PRESETS

@@ -1,10 +1,7 @@
 """TD3: DDPG with three changes (Fujimoto et al. 2018; Bi-DexHands' appendix B.1.4), on all tasks of a world at once.
 
-    a' = mu'(s') + clip(noise, -c, c)            targets are smoothed over actions,
-    y  = r + gamma (1 - terminated) min_i Q'_i(s', a')        taken from the lower of two critics,
-    mu, mu', Q'  at every second update          and the actor waits for the critics
-
-All else is as in ``ddpg.py``.
+Targets are smoothed over actions, a' = mu'(s') + clip(noise, -c, c), and taken from the lower of two critics; the actor
+and all targets wait for the critics, and move at every second update.
 """
 
 from dataclasses import dataclass

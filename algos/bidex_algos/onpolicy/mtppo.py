@@ -1,8 +1,7 @@
 """MT-PPO: proximal policy optimisation (Schulman et al. 2017) on all tasks of a world at once.
 
-One policy reads the task's one-hot in its observation. An iteration collects ``rollout_steps`` steps in every
-environment, then makes ``epochs`` passes over them in shuffled mini-batches. What is done differently from Bi-DexHands'
-MTPPO, and why, stands in ``docs/learners/mtppo.md``.
+One policy reads the task's one-hot in its observation. What is done differently from Bi-DexHands' MTPPO, and why,
+stands in ``docs/learners/mtppo.md``.
 """
 
 import math
