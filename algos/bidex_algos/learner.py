@@ -234,7 +234,6 @@ def _network(weights: State) -> State:
 
 
 def _seen(shape: Shape) -> State:
-    """What of a world's shape a network's weights depend on."""
     ids = [[part.start, part.stop] for group in shape.groups if group.name == "task_id" for part in group.where]
     return dict(zip(_WORLD, (shape.observations, shape.actions, ids), strict=True))
 

@@ -117,7 +117,6 @@ class Adapter:
         return [name for name in names if name.startswith(self._prefix)]
 
     def _slopes(self, params: Params, batch: TaskBatch, own: list[str]) -> Params:
-        """Gradients of the tasks' inner losses by the parameters named; no task's loss knows another's parameters."""
 
         def loss(moved: Params) -> Tensor:
             means, log_stds = self.distribution(params | moved, batch.obs)
@@ -140,7 +139,6 @@ def _old_log_prob(b: TaskBatch) -> Tensor:
 
 
 def _parts(params: Params, batch: TaskBatch) -> Iterator[tuple[Params, TaskBatch]]:
-    """Tasks to be differentiated together: on a CPU as many as its caches hold, elsewhere all."""
     tasks, transitions = batch.weights.shape
     size = max(1, _TRANSITIONS_AT_ONCE // transitions) if batch.obs.device.type == "cpu" else tasks
     for k in range(0, tasks, size):

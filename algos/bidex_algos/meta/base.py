@@ -175,7 +175,6 @@ class MetaLearner(Learner):
         return {"adam": self.adam}
 
     def _descend(self, loss: Tensor) -> Tensor:
-        """One step of Adam of the meta-parameters; the norm of the meta-gradient before it was shortened, a scalar."""
         self.adam.zero_grad()
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.policy.actor.parameters(), self.config.max_grad_norm)

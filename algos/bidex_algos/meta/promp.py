@@ -80,7 +80,6 @@ class ProMP(MetaLearner):
         return {**dict(zip(names, means, strict=True)), "Policy/outer_learning_rate": rate}
 
     def _objective(self, batches: list[TaskBatch]) -> tuple[Tensor, Tensor, Tensor]:
-        """Clipped objective, summed KL before adaptation, and KL after it: means over tasks, scalars."""
         adapter, clip = self.policy.adapter, self.config.clip
         params = adapter.meta(self.rows.count)
         inner_kl = torch.zeros((), device=self.device)

@@ -283,7 +283,6 @@ class Sequential(MultiAgent):
         return torch.exp(gaussian_log_prob(share.actions, mean, log_std) - share.old_log_probs)
 
     def _distribution(self, agent: int, share: AgentBatch) -> tuple[Tensor, Tensor]:
-        """Mean (B, a_i) and logarithm of the standard deviation of an agent's present policy, (a_i,) or (B, a_i)."""
         with autocast(self.device, self.low_precision):
             return self.policy.actor.distribution_of(agent, share.seen, share.task)
 

@@ -56,7 +56,6 @@ class HAPPO(OwnAdams, Sequential):
         return reported | {"Policy/lr": rate}
 
     def _agent_epochs(self, agent: int, share: AgentBatch) -> Tensor:
-        """Some passes over the batch by one agent; the means of surrogate loss, KL and share of clipped ratios (3,)."""
         cfg, adam, parameters = self.config, self.adams[agent], self.policy.actor.parameters_of(agent)
         measured: list[Tensor] = []
         for first, index, count in self._mini_batches(share.weights, cfg.epochs, cfg.num_minibatches):

@@ -85,7 +85,6 @@ class MAPPO(OwnAdams):
         return sum_gradients([*actor.parameters(), *self.critic.parameters()], torch.stack(numbers))
 
     def _agent_losses(self, b: Batch, weights: Tensor, old_log_std: Tensor) -> list[PolicyLoss]:
-        """The loss of each agent; ``b`` has old log-densities and, of several critics, advantages (B, agents)."""
         actor, task = self.policy.actor, self.policy.actor.one_hot(b.obs)
         with autocast(self.device, self.low_precision):
             means = actor.means(b.obs)

@@ -59,7 +59,6 @@ class Team(nn.Module):
         return [found[i] for i in range(len(self.net_of))]
 
     def _family(self, family: list[int], x: Tensor) -> Tensor:
-        """Outputs (M, B, outputs) of the agents of one form for what they see (M, B, inputs)."""
         nets = [cast(MLP, self.nets[self.net_of[i]]) for i in family]
         if self.share:
             return nets[0](x.flatten(0, 1)).unflatten(0, x.shape[:2])

@@ -184,7 +184,6 @@ class Offline(Learner):
         return Critics(inputs, heads, self.config, layer_norm, self.initial, count).to(self.device)
 
     def _own_parts(self) -> Parts:
-        """Networks of its own, beside those of the base, by their names in a checkpoint."""
         return {}
 
     def _iterate(self) -> dict[str, float]:
@@ -206,7 +205,6 @@ class Offline(Learner):
             return critic(obs, actions, self.task_of_draw)
 
     def _bootstrapped(self, draw: Transitions, following: Tensor) -> Tensor:
-        """Targets (B,): scaled reward + gamma * ``following`` (B,), the value of the next state."""
         rewards = draw.rewards / self.reward_scale[self.task_of_draw]
         return rewards + self.gamma_of_draw * following.masked_fill(draw.terminated, 0.0)
 
@@ -219,7 +217,6 @@ class Offline(Learner):
         return {"Loss/critic": loss.detach()} | reported
 
     def _descend(self, loss: Tensor, name: str, *modules: nn.Module) -> None:
-        """One step of the optimiser named, down ``loss``; weights of these modules alone get a slope."""
         weights = [weight for module in modules for weight in module.parameters()]
         self.adams[name].zero_grad()
         loss.backward(inputs=weights)

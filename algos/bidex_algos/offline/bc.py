@@ -41,5 +41,4 @@ class BC(Offline):
         return reported | {"Loss/imitation": imitation.detach()}
 
     def _actor_loss(self, imitation: Tensor, obs: Tensor, actions: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """The actor's loss and further metrics, for its actions (B, a) and their distance to the data's."""
         return imitation, {}

@@ -169,11 +169,9 @@ class OffPolicy(Learner):
         """One update by a draw (B), whose weights (B,) are 0 for what teaches nothing; ``counts``: of all processes."""
 
     def _own_parts(self) -> Parts:
-        """Networks and parameters of its own, beside those of the base, by their names in a checkpoint."""
         return {}
 
     def _reported(self) -> dict[str, Tensor]:
-        """Scalars to be logged at the end of every iteration, before the first update too."""
         return {}
 
     def _iterate(self) -> dict[str, float]:
@@ -196,7 +194,6 @@ class OffPolicy(Learner):
 
     @torch.no_grad()
     def _step(self) -> Tensor:
-        """One step in every environment; returns how many broke physics."""
         actions = self._act(self.replay.obs)
         obs, reward, terminated, truncated, info = self.world.step(actions)
         self.replay.add(actions, reward, terminated, truncated, obs, info)
@@ -211,7 +208,6 @@ class OffPolicy(Learner):
         return self._explore(obs)
 
     def _reward_scale(self) -> Tensor:
-        """What rewards of each task are divided by (num_tasks,); 1 unless ``per_task_rewards``."""
         scale = self.returns.deviation()
         return scale if self.config.per_task_rewards else torch.ones_like(scale)
 
@@ -249,7 +245,6 @@ class OffPolicy(Learner):
         return dict(zip(["Loss/critic", "Train/weightless", *names], numbers, strict=True))
 
     def _critic_losses(self, obs: Tensor, actions: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-        """How far the critics are from the targets (num_critics, B), and the first one's values (B,)."""
         values = self._values(self.critic, obs, actions)
         return (values - target).square(), values[0].detach()
 

@@ -173,7 +173,6 @@ class Categorical(OffPolicy):
         return values.amin(0) if self.config.clipped_double_q else values.mean(0)
 
     def _following(self, next_obs: Tensor, next_actions: Tensor) -> Tensor:
-        """Distribution of the return (B, atoms) from where a draw leads, by the target critics."""
         probs = self._log_probs(self.target_critic, next_obs, next_actions).exp()
         if not self.config.clipped_double_q:
             return probs.mean(0)

@@ -92,12 +92,10 @@ class DDPG(OffPolicy):
 
     @torch.no_grad()
     def _target(self, draw: Transitions, next_obs: Tensor) -> Tensor:
-        """What the critics shall say of the drawn transitions (B,); ``next_obs`` are normalised."""
         following = self._values(self.target_critic, next_obs, self._target_action(next_obs))
         return self._bootstrapped(draw, self._pooled(following))
 
     def _target_action(self, next_obs: Tensor) -> Tensor:
-        """What a target assumes to be done (B, a) at normalised observations (B, d)."""
         actor = self.target_actor if self.delayed_targets else self.policy.actor
         with autocast(self.device, self.low_precision):
             return actor(next_obs)
@@ -111,7 +109,6 @@ class DDPG(OffPolicy):
         self.actor_loss = self._descend(loss, loss.detach()[None], "actor", actor=actor)[0]
 
     def _climbed(self, values: Tensor) -> Tensor:
-        """What the actor climbs (B,): the first critic's values."""
         return values[0]
 
     def _reported(self) -> dict[str, Tensor]:

@@ -133,7 +133,6 @@ class MTSAC(OffPolicy):
         return dict(zip(["Loss/actor", "Policy/entropy"], numbers, strict=True))
 
     def _gap_that_counts(self, gap: Tensor) -> Tensor:
-        """The gap in entropy that each task's temperature follows, of the tasks' own (num_tasks,)."""
         return gap
 
     def _reported(self) -> dict[str, Tensor]:

@@ -164,7 +164,6 @@ class OnPolicy(Learner):
         return of_head(out, task_id) if self.config.value_heads else out.squeeze(1)
 
     def _element(self, task_id: Tensor) -> Tensor:
-        """Where the returns of a task (B,) stand in the statistics: (B,), of several critics (B, critics)."""
         if self.num_critics == 1:
             return task_id
         return task_id[:, None] + self.world.num_tasks * torch.arange(self.num_critics, device=self.device)
@@ -183,7 +182,6 @@ class OnPolicy(Learner):
 
     @torch.no_grad()
     def _prepare(self) -> tuple[Batch, Tensor]:
-        """Turns the rollout into a batch; also the explained variance per task (num_tasks,)."""
         r, cfg, num_tasks = self.rollout, self.config, self.world.num_tasks
         steps, rows = r.rewards.shape
         task_id = self.world.task_id
