@@ -91,7 +91,6 @@ class PointGoals(FakePools):
         return obs, reward, terminated, truncated, info
 
     def best(self, obs: Tensor) -> Tensor:
-        """The best action (N, 2) for observations (N, 4) that show the goal."""
         return ((obs[:, 2:] - obs[:, :2]) / self.speed).clamp(-1.0, 1.0)
 
 

@@ -14,7 +14,6 @@ from tests.fake_world import FakeWorld
 
 
 def one_step_bandit(target: float = 0.6, rows: int = 32) -> ToyWorld:
-    """Episodes of one step that end truly. The best action is ``target`` in each entry and pays 1."""
     return ToyWorld([nearness(target)], rows=rows, horizon=1, terminal=True)
 
 
@@ -76,13 +75,11 @@ class LQR(_TimedWorld):
         return -cost, self.state.abs().amax(1) < 0.1, self.never
 
     def optimum(self, gamma: float) -> tuple[np.ndarray, np.ndarray]:
-        """P and K: the best discounted return from x is -x·Px, by the actions -Kx."""
         a, b = np.sqrt(gamma) * self.a, np.sqrt(gamma) * self.b
         p = scipy.linalg.solve_discrete_are(a, b, self.q, self.r)
         return p, np.linalg.solve(self.r + b.T @ p @ b, b.T @ p @ a)
 
     def best(self, gamma: float) -> Callable[[Tensor], Tensor]:
-        """The best policy, observations to actions."""
         k = torch.from_numpy(self.optimum(gamma)[1]).float()
         return lambda obs: -obs @ k.T
 
@@ -116,7 +113,6 @@ class PointMass(_TimedWorld):
         return -distance, distance < 0.05, self.never
 
     def best(self, obs: Tensor) -> Tensor:
-        """The best action (N, 2) for observations that show the goal."""
         return ((obs[:, 2:] - obs[:, :2]) / self.speed).clamp(-1.0, 1.0)
 
 
@@ -142,7 +138,6 @@ def trained(kind: Any, world: Any, config: Any, iterations: int) -> Any:
 
 
 def errors(learner: Any, *targets: float) -> list[float]:
-    """Mean distance of the action from each task's target."""
     obs, _ = learner.world.reset(seed=1)
     action = learner.eval_action(obs)
     return [float((action[learner.world.task_id == k] - target).abs().mean()) for k, target in enumerate(targets)]

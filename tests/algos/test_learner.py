@@ -5,7 +5,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bidex_algos.learner import as_numbers
 from bidex_algos.meta.maml import PRESETS as MAML_PRESETS
 from bidex_algos.meta.promp import PRESETS as PROMP_PRESETS
 from bidex_algos.meta.promp import ProMP, ProMPConfig
@@ -87,10 +86,3 @@ def test_another_kind_of_policy_is_refused():
     learner = MTSAC(PointGoals(rows=16, autoreset_mode="SAME_STEP"), config, seed=0)
     with pytest.raises(BidexError, match="of the same kind"):
         learner.start_from(trained().policy_state_dict())
-
-
-def test_scalars_of_any_type_become_numbers():
-    assert as_numbers({"a": torch.tensor(3), "b": torch.tensor(0.5), "c": torch.tensor(True)}) == {
-        "a": 3.0, "b": 0.5, "c": 1.0
-    }  # fmt: skip
-    assert as_numbers({}) == {}

@@ -20,7 +20,6 @@ SMALL: dict[str, Any] = {
 
 
 def rosenbrock(action: Tensor) -> Tensor:
-    """Best at (0.5, 0.25): the second agent shall do the square of what the first does, which shall do 0.5."""
     first, second = action.unbind(1)
     return 1.0 - 2.0 * (second - first.square()).square() - (first - 0.5).square()
 

@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from bidex_algos.meta.adaptation import weighted_mean
-from bidex_algos.meta.maml import MAML, MAMLConfig
 from bidex_algos.meta.base import make_meta_policy
+from bidex_algos.meta.maml import MAML, MAMLConfig
 from bidex_algos.meta.promp import ProMP, ProMPConfig
 from bidex_algos.meta.stage import features
 from bidex_algos.nets.inputs import Inputs
@@ -32,7 +32,6 @@ both = pytest.mark.parametrize(("kind", "config"), [(ProMP, PROMP), (MAML, MAML_
 
 
 def tiny(kind: Any, config: Any, tasks: int = 3) -> tuple[Any, Any]:
-    """A learner whose actor and data are those of ``problem``, in float64."""
     learner = kind(PointGoals(rows=tasks, classes=(PointClass(count=tasks),)), replace(config, hidden=(5,)), seed=0)
     actor, batches = problem(tasks=tasks, dtype=torch.float64)
     learner.policy.double().actor.load_state_dict(actor.state_dict())
@@ -41,7 +40,6 @@ def tiny(kind: Any, config: Any, tasks: int = 3) -> tuple[Any, Any]:
 
 
 def surrogate(learner: Any, batches: Any) -> Tensor:
-    """What the outer step raises, without its KL terms."""
     return learner._objective(batches)[0]
 
 
@@ -95,7 +93,6 @@ def test_first_order_leaves_the_second_derivatives_out(kind: Any, config: Any):
 
 
 def test_a_promp_step_without_kl_equals_an_independent_computation():
-    """Layer by layer, task by task, by plain autograd and Adam's first step as its paper writes it."""
     config = replace(PROMP, kl_weight=0.0, inner_learning_rate=0.2, outer_epochs=1, max_grad_norm=1e9)
     learner, [before, after] = tiny(ProMP, config)
     actor = learner.policy.actor
@@ -158,7 +155,6 @@ def test_mamls_trust_region_holds_after_adaptation(max_kl: float):
 
 
 def returns(learner: Any, shots: int = 1) -> list[float]:
-    """Mean return at goals between those of training, before adaptation and after each shot."""
     world = PointGoals(rows=80)
     world.set_tasks({"PointGoals": circle(8, first=np.pi / 8)})
     policy = learner.load_policy(learner.policy_state_dict())

@@ -48,30 +48,6 @@ def test_the_baseline_is_the_ridge_regression_of_each_task():
         assert_close(found[k], (x[k].double() @ c).float(), rtol=1e-3, atol=1e-4)
 
 
-def test_the_baseline_knows_time_and_what_has_no_weight_does_not_count():
-    t = torch.arange(40)
-    obs, returns = torch.zeros(1, 40, 2), (40.0 - t)[None].clone()
-    weights = torch.ones(1, 40)
-    returns[0, 5], weights[0, 5] = 1e6, 0.0
-    found = fitted(obs, t[None], returns, weights)
-    assert_close(found, (40.0 - t)[None], rtol=0, atol=0.2)
-
-
-def test_the_baseline_does_not_remember_what_it_cannot_know():
-    """As many features as samples: what is left must still be the noise, and what can be known must go."""
-    g = torch.Generator().manual_seed(2)
-    obs, noise = torch.randn(1, 400, 200, generator=g), torch.randn(1, 400, generator=g)
-    t = torch.arange(400) % 50
-    returns = 1.5 * obs[..., 0] + 0.1 * t + noise
-
-    def likeness(left: Tensor) -> float:
-        return float(torch.corrcoef(torch.cat([left, noise]))[0, 1])
-
-    weights = torch.ones(1, 400)
-    free, held = (likeness(returns - fitted(obs, t[None], returns, weights, ridge)) for ridge in (1e-5, 1.0))
-    assert free < 0.2 and held > likeness(returns) + 0.1
-
-
 def stage_of(rewards: Tensor, valid: Tensor, ended: Tensor, d: int = 2) -> Stage:
     g, stage = torch.Generator().manual_seed(1), Stage()
     for t in range(len(rewards)):
@@ -108,7 +84,6 @@ def test_advantages_are_normalised_in_each_task_and_frozen_steps_weigh_nothing()
 def problem(
     seed: int = 0, tasks: int = 3, samples: int = 20, dtype: torch.dtype = torch.float32
 ) -> tuple[GaussianActor, list[TaskBatch]]:
-    """A tiny actor and two stages of data of each task."""
     g = torch.Generator().manual_seed(seed)
     actor = GaussianActor(4, (5,), 2, 0.6, g, "tanh").to(dtype)
 
@@ -126,7 +101,6 @@ def problem(
 
 
 def one_by_one(actor: GaussianActor, batch: TaskBatch, objective: str, rate: float, params: Any = None) -> list[Any]:
-    """The inner step by plain autograd, task after task."""
     found = []
     for k in range(len(batch.obs)):
         own = {n: p.clone() for n, p in actor.named_parameters()} if params is None else params[k]
@@ -166,24 +140,3 @@ def test_adaptation_of_all_tasks_equals_a_loop_over_them(objective: Any):
             for name, value in own.items():
                 assert_close(params[name][k], value, rtol=1e-5, atol=1e-5)
     assert not torch.equal(params["log_std"][0], params["log_std"][1])
-
-
-def test_policies_of_all_tasks_act_as_each_alone():
-    actor, [batch, _] = problem()
-    adapter = Adapter(actor, 0.1, "ratio", (0.01, 10.0))
-    params = adapter.adapt(adapter.meta(3), batch)
-    means, log_std = adapter.distribution(params, batch.obs)
-    for k in range(3):
-        own = {name: value[k] for name, value in params.items()}
-        assert_close(means[k], functional_call(actor, own, (batch.obs[k],)))
-    assert log_std.shape == (3, 2)
-
-
-def test_ratios_start_at_one_and_the_kl_at_zero():
-    actor, [batch, _] = problem()
-    adapter = Adapter(actor, 0.1, "ratio", (0.01, 10.0))
-    params = adapter.meta(3)
-    batch.old_means, batch.old_log_stds = (x.detach() for x in adapter.distribution(params, batch.obs))
-    ratio, kl = adapter.ratio_and_kl(params, batch)
-    assert_close(ratio, torch.ones(3, 20))
-    assert_close(kl, torch.zeros(3), rtol=0, atol=1e-6)

@@ -7,7 +7,7 @@ from torch.testing import assert_close
 
 from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_meta.errors import BidexError
-from tests.algos.problems import errors, one_step_bandit, opposite_bandits, trained
+from tests.algos.problems import one_step_bandit, opposite_bandits, trained
 from tests.algos.toy import ToyWorld, nearness
 
 SMALL = MTSACConfig(
@@ -17,14 +17,7 @@ SMALL = MTSACConfig(
 )  # fmt: skip
 
 
-def test_without_rewards_per_task_the_small_task_is_lost():
-    config = replace(SMALL, per_task_rewards=False)
-    learner = trained(MTSAC, opposite_bandits(0.5, scale=1000.0), config, 12)
-    assert errors(learner, 0.5, -0.5)[0] > 0.3
-
-
 def density(learner: MTSAC, obs: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Actions for normalised observations and their log-densities, by torch.distributions in float64."""
     mean, log_std = (x.detach().double() for x in learner.policy.actor(obs))
     squashed = Independent(TransformedDistribution(Normal(mean, log_std.exp()), TanhTransform(cache_size=1)), 1)
     action = torch.tanh(mean + log_std.exp() * noise.double())

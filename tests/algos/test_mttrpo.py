@@ -14,7 +14,6 @@ SMALL = MTTRPOConfig(hidden=(32, 32), rollout_steps=8, std_range=(0.2, 1.0), fis
 
 
 def ready(config: MTTRPOConfig, world: ToyWorld) -> MTTRPO:
-    """A learner with a fresh rollout to learn from."""
     learner = MTTRPO(world, config, seed=0)
     learner.iterate()
     assert learner.obs is not None
@@ -34,11 +33,6 @@ def test_the_kl_after_the_step_is_kept_and_nearly_used(max_kl: float, policy_hea
     kl = kl_divergence(p, q).mean()
     assert 0.3 * max_kl < kl <= max_kl * (1 + 1e-5)
     assert_close(told.float(), kl, rtol=1e-3, atol=1e-6)
-
-
-def test_the_step_raises_the_surrogate():
-    learner = ready(SMALL, ToyWorld([nearness(0.6)]))
-    assert learner._update(learner._prepare()[0])["Loss/surrogate"] < 0
 
 
 def test_the_fisher_matrix_is_made_of_samples_of_all_rows():
@@ -65,11 +59,3 @@ def test_a_step_that_the_line_search_refuses_leaves_the_policy_alone():
     told = learner._update(learner._prepare()[0])
     assert told["Policy/step_share"] == 0.0 and told["Policy/kl"].abs() < 1e-6
     assert same(before, [p.detach() for p in learner.policy.actor.parameters()])
-
-
-def test_the_standard_deviation_keeps_its_bounds():
-    learner = MTTRPO(ToyWorld([nearness(0.6)]), replace(SMALL, std_range=(0.79, 0.81)), seed=0)
-    for _ in range(5):
-        learner.iterate()
-    std = learner.policy.actor.log_std.exp()
-    assert std.min() > 0.789 and std.max() < 0.811

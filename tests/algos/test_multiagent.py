@@ -31,7 +31,6 @@ every = pytest.mark.parametrize("kind", KINDS)
 
 
 def weights_of(learner: Any) -> Tensor:
-    """All weights of actor and critic in one order."""
     actor = learner.policy.actor
     net, log_std = (actor.nets[0], actor.log_stds[0]) if hasattr(actor, "nets") else (actor.mean, actor.log_std)
     return torch.cat([p.detach().flatten() for p in (*net.parameters(), log_std, *learner.critic.parameters())])
@@ -63,7 +62,6 @@ def test_hatrpo_of_one_agent_is_mt_trpo() -> None:
 
 @pytest.mark.parametrize("max_factor", [0.0, 1.1])
 def test_the_factor_is_the_product_of_the_ratios_before(max_factor: float) -> None:
-    """Against torch.distributions on networks called one by one; agents are moved by hand between their turns."""
     config = HAPPOConfig(agents="a=action/2;b=action/3+action/0;c=action/1", max_factor=max_factor, **SMALL)
     learner = HAPPO(ToyWorld([nearness(0.3)], actions=4), config, seed=0)
     learner.iterate()
@@ -114,7 +112,6 @@ LARGE: dict[str, Any] = {
 
 
 def exclusive_or(action: Tensor) -> Tensor:
-    """A matrix game: 1 if one agent alone goes (its action is positive), else 0."""
     return (action > 0).sum(1).eq(1).float()
 
 
@@ -175,7 +172,6 @@ def test_ippos_critics_see_no_more_than_their_agents() -> None:
 
 
 def test_ippo_estimates_apart() -> None:
-    """With critics alike it says of each agent what MAPPO says of all, cut episodes and all."""
     learners = [make(LQR(rows=8, horizon=5), config, seed=0) for make, config in (KINDS["ippo"], KINDS["mappo"])]
     ippo, mappo = learners
     first, second = ippo.critic.nets
@@ -196,7 +192,6 @@ def test_ippo_estimates_apart() -> None:
 @pytest.mark.parametrize("popart", [True, False])
 @every
 def test_popart_keeps_values_when_statistics_change(kind: str, popart: bool) -> None:
-    """Returns grow and move away from 0: the critic's units change, what it says in units of reward does not."""
     make, config = KINDS[kind]
     learner = make(opposite_bandits(scale=1000.0), replace(config, popart=popart), seed=0)
     learner.iterate()

@@ -50,18 +50,6 @@ def test_initial_weights_follow_the_seed_and_leave_the_global_generator_alone():
     assert_close(nets[0].log_std.exp(), torch.full((3,), 0.8))
 
 
-def test_a_head_sees_its_own_task_alone():
-    actor = GaussianActor(TASKS_LAST, (8,), 3, 0.8, torch.Generator().manual_seed(0), heads=2)
-    x = torch.cat([torch.randn(4, 3), torch.eye(2).repeat(2, 1)], dim=1)
-    mean, log_std = actor(x), actor.log_std_of(x)
-    with torch.no_grad():
-        actor.mean.head.bias[3:] += 1.0  # the second head's
-        actor.log_std[1] += 1.0
-    assert_close(actor(x) - mean, torch.tensor([0.0, 1.0, 0.0, 1.0])[:, None].expand(4, 3))
-    assert_close(actor.log_std_of(x) - log_std, torch.tensor([0.0, 1.0, 0.0, 1.0])[:, None].expand(4, 3))
-    assert mean.shape == log_std.shape == (4, 3)
-
-
 def test_the_output_layer_stays_float32_under_autocast():
     net = MLP(4, (8,), 2, 1.0, torch.Generator())
     with torch.autocast("cpu", dtype=torch.bfloat16):
@@ -148,7 +136,6 @@ ROWS, INPUTS, OUTPUTS = 8, 6, 5
 
 @pytest.fixture(params=["own", "onednn"])
 def chosen(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Rows of the products that oneDNN makes, in whichever way the machine would choose."""
     made: list[int] = []
     computed = products._onednn
 
@@ -189,7 +176,6 @@ def test_values_and_gradients_are_those_of_double_precision(chosen, shape, biase
 
 
 def test_gradients_have_gradients(chosen) -> None:
-    """What MAML's outer loop and TRPO's curvature need, by autograd and by ``torch.func``."""
     x, first, second = drawn(ROWS, INPUTS), drawn(INPUTS, INPUTS, seed=1), drawn(OUTPUTS, INPUTS, seed=2)
 
     def stepped(product, x, first, second):
@@ -203,16 +189,6 @@ def test_gradients_have_gradients(chosen) -> None:
     expected = torch.autograd.grad(stepped(torch.nn.functional.linear, *doubles), doubles[1:])
     for one, other in zip(found, expected, strict=True):
         assert_close(one.double(), other, rtol=1e-3, atol=1e-3)
-
-
-@pytest.mark.parametrize("view", ["rows", "columns", "expanded", "middle"])
-def test_operands_are_without_gaps(view) -> None:
-    """What soft modules and MOORE hand on: slices of stacks, which oneDNN would multiply by its slowest code."""
-    x = torch.arange(60.0).view(4, 3, 5)
-    given = {"rows": x[0], "columns": x[0].t(), "expanded": x[0, :1].expand(3, 5), "middle": x[:, 1]}[view]
-    dense = products._dense(given)
-    assert torch.equal(dense, given) and (dense.is_contiguous() or dense.t().is_contiguous())
-    assert (dense.data_ptr() == given.data_ptr()) == (view in ("rows", "columns"))
 
 
 def test_layers_side_by_side(chosen) -> None:
@@ -235,15 +211,6 @@ def test_small_products_other_types_and_what_is_turned_off_are_pytorchs(chosen, 
     monkeypatch.setattr(products, "_LEAST", ROWS * INPUTS * OUTPUTS + 1)
     layer(x)
     assert chosen == made
-
-
-def test_the_layer_is_pytorchs_to_rounding(chosen) -> None:
-    torch.manual_seed(0)
-    layer = Linear(INPUTS, OUTPUTS)
-    own = torch.nn.Linear(INPUTS, OUTPUTS)
-    own.load_state_dict(layer.state_dict())
-    x = drawn(ROWS, INPUTS)
-    assert_close(layer(x), own(x))
 
 
 @pytest.mark.parametrize(("processor", "capability", "faster"), [

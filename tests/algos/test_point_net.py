@@ -7,10 +7,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from bidex_algos.nets.inputs import Inputs
-from bidex_algos.nets.point_net import PointNet, _largest_of, with_point_net
-from bidex_algos.onpolicy.mtppo import MTPPOConfig
-from bidex_meta.world.contract import ObservationGroup
+from bidex_algos.nets.point_net import PointNet, _largest_of
 
 
 def net(points: int, channels: int = 3, **config: Any) -> PointNet:
@@ -63,12 +60,3 @@ def test_points_read_leaves_points_out_evenly() -> None:
     assert torch.equal(made(cloud.flatten(1)), made(changed.flatten(1)))
     changed[:, 0] += 1.0
     assert not torch.equal(made(cloud.flatten(1)), made(changed.flatten(1)))
-
-
-def test_clouds_alone_are_encoded_by_the_widths_of_the_config() -> None:
-    groups = (ObservationGroup("right_hand", (slice(0, 4),)), ObservationGroup("kind_points", (slice(4, 24),)))
-    plain = Inputs(groups[:1])
-    assert with_point_net(plain, MTPPOConfig()).groups == plain.groups
-    both = with_point_net(Inputs(groups), MTPPOConfig(point_widths=(6, 7)))
-    made = both.encoders["kind_points"]
-    assert made is not None

@@ -7,11 +7,9 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from bidex_algos.meta.rl2 import RL2, RL2Config
-from bidex_algos.meta.rl2 import RL2Agent
+from bidex_algos.meta.rl2 import RL2, RL2Agent, RL2Config
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.recurrent import RecurrentNet
-from bidex_meta import Benchmark
 from bidex_meta.agents import MetaLearningAgent, Timestep
 from bidex_meta.cli.learners import learner_kind
 from bidex_meta.errors import BidexError
@@ -33,7 +31,6 @@ def everyone(world: PointGoals) -> Tensor:
 
 
 def evaluated(agent: MetaLearningAgent, world: PointGoals) -> float:
-    """Mean return of one evaluation episode in each row."""
     obs, _ = world.reset()
     agent.reset(everyone(world))
     total = 0.0
@@ -44,7 +41,6 @@ def evaluated(agent: MetaLearningAgent, world: PointGoals) -> float:
 
 
 def adapted(agent: MetaLearningAgent, world: PointGoals) -> None:
-    """One shot: an exploring episode in each row."""
     obs, _ = world.reset()
     agent.reset(everyone(world))
     over = ~everyone(world)
@@ -160,28 +156,6 @@ def test_the_update_sees_what_the_rollout_saw():
         assert_close(batch.old_means[: len(played), row], played)
 
 
-def test_the_memory_lasts_for_a_trial_and_waits_unchanged():
-    learner = RL2(PointGoals(6, classes=UNEVEN), TINY, seed=0)
-    states: list[tuple[Tensor, Tensor, Tensor]] = []
-    step, world = learner.policy.step, learner.world
-
-    def spy(obs: Tensor, memory: Any) -> tuple[Tensor, Tensor]:
-        states.append((memory.state, memory.done, world.episodes.elapsed))
-        return step(obs, memory)
-
-    learner.policy.step = spy  # type: ignore[method-assign]
-    for _ in range(2):
-        states.clear()
-        learner.iterate()
-        assert len(states) == 3 * 7
-        assert not states[0][0].any() and not states[0][1].any()  # zero at the start of a trial
-        for t, (state, done, elapsed) in enumerate(states[1:], 1):
-            assert state.any(1).all()
-            waited = elapsed == states[t - 1][2]
-            assert torch.equal(state[waited], states[t - 1][0][waited])
-            assert done[elapsed == 0].all() and not done[(elapsed > 0) & (elapsed < world.max_episode_steps)].any()
-
-
 def test_rows_of_different_length_are_recorded_without_gaps():
     learner = RL2(PointGoals(6, classes=UNEVEN), replace(TINY, max_adapt_steps=5), seed=0)
     metrics = learner.iterate()
@@ -241,22 +215,6 @@ def test_without_rewards_nothing_that_the_policy_sees_tells_the_task():
         learner.iterate()
         t = learner.trials
         seen.append((learner.policy.see(t.obs[:-1], *t.previous(len(t.obs) - 1)), t.rewards))
-    assert torch.equal(seen[0][0], seen[1][0]) and not torch.equal(seen[0][1], seen[1][1])
-
-
-def test_nor_in_a_world_of_hands():
-    benchmark = Benchmark("ML1-wide", seed=0)
-    seen = []
-    for order in ([0, 1, 2], [2, 0, 1]):
-        world = benchmark.make_world("train", num_envs=3, device="cpu", threads=1, autoreset_mode="DISABLED")
-        world.set_tasks({"CatchUnderarm": world.slots[0].tasks[order]})
-        learner = RL2(world, replace(TINY, blind_share=1.0, max_adapt_steps=4), seed=0)
-        learner._update = lambda batch: {}  # type: ignore[method-assign]
-        learner.iterate()
-        t = learner.trials
-        assert t.lengths.tolist() == [12, 12, 12]
-        seen.append((learner.policy.see(t.obs[:12], *t.previous(12)), t.rewards[:12].clone()))
-        world.close()
     assert torch.equal(seen[0][0], seen[1][0]) and not torch.equal(seen[0][1], seen[1][1])
 
 

@@ -5,8 +5,7 @@ from dataclasses import replace
 import torch
 from torch.testing import assert_close
 
-from bidex_algos.meta.rl2 import RL2
-from bidex_algos.meta.rl2 import RL2Agent
+from bidex_algos.meta.rl2 import RL2, RL2Agent
 from bidex_meta.agents import Timestep
 from tests.algos.families import PointGoals
 from tests.algos.test_rl2 import SMALL, TEN, TINY, UNEVEN, adapted, everyone, state_of
@@ -87,7 +86,6 @@ def test_rows_that_play_no_episode_learn_nothing():
 
 
 def test_the_agent_plays_the_trial_that_the_training_played():
-    """Fed with the training's actions and rewards, its memory becomes the training's."""
     learner = RL2(PointGoals(6, classes=UNEVEN), replace(TINY, blind_share=0.0), seed=0)
     learner._update = lambda batch: {}  # type: ignore[method-assign]
     learner.iterate()

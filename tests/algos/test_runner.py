@@ -3,11 +3,10 @@ import signal
 from typing import Any
 
 import pytest
-import torch
 
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_meta.train import runner
-from bidex_meta.train.runner import checkpoint, resume, train
+from bidex_meta.train.runner import checkpoint, train
 from tests.algos.ranks import same
 from tests.algos.toy import ToyWorld, nearness
 
@@ -168,18 +167,3 @@ def test_a_second_signal_acts_at_once():
 
     with pytest.raises(KeyboardInterrupt):
         train(learner, world, total_steps=100 * ITERATION, record=Notes(after=twice))
-
-
-def test_an_interrupted_run_ends_like_an_unbroken_one():
-    whole, world = make()
-    train(whole, world, total_steps=4 * ITERATION, record=Notes())
-    first, first_world = make()
-    notes = Notes()
-    train(first, first_world, total_steps=2 * ITERATION, record=notes)
-    second, second_world = make()
-    resume(second, second_world, notes.saved[-1][1])
-    train(second, second_world, total_steps=4 * ITERATION, record=Notes())
-    a, b = checkpoint(whole, world)["learner"], checkpoint(second, second_world)["learner"]
-    assert a["env_steps"] == b["env_steps"] == 4 * ITERATION
-    assert all(torch.equal(a["critic"][k], b["critic"][k]) for k in a["critic"])
-    assert all(torch.equal(a["policy"]["weights"][k], b["policy"]["weights"][k]) for k in a["policy"]["weights"])

@@ -32,7 +32,6 @@ def a_draw() -> Transitions:
 
 
 def plain(net: Any, x: Tensor) -> Tensor:
-    """What an MLP says, layer by layer in float64."""
     x = x.double()
     for layer in net.body:
         x = layer(x) if not hasattr(layer, "weight") else x @ layer.weight.double().T + layer.bias.double()
@@ -76,20 +75,6 @@ def test_actor_and_targets_wait_for_the_critics(delay: int) -> None:
 
 
 @both
-def test_the_actor_climbs_the_first_critic(kind: Any, config: Any) -> None:
-    learner, draw = kind(opposite_bandits(rows=6), replace(config, batch_per_task=3), seed=0), a_draw()
-
-    def value() -> Tensor:
-        return learner._values(learner.critic, draw.obs, learner.policy.raw(draw.obs).tanh())[0].mean()
-
-    before, critic = value(), copy.deepcopy(learner.critic.state_dict())
-    for _ in range(5):
-        learner._policy_step(draw.obs, draw, torch.ones(6), torch.full((2,), 3.0))
-    assert value() > before
-    assert all(torch.equal(critic[name], weight) for name, weight in learner.critic.state_dict().items())
-
-
-@both
 def test_the_price_keeps_actions_from_their_corners(kind: Any, config: Any) -> None:
     def greedy(action: Tensor) -> Tensor:
         return 10.0 * action.sum(1)  # the more the better
@@ -104,6 +89,3 @@ def test_the_price_keeps_actions_from_their_corners(kind: Any, config: Any) -> N
 def test_noise_goes_from_little_to_much_over_the_rows_of_each_task() -> None:
     task_id = torch.tensor([0, 0, 0, 1, 2, 2])
     assert_close(spread(0.1, 0.5, task_id, 3), torch.tensor([0.1, 0.3, 0.5, 0.5, 0.1, 0.5]))
-
-
-# Checkpoints, metrics, errors.

@@ -7,7 +7,7 @@ from torch.testing import assert_close
 
 from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import GaussianActor, gaussian_kl
-from bidex_algos.trust_region import conjugate_gradient, fisher_product, flatten, line_search, write
+from bidex_algos.trust_region import conjugate_gradient, fisher_product, flatten, line_search
 from bidex_meta.world.contract import plain_groups
 
 
@@ -53,41 +53,22 @@ def test_fisher_products_are_those_of_the_hessian_of_the_kl(heads: int):
     assert_close(product(v), hessian @ v + 0.3 * v)
 
 
-def search(objective, kl, **changed) -> tuple[float, float]:
-    """The accepted share and the point where the search along 1 from 2 ends."""
+@pytest.mark.parametrize(
+    ("objective", "kl", "asked", "found"),
+    [
+        (lambda m: m, lambda m: m * m, {}, (1.0, 3.0)),  # what keeps its promise is taken whole
+        (lambda m: m, lambda m: 5 * m, {}, (0.125, 2.125)),  # back until the KL is kept
+        # At 1 it has risen by 0.05 of the promised 1, at 0.5 by 0.31 of 0.5.
+        (lambda m: 1.2 * m - 1.15 * m * m, lambda m: 0.0, {"accept_ratio": 0.5}, (0.5, 2.5)),
+        *((worse, lambda m: 0.0, {}, (0.0, 2.0)) for worse in (lambda m: -m, lambda m: float("nan") if m else 0.0)),
+    ],
+)
+def test_the_search_goes_back_as_far_as_it_must(objective, kl, asked, found):
     x = nn.Parameter(torch.tensor([2.0]))
 
     def measure() -> tuple[float, float]:
         moved = float(x.detach()) - 2.0
         return objective(moved), kl(moved)
 
-    asked = {"expected": 1.0, "max_kl": 1.0, "accept_ratio": 0.1, "factor": 0.5, "tries": 5} | changed
-    share = line_search([x], torch.ones(1), measure, **asked)
-    return share, float(x.detach())
-
-
-def test_a_step_that_keeps_its_promise_is_taken_whole():
-    assert search(lambda m: m, lambda m: m * m) == (1.0, 3.0)
-
-
-def test_the_search_goes_back_until_the_kl_is_kept():
-    assert search(lambda m: m, lambda m: 5 * m) == (0.125, 2.125)
-
-
-def test_the_search_goes_back_until_enough_of_the_promise_comes_true():
-    # At 1 it has risen by 0.05 of the promised 1, at 0.5 by 0.31 of 0.5.
-    assert search(lambda m: 1.2 * m - 1.15 * m * m, lambda m: 0.0, accept_ratio=0.5) == (0.5, 2.5)
-
-
-@pytest.mark.parametrize("objective", [lambda m: -m, lambda m: float("nan") if m else 0.0])
-def test_without_a_better_point_nothing_changes(objective):
-    assert search(objective, lambda m: 0.0) == (0.0, 2.0)
-
-
-def test_parameters_are_written_in_order():
-    layer = nn.Linear(2, 3)
-    parameters = list(layer.parameters())
-    write(parameters, torch.arange(9.0))
-    assert torch.equal(flatten(parameters), torch.arange(9.0)) and torch.equal(
-        layer.bias, torch.tensor([6.0, 7.0, 8.0])
-    )
+    asked = {"expected": 1.0, "max_kl": 1.0, "accept_ratio": 0.1, "factor": 0.5, "tries": 5} | asked
+    assert (line_search([x], torch.ones(1), measure, **asked), float(x.detach())) == found

@@ -10,7 +10,6 @@ from tests.fake_world import FakeWorld
 
 
 def nearness(target: float, scale: float = 1.0) -> Callable[[Tensor], Tensor]:
-    """Reward scale * (1 - mean squared distance of the clamped action from ``target``)."""
     return lambda action: scale * (1.0 - (action - target).square().mean(-1))
 
 
