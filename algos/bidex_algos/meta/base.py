@@ -223,7 +223,11 @@ class MetaLearner(Learner):
         policy, rows, stage = self.policy, self.rows, Stage()
         longest = min(int(self.world.max_episode_steps.max()), self.config.max_adapt_steps)
         horizon = self.config.slice_steps or longest
-        obs = self._begin()
+        obs = self.obs
+        if obs is None or self.config.slice_steps is None:
+            self.elapsed = torch.zeros_like(self.elapsed)
+            first = self.env_steps == 0 and self.steps_with_tasks == 0
+            obs = self._first_observations() if first else self.world.reset()[0]
         running = torch.ones_like(self.elapsed, dtype=torch.bool)
         earned, success = torch.zeros(len(running), device=self.device), torch.zeros_like(running)
         steps = torch.zeros_like(self.elapsed[0])
@@ -255,14 +259,6 @@ class MetaLearner(Learner):
         self.obs = obs
         self.steps_with_tasks += len(stage)
         return stage, Outcome(earned, success, steps)
-
-    def _begin(self) -> Tensor:
-        if self.obs is not None and self.config.slice_steps is not None:
-            return self.obs
-        self.elapsed = torch.zeros_like(self.elapsed)
-        if self.env_steps == 0 and self.steps_with_tasks == 0:
-            return self._first_observations()
-        return self.world.reset()[0]
 
     def _reported(self, outcome: Outcome, k: int) -> dict[str, float]:
         last = k == self.config.inner_steps

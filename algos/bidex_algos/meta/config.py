@@ -78,10 +78,9 @@ TABLE_48: Options = {
     "inner_learning_rate": 3e-4, "gamma": 0.9, "lam": 0.95, "normalise_observations": False,
 }  # fmt: skip
 
-# For what MT-PPO's preset laptop has learned on the same tasks (--start-from): its network and discount. Inner steps of
-# 0.1 lost more than they gained. Before any meta-training (seed 0) five shots of 100 episodes moved the return on
-# ML1-wide's held-out task, 8, by +2.2 with inner steps of 0.05, whether all layers move or the head alone, by +0.8 with
-# 0.02; a trace of 0.95 by +1.7, of 0.7 by 0.0, of 0.5 by -1.7 (4 to 6 trials, intervals of about 1.2 to either side).
+# For what MT-PPO's preset laptop has learned on the same tasks (--start-from): its network and discount. Before any
+# meta- training (seed 0) five shots of 100 episodes moved the return on ML1-wide's held-out task, 8, by +2.2 with inner
+# steps of 0.05 (0.02: +0.8; 0.1: less than 0), of all layers or the head alone; a trace of 0.95 by +1.7, of 0.7 by 0.0.
 TUNED: Options = {
     "hidden": (256, 256, 128), "activation": "elu", "std_range": (0.05, 1.5), "adapted": "head",
     "inner_learning_rate": 0.05, "gamma": 0.93, "lam": 0.9,

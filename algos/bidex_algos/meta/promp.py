@@ -44,8 +44,8 @@ class ProMPConfig(OuterConfig):
 
 
 PRESETS: dict[str, ProMPConfig] = {
-    # Table 48 of the Bi-DexHands appendix to the letter. It names no KL weight: ProMP's own 5e-4. "Desired kl" is read
-    # by the original and used nowhere; here the outer step size follows it from 3e-4 on, as in PPO's tables.
+    # Table 48 of the Bi-DexHands appendix, with ProMP's own KL weight. "Desired kl" is read by the original and used
+    # nowhere; here the outer step size follows it from 3e-4 on, as in PPO's tables.
     "paper": ProMPConfig(
         **TABLE_48, outer_epochs=3, outer_learning_rate=3e-4, desired_kl=0.016, clip=0.2, kl_weight=5e-4,
         max_grad_norm=1.0,

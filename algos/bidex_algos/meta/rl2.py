@@ -57,10 +57,8 @@ class RL2Config(PPOConfig, TrialConfig):
 
 
 PRESETS: dict[str, RL2Config] = {
-    # The appendix has no table for RL². Layers, epochs, mini-batches, clip, gradient norm, step size, discount, trace,
-    # starting noise and KL are Table 48's, ProMP's: its outer loop is PPO too. Its 8 steps a rollout have no
-    # counterpart, since a trial is made of whole episodes. Memory, ten episodes a trial and 250 steps of
-    # backpropagation are those of RL² in Meta-World's baselines (metaworld-algorithms).
+    # The appendix has no table for RL²: what ProMP's (48) has too is from there, but for its 8 steps a rollout; memory,
+    # ten episodes a trial and 250 steps of backpropagation are of RL² in Meta-World's baselines (metaworld-algorithms).
     "paper": RL2Config(
         hidden=(2048, 1024, 512), memory=256, value_heads=False, init_std=1.0, episodes_per_trial=10, gamma=0.9,
         lam=0.95, chunk=250, num_minibatches=1, epochs=3, clip=0.2, learning_rate=3e-4, desired_kl=0.016,
@@ -176,7 +174,6 @@ class RL2(Learner):
             config.trial_steps
         ).to(self.device)  # fmt: skip
         self.adams = AdaptiveAdams(self.policy.parameters(), self.critic.parameters(), config, self.device)
-
         limits = world.max_episode_steps.clamp_max(config.max_adapt_steps)
         d, a = self.shape.observations, self.shape.actions
         self.trials, self.trials_played = Trials(config.episodes_per_trial, limits, d, a, config.chunk), 0
@@ -232,10 +229,10 @@ class RL2(Learner):
     def _update(self, b: Batch) -> dict[str, Tensor]:
         cfg, policy = self.config, self.policy
         old_log_std = policy.log_std.detach().clone()
-        low, high = (math.log(std) for std in cfg.std_range)
-        measured: list[Tensor] = []
+        (low, high), measured = (math.log(std) for std in cfg.std_range), list[Tensor]()
         # The same number of parts in every process, whatever the number of its chunks.
-        batches = mini_batches(b.chunk_weights(), cfg.epochs, cfg.num_minibatches, self.generator, Tensor.tensor_split)
+        weights = b.weights.unflatten(0, (-1, b.size)).sum(1)[b.chunk, b.row]  # of each chunk (S,)
+        batches = mini_batches(weights, cfg.epochs, cfg.num_minibatches, self.generator, Tensor.tensor_split)
         for first, index, count in batches:
             measured.append(self._gradients(b, index, count, old_log_std))
             self.adams.descend(None if first else measured[-1][2], cfg.max_grad_norm)

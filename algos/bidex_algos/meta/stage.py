@@ -104,10 +104,6 @@ class Stage:
     def __len__(self) -> int:
         return len(self.obs)
 
-    def stacked(self, name: str) -> Tensor:
-        """A field of all steps (T, N, ...)."""
-        return torch.stack(vars(self)[name])
-
     def by_task(self, name: str, rows: TaskRows) -> Tensor:
         """A field of all steps by task (M, T * R, ...); rearranged step by step, so that nothing large is copied."""
         return torch.stack([rows.by_task(x) for x in vars(self)[name]], dim=1).flatten(1, 2)
@@ -119,7 +115,9 @@ def task_batch(stage: Stage, rows: TaskRows, log_std: Tensor, config: MetaConfig
 
     Returns count to the end of the stage and no further: a baseline fitted to these very returns knows nothing beyond.
     """
-    rewards, terminated, ended, valid = (stage.stacked(n) for n in ("rewards", "terminated", "ended", "valid"))
+    rewards, terminated, ended, valid = (
+        torch.stack(each) for each in (stage.rewards, stage.terminated, stage.ended, stage.valid)
+    )
     obs, elapsed = stage.by_task("obs", rows), stage.by_task("elapsed", rows)
     nothing = torch.zeros_like(rewards)
 

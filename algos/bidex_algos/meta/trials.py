@@ -84,11 +84,6 @@ class Trials:
         slot = torch.arange(slots or len(self.obs), device=self.lengths.device)
         return slot[:, None] < self.lengths
 
-    def last(self, slots: int) -> Tensor:
-        """Which of the first ``slots`` slots hold the last step of a trial, bool (slots, N)."""
-        slot = torch.arange(slots, device=self.lengths.device)
-        return slot[:, None] == self.lengths - 1
-
     def previous(self, slots: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """What the memory was fed beside the observation: last action, last reward, whether it was shown, end.
 
@@ -184,10 +179,6 @@ class Batch:
         """Steps of a chunk, C."""
         return len(self.weights) // len(self.actor_states)
 
-    def chunk_weights(self) -> Tensor:
-        """Sum of the weights of each chunk (S,)."""
-        return self.weights.unflatten(0, (-1, self.size)).sum(1)[self.chunk, self.row]
-
     def take(self, x: Tensor, chosen: Tensor) -> Tensor:
         """The chosen chunks, int64 (B,), of a tensor (T, N, ...): (C, B, ...)."""
         chunks = x.unflatten(0, (-1, self.size)).transpose(1, 2)
@@ -214,8 +205,7 @@ def make_batch(
     # The only wait for the device: how many steps the longest trial has.
     slots, size = in_chunks(int(t.lengths.max()), config.chunk)
     previous = t.previous(slots)
-    means, values = [], []
-    actor_states, critic_states = [], []
+    means, values, actor_states, critic_states = [], [], [], []
     actor_state = critic_state = policy.fresh_memory(len(task_id)).state
     for begin in range(0, slots, size):
         part = slice(begin, begin + size)
@@ -229,7 +219,8 @@ def make_batch(
     old_means = torch.cat(means)
 
     values = return_stats.restore(torch.cat(values), task_id)
-    filled, last = t.filled(slots), t.last(slots)
+    filled = t.filled(slots)
+    last = torch.arange(slots, device=task_id.device)[:, None] == t.lengths - 1
     valid = t.valid[:slots] & filled
     # What follows the trial's last slot is never asked for.
     next_values = torch.cat([values[1:], values[-1:]])

@@ -194,18 +194,17 @@ class OffPolicy(Learner):
 
     @torch.no_grad()
     def _step(self) -> Tensor:
-        actions = self._act(self.replay.obs)
+        rows, device = self.world.num_envs, self.device
+        if self.replay.added < self.config.warmup_steps:
+            actions = torch.rand(rows, self.shape.actions, generator=self.generator, device=device) * 2.0 - 1.0
+        else:
+            actions = self._explore(self.replay.obs)
         obs, reward, terminated, truncated, info = self.world.step(actions)
         self.replay.add(actions, reward, terminated, truncated, obs, info)
         self.returns.note(reward, terminated, truncated, info["unstable"])
         self.policy.observations.update(obs)
         self.episodes.update(info)
         return info["unstable"].sum()
-
-    def _act(self, obs: Tensor) -> Tensor:
-        if self.replay.added < self.config.warmup_steps:
-            return torch.rand(len(obs), self.shape.actions, generator=self.generator, device=self.device) * 2.0 - 1.0
-        return self._explore(obs)
 
     def _reward_scale(self) -> Tensor:
         scale = self.returns.deviation()

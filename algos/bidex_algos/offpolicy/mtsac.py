@@ -56,11 +56,10 @@ _PLAIN = MTSACConfig(
 )  # fmt: skip
 
 PRESETS: dict[str, MTSACConfig] = {
-    # Table 43 of the Bi-DexHands appendix (SAC, "other tasks"; it has none for MT-SAC): layers, step size, discount,
-    # Polyak 0.99, gradient norm, entropy coefficient 0.2 (here where each temperature starts), reward scale 1, 5000
-    # steps of replay, 1 epoch of 4 mini-batches of 32 (here after every vector step, and of each task). From Table 49
-    # (SAC on Humanoid) only what Table 43 leaves out: 32 steps, here between two reports. Both are silent on
-    # non-linearity, bounds of the standard deviation, target entropy and warm-up, and learn no temperature.
+    # Table 43 of the Bi-DexHands appendix (SAC, "other tasks"; it has none for MT-SAC), with its entropy coefficient
+    # 0.2 where each temperature starts and its 4 mini-batches of 32 after every vector step, of each task. From Table
+    # 49 (SAC on Humanoid) 32 steps, here between two reports. Both are silent on non-linearity, bounds of the standard
+    # deviation, target entropy and warm-up, and learn no temperature.
     "paper": replace(
         _PLAIN, hidden=(1024, 1024, 1024), replay_steps=5000, warmup_steps=32, steps_per_iteration=32,
         updates_per_step=4, batch_per_task=32, gamma=0.96, tau=0.01, init_alpha=0.2,

@@ -188,8 +188,7 @@ class OnPolicy(Learner):
         flat_task_id = task_id.expand(steps, rows).reshape(-1)
         obs = self.policy.observations(r.obs).flatten(0, 1)
         if self.low_precision:
-            # Autocast would make this cast in every mini-batch; the result is the same.
-            obs = obs.bfloat16()
+            obs = obs.bfloat16()  # autocast would make this cast in every mini-batch; the result is the same
 
         # Several critics make several columns of a row, each like a row of its own.
         def each(x: Tensor) -> Tensor:

@@ -68,9 +68,9 @@ PRESETS: dict[str, MTPPOConfig] = {
         value_loss_weight=2.0, entropy_weight=0.0,
     ),
     "laptop": MTPPOConfig(),
-    # Meta-World's multi-task suites: discount, trace and clip are those of the MTPPO that its authors publish
-    # (metaworld-algorithms). A rollout is 100 steps instead of their 10,000 and the networks are small: on MT3 one of
-    # 250 steps (ELU, 8 mini-batches) had learned less after 150 k steps: 24 against 42 % in training, one seed each.
+    # Meta-World's multi-task suites: discount, trace and clip of its authors' MTPPO (metaworld-algorithms). Networks
+    # are small, rollouts 100 steps instead of 10,000: of 250 (ELU, 8 mini-batches) MT3 was at 24 % after 150 k steps,
+    # not 42.
     "metaworld": MTPPOConfig(
         hidden=(256, 256, 128), activation="tanh", init_std=0.8, rollout_steps=100, num_minibatches=4, epochs=5,
         clip=0.2, gamma=0.99, lam=0.97, learning_rate=5e-4, desired_kl=0.02, std_range=(0.1, 1.5),
@@ -150,14 +150,6 @@ class Demonstrations:
             sum_gradients(weights, loss.detach()[None])
             adam.step()
 
-    def check(self, name: str, stored: State | None) -> None:
-        """Refuses, by a BidexError, a checkpoint of other demonstrations, whose fingerprint is ``stored``."""
-        if stored is not None and stored != self.fingerprint:
-            raise BidexError(
-                f"{name}: the checkpoint's demonstrations are others ({stored['transitions']:,.0f} transitions, here "
-                f"{self.fingerprint['transitions']:,.0f}). Resume with the run's own data set."
-            )
-
 
 def imitation(actions: Tensor, means: Tensor, log_std: Tensor) -> Tensor:
     """Half the mean squared distance, in standard deviations, of actions (B, a) from means (B, a): a scalar."""
@@ -208,8 +200,7 @@ class MTPPO(OnPolicy):
     def _update(self, batch: Batch) -> dict[str, Tensor]:
         cfg, actor, critic_alone = self.config, self.policy.actor, self._critic_alone()
         old_log_std = actor.log_std.detach().clone()
-        low, high = (math.log(std) for std in cfg.std_range)
-        measured: list[Tensor] = []
+        (low, high), measured = (math.log(std) for std in cfg.std_range), list[Tensor]()
         for first, index, count in self._mini_batches(batch.weights, cfg.epochs, cfg.num_minibatches):
             part = batch.select(index)
             measured.append(self._gradients(part, count, old_log_std))
@@ -273,8 +264,12 @@ class MTPPO(OnPolicy):
 
     def _check_size(self, state: State) -> None:
         super()._check_size(state)
-        if self.demonstrations is not None:
-            self.demonstrations.check(self.name, state.get("demonstrations"))
+        stored, own = state.get("demonstrations"), self.demonstrations
+        if own is not None and stored is not None and stored != own.fingerprint:
+            raise BidexError(
+                f"{self.name}: the checkpoint's demonstrations are others ({stored['transitions']:,.0f} transitions, "
+                f"here {own.fingerprint['transitions']:,.0f}). Resume with the run's own data set."
+            )
 
     def _per_task(self, x: Tensor, task_id: Tensor) -> Tensor:
         return x.new_zeros(self.world.num_tasks).index_add(0, task_id, x)
