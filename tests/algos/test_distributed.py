@@ -26,6 +26,7 @@ from bidex_meta.train.runner import checkpoint, resume, train
 from tests.algos.families import PointClass, PointGoals
 from tests.algos.problems import opposite_bandits
 from tests.algos.ranks import exit_codes, in_two_processes, same
+from tests.algos.test_runner import Notes
 from tests.algos.toy import ToyWorld, nearness
 
 CONFIG = MTPPOConfig(hidden=(32, 32), rollout_steps=8, learning_rate_range=(1e-5, 2e-3), autocast="off")
@@ -105,20 +106,6 @@ def one_update(rank: int, dtype: torch.dtype, config: Any) -> Callable[[], dict[
         return {"whole": expected, "half": update(half)}
 
     return in_two
-
-
-class Notes:
-    def __init__(self, after: Any = lambda iteration: None):
-        self.metrics: list[dict[str, float]] = []
-        self.saved: list[tuple[int, dict[str, Any]]] = []
-        self.after = after
-
-    def log(self, metrics: dict[str, float], step: int) -> None:
-        self.metrics.append(metrics)
-        self.after(len(self.metrics))
-
-    def save(self, state: dict[str, Any], step: int) -> None:
-        self.saved.append((step, state))
 
 
 def make(rank: int) -> tuple[MTPPO, ToyWorld]:

@@ -14,16 +14,12 @@ from bidex_algos.offpolicy.brc import BRC, BRCConfig
 from bidex_algos.offpolicy.fasttd3 import FastTD3, FastTD3Config
 from bidex_algos.replay import Transitions
 from bidex_meta.train import distributed
-from tests.algos.problems import LQR, opposite_bandits, trained
+from tests.algos.problems import LQR, OFF_POLICY, opposite_bandits, trained
 from tests.algos.ranks import in_two_processes, same
 from tests.algos.test_categorical import slow_projection
 from tests.algos.toy import ToyWorld, nearness
 
-SHARED: dict[str, Any] = {
-    "hidden": (32, 32), "critic_hidden": (32, 32), "replay_steps": 200, "cut_share": 0.3, "warmup_steps": 4,
-    "updates_per_step": 2, "batch_size": 128, "gamma": 0.8, "tau": 0.1, "learning_rate": 3e-3,
-    "critic_learning_rate": 5e-3, "autocast": "off", "atoms": 51,
-}  # fmt: skip
+SHARED = OFF_POLICY | {"critic_hidden": (32, 32), "updates_per_step": 2, "tau": 0.1, "atoms": 51}
 FAST = FastTD3Config(**SHARED | {"updates_per_step": 4}, critic_layer_norm=False, n_steps=1, squash_price=0.0)
 SMALL = BRCConfig(**SHARED, n_steps=1, task_embedding=4, init_alpha=0.01, target_entropy_per_action=-2.0)
 both = pytest.mark.parametrize(("kind", "config"), [(FastTD3, FAST), (BRC, SMALL)], ids=["fasttd3", "brc"])

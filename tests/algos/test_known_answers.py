@@ -11,7 +11,7 @@ from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig
 from tests.algos.families import Recall
-from tests.algos.problems import LQR, PointMass, discounted_return, opposite_bandits, trained
+from tests.algos.problems import LQR, OFF_POLICY, PointMass, discounted_return, opposite_bandits, trained
 
 GAMMA = 0.8
 SHARED: dict[str, Any] = {"hidden": (32, 32), "rollout_steps": 16, "gamma": GAMMA, "init_std": 0.5, "autocast": "off"}
@@ -50,10 +50,7 @@ PAID_ALIKE = MTPPOConfig(
     hidden=(32, 32), rollout_steps=8, learning_rate=1e-3, learning_rate_range=(1e-4, 4e-3), std_range=(0.05, 1.0),
     autocast="off",
 )  # fmt: skip
-SAC = MTSACConfig(
-    hidden=(32, 32), replay_steps=200, cut_share=0.3, warmup_steps=4, batch_size=128, gamma=0.8, tau=0.05,
-    learning_rate=3e-3, critic_learning_rate=5e-3, init_alpha=0.01, autocast="off",
-)  # fmt: skip
+SAC = MTSACConfig(**OFF_POLICY, init_alpha=0.01)
 WAYS: list[tuple[Any, Any, dict[str, Any], int, float]] = [
     (MTPPO, PAID_ALIKE, {"value_heads": False}, 40, 1000.0),
     (MTPPO, PAID_ALIKE, {"policy_heads": True}, 40, 1000.0),

@@ -19,12 +19,14 @@ class Notes:
 
     def __init__(self, after: Any = lambda iteration: None):
         self.logged: list[int] = []
+        self.metrics: list[dict[str, float]] = []
         self.saved: list[tuple[int, dict[str, Any]]] = []
         self.after = after
 
     def log(self, metrics: dict[str, float], step: int) -> None:
         assert all(isinstance(value, float) for value in metrics.values())
         self.logged.append(step)
+        self.metrics.append(metrics)
         self.after(len(self.logged))
 
     def save(self, state: dict[str, Any], step: int) -> None:

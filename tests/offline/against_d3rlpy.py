@@ -50,11 +50,7 @@ def against(
     data: Joined, world: Any, judge: Callable[[Any], float], python: str, updates: int, seeds: int = 3,
     algos: Sequence[str] = ALGOS
 ) -> dict[str, Any]:  # fmt: skip
-    """What both reach: per algo ``ours`` and ``theirs`` (a number a seed), means, intervals, ``overlap``.
-
-    ``data``: the transitions; ``world``: what they were recorded of; ``judge``: the score of an agent; ``python``:
-    interpreter that has d3rlpy; ``updates``: Gradient steps; ``seeds``: runs of each; ``algos``: which learners.
-    """
+    """What both reach: per algo ``ours`` and ``theirs`` (a number a seed), intervals, ``overlap``."""
     found = {}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "data.npz"
