@@ -87,10 +87,10 @@ def conflict_averse(gradients: Tensor, radius: float) -> tuple[Tensor, Tensor]:
 def worst_served(gram: Tensor, even: Tensor, reach: Tensor) -> Tensor:
     """The weights w (n,) on the simplex that minimise w'G e + reach sqrt(w'G w), to 1e-4 of e'G e.
 
-    An interior-point method: the weights' logarithms, times a mu that is halved at each step, keep them positive, and a
-    cone of the same mu rounds off the tip where w'G w is 0, at which a descent along w would get stuck. Each step is
-    Newton's, as long as is best of some lengths. It looks at no number, so that a GPU need not be waited for. ``gram``:
-    products of the gradients (n, n), float64; ``even``: the weights e of the mean (n,), where it starts.
+    An interior-point method: logarithms of the weights, times a mu that is halved at each step, keep them positive, and
+    a cone of the same mu rounds off the tip where w'G w is 0. Each step is Newton's, as long as is best of some
+    lengths. It looks at no number, so that a GPU need not be waited for. ``gram``: products of the gradients (n, n),
+    float64; ``even``: the weights e of the mean (n,), where it starts.
     """
     weights, mean, square = even, gram @ even, reach.square()
     lengths = 0.7 ** torch.arange(15, dtype=gram.dtype, device=gram.device)[:, None]
@@ -137,14 +137,9 @@ _LEAST = 1e-8
 class Famo(Balance):
     """FAMO (Liu et al. 2023): weights of tasks under which all losses fall at the same rate, without a gradient each.
 
-        z = softmax(xi)
-        theta  down on  sum_i (z_i / l_i) l_i' / sum_j (z_j / l_j)    the mean of log l_i, weighted by z
-        xi     down on  J'(log l - log l after the step), J = dz / dxi
-
-    The slower a loss falls, the more it weighs. Losses have to be positive: what counts is how far each is above the
-    least that it can become (``min_losses`` of the authors' code). Adam moves xi with a decay towards even weights.
-    ``rate``: adam's step size of xi; ``decay``: by which xi is drawn to zero. ``logits``: xi (num_tasks,), float64, in
-    checkpoints.
+    theta goes down on sum_i (z_i / l_i) l_i' / sum_j (z_j / l_j), z = softmax(xi); xi down on J'(log l - log l after
+    the step), J = dz / dxi. Losses have to be positive: what counts is how far each is above the least that it can
+    become. Adam, of step size ``rate``, moves xi (``logits``, float64) with a ``decay`` towards even weights.
     """
 
     tag = "Policy/largest_weight"

@@ -41,10 +41,9 @@ _FORM = ("hidden", "activation", "normalise_observations", "reward_unit", "task_
 class Learner(Contract):
     """Base of all learners of this package; ``policy`` acts, ``agent`` is what evaluation plays of it.
 
-    In a run of several processes each has a world, samples and ``generator`` of its own, and all have the same
-    networks: statistics and gradients are those of the samples of all, and so is ``env_steps``. Raises BidexError for a
-    world in another mode, with discounts of its classes where the learner has one for all, or without a one-hot that an
-    option needs.
+    Of several processes each has a world, samples and ``generator`` of its own, and all the same networks: statistics,
+    gradients and ``env_steps`` are of all. Raises BidexError for a world in another mode, with discounts of its classes
+    where the learner has one for all, or without a one-hot that an option needs.
     """
 
     remedy: ClassVar[str]

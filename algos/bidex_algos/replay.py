@@ -62,7 +62,6 @@ class Replay:
         # The cell behind the last takes what nobody will read.
         self._final_obs = ring(self.cuts_kept + 1, observations)
         self._cuts = torch.zeros((), dtype=torch.int64, device=device)
-
         self._rows_of_task = torch.argsort(task_id, stable=True)
         self._count = torch.bincount(task_id, minlength=num_tasks)
         self._first = self._count.cumsum(0) - self._count

@@ -14,8 +14,7 @@ from bidex_meta.world.contract import Info, VectorWorld
 class EpisodeStatistics:
     """Fading sums over about the last ``window`` finished episodes of each task, in each process.
 
-    A rollout is shorter than an episode, so the episodes that happen to end in one are few and, for a slow task, often
-    none: an average over one rollout would jump. ``task_id`` is that of each environment, int64 (N,).
+    Few episodes end in one rollout, and often none of a slow task. ``task_id``: of each environment, int64 (N,).
     """
 
     def __init__(self, task_id: Tensor, task_names: list[str], window: float = 100.0):

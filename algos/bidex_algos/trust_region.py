@@ -63,10 +63,10 @@ def line_search(
     parameters: Sequence[nn.Parameter], step: Tensor, measure: Callable[[], tuple[float, float]], *, expected: float,
     max_kl: float, accept_ratio: float, factor: float, tries: int
 ) -> float:  # fmt: skip
-    """Goes back along ``step`` (P,) until the objective has risen and the KL is kept; else nothing changes.
+    """Goes back along ``step`` (P,) until the objective has risen and the KL is kept; else nothing changes: 0.
 
-    ``measure`` gives objective and KL of the present parameters; ``expected`` is the rise promised for the whole step,
-    of which ``accept_ratio`` must come true. Returns the accepted share of the step, 0 if there was none.
+    ``measure`` gives both; of the rise ``expected`` of the whole step ``accept_ratio`` must come true. Returns the
+    share.
     """
     start = flatten(parameters).detach().clone()
     before, _ = measure()

@@ -127,8 +127,7 @@ class RL2Agent:
     def eval_action(self, obs: Tensor) -> Tensor:
         """Mean actions (N, a) in [-1, 1] for raw observations (N, d).
 
-        The memory goes on within the episode, without rewards: nobody passes them in an evaluation. The policy is
-        shown that they are not known, and has met that in training (``blind_share``).
+        The memory goes on within the episode, shown that rewards are not known, as in training (``blind_share``).
         """
         memory = self._memory(self._playing, len(obs))
         mean, state = self.policy.step(obs, memory)
@@ -198,7 +197,6 @@ class RL2(Learner):
         with self._collecting():
             obs = self._begin()
             play(self.world, self.policy, self.trials, obs, self.config.blind_share, self.generator, counts)
-
         filled = self.trials.filled()
         valid = self.trials.valid & filled
         seen = self.trials.obs[filled], self.trials.rewards[valid]

@@ -14,8 +14,8 @@ from bidex_algos.meta.config import MetaConfig
 class TaskRows:
     """Rows by task, as a rectangle: tasks with fewer environments than others repeat one, without weight.
 
-    ``task_of_row``: task of each environment, numbers from 0 on without gaps, int64 (N,). ``count``: number of tasks M;
-    ``weight``: 1, or 0 where a row is repeated to fill the rectangle, (M, R) float32.
+    ``task_of_row``: task of each environment, 0 to ``count`` - 1, int64 (N,); ``weight``: 1, or 0 of repeated ones (M,
+    R).
     """
 
     def __init__(self, task_of_row: Tensor):

@@ -85,10 +85,9 @@ class Trials:
         return slot[:, None] < self.lengths
 
     def previous(self, slots: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """What the memory was fed beside the observation: last action, last reward, whether it was shown, end.
+        """What the memory was fed beside the observation: last action (slots, N, a), last reward, whether shown, end.
 
-        Returns of the first ``slots`` slots: (slots, N, a), then (slots, N) each. The slot after the last step counts
-        as a step of the same episode: its value is what the time limit cut off.
+        The slot after the last step counts as of the same episode: its value is what the time limit cut off.
         """
         after = [x[: slots - 1] for x in (self.actions, self.rewards, self.shown & self.valid, self.ended)]
         action, reward, known, done = (torch.cat([torch.zeros_like(x[:1]), x]) for x in after)
@@ -97,8 +96,8 @@ class Trials:
     def discounts(self, slots: int, gamma: float) -> Tensor:
         """Discount of what follows each of the first ``slots`` transitions, (slots, N): gamma within an episode.
 
-        At a time limit the next episode follows at the next step. After a true end the row counts as standing still,
-        unrewarded, until its time limit: else a policy that earns little would end its episode to begin anew.
+        After a true end a row stands still, unrewarded, until its time limit: else to end an episode would be to begin
+        anew.
         """
         left = self.left[:slots].masked_fill(~self.terminated[:slots], 0)
         return gamma ** (1.0 + left.float())
@@ -135,14 +134,12 @@ def play(
             elapsed = elapsed + playing
             left = trials.limits - elapsed
             ended = terminated | truncated | ~valid | (left <= 0)
-
             # A waiting row writes into its next slot, and so leaves there the observation that its last step led to.
             at = trials.lengths
             trials.obs[at, rows], trials.actions[at, rows], trials.rewards[at, rows] = obs, action, reward
             trials.shown[at, rows], trials.valid[at, rows], trials.ended[at, rows] = shown, valid, ended
             trials.terminated[at, rows], trials.left[at, rows] = terminated, left
             trials.lengths += playing
-
             memory = memory.replaced(playing, Memory(state, action, reward, shown & valid, ended))
             obs = torch.where(playing[:, None], next_obs, obs)
             earned, whole = earned + reward, whole & (valid | ~playing)

@@ -248,11 +248,11 @@ class OwnAdams(MultiAgent):
 
 
 class Sequential(MultiAgent):
-    """Agents that are updated one after another, in a random order (Kuba et al. 2022).
+    """Agents that are updated one after another, in a random order (Kuba et al. 2022), alike in all processes.
 
-    Each sees the advantage times the ratio, new over old, of all that were before it. The order is drawn alike in all
-    processes. All of them learn from the same samples, so that the same few can earn from every one: with twelve agents
-    the largest products grew to 20,000 (HAPPO) and 130,000 within an update. ``max_factor`` bounds them.
+    Each sees the advantage times the ratios, new over old, of all before it. All learn from the same samples, so that
+    the same few can earn from every one: with twelve agents products grew to 20,000 within an update. ``max_factor``
+    bounds them.
     """
 
     config: Any

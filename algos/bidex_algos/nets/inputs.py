@@ -43,8 +43,8 @@ MakeEncoder = Callable[[int, torch.Generator], nn.Module]
 class Inputs:
     """How a network reads an observation, before it has weights. A ``BidexError`` names a group that is not there.
 
-    Groups enter as they are, by the encoder of their name, or, ``hidden``, not at all; of ``unscaled`` ones running
-    statistics change nothing but for the clip. A network reads the task from ``task_id``.
+    Groups enter as they are, by an encoder, or, ``hidden``, not at all; ``unscaled`` ones are normalised by no
+    statistics.
     """
 
     groups: tuple[ObservationGroup, ...]

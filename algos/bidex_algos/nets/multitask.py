@@ -154,15 +154,10 @@ class PaCo(nn.Module):
 class SoftModules(Headed):
     """Soft modularisation: layers of modules, and for each task soft routes between them (Yang et al. 2020).
 
-        e     = f(s) * h(k)                          embeddings of state and task, entry by entry
-        p^1   = D^1 relu(e)                          logits of the routes from the first layer to the second
-        p^l+1 = D^l+1 relu(U^l p^l * e)              each further layer of routes depends on the one before
-        g_i   = sum_j softmax_j(p_ij) relu(W_j g_j)  module i takes its shares of the modules before it
-
-    The first of ``hidden`` is the width of f(s), which feeds the first layer; each further one is that of a layer of
-    modules. The task's one-hot enters by h alone. Ours: the head takes shares of the last layer, where the paper adds
-    its modules up; f is one layer; modules have the config's non-linearity. The paper's loss weights by temperature are
-    left out.
+    With e = f(s) * h(k), entry by entry: p^1 = D^1 relu(e), p^l+1 = D^l+1 relu(U^l p^l * e) are logits of the routes,
+    and module i takes g_i = sum_j softmax_j(p_ij) relu(W_j g_j). The first of ``hidden`` is the width of f(s), each
+    further one that of a layer of modules. Ours: the head takes shares of the last layer, where the paper adds its
+    modules up; f is one layer; modules have the config's non-linearity. The loss weights by temperature are left out.
     """
 
     def __init__(

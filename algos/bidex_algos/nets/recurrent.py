@@ -68,9 +68,8 @@ class Memory:
 class RecurrentPolicy(nn.Module):
     """A Gaussian policy whose memory is fed with observation, last action, last reward and end of episode.
 
-    Rewards of task classes differ by orders of magnitude, and which class is played is not known. One rule serves all:
-    asinh(reward / ``reward_unit``), linear below the unit and showing ratios above it, normalised by running
-    statistics. ``inputs`` gets a group ``last_step`` of what is fed beside the observation.
+    Rewards of unknown classes differ by orders of magnitude; one rule serves all: asinh(reward / ``reward_unit``),
+    normalised by running statistics. ``inputs`` gets a group ``last_step`` of what is fed beside the observation.
     """
 
     def __init__(

@@ -86,8 +86,7 @@ class OffPolicyConfig(NetworkConfig):
 class ReturnScale:
     """Running statistics of the discounted sum of rewards since an episode began.
 
-    Returns of a task fade after ``horizon`` newer ones; ``gamma`` is a discount for all, or of each environment (N,).
-    ``stats``: mean and variance of each task (num_tasks,); ``discounted``: the sum in each environment so far (N,).
+    Returns of a task fade after ``horizon`` newer ones; ``gamma`` is for all, or of each environment (N,).
     """
 
     def __init__(self, world: VectorWorld, gamma: float | Tensor, horizon: float):
@@ -117,9 +116,8 @@ class ReturnScale:
 class OffPolicy(Learner):
     """An actor and critics that learn from a replay; the critics from the value of the next state by their targets.
 
-    Several processes have a replay each, and an update is of as many times more transitions: of each process B,
-    ``batch_per_task`` of each task, task after task (``task_of_draw``). ``gamma_of_rows`` and ``gamma_of_draw`` are
-    discounts of environments and of a draw. Raises BidexError where a task has no environments, or a replay no room.
+    Of several processes each has a replay and draws ``batch_per_task`` of each task, task after task
+    (``task_of_draw``). ``gamma_of_rows`` and ``gamma_of_draw`` are discounts of environments and of a draw.
     """
 
     config: OffPolicyConfig

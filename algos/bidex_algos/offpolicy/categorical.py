@@ -112,11 +112,9 @@ RECENT = 0.9
 class ReturnBound(ReturnScale):
     """Beside the statistics the largest return of each task, without its sign: what a fixed range of values must hold.
 
-    The sum is discounted towards the episode's beginning and not, as a return is, towards its end, which is known only
-    when the episode is over; both weigh any stretch of rewards alike. At a time limit the episode is taken to go on as
-    it went, or as it went most recently if that is more: a critic is taught that, though the episode reached such
-    states late. ``mass`` is the sum (N,), had all rewards been 1, ``recent`` both with a discount of at most
-    :data:`RECENT` (2, N).
+    The sum is discounted towards the episode's beginning, since its end is not known; both weigh any stretch of rewards
+    alike. At a time limit the episode is taken to go on as it went, or as it went most recently if that is more.
+    ``mass`` is the sum (N,), had all rewards been 1, ``recent`` both with a discount of at most :data:`RECENT` (2, N).
     """
 
     def __init__(self, world: VectorWorld, gamma: float | Tensor, horizon: float):

@@ -206,7 +206,6 @@ class OnPolicy(Learner):
         self._merge_returns(*estimates.task_moments(returns, element, elements, valid))
         group = element if cfg.per_task_advantages else element // num_tasks * num_tasks
         advantages = estimates.normalise_per_task(advantages, group, elements, valid)
-
         actions, old_means = r.actions.flatten(0, 1), r.means.flatten(0, 1)
         batch = Batch(
             obs=obs, task_id=flat_task_id, actions=actions, old_means=old_means,

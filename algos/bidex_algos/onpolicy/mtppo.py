@@ -100,11 +100,10 @@ _DEMONSTRATED = 0xDE30  # tells their draws apart from the learner's, which are 
 
 
 class Demonstrations:
-    """Transitions to be imitated beside reinforcement, and how much they count; some tasks may have none.
+    """Transitions to be imitated beside reinforcement; some tasks may have none.
 
-    A term of behaviour cloning in the policy's loss, which fades: as in DAPG (Rajeswaran et al. 2018, arXiv 1709.10087,
-    equation 6), with normalised advantages in the place of their weight by the largest one, and with standard
-    deviations that demonstrations do not touch.
+    A term of behaviour cloning, which fades, as in DAPG (Rajeswaran et al. 2018, arXiv 1709.10087, equation 6), with
+    normalised advantages in the place of their weight by the largest one.
     """
 
     def __init__(self, data: Joined, config: MTPPOConfig, seed: int, device: torch.device):

@@ -45,8 +45,8 @@ def mini_batches(
 ) -> Iterator[tuple[bool, Tensor, Tensor]]:  # fmt: skip
     """Passes over shuffled samples with ``weights`` (B,), in the order of PPO's epochs.
 
-    Divided by the count, which is of all processes, losses and gradients become means by being summed over them. Yields
-    whether it is the very first, the samples int64 (b,), and the sum of their weights, at least 1.
+    Yields whether it is the very first, the samples int64 (b,), and the sum of their weights over all processes, at
+    least 1.
     """
     for epoch in range(epochs):
         parts = split(torch.randperm(len(weights), generator=generator, device=weights.device), number)
@@ -110,8 +110,8 @@ class _Adam(torch.optim.Adam):
 class AdaptiveAdam:
     """Adam whose step size is divided by 1.5 above twice the desired KL, multiplied below half of it.
 
-    The step size is a tensor: adapting it needs no wait for the device. ``share`` is the part of the config's
-    ``desired_kl`` that is these parameters' own: of several agents', each has one.
+    It is a tensor: no wait for the device. ``share``: the part of the config's ``desired_kl`` that is these
+    parameters'.
     """
 
     def __init__(
