@@ -91,13 +91,10 @@ class BRCConfig(CategoricalConfig, MTSACConfig):
 
 
 PRESETS: dict[str, BRCConfig] = {
-    # The authors' code (github.com/naumix/BiggerRegularizedCategorical, 2025). train.py: batches of 1,024 in all, 2
-    # updates a vector step, critics 4,096 wide; there each task has one environment, 5,000 transitions of it come first
-    # and 1,000,000 are kept: here as many at 256 environments of each task. jaxrl/agent/brc_learner.py: 2 blocks, the
-    # actor 256 with 1, embedding of 32, steps of 3e-4, discount 0.99, tau 0.005, entropy -1/2 per action, one
-    # temperature from 0.1, 101 atoms to 10. jaxrl/networks.py: ReLU, log standard deviations from -10 to 2, which begin
-    # in the middle. Decay: AdamW's default there, 1e-4. No limit of the gradient (here a huge one), observations as
-    # they are.
+    # The authors' code (github.com/naumix/BiggerRegularizedCategorical, 2025): train.py, jaxrl/agent/brc_learner.py and
+    # jaxrl/networks.py. There each task has one environment, 5,000 transitions of it come first and 1,000,000 are kept:
+    # here as many at 256 environments of each task. Log standard deviations go from -10 to 2 and begin in the middle.
+    # Decay: AdamW's default there, 1e-4. No limit of the gradient (here a huge one), observations as they are.
     "paper": BRCConfig(
         hidden=(256, 256), critic_hidden=(4096, 4096, 4096), replay_steps=4000, warmup_steps=20, updates_per_step=2,
         batch_size=1024, gamma=0.99, n_steps=1, tau=0.005, learning_rate=3e-4, critic_learning_rate=3e-4,

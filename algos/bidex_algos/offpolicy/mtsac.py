@@ -47,8 +47,7 @@ class MTSACConfig(OffPolicyConfig):
             )
 
 
-# What the published settings have in common: log standard deviations from -20 to 2, one step size for all, nothing
-# normalised.
+# What the published settings have in common, with log standard deviations from -20 to 2.
 _PLAIN = MTSACConfig(
     value_heads=False, critic_layer_norm=False, init_std=1.0, std_range=(2e-9, 7.4), learning_rate=3e-4,
     critic_learning_rate=3e-4, alpha_learning_rate=3e-4, max_grad_norm=1.0, normalise_observations=False,
@@ -65,16 +64,14 @@ PRESETS: dict[str, MTSACConfig] = {
         updates_per_step=4, batch_per_task=32, gamma=0.96, tau=0.01, init_alpha=0.2,
     ),
     "laptop": MTSACConfig(),
-    # MT-SAC as Meta-World's baselines run it, with one environment of each task: 128 transitions of each task in an
-    # update, one update a vector step, 100,000 transitions of each task.
+    # MT-SAC as Meta-World's baselines run it, with one environment of each task.
     "metaworld": replace(
         _PLAIN, hidden=(400, 400, 400), replay_steps=100_000, warmup_steps=4000, steps_per_iteration=500,
         updates_per_step=1, batch_per_task=128, gamma=0.99, tau=0.005, adam_eps=1e-5, init_alpha=1.0,
     ),
 }  # fmt: skip
 
-# Table 49; its 2 epochs of one mini-batch are made after every vector step, as in ``paper``. Its replay of 40,000
-# counts vector steps, as everywhere here, and ends where ``replay_memory`` does.
+# Table 49; its 2 epochs of one mini-batch are made after every vector step; its replay of 40,000 counts vector steps.
 _TABLE_49: Options = {
     "replay_steps": 40_000, "steps_per_iteration": 32, "updates_per_step": 2, "batch_per_task": 64, "gamma": 0.99,
     "tau": 0.005, "learning_rate": 3e-4, "critic_learning_rate": 3e-4, "init_alpha": 0.2, "max_grad_norm": 1.0,
