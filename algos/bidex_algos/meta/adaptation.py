@@ -72,6 +72,10 @@ class TaskBatch:
     advantages: Tensor  # normalised within each task (M, B)
     weights: Tensor  # 1, or 0 for what teaches nothing: after an episode's end, or where physics broke (M, B)
 
+    def tensors(self) -> tuple[Tensor, ...]:
+        """The fields, in order."""
+        return tuple(vars(self).values())
+
 
 class Adapter:
     """Gradient steps on parameters of an actor, whose own are the meta-parameters; options as in ``MetaConfig``."""
@@ -143,7 +147,7 @@ def _parts(params: Params, batch: TaskBatch) -> Iterator[tuple[Params, TaskBatch
     size = max(1, _TRANSITIONS_AT_ONCE // transitions) if batch.obs.device.type == "cpu" else tasks
     for k in range(0, tasks, size):
         part = slice(k, k + size)
-        yield {name: p[part] for name, p in params.items()}, TaskBatch(*(x[part] for x in vars(batch).values()))
+        yield {name: p[part] for name, p in params.items()}, TaskBatch(*(x[part] for x in batch.tensors()))
 
 
 def weighted_mean(x: Tensor, weights: Tensor) -> Tensor:
