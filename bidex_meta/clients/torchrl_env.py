@@ -1,7 +1,5 @@
 """A world as TorchRL's environment: `Collector(TorchRLEnv(world), policy, ...)`. Extra: `torchrl`."""
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
@@ -47,7 +45,7 @@ class TorchRLEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         self._world_seed = seed
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
         asked = tensordict.get("_reset", None) if tensordict is not None else None
         mask = torch.ones_like(self._begun) if asked is None else asked.squeeze(-1)
         left = mask & ~self._begun  # what did not end in the last step
@@ -56,17 +54,17 @@ class TorchRLEnv(EnvBase):
             self._obs, _ = self.world.reset(seed=self._world_seed if options is None else None, options=options)
             self._world_seed = None if options is None else self._world_seed
         self._begun = self._begun & ~mask
-        return self._told(self._obs, {name: torch.zeros_like(mask, dtype=kind) for name, kind in _EPISODE.items()})
+        return self._entries(self._obs, {name: torch.zeros_like(mask, dtype=kind) for name, kind in _EPISODE.items()})
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         self._obs, reward, terminated, truncated, info = self.world.step(tensordict.get("action"))
         self._begun = terminated | truncated
-        told = self._told(info["final_obs"], info["so_far"], info["success"])
+        entries = self._entries(info["final_obs"], info["so_far"], info["success"])
         ends = {"reward": reward, "done": self._begun, "terminated": terminated, "truncated": truncated}
-        return told.update({name: value[:, None] for name, value in ends.items()})
+        return entries.update({name: value[:, None] for name, value in ends.items()})
 
-    def _told(self, obs: Tensor, episode: dict[str, Tensor], success: Tensor | None = None) -> TensorDict:
+    def _entries(self, obs: Tensor, episode: dict[str, Tensor], success: Tensor | None = None) -> TensorDict:
         so_far = TensorDict({name: episode[name][:, None] for name in _EPISODE}, self.batch_size)
         success = torch.zeros_like(self._begun) if success is None else success
-        told = {"observation": obs.clone(), "success": success[:, None], "episode": so_far}
-        return TensorDict(told, self.batch_size, device=self.device)
+        entries = {"observation": obs.clone(), "success": success[:, None], "episode": so_far}
+        return TensorDict(entries, self.batch_size, device=self.device)

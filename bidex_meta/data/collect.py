@@ -44,33 +44,28 @@ class SamplingAgent(Agent, Protocol):
 
 @dataclass(frozen=True)
 class Actor:
-    """A policy as it acts in a collection.
-
-    Attributes:
-        policy: An agent; None: uniform actions.
-        sampled: Whether actions are drawn from the policy's distribution, if it has one; else its mean action is taken.
-        noise: Standard deviation of Gaussian noise on the actions.
-    """
+    """A policy as it acts in a collection."""
 
     policy: Agent | None
+    """None: uniform actions."""
     sampled: bool = False
+    """Whether actions are drawn from the policy's distribution, if it has one; else its mean action is taken."""
     noise: float = 0.0
+    """Standard deviation of Gaussian noise on the actions."""
 
     def acting(self, world: PooledWorld, seed: int) -> Callable[[Tensor], Tensor]:
         """A function from observations (N, d) to actions (N, a) that draws by the seed alone."""
         if self.policy is None:
             return RandomAgent(world.action_space, seed).eval_action
         policy: Agent = self.policy
+        drawing = policy if self.sampled and isinstance(policy, SamplingAgent) else None
         # A generator for each kind of draw: the policy's lives where its network does. With one seed the noise would be
         # the policy's own normals once more.
         inner = torch.Generator(world.device).manual_seed(seed)
         outer = torch.Generator().manual_seed(int(np.random.SeedSequence(seed).generate_state(1)[0]))
 
         def act(obs: Tensor) -> Tensor:
-            if self.sampled and isinstance(policy, SamplingAgent):
-                action = policy.sample_action(obs, inner)
-            else:
-                action = policy.eval_action(obs)
+            action = drawing.sample_action(obs, inner) if drawing else policy.eval_action(obs)
             if self.noise > 0.0:
                 action = action + self.noise * torch.randn(action.shape, generator=outer).to(action)
             return action.clamp(-1.0, 1.0)
@@ -80,29 +75,17 @@ class Actor:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a collection is, by policy; computed from its parts alone.
+    """How far a collection is, by policy; computed from its parts alone."""
 
-    Attributes:
-        rounds: Parts that are there.
-        steps: Transitions of each policy.
-        episodes: Episodes of each policy.
-        returns: Mean unscaled return over all episodes, NaN without any.
-        success: Share of them that succeeded, NaN without any.
-    """
-
-    rounds: int
-    steps: list[int]
-    episodes: list[int]
-    returns: float
-    success: float
+    rounds: int  # parts that are there
+    steps: list[int]  # transitions of each policy
+    episodes: list[int]  # of each policy
+    returns: float  # mean unscaled return over all episodes, NaN without any
+    success: float  # share of them that succeeded, NaN without any
 
 
 def progress(writer: DatasetWriter, policies: int = 1) -> Progress:
-    """The progress of a collection.
-
-    Raises:
-        BidexError: A part is damaged.
-    """
+    """The progress of a collection; raises BidexError where a part is damaged."""
     paths = part_files.parts_of(writer.folder, writer.process)
     tables = [part_files.read_table(path) for path in paths]
     owner, steps, returns, success = (
@@ -131,16 +114,10 @@ def collect(
 ) -> None:
     """Plays rounds until each actor has its share of ``size`` transitions; goes on where the writer's parts end.
 
-    Args:
-        world: In autoreset mode DISABLED.
-        actors: Who acts, in rounds of their own.
-        writer: Where episodes go; its parts are counted as rounds.
-        size: Transitions in all; the last episodes may make it a little more.
-        seed: Of all that is drawn.
-        report: Receives the progress after each round, and the seconds since the call.
-
-    Raises:
-        BidexError: A part is damaged, or no transition can be recorded.
+    ``world`` is in autoreset mode DISABLED; actors act in rounds of their own; the writer's parts count as rounds; the
+    last episodes may make it a little more than ``size``; all that is drawn follows from ``seed``. ``report`` receives
+    the progress after each round, and the seconds since the call. Raises BidexError where a part is damaged, or no
+    transition can be recorded.
     """
     began, share = time.monotonic(), math.ceil(size / len(actors))
     now = progress(writer, len(actors))
@@ -153,10 +130,8 @@ def collect(
         collector.policy, collector.active = which, rows
         _round(collector, actors[which], torch.from_numpy(rows), repeats, int(number >> np.uint64(1)))
         if writer.open_steps == 0:
-            raise BidexError(
-                f"Physics broke in the first step of all {int(rows.sum())} episodes: nothing can be recorded. "
-                "Check the policy's actions."
-            )
+            what = f"Physics broke in the first step of all {int(rows.sum())} episodes: nothing can be recorded"
+            raise BidexError(f"{what}. Check the policy's actions.")
         writer.left_out.update({name: count for name, count in collector.left_out.items() if name == BROKEN})
         collector.left_out.clear()
         writer.commit()
@@ -192,8 +167,6 @@ def _round(collector: EpisodeCollector, actor: Actor, rows: Tensor, repeats: int
     while bool((left > 0).any()):
         obs, _, _, _, info = collector.step(act(obs))
         ended = info["_final_obs"]
-        if not bool(ended.any()):
-            continue
         left = left - (ended & (left > 0)).long()
         again = ended & (left > 0)
         if bool(again.any()):
@@ -206,11 +179,8 @@ def _round(collector: EpisodeCollector, actor: Actor, rows: Tensor, repeats: int
 def collect_successes(world: PooledWorld, agent_of: Callable[[int], Agent], writer: DatasetWriter, seed: int) -> None:
     """Plays one round, an episode in every environment, and stores those that succeed as a part.
 
-    Args:
-        world: In autoreset mode DISABLED.
-        agent_of: Makes the agent of a round from a seed, once the world has been reset.
-        writer: Where episodes go; the round's draws follow from the seed and its number of parts.
-        seed: The collection's.
+    ``world`` is in autoreset mode DISABLED; ``agent_of`` makes the agent of a round from a seed, once the world has
+    been reset; the round's draws follow from the collection's seed and the writer's number of parts.
     """
 
     def sink(episode: Episode) -> None:

@@ -7,39 +7,22 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Episode:
-    """T transitions of one environment, from a start to an end.
+    """T transitions of one environment, from a start to an end."""
 
-    Attributes:
-        observations: (T + 1, d), float32: the start, and the state after each transition.
-        actions: (T, a), float32, clipped to [-1, 1].
-        rewards: (T,), float32, with the suite's scale of the class.
-        terminated: (T,), bool: true at most for the last transition.
-        truncated: (T,), bool: likewise, by time, or before a broken transition.
-        task: Slot of the world.
-        task_name: Its name: a class, or ``Class/task``.
-        task_index: Task of the slot's pool.
-        variation: (v,), float64: what that task freezes; empty where the world has none.
-        success: Whether the goal was met after any transition.
-        broken: Whether physics broke in the next transition, which is left out.
-        return_unscaled: Sum of the rewards by the printed formula, before the suite's scale.
-        row: Environment of the process's world.
-        policy: Which of several policies acted, from 0 on.
-    """
-
-    observations: np.ndarray
-    actions: np.ndarray
-    rewards: np.ndarray
-    terminated: np.ndarray
-    truncated: np.ndarray
-    task: int = 0
-    task_name: str = ""
-    task_index: int = 0
-    variation: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    success: bool = False
-    broken: bool = False
-    return_unscaled: float = 0.0
-    row: int = 0
-    policy: int = 0
+    observations: np.ndarray  # (T + 1, d), float32: the start, and the state after each transition
+    actions: np.ndarray  # (T, a), float32, clipped to [-1, 1]
+    rewards: np.ndarray  # (T,), float32, with the suite's scale of the class
+    terminated: np.ndarray  # (T,), bool: true at most for the last transition
+    truncated: np.ndarray  # (T,), bool: likewise, by time, or before a broken transition
+    task: int = 0  # slot of the world
+    task_name: str = ""  # its name: a class, or ``Class/task``
+    task_index: int = 0  # task of the slot's pool
+    variation: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (v,), float64: what that task freezes, if any
+    success: bool = False  # whether the goal was met after any transition
+    broken: bool = False  # whether physics broke in the next transition, which is left out
+    return_unscaled: float = 0.0  # sum of the rewards by the printed formula, before the suite's scale
+    row: int = 0  # environment of the process's world
+    policy: int = 0  # which of several policies acted, from 0 on
 
     def __len__(self) -> int:
         """Transitions, T."""

@@ -5,7 +5,7 @@ Each observation of an episode is held once, in half of the memory that observat
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from bidex_meta.errors import BidexError, unknown_name
 from bidex_meta.utils.memory import check_memory
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.world.depth_sensor import POINT_ENTRIES
+from bidex_meta.world.groups import Slot
 
 
 @dataclass(frozen=True)
@@ -45,27 +46,19 @@ class Joined:
     def fingerprint(self) -> dict[str, float]:
         """Sums by which a checkpoint recognises the data that its run must go on with."""
         parts = {"rewards": self.rewards, "actions": self.actions, "task": self.task}
-        return {
-            "transitions": len(self),
-            **{name: float(part.sum(dtype=torch.float64)) for name, part in parts.items()},
-        }
+        sums = {name: float(part.sum(dtype=torch.float64)) for name, part in parts.items()}
+        return {"transitions": len(self), **sums}
 
 
 def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) -> Joined:
-    """Reads data sets for a world.
+    """Reads data sets, at least one, for a world, which is neither stepped nor reset.
 
     Slots are matched by name. Observations of a class recorded on its own get the world's padding and one-hot, and
-    rewards its scale; goals that the world hides become zero. Actions of a data set from elsewhere are mapped to
-    [-1, 1].
+    rewards its scale; goals that the world hides become zero. Actions of a data set from elsewhere are mapped to [-1,
+    1]. With ``every`` each of the world's classes needs data.
 
-    Args:
-        datasets: At least one.
-        world: It is neither stepped nor reset.
-        every: Whether each of the world's classes needs data.
-
-    Raises:
-        BidexError: Actions, states or clouds of another form, actions from elsewhere without bounds, classes that do
-            not match, or too little memory.
+    Raises BidexError for actions, states or clouds of another form, actions from elsewhere without bounds, classes that
+    do not match, or too little memory.
     """
     ids = world.num_id_columns
     plain, actions = world.single_observation_space.shape[0] - ids, world.single_action_space.shape[0]
@@ -87,17 +80,9 @@ def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) ->
 def gathered(
     episodes: Iterable[tuple[Episode, int, np.ndarray]], steps: int, count: int, observations: int, actions: int
 ) -> Joined:
-    """Concatenates episodes.
+    """Concatenates ``count`` episodes of ``steps`` transitions in all; raises BidexError where they have fewer.
 
-    Args:
-        episodes: Each with its slot, and observations (T + 1, d) in the world's form.
-        steps: Transitions of all.
-        count: Number of episodes.
-        observations: Entries of an observation, d.
-        actions: Actions, a.
-
-    Raises:
-        BidexError: They have fewer transitions.
+    Each comes with its slot, and observations (T + 1, ``observations``) in the world's form; ``actions`` is a.
     """
     states, acts, rewards = torch.zeros(steps + count, observations), torch.zeros(steps, actions), torch.zeros(steps)
     at, task, left = torch.zeros(3, steps, dtype=torch.int64).unbind()
@@ -120,12 +105,9 @@ def gathered(
 class _Columns(NamedTuple):
     """Columns of an observation without its task id; padding stands before the cloud."""
 
-    state: np.ndarray
-    """Without the cloud, ascending."""
-    cloud: np.ndarray
-    """Of the point cloud, point after point."""
-    label: str
-    """Form of the cloud, for messages."""
+    state: np.ndarray  # without the cloud, ascending
+    cloud: np.ndarray  # of the point cloud, point after point
+    label: str  # form of the cloud, for messages
 
     @staticmethod
     def of(groups: Iterable[tuple[str, Sequence[tuple[int, int]]]], size: int) -> "_Columns":
@@ -140,16 +122,9 @@ class _Columns(NamedTuple):
 
 
 class _Form:
-    """How a data set's episodes become a world's.
+    """How a data set's episodes become a world's; ``slots`` are the world's for each of the data set's.
 
-    Args:
-        dataset: The data set.
-        world: The world.
-        plain: Entries of the world's observation without its one-hot.
-        actions: The world's actions.
-
-    Attributes:
-        slots: The world's slot for each of the data set's.
+    ``plain`` is the entries of the world's observation without its one-hot.
     """
 
     def __init__(self, dataset: Dataset, world: VectorWorld, plain: int, actions: int) -> None:
@@ -168,7 +143,7 @@ class _Form:
         self._theirs = _Columns.of(seen, plain)
         self._bounds = dataset.action_bounds
         hide = getattr(world, "hides_goals", False) and not about.get("hides_goals", True)
-        slots: Sequence[Any] = getattr(world, "slots", ())  # of Meta-World's there are none
+        slots: Sequence[Slot] = getattr(world, "slots", ())  # of Meta-World's there are none
         self._hidden = [slots[slot].task_class.layout.goal_indices() if hide else [] for slot in self.slots]
         self._check_observations(world.num_tasks > 1 and len(names) == 1)
         own, theirs = about.get("reward_scales", {}), {slot.name: slot.reward_scale for slot in slots}
@@ -178,7 +153,7 @@ class _Form:
         ]
 
     def _check_observations(self, may_pad: bool) -> None:
-        """Refuses states and clouds of other sizes; ``may_pad``: whether the world's states may be wider."""
+        """``may_pad``: whether the world's states may be wider."""
         name, own, theirs = self.dataset.name, self._own, self._theirs
         if own.label != theirs.label:
             raise BidexError(

@@ -1,26 +1,20 @@
 """Data sets from elsewhere, such as Minari's: which of their arrays can be read, and the range of their actions."""
 
 import json
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
+from bidex_meta.data.part_files import H5, Json
 from bidex_meta.errors import BidexError, shortened
 
 _SPACES = {"observations": "observation_space", "actions": "action_space"}
 """Arrays of several numbers a step, and the entries of their spaces."""
 
 
-def check_spaces(content: Mapping[str, Any], name: str) -> None:
-    """Refuses observations or actions that are not flat, where the metadata have their spaces.
+def check_spaces(content: Json, name: str) -> None:
+    """Refuses observations or actions that are not flat, where the metadata of a data set have their spaces.
 
-    Args:
-        content: All of ``metadata.json``.
-        name: The data set's.
-
-    Raises:
-        BidexError: One is anything else than a Box of one dimension.
+    ``content`` is all of ``metadata.json``, ``name`` the data set's. Raises BidexError unless each is a flat Box.
     """
     for what, entry in _SPACES.items():
         space = _space(content, entry)
@@ -29,17 +23,10 @@ def check_spaces(content: Mapping[str, Any], name: str) -> None:
             raise _not_flat(name, what, f"a Box of shape {shortened(shape)}" if kind == "Box" else f"{kind} ones")
 
 
-def numbers(stored: Any, what: str, name: str, length: int | None = None) -> np.ndarray:
-    """An episode's array as it is stored.
+def numbers(stored: H5, what: str, name: str, length: int | None = None) -> np.ndarray:
+    """An episode's array from HDF5's group or dataset; ``what`` is Minari's name of it, ``length`` the required one.
 
-    Args:
-        stored: HDF5's group or dataset.
-        what: Minari's name of the array: ``observations``, ``rewards``, ...
-        name: The data set's.
-        length: Required length; None: any.
-
-    Raises:
-        BidexError: It is a group, has another shape, or holds no numbers.
+    Raises BidexError where it is a group, has another shape, or holds no numbers.
     """
     if not hasattr(stored, "shape"):
         raise _not_flat(name, what, f"a group of {shortened(', '.join(stored))}")
@@ -51,16 +38,10 @@ def numbers(stored: Any, what: str, name: str, length: int | None = None) -> np.
     return np.asarray(stored[()])
 
 
-def action_bounds(content: Mapping[str, Any], name: str, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Least and largest actions, (a,) each, float64, which become -1 and 1 here.
+def action_bounds(content: Json, name: str, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Least and largest actions, (a,) each, float64, which become -1 and 1 here; ``size`` is a.
 
-    Args:
-        content: All of ``metadata.json``.
-        name: The data set's.
-        size: Actions, a.
-
-    Raises:
-        BidexError: There are none, or not finite and rising ones.
+    Raises BidexError where there are none, or not finite and rising ones.
     """
     space = _space(content, "action_space")
     try:
@@ -77,7 +58,7 @@ def action_bounds(content: Mapping[str, Any], name: str, size: int) -> tuple[np.
     return low, high
 
 
-def _space(content: Mapping[str, Any], entry: str) -> dict[str, Any]:
+def _space(content: Json, entry: str) -> Json:
     """A space as Minari writes it, JSON within JSON; empty without one."""
     space = content.get(entry)
     try:

@@ -4,7 +4,6 @@ Our learners, evaluation and checkpoints run on it unchanged. Environments are s
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -87,7 +86,7 @@ class MetaWorldWorld(ForeignWorld):
         for row in mask.nonzero().squeeze(1).tolist():
             self._obs[row, :OBSERVATION_SIZE] = torch.from_numpy(self._singles[row].start(self._task(row)))
 
-    def _task(self, row: int) -> Any:
+    def _task(self, row: int) -> object:
         name = self.task_names[self.task_id[row]]
         return self._tasks[name][self._pools[name][self.task_index[row]]]
 
@@ -107,13 +106,8 @@ class MetaWorldWorld(ForeignWorld):
 
     def state_dict(self) -> State:
         """All that decides the world's future: tensors and plain values, copied."""
-        return {
-            **super().state_dict(),
-            "suite": self.suite,
-            "task_seed": self._task_seed,
-            "pools": {name: list(pool) for name, pool in self._pools.items()},
-            "actions": self._actions.clone(),
-        }
+        own = {"suite": self.suite, "task_seed": self._task_seed, "actions": self._actions.clone()}
+        return {**super().state_dict(), **own, "pools": {name: list(pool) for name, pool in self._pools.items()}}
 
     def load_state_dict(self, state: State) -> None:
         """Restores a ``state_dict``; raises BidexError for one of another suite, seed or size.
@@ -124,9 +118,8 @@ class MetaWorldWorld(ForeignWorld):
         fits(state, self.state_dict())
         here, there = (self.suite, self._task_seed), (state["suite"], state["task_seed"])
         if here != there:
-            raise BidexError(
-                f"Expected the state of a world of (suite, seed) = {here}, got {there}; build the world with the same."
-            )
+            what = f"Expected the state of a world of (suite, seed) = {here}, got {there}"
+            raise BidexError(f"{what}; build the world with the same.")
         self.set_tasks(state["pools"])
         self._restore(state)
         self._actions = state["actions"].clone()
@@ -137,7 +130,7 @@ class MetaWorldWorld(ForeignWorld):
             for action in self._actions[row, : int(self.episodes.length[row])].numpy():
                 self._singles[row].step(action)
 
-    def close_extras(self, **kwargs: Any) -> None:
+    def close_extras(self, **kwargs: object) -> None:
         """Frees the environments."""
         for single in self._singles:
             single.close()

@@ -1,6 +1,8 @@
 """Meta-World's library, fixed for MuJoCo 4: its tasks and its environments, one at a time."""
 
 import functools
+from importlib import import_module
+from types import ModuleType
 from typing import Any
 
 import mujoco
@@ -19,18 +21,15 @@ _WARNINGS = ("BADQPOS", "BADQVEL", "BADQACC", "CONTACTFULL", "CNSTRFULL")
 _BROKEN = [int(getattr(mujoco.mjtWarning, f"mjWARN_{kind}")) for kind in _WARNINGS]
 
 
-def mended() -> Any:
+def mended() -> ModuleType:
     """Meta-World's module, its environments fixed in this process; raises ModuleNotFoundError without it.
 
     Meta-World 3.0.0 (its newest release without an upper bound on MuJoCo) sets the hand's weld by eleven numbers for
     the whole row of ``eq_data``; since MuJoCo 3.17 that row is twelve wide, so no environment could be made. Here the
     eleven go to the first eleven entries, as they were meant; the twelfth stays as the model was compiled.
     """
-    import metaworld
-    from metaworld.sawyer_xyz_env import SawyerMocapBase
-
-    SawyerMocapBase.reset_mocap_welds = _reset_mocap_welds
-    return metaworld
+    import_module("metaworld.sawyer_xyz_env").SawyerMocapBase.reset_mocap_welds = _reset_mocap_welds
+    return import_module("metaworld")
 
 
 def _reset_mocap_welds(self: Any) -> None:
@@ -39,21 +38,19 @@ def _reset_mocap_welds(self: Any) -> None:
 
 
 @functools.cache
-def _library() -> Any:
+def _library() -> ModuleType:
     try:
         library = mended()
     except ModuleNotFoundError as error:
-        raise BidexError(
-            f"Expected Meta-World for a suite metaworld/..., but {error.name} is not installed. "
-            "Mend: pip install metaworld==3.0.0"
-        ) from None
+        what = f"Expected Meta-World for a suite metaworld/..., but {error.name} is not installed"
+        raise BidexError(f"{what}. Mend: pip install metaworld==3.0.0") from None
     # MuJoCo would print each broken environment to stderr and a log file; Single.step reports it.
     mujoco.set_mju_user_warning(lambda message: None)
     return library
 
 
 @functools.lru_cache(maxsize=8)  # drawing them resets each class fifty times: seconds
-def make_tasks(suite: str, seed: int) -> dict[str, tuple[Any, ...]]:
+def make_tasks(suite: str, seed: int) -> dict[str, tuple[object, ...]]:
     """Meta-World's own fifty tasks of each class of a suite, e.g. ``"metaworld/MT3"``, goal visible.
 
     Those of MT10 are ``metaworld.MT10(seed)``'s, those of MT3 ``metaworld.MT1(name, seed)``'s. Meta-World restores
@@ -72,7 +69,7 @@ class Single:
     def __init__(self, name: str) -> None:
         self._env = _library().ALL_V3_ENVIRONMENTS[name]()
 
-    def start(self, task: Any) -> np.ndarray:
+    def start(self, task: object) -> np.ndarray:
         """Begins an episode of a task; the observation, (39,), float64, with the goal in the last three entries."""
         self._env.set_task(task)
         return self._env.reset()[0]

@@ -11,6 +11,7 @@ from bidex_meta.viewer.playback import Stage
 from bidex_meta.world.rendering import CAMERAS, GHOST
 
 _TYPE = mujoco.mjtGeom
+_Handle = Any  # viser's, of an optional extra
 _SHOWN_GROUPS = 3
 """Groups from here on are hidden, as in MuJoCo's own viewer."""
 
@@ -44,11 +45,9 @@ def shape(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
             model.mesh_vert[points : points + model.mesh_vertnum[index]].astype(float),
             model.mesh_face[faces : faces + model.mesh_facenum[index]].astype(int),
         )
-    if kind == _TYPE.mjGEOM_SPHERE:
-        mesh = make.icosphere(subdivisions=3, radius=size[0])
-    elif kind == _TYPE.mjGEOM_ELLIPSOID:
+    if kind in (_TYPE.mjGEOM_SPHERE, _TYPE.mjGEOM_ELLIPSOID):
         mesh = make.icosphere(subdivisions=3, radius=1.0)
-        mesh.apply_scale(size)
+        mesh.apply_scale(size if kind == _TYPE.mjGEOM_ELLIPSOID else size[0])
     elif kind == _TYPE.mjGEOM_CAPSULE:
         mesh = make.capsule(height=2.0 * size[1], radius=size[0], count=(16, 16))
         mesh.apply_translation((0.0, 0.0, -mesh.bounds.mean(axis=0)[2]))  # from one end on in some versions
@@ -79,11 +78,11 @@ class Browser:
             ) from None
         self.paused, self.speed = False, speed
         self._asked: list[str] = []
-        self._server: Any = viser.ViserServer(host=host, port=port, label="bidex-meta", verbose=False)
+        self._server = viser.ViserServer(host=host, port=port, label="bidex-meta", verbose=False)
         self.address = f"http://{host}:{self._server.get_port()}"
         self._server.scene.set_up_direction("+z")
-        self._shapes: dict[int, Any] = {}
-        self._ghosts: list[Any] = []
+        self._shapes: dict[int, _Handle] = {}
+        self._ghosts: list[_Handle] = []
         self._add_controls(stage)
         self._set_the_scene(stage)
 

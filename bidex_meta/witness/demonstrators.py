@@ -1,7 +1,6 @@
 """Witnesses and scripted policies as agents, and the shifted starts from which demonstrations begin."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,6 +11,7 @@ from bidex_meta.witness.replay import SEED, Simulator, task_slot
 from bidex_meta.witness.scripts import script_of
 from bidex_meta.witness.store import Witness
 from bidex_meta.world import World
+from bidex_meta.world.contract import Info, Options
 from bidex_meta.world.wrapper import PooledWorldWrapper
 
 
@@ -112,7 +112,7 @@ class ShiftedStarts(PooledWorldWrapper):
         super().__init__(World([task_slot(name)], rows, autoreset_mode="DISABLED", seed=SEED, threads=threads))
         self._shift = shift
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
         """Starts episodes of all environments, shifted by the seed; raises BidexError for options."""
         if options:
             raise BidexError("Shifted starts begin all environments together. Leave options out.")

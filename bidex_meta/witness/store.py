@@ -19,6 +19,7 @@ from bidex_meta.utils.validation import Finite, Whole, parse
 if TYPE_CHECKING:
     from torch import Tensor
 
+Json = dict[str, Any]
 LEVELS = 127
 """Actions are whole multiples of 1/127, so that a byte holds one exactly."""
 _MOST_BYTES, _MOST_STEPS = 50_000_000, 100_000
@@ -31,7 +32,7 @@ class Witness:
 
     actions: np.ndarray
     """Actions (T, action_size), float32, multiples of 1/127."""
-    made: dict[str, Any]
+    made: Json
     """Return, step of the first success, return of the best unsuccessful episode (``rival``), settings, versions."""
 
 
@@ -66,7 +67,7 @@ def load_witness(name: str, path: Path | None = None) -> Witness:
     return witness
 
 
-def save_witness(path: Path, actions: np.ndarray, made: dict[str, Any]) -> Path:
+def save_witness(path: Path, actions: np.ndarray, made: Json) -> Path:
     """Writes a witness; actions (T, action_size) must be multiples of 1/127."""
     path.parent.mkdir(parents=True, exist_ok=True)
     levels = np.rint(actions * LEVELS).astype(np.int8)

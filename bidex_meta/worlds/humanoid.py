@@ -7,6 +7,7 @@ bit for bit, to single precision.
 from collections.abc import Mapping
 from pathlib import Path
 
+import gymnasium
 import mujoco
 import numpy as np
 import torch
@@ -50,9 +51,8 @@ class HumanoidWorld(ForeignWorld):
         threads: int | None = None,
         stagger: bool = True,
     ) -> None:
-        import gymnasium.envs.mujoco as home
-
-        model = mujoco.MjModel.from_xml_path(str(Path(home.__file__).parent / "assets" / "humanoid.xml"))
+        file = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "humanoid.xml"
+        model = mujoco.MjModel.from_xml_path(str(file))
         num_state = (model.nq - 2) + model.nv + (model.nbody - 1) * 22 + (model.nv - 6)
         super().__init__([NAME], num_envs, Sizes(num_state, model.nu, EPISODE_STEPS), seed, autoreset_mode, stagger)
         self._model, self._data = model, mujoco.MjData(model)
@@ -132,13 +132,8 @@ class HumanoidWorld(ForeignWorld):
 
     def state_dict(self) -> State:
         """All that decides the world's future: tensors and plain values, copied."""
-        return {
-            **super().state_dict(),
-            "tasks": self.num_slot_tasks[0],
-            "engine": self._engine.state_dict(),
-            "x": self._x.clone(),
-            "contact": self._contact.clone(),
-        }
+        own = {"tasks": self.num_slot_tasks[0], "engine": self._engine.state_dict()}
+        return {**super().state_dict(), **own, "x": self._x.clone(), "contact": self._contact.clone()}
 
     def load_state_dict(self, state: State) -> None:
         """Restores a ``state_dict``; raises BidexError for one of another size."""
