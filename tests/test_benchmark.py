@@ -158,9 +158,7 @@ def test_listed_tasks_fix_the_goal_and_share_the_drawn_rest() -> None:
      ("ML1", "test", "masked", 422, "fixed"), ("ML4", "train", "masked", 446, "fixed"),
      ("ML4", "test", "masked", 446, "fixed")]
 )  # fmt: skip
-def test_what_a_world_is_asked_for(
-    asked: None, name: str, split: str, observation: str, pad_to: int, sampling: str
-) -> None:
+def test_what_a_world_is_asked_for(asked, name, split, observation, pad_to, sampling):
     world = Benchmark(name, seed=4).make_world(split, num_envs=9, device="cpu", threads=2)
     assert world.num_envs == 9
     given = {"device": "cpu", "seed": 4, "threads": 2, "engine": "auto", "stagger": True, "points": None}

@@ -25,9 +25,7 @@ def suite_file(folder: Path, table: str) -> Path:
 
 
 @pytest.mark.parametrize("algo", ["ppo", "sac", "happo"])
-def test_a_run_reads_clouds_and_is_evaluated_on_them(
-    algo: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_reads_clouds_and_is_evaluated_on_them(algo, tmp_path, capsys):
     flags = ["--task", "HandOver", "--algo", algo, *_SMALL, "--learner.point-widths", "4", "8", "--learner.hidden", "8"]
     flags += ["--learner.warmup-steps", "2"] if algo == "sac" else []
     assert main(["run", *flags, "--steps", "64", "--episodes", "1", "--run-dir", str(tmp_path / "a")]) == 0
@@ -94,9 +92,7 @@ def test_bad_tables_are_one_line(table: str, tmp_path: Path) -> None:
         (["--suite", "ML1", "--algo", "maml", "--points", "16", "--threads", "1"], "does not read point clouds"),
     ],
 )
-def test_what_cannot_be_is_one_line(
-    flags: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_is_one_line(flags, told, tmp_path, capsys):
     assert main(["run", *flags, "--run-dir", str(tmp_path / "a")]) == 2
     assert told in capsys.readouterr().err
 

@@ -69,14 +69,6 @@ def test_shipped_suite_is_sound(name: str) -> None:
     assert suite.splits == (("train", "test") if suite.kind == "meta" else ("train",))
 
 
-def test_composition_of_mt4_and_ml4() -> None:
-    mt4, ml4 = load_suite("MT4"), load_suite("ML4")
-    assert [c.name for c in mt4.classes] == ["CatchUnderarm", "HandOver", "CatchAbreast", "TwoCatchUnderarm"]
-    assert [c.name for c in ml4.split_classes("train")] == ["CatchUnderarm", "HandOver", "CatchAbreast"]
-    assert [c.name for c in ml4.split_classes("test")] == ["TwoCatchUnderarm"]
-    assert mt4.tasks_per_class == ml4.tasks_per_class == 50
-
-
 def test_composition_of_mt20_and_ml20() -> None:
     """Appendix, section D: eleven classes at a tenth of their reward, five held out."""
     mt20, ml20 = load_suite("MT20"), load_suite("ML20")

@@ -43,15 +43,7 @@ def actions(seed: int, step: int, num: int) -> torch.Tensor:
     resets=st.lists(st.tuples(st.integers(0, 30), st.lists(st.booleans(), min_size=5, max_size=5)), max_size=6),
     commits=st.sets(st.integers(0, 30), max_size=5),
 )
-def test_what_is_stored_is_what_a_plain_loop_saw(
-    seed: int,
-    steps: int,
-    mode: str,
-    breaks_at: list[tuple[int, int]],
-    late: list[int],
-    resets: list[tuple[int, list[bool]]],
-    commits: set[int],
-) -> None:
+def test_what_is_stored_is_what_a_plain_loop_saw(seed, steps, mode, breaks_at, late, resets, commits):
     """Over resets, time limits and broken rows; two processes write into one data set."""
     masks = dict(resets)
     with tempfile.TemporaryDirectory() as place:

@@ -61,10 +61,7 @@ BAD = {
         mjcf('<geom type="mesh" mesh="m"/>', '<asset><mesh name="m" file="../outside.obj"/></asset>'),
         "files in its own folder",
     ),
-    "a folder from elsewhere": (
-        mjcf(GEOM, '<compiler meshdir="/etc"/>'),
-        "meshdir with an absolute path",
-    ),
+    "a folder from elsewhere": (mjcf(GEOM, '<compiler meshdir="/etc"/>'), "meshdir with an absolute path"),
     "an include": (mjcf(GEOM, '<include file="/etc/passwd"/>'), "an object in one file"),
     "a plugin": (mjcf(GEOM, '<extension><plugin plugin="mujoco.sdf.torus"/></extension>'), "<extension>"),
     "an actuator": (mjcf(GEOM, "<actuator/>"), "<actuator>"),
@@ -130,9 +127,7 @@ def test_a_pipe_a_folder_and_a_link_that_leads_away(tmp_path: Path) -> None:
             registry.get("CatchUnderarm", True, object=str(tmp_path / name))
 
 
-def test_the_command_says_so_and_writes_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_says_so_and_writes_nothing(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "heavy.xml").write_text(mjcf(GEOM.replace("0.1", "100")))
     run = ["run", "--algo", "ppo", "--steps", "8", "--num-envs", "2"]

@@ -61,9 +61,7 @@ def test_success_is_told_by_object(tmp_path: Path) -> None:
     assert list(classes) == FOUR and all(classes[name]["episodes"] == 1 for name in FOUR)
 
 
-def test_a_class_on_its_own_with_an_object_trains_and_is_evaluated(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_class_on_its_own_with_an_object_trains_and_is_evaluated(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "puck.xml").write_text(
         '<mujoco><worldbody><body><geom type="cylinder" size="0.03 0.01" mass="0.1"/></body></worldbody></mujoco>'

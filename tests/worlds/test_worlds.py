@@ -1,6 +1,5 @@
 """``Worlds.open``: own suites, single classes and Meta-World's suites answer the same questions."""
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -115,13 +114,6 @@ def test_a_world_that_cannot_be_is_refused(config: dict[str, Any], split: str, t
     with pytest.raises(BidexError) as error:
         Worlds.open(config).world(split)
     assert told in str(error.value) and "\n" not in str(error.value)
-
-
-def test_nobody_else_asks_whose_suite_it_is() -> None:
-    asked = re.compile(r"METAWORLD_SUITES|metaworld_classes|metaworld\.(batched|library)")
-    others = [path for path in CORE.rglob("*.py") if path.parent.name not in ("worlds", "metaworld")]
-    asking = [path.name for path in others if asked.search(path.read_text())]
-    assert len(others) > 50 and asking == ["suite.py"]
 
 
 def test_a_config_is_taken_as_it_is_or_from_a_run() -> None:
