@@ -8,8 +8,9 @@ from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import BidexError
 from bidex_meta.suite import load_suite, suite_names
 from bidex_meta.tasks import registry
+from bidex_meta.utils.paths import suites_dir
 
-META = """
+HEAD = """
 name = "own"
 version = 1
 kind = "meta"
@@ -18,6 +19,9 @@ observation = "masked"
 task_id = "class"
 reward = "paper"
 base = "moving"
+"""
+
+META = f"""{HEAD}
 tasks_per_class = 5
 
 [[classes]]
@@ -29,28 +33,19 @@ name = "HandOver"
 split = "test"
 """
 
-LISTED = """
-name = "own"
-version = 1
-kind = "meta"
-description = "one class"
-observation = "masked"
-task_id = "task"
-reward = "paper"
-base = "moving"
-
+LISTED = f"""{HEAD.replace('"class"', '"task"')}
 [[classes]]
 name = "CatchUnderarm"
 split = "both"
 
 [[classes.tasks]]
 name = "near"
-fixed = { goal_x = 0.0 }
+fixed = {{ goal_x = 0.0 }}
 
 [[classes.tasks]]
 name = "far"
 split = "test"
-fixed = { goal_x = 0.1 }
+fixed = {{ goal_x = 0.1 }}
 """
 
 
@@ -113,13 +108,13 @@ def test_names_and_paths(tmp_path: Path) -> None:
     assert load_suite(file) == load_suite(str(file)) and load_suite(file).classes[0].reward_scale == 1.0
     with pytest.raises(BidexError, match=r"absent\.toml, but No such file"):
         load_suite(tmp_path / "absent.toml")
-    with pytest.raises(
-        BidexError,
-        match=r"Did you mean 'MT4'\? Known: ML1, ML1-objects, ML1-wide, ML20, ML4, MT1, MT1-objects, MT20, MT4",
-    ):
+    known = "ML1, ML1-objects, ML1-wide, ML20, ML4, MT1, MT1-objects, MT20, MT4"
+    with pytest.raises(BidexError, match=rf"Did you mean 'MT4'\? Known: {known}"):
         load_suite("MT44")
 
 
+BOTH = 'split = "test"', 'objects = ["egg"]\noptions = {object = "egg"}'
+COUNTED = "version = 1\ntasks_per_class = 3"
 FAULTS = {
     "unknown key": (META, 'base = "moving"', 'base = "moving"\nbasis = 1', "basis: unknown entry, did you mean 'base'"),
     "unknown key in a class": (META, 'split = "test"', 'splitt = "test"', "classes[1].splitt: unknown entry"),
@@ -142,22 +137,12 @@ FAULTS = {
     "discount of 1": (META, 'split = "test"', 'split = "test"\ngamma = 1.0', "classes[1].gamma: expected"),
     "a text option": (META, 'split = "test"', 'options = {water = "3"}', "classes[1].options.water: expected"),
     "a number as object": (META, 'split = "test"', "options = {object = 3}", "classes[1].options.object: expected"),
-    "object and objects": (
-        META,
-        'split = "test"',
-        'objects = ["egg"]\noptions = {object = "egg"}',
-        "classes[1].objects: expected either",
-    ),
+    "object and objects": (META, *BOTH, "classes[1].objects: expected either"),
     "too many points": (META, "version = 1", "version = 1\npoints = {count = 20000}", "points.count: expected"),
     "overlap": (LISTED, "goal_x = 0.1", "goal_x = 0.0", "train and test tasks that differ, got 'near' and 'far'"),
     "task twice": (LISTED, '"far"', '"near"', "classes[0].tasks.name: expected each name once"),
     "listed split absent": (LISTED, 'split = "both"', 'split = "test"', "classes"),
-    "listed and counted": (
-        LISTED,
-        "version = 1",
-        "version = 1\ntasks_per_class = 3",
-        "tasks_per_class: expected nothing",
-    ),
+    "listed and counted": (LISTED, "version = 1", COUNTED, "tasks_per_class: expected nothing"),
     "value is no number": (LISTED, "goal_x = 0.1", 'goal_x = "0.1"', "classes[0].tasks[1].fixed[...]: expected"),
     "value is not finite": (LISTED, "goal_x = 0.1", "goal_x = nan", "classes[0].tasks[1].fixed[...]: expected"),
     "no TOML": (META, 'name = "own"', "name: own", "expected a suite file in TOML, but"),
@@ -189,8 +174,6 @@ def test_any_other_content_is_a_bidex_error(tmp_path_factory: pytest.TempPathFac
 
 
 def test_readme_explains_every_key() -> None:
-    from bidex_meta.utils.paths import suites_dir
-
     readme = (suites_dir() / "README.md").read_text(encoding="utf-8")
     for key in [*KEYS[:-1], "description", "split", "reward_scale", "gamma", "options", "tasks", "fixed"]:
         assert f"| `{key}` |" in readme

@@ -1,7 +1,4 @@
-"""Gymnasium ids of every shipped suite and every task class.
-
-Suites register a vector entry point only: a suite is a batch of different tasks. Task classes register both.
-"""
+"""Gymnasium ids of every shipped suite (vector entry points alone) and every task class (both)."""
 
 from typing import TYPE_CHECKING, Any
 

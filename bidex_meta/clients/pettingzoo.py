@@ -99,5 +99,4 @@ class HandsEnv(ParallelEnv):
         return {name: self._state[self._columns[name]] for name in self.agents}
 
 
-parallel_env = HandsEnv
-"""Under the name of PettingZoo's packages."""
+parallel_env = HandsEnv  # under the name of PettingZoo's packages

@@ -1,9 +1,8 @@
 """Checks and summaries of a data set.
 
-The check computes rewards again by the class's own formula (``TaskClass.reward_terms``), from the sensors that the
-observation shows and the variation that the episode stores. So it finds errors of a collector: shifted rows, wrong
-tasks or starts. A formula that reads more than the observation shows (the hand's point of most classes with tables, or
-the objects' states where point clouds take their place) cannot be computed again, and the check reports that.
+The check computes rewards again by the class's own formula, from the sensors that the observation shows and the
+variation that the episode stores: so it finds shifted environments, wrong tasks or starts. A formula that reads more
+(the hand's point of most classes with tables, objects' states where point clouds take their place) is reported.
 """
 
 import math
@@ -54,10 +53,7 @@ class _NotShown(Exception):
 
 
 class _ShownState(TaskState):
-    """The state as far as observations (n, d), float64, show it.
-
-    ``shown`` is the index range of each sensor in an observation, and the factor that it was shown with.
-    """
+    """The state as far as observations (n, d), float64, show it: ``shown`` are their entries."""
 
     def __init__(self, shown: _Shown, observations: Tensor, frozen: dict[str, Tensor]) -> None:
         super().__init__(observations, {}, frozen)
@@ -77,10 +73,7 @@ class _ShownState(TaskState):
 
 
 def verify(dataset: Dataset, most: int | None = None) -> Findings:
-    """Checks every file's digest, and every episode, or ``most`` of them (from 1 on), evenly spread.
-
-    Raises BidexError where files are missing or damaged.
-    """
+    """Checks all digests, and ``most`` episodes (None: all), evenly spread; BidexError for damaged files."""
     findings, formulas = Findings(unsealed=dataset.check_digests()), _Formulas(dataset)
     table = dataset.table
     for number, episode in _spread_episodes(dataset, most):
@@ -186,10 +179,7 @@ class _Formulas:
 
 
 def shown_sensors(task: TaskClass, hidden: frozenset[int] = frozenset()) -> _Shown:
-    """Where a class's observation shows each sensor whole and unmapped, and the factor on it.
-
-    ``hidden`` entries show nothing.
-    """
+    """Where an observation shows each sensor whole and unmapped, and its factor; ``hidden`` entries show nothing."""
     shown: _Shown = {}
     for block, where in task.layout:
         if block.sensors and not block.name.endswith("joint_position"):  # those are mapped from the joint's range

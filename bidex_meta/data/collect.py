@@ -1,8 +1,8 @@
 """Plays policies and collects their episodes in rounds, each of which is one part of a data set and can be replayed.
 
-In a round every environment plays the same number of whole episodes of its task; a collection that stopped after so
-many steps would lack the long ones. All that a round draws follows from the collection's seed and the round's number.
-So a collection that was killed goes on with the first round whose part is missing, and ends with the same data.
+In a round every environment plays the same number of whole episodes: one that stopped after so many steps would lack
+the long ones. All draws of a round follow from the collection's seed and its number, so that a collection that was
+killed goes on with the first missing part, and ends with the same data.
 """
 
 import math
@@ -25,12 +25,9 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import RandomAgent
 from bidex_meta.world.contract import PooledWorld
 
-PART_BYTES = 64_000_000
-"""Bytes of a part, about: what is played again after a kill at the worst moment."""
-FAILED = "unsuccessful_episodes"
-"""What is left out of demonstrations."""
-_SLACK = 1.05
-"""The last round is planned for a little more than is missing, since episodes differ in length."""
+PART_BYTES = 64_000_000  # bytes of a part, about: what is played again after a kill at the worst moment
+FAILED = "unsuccessful_episodes"  # what is left out of demonstrations
+_SLACK = 1.05  # the last round is planned for a little more than is missing, since episodes differ in length
 
 
 @runtime_checkable
@@ -46,12 +43,10 @@ class SamplingAgent(Agent, Protocol):
 class Actor:
     """A policy as it acts in a collection."""
 
-    policy: Agent | None
-    """None: uniform actions."""
+    policy: Agent | None  # None: uniform actions
     sampled: bool = False
     """Whether actions are drawn from the policy's distribution, if it has one; else its mean action is taken."""
-    noise: float = 0.0
-    """Standard deviation of Gaussian noise on the actions."""
+    noise: float = 0.0  # standard deviation of Gaussian noise on the actions
 
     def acting(self, world: PooledWorld, seed: int) -> Callable[[Tensor], Tensor]:
         """A function from observations (N, d) to actions (N, a) that draws by the seed alone."""

@@ -28,13 +28,10 @@ class EpisodeCollector(PooledWorldWrapper):
     """Collects whole episodes; it changes nothing of what the world does.
 
     A transition in which physics broke is left out, and its episode ends as truncated before it. Only ``rows``, the
-    environments to collect from (None: all), are kept in memory: a step of one takes 4 (d + a + 2) bytes. In DISABLED
-    mode a frozen environment collects nothing until it is reset. ``sink`` receives each episode when it has ended,
-    those of one step by ascending environment.
-
-    ``left_out`` counts what was not collected, by reason; ``policy`` is the number of the one that acts, for the
-    episodes that end; ``active``, bool (rows,), is which of the chosen environments collect the episodes that begin:
-    all at first.
+    environments to collect from (None: all), are in memory: a step of one takes 4 (d + a + 2) bytes. ``sink`` receives
+    each episode when it has ended, those of one step by ascending environment. ``left_out`` counts what was not
+    collected, by reason; ``policy`` is the number of the one that acts; ``active``, bool (rows,), which environments
+    collect the episodes that begin: all at first.
     """
 
     def __init__(self, world: VectorWorld, sink: Callable[[Episode], None], rows: Sequence[int] | None = None) -> None:
@@ -173,10 +170,7 @@ class EpisodeCollector(PooledWorldWrapper):
         return {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
 
     def load_collector_state(self, state: dict[str, Tensor]) -> None:
-        """Goes on with the episodes of ``collector_state``; the world must have been restored before.
-
-        Raises BidexError where other environments were collected from, or observations and actions had other sizes.
-        """
+        """Goes on, in a restored world, with ``collector_state``; BidexError for other environments or sizes."""
         given = {name: value.numpy() for name, value in state.items()}
         self._forget()
         sizes = [given[name].shape[-1] for name in ("observations", "actions")]

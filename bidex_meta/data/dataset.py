@@ -91,10 +91,7 @@ def dataset_names(folder: Path | None = None) -> list[str]:
 
 
 def open_dataset(name_or_path: str | Path) -> "Dataset":
-    """A data set by its name in ``data_folder()``, or by the path of a folder that holds ``data/metadata.json``.
-
-    Raises BidexError where there is none, it is incomplete or damaged, or h5py is not installed.
-    """
+    """A data set by name in ``data_folder()``, or by folder; BidexError where it is missing, incomplete or damaged."""
     named = expanded(name_or_path)
     for folder in (named, data_folder() / named):
         for inner in (folder / "data", folder):
@@ -124,10 +121,7 @@ class Dataset:
         self._sealed = {folder / part_files.METADATA: sealed}
 
     def check_digests(self) -> list[str]:
-        """Checks every file's digest, reading all of it; returns the names of files without one.
-
-        Raises BidexError where a file has changed since it was written.
-        """
+        """Names of the files without a digest; reads all files, and raises BidexError where one has changed."""
         if "bidex" not in self.content:
             return [part_files.METADATA, part_files.MAIN]
         for path in (*self._paths, self.folder / part_files.MAIN):
@@ -149,10 +143,7 @@ class Dataset:
 
     @cached_property
     def table(self) -> dict[str, np.ndarray]:
-        """One entry an episode, in the order of ``episodes()``: columns of ``part_files.TABLE``, ``variation``.
-
-        Raises BidexError where parts are missing or damaged.
-        """
+        """By episode, in their order: columns of ``part_files.TABLE``, ``variation``; BidexError for damage."""
         columns = {name: _joined([table[name] for table in self._tables]) for name in (*part_files.TABLE, "variation")}
         episodes, steps = len(columns["steps"]), int(columns["steps"].sum())
         if (self.num_episodes, self.num_steps) != (episodes, steps):
@@ -187,10 +178,7 @@ class Dataset:
 
     @property
     def action_bounds(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Least and largest actions, (a,) each, of a data set from elsewhere; None: -1 and 1.
-
-        Raises BidexError where its metadata have no finite ones.
-        """
+        """Least and largest actions, (a,) each, if from elsewhere (BidexError without finite ones); None: ±1."""
         if "bidex" in self.content:
             return None
         return other_formats.action_bounds(self.content, self.name, self.action_size)
@@ -208,10 +196,7 @@ class Dataset:
         return size, first.actions.shape[1]
 
     def episodes(self) -> Iterator[Episode]:
-        """All episodes, read one by one.
-
-        Raises BidexError for a damaged file, or observations or actions of a data set from elsewhere that are not flat.
-        """
+        """All episodes, read one by one; BidexError for a damaged file, or observations or actions not flat."""
         other_formats.check_spaces(self.content, self.name)
         number, sizes = 0, None
         for path, table in zip(self._paths, self._tables, strict=True):

@@ -1,7 +1,4 @@
-"""Data sets in memory as one, in the form of the world that a policy is learned for.
-
-Each observation of an episode is held once, in half of the memory that observations and next observations would take.
-"""
+"""Data sets in memory as one, each observation once, in the form of the world that a policy is learned for."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,20 +21,13 @@ from bidex_meta.world.groups import Slot
 class Joined:
     """N transitions of E episodes, on the CPU."""
 
-    observations: Tensor
-    """All states, episode after episode, (N + E, d), float32."""
-    at: Tensor
-    """Row of each transition's observation, int64 (N,); the next row is its next observation."""
-    actions: Tensor
-    """(N, a), float32."""
-    rewards: Tensor
-    """(N,), float32, in the world's scale."""
-    terminated: Tensor
-    """Whether the episode came to a true end, bool (N,)."""
-    task: Tensor
-    """Slot of the world, int64 (N,)."""
-    left: Tensor
-    """Later transitions of the same episode, int64 (N,)."""
+    observations: Tensor  # all states, episode after episode, (N + E, d), float32
+    at: Tensor  # row of each transition's observation, int64 (N,); the next row is its next observation
+    actions: Tensor  # (N, a), float32
+    rewards: Tensor  # (N,), float32, in the world's scale
+    terminated: Tensor  # whether the episode came to a true end, bool (N,)
+    task: Tensor  # slot of the world, int64 (N,)
+    left: Tensor  # later transitions of the same episode, int64 (N,)
 
     def __len__(self) -> int:
         """Transitions, N."""
@@ -54,11 +44,9 @@ def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) ->
     """Reads data sets, at least one, for a world, which is neither stepped nor reset.
 
     Slots are matched by name. Observations of a class recorded on its own get the world's padding and one-hot, and
-    rewards its scale; goals that the world hides become zero. Actions of a data set from elsewhere are mapped to [-1,
-    1]. With ``every`` each of the world's classes needs data.
-
-    Raises BidexError for actions, states or clouds of another form, actions from elsewhere without bounds, classes that
-    do not match, or too little memory.
+    rewards its scale; goals that the world hides become zero; actions from elsewhere are mapped to [-1, 1]. With
+    ``every`` each of the world's classes needs data. Raises BidexError for actions, states or clouds of another form,
+    actions from elsewhere without bounds, classes that do not match, or too little memory.
     """
     ids = world.num_id_columns
     plain, actions = world.single_observation_space.shape[0] - ids, world.single_action_space.shape[0]
@@ -80,10 +68,7 @@ def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) ->
 def gathered(
     episodes: Iterable[tuple[Episode, int, np.ndarray]], steps: int, count: int, observations: int, actions: int
 ) -> Joined:
-    """Concatenates ``count`` episodes of ``steps`` transitions in all; raises BidexError where they have fewer.
-
-    Each comes with its slot, and observations (T + 1, ``observations``) in the world's form; ``actions`` is a.
-    """
+    """Episodes with slot, and observations (T + 1, d) in the world's form, as one; BidexError for too few steps."""
     states, acts, rewards = torch.zeros(steps + count, observations), torch.zeros(steps, actions), torch.zeros(steps)
     at, task, left = torch.zeros(3, steps, dtype=torch.int64).unbind()
     ends = torch.zeros(steps, dtype=torch.bool)
@@ -122,10 +107,7 @@ class _Columns(NamedTuple):
 
 
 class _Form:
-    """How a data set's episodes become a world's; ``slots`` are the world's for each of the data set's.
-
-    ``plain`` is the entries of the world's observation without its one-hot.
-    """
+    """How a data set's episodes become a world's; ``slots`` are the world's; ``plain``: without one-hot."""
 
     def __init__(self, dataset: Dataset, world: VectorWorld, plain: int, actions: int) -> None:
         self.dataset, about = dataset, dataset.metadata

@@ -12,10 +12,7 @@ _SPACES = {"observations": "observation_space", "actions": "action_space"}
 
 
 def check_spaces(content: Json, name: str) -> None:
-    """Refuses observations or actions that are not flat, where the metadata of a data set have their spaces.
-
-    ``content`` is all of ``metadata.json``, ``name`` the data set's. Raises BidexError unless each is a flat Box.
-    """
+    """Raises BidexError where the spaces in ``metadata.json`` say that observations or actions are not flat."""
     for what, entry in _SPACES.items():
         space = _space(content, entry)
         kind, shape = space.get("type", "Box"), space.get("shape", [0])
@@ -24,10 +21,7 @@ def check_spaces(content: Json, name: str) -> None:
 
 
 def numbers(stored: H5, what: str, name: str, length: int | None = None) -> np.ndarray:
-    """An episode's array from HDF5's group or dataset; ``what`` is Minari's name of it, ``length`` the required one.
-
-    Raises BidexError where it is a group, has another shape, or holds no numbers.
-    """
+    """An episode's array ``what`` (Minari's name); BidexError for another shape or ``length``, or no numbers."""
     if not hasattr(stored, "shape"):
         raise _not_flat(name, what, f"a group of {shortened(', '.join(stored))}")
     shape, kind = stored.shape or (), stored.dtype
@@ -39,10 +33,7 @@ def numbers(stored: H5, what: str, name: str, length: int | None = None) -> np.n
 
 
 def action_bounds(content: Json, name: str, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Least and largest actions, (a,) each, float64, which become -1 and 1 here; ``size`` is a.
-
-    Raises BidexError where there are none, or not finite and rising ones.
-    """
+    """Least and largest actions, (a,) each, float64, which become ±1; BidexError unless finite and rising."""
     space = _space(content, "action_space")
     try:
         low, high = (np.array(space[end], np.float64) for end in ("low", "high"))

@@ -29,16 +29,13 @@ from bidex_meta.errors import BidexError, one_line
 from bidex_meta.runs.atomic import sync_folder
 from bidex_meta.utils.files import is_file
 
-H5 = Any
-"""h5py's file, group, array or buffer: of an optional package without types."""
+H5 = Any  # h5py's file, group, array or buffer: of an optional package without types
 Json = dict[str, Any]
 
 MAIN, METADATA, RECORDING = "main_data.hdf5", "metadata.json", "recording.json"
-FORMAT = 1
-"""Raised when older code could no longer read what is written."""
+FORMAT = 1  # raised when older code could no longer read what is written
 _PART = re.compile(r"part-(\d{1,4})-(\d{1,6})\.hdf5", re.ASCII)
-EPISODE_BYTES = 3800
-"""Bytes of an episode in HDF5 beside its numbers: measured 3,675 with five attributes."""
+EPISODE_BYTES = 3800  # bytes of an episode in HDF5 beside its numbers: measured 3,675 with five attributes
 ARRAYS = {"observations": "observations", "actions": "actions", "rewards": "rewards"}
 ARRAYS |= {"terminations": "terminated", "truncations": "truncated"}
 """Minari's names of an episode's arrays, and ours."""
@@ -83,7 +80,7 @@ def _files(folder: Path) -> Iterator[Path]:
 class _Disk(io.FileIO):
     """A file for HDF5 that stores the system's first error (``refused``) instead of raising it.
 
-    HDF5 would try again at each close, print tracebacks that nobody can catch, and crash at the end of the process.
+    HDF5 would try again at each close, print tracebacks that nobody can catch, and crash as the process ends.
     """
 
     refused: OSError | None = None
@@ -226,10 +223,7 @@ def reading(path: Path) -> Iterator[H5]:
 
 
 def read_table(path: Path) -> dict[str, np.ndarray]:
-    """The table of a part's episodes, each column (episodes,), ``variation`` (episodes, v).
-
-    Raises BidexError where it is no part, or a damaged one.
-    """
+    """Columns of a part's episodes, (episodes,), ``variation`` (episodes, v); BidexError for a damaged one."""
     with reading(path) as file:
         table = {name: file["table"][name] for name in (*TABLE, "variation")}
         rows = table["steps"].shape[:1]

@@ -1,8 +1,7 @@
 """Digests of a data set's files, so that no flipped bit is read in silence.
 
-The user block of a file of HDF5 holds the file's length and the CRC-32 of all that follows the block. In
-``metadata.json`` the last entry is the digest of all before it. CRC-32 finds every single flipped bit and all but one
-in four billion other damages; it is no protection against intent.
+The user block of a file of HDF5 holds the file's length and the CRC-32 of all that follows; the last entry of
+``metadata.json`` is the digest of all before it. It is no protection against intent.
 """
 
 import json
@@ -15,13 +14,11 @@ from typing import IO
 from bidex_meta.errors import BidexError
 from bidex_meta.utils.files import open_regular
 
-BLOCK = 512
-"""Bytes of the user block: the least that HDF5 takes."""
+BLOCK = 512  # bytes of the user block: the least that HDF5 takes
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _PIECE = 1 << 20
 _LAST = ',\n  "digest": '
-_MARK = "sealed"
-"""Entry in the metadata beside the digest: one flipped bit cannot remove both."""
+_MARK = "sealed"  # entry in the metadata beside the digest: one flipped bit cannot remove both
 
 
 def block(file: IO[bytes]) -> bytes:
@@ -38,10 +35,7 @@ def _line(length: int, digest: str) -> bytes:
 
 
 def check_file(path: Path) -> bool:
-    """Checks the digest of a file of HDF5, reading all of it; false for one without.
-
-    Raises BidexError where it is no file, or has changed since it was written.
-    """
+    """Checks a file's digest, reading all of it; false for one without. Raises BidexError where it has changed."""
     with open_regular(path, "a file of a data set") as file:
         first = file.read(BLOCK)
         if first.startswith(_HDF5):

@@ -25,10 +25,8 @@ from bidex_meta.utils.files import absolute, exists, expanded, is_file, read_jso
 from bidex_meta.utils.plugins import short_name
 from bidex_meta.utils.validation import Threads, parse
 
-_MARGIN = 1.05
-"""What file systems take beside the files."""
-_MINARI = "0.5.0"
-"""The version of Minari whose layout is written."""
+_MARGIN = 1.05  # what file systems take beside the files
+_MINARI = "0.5.0"  # the version of Minari whose layout is written
 _NAME = re.compile(r"(?:[-\w]+/)*[-\w]+-v\d{1,4}", re.ASCII)
 """Names that Minari takes: words of letters, digits, - and _, parted by /, and a version such as -v0."""
 
@@ -50,10 +48,7 @@ def default_name(subject: str, kind: str) -> str:
 
 
 def dataset_path(out: Path | None, subject: str, kind: str) -> tuple[Path, str]:
-    """Folder and name of a new data set of a suite or class (``subject``), by its folder ``out`` or the usual name.
-
-    The usual one is ``default_name`` in the data folder; ``kind`` is ``random``, ``medium``, ...
-    """
+    """Folder and name of a new data set of a suite or class: ``out``, or ``default_name`` in the data folder."""
     root, usual = data_folder(), default_name(subject, kind)
     if out is None:
         return root / usual, usual
@@ -72,10 +67,7 @@ def check_name(name: str) -> None:
 
 
 def check_room(folder: Path, needed: int, what: str) -> None:
-    """Raises BidexError where ``needed`` bytes do not fit on the disk of a folder, which may be missing.
-
-    ``what`` takes them, for the message.
-    """
+    """Raises BidexError where ``needed`` bytes, of ``what``, do not fit on a folder's disk; it may be missing."""
     there = next(above for above in (folder.absolute(), *folder.absolute().parents) if exists(above))
     free = shutil.disk_usage(there).free
     if needed * _MARGIN > free:
@@ -131,8 +123,8 @@ class DatasetWriter:
 def claimed(folder: Path, plan: Json) -> Iterator[None]:
     """Locks a folder against other processes, from before anything is written there to the end.
 
-    It creates the folder, and removes it again if nothing was written into it. Arguments and errors as of
-    ``has_begun``; raises BidexError where another process records there.
+    It creates the folder, and removes it again if it stays empty. Arguments and errors as of ``has_begun``; and
+    BidexError where another process records there.
     """
     message = f"Another process records into {folder}. Wait for its end, or name another path by --out."
     missing = [above for above in (folder, *folder.parents) if not exists(above)]
@@ -227,10 +219,7 @@ def finish(folder: Path, name: str, observations: Box, actions: Box, metadata: J
 
 
 def adopt(inner: Path, folder: Path, name: str) -> None:
-    """Publishes the files of a data set's folder ``data`` under another name: as links, or copies on another disk.
-
-    Raises BidexError where there is something in the new folder already, or Minari would not take the name.
-    """
+    """Publishes a folder ``data`` as another data set, by links, or copies elsewhere; BidexError as ``claimed``."""
     check_name(name)
     with claimed(folder, plan := {"kind": "replay", "of": str(inner.resolve())}):
         begin(folder, plan)

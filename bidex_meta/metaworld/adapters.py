@@ -131,8 +131,7 @@ class FromMetaWorld:
 class MetaWorldEnvs(VectorEnv):
     """A world in NumPy arrays, with resets in the same step and the attributes and methods that Meta-World calls.
 
-    Raises BidexError for a world in another autoreset mode than DISABLED: episodes are started here, since success may
-    end them.
+    Raises BidexError unless its autoreset mode is DISABLED: episodes are started here, since success may end them.
     """
 
     def __init__(self, world: PooledWorld):

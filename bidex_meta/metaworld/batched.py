@@ -1,7 +1,4 @@
-"""Meta-World's MT suites as a world, for checks on tasks, rewards and physics that no one here wrote.
-
-Our learners, evaluation and checkpoints run on it unchanged. Environments are stepped one after the other.
-"""
+"""Meta-World's MT suites as a world, stepped one by one: tasks, rewards and physics that no one here wrote."""
 
 from collections.abc import Mapping, Sequence
 
@@ -59,10 +56,7 @@ class MetaWorldWorld(ForeignWorld):
         self.set_tasks({name: range(TASKS_PER_CLASS) for name in self.task_names})
 
     def set_tasks(self, pools: Mapping[str, Sequence[int] | np.ndarray]) -> None:
-        """Replaces the pools of some classes by numbers of tasks, (n,) or (n, 1), from the next full reset on.
-
-        Raises BidexError for an unknown class, an empty pool, a wrong shape or a number out of range.
-        """
+        """Replaces pools by numbers of tasks, (n,) or (n, 1), from the next full reset on; else BidexError."""
         chosen = dict(self._pools)
         for name, pool in pools.items():
             if name not in self.task_names:
@@ -112,8 +106,7 @@ class MetaWorldWorld(ForeignWorld):
     def load_state_dict(self, state: State) -> None:
         """Restores a ``state_dict``; raises BidexError for one of another suite, seed or size.
 
-        Meta-World's environments keep part of their state in Python attributes and in the model, so each running
-        episode is played again from its start: exact, and a fraction of a second for each.
+        Each running episode is played again from its start, exactly: Meta-World keeps part of its state in Python.
         """
         fits(state, self.state_dict())
         here, there = (self.suite, self._task_seed), (state["suite"], state["task_seed"])

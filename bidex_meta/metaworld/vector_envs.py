@@ -19,8 +19,7 @@ from bidex_meta.suite import suite_names
 from bidex_meta.tasks import registry
 from bidex_meta.world.single_env import AnyTask, EnvRecipe
 
-Option = Any
-"""A keyword of Meta-World's functions; ``make_env`` and ``SuiteEnv`` have their types."""
+Option = Any  # a keyword of Meta-World's functions; ``make_env`` and ``SuiteEnv`` have their types
 _STRATEGIES = {"sync": SyncVectorEnv, "async": AsyncVectorEnv}
 
 

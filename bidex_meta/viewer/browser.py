@@ -12,8 +12,7 @@ from bidex_meta.world.rendering import CAMERAS, GHOST
 
 _TYPE = mujoco.mjtGeom
 _Handle = Any  # viser's, of an optional extra
-_SHOWN_GROUPS = 3
-"""Groups from here on are hidden, as in MuJoCo's own viewer."""
+_SHOWN_GROUPS = 3  # groups from here on are hidden, as in MuJoCo's own viewer
 
 
 def visible(model: mujoco.MjModel) -> list[int]:
@@ -64,10 +63,7 @@ def shape(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Browser:
-    """A ``Screen`` as a web server; raises BidexError where viser is missing.
-
-    ``host`` 0.0.0.0 lets other machines in; if ``port`` is in use, the next free one is taken.
-    """
+    """A ``Screen`` as a web server (``host`` 0.0.0.0: for all), on the next free port; BidexError without viser."""
 
     def __init__(self, stage: Stage, host: str = "127.0.0.1", port: int = 8080, speed: float = 1.0) -> None:
         try:

@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 Json = dict[str, Any]
-LEVELS = 127
-"""Actions are whole multiples of 1/127, so that a byte holds one exactly."""
+LEVELS = 127  # actions are whole multiples of 1/127, so that a byte holds one exactly
 _MOST_BYTES, _MOST_STEPS = 50_000_000, 100_000
 _Made = TypedDict("_Made", {"return": Finite, "first_success": Whole | None, "rival": Finite | None}, total=False)
 
@@ -30,8 +29,7 @@ _Made = TypedDict("_Made", {"return": Finite, "first_success": Whole | None, "ri
 class Witness:
     """Recorded actions that solve a task, and their record."""
 
-    actions: np.ndarray
-    """Actions (T, action_size), float32, multiples of 1/127."""
+    actions: np.ndarray  # actions (T, action_size), float32, multiples of 1/127
     made: Json
     """Return, step of the first success, return of the best unsuccessful episode (``rival``), settings, versions."""
 
@@ -47,10 +45,7 @@ def witness_path(name: str) -> Path:
 
 
 def load_witness(name: str, path: Path | None = None) -> Witness:
-    """The witness of a class, or the one in a file.
-
-    Raises BidexError where there is none, it is damaged, or its actions are not of the class's size.
-    """
+    """A class's witness, or one in a file; BidexError for none, a damaged one or actions of another size."""
     if path is None:
         path = witness_path(name)
         if not path.is_file():

@@ -1,7 +1,4 @@
-"""What a config names, resolved once: `Worlds.open(config)`, whichever kind it is.
-
-Opening reads a suite file at most; torch and physics are imported when a world is made or evaluated in.
-"""
+"""What a config names, resolved once: `Worlds.open(config)`, which does not load torch and physics."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -33,13 +30,10 @@ class WorldConfig:
     suite: str | None = None
     task: str | None = None
     base: Base = "own"
-    points: int = 0
-    """Points of the cloud in place of objects' states; 0: as the suite has it."""
+    points: int = 0  # points of the cloud in place of objects' states; 0: as the suite has it
     object: str | None = None
-    seed: int = 0
-    """Of starts, and of tasks without ``task_seed``."""
-    task_seed: int | None = None
-    """Of tasks and starts instead."""
+    seed: int = 0  # of starts, and of tasks without ``task_seed``
+    task_seed: int | None = None  # of tasks and starts instead
     device: str = "cpu"
     threads: int | None = None
     engine: str = "auto"
@@ -58,20 +52,15 @@ Identity = dict[str, str | int | None]
 class Worlds(ABC):
     """The worlds that a config names, and what holds for all of them; ``name`` is as the user wrote it."""
 
-    hides_goals: bool = False
-    """Whether it is a meta suite, whose goals have to be found out."""
+    hides_goals: bool = False  # whether it is a meta suite, whose goals have to be found out
     suite: Suite | None = None
-    class_name: str | None = None
-    """The class, where it is a single one."""
+    class_name: str | None = None  # the class, where it is a single one
     object: str | None = None
-    moving_base: bool | None = None
-    """Whether the bases of a single class move; None: as it has them."""
-    on_gpu: ClassVar[bool] = True
-    """Whether a GPU is of use to its worlds."""
+    moving_base: bool | None = None  # whether the bases of a single class move; None: as it has them
+    on_gpu: ClassVar[bool] = True  # whether a GPU is of use to its worlds
     preset: ClassVar[tuple[str, str] | None] = None
     """A preset for such worlds alone, which goes before others where a learner has it; and, in words, why."""
-    default_episodes: ClassVar[int] = 4
-    """Episodes of each task in an evaluation where none are given."""
+    default_episodes: ClassVar[int] = 4  # episodes of each task in an evaluation where none are given
 
     def __init__(self, name: str, config: WorldConfig) -> None:
         self.name, self.config = name, config
@@ -81,10 +70,7 @@ class Worlds(ABC):
 
     @staticmethod
     def open(config: Json | WorldConfig) -> "Worlds":
-        """Those of a config: its ``suite``, or without one the class ``task`` on its own, in any case.
-
-        Raises BidexError for an unknown suite or task, with the nearest name; or a faulty suite file.
-        """
+        """Those of a config's ``suite``, or its class ``task``, in any case; BidexError for unknown or faulty ones."""
         from bidex_meta.worlds import external, own
 
         config = WorldConfig.of(config)
@@ -143,10 +129,7 @@ class Worlds(ABC):
         return references() if self.moving_bases else {}
 
     def judge(self, agent: "Agent", world: "PooledWorld", episodes: int | None, seed: int) -> Evaluation:
-        """Evaluates a policy on all tasks of a split, beside the references, with a seed for the starts.
-
-        ``world`` is in mode DISABLED; ``episodes`` of each task, None takes ``default_episodes``.
-        """
+        """Evaluates a policy on all tasks of a split (mode DISABLED), ``default_episodes`` or so many of each."""
         from bidex_meta.evaluation.play import evaluate
 
         episodes = self.default_episodes if episodes is None else episodes

@@ -12,8 +12,7 @@ from bidex_meta.worlds.base import Identity, WorldConfig, Worlds
 if TYPE_CHECKING:
     from bidex_meta.worlds.base import Agent, PooledWorld, TaskClass
 
-HUMANOID = "gymnasium/Humanoid-v5"
-"""How a run names it (``--task``)."""
+HUMANOID = "gymnasium/Humanoid-v5"  # how a run names it (``--task``)
 
 # Of each of Meta-World's classes; 2 M steps are the budget of published results.
 _TRAINING_SIZE, _TRAINING_STEPS = 4, 2_000_000
