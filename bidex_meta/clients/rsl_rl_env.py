@@ -50,10 +50,8 @@ class RslRlVecEnv(VecEnv):
         given = torch.as_tensor(value, device=self.world.device)
         steps = given.to(torch.int64)
         if steps.shape != (self.num_envs,) or not bool(((given >= 0) & (given == steps)).all()):
-            raise BidexError(
-                f"episode_length_buf: expected whole numbers from 0 on, shape ({self.num_envs},), "
-                f"got {shortened(given.tolist())}. Give steps, one number for each environment."
-            )
+            what = f"whole numbers from 0 on, shape ({self.num_envs},), got {shortened(given.tolist())}"
+            raise BidexError(f"episode_length_buf: expected {what}. Give steps, one number for each environment.")
         self.get_observations()
         episodes = self.world.episodes
         episodes.counts = episodes.counts & (steps == episodes.elapsed)

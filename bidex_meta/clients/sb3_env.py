@@ -12,11 +12,10 @@ from bidex_meta.world.contract import Info, VectorWorld
 _Rows = None | int | Iterable[int]
 
 with extra("sb3"):
-    from stable_baselines3.common.monitor import Monitor
-    from stable_baselines3.common.vec_env import VecEnv
+    from stable_baselines3.common import monitor, vec_env
 
 
-class SB3VecEnv(VecEnv):
+class SB3VecEnv(vec_env.VecEnv):
     """All environments of one world, NumPy arrays in and out; one seed of SB3's starts them all.
 
     `infos` at an end: `terminal_observation`, `TimeLimit.truncated` (cut: SB3 goes on with the value of that
@@ -73,7 +72,7 @@ class SB3VecEnv(VecEnv):
 
     def env_is_wrapped(self, wrapper_class: type, indices: _Rows = None) -> list[bool]:
         """True for `Monitor` alone: like it, `infos` reports whole episodes, and SB3 counts those in evaluations."""
-        return [wrapper_class is Monitor for _ in self._get_indices(indices)]
+        return [wrapper_class is monitor.Monitor for _ in self._get_indices(indices)]
 
     def close(self) -> None:
         """Frees the world."""

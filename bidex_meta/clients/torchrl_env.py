@@ -8,13 +8,12 @@ from bidex_meta.world.contract import VectorWorld
 
 with extra("torchrl"):
     from tensordict import TensorDict, TensorDictBase
-    from torchrl.data import Binary, Bounded, Composite, Unbounded
-    from torchrl.envs import EnvBase
+    from torchrl import data, envs
 
 _EPISODE = {"r": torch.float32, "l": torch.int64, "success": torch.bool}
 
 
-class TorchRLEnv(EnvBase):
+class TorchRLEnv(envs.EnvBase):
     """All environments of one world, batch size (num_envs,), each entry (num_envs, ...).
 
     `next` holds the observation that the step led to, also where an episode ended; the reset that TorchRL asks for then
@@ -30,15 +29,17 @@ class TorchRLEnv(EnvBase):
         self.world, self._world_seed = world, None
         low, high = torch.as_tensor(world.observation_space.low), torch.as_tensor(world.observation_space.high)
         bounded = bool(low.isfinite().all() and high.isfinite().all())
-        seen = Bounded(low, high, device=device) if bounded else Unbounded(low.shape, device=device)
+        seen = data.Bounded(low, high, device=device) if bounded else data.Unbounded(low.shape, device=device)
         column = torch.Size([rows, 1])
-        flag = Binary(1, column, dtype=torch.bool, device=device)
-        counters = {name: Unbounded(column, dtype=_EPISODE[name], device=device) for name in ("r", "l")}
-        episode = Composite({**counters, "success": flag}, shape=(rows,))
-        self.observation_spec = Composite(observation=seen, success=flag.clone(), episode=episode, shape=(rows,))
-        self.done_spec = Composite({name: flag.clone() for name in ("done", "terminated", "truncated")}, shape=(rows,))
-        self.action_spec = Bounded(-1.0, 1.0, torch.Size(world.action_space.shape), device=device)
-        self.reward_spec = Unbounded(column, device=device)
+        flag = data.Binary(1, column, dtype=torch.bool, device=device)
+        counters = {name: data.Unbounded(column, dtype=_EPISODE[name], device=device) for name in ("r", "l")}
+        episode = data.Composite({**counters, "success": flag}, shape=(rows,))
+        self.observation_spec = data.Composite(observation=seen, success=flag.clone(), episode=episode, shape=(rows,))
+        self.done_spec = data.Composite(
+            {name: flag.clone() for name in ("done", "terminated", "truncated")}, shape=(rows,)
+        )
+        self.action_spec = data.Bounded(-1.0, 1.0, torch.Size(world.action_space.shape), device=device)
+        self.reward_spec = data.Unbounded(column, device=device)
         self._obs = torch.zeros_like(low, device=device)
         self._begun = torch.zeros(rows, dtype=torch.bool, device=device)
 

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.data.dataset import Dataset
-from bidex_meta.data.episode import Episode
-from bidex_meta.data.part_files import Json
+from bidex_meta.data.part_files import Episode, Json
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.references import Reference
 from bidex_meta.tasks import registry

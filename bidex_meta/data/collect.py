@@ -19,7 +19,7 @@ from torch import Tensor
 from bidex_meta.agents import Agent
 from bidex_meta.data import part_files
 from bidex_meta.data.collector import BROKEN, EpisodeCollector
-from bidex_meta.data.episode import Episode
+from bidex_meta.data.part_files import Episode
 from bidex_meta.data.writer import DatasetWriter
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import RandomAgent

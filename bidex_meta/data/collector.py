@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.data import part_files
-from bidex_meta.data.episode import Episode
+from bidex_meta.data.part_files import Episode
 from bidex_meta.data.writer import DatasetWriter
 from bidex_meta.errors import BidexError
 from bidex_meta.runs.atomic import write_json

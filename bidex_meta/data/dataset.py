@@ -13,8 +13,7 @@ import numpy as np
 from msgspec import Meta
 
 from bidex_meta.data import other_formats, part_files, seals
-from bidex_meta.data.episode import Episode
-from bidex_meta.data.part_files import H5, Json
+from bidex_meta.data.part_files import H5, Episode, Json
 from bidex_meta.errors import BidexError, shortened, unknown_name
 from bidex_meta.utils.files import expanded, is_file, read_bytes, read_json
 from bidex_meta.utils.memory import check_memory
@@ -115,6 +114,8 @@ class Dataset:
 
     def __init__(self, folder: Path, content: Json, sealed: bool = False) -> None:
         self.folder, self.content = folder, content
+        self.num_episodes: int = content["total_episodes"]
+        self.num_steps: int = content["total_steps"]
         self.name: str = content.get("dataset_id", folder.parent.name)
         self.metadata: Json = content.get("bidex") or {"tasks": [self.name], "kind": "outside"}
         self._paths = part_files.parts_of(folder) if "bidex" in content else [folder / part_files.MAIN]
@@ -147,24 +148,12 @@ class Dataset:
         columns = {name: _joined([table[name] for table in self._tables]) for name in (*part_files.TABLE, "variation")}
         episodes, steps = len(columns["steps"]), int(columns["steps"].sum())
         if (self.num_episodes, self.num_steps) != (episodes, steps):
-            raise BidexError(
-                f"{self.folder}: expected {self.num_episodes} episodes of {self.num_steps} steps, found {episodes} of "
-                f"{steps}. Parts are missing: record it again, or bring them back."
-            )
+            what = f"expected {self.num_episodes} episodes of {self.num_steps} steps, found {episodes} of {steps}"
+            raise BidexError(f"{self.folder}: {what}. Parts are missing: record it again, or bring them back.")
         slots = len(self.metadata["tasks"])
         if ((columns["task"] < 0) | (columns["task"] >= slots)).any():
             raise BidexError(f"{self.folder}: expected tasks from 0 to {slots - 1}, found others. Record it again.")
         return columns
-
-    @property
-    def num_episodes(self) -> int:
-        """Episodes."""
-        return self.content["total_episodes"]
-
-    @property
-    def num_steps(self) -> int:
-        """Transitions over all episodes."""
-        return self.content["total_steps"]
 
     @property
     def observation_size(self) -> int:

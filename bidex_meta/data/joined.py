@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.data.dataset import Dataset
-from bidex_meta.data.episode import Episode
+from bidex_meta.data.part_files import Episode
 from bidex_meta.errors import BidexError, unknown_name
 from bidex_meta.utils.memory import check_memory
 from bidex_meta.world.contract import VectorWorld
@@ -55,10 +55,8 @@ def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) ->
     slots = {form.slots[task] for form in forms for task in np.unique(form.dataset.table["task"])}
     missing = [name for slot, name in enumerate(world.task_names) if slot not in slots]
     if missing and every:
-        raise BidexError(
-            f"Expected data of every class, found none of {', '.join(missing)}. Add a data set, or name a suite of the "
-            "others alone."
-        )
+        what = f"Expected data of every class, found none of {', '.join(missing)}"
+        raise BidexError(f"{what}. Add a data set, or name a suite of the others alone.")
     needed = 4 * (steps + episodes) * (plain + ids) + steps * (4 * (actions + 1) + 1 + 3 * 8)
     check_memory(needed, f"The {steps:,} transitions", "Name fewer data sets, or record smaller ones.")
     fitted = (form.fitted(episode, ids) for form in forms for episode in form.dataset.episodes())
@@ -114,10 +112,8 @@ class _Form:
         names: list[str] = about["tasks"]
         self.slots = list(_slots(names, world, outside=about["kind"] == "outside"))
         if dataset.action_size != actions:
-            raise BidexError(
-                f"{dataset.name} has {dataset.action_size} actions, the world {actions}. Record it with the same bases "
-                "(--base), or learn for what it was recorded of."
-            )
+            what = f"{dataset.name} has {dataset.action_size} actions, the world {actions}"
+            raise BidexError(f"{what}. Record it with the same bases (--base), or learn for what it was recorded of.")
         shown = about.get("observation_groups", ())
         ids = sum(stop - start for name, parts in shown if name == "task_id" for start, stop in parts)
         self._width, self._own = plain, _Columns.of(shown, dataset.observation_size - ids)
@@ -138,16 +134,12 @@ class _Form:
         """``may_pad``: whether the world's states may be wider."""
         name, own, theirs = self.dataset.name, self._own, self._theirs
         if own.label != theirs.label:
-            raise BidexError(
-                f"{name} has point clouds: {own.label}, the world: {theirs.label}. Learn with the points that it was "
-                "recorded with (--points, or [points] in the suite's file)."
-            )
+            mend = "Learn with the points that it was recorded with (--points, or [points] in the suite's file)"
+            raise BidexError(f"{name} has point clouds: {own.label}, the world: {theirs.label}. {mend}.")
         here, there = len(own.state), len(theirs.state)
         if here > there or (here < there and not may_pad):
-            raise BidexError(
-                f"{name} has observations of {here} entries beside the task id and cloud, the world {there}. Learn for "
-                "what it was recorded of."
-            )
+            what = f"{name} has observations of {here} entries beside the task id and cloud, the world {there}"
+            raise BidexError(f"{what}. Learn for what it was recorded of.")
 
     def fitted(self, episode: Episode, ids: int) -> tuple[Episode, int, np.ndarray]:
         """An episode, its slot, and its observations in the world's form."""

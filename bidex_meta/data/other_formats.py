@@ -42,10 +42,8 @@ def action_bounds(content: Json, name: str, size: int) -> tuple[np.ndarray, np.n
     fits = low.shape == high.shape == (size,)
     if not fits or not np.isfinite([low, high]).all() or (low >= high).any():
         got = " to ".join(shortened(space.get(end)) for end in ("low", "high"))
-        raise BidexError(
-            f"Expected finite bounds of the {size} actions of {name}, which become -1 and 1, got {got}. Store it "
-            "with an action_space that has them."
-        )
+        what = f"Expected finite bounds of the {size} actions of {name}, which become -1 and 1, got {got}"
+        raise BidexError(f"{what}. Store it with an action_space that has them.")
     return low, high
 
 

@@ -16,8 +16,7 @@ from gymnasium.spaces import Box
 
 from bidex_meta.data import part_files, seals
 from bidex_meta.data.dataset import data_folder
-from bidex_meta.data.episode import Episode
-from bidex_meta.data.part_files import Json
+from bidex_meta.data.part_files import Episode, Json
 from bidex_meta.errors import BidexError, shortened
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import check_writable, remove_leftovers, write_atomic, write_json

@@ -15,6 +15,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 from bidex_meta.benchmark import Benchmark, Task
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.metaworld.benchmarks import ML1, MT1, CustomML, CustomMT
+from bidex_meta.metaworld.library import mended
 from bidex_meta.suite import suite_names
 from bidex_meta.tasks import registry
 from bidex_meta.world.single_env import AnyTask, EnvRecipe
@@ -122,10 +123,8 @@ def _meta(
     classes = benchmark.train_classes if split == "train" else benchmark.test_classes
     size = len(classes) if meta_batch_size is None else meta_batch_size
     if size < 1 or size % len(classes):
-        raise BidexError(
-            f"meta_batch_size: expected a multiple of {len(classes)}, the classes of {benchmark.name}'s {split} split; "
-            f"got {size}."
-        )
+        what = f"a multiple of {len(classes)}, the classes of {benchmark.name}'s {split} split"
+        raise BidexError(f"meta_batch_size: expected {what}; got {size}.")
     places = [
         (env_class.recipe, share)
         for name, env_class in classes.items()
@@ -158,8 +157,7 @@ def make_env(
     whether the episode ended. `task_select`: `"random"` draws a task at each reset, `"pseudorandom"` takes them in
     turn, at `sample_tasks()`. Other options are those of `SuiteEnv`.
     """
-    from metaworld import wrappers  # not needed by the package's other names
-
+    wrappers = mended().wrappers  # not needed by the package's other names
     env: Any = recipe.make_class()(**options)
     if seed is not None:
         env.seed(seed)

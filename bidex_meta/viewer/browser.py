@@ -44,9 +44,11 @@ def shape(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
             model.mesh_vert[points : points + model.mesh_vertnum[index]].astype(float),
             model.mesh_face[faces : faces + model.mesh_facenum[index]].astype(int),
         )
-    if kind in (_TYPE.mjGEOM_SPHERE, _TYPE.mjGEOM_ELLIPSOID):
+    if kind == _TYPE.mjGEOM_SPHERE:
+        mesh = make.icosphere(subdivisions=3, radius=size[0])
+    elif kind == _TYPE.mjGEOM_ELLIPSOID:
         mesh = make.icosphere(subdivisions=3, radius=1.0)
-        mesh.apply_scale(size if kind == _TYPE.mjGEOM_ELLIPSOID else size[0])
+        mesh.apply_scale(size)
     elif kind == _TYPE.mjGEOM_CAPSULE:
         mesh = make.capsule(height=2.0 * size[1], radius=size[0], count=(16, 16))
         mesh.apply_translation((0.0, 0.0, -mesh.bounds.mean(axis=0)[2]))  # from one end on in some versions
@@ -69,9 +71,8 @@ class Browser:
         try:
             viser = import_module("viser")
         except ImportError:
-            raise BidexError(
-                "The view in the browser needs viser: pip install 'bidex-meta[viewer]'. Or film it: bidex-meta render."
-            ) from None
+            what = "The view in the browser needs viser: pip install 'bidex-meta[viewer]'"
+            raise BidexError(f"{what}. Or film it: bidex-meta render.") from None
         self.paused, self.speed = False, speed
         self._asked: list[str] = []
         self._server = viser.ViserServer(host=host, port=port, label="bidex-meta", verbose=False)

@@ -55,10 +55,8 @@ def load_witness(name: str, path: Path | None = None) -> Witness:
         raise BidexError(f"Expected a witness file such as {witness_path(name)}, got {path}, which is no file.")
     witness, size = _read(path), registry.get(name, moving_base=True).action_size
     if witness.actions.shape[1] != size:
-        raise BidexError(
-            f"{path}: expected actions of shape (steps, {size}), as {name} has, got {witness.actions.shape}. Give a "
-            f"witness of {name}, or leave --file out."
-        )
+        what = f"expected actions of shape (steps, {size}), as {name} has, got {witness.actions.shape}"
+        raise BidexError(f"{path}: {what}. Give a witness of {name}, or leave --file out.")
     return witness
 
 
@@ -84,8 +82,7 @@ def _read(path: Path) -> Witness:
         reason = one_line(error)[:150].rstrip(".")
         raise BidexError(f"Expected a witness at {path}, but {reason}. Copy the file again.") from None
     if levels.dtype != np.int8 or levels.ndim != 2 or not 1 <= len(levels) <= _MOST_STEPS:
-        raise BidexError(
-            f"{path}: expected actions as bytes, (steps, actions), got {levels.dtype} of shape {levels.shape}."
-        )
+        what = f"got {levels.dtype} of shape {levels.shape}"
+        raise BidexError(f"{path}: expected actions as bytes, (steps, actions), {what}.")
     parse(made, _Made, str(path))
     return Witness(levels.astype(np.float32) / LEVELS, made)

@@ -11,7 +11,6 @@ from bidex_meta.utils.plugins import name_with_object
 from bidex_meta.worlds.base import Identity, WorldConfig, Worlds, physics_of
 
 if TYPE_CHECKING:
-    from bidex_meta.benchmark import Benchmark
     from bidex_meta.worlds.base import PooledWorld, TaskClass
 
 _TASKS_ALONE = 50  # that ``make_task_world`` draws for a class on its own
@@ -29,7 +28,7 @@ class OwnSuite(Worlds):
         self.hides_goals = self.suite.kind == "meta"
 
     @cached_property
-    def benchmark(self) -> "Benchmark":
+    def benchmark(self):
         """The suite with its classes and the tasks that the config's seed draws."""
         from bidex_meta.benchmark import Benchmark
 

@@ -62,13 +62,6 @@ def test_an_object_starts_on_a_broad_side(brick: str) -> None:
     assert 16 < (np.array(up) > 0).sum() < 48
 
 
-def test_a_changed_file_is_read_again(tmp_path: Path) -> None:
-    file = tmp_path / "ball.xml"
-    for size in ("0.03", "0.0325"):
-        file.write_text(f'<mujoco><worldbody><body><geom size="{size}"/></body></worldbody></mujoco>')
-        assert registry.get("HandOver", object=str(file)).held.high[0] == float(size)  # type: ignore[attr-defined]
-
-
 EXAMPLES = {"LiftUnderarm": "roasting_tin", "BottleCap": "flask", "SwingCup": "tankard"}
 _MOVED = {"LiftUnderarm": 0.01, "BottleCap": 0.1, "SwingCup": 0.01}
 """Metres in a second of doing nothing: two stand on a table, a bottle sinks with the hand that yields under it."""
