@@ -85,7 +85,7 @@ class MetaWorldSuite(Foreign):
 
 
 class HumanoidTask(Foreign):
-    """``clients/humanoid_world.py``, a single class with one task."""
+    """``worlds/humanoid.py``, a single class with one task."""
 
     default_episodes = _HUMANOIDS
     class_name = HUMANOID

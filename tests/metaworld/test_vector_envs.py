@@ -235,15 +235,6 @@ def test_ids_of_custom_benchmarks_and_of_one_class() -> None:
     assert {task for share in split.get_attr("tasks") for task in share} == set(ours.ML1("Switch", 1).test_tasks)
 
 
-def test_sampled_tasks_go_round_without_one_twice() -> None:
-    envs: Any = ours.make_ml_envs_train("HandOver", seed=0, total_tasks_per_cls=4)
-    seen = []
-    for _ in range(4):
-        envs.call("sample_tasks")
-        seen.append(envs.envs[0].unwrapped._task)
-    assert set(seen) == set(ours.ML1("HandOver", 0).train_tasks[:4])
-
-
 def test_an_environment_ends_as_its_class_says_and_at_success_if_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     mt1 = ours.MT1("CatchUnderarm", 0)
     env = mt1.train_classes["CatchUnderarm"]()

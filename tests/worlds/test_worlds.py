@@ -73,7 +73,8 @@ def test_defaults_follow_the_source() -> None:
 
 def test_references_are_of_moving_bases() -> None:
     assert Worlds.open({"suite": "MT4"}).references().keys() >= {"CatchUnderarm"}
-    assert Worlds.open({"task": "HandOver"}).references() == {} == Worlds.open({"suite": "metaworld/MT3"}).references()
+    for config in ({"task": "HandOver"}, {"suite": "metaworld/MT3"}, {"task": "gymnasium/Humanoid-v5"}):
+        assert Worlds.open(config).references() == {}
     assert Worlds.open({"task": "HandOver", "base": "moving"}).references()
 
 
@@ -106,6 +107,7 @@ def test_an_unknown_name_is_one_line(config: dict[str, Any], told: str) -> None:
         ({"suite": "MT4"}, "test", "MT4 has the splits train, got 'test'"),
         ({"task": "HandOver"}, "test", "HandOver alone has no test split. Leave --split out."),
         ({"suite": "metaworld/MT3"}, "test", "metaworld/MT3 has the split train alone, got 'test'."),
+        ({"task": "gymnasium/Humanoid-v5"}, "test", "gymnasium/Humanoid-v5 has the split train alone, got 'test'."),
         ({"suite": "metaworld/MT3", "device": "cuda"}, "train", "got --device cuda. Add --device cpu."),
         ({"suite": "metaworld/MT3", "engine": "warp"}, "train", "got --engine warp. Add --device cpu."),
     ],
