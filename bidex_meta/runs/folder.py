@@ -40,9 +40,19 @@ _MOST_LOOKED_AT = 2000
 """Entries that are looked at to find runs below a folder that is none."""
 
 
+class _Part:
+    """The path of a part of a run folder."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, folder: "RunFolder", kind: type["RunFolder"]) -> Path:
+        return folder.path / self._name
+
+
 @dataclass(frozen=True)
 class RunFolder:
-    """One run on disk. Made by ``create`` or ``open``."""
+    """One run on disk, from ``create`` or ``open``."""
 
     path: Path
 
@@ -80,25 +90,11 @@ class RunFolder:
             raise BidexError(f"{path} is not a run folder: it has no config.json.{hint}")
         return folder
 
-    @property
-    def config_path(self) -> Path:
-        """``config.json``."""
-        return self.path / "config.json"
-
-    @property
-    def metrics_path(self) -> Path:
-        """``metrics.jsonl``."""
-        return self.path / "metrics.jsonl"
-
-    @property
-    def checkpoints_path(self) -> Path:
-        """``checkpoints/``."""
-        return self.path / "checkpoints"
-
-    @property
-    def videos_path(self) -> Path:
-        """``videos/``."""
-        return self.path / "videos"
+    config_path = _Part("config.json")
+    metrics_path = _Part("metrics.jsonl")
+    checkpoints_path = _Part("checkpoints")
+    videos_path = _Part("videos")
+    evaluation_path = _Part("evaluation.json")  # when it has ended and was evaluated
 
     @property
     def checkpoints(self) -> Checkpoints:
@@ -108,11 +104,6 @@ class RunFolder:
     def config(self) -> RunConfig[Json]:
         """The resolved config; raises BidexError where ``config.json`` cannot be read, or is not a run's."""
         return read_config(self.config_path)
-
-    @property
-    def evaluation_path(self) -> Path:
-        """``evaluation.json``, which stands there when a run has ended and was evaluated."""
-        return self.path / "evaluation.json"
 
     @property
     def again(self) -> str:
