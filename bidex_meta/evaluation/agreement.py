@@ -37,11 +37,9 @@ class Agreement:
 def agreements(recorded: Mapping[str, Json], again: Mapping[str, Json]) -> list[Agreement]:
     """Compares two evaluations of one policy on the same tasks and starts, per class as in ``Evaluation.to_json``.
 
-    Results that differ in the last digits soon come from other episodes, so that the two are at worst independent
-    samples: means may differ by the root of the sum of both half intervals' squares. These are widened so that of all
-    measures of all classes together one in twenty honest repetitions has any beyond (Bonferroni; simulated for twenty
-    classes: one in eighteen of 200 episodes a class, one in fourteen of 60, one in seven of 20).
-
+    At worst they are independent samples: means may differ by the root of the sum of both half intervals' squares,
+    widened so that of all measures of all classes one in twenty honest repetitions has any beyond (Bonferroni; by
+    simulation of twenty classes: one in eighteen of 200 episodes a class, one in fourteen of 60, one in seven of 20).
     Raises BidexError where the classes differ.
     """
     if set(recorded) != set(again):

@@ -10,7 +10,7 @@ import numpy as np
 
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.references import rescored
-from bidex_meta.evaluation.statistics import Interval, bootstrap_band, bootstrap_interval, interquartile_mean
+from bidex_meta.evaluation.statistics import Estimate, Interval, bootstrap_band, bootstrap_interval, interquartile_mean
 from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.folder import AnyConfig
 from bidex_meta.runs.metrics import training_seconds
@@ -18,6 +18,8 @@ from bidex_meta.runs.plots import Curve
 from bidex_meta.runs.stored import Run
 from bidex_meta.utils.plugins import name_with_object, short_name
 
+_SETTINGS = ("algo", "steps", "num_envs", "minutes", "stop_at_return", "stop_at_success", "stop_at_score")
+_SETTINGS += ("base", "points", "object")
 _POINTS = 200
 """Of a curve over several runs."""
 
@@ -53,21 +55,6 @@ class Group:
         return f"{self.steps:,}" if low == high else f"{self.steps:,} ({low:,} to {high:,})"
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """A number with its uncertainty over seeds."""
-
-    value: float
-    """The number."""
-    interval: Interval | None
-    """95 % bootstrap interval, seeds resampled; None with a single one."""
-
-    def text(self, factor: float = 1.0, unit: str = "", form: str = ".1f") -> str:
-        """The number times ``factor``, and its interval in brackets where there is one."""
-        ends = "" if self.interval is None else f" [{', '.join(f'{factor * end:{form}}' for end in self.interval)}]"
-        return f"{factor * self.value:{form}}{unit}{ends}"
-
-
 def read_groups(runs: Sequence[Run]) -> list[Group]:
     """Evaluated runs by group, in the order they are named.
 
@@ -79,12 +66,9 @@ def read_groups(runs: Sequence[Run]) -> list[Group]:
 
 def run_kind(config: AnyConfig, split: str = "train") -> Json:
     """The settings that runs compared as one share: all of the config that matters but the seed."""
-    kind = {"algo": config.algo, "on": config.suite or "one class at a time", "steps": config.steps}
-    kind |= {"num_envs": config.num_envs, "minutes": config.minutes, "split": split}
-    kind |= {"stop_at_return": config.stop_at_return, "stop_at_success": config.stop_at_success}
-    kind["stop_at_score"] = config.stop_at_score
+    kind = {name: vars(config)[name] for name in _SETTINGS}
+    kind |= {"on": config.suite or "one class at a time", "split": split}
     kind["started"] = "afresh" if config.start_from is None else "from another run"  # which: one for each seed
-    kind |= {"base": config.base, "points": config.points, "object": config.object}
     kind |= {"dataset": _data(config, config.dataset), "demonstrations": _data(config, config.demonstrations)}
     return kind | {f"learner.{name}": value for name, value in config.learner_values.items()}
 
@@ -148,12 +132,12 @@ def iqm_difference(a: np.ndarray, b: np.ndarray) -> Estimate:
 
 def success_over(group: Group, first: Group) -> Estimate | None:
     """Success above the first group's; None of the first itself, and of other classes than its own."""
-    known = group is not first and set(group.classes) == set(first.classes)
-    return iqm_difference(group.success, first.success) if known else None
+    comparable = group is not first and set(group.classes) == set(first.classes)
+    return iqm_difference(group.success, first.success) if comparable else None
 
 
 def score_over(group: Group, first: Group) -> Estimate | None:
-    """Normalised score above the first group's; None too where either is unknown."""
+    """Normalised score above the first group's, likewise; None too where either is unknown."""
     known = group is not first and set(group.classes) == set(first.classes)
     if not known or group.scores is None or first.scores is None:
         return None

@@ -45,18 +45,11 @@ def control(
     say: Callable[[str], None] = lambda line: None,
     **played: Any,
 ) -> Control:
-    """Play all arms.
+    """Play all arms; ``played`` goes to ``meta_evaluate``, whose errors are raised.
 
-    Args:
-        load: Returns the agent, a MetaLearningAgent; called anew for each arm, so that all draw the same numbers.
-        test_world: The held-out tasks, in autoreset mode DISABLED.
-        train_world: The train tasks of the same classes, with as many environments. Its pools are replaced.
-        shots: How often each arm adapts.
-        say: Called with the mean returns of each arm when it has been played, which may take minutes.
-        played: Other keyword arguments of ``meta_evaluate``.
-
-    Raises:
-        BidexError: The worlds have different classes, or that of ``meta_evaluate``.
+    ``load`` returns the agent, a MetaLearningAgent, anew for each arm, so that all draw the same numbers. The worlds,
+    in autoreset mode DISABLED, have as many environments and the same classes (else BidexError); ``train_world``'s
+    pools are replaced. ``say`` gets the mean returns of each arm when it has been played, which may take minutes.
     """
     if list(test_world.task_names) != list(train_world.task_names):
         raise BidexError(

@@ -104,7 +104,7 @@ def meta_evaluate(
     world must be reset afterwards.
 
     Args:
-        agent: A MetaLearningAgent; any Agent if ``shots`` is 0. Its ``assign``, if it has one, gets the tasks.
+        agent: A MetaLearningAgent; any Agent if ``shots`` is 0.
         world: A world in autoreset mode DISABLED whose environments keep their tasks.
         shots: How often it adapts, one after the other.
         rollouts: Episodes of each task in a shot; None: one in each environment that plays it.
@@ -114,13 +114,11 @@ def meta_evaluate(
         max_adapt_steps: Episodes of adaptation are cut (``truncated``) after so many steps.
         seed: Of all starts; without adaptation, and with all tasks in the world at once, those of ``evaluate``.
         references: As in ``evaluate``.
-        adapt_world: Where to play episodes of adaptation instead: of as many environments and tasks, so that adaptation
-            to other tasks' data has the same starts (``bidex_meta.evaluation.control_arms``).
+        adapt_world: Where to play episodes of adaptation instead, with the same starts: of as many environments, tasks.
         evaluated: After how many shots to evaluate (0: before all); None: always.
         split: Name of the tasks, for the result.
 
-    Raises:
-        BidexError: A number out of range, a world that cannot be used, or an agent that cannot adapt.
+    Raises BidexError for a number out of range, a world that cannot be used, or an agent that cannot adapt.
     """
     worlds = [world] if adapt_world is None else [world, adapt_world]
     _check(agent, worlds, shots, episodes_per_task, max_adapt_steps)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bidex_meta.evaluation.references import Reference, counted_returns
-from bidex_meta.evaluation.statistics import Interval, aggregate, bootstrap_interval, mean, mean_difference
+from bidex_meta.evaluation.statistics import Estimate, aggregate, bootstrap_interval, mean, mean_difference
 from bidex_meta.runs.atomic import Json
 
 MANY_TASKS = 10
@@ -100,19 +100,8 @@ class Evaluation:
         }
 
 
-@dataclass(frozen=True)
-class Difference:
-    """Mean return of one policy above another's, in one class."""
-
-    value: float
-    """Difference of the means."""
-    interval: Interval | None
-    """95 % bootstrap interval, both policies' tasks (of few tasks: episodes) resampled; None with fewer than two."""
-
-    @property
-    def excludes_zero(self) -> bool:
-        """Whether the interval lies on one side of zero."""
-        return self.interval is not None and (self.interval[0] > 0 or self.interval[1] < 0)
+Difference = Estimate
+"""Mean return of one policy above another's in a class; tasks of both (of few tasks: episodes) are resampled."""
 
 
 def results_by_class(

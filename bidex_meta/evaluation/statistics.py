@@ -1,6 +1,7 @@
 """Means with bootstrap intervals."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,26 @@ Statistic = Callable[..., Any]
 """Of samples, along ``axis``."""
 Interval = tuple[float, float]
 """Lower and upper end of a 95 % bootstrap interval."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its uncertainty."""
+
+    value: float
+    interval: Interval | None
+    """95 % bootstrap interval; None with fewer than two samples."""
+
+    @property
+    def excludes_zero(self) -> bool:
+        """Whether the interval lies on one side of zero."""
+        return self.interval is not None and (self.interval[0] > 0 or self.interval[1] < 0)
+
+    def text(self, factor: float = 1.0, unit: str = "", form: str = ".1f") -> str:
+        """The number times ``factor``, and its interval in brackets where there is one."""
+        ends = "" if self.interval is None else f" [{', '.join(f'{factor * end:{form}}' for end in self.interval)}]"
+        return f"{factor * self.value:{form}}{unit}{ends}"
+
 
 RESAMPLES = 2000
 BOOTSTRAP_SEED = 0

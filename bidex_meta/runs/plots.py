@@ -77,15 +77,12 @@ def draw_learning(groups: Sequence[Group], families: Sequence[str] = ("Train", "
 
 def draw_metrics(groups: Sequence[Group], tags: Mapping[str, str]) -> Figure:
     """Metrics, each with the label of its panel, against environment steps, a line for each group of runs."""
-    figure = _figure(5.2 * len(tags), 3.0)
+    figure, labels = _figure(5.2 * len(tags), 3.0), [label for label, _ in groups]
     for axis, (tag, title) in zip(figure.subplots(1, len(tags), squeeze=False).flat, tags.items(), strict=True):
-        for number, (label, curves) in enumerate(groups):
-            _draw_curve(axis, curves.get(tag), label, number, "-")
-        axis.grid(alpha=0.3)
+        _draw_groups(axis, groups, tag, range(len(groups)))
         axis.set_ylabel(title)
-        axis.set_xlabel(_STEPS)
     if len(groups) > 1:
-        _add_legend(figure, [label for label, _ in groups])
+        _add_legend(figure, labels)
     return figure
 
 
@@ -98,11 +95,8 @@ def draw_panels(panels: Mapping[str, Sequence[Group]], tag: str, title: str) -> 
     figure = _figure(5.2 * len(panels), 3.6)
     axes = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
     for axis, (name, groups) in zip(axes, panels.items(), strict=True):
-        for label, curves in groups:
-            _draw_curve(axis, curves.get(tag), label, labels.index(label), "-")
+        _draw_groups(axis, groups, tag, [labels.index(label) for label, _ in groups])
         axis.set_title(_plain(name))
-        axis.grid(alpha=0.3)
-        axis.set_xlabel(_STEPS)
     axes[0].set_ylabel(title)
     _add_legend(figure, labels)
     return figure
@@ -239,6 +233,13 @@ def _draw_curve(axis: Axes, curve: Curve | None, label: str, number: int, style:
     axis.plot(steps, curve.mean, linewidth=1.2, color=colour, linestyle=style, marker=marker, label=_plain(label))
     if curve.low is not None and curve.high is not None:
         axis.fill_between(steps, curve.low, curve.high, alpha=0.2, color=colour, linewidth=0.0)
+
+
+def _draw_groups(axis: Axes, groups: Sequence[Group], tag: str, numbers: Sequence[int]) -> None:
+    for (label, curves), number in zip(groups, numbers, strict=True):
+        _draw_curve(axis, curves.get(tag), label, number, "-")
+    axis.grid(alpha=0.3)
+    axis.set_xlabel(_STEPS)
 
 
 def _colour(number: int) -> Any:

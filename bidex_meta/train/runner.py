@@ -11,9 +11,9 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from types import FrameType
-from typing import Protocol
 
 from bidex_meta.errors import BidexError
+from bidex_meta.runs.recorder import Recorder
 from bidex_meta.train.distributed import any_process, gather, is_main, rank, world_size
 from bidex_meta.train.launch import hangup
 from bidex_meta.train.learner import Learner, State
@@ -23,24 +23,12 @@ from bidex_meta.world.contract import VectorWorld
 _SAVING_SHARE = 0.02
 
 
-class Record(Protocol):
-    """Where metrics and checkpoints go."""
-
-    def log(self, metrics: dict[str, float], step: int) -> None:
-        """Takes the metrics of one iteration that ended at environment step ``step``."""
-        ...
-
-    def save(self, state: State, step: int) -> None:
-        """Writes a checkpoint, atomically."""
-        ...
-
-
 def train(
     learner: Learner,
     world: VectorWorld,
     *,
     total_steps: int,
-    record: Record | None,
+    record: Recorder | None,
     total_seconds: float = math.inf,
     spent_seconds: float = 0.0,
     checkpoint_seconds: float = 60.0,
@@ -52,13 +40,11 @@ def train(
 
     Both include those of a run that is resumed (``spent_seconds``). Time, which metrics get as ``Perf/training_time``,
     counts from the first world step to the end of an iteration, with checkpoints; there is at least one iteration.
-
-    SIGINT, SIGTERM or SIGHUP, in any process, finishes the current iteration, saves and returns; so does the end of the
-    printed output's reader (BrokenPipeError of ``record``, ``watch`` or ``enough``). A second SIGINT or SIGTERM acts at
-    once. SIGHUP stays ignored where it was.
+    SIGINT, SIGTERM or SIGHUP (unless ignored), in any process, finishes the iteration, saves and returns; so does a
+    BrokenPipeError of ``record``, ``watch`` or ``enough``. A second SIGINT or SIGTERM acts at once.
 
     Args:
-        learner: Trained on ``world``.
+        learner: On ``world``.
         world: Its state is saved beside the learner's.
         total_steps: Environment steps in all.
         record: Receives metrics and checkpoints; in process 0 only, as ``watch`` and ``last``.
@@ -115,7 +101,7 @@ def train(
         return stop.number if stopped else 0
 
 
-def _save(learner: Learner, world: VectorWorld, record: Record | None) -> None:
+def _save(learner: Learner, world: VectorWorld, record: Recorder | None) -> None:
     state = checkpoint(learner, world)
     if record is not None and state is not None:
         record.save(state, learner.env_steps)
