@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from bidex_meta.agents import Agent
-from bidex_meta.cli.parsing import Switch, parse
+from bidex_meta.cli.parsing import JsonSwitch, parse
 from bidex_meta.cli.tables import evaluation_table, print_table
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.evaluation import references
@@ -58,8 +58,7 @@ class BaselineFlags:
     out: Path | None = None
     """JSON file that takes the figures, beside those it has of other classes; None: print them alone. `evaluate` reads
     assets/references/ of the installation, which is not written unless this names it."""
-    json: Switch = False
-    """Print JSON."""
+    json: JsonSwitch = False
 
 
 def main(arguments: Sequence[str]) -> None:

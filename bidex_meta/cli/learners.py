@@ -61,14 +61,9 @@ class LearnerKind:
 
 
 def learner_kind(name: str, task: str | None = None) -> LearnerKind:
-    """Load a learner by name.
+    """The learner of a name in ``ALGOS``, in any case, or ``package.module:Class``; BidexError where there is none.
 
-    Args:
-        name: As in ``ALGOS``, in any case, or ``package.module:Class``.
-        task: The task class it shall learn alone, for which it may have presets of its own.
-
-    Raises:
-        BidexError: There is none of this name, its package is not installed, or it is no learner.
+    It may have presets of its own for the ``task`` that it shall learn alone.
     """
     if is_outside(name):
         make = _from_elsewhere(name)
@@ -110,11 +105,7 @@ def _from_elsewhere(name: str) -> type[Learner]:
 def choose_preset(kind: LearnerKind, asked: str, device: str, first: tuple[str, str] | None = None) -> tuple[str, str]:
     """The preset's name and, in words, why this one.
 
-    Args:
-        kind: The learner.
-        asked: A preset's name, or ``auto``.
-        device: ``cpu``, ``cuda``, ``cuda:0``, ...
-        first: A preset that goes before others where the learner has it, and why; ``Worlds.preset``.
+    ``asked`` may be ``auto``; then ``first`` (``Worlds.preset``: a preset and why) goes before what fits the device.
     """
     if asked.casefold() != "auto":
         return known_name("preset", asked, ["auto", *kind.presets]), "as asked"
@@ -130,14 +121,9 @@ def choose_preset(kind: LearnerKind, asked: str, device: str, first: tuple[str, 
 
 
 def resolve_device(asked: str, on_gpu: bool) -> str:
-    """``auto`` to ``cuda`` where there is one, else ``cpu``; anything else as it is.
+    """``auto`` to ``cuda`` where there is one and it is of use (``Worlds.on_gpu``), else ``cpu``; others as they are.
 
-    Args:
-        asked: ``auto``, ``cpu``, ``cuda``, ``cuda:0``, ...
-        on_gpu: Whether a GPU is of use; ``Worlds.on_gpu``.
-
-    Raises:
-        BidexError: torch does not know the device, or it is not there (for each of several processes).
+    Raises BidexError where torch does not know the device, or it is not there (for each of several processes).
     """
     import torch
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from bidex_meta.cli.parsing import Switch, parse
+from bidex_meta.cli.parsing import CheckpointName, ObjectName, PolicyName, Switch, parse
 from bidex_meta.errors import known_name
 from bidex_meta.utils import gl_backend
 from bidex_meta.utils.plugins import name_with_object
@@ -32,13 +32,9 @@ class PlayFlags:
     """Run folder; the same as --policy RUN."""
     task: str | None = None
     """Class to look at; None: the first one. In the browser it can be changed."""
-    object: str | None = None
-    """With --task alone: another object of the class, of the shelf or an MJCF file (docs/objects.md); None: the run's,
-    or the class's own."""
-    policy: str = "zero"
-    """zero, random, or a run folder."""
-    checkpoint: str = "last"
-    """Of a run: last, best (see `bidex-meta run --help`, --evaluate-every) or a file."""
+    object: ObjectName = None
+    policy: PolicyName = "zero"
+    checkpoint: CheckpointName = "last"
     suite: str | None = None
     """Show the classes of this suite; None: the run's."""
     seed: Seed = 0

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from bidex_meta.cli.parsing import Switch, parse
+from bidex_meta.cli.parsing import CheckpointName, ObjectName, PolicyName, Switch, parse
 from bidex_meta.config import Steps
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.runs import video
@@ -30,16 +30,12 @@ class RenderFlags:
     """Run folder whose policy is shown; the same as --policy RUN."""
     task: str | None = None
     """Task class; None: the run's first one."""
-    object: str | None = None
-    """With --task alone: another object of the class, of the shelf or an MJCF file (docs/objects.md); None: the run's,
-    or the class's own."""
+    object: ObjectName = None
     out: Path | None = None
     """File to write: .png for a picture, .mp4 for a film, .webp for one that web pages show; None, of a run: a film in
     its folder videos/."""
-    policy: str = "zero"
-    """zero, random, or a run folder."""
-    checkpoint: str = "last"
-    """Of a run: last, best (see `bidex-meta run --help`, --evaluate-every) or a file."""
+    policy: PolicyName = "zero"
+    checkpoint: CheckpointName = "last"
     suite: str | None = None
     """Show the task as this suite has it; None: on its own, or as in the run."""
     tiled: Switch = False

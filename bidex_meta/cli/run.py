@@ -17,8 +17,9 @@ from bidex_meta.cli import metatest, run_data, run_recording, watching
 from bidex_meta.cli.evaluate import conditions
 from bidex_meta.cli.policies import checkpoint, fitting
 from bidex_meta.cli.run_config import RunPlan, plan_run
-from bidex_meta.cli.tables import evaluation_table, print_table
+from bidex_meta.cli.tables import Json, evaluation_table, print_table, say
 from bidex_meta.config import RunConfig, printed
+from bidex_meta.data.joined import join
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import EVALUATION_SEED, RandomAgent
 from bidex_meta.evaluation.results import compare
@@ -31,17 +32,15 @@ from bidex_meta.train.launch import launch, resume_command
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.world.threads import set_up_torch
 
-Checkpoint = tuple[dict[str, Any], int]
+Checkpoint = tuple[Json, int]
 """State and environment steps."""
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Train and evaluate.
+    """Train and evaluate. After bad input nothing has been written.
 
-    Raises:
-        BidexError: Bad input. Nothing has been written then.
-        SystemExit: Another process was lost (exit code 1), or has reported what is wrong with the input (2); Ctrl-C
-            (130), SIGHUP (129) or the end of what reads stderr (141) came while it trained, which has saved then.
+    Raises SystemExit where another process was lost (exit code 1), or has reported what is wrong with the input (2);
+    where Ctrl-C (130), SIGHUP (129) or the end of what reads stderr (141) came while it trained, which has saved then.
     """
     try:
         distributed.init_from_environment()
@@ -60,9 +59,7 @@ def main(arguments: Sequence[str]) -> None:
 def run(plan: RunPlan) -> None:
     """Trains what was planned, from its last checkpoint where there is one, and evaluates it.
 
-    Raises:
-        LostProcess: Another process is gone before the training has begun.
-        SystemExit: As of :func:`main`.
+    Raises LostProcess where another process is gone before the training has begun, SystemExit as :func:`main`.
     """
     with contextlib.ExitStack() as held:  # the lock of the run's folder
         together(lambda: _check(plan, held))
@@ -75,7 +72,7 @@ def run(plan: RunPlan) -> None:
         world = together(lambda: _make_world(plan))
         learner = together(lambda: _make_learner(plan, world, fresh=loaded is None))
         folder = _shared(together(lambda: _own_folder(plan, held)))
-        _say(f"Run folder: {folder.path}")
+        say(f"Run folder: {folder.path}")
         try:
             if config.record:
                 together(lambda: run_recording.begin(world, folder.path, fresh=loaded is None))
@@ -115,11 +112,7 @@ def _check(plan: RunPlan, held: contextlib.ExitStack) -> None:
 
 
 def _agree(plan: RunPlan, loaded: Checkpoint | None) -> RunPlan:
-    """The plan with process 0's config.
-
-    Raises:
-        BidexError: The processes were started with different flags, or see different checkpoints.
-    """
+    """The plan with process 0's config; refuses processes that have other flags, or see other checkpoints."""
     everyone = distributed.share((plan.config, loaded and loaded[1]))
 
     def check() -> None:
@@ -146,11 +139,11 @@ def _agree(plan: RunPlan, loaded: Checkpoint | None) -> RunPlan:
 def _announce(plan: RunPlan) -> None:
     config, processes = plan.config, launch().count
     times = f"{processes} x " if processes > 1 else ""
-    _say(
+    say(
         f"{config.algo} on {plan.source.name}, {times}{config.num_envs} environments on {config.device}, "
         f"seed {config.seed}"
     )
-    _say(f"Preset {config.preset}: {plan.preset_reason}.")
+    say(f"Preset {config.preset}: {plan.preset_reason}.")
 
 
 def _make_world(plan: RunPlan) -> Any:
@@ -164,15 +157,16 @@ def _make_learner(plan: RunPlan, world: VectorWorld, fresh: bool) -> Any:
     config = plan.config
     learner = plan.kind.make(world, config.learner, config.seed)
     if plan.kind.make.offline:
-        run_data.give_datasets(config.dataset, learner)
+        learner.learn_from(join(run_data.announced(config.dataset, "Reading"), world))
     if config.demonstrations:
-        run_data.give_demonstrations(config.demonstrations, learner)
+        demonstrations = run_data.announced(config.demonstrations, "Demonstrations:")
+        learner.learn_from_demonstrations(join(demonstrations, world, every=False))
     if fresh and config.start_from is not None:
         start = RunFolder.open(Path(config.start_from))
         state, step = checkpoint(start)
         with fitting(start.path):
             learner.start_from(state["learner"]["policy"])
-        _say(f"Starting from the policy of {config.start_from} at {step:,} steps.")
+        say(f"Starting from the policy of {config.start_from} at {step:,} steps.")
     return learner
 
 
@@ -199,10 +193,10 @@ def _train(plan: RunPlan, folder: RunFolder, world: VectorWorld, learner: Any, l
         state, resume_step = loaded
         with fitting(folder.path):
             together(lambda: runner.resume(learner, world, state))
-        _say(f"Continuing at {resume_step:,} steps.")
+        say(f"Continuing at {resume_step:,} steps.")
     elif plan.folder is not None:
         resume_step = 0  # killed before its first checkpoint: the same seed takes it there again
-        _say("No checkpoint yet: starting from the beginning.")
+        say("No checkpoint yet: starting from the beginning.")
     seconds = math.inf if config.minutes is None else 60.0 * config.minutes
     train = partial(
         runner.train, learner, world, total_steps=config.steps, total_seconds=seconds, enough=_early_end(config)
@@ -220,19 +214,19 @@ def _train(plan: RunPlan, folder: RunFolder, world: VectorWorld, learner: Any, l
     ):
         stopped = train(record=record, watch=watch, last=last, spent_seconds=training_seconds(rows))
     if not stopped and learner.env_steps < config.steps and config.minutes is not None:
-        _say(f"The {config.minutes:g} minutes are up after {learner.env_steps:,} steps.")
+        say(f"The {config.minutes:g} minutes are up after {learner.env_steps:,} steps.")
     return stopped
 
 
-def _early_end(config: RunConfig[Any]) -> Any:
+def _early_end(config: RunConfig) -> Any:
     """What ends the training early, by its metrics; None where nothing does."""
     if config.stop_at_return is None and config.stop_at_success is None and config.stop_at_score is None:
         return None
 
-    def reached(metrics: dict[str, Any]) -> bool:
+    def reached(metrics: Json) -> bool:
         tag = config.early_end(metrics)
         if tag is not None:
-            _say(f"Enough: {tag} is {metrics[tag]:.4g}.")
+            say(f"Enough: {tag} is {metrics[tag]:.4g}.")
         return tag is not None
 
     return reached
@@ -241,7 +235,7 @@ def _early_end(config: RunConfig[Any]) -> Any:
 def _end_early(folder: RunFolder, learner: Any, number: int) -> None:
     # A batch system's SIGTERM asks for a checkpoint and gets it; the others break off whatever calls this too.
     command = resume_command(folder.path, launch().count)
-    _say(f"Stopped after {learner.env_steps:,} steps and saved. Continue: {command}")
+    say(f"Stopped after {learner.env_steps:,} steps and saved. Continue: {command}")
     if number != signal.SIGTERM:
         raise SystemExit(128 + number)
 
@@ -274,7 +268,7 @@ def _evaluate(plan: RunPlan, folder: RunFolder, learner: Any) -> None:
         return
     source, seed = plan.source, EVALUATION_SEED
     episodes = plan.flags.episodes or source.default_episodes
-    _say(f"Evaluating: {episodes} episode{'s' * (episodes > 1)} of each task, and as many of a random policy.")
+    say(f"Evaluating: {episodes} episode{'s' * (episodes > 1)} of each task, and as many of a random policy.")
     world = source.world()
     trained = source.judge(learner, world, episodes, seed)
     random = source.judge(RandomAgent(world.action_space), world, episodes, seed)
@@ -285,7 +279,7 @@ def _evaluate(plan: RunPlan, folder: RunFolder, learner: Any) -> None:
     write_json(folder.evaluation_path, result | {"conditions": conditions(source)})
     title = f"{plan.config.algo} on {source.name}, {learner.env_steps:,} steps"
     print_table(evaluation_table(title, trained, random))
-    _say(f"Again: bidex-meta evaluate {folder.path}   Curves: bidex-meta plot {folder.path}")
+    say(f"Again: bidex-meta evaluate {folder.path}   Curves: bidex-meta plot {folder.path}")
 
 
 def _meta_test(plan: RunPlan, folder: RunFolder, learner: Any) -> None:
@@ -293,14 +287,9 @@ def _meta_test(plan: RunPlan, folder: RunFolder, learner: Any) -> None:
     flags, source = plan.flags, plan.source
     options = metatest.Options(shots=flags.shots, rollouts=flags.rollouts, episodes=flags.episodes, tasks=flags.tasks)
     load = partial(plan.kind.make.load_policy, learner.policy_state_dict(), device)
-    result = metatest.meta_test(source, plan.config, load, options, metatest.splits_of(source, flags.split), _say)
+    result = metatest.meta_test(source, plan.config, load, options, metatest.splits_of(source, flags.split), say)
     report = {"steps": learner.env_steps, "seed": options.starts}
     report["splits"] = {split: each.to_json() for split, each in result.items()}
     write_json(folder.evaluation_path, report | {"conditions": conditions(source)})
     metatest.print_tables(f"{plan.config.algo} on {source.name}, {learner.env_steps:,} steps", result)
-    _say(f"More: bidex-meta evaluate {folder.path} --shots 3 --tasks 50   See bidex-meta plot --help for curves.")
-
-
-def _say(text: str) -> None:
-    if launch().rank == 0:
-        print(text, file=sys.stderr, flush=True)
+    say(f"More: bidex-meta evaluate {folder.path} --shots 3 --tasks 50   See bidex-meta plot --help for curves.")

@@ -1,13 +1,11 @@
 """``bidex-meta witness``: replays stored reference solutions."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from bidex_meta.cli.parsing import Switch, parse
-from bidex_meta.cli.tables import plain_table, print_table
+from bidex_meta.cli.parsing import JsonSwitch, Switch, parse
+from bidex_meta.cli.tables import Json, print_rows
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.runs import video
 from bidex_meta.runs.atomic import check_writable
@@ -35,16 +33,11 @@ class WitnessFlags:
     """front, side, top or back."""
     threads: Threads | None = None
     """Threads of the physics; None: one per core."""
-    json: Switch = False
-    """Print JSON."""
+    json: JsonSwitch = False
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Replays the witnesses of one class or of all, and prints what they reach.
-
-    Raises:
-        BidexError: The flags contradict each other, there is no such class, or the film could not be written.
-    """
+    """Replays the witnesses of one class or of all, and prints what they reach."""
     flags = parse(WitnessFlags, arguments, "witness")
     if flags.all == (flags.task is not None):
         raise BidexError("witness: expected --task T or --all, got " + ("both." if flags.all else "neither."))
@@ -57,14 +50,10 @@ def main(arguments: Sequence[str]) -> None:
     rows = [_replay(name, flags) for name in names]
     if flags.out is not None:
         _film(names[0], flags.out, flags)
-    if flags.json:
-        print(json.dumps(rows, indent=2))
-    else:
-        print_table(plain_table(list(rows[0]), [list(row.values()) for row in rows]))
+    print_rows(rows, flags.json)
 
 
-def _replay(name: str, flags: WitnessFlags) -> dict[str, Any]:
-    """A row of the table."""
+def _replay(name: str, flags: WitnessFlags) -> Json:
     from bidex_meta.witness.replay import replay
 
     if flags.file is None and not witness_path(name).is_file():
