@@ -5,6 +5,9 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
+from rich.table import Table
+
+from bidex_meta.agents import Agent
 from bidex_meta.cli.learners import learner_kind, resolve_device
 from bidex_meta.cli.metatest import Options, check_worlds, meta_test, print_tables, splits_of
 from bidex_meta.cli.parsing import Device, Engine, JsonSwitch, RunPath, Switch, parse
@@ -72,19 +75,26 @@ def _evaluate(flags: EvaluateFlags, folder: RunFolder, config: RunConfig, worlds
         )
     policy, step = load_policy(folder, config.device, flags.checkpoint)
     split = "train" if flags.split == "auto" else flags.split
-    world = worlds.world(split, flags.num_envs)
-    found = worlds.judge(policy, world, flags.episodes, flags.starts)
-    result = {"steps": step, "split": split, "seed": flags.starts, "policy": found.to_json()}
-    random = None
-    if flags.random:
-        random = worlds.judge(RandomAgent(world.action_space), world, flags.episodes, flags.starts)
-        differences = {name: asdict(difference) for name, difference in compare(found, random).items()}
-        result |= {"random": random.to_json(), "return_above_random": differences}
-    world.close()
+    title = f"{config.algo} on {worlds.name}, {split} tasks, {step:,} steps"
+    result, table = judged(worlds, policy, step, split, flags, flags.random, title)
     if not flags.json:
-        title = f"{config.algo} on {worlds.name}, {split} tasks, {step:,} steps"
-        print_table(evaluation_table(title, found, random))
+        print_table(table)
     return result
+
+
+def judged(
+    worlds: Worlds, policy: Agent, step: int, split: str, options: Options, random: bool, title: str
+) -> tuple[Json, Table]:
+    """The evaluation of a policy on a split, beside that of a random one if asked, as JSON and as a table."""
+    world = worlds.world(split, options.num_envs)
+    found = worlds.judge(policy, world, options.episodes, options.starts)
+    result, other = {"steps": step, "split": split, "seed": options.starts, "policy": found.to_json()}, None
+    if random:
+        other = worlds.judge(RandomAgent(world.action_space), world, options.episodes, options.starts)
+        differences = {name: asdict(difference) for name, difference in compare(found, other).items()}
+        result |= {"random": other.to_json(), "return_above_random": differences}
+    world.close()
+    return result, evaluation_table(title, found, other)
 
 
 def _meta_test(flags: EvaluateFlags, folder: RunFolder, config: RunConfig, worlds: Worlds) -> Json:
