@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, NoReturn, TypeVar
 import tyro
 
 from bidex_meta.errors import BidexError
-from bidex_meta.utils.validation import check_fields
+from bidex_meta.utils.validation import Seed, check_fields
 
 Options = TypeVar("Options")
 
@@ -51,21 +51,36 @@ Device = Annotated[str, tyro.conf.arg(help="auto, cpu or cuda:N.")]
 Engine = Annotated[
     Literal["auto", "c", "warp"], tyro.conf.arg(help="Physics; auto: the one that is fast on the device.")
 ]
-PolicyName = Annotated[str, tyro.conf.arg(help="zero, random, or a run folder.")]
-CheckpointName = Annotated[
-    str, tyro.conf.arg(help="Of a run: last, best (see `bidex-meta run --help`, --evaluate-every) or a file.")
-]
-ObjectName = Annotated[
-    str | None,
-    tyro.conf.arg(
-        help="With --task alone: another object of the class, of the shelf or an MJCF file (docs/objects.md); None: "
-        "the run's, or the class's own."
-    ),
-]
 RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
 """A run folder, as the first word."""
 RunPaths = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
 """Run folders, or files of ``results/data/``."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LookFlags:
+    """What a policy is looked at in."""
+
+    run: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = None
+    """Run folder whose policy is shown; the same as --policy RUN."""
+    task: str | None = None
+    """Task class; None: the run's first one. In a browser it can be changed."""
+    object: str | None = None
+    """With --task alone: another object of the class, of the shelf or an MJCF file (docs/objects.md); None: the run's,
+    or the class's own."""
+    policy: str = "zero"
+    """zero, random, or a run folder."""
+    checkpoint: str = "last"
+    """Of a run: last, best (see `bidex-meta run --help`, --evaluate-every) or a file."""
+    suite: str | None = None
+    """Show the task as this suite has it; None: on its own, or as in the run."""
+    seed: Seed = 0
+    """Seed of tasks and starts."""
+
+    @property
+    def actor(self) -> str:
+        """The policy, however it was named."""
+        return self.policy if self.run is None else str(self.run)
 
 
 def parse(options: type[Options], arguments: Sequence[str], command: str, default: Options | None = None) -> Options:

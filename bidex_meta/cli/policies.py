@@ -7,12 +7,14 @@ from pathlib import Path
 
 from bidex_meta.agents import Agent
 from bidex_meta.cli.learners import learner_kind
+from bidex_meta.cli.parsing import LookFlags
 from bidex_meta.cli.tables import Json
-from bidex_meta.errors import BidexError, one_line
+from bidex_meta.errors import BidexError, known_name, one_line
 from bidex_meta.evaluation.play import RandomAgent, ZeroAgent
 from bidex_meta.runs import RunFolder
 from bidex_meta.train.distributed import LostProcess
 from bidex_meta.utils.files import is_file
+from bidex_meta.utils.plugins import name_with_object
 from bidex_meta.world.contract import TaskWorld
 from bidex_meta.worlds import WorldConfig, Worlds
 
@@ -99,22 +101,26 @@ def acting(policy: str, world: TaskWorld, seed: int, which: str = "last") -> Age
     return policy_of(folder, state, "cpu")
 
 
-def looked_at(policy: str, suite: str | None, task: str | None, seed: int, held: str | None = None) -> Worlds:
-    """The worlds in which a policy (``zero``, ``random`` or a run folder) is looked at.
+def looked_at(flags: LookFlags, all_slots: bool = False) -> tuple[Worlds, list[str], str]:
+    """The worlds in which a policy is looked at, the class of each slot, and the class to look at.
 
-    Those of its run, or of the suite or the task that is named; ``held`` is an object of the class alone.
+    Those of its run, or of the suite or the task that is named.
     """
-    if held is not None and (suite is not None or task is None):
+    if flags.object is not None and (flags.suite is not None or flags.task is None):
         raise BidexError("--object goes with --task alone: bidex-meta render --task CatchUnderarm --object mug ...")
-    config = WorldConfig(suite=suite, task=task, object=held, threads=1, seed=seed)
-    if policy not in ("zero", "random"):
-        run = RunFolder.open(Path(policy)).config()
-        config = replace(config, suite=suite or run.suite, task=task or run.task, base=run.base, points=run.points)
-        if not task and not held:
+    config = WorldConfig(suite=flags.suite, task=flags.task, object=flags.object, threads=1, seed=flags.seed)
+    if flags.actor not in ("zero", "random"):
+        run = RunFolder.open(Path(flags.actor)).config()
+        config = replace(config, suite=config.suite or run.suite, task=config.task or run.task)
+        config = replace(config, base=run.base, points=run.points)
+        if not flags.task and not flags.object:
             config = replace(config, object=run.object)
     if config.suite is None and config.task is None:
         raise BidexError("Name what to show: a run folder, --task TASK or --suite SUITE.")
-    return Worlds.open(config)
+    worlds = Worlds.open(config)
+    slots, classes = slots_of(worlds), worlds.task_classes()  # which refuses what is not of ours
+    task = (flags.task and name_with_object(flags.task, flags.object)) or slots[0]
+    return worlds, slots, task if all_slots else known_name(f"task of {worlds.name}", task, classes)
 
 
 def slots_of(worlds: Worlds) -> list[str]:
