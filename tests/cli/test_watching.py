@@ -11,9 +11,7 @@ from bidex_meta.cli import main, watching
 from bidex_meta.runs import RunFolder, read_metrics
 from bidex_meta.runs.writers import LOGGERS, Writer
 from bidex_meta.utils import gl_backend
-from tests.cli.test_run import final, run, same, toy_worlds
-
-__all__ = ["toy_worlds"]
+from tests.cli.test_run import final, run, same
 
 
 @pytest.fixture(autouse=True)
