@@ -80,12 +80,7 @@ def test_compare_takes_what_is_reached_after_adaptation(adapted):
 
 @pytest.mark.parametrize(
     "flags, expected",
-    [
-        ("--shots -1", "--shots"),
-        ("--rollouts 0", "--rollouts"),
-        ("--random", "Leave --random out"),
-        ("--split x", "both"),
-    ],
+    [("--shots -1", "--shots"), ("--rollouts 0", "--rollouts"), ("--random", "Leave --random"), ("--split x", "both")],
 )
 def test_bad_flags_are_one_line(adapted, refused, flags, expected):
     error = [line for line in refused("evaluate", adapted, *flags.split()).splitlines() if "Meta-test on" not in line]
