@@ -11,20 +11,8 @@ from tests.fakes import ToyWorld
 from tests.points import PointWorld, ring
 
 COUNTS = {"train": {"Near": 6, "Far": 6}, "test": {"Near": 2}}
-FINDER = [
-    "--suite",
-    "ML4",
-    "--algo",
-    "finder",
-    "--num-envs",
-    "24",
-    "--steps",
-    "24",
-    "--threads",
-    "1",
-    "--device",
-    "cpu",
-]
+FINDER = ["--suite", "ML4", "--algo", "finder", "--num-envs", "24", "--steps", "24"]
+FINDER += ["--threads", "1", "--device", "cpu"]
 
 Command = Callable[..., str]
 

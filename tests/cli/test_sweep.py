@@ -110,16 +110,11 @@ def test_an_arm_starts_from_another_on_the_same_subject_seed_and_value(tmp_path:
     for run in runs:
         assert run.after is not None and run.after.name == run.name.replace("-on-", "-ppo-")
         assert f"--start-from={run.after}" in run.begin
+    own = STARTING.replace('"on"', '"on"\noverrides = { num_envs = 4 }')
     for text, told in (
-        (
-            STARTING.replace('"on"', '"on"\noverrides = { num_envs = 4 }') + "[grid]\nnum_envs = [8, 16]\n",
-            "'ppo'.* 2 runs",
-        ),
+        (own + "[grid]\nnum_envs = [8, 16]\n", "'ppo', of which there are 2 runs on HandOver"),
         (STARTING.replace('"ppo"\n', '"ppo"\ntasks = ["Switch"]\n', 1), "'ppo', of which there are 0 runs on Switch"),
-        (
-            STARTING.replace('start_from = "ppo"', 'start_from = "on"'),
-            "'on', of which there are 0 runs on HandOver above",
-        ),
+        (STARTING.replace('start_from = "ppo"', 'start_from = "on"'), "'on', of which there are 0 runs on HandOver"),
     ):
         path.write_text(FILE + text)
         with pytest.raises(BidexError, match=told):
