@@ -126,19 +126,12 @@ def _play(folder: RunFolder, flags: ControlFlags) -> Control:
     size = metatest.environments_for(len(counts), max(counts) * flags.trials, rollouts, flags.num_envs)
     say(f"{folder.path}: {flags.trials} adaptations of each held-out task, {size} environments.")
     test, train = (worlds.world(split, size) for split in ("test", "train"))
+    seed = EVALUATION_SEED if flags.seed is None else flags.seed
     found = control(
-        policy_loader(folder, device)[0],
-        test,
-        train,
-        flags.shots,
-        say=say,
-        rollouts=rollouts,
-        episodes_per_task=flags.episodes,
-        trials=flags.trials,
-        max_adapt_steps=metatest.adapt_steps_of(config),
-        seed=EVALUATION_SEED if flags.seed is None else flags.seed,
-        references=worlds.references(),
-    )
+        policy_loader(folder, device)[0], test, train, flags.shots, say=say, rollouts=rollouts,
+        episodes_per_task=flags.episodes, trials=flags.trials, max_adapt_steps=metatest.adapt_steps_of(config),
+        seed=seed, references=worlds.references(),
+    )  # fmt: skip
     test.close()
     train.close()
     return found

@@ -57,17 +57,9 @@ def _list(flags: DataFlags) -> None:
         except BidexError as error:
             print(f"{name}: {error}", file=sys.stderr)
             continue
-        about = dataset.metadata
-        rows.append(
-            {
-                "name": name,
-                "kind": about.get("kind"),
-                "source": about.get("suite") or about.get("task"),
-                "transitions": dataset.num_steps,
-                "episodes": dataset.num_episodes,
-                "megabytes": dataset.content.get("dataset_size"),
-            }
-        )
+        about, sizes = dataset.metadata, {"transitions": dataset.num_steps, "episodes": dataset.num_episodes}
+        what = {"name": name, "kind": about.get("kind"), "source": about.get("suite") or about.get("task")}
+        rows.append({**what, **sizes, "megabytes": dataset.content.get("dataset_size")})
     none = f"No data sets in {data_folder()}. Record one: bidex-meta record random --task CatchUnderarm"
     print_rows(rows, flags.json, none)
 

@@ -47,12 +47,9 @@ _RENAMED = {"autoreset": "autoreset_mode(config)", "adapts_by_row": "independent
 class LearnerKind:
     """A learner and its presets."""
 
-    name: str
-    """Name in ``ALGOS``, or ``package.module:Class``."""
+    name: str  # in ALGOS, or package.module:Class
     make: type[Learner]
-    """The learner's class."""
-    presets: Mapping[str, Any]
-    """Configs by name; all of one dataclass."""
+    presets: Mapping[str, Any]  # configs by name, all of one dataclass
 
     def autoreset(self, config: dict[str, Any]) -> str:
         """Mode of the world it trains on, for fields of its config."""

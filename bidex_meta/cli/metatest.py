@@ -81,18 +81,9 @@ def meta_test(
         )
         world = worlds.world(split, num_envs)
         found[split] = meta_evaluate(
-            load(),
-            world,
-            shots,
-            rollouts=rollouts,
-            episodes_per_task=episodes,
-            tasks=tasks,
-            trials=trials,
-            max_adapt_steps=adapt_steps_of(config),
-            seed=options.starts,
-            references=worlds.references(),
-            split=split,
-        )
+            load(), world, shots, rollouts=rollouts, episodes_per_task=episodes, tasks=tasks, trials=trials,
+            max_adapt_steps=adapt_steps_of(config), seed=options.starts, references=worlds.references(), split=split,
+        )  # fmt: skip
         world.close()
     return found
 

@@ -1,6 +1,6 @@
 """``bidex-meta render``: what a task looks like, or what a policy does."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,6 +65,8 @@ def main(arguments: Sequence[str]) -> None:
         video.check_films()
     every = flags.every or (2 if flags.tiled else 1)
     from bidex_meta.cli.policies import acting, looked_at
+    from bidex_meta.evaluation.filming import film_row, film_tiles
+    from bidex_meta.tasks.base import CONTROL_RATE
 
     source, slots, task = looked_at(flags, all_slots=flags.tiled)
     # One environment for each slot is enough to see one of them.
@@ -73,8 +75,23 @@ def main(arguments: Sequence[str]) -> None:
     if flags.points:
         world = _with_clouds(world)
     rows = list(range(len(slots))) if flags.tiled else [world.slot_rows[slots.index(task)].start]
+    longest = int(world.max_episode_steps[rows].max())
+    steps = flags.steps if flags.steps is not None else 0 if suffix == ".png" else longest
     look = {"width": width, "height": height, "camera": flags.camera}
-    _write(out, _frames(flags, agent, world, rows, every if suffix != ".png" else None, look), every)
+    if flags.tiled:
+        every = every if suffix != ".png" else max(steps, 1)
+        frames, count = film_tiles(agent, world, rows, steps, flags.seed, every, **look), steps // every + 1
+    elif suffix == ".png":  # the last one alone
+        frames, count = film_row(agent, world, rows[0], steps, flags.seed, None, **look), 1
+    else:
+        frames, count = film_row(agent, world, rows[0], steps, flags.seed, every, **look), steps // every + 1
+    frames = counted(frames, count, "frames")
+    write = {".mp4": video.write_video, ".webp": video.write_animation}.get(suffix)
+    if write is not None:
+        write(out, frames, CONTROL_RATE / every)
+    else:
+        for frame in frames:  # a tiled picture comes after the first frame
+            video.write_image(out, frame)
     world.close()
     print(out)
 
@@ -87,30 +104,3 @@ def _with_clouds(world: Any) -> Any:
     if not isinstance(world, World):
         raise BidexError("Point clouds are made of scenes of our own, not of Meta-World's. Leave --points out.")
     return CloudView(world, (world.points or PointsRule()).count)
-
-
-def _frames(
-    flags: RenderFlags, agent: Any, world: Any, rows: list[int], every: Few | None, look: dict[str, Any]
-) -> tuple[Iterator[Any], int]:
-    """The frames, and how many there will be at most; with ``every`` None the last one alone."""
-    from bidex_meta.evaluation.filming import film_row, film_tiles
-
-    longest = int(world.max_episode_steps[rows].max())
-    steps = flags.steps if flags.steps is not None else 0 if every is None else longest
-    if flags.tiled:
-        each = every or max(steps, 1)
-        frames = film_tiles(agent, world, rows, steps, flags.seed, each, **look)
-        return frames, steps // each + 1
-    return film_row(agent, world, rows[0], steps, flags.seed, every, **look), 1 if every is None else steps // every + 1
-
-
-def _write(out: Path, frames: tuple[Iterator[Any], int], every: int) -> None:
-    from bidex_meta.tasks.base import CONTROL_RATE
-
-    shown = counted(*frames, "frames")
-    write = {".mp4": video.write_video, ".webp": video.write_animation}.get(out.suffix.lower())
-    if write is not None:
-        write(out, shown, CONTROL_RATE / every)
-    else:
-        for frame in shown:  # a tiled picture comes after the first frame
-            video.write_image(out, frame)

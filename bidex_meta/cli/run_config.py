@@ -103,14 +103,9 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
         sizes = run_data.rows_and_steps(source) if make.offline else source.rows_and_steps(device, make.adapts)
         default = RunConfig(
             **{"suite": None, "task": None, **implied},
-            algo=kind.name,
-            learner=kind.presets[preset],
-            num_envs=sizes[0],
-            steps=sizes[1],
-            seed=0,
-            task_seed=run_data.task_seed(datasets),
-            threads=max(1, usable_cores() // launch().local_count),
-        )
+            algo=kind.name, learner=kind.presets[preset], num_envs=sizes[0], steps=sizes[1], seed=0,
+            task_seed=run_data.task_seed(datasets), threads=max(1, usable_cores() // launch().local_count),
+        )  # fmt: skip
     # The learner's flags are among those of its config; lists begin empty, since flags add to them.
     options: type[RunFlags] = RunFlags[type(default.learner)]  # pyright: ignore
     flags = parse(options, arguments, "run", RunFlags(replace(default, dataset=(), demonstrations=())))

@@ -161,14 +161,11 @@ class Job:
             return
         words = ["run", f"--resume={run.path}", *run.words] if exists(run.folder.config_path) else run.begin
         with _beside(run, "log").open("ab") as log:
-            self.process = subprocess.Popen(
-                [*self.command, *words],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                env={**os.environ, "OMP_NUM_THREADS": "1"},
-                start_new_session=True,  # Ctrl-C reaches the sweep alone, which then stops its runs
-            )
+            one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}
+            self.process = subprocess.Popen(  # Ctrl-C reaches the sweep alone, which then stops its runs
+                [*self.command, *words], stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=one_thread,
+                start_new_session=True,
+            )  # fmt: skip
         if self.stopped:
             self.process.terminate()
         code = self.process.wait()

@@ -186,15 +186,12 @@ def _again(
     for split, part in recorded["splits"].items():
         if split not in worlds.splits:
             raise BidexError(f"{worlds.name} has no {split} tasks, which the evaluation is of.")
+        before = part["before"]
         options = Options(
-            shots=part["shots"],
-            rollouts=part["rollouts"],
-            episodes=part["before"]["episodes_per_task"],
-            tasks=max(row.get("tasks", TASKS) for row in part["before"]["classes"].values()),
-            trials=part["trials"],
-            num_envs=num_envs,
-            seed=recorded["seed"],
-        )
+            shots=part["shots"], rollouts=part["rollouts"], trials=part["trials"], episodes=before["episodes_per_task"],
+            tasks=max(row.get("tasks", TASKS) for row in before["classes"].values()),
+            num_envs=num_envs, seed=recorded["seed"],
+        )  # fmt: skip
         splits[split] = meta_test(worlds, config, load, options, [split], say)[split].to_json()
     return {"splits": splits}
 

@@ -10,7 +10,9 @@ from bidex_meta.errors import BidexError, known_name
 from bidex_meta.runs import video
 from bidex_meta.runs.atomic import check_writable
 from bidex_meta.tasks import registry
+from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.utils.validation import Threads
+from bidex_meta.witness.replay import frames, replay
 from bidex_meta.witness.store import load_witness, witness_path
 
 
@@ -49,13 +51,16 @@ def main(arguments: Sequence[str]) -> None:
         check_writable(flags.out)
     rows = [_replay(name, flags) for name in names]
     if flags.out is not None:
-        _film(names[0], flags.out, flags)
+        pictures = frames(names[0], load_witness(names[0], flags.file), camera=flags.camera)
+        if video.check_suffix(flags.out) == ".mp4":
+            video.write_video(flags.out, pictures, CONTROL_RATE)
+        else:
+            *_, last = pictures
+            video.write_image(flags.out, last)
     print_rows(rows, flags.json)
 
 
 def _replay(name: str, flags: WitnessFlags) -> Json:
-    from bidex_meta.witness.replay import replay
-
     if flags.file is None and not witness_path(name).is_file():
         keys = ("return", "first_success", "shifted", "steps", "deepest_mm", "rival")
         return {"task": name, "found": False, **dict.fromkeys(keys)}
@@ -71,15 +76,3 @@ def _replay(name: str, flags: WitnessFlags) -> Json:
         "deepest_mm": round(1000.0 * result.deepest, 1),
         "rival": None if rival is None else round(rival, 3),
     }
-
-
-def _film(name: str, out: Path, flags: WitnessFlags) -> None:
-    from bidex_meta.tasks.base import CONTROL_RATE
-    from bidex_meta.witness.replay import frames
-
-    pictures = frames(name, load_witness(name, flags.file), camera=flags.camera)
-    if video.check_suffix(out) == ".mp4":
-        video.write_video(out, pictures, CONTROL_RATE)
-        return
-    *_, last = pictures
-    video.write_image(out, last)
