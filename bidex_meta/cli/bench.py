@@ -76,14 +76,12 @@ def world_speed(flags: BenchFlags) -> Json:
     times = [paired_steps(full, bare, flags.steps, generator) for _ in range(flags.repeats)]
     steps = flags.num_envs * flags.steps
     return {
-        "suite": flags.suite,
-        "num_envs": flags.num_envs,
-        "threads": flags.threads or usable_cores(),
+        "suite": flags.suite, "num_envs": flags.num_envs, "threads": flags.threads or usable_cores(),
         "env_steps_per_s": round(statistics.median(steps / t for t, _ in times)),
         "engine_steps_per_s": round(statistics.median(steps / t for _, t in times)),
         "ratio": round(statistics.median(b / f for f, b in times), 4),
         "groups": [part.group.engine.num for part in full.parts],
-    }
+    }  # fmt: skip
 
 
 def paired_steps(full: World, bare: World, steps: int, generator: torch.Generator) -> tuple[float, float]:

@@ -33,6 +33,10 @@ def main(arguments: Sequence[str]) -> None:
     """Print the script. Flags of ``run`` that are the learner's are MT-PPO's."""
     shell = parse(CompletionFlags, arguments, "completion").shell
     from bidex_meta.cli import COMMANDS
+    from bidex_meta.tasks.objects.held import EGG, shelf
+
+    choices = {"--suite": suites_to_run(), "--task": registry.names(), "--algo": list(ALGOS)}
+    choices["--object"] = [EGG, *shelf()]
 
     app = tyro.extras.SubcommandApp()
     for name, command in COMMANDS.items():
@@ -52,16 +56,8 @@ def main(arguments: Sequence[str]) -> None:
         if line.startswith("COMPLETION_SPEC = "):
             # tyro's script gives a line to each completion, but keeps the line breaks of help texts.
             line = re.sub(r"\\+n", " ", line)
-            for flag, names in _names().items():
+            for flag, names in choices.items():
                 line = re.sub(
                     rf"({{'flags': \['{flag}'\].*?)'type': '\w+'", rf"\1'type': 'choice', 'choices': {names}", line
                 )
         print(line)
-
-
-def _names() -> dict[str, list[str]]:
-    """What the values of flags may be."""
-    from bidex_meta.tasks.objects.held import EGG, shelf
-
-    names = {"--suite": suites_to_run(), "--task": registry.names(), "--algo": list(ALGOS)}
-    return {**names, "--object": [EGG, *shelf()]}

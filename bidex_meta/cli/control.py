@@ -102,13 +102,9 @@ def _check(folders: Sequence[RunFolder]) -> None:
         if not learner_kind(config.algo).make.adapts:
             raise BidexError(f"{folder.path}: {config.algo} does not adapt to tasks. Name runs of maml, promp or rl2.")
         metatest.check_worlds(Worlds.open(config.to_json()), config.algo)
-        if config.seed in seeds:
-            raise BidexError(
-                f"{folder.path} and {seeds[config.seed]} both have seed {config.seed}. Name one run for each seed."
-            )
-        seeds[config.seed] = folder.path
-        differing = [name for name, value in run_kind(config).items() if value != first.get(name)]
-        if differing:
+        if (other := seeds.setdefault(config.seed, folder.path)) is not folder.path:
+            raise BidexError(f"{folder.path} and {other} both have seed {config.seed}. Name one run for each seed.")
+        if differing := [name for name, value in run_kind(config).items() if value != first.get(name)]:
             raise BidexError(
                 f"Expected runs that differ in the seed alone, but {folders[0].path} and {folder.path} differ in "
                 f"{', '.join(differing)}. Name them in separate calls."

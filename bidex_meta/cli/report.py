@@ -64,8 +64,7 @@ def render(runs: Sequence[Run]) -> str:
     histories = read_histories(runs)
     short = [f"{_letter(place)} {history.label.partition(',')[0]}" for place, history in enumerate(histories)]
     named = list(zip(short, histories, strict=True))
-    curves = [(name, history.curves) for name, history in named]
-    names = _names(named)
+    curves, names = [(name, history.curves) for name, history in named], _names(named)
     configs = [run.config() for run in runs]
     algos = ", ".join(dict.fromkeys(config.algo for config in configs))
     subjects = ", ".join(dict.fromkeys(Path(config.suite or config.task or "").stem for config in configs))
@@ -109,16 +108,14 @@ def _run(run: Run, name: str) -> Json:
     hardware = ", ".join(versions.get("gpus") or []) or f"{versions.get('cpus', '?')} processors"
     git = versions.get("git") or {}
     return {
-        "name": name,
-        "path": str(run.path),
-        "on": config.suite or config.task,
+        "name": name, "path": str(run.path), "on": config.suite or config.task,
         "steps": f"{max((row['step'] for row in rows), default=0):,}",
         "hours": f"{training_seconds(rows) / 3600.0:.2f}",
-        "speed": f"{median(speeds):,.0f}" if speeds else "–",
+        "speed": f"{median(speeds):,.0f}" if speeds else NONE,
         "environments": f"{config.num_envs:,}",
         "device": f"{config.device} ({hardware})",
-        "commit": (git.get("commit") or "–")[:10] + ("+" if git.get("dirty") else ""),
-    }
+        "commit": (git.get("commit") or NONE)[:10] + ("+" if git.get("dirty") else ""),
+    }  # fmt: skip
 
 
 def _final(runs: Sequence[Run], short: dict[Path, str]) -> Json:

@@ -100,7 +100,9 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     if folder and stored:
         default = replace(stored, learner=_stored_learner(type(kind.presets[preset]), stored, folder))
     else:
-        sizes = run_data.rows_and_steps(source) if make.offline else source.rows_and_steps(device, make.adapts)
+        # An offline learner takes sizes and names from its world.
+        offline = max(1, len(source.tasks("train"))), run_data.UPDATES
+        sizes = offline if make.offline else source.rows_and_steps(device, make.adapts)
         default = RunConfig(
             **{"suite": None, "task": None, **implied},
             algo=kind.name, learner=kind.presets[preset], num_envs=sizes[0], steps=sizes[1], seed=0,

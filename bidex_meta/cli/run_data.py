@@ -29,29 +29,21 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
     """
     alone, versions = source.class_name, collect_versions()
     names = {name.partition("/")[0] for name in world.task_names}
+    references = {name: known for name, known in source.references().items() if name in names}
     return {
         "suite": None if alone else source.name,
         "suite_version": source.suite.version if source.suite else None,
-        "task": alone,
-        "object": source.object,
-        "points": source.points,
+        "task": alone, "object": source.object, "points": source.points,
         "base": {None: "own", True: "moving", False: "fixed"}[source.moving_base] if alone else None,
         "tasks": list(world.task_names),
         "reward_scales": {slot.name: slot.reward_scale for slot in getattr(world, "slots", ())},
         "hides_goals": source.hides_goals,
         "observation_groups": [[g.name, [[p.start, p.stop] for p in g.where]] for g in world.observation_groups],
-        "kind": kind,
-        "policies": list(policies),
-        "seed": source.seed,
-        "references": {
-            name: {"random": known.random, "zero": known.zero, "expert": known.expert}
-            for name, known in source.references().items()
-            if name in names
-        },
-        "versions": versions,
-        "commit": (versions["git"] or {}).get("commit"),
+        "kind": kind, "policies": list(policies), "seed": source.seed,
+        "references": {n: {"random": k.random, "zero": k.zero, "expert": k.expert} for n, k in references.items()},
+        "versions": versions, "commit": (versions["git"] or {}).get("commit"),
         **more,
-    }
+    }  # fmt: skip
 
 
 def whole_paths(names: Sequence[str]) -> tuple[str, ...]:
@@ -86,11 +78,6 @@ def implied(datasets: Sequence[Dataset]) -> Json:
 def task_seed(datasets: Sequence[Dataset]) -> int | None:
     """The seed of the tasks that the first data set was collected on: a learner is evaluated on those."""
     return datasets[0].metadata.get("seed") if datasets else None
-
-
-def rows_and_steps(source: Worlds) -> tuple[int, int]:
-    """Environments of the world from which an offline learner takes sizes and names, and updates."""
-    return max(1, len(source.tasks("train"))), UPDATES
 
 
 def check_offline(kind: LearnerKind, record: int, datasets: Sequence[Dataset], source: Worlds) -> None:
