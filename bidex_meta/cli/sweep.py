@@ -263,17 +263,15 @@ def submit(runs: Sequence[PlannedRun], out: Path, where: str, parameters: Json) 
 
 def choose_cores(asked: str | None, workers: int | None) -> list[int | None]:
     """A core for each worker, of those asked for (``1``, ``0,2-3``); None where the system binds no processes."""
-    usable: list[int | None] = [None] * (os.cpu_count() or 1)
-    if sys.platform == "linux":
-        usable = [*sorted(os.sched_getaffinity(0))]
+    linux = sys.platform == "linux"
+    usable: list[int | None] = [*sorted(os.sched_getaffinity(0))] if linux else [None] * (os.cpu_count() or 1)
     chosen = usable
     if asked is not None:
         try:
             parts = [[usable.index(int(end)) for end in part.split("-")] for part in asked.split(",")]
         except ValueError:
-            raise BidexError(
-                f"--cores: expected numbers such as 1 or 0,2-3, of {usable}, got {shortened(asked)}."
-            ) from None
+            message = f"--cores: expected numbers such as 1 or 0,2-3, of {usable}, got {shortened(asked)}."
+            raise BidexError(message) from None
         chosen = list(dict.fromkeys(core for ends in parts for core in usable[min(ends) : max(ends) + 1]))
     count = workers or (1 if asked is None else len(chosen))
     if count > len(chosen):

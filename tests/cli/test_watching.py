@@ -67,6 +67,14 @@ def test_a_resumed_run_looks_when_the_unbroken_one_does(toy_worlds, tmp_path):
     assert same(*best)
 
 
+def test_a_resumed_run_may_be_looked_at_otherwise(toy_worlds, tmp_path):
+    assert run("--steps", 48, "--run-dir", tmp_path / "r", "--no-evaluate") == 0
+    more = ["--steps", "96", "--evaluate-every", "1", "--logger", "none", "--no-evaluate"]
+    assert main(["run", "--resume", str(tmp_path / "r"), *more]) == 0
+    assert RunFolder.open(tmp_path / "r").config().evaluate_every == 1
+    assert ["Eval/success_rate" in row for row in learned(tmp_path / "r")] == [False, False, True, True]
+
+
 def test_the_best_policy_is_kept_and_judged(toy_worlds, tmp_path, monkeypatch, shown, refused):
     path, marks = tmp_path / "r", iter([0.25, 0.75, 0.75, 0.5])
     monkeypatch.setattr(watching.Watch, "_judge", lambda watch: None)
