@@ -271,6 +271,8 @@ import functools, sys, time
 import bidex_meta.runs.progress as progress
 import bidex_meta.train.runner as runner
 from bidex_meta.cli import main
+from bidex_meta.worlds.own import OwnSuite
+from tests.fakes import ToyWorld
 class Slow(ToyWorld):
     def step(self, action):
         time.sleep(0.002)
