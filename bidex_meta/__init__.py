@@ -10,7 +10,7 @@ threads spin (docs/training.md#beside-other-work); torch and MuJoCo are loaded w
 import os
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from bidex_meta.clients.gymnasium_ids import register_ids
 from bidex_meta.errors import BidexError
@@ -22,23 +22,10 @@ if TYPE_CHECKING:
     from bidex_meta.world import World
 
 __all__ = [
-    "Benchmark",
-    "BidexError",
-    "Suite",
-    "Task",
-    "World",
-    "__version__",
-    "load_suite",
-    "make_task_world",
-    "suite_names",
-]
+    "Benchmark", "BidexError", "Suite", "Task", "World", "__version__", "load_suite", "make_task_world", "suite_names",
+]  # fmt: skip
 
-_LAZY = {
-    "Benchmark": "bidex_meta.benchmark",
-    "Task": "bidex_meta.benchmark",
-    "World": "bidex_meta.world",
-    "make_task_world": "bidex_meta.benchmark",
-}
+_LAZY = dict.fromkeys(("Benchmark", "Task", "make_task_world"), "bidex_meta.benchmark") | {"World": "bidex_meta.world"}
 
 try:
     __version__ = version("bidex-meta")
@@ -55,7 +42,7 @@ set_aside_what_is_missing()
 register_ids()
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(_LAZY[name]), name)

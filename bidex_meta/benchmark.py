@@ -55,13 +55,10 @@ class Task(NamedTuple):
 class Benchmark:
     """A suite with its task classes, its tasks and the worlds made of them.
 
-    The same name and seed give the same tasks in every process; no global random generator is read or written. Its
-    classes make single environments as Meta-World's do; with `bidex_meta.metaworld` imported it is a
-    `metaworld.Benchmark`.
-
-    Args:
-        name_or_path: A shipped suite (`bidex_meta.suite_names()`), the path of a suite file of your own, or a `Suite`.
-        seed: Chooses the tasks; also the default seed of the worlds. A whole number from 0 on.
+    `name_or_path` is a shipped suite (`bidex_meta.suite_names()`), the path of a suite file of your own, or a `Suite`;
+    `seed`, a whole number from 0 on, chooses the tasks and is the default seed of the worlds. Both give the same tasks
+    in every process; no global random generator is read or written. Its classes make single environments as
+    Meta-World's do; with `bidex_meta.metaworld` imported it is a `metaworld.Benchmark`.
 
     Raises BidexError for an unknown suite, a faulty suite file or seed.
 

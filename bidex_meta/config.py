@@ -171,8 +171,10 @@ class RunConfig(Generic[LearnerSettings]):
             f"{prefix}/success_rate": self.stop_at_success,
             "Eval/score": self.stop_at_score,
         }
-        told = ((tag, limit, metrics.get(tag)) for tag, limit in limits.items())
-        return next((tag for tag, limit, value in told if None not in (limit, value) and value >= limit), None)
+        for tag, limit in limits.items():
+            if limit is not None and (value := metrics.get(tag)) is not None and value >= limit:
+                return tag
+        return None
 
     def goal(self, last: Mapping[str, Json]) -> int:
         """Steps that a run trains for: those of its last metrics where time or these ended it, else ``steps``."""

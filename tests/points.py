@@ -19,22 +19,10 @@ def ring(count: int, turn: float = 0.0) -> np.ndarray:
 
 
 class PointWorld(FakePools):
-    """Rows are points in the plane that see their place and the time left, not their goal.
+    """Rows are points in the plane that see their place and the time left, not their goal, (n, 2) of each slot.
 
-    Reward: minus the distance to the goal, by two.
-
-    Args:
-        num_envs: Rows over all slots.
-        pools: Goals of each slot, (n, 2).
-        steps: Time limit of each slot.
-        ends: Whether an episode ends (terminated) at its goal.
-        noise: Half the range of starts around the origin.
-        breaks: Rows whose physics breaks in the second step of each episode.
-
-    Attributes:
-        seeds: What each reset was given.
-        starts: Places of the rows that each reset started.
-        given: What each ``set_tasks`` was given.
+    Reward: minus the distance to the goal, by two. With ``ends`` an episode ends (terminated) at its goal; ``noise`` is
+    half the range of starts around the origin; in rows ``breaks`` the second step of each episode breaks the physics.
     """
 
     kept = ("x",)
@@ -54,9 +42,9 @@ class PointWorld(FakePools):
         super().__init__(pools, num_envs, (3, 2), steps[: len(pools)], mode, seed=seed)
         self.ends, self.noise, self.x = ends, noise, torch.zeros(num_envs, 2)
         self._breaks = torch.isin(torch.arange(num_envs), torch.tensor(breaks, dtype=torch.int64))
-        self.seeds: list[int | None] = []
-        self.starts: list[Tensor] = []
-        self.given: list[dict[str, np.ndarray]] = []
+        self.seeds: list[int | None] = []  # of each reset
+        self.starts: list[Tensor] = []  # places of the rows that each reset started
+        self.given: list[dict[str, np.ndarray]] = []  # to each ``set_tasks``
 
     def set_tasks(self, pools: dict[str, np.ndarray]) -> None:
         self.given.append(pools)

@@ -3,9 +3,8 @@ import multiprocessing
 import pickle
 import subprocess
 import sys
-from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,19 +23,11 @@ from bidex_meta.suite import suite_names
 MT4_CLASSES = ["CatchUnderarm", "HandOver", "CatchAbreast", "TwoCatchUnderarm"]
 
 
-@dataclass
-class Asked:
-    """Stands in for World and keeps what it was asked for."""
-
-    slots: list[Any]
-    num_envs: int
-    options: dict[str, Any] = field(default_factory=dict)
-
-
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(bidex_meta.benchmark, "World", lambda slots, num, **options: Asked(slots, num, options))
-    yield
+def asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In place of worlds there is what they are asked for."""
+    make = lambda slots, num, **options: SimpleNamespace(slots=slots, num_envs=num, options=options)  # noqa: E731
+    monkeypatch.setattr(bidex_meta.benchmark, "World", make)
 
 
 def own_suite(folder: Path, **replaced: str) -> Path:
@@ -96,11 +87,9 @@ def test_classes_and_task_counts() -> None:
     mt4, ml4 = Benchmark("MT4"), Benchmark("ML4")
     in_suite = mt4.task_classes()["HandOver"]  # moves there; alone its base is fixed (tests/worlds)
     assert (in_suite.observation_size, in_suite.action_size) == (422, 52)
-    assert list(mt4.train_classes) == MT4_CLASSES
-    assert mt4.test_classes == {} and mt4.test_tasks == []
+    assert list(mt4.train_classes) == MT4_CLASSES and mt4.test_classes == {} and mt4.test_tasks == []
     assert [task.env_name for task in mt4.train_tasks] == [name for name in MT4_CLASSES for _ in range(50)]
-    assert list(ml4.train_classes) == MT4_CLASSES[:3]
-    assert list(ml4.test_classes) == MT4_CLASSES[3:]
+    assert [*ml4.train_classes] == MT4_CLASSES[:3] and [*ml4.test_classes] == MT4_CLASSES[3:]
     assert (len(ml4.train_tasks), len(ml4.test_tasks)) == (150, 50)
 
 
@@ -158,9 +147,7 @@ def test_listed_tasks_fix_the_goal_and_share_the_drawn_rest() -> None:
      ("ML1", "test", "masked", 422, "fixed"), ("ML4", "train", "masked", 446, "fixed"),
      ("ML4", "test", "masked", 446, "fixed")]
 )  # fmt: skip
-def test_what_a_world_is_asked_for(
-    asked: None, name: str, split: str, observation: str, pad_to: int, sampling: str
-) -> None:
+def test_what_a_world_is_asked_for(asked, name, split, observation, pad_to, sampling):
     world = Benchmark(name, seed=4).make_world(split, num_envs=9, device="cpu", threads=2)
     assert world.num_envs == 9
     given = {"device": "cpu", "seed": 4, "threads": 2, "engine": "auto", "stagger": True, "points": None}
@@ -169,10 +156,9 @@ def test_what_a_world_is_asked_for(
 
 
 def test_evaluation_worlds_keep_their_tasks(asked: None) -> None:
-    for mode in ("DISABLED", "disabled", "Disabled", AutoresetMode.DISABLED):
-        world = Benchmark("MT4").make_world(autoreset_mode=mode)
-        assert world.options["autoreset_mode"] is AutoresetMode.DISABLED
-        assert world.options["task_sampling"] == "fixed"
+    for mode in ("DISABLED", "Disabled", AutoresetMode.DISABLED):
+        options = Benchmark("MT4").make_world(autoreset_mode=mode).options
+        assert options["autoreset_mode"] is AutoresetMode.DISABLED and options["task_sampling"] == "fixed"
     assert Benchmark("MT4").make_world(autoreset_mode="same-step").options["task_sampling"] == "uniform"
 
 
@@ -183,9 +169,9 @@ def test_slots(asked: None) -> None:
     assert all(slot.tasks.shape == (1, 5) for slot in slots)
     (slot,) = Benchmark("ML1").make_world("train").slots
     assert (slot.name, slot.tasks.shape) == ("CatchUnderarm", (3, 5))
-    mt4 = Benchmark("MT4").make_world().slots
-    assert [slot.name for slot in mt4] == MT4_CLASSES
-    assert [len(slot.tasks) for slot in mt4] == [50] * 4
+    assert [(slot.name, len(slot.tasks)) for slot in Benchmark("MT4").make_world().slots] == [
+        (n, 50) for n in MT4_CLASSES
+    ]
 
 
 def test_discount_and_reward_scale_reach_slot_and_world(tmp_path: Path) -> None:
@@ -226,15 +212,9 @@ def test_bad_names_and_seeds(tmp_path: Path) -> None:
         make_task_world("HandOve")
     with pytest.raises(BidexError, match=r"own\.toml: classes: Unknown task class 'HandOvr'\. Did you mean 'HandOver'"):
         Benchmark(own_suite(tmp_path, HandOver="HandOvr"))
-    listed = own_suite(
-        tmp_path,
-        **{
-            "tasks_per_class = 3\n": "",
-            '"HandOver"': '"HandOver"\n[[classes.tasks]]\nname = "a"\nfixed = { goal_q = 0 }',
-        },
-    )
+    tasks = '"HandOver"\n[[classes.tasks]]\nname = "a"\nfixed = { goal_q = 0 }'
     with pytest.raises(BidexError, match="Unknown component of HandOver 'goal_q'"):
-        Benchmark(listed)
+        Benchmark(own_suite(tmp_path, **{"tasks_per_class = 3\n": "", '"HandOver"': tasks}))
     with pytest.raises(BidexError, match="seed: expected a whole number"):
         Benchmark("MT4", seed=0.5)  # type: ignore[arg-type]
 

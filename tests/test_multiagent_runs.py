@@ -50,13 +50,6 @@ def test_a_run_a_resume_and_its_policy(tmp_path: Path, capsys: pytest.CaptureFix
     assert "is of no agent" in capsys.readouterr().err and not (tmp_path / "bad").exists()
 
 
-@pytest.mark.parametrize("algo", ["ippo", "mappo", "happo", "hatrpo", "maddpg"])
-def test_presets_and_partitions(algo: str) -> None:
-    kind = learner_kind(algo)
-    assert list(kind.presets) == ["paper", "laptop"]
-    assert {config.agents for config in kind.presets.values()} == {"hands"}
-
-
 def test_presets_are_the_tables() -> None:
     happo, mappo = (learner_kind(algo).presets["paper"] for algo in ("happo", "mappo"))
     for config in (happo, mappo):

@@ -3,6 +3,7 @@
 import copy
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -25,9 +26,7 @@ def suite_file(folder: Path, table: str) -> Path:
 
 
 @pytest.mark.parametrize("algo", ["ppo", "sac", "happo"])
-def test_a_run_reads_clouds_and_is_evaluated_on_them(
-    algo: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_reads_clouds_and_is_evaluated_on_them(algo, tmp_path, capsys):
     flags = ["--task", "HandOver", "--algo", algo, *_SMALL, "--learner.point-widths", "4", "8", "--learner.hidden", "8"]
     flags += ["--learner.warmup-steps", "2"] if algo == "sac" else []
     assert main(["run", *flags, "--steps", "64", "--episodes", "1", "--run-dir", str(tmp_path / "a")]) == 0
@@ -56,11 +55,13 @@ def test_a_data_set_of_clouds_is_learned_from(tmp_path: Path) -> None:
 
 
 def test_a_suite_file_asks_for_points(tmp_path: Path) -> None:
-    suite = load_suite(suite_file(tmp_path, "[points]\ncount = 12\nkinds = true"))
-    assert (suite.points, suite.point_kinds) == (12, True)
-    suite = load_suite(suite_file(tmp_path, "[points]"))
-    assert (suite.points, suite.point_kinds) == (768, False)
-    assert load_suite("MT4").points == 0
+    for table, points in (
+        ("[points]\ncount = 12\nkinds = true", (12, True)),
+        ("[points]", (768, False)),
+        ("", (0, False)),
+    ):
+        suite = load_suite(suite_file(tmp_path, table))
+        assert (suite.points, suite.point_kinds) == points
 
 
 def test_environments_of_a_suites_classes_show_its_points(tmp_path: Path) -> None:
@@ -78,7 +79,7 @@ def test_environments_of_a_suites_classes_show_its_points(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    "table", ["points = 3", "[points]\ncount = 0", "[points]\ncount = 99999", "[points]\nkind = 1"]
+    "table", ["points = 3", *(f"[points]\n{line}" for line in ("count = 0", "count = 99999", "kind = 1"))]
 )
 def test_bad_tables_are_one_line(table: str, tmp_path: Path) -> None:
     with pytest.raises(BidexError, match=r"points|count|kind"):
@@ -94,18 +95,15 @@ def test_bad_tables_are_one_line(table: str, tmp_path: Path) -> None:
         (["--suite", "ML1", "--algo", "maml", "--points", "16", "--threads", "1"], "does not read point clouds"),
     ],
 )
-def test_what_cannot_be_is_one_line(
-    flags: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_is_one_line(flags, told, tmp_path, capsys):
     assert main(["run", *flags, "--run-dir", str(tmp_path / "a")]) == 2
     assert told in capsys.readouterr().err
 
 
 def test_render_puts_the_cloud_beside_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    import numpy as np
-
     world = make_task_world("HandOver", 3, "cpu", autoreset_mode="DISABLED", threads=1)
-    monkeypatch.setattr(type(world), "render", lambda self, row, width, height, camera: np.zeros((height, width, 3), np.uint8))  # fmt: skip  # noqa: E501
+    black = lambda self, row, width, height, camera: np.zeros((height, width, 3), np.uint8)  # noqa: E731
+    monkeypatch.setattr(type(world), "render", black)
     looked = filming.CloudView(world, 200)
     looked.reset(seed=0)
     pictures = [looked.render(row=row, width=60, height=50) for row in (0, 2)]

@@ -21,11 +21,11 @@ from bidex_meta.errors import BidexError
 from bidex_meta.runs import RunFolder, read_metrics
 from bidex_meta.train.distributed import TIMEOUT
 from tests.algos.ranks import same
+from tests.test_real_run import environment, final
 
 SMALL = ["--suite", "MT4", "--num-envs", "4", "--threads", "1", "--device", "cpu", "--seed", "3", "--no-evaluate"]
 SMALL += ["--learner.hidden", "16", "--learner.rollout-steps", "4", "--learner.num-minibatches", "2"]
 ITERATION = 2 * 4 * 4
-ROOT = Path(__file__).parents[1]
 
 # Checkpoints come once a minute; here, after every iteration. The weights of each process are kept for a look.
 _SCRIPT = """
@@ -48,11 +48,9 @@ def start(folder: Path, *arguments: object) -> subprocess.Popen[str]:
     script.write_text(_SCRIPT)
     # --standalone finds a free port, so that tests may run side by side.
     line = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script), "run"]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (ROOT, ROOT / "algos")))}
     line += map(str, arguments)
-    return subprocess.Popen(
-        line, env=environment, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    output = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return subprocess.Popen(line, env=environment(), cwd=folder, text=True, **output)
 
 
 def finish(process: subprocess.Popen[str]) -> tuple[int, list[str]]:
@@ -82,12 +80,6 @@ def wait_for_iterations(process: subprocess.Popen[str], path: Path, count: int) 
             return
         time.sleep(0.01)
     raise AssertionError(finish(process))
-
-
-def final(path: Path) -> tuple[dict[str, Any], int]:
-    loaded = RunFolder.open(path).checkpoints.load()
-    assert loaded is not None
-    return loaded
 
 
 def test_two_processes_train_mt4_and_end_with_equal_networks(tmp_path: Path) -> None:

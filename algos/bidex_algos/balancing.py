@@ -2,11 +2,11 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
+from typing_extensions import override
 
 from bidex_meta.train.distributed import all_sum, world_size
 from bidex_meta.train.learner import Parts
@@ -17,8 +17,7 @@ Balancing = Literal["none", "pcgrad", "cagrad", "famo"]
 class Balance(ABC):
     """Puts one gradient in the place of the sum of all tasks' losses."""
 
-    tag: ClassVar[str]
-    """Name of the number that it tells, in the log."""
+    tag: ClassVar[str]  # of the number that it reports
 
     @abstractmethod
     def backward(self, losses: Tensor, least: Tensor, parameters: Sequence[nn.Parameter]) -> Tensor:
@@ -63,10 +62,6 @@ def project_conflicting(gradients: Tensor) -> tuple[Tensor, Tensor]:
     return combination.sum(0) @ gradients, apart
 
 
-STEPS = 24
-"""Of the dual's solution; the last one's mu is 1e-8 of the mean gradient's square."""
-
-
 def conflict_averse(gradients: Tensor, radius: float) -> tuple[Tensor, Tensor]:
     """CAGrad (Liu et al. 2021): the sum of all gradients, turned towards those that it serves worst.
 
@@ -92,17 +87,16 @@ def conflict_averse(gradients: Tensor, radius: float) -> tuple[Tensor, Tensor]:
 def worst_served(gram: Tensor, even: Tensor, reach: Tensor) -> Tensor:
     """The weights w (n,) on the simplex that minimise w'G e + reach sqrt(w'G w), to 1e-4 of e'G e.
 
-    An interior-point method: the weights' logarithms, times a mu that is halved at each step, keep them positive, and a
-    cone of the same mu rounds off the tip where w'G w is 0, at which a descent along w would get stuck. Each step is
-    Newton's, as long as is best of some lengths. It looks at no number, so that a GPU need not be waited for. ``gram``:
-    products of the gradients (n, n), float64; ``even``: the weights e of the mean (n,), where it starts; ``reach``: A
-    scalar.
+    An interior-point method: logarithms of the weights, times a mu that is halved at each step, keep them positive, and
+    a cone of the same mu rounds off the tip where w'G w is 0. Each step is Newton's, as long as is best of some
+    lengths. It looks at no number, so that a GPU need not be waited for. ``gram``: products of the gradients (n, n),
+    float64; ``even``: the weights e of the mean (n,), where it starts.
     """
     weights, mean, square = even, gram @ even, reach.square()
     lengths = 0.7 ** torch.arange(15, dtype=gram.dtype, device=gram.device)[:, None]
     mu = 0.1 * (even @ mean).clamp_min(1e-30)
     diagonal = torch.eye(len(even), dtype=gram.dtype, device=gram.device)
-    for _ in range(STEPS):
+    for _ in range(24):  # the last mu is 1e-8 of the mean gradient's square
         own = gram @ weights
         root = (mu.square() + square * (weights @ own).clamp_min(0.0)).sqrt()
         pull = square / (mu + root)
@@ -128,8 +122,8 @@ class GradientBalance(Balance):
     def __init__(self, combine: Callable[[Tensor], tuple[Tensor, Tensor]]):
         self.combine = combine
 
+    @override
     def backward(self, losses: Tensor, least: Tensor, parameters: Sequence[nn.Parameter]) -> Tensor:
-        """As in the base."""
         gradient, apart = self.combine(all_sum(per_task_gradients(losses, parameters)))
         for parameter, part in zip(parameters, gradient.split([p.numel() for p in parameters]), strict=True):
             # All processes have the whole of it, and sum it.
@@ -143,14 +137,9 @@ _LEAST = 1e-8
 class Famo(Balance):
     """FAMO (Liu et al. 2023): weights of tasks under which all losses fall at the same rate, without a gradient each.
 
-        z = softmax(xi)
-        theta  down on  sum_i (z_i / l_i) l_i' / sum_j (z_j / l_j)    the mean of log l_i, weighted by z
-        xi     down on  J'(log l - log l after the step), J = dz / dxi
-
-    The slower a loss falls, the more it weighs. Losses have to be positive: what counts is how far each is above the
-    least that it can become (``min_losses`` of the authors' code). Adam moves xi with a decay towards even weights.
-    ``rate``: adam's step size of xi; ``decay``: by which xi is drawn to zero. ``logits``: xi (num_tasks,), float64, in
-    checkpoints.
+    theta goes down on sum_i (z_i / l_i) l_i' / sum_j (z_j / l_j), z = softmax(xi); xi down on J'(log l - log l after
+    the step), J = dz / dxi. Losses have to be positive: what counts is how far each is above the least that it can
+    become. Adam, of step size ``rate``, moves xi (``logits``, float64) with a ``decay`` towards even weights.
     """
 
     tag = "Policy/largest_weight"
@@ -185,14 +174,3 @@ class Famo(Balance):
     def parts(self) -> Parts:
         """What a checkpoint holds of it."""
         return {"famo_logits": self.logits, "famo_adam": self.adam}
-
-
-def balance_of(config: Any, num_tasks: int, device: torch.device) -> Balance | None:
-    """What a config's ``gradient_surgery`` names; None: the losses are summed."""
-    if config.gradient_surgery == "pcgrad":
-        return GradientBalance(project_conflicting)
-    if config.gradient_surgery == "cagrad":
-        return GradientBalance(partial(conflict_averse, radius=config.cagrad_radius))
-    if config.gradient_surgery == "famo":
-        return Famo(num_tasks, config.famo_rate, config.famo_decay, device)
-    return None

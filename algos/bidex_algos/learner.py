@@ -4,7 +4,7 @@ import copy
 import math
 import time
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any, ClassVar
@@ -33,12 +33,6 @@ def as_numbers(tensors: dict[str, Tensor]) -> dict[str, float]:
     return dict(zip(tensors, values, strict=True))
 
 
-def check_finite(metrics: dict[str, float], losses: Iterable[str], learner: str, steps: int, remedy: str) -> None:
-    """Ends a training that can no longer learn: a FloatingPointError where one of the ``losses`` is not finite."""
-    if not math.isfinite(sum(metrics.get(name, 0.0) for name in losses)):
-        raise FloatingPointError(f"{learner}: the loss is not finite after {steps} steps; {remedy}.")
-
-
 # What decides, beside the shapes of the weights, what they compute.
 _WORLD = ("observations", "actions", "task_id")
 _FORM = ("hidden", "activation", "normalise_observations", "reward_unit", "task_embedding", *_WORLD)
@@ -47,10 +41,9 @@ _FORM = ("hidden", "activation", "normalise_observations", "reward_unit", "task_
 class Learner(Contract):
     """Base of all learners of this package; ``policy`` acts, ``agent`` is what evaluation plays of it.
 
-    In a run of several processes each has a world, samples and ``generator`` of its own, and all have the same
-    networks: statistics and gradients are those of the samples of all, and so is ``env_steps``. Raises BidexError for a
-    world in another mode, with discounts of its classes where the learner has one for all, or without a one-hot that an
-    option needs.
+    Of several processes each has a world, samples and ``generator`` of its own, and all the same networks: statistics,
+    gradients and ``env_steps`` are of all. Raises BidexError for a world in another mode, with discounts of its classes
+    where the learner has one for all, or without a one-hot that an option needs.
     """
 
     remedy: ClassVar[str]
@@ -59,6 +52,12 @@ class Learner(Contract):
     """Its config, a dataclass."""
     discounts_by_class: ClassVar[bool] = False
     """Whether it takes the discount of each class where a world has some (``world.gammas``)."""
+    unit_embeddings: ClassVar[bool] = False
+    """Whether the vectors of ``task_embedding`` have length 1."""
+    going_on: ClassVar[tuple[str, ...]] = ("env_steps",)
+    """Attributes (tensors, numbers, None) from which the next iteration goes on: in the checkpoint too."""
+    policy_of: ClassVar[Callable[..., nn.Module]]
+    """Makes the policy of config, inputs, shape, a CPU generator for the weights, and device."""
 
     def __init__(self, world: VectorWorld, config: Any, seed: int):
         check_autoreset(world, self.name, self.autoreset_mode(config))
@@ -77,19 +76,15 @@ class Learner(Contract):
         self._collected = 0.0
 
     @classmethod
-    @abstractmethod
     def _make_policy(cls, config: Any, shape: Shape, init: torch.Generator, device: torch.device) -> nn.Module:
         """A policy with fresh weights, drawn from ``init`` (a CPU generator), on ``device``."""
+        return cls.policy_of(config, cls._inputs(config, shape), shape, init, device).to(device)
 
     @classmethod
-    def _inputs(cls, config: Any, shape: Shape) -> Inputs:
+    def _inputs(cls, config: LearnerConfig, shape: Shape) -> Inputs:
         """How its networks read an observation: the place for encoders of its groups."""
-        return with_task_embedding(with_point_net(Inputs(shape.groups), config), cls._embedded(config, shape))
-
-    @staticmethod
-    def _embedded(config: Any, shape: Shape) -> int:
-        """Size of a task's embedding, 0 where there is none."""
-        return vars(config).get("task_embedding", 0) if shape.num_id_columns else 0
+        size = vars(config).get("task_embedding", 0) if shape.num_id_columns else 0
+        return with_task_embedding(with_point_net(Inputs(shape.groups), config), size, cls.unit_embeddings)
 
     @abstractmethod
     def _iterate(self) -> dict[str, float]:
@@ -100,23 +95,24 @@ class Learner(Contract):
         """What a checkpoint holds beside the policy, by name."""
 
     def _place(self) -> State:
-        """Tensors, numbers and None from which the next iteration goes on, for the checkpoint."""
-        return {"env_steps": self.env_steps}
+        """What ``going_on`` names, and other plain values, for the checkpoint."""
+        return {name: vars(self)[name] for name in self.going_on}
 
     def _go_on_from(self, state: State) -> None:
-        """Puts back what :meth:`_place` gave, from a whole state."""
-        self.env_steps = int(state["env_steps"])
+        for name in self.going_on:
+            value = state[name]
+            vars(self)[name] = value.to(self.device, copy=True) if isinstance(value, Tensor) else value
 
     def _check_size(self, state: State) -> None:
-        """Refuses a state of a world of another size."""
         self._expect("", Shape.load(state["policy"]["shape"]).sizes(), self.shape.sizes())
 
     def iterate(self) -> dict[str, float]:
-        """Collects experience, learns from it; metrics (``docs/metrics.md``), or the error of :func:`check_finite`."""
+        """Collects experience, learns from it; metrics, or a FloatingPointError where a loss is not finite."""
         started, steps, self._collected = time.perf_counter(), self.env_steps, 0.0
         metrics = self._iterate()
-        judged = [name for name in metrics if name.startswith(("Loss/", "Policy/"))]
-        check_finite(metrics, judged, self.name, self.env_steps, self.remedy)
+        if not math.isfinite(sum(value for name, value in metrics.items() if name.startswith(("Loss/", "Policy/")))):
+            steps = self.env_steps
+            raise FloatingPointError(f"{self.name}: the loss is not finite after {steps} steps; {self.remedy}.")
         whole = time.perf_counter() - started
         metrics["Perf/collection_time"], metrics["Perf/learning_time"] = self._collected, whole - self._collected
         metrics["Perf/steps_per_second"] = (self.env_steps - steps) / whole
@@ -154,8 +150,7 @@ class Learner(Contract):
     def load_policy(cls, state: State, device: str | torch.device = "cpu") -> Any:
         """The agent of a checkpoint (its entry ``learner.policy``), for a world of any number of environments.
 
-        Raises:
-            ValueError: The config asks for other layers than the weights; found out before these take memory.
+        Raises ValueError where the config asks for other layers than the weights, before these take memory.
         """
         init, weights, sizes = torch.Generator().manual_seed(0), state["weights"], state["shape"]
         total = sum(weight.numel() for weight in weights.values())
@@ -176,7 +171,7 @@ class Learner(Contract):
         given = policy["config"] | _seen(Shape.load(policy["shape"]))
         _agree(own, given, _FORM)
         network, weights = _network(self.policy.state_dict()), _network(policy["weights"])
-        if {n: w.shape for n, w in network.items()} != {n: w.shape for n, w in weights.items()}:
+        if _shapes(network) != _shapes(weights):
             raise BidexError(
                 "Expected a policy to start from of the same kind (mtppo, mttrpo, promp and maml share one; mtsac and "
                 "rl2 have their own, other architectures, policy heads and a task embedding others), got one with "
@@ -198,8 +193,7 @@ class Learner(Contract):
         _restore(self._parts(), state)
         self._go_on_from(state)
 
-    def _expect(self, what: str, there: Any, here: Any) -> None:
-        """Refuses a state whose world was not as this one."""
+    def _expect(self, what: str, there: object, here: object) -> None:
         if there != here:
             raise BidexError(
                 f"{self.name}: the checkpoint's world had {what}{there}, this one has {here}. Resume with the run's "
@@ -208,7 +202,6 @@ class Learner(Contract):
 
 
 def _saved(part: Any) -> Any:
-    """A part of a learner as a part of its checkpoint, not yet copied."""
     if isinstance(part, dict):
         return {name: _saved(each) for name, each in part.items()}
     if isinstance(part, list):
@@ -220,7 +213,6 @@ def _saved(part: Any) -> Any:
 
 @torch.no_grad()
 def _restore(part: Any, state: Any) -> None:
-    """Puts a part of a checkpoint into the part of a learner that it was made of."""
     if isinstance(part, dict):
         for name, each in part.items():
             _restore(each, state[name])
@@ -241,13 +233,11 @@ def _network(weights: State) -> State:
 
 
 def _seen(shape: Shape) -> State:
-    """What of a world's shape a network's weights depend on."""
     ids = [[part.start, part.stop] for group in shape.groups if group.name == "task_id" for part in group.where]
     return dict(zip(_WORLD, (shape.observations, shape.actions, ids), strict=True))
 
 
 def _agree(own: State, given: State, names: tuple[str, ...]) -> None:
-    """Refuses what is not alike in both, where both know it."""
     for name in names:
         if name in own and name in given and _plain(own[name]) != _plain(given[name]):
             flag = f"--learner.{name.replace('_', '-')}"
@@ -258,7 +248,7 @@ def _agree(own: State, given: State, names: tuple[str, ...]) -> None:
             )
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     return list(value) if isinstance(value, tuple) else value
 
 

@@ -1,15 +1,13 @@
 """A replay with a part of its own for each task: the last vector steps of all environments, in a ring on the device.
 
-An observation is kept once, since it is both where one transition leads and where the next begins. Only where a time
-limit cut an episode does the world show another one; those last observations lie in a ring of their own. Nothing here
-has a shape that depends on data, and nothing makes the host wait for the device.
+An observation is kept once, as where one transition leads and the next begins; last ones before time limits lie in a
+ring of their own. No shape depends on data, and nothing makes the host wait for the device.
 """
 
 import math
 import sys
 from bisect import bisect_right
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,7 +15,7 @@ from torch import Tensor
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import is_main
 from bidex_meta.train.learner import State
-from bidex_meta.world.contract import VectorWorld
+from bidex_meta.world.contract import Info, VectorWorld
 
 
 @dataclass
@@ -44,10 +42,8 @@ class Replay:
         cut_share: float = 1 / 16
     ):  # fmt: skip
         rows = len(task_id)
-        self.steps, self.rows, self.num_tasks, self.device = steps, rows, num_tasks, device
-        self.added = 0
-        # One slot more than transitions: the newest observation has no transition yet.
-        self.slots = steps + 1
+        self.steps, self.rows, self.num_tasks, self.device, self.added = steps, rows, num_tasks, device, 0
+        self.slots = steps + 1  # one more than transitions: the newest observation has none yet
         self.cuts_kept = _cuts_kept(steps, rows, cut_share)
 
         # Not filled: an operating system gives memory when it is first written, and nothing is read before that.
@@ -66,7 +62,6 @@ class Replay:
         # The cell behind the last takes what nobody will read.
         self._final_obs = ring(self.cuts_kept + 1, observations)
         self._cuts = torch.zeros((), dtype=torch.int64, device=device)
-
         self._rows_of_task = torch.argsort(task_id, stable=True)
         self._count = torch.bincount(task_id, minlength=num_tasks)
         self._first = self._count.cumsum(0) - self._count
@@ -86,7 +81,7 @@ class Replay:
         self.obs.copy_(obs)
 
     def add(
-        self, actions: Tensor, reward: Tensor, terminated: Tensor, truncated: Tensor, obs: Tensor, info: dict[str, Any]
+        self, actions: Tensor, reward: Tensor, terminated: Tensor, truncated: Tensor, obs: Tensor, info: Info
     ) -> None:
         """Takes one vector step from ``self.obs``: ``actions`` (N, a) and what a world's ``step`` returned for them."""
         valid = ~info["unstable"]
@@ -96,17 +91,11 @@ class Replay:
         cell = torch.where(cut, (number - 1) % self.cuts_kept, self.cuts_kept)
         self._final_obs.index_copy_(0, cell, info["final_obs"])
         self._cuts += cut.sum()
-        step = {
-            "actions": actions,
-            # A weight of 0 does not undo a reward that is not a number.
-            "rewards": reward.masked_fill(~valid, 0.0),
-            "terminated": terminated,
-            "valid": valid,
-            "cut": number.masked_fill(~cut, 0),
-        }
-        slot = self.added % self.slots
+        # A weight of 0 does not undo a reward that is not a number.
+        rewards, numbers = reward.masked_fill(~valid, 0.0), number.masked_fill(~cut, 0)
+        step = {"actions": actions, "rewards": rewards, "terminated": terminated, "valid": valid, "cut": numbers}
         for name, value in step.items():
-            self._steps[name][slot] = value
+            self._steps[name][self.added % self.slots] = value
         self.added += 1
         self.obs.copy_(obs)
 
@@ -140,12 +129,10 @@ class Replay:
         cut = self.at("cut", last)
         final = self._final_obs.index_select(0, (cut - 1) % self.cuts_kept)
         return Transitions(
-            obs=everything.index_select(0, places),
-            actions=self.at("actions", places),
-            rewards=self.at("rewards", places),
-            next_obs=torch.where((cut > 0)[:, None], final, following),
-            terminated=self.at("terminated", last),
-        )
+            obs=everything.index_select(0, places), actions=self.at("actions", places),
+            rewards=self.at("rewards", places), next_obs=torch.where((cut > 0)[:, None], final, following),
+            terminated=self.at("terminated", last)
+        )  # fmt: skip
 
     def at(self, name: str, places: Tensor) -> Tensor:
         """What was stored under a name at ``places``, in their shape: rewards, terminated, valid, cut."""
@@ -155,13 +142,10 @@ class Replay:
         """A copy of all that was taken in."""
         cuts = min(int(self._cuts), self.cuts_kept)
         return {
-            "added": self.added,
-            "steps": self.steps,
-            "obs": self._obs[: self.added + 1].clone(),
+            "added": self.added, "steps": self.steps, "obs": self._obs[: self.added + 1].clone(),
             **{name: ring[: self.added].clone() for name, ring in self._steps.items()},
-            "final_obs": self._final_obs[:cuts].clone(),
-            "cuts": self._cuts.clone(),
-        }
+            "final_obs": self._final_obs[:cuts].clone(), "cuts": self._cuts.clone(),
+        }  # fmt: skip
 
     def load_state_dict(self, state: State) -> None:
         """Restores what :meth:`state_dict` gave. Raises BidexError: it comes from a replay of another size."""
@@ -185,13 +169,10 @@ def replay_bytes(steps: int, rows: int, observations: int, actions: int, cut_sha
     return (steps + 1) * rows * transition + (_cuts_kept(steps, rows, cut_share) + 1) * 4 * observations
 
 
-def steps_within(
-    memory: float, steps: int, rows: int, observations: int, actions: int, cut_share: float = 1 / 16
-) -> int:
+def steps_within(memory: float, steps: int, rows: int, observations: int, actions: int, cut_share: float) -> int:
     """The most vector steps, up to ``steps``, that take no more than ``memory`` bytes; 0 if not even one does."""
-    return bisect_right(
-        range(1, steps + 1), memory, key=lambda n: replay_bytes(n, rows, observations, actions, cut_share)
-    )
+    sizes = rows, observations, actions, cut_share
+    return bisect_right(range(1, steps + 1), memory, key=lambda n: replay_bytes(n, *sizes))
 
 
 def _cuts_kept(steps: int, rows: int, cut_share: float) -> int:
@@ -243,10 +224,7 @@ def replay_within(
     if steps == 0:
         raise BidexError(f"{learner}: replay_memory {memory:g} GB holds not one step of {rows} environments. Raise it.")
     if steps < asked and is_main():
-        print(
-            f"{learner}: a replay of {asked:,} vector steps ({asked * rows:,} transitions) needs {needed:.1f} GB; "
-            f"replay_memory is {memory:g} GB: it keeps {steps:,} ({steps * rows:,} transitions).",
-            file=sys.stderr,
-            flush=True,
-        )
+        kept = f"it keeps {steps:,} ({steps * rows:,} transitions)."
+        said = f"{learner}: a replay of {asked:,} vector steps ({asked * rows:,} transitions) needs {needed:.1f} GB; "
+        print(f"{said}replay_memory is {memory:g} GB: {kept}", file=sys.stderr, flush=True)
     return Replay(steps, world.task_id, world.num_tasks, observations, actions, world.device, share)

@@ -1,7 +1,6 @@
 """A stretch of transitions of all environments, and the loop that collects it; shared by the on-policy learners."""
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -9,24 +8,21 @@ from torch import Tensor
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import all_sum
 from bidex_meta.utils.maths import check_precision
-from bidex_meta.world.contract import VectorWorld
+from bidex_meta.world.contract import Info, VectorWorld
 
 
 class EpisodeStatistics:
     """Fading sums over about the last ``window`` finished episodes of each task, in each process.
 
-    A rollout is shorter than an episode, so the episodes that happen to end in one are few and, for a slow task, often
-    none: an average over one rollout would jump. ``task_id`` is that of each environment, int64 (N,).
+    Few episodes end in one rollout, and often none of a slow task. ``task_id``: of each environment, int64 (N,).
     """
 
     def __init__(self, task_id: Tensor, task_names: list[str], window: float = 100.0):
-        self.task_id = task_id
-        self.task_names = task_names
-        self.window = window
+        self.task_id, self.task_names, self.window = task_id, task_names, window
         # Rows: return, length, success, count.
         self.sums = torch.zeros(4, len(task_names), device=task_id.device)
 
-    def update(self, info: dict[str, Any]) -> None:
+    def update(self, info: Info) -> None:
         """Takes in the episodes that ``info["counted"]`` says ended in this step."""
         episode, ended = info["so_far"], info["counted"]
         values = torch.stack([episode["r"].float(), episode["l"].float(), episode["success"].float(), ended.float()])
@@ -99,9 +95,13 @@ def collect(
         rollout.rewards[t] = reward.masked_fill(~valid, 0.0)
         rollout.terminated[t], rollout.ended[t], rollout.valid[t] = terminated, terminated | truncated | ~valid, valid
         cut = truncated & ~terminated & valid
-        rollout.final_values[t] = _values_where(
-            cut, info["final_obs"], world.task_id, final_value, rollout.final_values[t]
-        )
+        values, final_obs = rollout.final_values[t].zero_(), info["final_obs"]
+        if not may_look(cut.device):
+            # A forward of all environments is cheaper than the wait for which rows there are.
+            there = cut.view(-1, *[1] * (values.dim() - 1))
+            values.copy_(torch.where(there, final_value(final_obs, world.task_id), 0.0))
+        elif len(rows := cut.nonzero().squeeze(-1)):
+            values[rows] = final_value(final_obs[rows], world.task_id[rows])
         episodes.update(info)
     rollout.last_obs.copy_(obs)
     return obs
@@ -121,15 +121,3 @@ def check_autoreset(world: VectorWorld, learner: str, expected: str) -> None:
 def may_look(device: torch.device) -> bool:
     """Whether asking a tensor for its values costs nothing: elsewhere the host would wait for the device."""
     return device.type == "cpu"
-
-
-def _values_where(cut: Tensor, final_obs: Tensor, task_id: Tensor, final_value: FinalValue, like: Tensor) -> Tensor:
-    """Values of ``final_obs`` in the rows ``cut``, 0 elsewhere; of the shape of ``like``."""
-    values = torch.zeros_like(like)
-    if not may_look(cut.device):
-        # A forward of all environments is cheaper than the wait for which rows there are.
-        return torch.where(cut.view(-1, *[1] * (like.dim() - 1)), final_value(final_obs, task_id), values)
-    rows = cut.nonzero().squeeze(-1)
-    if len(rows):
-        values[rows] = final_value(final_obs[rows], task_id[rows])
-    return values

@@ -1,7 +1,7 @@
 """A step as far as the KL allows: conjugate gradients, Fisher-vector products and line search, on flat vectors."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -59,29 +59,14 @@ def fisher_product(kl: Tensor, parameters: Sequence[nn.Parameter], damping: floa
     return product
 
 
-def natural_step(
-    objective: Tensor, kl: Tensor, parameters: Sequence[nn.Parameter], *, max_kl: float, damping: float, iterations: int
-) -> tuple[Tensor, float]:
-    """The step (P,) along F^-1 g that has the KL ``max_kl`` to second order, and the rise it promises.
-
-    ``objective`` is this process's part of what shall rise, with its graph; ``kl`` as for :func:`fisher_product`.
-    """
-    gradient = all_sum(flatten(torch.autograd.grad(objective, parameters, retain_graph=True)))
-    product = fisher_product(kl, parameters, damping)
-    direction = conjugate_gradient(product, gradient, iterations)
-    curvature = direction.dot(product(direction)).clamp_min(1e-12)
-    step = torch.sqrt(2.0 * max_kl / curvature) * direction
-    return step, float(gradient.dot(step))
-
-
 def line_search(
     parameters: Sequence[nn.Parameter], step: Tensor, measure: Callable[[], tuple[float, float]], *, expected: float,
     max_kl: float, accept_ratio: float, factor: float, tries: int
 ) -> float:  # fmt: skip
-    """Goes back along ``step`` (P,) until the objective has risen and the KL is kept; else nothing changes.
+    """Goes back along ``step`` (P,) until the objective has risen and the KL is kept; else nothing changes: 0.
 
-    ``measure`` gives objective and KL of the present parameters; ``expected`` is the rise promised for the whole step,
-    of which ``accept_ratio`` must come true. Returns the accepted share of the step, 0 if there was none.
+    ``measure`` gives both; of the rise ``expected`` of the whole step ``accept_ratio`` must come true. Returns the
+    share.
     """
     start = flatten(parameters).detach().clone()
     before, _ = measure()
@@ -97,31 +82,24 @@ def line_search(
     return 0.0
 
 
-class Stepped(NamedTuple):
-    """What a trust-region step has come to."""
-
-    objective: float  # the objective where it ended
-    kl: float  # KL from the sampling policy there
-    share: float  # share of the natural step that was taken; 0: the parameters are as before
-
-    def reported(self, kl_tag: str, device: torch.device) -> dict[str, Tensor]:
-        """Scalars to be logged."""
-        found = {"Loss/surrogate": -self.objective, kl_tag: self.kl, "Policy/step_share": self.share}
-        return {name: torch.tensor(value, device=device) for name, value in found.items()}
-
-
 def trust_region_step(
     parameters: Sequence[nn.Parameter], objective: Tensor, kl: Tensor, measure: Callable[[], tuple[float, float]],
-    config: Any, max_kl: float, accept_ratio: float = 0.0
-) -> Stepped:  # fmt: skip
-    """Moves parameters along :func:`natural_step`, back along it by :func:`line_search`.
+    config: Any, max_kl: float, kl_tag: str, accept_ratio: float = 0.0
+) -> dict[str, Tensor]:  # fmt: skip
+    """Goes along F^-1 g as far as has the KL ``max_kl`` to second order, and back by :func:`line_search`.
 
-    The config has ``damping``, ``cg_iterations``, ``backtracks`` and ``backtrack_factor``.
+    Returns scalars to be logged. ``objective`` is this process's part of what shall rise, with its graph, ``kl`` as for
+    :func:`fisher_product`. The config has ``damping``, ``cg_iterations``, ``backtracks`` and ``backtrack_factor``.
     """
-    damping, iterations = config.damping, config.cg_iterations
-    step, promised = natural_step(objective, kl, parameters, max_kl=max_kl, damping=damping, iterations=iterations)
+    gradient = all_sum(flatten(torch.autograd.grad(objective, parameters, retain_graph=True)))
+    product = fisher_product(kl, parameters, config.damping)
+    direction = conjugate_gradient(product, gradient, config.cg_iterations)
+    curvature = direction.dot(product(direction)).clamp_min(1e-12)
+    step = torch.sqrt(2.0 * max_kl / curvature) * direction
     share = line_search(
-        parameters, step, measure, expected=promised, max_kl=max_kl, accept_ratio=accept_ratio,
+        parameters, step, measure, expected=float(gradient.dot(step)), max_kl=max_kl, accept_ratio=accept_ratio,
         factor=config.backtrack_factor, tries=config.backtracks
     )  # fmt: skip
-    return Stepped(*measure(), share)
+    rise, moved = measure()
+    found = {"Loss/surrogate": -rise, kl_tag: moved, "Policy/step_share": share}
+    return {name: torch.tensor(value, device=gradient.device) for name, value in found.items()}

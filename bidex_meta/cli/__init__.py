@@ -31,7 +31,6 @@ from bidex_meta.utils.streams import open_missing, silence, unread
 
 _LONGEST = 2000
 """Letters of an error: what was given may be any text."""
-_EXAMPLE = "bidex-meta run --suite MT4 --algo mtppo"
 
 
 class Command(NamedTuple):
@@ -63,18 +62,11 @@ COMMANDS: dict[str, Command] = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line.
+    """Run the command line of what follows ``bidex-meta``, the process's own by default, and return the exit code.
 
-    Args:
-        arguments: What follows ``bidex-meta``; the process's own by default.
-
-    Returns:
-        The exit code: 0, 1 where training diverged or a run differs from what it recorded, 2 for bad input or what the
-        system refuses (a full disk, a folder that cannot be written, no memory), 129 after SIGHUP, 130 after Ctrl-C,
-        141 where nobody reads stderr any more, 143 after SIGTERM (0 where training saved and ended at SIGTERM).
-
-    Raises:
-        SystemExit: With another exit code, from a subcommand.
+    0, 1 where training diverged or a run differs from what it recorded, 2 for bad input or what the system refuses (a
+    full disk, a folder that cannot be written, no memory), 129 after SIGHUP, 130 after Ctrl-C, 141 where nobody reads
+    stderr any more, 143 after SIGTERM (0 where training saved and ended at SIGTERM). A subcommand may raise SystemExit.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in given
@@ -83,7 +75,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with _signals_raise():
             try:
-                _check_text(given)
                 return _dispatch(given)
             finally:
                 sys.stdout.flush()  # at Python's own end nobody would catch that it cannot be written
@@ -158,6 +149,13 @@ def _failed(reason: str, code: int, debug: bool) -> int:
 
 
 def _dispatch(arguments: list[str]) -> int:
+    for word in arguments:
+        try:
+            word.encode()  # Python gives bytes as surrogates, which go into no config, log or event file
+        except UnicodeEncodeError:
+            raise BidexError(
+                f"Expected arguments in UTF-8, got {shortened(word)}. Rename the file or folder, or name another."
+            ) from None
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_help())
         return 0
@@ -176,30 +174,16 @@ def _dispatch(arguments: list[str]) -> int:
     return 0
 
 
-def _check_text(arguments: Sequence[str]) -> None:
-    """Refuses what cannot be written into a config, a log or an event file; Python gives such bytes as surrogates."""
-    for word in arguments:
-        try:
-            word.encode()
-        except UnicodeEncodeError:
-            raise BidexError(
-                f"Expected arguments in UTF-8, got {shortened(word)}. Rename the file or folder, or name another."
-            ) from None
-
-
 def _help() -> str:
     width = max(map(len, COMMANDS))
-    commands = [f"  {name:<{width}}  {command.summary}" for name, command in COMMANDS.items()]
-    return "\n".join(
-        [
-            "Multi-task and meta reinforcement learning for two dexterous hands: train, judge and look at policies.",
-            f"Example: {_EXAMPLE}",
-            "",
-            "usage: bidex-meta COMMAND [OPTIONS]",
-            "",
-            *commands,
-            "",
-            "bidex-meta COMMAND --help shows the options of a command; --debug shows the traceback of an error;",
-            "--version the version.",
-        ]
-    )
+    commands = "\n".join(f"  {name:<{width}}  {command.summary}" for name, command in COMMANDS.items())
+    return f"""\
+Multi-task and meta reinforcement learning for two dexterous hands: train, judge and look at policies.
+Example: bidex-meta run --suite MT4 --algo mtppo
+
+usage: bidex-meta COMMAND [OPTIONS]
+
+{commands}
+
+bidex-meta COMMAND --help shows the options of a command; --debug shows the traceback of an error;
+--version the version."""

@@ -8,8 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from bidex_meta.agents import Agent
-from bidex_meta.cli.parsing import Switch, parse
+from bidex_meta.cli.parsing import JsonSwitch, parse
 from bidex_meta.cli.tables import evaluation_table, print_table
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.evaluation import references
@@ -21,7 +20,6 @@ from bidex_meta.utils.validation import Few, Seed, Threads
 from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted
 from bidex_meta.witness.scripts import SCRIPTS
 from bidex_meta.witness.store import load_witness, witness_path
-from bidex_meta.world.contract import TaskWorld
 from bidex_meta.world.world import World
 from bidex_meta.worlds import WorldConfig, Worlds
 
@@ -58,8 +56,7 @@ class BaselineFlags:
     out: Path | None = None
     """JSON file that takes the figures, beside those it has of other classes; None: print them alone. `evaluate` reads
     assets/references/ of the installation, which is not written unless this names it."""
-    json: Switch = False
-    """Print JSON."""
+    json: JsonSwitch = False
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -88,7 +85,15 @@ def main(arguments: Sequence[str]) -> None:
 
 def _played(what: str, worlds: Worlds, flags: BaselineFlags) -> Evaluation:
     world = worlds.world()
-    agent, names = _agent(what, world, flags.seed)
+    names = world.task_names
+    if what == "random":
+        agent = RandomAgent(world.action_space, flags.seed)
+    elif what == "zero":
+        agent = ZeroAgent(world.action_space)
+    else:
+        witnesses = {name: load_witness(name) for name in names if witness_path(name).is_file()}
+        agent = OpenLoopReplay(witnesses, list(names), world.task_id, world.single_action_space.shape[0])
+        names = list(witnesses)
     found = evaluate(agent, world, flags.episodes, seed=EVALUATION_SEED, references={})
     world.close()
     return replace(found, classes={name: found.classes[name] for name in names})
@@ -104,19 +109,6 @@ def _scripted(worlds: Worlds, flags: BaselineFlags) -> Evaluation:
         config = WorldConfig(task=name, base="moving", seed=flags.seed, engine="c", threads=flags.threads)
         world = Worlds.open(config).world()
         assert isinstance(world, World)
-        played = evaluate(Scripted(world), world, flags.episodes, seed=EVALUATION_SEED, references={})
-        classes |= played.classes
+        classes |= evaluate(Scripted(world), world, flags.episodes, seed=EVALUATION_SEED, references={}).classes
         world.close()
     return Evaluation(classes, flags.episodes)
-
-
-def _agent(what: str, world: TaskWorld, seed: int) -> tuple[Agent, list[str]]:
-    """The policy, and the classes that it can play."""
-    names = list(world.task_names)
-    if what == "random":
-        return RandomAgent(world.action_space, seed), names
-    if what == "zero":
-        return ZeroAgent(world.action_space), names
-    witnesses = {name: load_witness(name) for name in names if witness_path(name).is_file()}
-    agent = OpenLoopReplay(witnesses, names, world.task_id, world.single_action_space.shape[0])
-    return agent, list(witnesses)

@@ -5,19 +5,19 @@ import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
+import torch
 import tyro
 
-from bidex_meta.cli.parsing import Switch, parse
+from bidex_meta.benchmark import Benchmark
+from bidex_meta.cli.parsing import Device, JsonSwitch, parse
+from bidex_meta.cli.tables import Json, plain_table, print_table
 from bidex_meta.config import Steps
 from bidex_meta.errors import BidexError, known_name
+from bidex_meta.utils.memory import usable_cores
 from bidex_meta.utils.validation import Environments, Few, Seed, Threads
-
-if TYPE_CHECKING:
-    import torch
-
-    from bidex_meta.world import World
+from bidex_meta.world import World
 
 
 @dataclass(frozen=True)
@@ -39,14 +39,12 @@ class BenchFlags:
     """Interleaved repeats; medians are reported."""
     threads: Threads | None = None
     """Threads of the physics on a CPU; None takes all cores."""
-    device: str = "cpu"
-    """auto, cpu or cuda:N."""
+    device: Device = "cpu"
     engine: str = "auto"
     """auto, c or warp."""
     seed: Seed = 0
     """Seed of world and actions."""
-    json: Switch = False
-    """Print JSON."""
+    json: JsonSwitch = False
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -59,25 +57,16 @@ def main(arguments: Sequence[str]) -> None:
     if flags.json:
         print(json.dumps(result, indent=2))
         return
-    from bidex_meta.cli.tables import plain_table, print_table
-
     print_table(plain_table(["measure", "value"], list(result.items())))
 
 
-def world_speed(flags: BenchFlags) -> dict[str, Any]:
-    """Speed of the whole world against bare engine steps, in turns within one process.
+def world_speed(flags: BenchFlags) -> Json:
+    """Medians of environment steps per second of the whole world and of bare engines, in turns within one process.
 
     The engines of a second world are stepped bare: the same states, controls, threads, sensors and substeps. They
-    follow the first world's resets outside the clock, so both do the same physics.
-
-    ``env_steps_per_s``, ``engine_steps_per_s`` (also in environment steps) and their ``ratio`` are medians; ``groups``
-    is the number of environments in each engine batch.
+    follow the first world's resets outside the clock, so both do the same physics. ``ratio`` is the median of ratios;
+    ``groups`` has the number of environments in each engine batch.
     """
-    import torch
-
-    from bidex_meta.benchmark import Benchmark
-    from bidex_meta.utils.memory import usable_cores
-
     options = {"device": flags.device, "num_envs": flags.num_envs, "threads": flags.threads, "engine": flags.engine}
     full, bare = (Benchmark(flags.suite, seed=flags.seed).make_world("train", **options) for _ in range(2))
     full.reset(seed=flags.seed)
@@ -87,19 +76,16 @@ def world_speed(flags: BenchFlags) -> dict[str, Any]:
     times = [paired_steps(full, bare, flags.steps, generator) for _ in range(flags.repeats)]
     steps = flags.num_envs * flags.steps
     return {
-        "suite": flags.suite,
-        "num_envs": flags.num_envs,
-        "threads": flags.threads or usable_cores(),
+        "suite": flags.suite, "num_envs": flags.num_envs, "threads": flags.threads or usable_cores(),
         "env_steps_per_s": round(statistics.median(steps / t for t, _ in times)),
         "engine_steps_per_s": round(statistics.median(steps / t for _, t in times)),
         "ratio": round(statistics.median(b / f for f, b in times), 4),
         "groups": [part.group.engine.num for part in full.parts],
-    }
+    }  # fmt: skip
 
 
-def paired_steps(full: "World", bare: "World", steps: int, generator: "torch.Generator") -> tuple[float, float]:
+def paired_steps(full: World, bare: World, steps: int, generator: torch.Generator) -> tuple[float, float]:
     """Seconds that a world and the bare engines of its twin take for the same random steps."""
-    import torch
 
     def now() -> float:
         if full.device.type == "cuda":

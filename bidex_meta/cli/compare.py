@@ -4,10 +4,10 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from bidex_meta.cli.parsing import RunPaths, Switch, named_runs, parse
-from bidex_meta.cli.tables import class_table, group_table, plain_table, print_table
+from bidex_meta.cli.parsing import JsonSwitch, RunPaths, parse
+from bidex_meta.cli.plot import named_runs
+from bidex_meta.cli.tables import NONE, Json, plain_table, print_table
 from bidex_meta.evaluation.comparison import Group, estimates, iqm, read_groups, score_over, success_over
 from bidex_meta.runs import plots
 
@@ -21,18 +21,13 @@ class CompareFlags:
 
     runs: RunPaths
     """Run folders, or files of results/data/."""
-    json: Switch = False
-    """Print JSON."""
+    json: JsonSwitch = False
     out: Path | None = None
     """Also draw success and score of the groups, with their intervals, into this picture (.png, .svg, .pdf)."""
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Read, compare, print.
-
-    Raises:
-        BidexError: No run is named, or one is not a run folder or not evaluated.
-    """
+    """Read, compare, print."""
     flags = parse(CompareFlags, arguments, "compare")
     groups = read_groups(named_runs(flags.runs, "compare"))
     if flags.out is not None:
@@ -45,8 +40,8 @@ def main(arguments: Sequence[str]) -> None:
     print("IQM over seeds and classes [95 % bootstrap over seeds]. An interval that holds 0 is no difference.")
 
 
-def _row(group: Group, first: Group) -> dict[str, Any]:
-    row: dict[str, Any] = {
+def _row(group: Group, first: Group) -> Json:
+    row: Json = {
         "group": group.label, "seeds": group.seeds, "steps": group.steps, "steps_range": list(group.steps_range),
         "hours": round(group.hours, 3),
     }  # fmt: skip
@@ -61,3 +56,34 @@ def _row(group: Group, first: Group) -> dict[str, Any]:
         for i, name in enumerate(group.classes)
     }
     return row
+
+
+def group_table(groups: Sequence[Group]) -> tuple[list[str], list[list[str]]]:
+    """Columns and rows of groups of runs beside each other, each measured against the first."""
+    columns = ["group", "seeds", "steps", "hours", "success, IQM (%)", "score, IQM"]
+    rows = []
+    for group in groups:
+        score = None if group.scores is None else iqm(group.scores)
+        measures = (iqm(group.success), 100.0, ".1f"), (score, 1.0, ".1f")
+        over = (success_over(group, groups[0]), 100.0, "+.1f"), (score_over(group, groups[0]), 1.0, "+.1f")
+        cells = [NONE if each is None else each.text(factor, form=form) for each, factor, form in (*measures, *over)]
+        seeds = ", ".join(map(str, group.seeds))
+        rows.append([group.label, seeds, group.steps_text(), f"{group.hours:.2f}", *cells])
+    return [*columns, "success over the first", "score over the first"], rows
+
+
+def class_table(groups: Sequence[Group]) -> tuple[list[str], list[list[str]]]:
+    """Columns and rows of each class by name: mean over seeds, and the seeds' range."""
+    names = list(dict.fromkeys(name for group in groups for name in group.classes))
+    rows = []
+    for group in groups:
+        for measure, table, factor, unit in (
+            ("success", group.success, 100.0, " %"),
+            ("return", group.returns, 1.0, ""),
+        ):
+            cells = {
+                name: f"{factor * of.mean():.4g}{unit} ({factor * of.min():.4g} to {factor * of.max():.4g})"
+                for name, of in zip(group.classes, table.T, strict=True)
+            }
+            rows.append([group.label, measure, *(cells.get(name, NONE) for name in names)])
+    return ["group", "measure", *names], rows

@@ -4,13 +4,16 @@ import contextlib
 import importlib
 import io
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
-from bidex_meta.cli.parsing import FlagsFound, flags_of, parse
+from bidex_meta.cli.learners import ALGOS
+from bidex_meta.cli.parsing import flags_of, parse
+from bidex_meta.tasks import registry
+from bidex_meta.worlds import suites_to_run
 
 
 @dataclass(frozen=True)
@@ -30,11 +33,21 @@ def main(arguments: Sequence[str]) -> None:
     """Print the script. Flags of ``run`` that are the learner's are MT-PPO's."""
     shell = parse(CompletionFlags, arguments, "completion").shell
     from bidex_meta.cli import COMMANDS
+    from bidex_meta.tasks.objects.held import EGG, shelf
+
+    choices = {"--suite": suites_to_run(), "--task": registry.names(), "--algo": list(ALGOS)}
+    choices["--object"] = [EGG, *shelf()]
 
     app = tyro.extras.SubcommandApp()
     for name, command in COMMANDS.items():
         found = flags_of(importlib.import_module(command.module).main)
-        app.command(name=name, help=command.summary)(_takes(found))
+
+        def takes(flags: object) -> None: ...
+
+        # tyro reads flags from a function's annotations; a name of its own would stand before every flag.
+        takes.__annotations__["flags"] = Annotated[found.options, tyro.conf.arg(name="")]
+        takes.__defaults__ = None if found.default is None else (found.default,)
+        app.command(name=name, help=command.summary)(takes)
     script = io.StringIO()
     # tyro prints and exits.
     with contextlib.redirect_stdout(script), contextlib.suppress(SystemExit):
@@ -43,30 +56,8 @@ def main(arguments: Sequence[str]) -> None:
         if line.startswith("COMPLETION_SPEC = "):
             # tyro's script gives a line to each completion, but keeps the line breaks of help texts.
             line = re.sub(r"\\+n", " ", line)
-            for flag, names in _names().items():
+            for flag, names in choices.items():
                 line = re.sub(
                     rf"({{'flags': \['{flag}'\].*?)'type': '\w+'", rf"\1'type': 'choice', 'choices': {names}", line
                 )
         print(line)
-
-
-def _names() -> dict[str, list[str]]:
-    """What the values of flags may be."""
-    from bidex_meta.cli.learners import ALGOS
-    from bidex_meta.tasks import registry
-    from bidex_meta.tasks.objects.held import EGG, shelf
-    from bidex_meta.worlds import suites_to_run
-
-    names = {"--suite": suites_to_run(), "--task": registry.names(), "--algo": list(ALGOS)}
-    return {**names, "--object": [EGG, *shelf()]}
-
-
-def _takes(found: FlagsFound) -> Callable[..., None]:
-    """A function of a command's flags, from which tyro reads them."""
-
-    def command(flags: Any) -> None: ...
-
-    # A name of its own would stand before every flag.
-    command.__annotations__["flags"] = Annotated[found.options, tyro.conf.arg(name="")]
-    command.__defaults__ = None if found.default is None else (found.default,)
-    return command

@@ -1,17 +1,15 @@
 """``bidex-meta control``: is it the task's own data that adaptation learns from?"""
 
 import json
-import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
 
 from bidex_meta.cli import metatest
 from bidex_meta.cli.learners import learner_kind, resolve_device
-from bidex_meta.cli.parsing import RunPaths, Switch, parse
+from bidex_meta.cli.parsing import Device, Engine, JsonSwitch, RunPaths, parse
 from bidex_meta.cli.policies import policy_loader
-from bidex_meta.cli.tables import control_table, print_table
+from bidex_meta.cli.tables import Json, gained, percent, plain, print_table, say, titled
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import run_kind
 from bidex_meta.evaluation.control_arms import Control, arms, control
@@ -45,20 +43,13 @@ class ControlFlags:
     """Environments stepped together at most; bounds memory."""
     seed: Seed | None = None
     """Seed of the episodes' starts; None: one that training does not use."""
-    device: str = "auto"
-    """auto, cpu or cuda:N."""
-    engine: Literal["auto", "c", "warp"] = "auto"
-    """Physics; auto: the one that is fast on the device."""
-    json: Switch = False
-    """Print JSON."""
+    device: Device = "auto"
+    engine: Engine = "auto"
+    json: JsonSwitch = False
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Play all arms of all runs and print a table of each class, or JSON.
-
-    Raises:
-        BidexError: No run is named, one cannot be used, or they are not seeds of one experiment.
-    """
+    """Play all arms of all runs and print a table of each class, or JSON."""
     flags = parse(ControlFlags, arguments, "control")
     if not flags.runs:
         raise BidexError("Name the run folders: bidex-meta control RUN...")
@@ -71,25 +62,33 @@ def main(arguments: Sequence[str]) -> None:
     found = {name: arms(played, name, tasks[name]) for name in played[0].own.classes}
     episodes = {name: result.episodes * len(played) for name, result in played[0].own.classes.items()}
     if flags.json:
-        report = {
-            "runs": [str(folder.path) for folder in folders],
-            "shots": flags.shots,
-            "rollouts": played[0].rollouts,
-            "trials": flags.trials,
-            "episodes": episodes,
-            "classes": {
-                name: {arm: _plain(values) for arm, values in by_arm.items()} for name, by_arm in found.items()
-            },
-        }
-        print(json.dumps(report, indent=2))
+        report = {"runs": [str(folder.path) for folder in folders], "shots": flags.shots, "trials": flags.trials}
+        report |= {"rollouts": played[0].rollouts, "episodes": episodes}
+        classes = {name: {arm: _plain(of) for arm, of in by_arm.items()} for name, by_arm in found.items()}
+        print(json.dumps(report | {"classes": classes}, indent=2))
         return
     for name, by_arm in found.items():
         title = f"{config.algo} on {worlds.name}, held-out tasks of {name}, "
         title += f"{len(played)} run{'s' * (len(played) > 1)}, {episodes[name]:,} episodes an arm"
-        print_table(control_table(title, by_arm))
+        _print_table(title, by_arm)
 
 
-def _plain(arm: dict[str, Any]) -> dict[str, Any]:
+def _print_table(title: str, by_arm: Mapping[str, Json]) -> None:
+    """An arm a row."""
+    caption = (
+        "gains: own data above this arm, same starts; [..] 95 % bootstrap interval over runs, adaptations, episodes"
+    )
+    headers = ("return", "return of each run", "success", "success gained", "return gained", "score gained")
+    table = titled(title, caption, ["adapted to"], headers)
+    labels = {"before": "nothing", "own": "its own data", "foreign": "train tasks' data, mean"}
+    for arm, of in by_arm.items():
+        cells = [labels.get(arm) or plain(f"data of {arm}"), f"{of['return']:.4g}"]
+        cells += [" ".join(f"{value:.4g}" for value in of["runs"]), percent(of["success"])]
+        table.add_row(*cells, *(gained(of["own_minus"]) if "own_minus" in of else []))
+    print_table(table)
+
+
+def _plain(arm: Json) -> Json:
     gains = arm.get("own_minus", {})
     return arm | {"own_minus": {name: None if gain is None else asdict(gain) for name, gain in gains.items()}}
 
@@ -103,13 +102,9 @@ def _check(folders: Sequence[RunFolder]) -> None:
         if not learner_kind(config.algo).make.adapts:
             raise BidexError(f"{folder.path}: {config.algo} does not adapt to tasks. Name runs of maml, promp or rl2.")
         metatest.check_worlds(Worlds.open(config.to_json()), config.algo)
-        if config.seed in seeds:
-            raise BidexError(
-                f"{folder.path} and {seeds[config.seed]} both have seed {config.seed}. Name one run for each seed."
-            )
-        seeds[config.seed] = folder.path
-        differing = [name for name, value in run_kind(config).items() if value != first.get(name)]
-        if differing:
+        if (other := seeds.setdefault(config.seed, folder.path)) is not folder.path:
+            raise BidexError(f"{folder.path} and {other} both have seed {config.seed}. Name one run for each seed.")
+        if differing := [name for name, value in run_kind(config).items() if value != first.get(name)]:
             raise BidexError(
                 f"Expected runs that differ in the seed alone, but {folders[0].path} and {folder.path} differ in "
                 f"{', '.join(differing)}. Name them in separate calls."
@@ -117,7 +112,6 @@ def _check(folders: Sequence[RunFolder]) -> None:
 
 
 def _play(folder: RunFolder, flags: ControlFlags) -> Control:
-    """The arms of one run."""
     stored = folder.config()
     device = resolve_device(flags.device, Worlds.open(stored.to_json()).on_gpu)
     config = replace(stored, device=device, engine=flags.engine)
@@ -126,25 +120,14 @@ def _play(folder: RunFolder, flags: ControlFlags) -> Control:
     counts = [len(pool) for pool in worlds.tasks("test").values()]
     rollouts = metatest.rollouts_of(worlds, config, flags.rollouts, max(1, flags.num_envs // len(counts)))
     size = metatest.environments_for(len(counts), max(counts) * flags.trials, rollouts, flags.num_envs)
-    _say(f"{folder.path}: {flags.trials} adaptations of each held-out task, {size} environments.")
+    say(f"{folder.path}: {flags.trials} adaptations of each held-out task, {size} environments.")
     test, train = (worlds.world(split, size) for split in ("test", "train"))
+    seed = EVALUATION_SEED if flags.seed is None else flags.seed
     found = control(
-        policy_loader(folder, device)[0],
-        test,
-        train,
-        flags.shots,
-        say=_say,
-        rollouts=rollouts,
-        episodes_per_task=flags.episodes,
-        trials=flags.trials,
-        max_adapt_steps=metatest.adapt_steps_of(config),
-        seed=EVALUATION_SEED if flags.seed is None else flags.seed,
-        references=worlds.references(),
-    )
+        policy_loader(folder, device)[0], test, train, flags.shots, say=say, rollouts=rollouts,
+        episodes_per_task=flags.episodes, trials=flags.trials, max_adapt_steps=metatest.adapt_steps_of(config),
+        seed=seed, references=worlds.references(),
+    )  # fmt: skip
     test.close()
     train.close()
     return found
-
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)

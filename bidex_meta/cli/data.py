@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from bidex_meta.cli.parsing import Switch, parse
-from bidex_meta.cli.tables import plain_table, print_table
+from bidex_meta.cli.parsing import JsonSwitch, parse
+from bidex_meta.cli.tables import Json, print_rows
 from bidex_meta.data.dataset import data_folder, dataset_names, open_dataset
 from bidex_meta.errors import EXIT_FAILED, BidexError, known_name
 from bidex_meta.utils.validation import Few
@@ -34,16 +34,11 @@ class DataFlags:
     """info, check: a data set's name or folder."""
     episodes: Few | None = None
     """check: at most so many episodes, evenly spread; None: all."""
-    json: Switch = False
-    """Print JSON."""
+    json: JsonSwitch = False
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Print a table or JSON.
-
-    Raises:
-        SystemExit: A check found something wrong (exit code 1).
-    """
+    """Print a table or JSON; exit code 1 where a check found something wrong."""
     flags = parse(DataFlags, arguments, "data")
     what = known_name("data command", flags.what, _ACTIONS)
     if (what == "list") == bool(flags.name):
@@ -55,28 +50,18 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _list(flags: DataFlags) -> None:
-    rows: list[dict[str, object]] = []
+    rows: list[Json] = []
     for name in dataset_names():
         try:
             dataset = open_dataset(data_folder() / name)
         except BidexError as error:
             print(f"{name}: {error}", file=sys.stderr)
             continue
-        about = dataset.metadata
-        rows.append(
-            {
-                "name": name,
-                "kind": about.get("kind"),
-                "source": about.get("suite") or about.get("task"),
-                "transitions": dataset.num_steps,
-                "episodes": dataset.num_episodes,
-                "megabytes": dataset.content.get("dataset_size"),
-            }
-        )
-    if flags.json:
-        print(json.dumps(rows, indent=2))
-        return
-    _print_rows(rows, f"No data sets in {data_folder()}. Record one: bidex-meta record random --task CatchUnderarm")
+        about, sizes = dataset.metadata, {"transitions": dataset.num_steps, "episodes": dataset.num_episodes}
+        what = {"name": name, "kind": about.get("kind"), "source": about.get("suite") or about.get("task")}
+        rows.append({**what, **sizes, "megabytes": dataset.content.get("dataset_size")})
+    none = f"No data sets in {data_folder()}. Record one: bidex-meta record random --task CatchUnderarm"
+    print_rows(rows, flags.json, none)
 
 
 def _info(flags: DataFlags) -> None:
@@ -98,7 +83,7 @@ def _info(flags: DataFlags) -> None:
     print(f"{dataset.name}: {about['kind']} data of {about.get('suite') or about.get('task') or 'elsewhere'}")
     print(f"{episodes}; {sizes}; commit {about.get('commit')}")
     print(f"Acted: {acted or 'unknown'}. Left out: {left or 'nothing'}.")
-    _print_rows(
+    print_rows(
         [
             {
                 "class": each.name,
@@ -112,7 +97,8 @@ def _info(flags: DataFlags) -> None:
                 "broken": each.broken,
             }
             for each in classes
-        ]
+        ],
+        as_json=False,
     )
     groups = ", ".join(f"{name} {value:.3g}" for name, value in spread["observation_std"].items())
     print(f"Spread (standard deviation over states, mean over entries): {groups}")
@@ -138,10 +124,3 @@ def _check(flags: DataFlags) -> None:
             print(line)
     if findings.count:
         raise SystemExit(EXIT_FAILED)
-
-
-def _print_rows(rows: list[dict[str, object]], otherwise: str = "Nothing.") -> None:
-    if not rows:
-        print(otherwise)
-        return
-    print_table(plain_table(list(rows[0]), [list(row.values()) for row in rows]))

@@ -1,16 +1,18 @@
 """``bidex-meta evaluate``: how good is a trained run."""
 
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
+from rich.table import Table
+
+from bidex_meta.agents import Agent
 from bidex_meta.cli.learners import learner_kind, resolve_device
 from bidex_meta.cli.metatest import Options, check_worlds, meta_test, print_tables, splits_of
-from bidex_meta.cli.parsing import RunPath, Switch, parse
+from bidex_meta.cli.parsing import Device, Engine, JsonSwitch, RunPath, Switch, parse
 from bidex_meta.cli.policies import load_policy, policy_loader
-from bidex_meta.cli.tables import evaluation_table, print_table
+from bidex_meta.cli.tables import Json, evaluation_table, print_table, say
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import RandomAgent
@@ -40,12 +42,9 @@ class EvaluateFlags(Options):
     """Tasks to play: those trained on, or a meta suite's unseen ones; auto: train, and both for learners that adapt."""
     random: Switch = False
     """Also play a random policy, and show the difference."""
-    device: str = "auto"
-    """auto, cpu or cuda:N."""
-    engine: Literal["auto", "c", "warp"] = "auto"
-    """Physics; auto: the one that is fast on the device."""
-    json: Switch = False
-    """Print JSON."""
+    device: Device = "auto"
+    engine: Engine = "auto"
+    json: JsonSwitch = False
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -64,7 +63,7 @@ def main(arguments: Sequence[str]) -> None:
         print(json.dumps(run, indent=2))
 
 
-def _evaluate(flags: EvaluateFlags, folder: RunFolder, config: RunConfig[Any], worlds: Worlds) -> dict[str, Any]:
+def _evaluate(flags: EvaluateFlags, folder: RunFolder, config: RunConfig, worlds: Worlds) -> Json:
     """Plays, and prints the table if no JSON is wanted."""
     asked = {"shots": flags.shots, "rollouts": flags.rollouts, "tasks": flags.tasks, "trials": flags.trials}
     for name, number in asked.items():
@@ -76,41 +75,46 @@ def _evaluate(flags: EvaluateFlags, folder: RunFolder, config: RunConfig[Any], w
         )
     policy, step = load_policy(folder, config.device, flags.checkpoint)
     split = "train" if flags.split == "auto" else flags.split
-    world = worlds.world(split, flags.num_envs)
-    found = worlds.judge(policy, world, flags.episodes, flags.starts)
-    result = {"steps": step, "split": split, "seed": flags.starts, "policy": found.to_json()}
-    random = None
-    if flags.random:
-        random = worlds.judge(RandomAgent(world.action_space), world, flags.episodes, flags.starts)
-        differences = {name: asdict(difference) for name, difference in compare(found, random).items()}
-        result |= {"random": random.to_json(), "return_above_random": differences}
-    world.close()
+    title = f"{config.algo} on {worlds.name}, {split} tasks, {step:,} steps"
+    result, table = judged(worlds, policy, step, split, flags, flags.random, title)
     if not flags.json:
-        title = f"{config.algo} on {worlds.name}, {split} tasks, {step:,} steps"
-        print_table(evaluation_table(title, found, random))
+        print_table(table)
     return result
 
 
-def _meta_test(flags: EvaluateFlags, folder: RunFolder, config: RunConfig[Any], worlds: Worlds) -> dict[str, Any]:
+def judged(
+    worlds: Worlds, policy: Agent, step: int, split: str, options: Options, random: bool, title: str
+) -> tuple[Json, Table]:
+    """The evaluation of a policy on a split, beside that of a random one if asked, as JSON and as a table."""
+    world = worlds.world(split, options.num_envs)
+    found = worlds.judge(policy, world, options.episodes, options.starts)
+    result, other = {"steps": step, "split": split, "seed": options.starts, "policy": found.to_json()}, None
+    if random:
+        other = worlds.judge(RandomAgent(world.action_space), world, options.episodes, options.starts)
+        differences = {name: asdict(difference) for name, difference in compare(found, other).items()}
+        result |= {"random": other.to_json(), "return_above_random": differences}
+    world.close()
+    return result, evaluation_table(title, found, other)
+
+
+def _meta_test(flags: EvaluateFlags, folder: RunFolder, config: RunConfig, worlds: Worlds) -> Json:
     """As ``_evaluate``, of a learner that adapts."""
     if flags.random:
         raise BidexError(f"{config.algo} is compared with itself before adaptation. Leave --random out.")
     check_worlds(worlds, config.algo)
     splits = splits_of(worlds, flags.split)
     load, step = policy_loader(folder, config.device, flags.checkpoint)
-    found = meta_test(worlds, config, load, flags, splits, lambda text: print(text, file=sys.stderr, flush=True))
+    found = meta_test(worlds, config, load, flags, splits, say)
     if not flags.json:
         print_tables(f"{config.algo} on {worlds.name}, {step:,} steps", found)
     tests = {split: result.to_json() for split, result in found.items()}
     return {"steps": step, "seed": flags.starts, "splits": tests}
 
 
-def conditions(worlds: Worlds, num_envs: int | None = None) -> dict[str, Any]:
+def conditions(worlds: Worlds, num_envs: int | None = None) -> Json:
     """What else than the policy an evaluation's numbers depend on: its ``conditions`` in ``evaluation.json``.
 
-    Args:
-        worlds: Those of the worlds that were played.
-        num_envs: Environments that were asked for; None: the default.
+    Of the worlds that were played, and the environments that were asked for (None: the default).
     """
     wanted, identity = [*_PACKAGES], worlds.identity()
     if worlds.device.startswith("cuda") or worlds.engine == "warp":

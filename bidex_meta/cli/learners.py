@@ -47,12 +47,9 @@ _RENAMED = {"autoreset": "autoreset_mode(config)", "adapts_by_row": "independent
 class LearnerKind:
     """A learner and its presets."""
 
-    name: str
-    """Name in ``ALGOS``, or ``package.module:Class``."""
+    name: str  # in ALGOS, or package.module:Class
     make: type[Learner]
-    """The learner's class."""
-    presets: Mapping[str, Any]
-    """Configs by name; all of one dataclass."""
+    presets: Mapping[str, Any]  # configs by name, all of one dataclass
 
     def autoreset(self, config: dict[str, Any]) -> str:
         """Mode of the world it trains on, for fields of its config."""
@@ -61,14 +58,9 @@ class LearnerKind:
 
 
 def learner_kind(name: str, task: str | None = None) -> LearnerKind:
-    """Load a learner by name.
+    """The learner of a name in ``ALGOS``, in any case, or ``package.module:Class``; BidexError where there is none.
 
-    Args:
-        name: As in ``ALGOS``, in any case, or ``package.module:Class``.
-        task: The task class it shall learn alone, for which it may have presets of its own.
-
-    Raises:
-        BidexError: There is none of this name, its package is not installed, or it is no learner.
+    It may have presets of its own for the ``task`` that it shall learn alone.
     """
     if is_outside(name):
         make = _from_elsewhere(name)
@@ -110,11 +102,7 @@ def _from_elsewhere(name: str) -> type[Learner]:
 def choose_preset(kind: LearnerKind, asked: str, device: str, first: tuple[str, str] | None = None) -> tuple[str, str]:
     """The preset's name and, in words, why this one.
 
-    Args:
-        kind: The learner.
-        asked: A preset's name, or ``auto``.
-        device: ``cpu``, ``cuda``, ``cuda:0``, ...
-        first: A preset that goes before others where the learner has it, and why; ``Worlds.preset``.
+    ``asked`` may be ``auto``; then ``first`` (``Worlds.preset``: a preset and why) goes before what fits the device.
     """
     if asked.casefold() != "auto":
         return known_name("preset", asked, ["auto", *kind.presets]), "as asked"
@@ -130,14 +118,9 @@ def choose_preset(kind: LearnerKind, asked: str, device: str, first: tuple[str, 
 
 
 def resolve_device(asked: str, on_gpu: bool) -> str:
-    """``auto`` to ``cuda`` where there is one, else ``cpu``; anything else as it is.
+    """``auto`` to ``cuda`` where there is one and it is of use (``Worlds.on_gpu``), else ``cpu``; others as they are.
 
-    Args:
-        asked: ``auto``, ``cpu``, ``cuda``, ``cuda:0``, ...
-        on_gpu: Whether a GPU is of use; ``Worlds.on_gpu``.
-
-    Raises:
-        BidexError: torch does not know the device, or it is not there (for each of several processes).
+    Raises BidexError where torch does not know the device, or it is not there (for each of several processes).
     """
     import torch
 

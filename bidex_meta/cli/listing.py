@@ -1,15 +1,19 @@
 """``bidex-meta list``: what there is."""
 
-import json
-from collections.abc import Callable, Sequence
+import ast
+import importlib.util
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from functools import cache
+from pathlib import Path
+from typing import Annotated
 
 import tyro
 
-from bidex_meta.cli.learners import ALGOS, learner_kind
-from bidex_meta.cli.parsing import Switch, parse
-from bidex_meta.cli.tables import plain_table, print_table
+from bidex_meta.cli.learners import ALGOS
+from bidex_meta.cli.parsing import JsonSwitch, parse
+from bidex_meta.cli.tables import Json, print_rows
 from bidex_meta.errors import known_name
 from bidex_meta.tasks import registry
 from bidex_meta.worlds import listed
@@ -24,57 +28,111 @@ class ListFlags:
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="suites|tasks|algos|objects")]
     """suites, tasks, algos or objects (what the throwing classes throw)."""
-    json: Switch = False
-    """Print JSON."""
+    json: JsonSwitch = False
 
 
 def main(arguments: Sequence[str]) -> None:
     """Print a table or JSON, one row for each."""
     flags = parse(ListFlags, arguments, "list")
-    kinds: dict[str, Callable[[], list[dict[str, Any]]]]
     kinds = {"suites": listed, "tasks": _tasks, "algos": _algos, "objects": _objects}
-    rows = kinds[known_name("list", flags.what, kinds)]()
-    if flags.json:
-        print(json.dumps(rows, indent=2))
-        return
-    columns = list(rows[0]) if rows else ["name"]
-    print_table(plain_table([column.replace("_", " ") for column in columns], [_cells(row) for row in rows]))
+    print_rows(kinds[known_name("list", flags.what, kinds)](), flags.json)
 
 
-def _tasks() -> list[dict[str, Any]]:
-    tasks = [(name, registry.get(name)) for name in registry.names()]
-    return [
-        {
-            "name": name,
-            "observation": task.observation_size,
-            "action": task.action_size,
-            "episode_steps": task.episode_steps,
-            "summary": task.summary,
-        }
-        for name, task in tasks
-    ]
-
-
-def _algos() -> list[dict[str, Any]]:
+def _tasks() -> list[Json]:
     rows = []
-    for name in ALGOS:
-        kind = learner_kind(name)
-        summary = (kind.make.__doc__ or "").strip().splitlines()[0]
-        rows.append({"name": name, "presets": list(kind.presets), "summary": summary})
+    for name in registry.names():
+        place = registry.module_of(name), name
+        moves, steps, summary = (_constant(*place, key) for key in ("moves_by_default", "episode_steps", "summary"))
+        (size,) = re.findall(r"\((\d{3})[;)]", _docstring(*place))  # as in "Observation: Table 10 (422)."
+        sizes = {"observation": int(size), "action": 52 if moves else 40}
+        rows.append({"name": name, **sizes, "episode_steps": steps, "summary": summary})
     return rows
 
 
-def _objects() -> list[dict[str, Any]]:
+def _algos() -> list[Json]:
+    rows = []
+    for name, path in ALGOS.items():
+        module, _, class_name = path.partition(":")
+        presets = _keys(*_attribute(module, class_name, "presets"))
+        rows.append({"name": name, "presets": presets, "summary": _docstring(module, class_name).splitlines()[0]})
+    return rows
+
+
+# Classes are read from their source: their modules load torch and mujoco.
+
+
+@cache
+def _statements(module: str) -> dict[str, ast.AST]:
+    spec = importlib.util.find_spec(module)
+    assert spec is not None and spec.origin is not None
+    return _bound(ast.parse(Path(spec.origin).read_bytes()).body)
+
+
+def _bound(body: Sequence[ast.stmt]) -> dict[str, ast.AST]:
+    """By name the class, the value, or the import that it comes from."""
+    found: dict[str, ast.AST] = {}
+    for node in body:
+        match node:
+            case ast.ClassDef():
+                found[node.name] = node
+            case ast.ImportFrom():
+                found |= dict.fromkeys((each.name for each in node.names), node)
+            case ast.Assign(targets=[ast.Tuple(elts=names)], value=ast.Tuple(elts=values)):
+                found |= {ast.unparse(name): value for name, value in zip(names, values, strict=True)}
+            case ast.Assign(targets=[ast.Name(name)]) | ast.AnnAssign(target=ast.Name(name)) if node.value:
+                found[name] = node.value
+            case _:
+                pass
+    return found
+
+
+def _found(module: str, name: str) -> tuple[str, ast.AST | None]:
+    """What is bound to a name, and in which module."""
+    node = _statements(module).get(name)
+    return _found(node.module or "", name) if isinstance(node, ast.ImportFrom) else (module, node)
+
+
+def _docstring(module: str, name: str) -> str:
+    node = _found(module, name)[1]
+    return (ast.get_docstring(node) or "") if isinstance(node, ast.ClassDef) else ""
+
+
+def _attribute(module: str, name: str, attribute: str) -> tuple[str, ast.AST | None]:
+    """The value that a class or the nearest that it derives from has, and in which module."""
+    module, node = _found(module, name)
+    if not isinstance(node, ast.ClassDef):
+        return module, None
+    if own := _bound(node.body).get(attribute):
+        return module, own
+    bases = (_attribute(module, base.id, attribute) for base in node.bases if isinstance(base, ast.Name))
+    return next((found for found in bases if found[1]), (module, None))
+
+
+def _constant(module: str, name: str, attribute: str) -> object:
+    value = _attribute(module, name, attribute)[1]
+    return value.value if isinstance(value, ast.Constant) else None
+
+
+def _keys(module: str, node: ast.AST | None) -> list[str]:
+    """Keys of a dictionary that is written out, named, or a union."""
+    match node:
+        case ast.Dict(keys):
+            return [key.value for key in keys if isinstance(key, ast.Constant) and isinstance(key.value, str)]
+        case ast.BinOp(left, _, right):
+            return list(dict.fromkeys([*_keys(module, left), *_keys(module, right)]))
+        case ast.Name(name):
+            return _keys(*_found(module, name))
+        case _:
+            return []
+
+
+def _objects() -> list[Json]:
     from bidex_meta.tasks.objects.held import held_object, shelf
 
     # The egg's figures: docs/figures.md, objects.
-    rows: list[dict[str, Any]] = [{"name": "egg", "mass_g": 75.4, "box_mm": "60 x 60 x 80", "geoms": 1}]
+    rows: list[Json] = [{"name": "egg", "mass_g": 75.4, "box_mm": "60 x 60 x 80", "geoms": 1}]
     for name in shelf():
         if found := held_object(name):
             box = " x ".join(f"{1000 * (high - low):.0f}" for low, high in zip(found.low, found.high, strict=True))
             rows.append({"name": name, "mass_g": round(1000 * found.mass, 1), "box_mm": box, "geoms": found.geoms})
     return rows
-
-
-def _cells(row: dict[str, Any]) -> list[Any]:
-    return [", ".join(value) if isinstance(value, list) else value for value in row.values()]

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from bidex_meta.agents import Agent
 from bidex_meta.cli.learners import learner_kind
@@ -52,24 +51,16 @@ class Options:
 
 def meta_test(
     worlds: Worlds,
-    config: RunConfig[Any],
+    config: RunConfig,
     load: Callable[[], Agent],
     options: Options,
     splits: list[str],
     say: Callable[[str], None] = lambda text: None,
 ) -> dict[str, MetaEvaluation]:
-    """The meta-test on some of a run's splits.
+    """The meta-test on some splits of a run's worlds.
 
-    Args:
-        worlds: The run's.
-        config: The run's config; read are ``algo``, ``num_envs`` and ``learner``.
-        load: Makes the agent, a MetaLearningAgent; called anew for each split, so that neither depends on the other.
-        options: How much is played.
-        splits: Out of ``worlds.splits``.
-        say: Called with what begins.
-
-    Raises:
-        BidexError: The suite shows its tasks.
+    ``load`` makes a MetaLearningAgent, anew for each split, so that neither depends on the other; of the config
+    ``algo``, ``num_envs`` and ``learner`` are read; ``say`` is called with what begins.
     """
     check_worlds(worlds, config.algo)
     found = {}
@@ -90,58 +81,38 @@ def meta_test(
         )
         world = worlds.world(split, num_envs)
         found[split] = meta_evaluate(
-            load(),
-            world,
-            shots,
-            rollouts=rollouts,
-            episodes_per_task=episodes,
-            tasks=tasks,
-            trials=trials,
-            max_adapt_steps=adapt_steps_of(config),
-            seed=options.starts,
-            references=worlds.references(),
-            split=split,
-        )
+            load(), world, shots, rollouts=rollouts, episodes_per_task=episodes, tasks=tasks, trials=trials,
+            max_adapt_steps=adapt_steps_of(config), seed=options.starts, references=worlds.references(), split=split,
+        )  # fmt: skip
         world.close()
     return found
 
 
-def adapt_steps_of(config: RunConfig[Any]) -> int:
+def adapt_steps_of(config: RunConfig) -> int:
     """Longest episode that a run's learner adapts to."""
     return config.learner_values.get("max_adapt_steps", MAX_ADAPT_STEPS)
 
 
-def rollouts_of(worlds: Worlds, config: RunConfig[Any], asked: int | None, most: int) -> int:
-    """Episodes of each task in a shot.
+def rollouts_of(worlds: Worlds, config: RunConfig, asked: int | None, most: int) -> int:
+    """Episodes of each task in a shot: as asked, else as the run was trained.
 
-    Args:
-        worlds: The run's.
-        config: The run's config.
-        asked: What the user wants; None: what the run was trained with.
-        most: Environments that a class has at most. Where each adapts from its own episodes alone it must have no
-            second one in a shot: then there are fewer.
+    ``most`` are the environments that a class has at most. Where each adapts from its own episodes alone it must have
+    no second one in a shot: then there are fewer.
     """
-    rollouts = asked or _trained_rollouts(worlds, config)
-    return min(rollouts, most) if learner_kind(config.algo).make.independent_adaptation else rollouts
-
-
-def _trained_rollouts(worlds: Worlds, config: RunConfig[Any]) -> int:
-    of_batch = config.learner_values.get("tasks_per_class")
-    if of_batch is None:
-        return _ROLLOUTS
-    counts = [len(pool) for pool in worlds.tasks("train").values()]
-    of_class = config.num_envs // len(counts)
-    return max(1, min(of_class // min(of_batch, max(counts)), _MOST_ROLLOUTS))
+    if asked is None:
+        asked, of_batch = _ROLLOUTS, config.learner_values.get("tasks_per_class")
+        if of_batch is not None:
+            counts = [len(pool) for pool in worlds.tasks("train").values()]
+            of_class = config.num_envs // len(counts)
+            asked = max(1, min(of_class // min(of_batch, max(counts)), _MOST_ROLLOUTS))
+    return min(asked, most) if learner_kind(config.algo).make.independent_adaptation else asked
 
 
 def environments_for(classes: int, adaptations: int, rollouts: int, limit: int) -> int:
-    """Environments of a world that plays as many adaptations of each class at once as the limit allows.
+    """Environments of a world that plays as many adaptations (tasks times trials) of each class at once as it can.
 
-    Args:
-        classes: Classes of the world.
-        adaptations: Adaptations (tasks times trials) of each class.
-        rollouts: Environments each takes, if there are so many; else it takes several rounds.
-        limit: Environments at most, but never fewer than one for each class.
+    Each takes ``rollouts`` environments, if there are so many; else it takes several rounds. ``limit`` is the number
+    of environments at most, but never fewer than one for each class.
     """
     of_class = max(1, limit // classes)
     if of_class < rollouts:
@@ -152,11 +123,7 @@ def environments_for(classes: int, adaptations: int, rollouts: int, limit: int) 
 
 
 def check_worlds(worlds: Worlds, algo: str) -> None:
-    """Refuses worlds on which there is no meta-test.
-
-    Raises:
-        BidexError: They show their tasks: they are Meta-World's, multi-task or of a class alone.
-    """
+    """Refuses worlds that show their tasks: Meta-World's, multi-task or of a class alone."""
     if not worlds.hides_goals:
         raise BidexError(
             f"{algo} adapts to hidden goals, but {worlds.name} shows them. Name an ML suite: "
@@ -165,11 +132,7 @@ def check_worlds(worlds: Worlds, algo: str) -> None:
 
 
 def splits_of(worlds: Worlds, asked: str) -> list[str]:
-    """The splits that a meta-test plays: the one of this name, or all there are for ``both`` and ``auto``.
-
-    Raises:
-        BidexError: There is no such split.
-    """
+    """The splits that a meta-test plays: the one of this name, or all there are for ``both`` and ``auto``."""
     if asked in ("train", "test") and asked not in worlds.splits:
         raise BidexError(f"{worlds.name} has no {asked} tasks. Leave --split out.")
     return [name for name in worlds.splits if asked in ("auto", "both", name)]

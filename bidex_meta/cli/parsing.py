@@ -9,24 +9,20 @@ from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from itertools import zip_longest
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TypeVar
+from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
 import tyro
 
 from bidex_meta.errors import BidexError
-from bidex_meta.runs.atomic import check_writable, refuse_links
-from bidex_meta.runs.folder import RunFolder
-from bidex_meta.runs.stored import StoredRun, open_run
-from bidex_meta.utils.validation import check_fields
+from bidex_meta.utils.validation import Seed, check_fields
 
 Options = TypeVar("Options")
 
 
 class FlagsFound(Exception):
-    """Tells the flags of a command in place of parsing them; only ``flags_of`` asks for it."""
+    """Reports the flags of a command in place of parsing them; only ``flags_of`` asks for it."""
 
-    def __init__(self, options: type, default: Any) -> None:
-        super().__init__(options.__name__)
+    def __init__(self, options: type, default: object) -> None:
         self.options, self.default = options, default
 
 
@@ -34,11 +30,9 @@ _asked_for_flags: ContextVar[bool] = ContextVar("asked_for_flags", default=False
 
 
 def flags_of(command: Callable[[Sequence[str]], None], arguments: Sequence[str] = ()) -> FlagsFound:
-    """The dataclass of a command's flags, and the default of it where the command has one of its own.
+    """The dataclass of the flags of a subcommand's ``main``, and the default of it where it has one of its own.
 
-    Args:
-        command: A subcommand's ``main``, which calls ``parse`` before it does anything.
-        arguments: What the flags may depend on, e.g. ``--algo``.
+    ``arguments`` are those that the flags may depend on, e.g. ``--algo``.
     """
     token = _asked_for_flags.set(True)
     try:
@@ -52,52 +46,48 @@ def flags_of(command: Callable[[Sequence[str]], None], arguments: Sequence[str] 
 
 Switch = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 """A flag without a value and without a ``--no-`` twin."""
-
-
+JsonSwitch = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="Print JSON.")]
+Device = Annotated[str, tyro.conf.arg(help="auto, cpu or cuda:N.")]
+Engine = Annotated[
+    Literal["auto", "c", "warp"], tyro.conf.arg(help="Physics; auto: the one that is fast on the device.")
+]
 RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
 """A run folder, as the first word."""
-
-
 RunPaths = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
 """Run folders, or files of ``results/data/``."""
 
 
-def named_runs(paths: Sequence[Path], command: str) -> list[RunFolder | StoredRun]:
-    """The runs that a command was given.
+@dataclasses.dataclass(frozen=True)
+class LookFlags:
+    """What a policy is looked at in."""
 
-    Raises:
-        BidexError: None, or one that is no run.
-    """
-    if not paths:
-        raise BidexError(f"Name the run folders: bidex-meta {command} RUN...")
-    return [open_run(path) for path in paths]
+    run: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = None
+    """Run folder whose policy is shown; the same as --policy RUN."""
+    task: str | None = None
+    """Task class; None: the run's first one. In a browser it can be changed."""
+    object: str | None = None
+    """With --task alone: another object of the class, of the shelf or an MJCF file (docs/objects.md); None: the run's,
+    or the class's own."""
+    policy: str = "zero"
+    """zero, random, or a run folder."""
+    checkpoint: str = "last"
+    """Of a run: last, best (see `bidex-meta run --help`, --evaluate-every) or a file."""
+    suite: str | None = None
+    """Show the task as this suite has it; None: on its own, or as in the run."""
+    seed: Seed = 0
+    """Seed of tasks and starts."""
 
-
-def output(asked: Path | None, runs: Sequence[RunFolder | StoredRun], name: str) -> Path:
-    """Where a command writes: as asked, else of this name into the run's folder or, of several runs, here.
-
-    Raises:
-        BidexError: The file cannot be written.
-    """
-    out = asked or (runs[0].path if len(runs) == 1 and runs[0].path.is_dir() else Path()) / name
-    if asked is None:
-        refuse_links(out)
-    check_writable(out)
-    return out
+    @property
+    def actor(self) -> str:
+        """The policy, however it was named."""
+        return self.policy if self.run is None else str(self.run)
 
 
 def parse(options: type[Options], arguments: Sequence[str], command: str, default: Options | None = None) -> Options:
-    """The flags of one subcommand.
+    """The flags of a subcommand, of a dataclass whose docstring opens with a sentence and an example.
 
-    Args:
-        options: A dataclass whose docstring opens with a sentence and an example: it heads the help text.
-        arguments: What follows the subcommand's name.
-        command: The subcommand's name.
-        default: Values of the flags that are not given; the dataclass's own by default.
-
-    Raises:
-        BidexError: An unknown flag (with the nearest one) or a bad value.
-        SystemExit: After printing the help text.
+    ``default`` has the values of flags that are not given. Raises BidexError where a flag is unknown (with the nearest
+    one) or a value bad, SystemExit after printing the help text.
     """
     if _asked_for_flags.get():
         raise FlagsFound(options, default)
@@ -120,17 +110,8 @@ def parse(options: type[Options], arguments: Sequence[str], command: str, defaul
 
 
 def peek(arguments: Sequence[str], flag: str) -> str | None:
-    """The value of ``flag`` before the real parse, which may need it to know its own defaults; None if not given.
-
-    Of several the last, as in the real parse.
-    """
-    found = None
-    for place, word in enumerate(arguments):
-        if word == flag and place + 1 < len(arguments):
-            found = arguments[place + 1]
-        if word.startswith(f"{flag}="):
-            found = word.partition("=")[2]
-    return found
+    """The value of ``flag`` before the real parse, which may need it to know its own defaults; of several the last."""
+    return next(reversed(peek_all(arguments, flag)), None)
 
 
 def peek_all(arguments: Sequence[str], flag: str) -> list[str]:
@@ -151,37 +132,28 @@ def _refuse(word: str, options: Any, command: str) -> NoReturn:
 
 
 def _near(flag: str, known: list[str]) -> list[str]:
-    """The flags that were probably meant.
-
-    Those of the same last part (``--gamma``) or of words that begin with its letters (``--lr``), else what is spelt
-    most like it.
-    """
+    """Flags of the same last part (``--gamma``), of words that begin with its letters (``--lr``), or spelt alike."""
     given = flag.lstrip("-").lower().replace("_", "-").rpartition(".")[2]
     last = {name: name.lstrip("-").rpartition(".")[2] for name in known}
+    initials = {name: "".join(word[:1] for word in last[name].split("-")) for name in known}
     same = [name for name in known if last[name] == given]
-    short = [name for name in known if _initials(last[name]) == given]
+    short = [name for name in known if initials[name] == given]
     # Of critic-learning-rate and the like, where there is no plain learning-rate.
-    ending = [name for name in known if _initials(last[name])[-2:] == given]
+    ending = [name for name in known if initials[name][-2:] == given]
     spelt = difflib.get_close_matches(flag.lower(), known, n=1, cutoff=0.5)
     by_last = difflib.get_close_matches(given, list(last.values()), n=1, cutoff=0.75)
     return same or short or ending or spelt or [name for name in known if last[name] in by_last]
 
 
-def _initials(name: str) -> str:
-    return "".join(word[:1] for word in name.split("-"))
-
-
 def _flags(options: Any, prefix: str = "--") -> Iterator[str]:
     """Every flag of a dataclass and of those it holds."""
     for field in dataclasses.fields(options):
-        name = prefix + field.name.replace("_", "-")
+        name = field.name.replace("_", "-")
         value = getattr(options, field.name, field.default)
         if dataclasses.is_dataclass(value):
-            yield from _flags(value, prefix if field.name == "config" else f"{name}.")
+            yield from _flags(value, prefix if name == "config" else f"{prefix}{name}.")
         else:
-            yield name
-            if isinstance(value, bool):
-                yield f"{prefix}no-{field.name.replace('_', '-')}"
+            yield from [prefix + name, f"{prefix}no-{name}"][: 1 + isinstance(value, bool)]
 
 
 def _one_line(box: str) -> str:

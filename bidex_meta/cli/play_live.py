@@ -4,23 +4,18 @@ import contextlib
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import tyro
-
-from bidex_meta.cli.parsing import Switch, parse
-from bidex_meta.errors import known_name
+from bidex_meta.cli.parsing import LookFlags, Switch, parse
 from bidex_meta.utils import gl_backend
-from bidex_meta.utils.plugins import name_with_object
-from bidex_meta.utils.validation import NonNegative, Port, Positive, Seed
+from bidex_meta.utils.validation import NonNegative, Port, Positive
 
 if TYPE_CHECKING:
     from bidex_meta.viewer.playback import Screen, Stage
 
 
 @dataclass(frozen=True)
-class PlayFlags:
+class PlayFlags(LookFlags):
     """Look at a policy live: in MuJoCo's viewer, or in the browser where there is no screen.
 
     Example: bidex-meta play runs/MT4/mtppo/2026-11-21_10-00-00_seed0 --task CatchAbreast
@@ -28,21 +23,6 @@ class PlayFlags:
     bidex-meta play --task SwingCup --policy random needs no run.
     """
 
-    run: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = None
-    """Run folder; the same as --policy RUN."""
-    task: str | None = None
-    """Class to look at; None: the first one. In the browser it can be changed."""
-    object: str | None = None
-    """With --task alone: another object of the class, of the shelf or an MJCF file (docs/objects.md); None: the run's,
-    or the class's own."""
-    policy: str = "zero"
-    """zero, random, or a run folder."""
-    checkpoint: str = "last"
-    """Of a run: last, best (see `bidex-meta run --help`, --evaluate-every) or a file."""
-    suite: str | None = None
-    """Show the classes of this suite; None: the run's."""
-    seed: Seed = 0
-    """Seed of tasks and starts."""
     speed: Positive = 1.0
     """Of the clock; 0.5 is slow motion."""
     browser: Switch = False
@@ -56,21 +36,14 @@ class PlayFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Play until it is closed.
-
-    Raises:
-        BidexError: Bad flags, a policy that does not fit, or no window and no viser.
-    """
+    """Play until it is closed."""
     flags = parse(PlayFlags, arguments, "play")
-    from bidex_meta.cli.policies import acting, looked_at, slots_of
+    from bidex_meta.cli.policies import acting, looked_at
     from bidex_meta.viewer.playback import Stage, play
 
-    policy = flags.policy if flags.run is None else str(flags.run)
-    source = looked_at(policy, flags.suite, flags.task, flags.seed, flags.object)
-    slots, named = slots_of(source), flags.task and name_with_object(flags.task, flags.object)
-    task = known_name(f"task of {source.name}", named or slots[0], source.task_classes())
+    source, slots, task = looked_at(flags)
     world: Any = source.world("train", len(slots))
-    stage = Stage(world, acting(policy, world, flags.seed, flags.checkpoint), slots.index(task), flags.seed)
+    stage = Stage(world, acting(flags.actor, world, flags.seed, flags.checkpoint), slots.index(task), flags.seed)
     screen = _screen(flags, stage)
     with contextlib.suppress(KeyboardInterrupt):  # how the view in the browser is ended
         play(stage, screen, flags.seconds)

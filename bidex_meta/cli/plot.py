@@ -4,11 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bidex_meta.cli.parsing import RunPaths, Switch, named_runs, output, parse
+from bidex_meta.cli.parsing import RunPaths, Switch, parse
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import read_histories
-from bidex_meta.runs import plots
-from bidex_meta.runs.stored import StoredRun
+from bidex_meta.runs import RunFolder, plots
+from bidex_meta.runs.atomic import check_writable, refuse_links
+from bidex_meta.runs.stored import StoredRun, open_run
 
 
 @dataclass(frozen=True)
@@ -31,11 +32,7 @@ class PlotFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Draw the curves and print where they are.
-
-    Raises:
-        BidexError: No run is named, or there is nothing to draw.
-    """
+    """Draw the curves and print where they are."""
     flags = parse(PlotFlags, arguments, "plot")
     runs = named_runs(flags.runs, "plot")
     if not (flags.adaptation or flags.evaluation):
@@ -52,3 +49,19 @@ def main(arguments: Sequence[str]) -> None:
             figure = plots.draw_adaptation(plots.read_evaluation(source), source)
     plots.save(figure, out)
     print(out)
+
+
+def named_runs(paths: Sequence[Path], command: str) -> list[RunFolder | StoredRun]:
+    """The runs that a command was given; BidexError where there is none, or one is no run."""
+    if not paths:
+        raise BidexError(f"Name the run folders: bidex-meta {command} RUN...")
+    return [open_run(path) for path in paths]
+
+
+def output(asked: Path | None, runs: Sequence[RunFolder | StoredRun], name: str) -> Path:
+    """Where a command writes: as asked, else of this name into the run's folder or, of several runs, here."""
+    out = asked or (runs[0].path if len(runs) == 1 and runs[0].path.is_dir() else Path()) / name
+    if asked is None:
+        refuse_links(out)
+    check_writable(out)
+    return out

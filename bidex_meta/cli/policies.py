@@ -4,28 +4,26 @@ import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from bidex_meta.agents import Agent
 from bidex_meta.cli.learners import learner_kind
-from bidex_meta.errors import BidexError, one_line
+from bidex_meta.cli.parsing import LookFlags
+from bidex_meta.cli.tables import Json
+from bidex_meta.errors import BidexError, known_name, one_line
 from bidex_meta.evaluation.play import RandomAgent, ZeroAgent
 from bidex_meta.runs import RunFolder
 from bidex_meta.train.distributed import LostProcess
 from bidex_meta.utils.files import is_file
+from bidex_meta.utils.plugins import name_with_object
+from bidex_meta.world.contract import TaskWorld
 from bidex_meta.worlds import WorldConfig, Worlds
 
 
-def checkpoint(folder: RunFolder, which: str = "last") -> tuple[dict[str, Any], int]:
-    """State and environment steps of a run's checkpoint.
+def checkpoint(folder: RunFolder, which: str = "last") -> tuple[Json, int]:
+    """State and environment steps of a run's checkpoint; BidexError where there is none such.
 
-    Args:
-        folder: The run.
-        which: ``last``, the newest one; ``best``, of which the state holds the policy alone; or a file, by its path or
-            by its name in the run's folder of checkpoints.
-
-    Raises:
-        BidexError: The run has not saved such a one.
+    ``which`` is ``last``, the newest one; ``best``, of which the state holds the policy alone; or a file, by its path
+    or by its name in the run's folder of checkpoints.
     """
     if which == "best":
         if not folder.checkpoints.best.is_file():
@@ -48,9 +46,6 @@ def fitting(path: Path) -> Iterator[None]:
     """What happens within puts a run's checkpoint into what its config describes; each error says that it does not fit.
 
     A checkpoint may be of another version, or of anybody: its tensors and words can be any.
-
-    Raises:
-        BidexError: It does not fit.
     """
     try:
         yield
@@ -65,21 +60,13 @@ def fitting(path: Path) -> Iterator[None]:
 
 
 def load_policy(folder: RunFolder, device: str, which: str = "last") -> tuple[Agent, int]:
-    """The policy of a run's checkpoint and the environment steps it was trained for.
-
-    Raises:
-        BidexError: The run has not saved such a checkpoint.
-    """
+    """The policy of a run's checkpoint and the environment steps it was trained for; errors as of ``checkpoint``."""
     load, step = policy_loader(folder, device, which)
     return load(), step
 
 
-def policy_of(folder: RunFolder, state: dict[str, Any], device: str) -> Agent:
-    """The policy in a run's checkpoint.
-
-    Raises:
-        BidexError: It does not fit the run's config, or its own.
-    """
+def policy_of(folder: RunFolder, state: Json, device: str) -> Agent:
+    """The policy in a run's checkpoint; BidexError where it does not fit the run's config, or its own."""
     with fitting(folder.path):
         return learner_kind(folder.config().algo).make.load_policy(state["learner"]["policy"], device)
 
@@ -88,20 +75,13 @@ def policy_loader(folder: RunFolder, device: str, which: str = "last") -> tuple[
     """What makes the policy of a run's checkpoint anew with each call, and that checkpoint's steps.
 
     The checkpoint is read once: a run that trains on meanwhile gives no other.
-
-    Raises:
-        BidexError: The run has not saved such a checkpoint.
     """
     state, step = checkpoint(folder, which)
     return lambda: policy_of(folder, state, device), step
 
 
-def acting(policy: str, world: Any, seed: int, which: str = "last") -> Agent:
-    """What acts in a world to be looked at: ``zero``, ``random``, or the policy of a run folder.
-
-    Raises:
-        BidexError: The policy is of other observations or actions than the world's.
-    """
+def acting(policy: str, world: TaskWorld, seed: int, which: str = "last") -> Agent:
+    """What acts in a world to be looked at: ``zero``, ``random``, or the policy of a run folder, which must fit it."""
     if policy == "zero":
         return ZeroAgent(world.action_space)
     if policy == "random":
@@ -109,7 +89,7 @@ def acting(policy: str, world: Any, seed: int, which: str = "last") -> Agent:
     folder = RunFolder.open(Path(policy))
     state, _ = checkpoint(folder, which)
     with fitting(folder.path):
-        shape: dict[str, Any] = state["learner"]["policy"].get("shape", {})
+        shape: Json = state["learner"]["policy"].get("shape", {})
     spaces = {"observations": world.single_observation_space, "actions": world.single_action_space}
     given = {name: space.shape[0] for name, space in spaces.items()}
     if any(shape.get(name, size) != size for name, size in given.items()):
@@ -121,30 +101,26 @@ def acting(policy: str, world: Any, seed: int, which: str = "last") -> Agent:
     return policy_of(folder, state, "cpu")
 
 
-def looked_at(policy: str, suite: str | None, task: str | None, seed: int, held: str | None = None) -> Worlds:
-    """The worlds in which a policy is looked at: those of its run, or of a suite or a task that is named.
+def looked_at(flags: LookFlags, all_slots: bool = False) -> tuple[Worlds, list[str], str]:
+    """The worlds in which a policy is looked at, the class of each slot, and the class to look at.
 
-    Args:
-        policy: ``zero``, ``random`` or a run folder.
-        suite: A suite; None: the run's, if it has one.
-        task: A class; alone where there is no suite.
-        seed: Of the tasks.
-        held: Object of the class alone; None: the run's, or the class's own.
-
-    Raises:
-        BidexError: Nothing is named, or what is not there.
+    Those of its run, or of the suite or the task that is named.
     """
-    if held is not None and (suite is not None or task is None):
+    if flags.object is not None and (flags.suite is not None or flags.task is None):
         raise BidexError("--object goes with --task alone: bidex-meta render --task CatchUnderarm --object mug ...")
-    config = WorldConfig(suite=suite, task=task, object=held, threads=1, seed=seed)
-    if policy not in ("zero", "random"):
-        run = RunFolder.open(Path(policy)).config()
-        config = replace(config, suite=suite or run.suite, task=task or run.task, base=run.base, points=run.points)
-        if not task and not held:
+    config = WorldConfig(suite=flags.suite, task=flags.task, object=flags.object, threads=1, seed=flags.seed)
+    if flags.actor not in ("zero", "random"):
+        run = RunFolder.open(Path(flags.actor)).config()
+        config = replace(config, suite=config.suite or run.suite, task=config.task or run.task)
+        config = replace(config, base=run.base, points=run.points)
+        if not flags.task and not flags.object:
             config = replace(config, object=run.object)
     if config.suite is None and config.task is None:
         raise BidexError("Name what to show: a run folder, --task TASK or --suite SUITE.")
-    return Worlds.open(config)
+    worlds = Worlds.open(config)
+    slots, classes = slots_of(worlds), worlds.task_classes()  # which refuses what is not of ours
+    task = (flags.task and name_with_object(flags.task, flags.object)) or slots[0]
+    return worlds, slots, task if all_slots else known_name(f"task of {worlds.name}", task, classes)
 
 
 def slots_of(worlds: Worlds) -> list[str]:

@@ -2,32 +2,45 @@
 
 import contextlib
 import math
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from msgspec import Meta
 
+from bidex_meta.agents import Agent
 from bidex_meta.cli.learners import learner_kind, resolve_device
-from bidex_meta.cli.parsing import Switch, parse
+from bidex_meta.cli.parsing import Device, Engine, Switch, parse
+from bidex_meta.cli.policies import load_policy
 from bidex_meta.cli.run_data import dataset_metadata
+from bidex_meta.cli.tables import Json, say
 from bidex_meta.config import Steps
 from bidex_meta.data import open_dataset, part_files, writer
+from bidex_meta.data.collect import (
+    Actor,
+    Progress,
+    SamplingAgent,
+    bytes_held,
+    collect,
+    collect_successes,
+    progress,
+    resumed_writer,
+)  # fmt: skip
+from bidex_meta.data.writer import DatasetWriter
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.runs import RunFolder
 from bidex_meta.utils.files import absolute
 from bidex_meta.utils.memory import usable_cores
 from bidex_meta.utils.validation import Environments, Seed, Threads
+from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted, ShiftedStarts
+from bidex_meta.witness.scripts import script_of
+from bidex_meta.witness.store import load_witness
+from bidex_meta.world.contract import PooledWorld
+from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds
-
-if TYPE_CHECKING:
-    from bidex_meta.agents import Agent
-    from bidex_meta.data.collect import Actor, Progress
-    from bidex_meta.data.writer import DatasetWriter
-    from bidex_meta.world.contract import PooledWorld
 
 RUNS = {"random": 0, "medium": 1, "expert": 1, "medium-expert": 2, "replay": 1, "demonstrations": 0}
 """Kinds of data sets, and how many runs each takes."""
@@ -88,10 +101,8 @@ class RecordFlags:
     """Seed of starts and actions, and of random's tasks (a run keeps its own tasks)."""
     out: Path | None = None
     """Folder of the data set; None: NAME/KIND-v0 in the folder that BIDEX_DATA names, else in data/."""
-    device: str = "auto"
-    """auto, cpu or cuda:N."""
-    engine: Literal["auto", "c", "warp"] = "auto"
-    """Physics; auto: the one that is fast on the device."""
+    device: Device = "auto"
+    engine: Engine = "auto"
     threads: Threads | None = None
     """Threads of torch and of the physics; None: one per core."""
     estimate: Switch = False
@@ -105,14 +116,14 @@ class _Collection:
     source: Worlds
     name: str
     """Kind in the data set's name."""
-    plan: dict[str, Any]
-    """What decides its content, ready for JSON; it has ``kind``, ``size`` and ``num_envs``."""
-    policies: list[dict[str, Any]]
+    plan: Json
+    """What decides its content; it has ``kind``, ``size`` and ``num_envs``."""
+    policies: list[Json]
     """Who acts, for the metadata."""
-    world: "Callable[[], PooledWorld]"
+    world: Callable[[], PooledWorld]
     episode_share: float
     """Mean length of an episode as a share of the time limit, at least."""
-    collect: "Callable[[PooledWorld, DatasetWriter], None]"
+    collect: Callable[[PooledWorld, DatasetWriter], None]
     """Plays in the world until the writer has all transitions."""
 
 
@@ -124,7 +135,6 @@ def main(arguments: Sequence[str]) -> None:
     if kind == "replay":
         _publish_replay(flags)
         return
-
     part_files.hdf5()  # refuses it where it is not installed
     _record(flags, _demonstrations(flags) if kind == "demonstrations" else _episodes(flags, kind))
 
@@ -147,8 +157,6 @@ def _check(flags: RecordFlags, kind: str) -> None:
 
 def _record(flags: RecordFlags, collection: _Collection) -> None:
     """Collects a data set, or goes on with it."""
-    from bidex_meta.data.collect import resumed_writer
-
     plan, size = collection.plan, collection.plan["size"]
     folder, name = writer.dataset_path(flags.out, collection.source.name, collection.name)
     with contextlib.ExitStack() as stack:
@@ -158,10 +166,16 @@ def _record(flags: RecordFlags, collection: _Collection) -> None:
         stack.callback(world.close)
         sizes = world.single_observation_space.shape[0], world.single_action_space.shape[0]
         length = collection.episode_share * float(world.max_episode_steps.float().mean())
-        needed = writer.estimated_bytes(size, *sizes, length)
-        _say(
+        needed, memory = writer.estimated_bytes(size, *sizes, length), bytes_held(world)
+        if memory > _MOST_HELD:
+            raise BidexError(
+                f"The episodes of {plan['num_envs']:,} rows would take {memory / 1e9:.1f} GB while they run, and "
+                f"{_MOST_HELD / 1e9:.1f} are allowed. Lower --num-envs."
+            )
+        say(
             f"{name}: {size:,} transitions of {len(world.task_names)} task class(es), observations {sizes[0]}, actions "
-            f"{sizes[1]}: at most about {needed / 1e9:.2f} GB on the disk{_checked_memory(world, plan)}."
+            f"{sizes[1]}: at most about {needed / 1e9:.2f} GB on the disk, and up to {memory / 1e9:.2f} GB of memory "
+            "beside the world."
         )
         if flags.estimate:
             return
@@ -176,59 +190,61 @@ def _record(flags: RecordFlags, collection: _Collection) -> None:
     _say_complete(folder, name)
 
 
-def _checked_memory(world: "PooledWorld", plan: dict[str, Any]) -> str:
-    """The memory of running episodes, for a message; refuses more than is allowed."""
-    from bidex_meta.data.collect import bytes_held
-
-    memory = bytes_held(world)
-    if memory > _MOST_HELD:
-        raise BidexError(
-            f"The episodes of {plan['num_envs']:,} rows would take {memory / 1e9:.1f} GB while they run, and "
-            f"{_MOST_HELD / 1e9:.1f} are allowed. Lower --num-envs."
-        )
-    return f", and up to {memory / 1e9:.2f} GB of memory beside the world"
-
-
 def _episodes(flags: RecordFlags, kind: str) -> _Collection:
     """Episodes of uniform actions, or of runs' policies."""
-    from bidex_meta.data.collect import collect
-    from bidex_meta.world.threads import set_up_torch
-
     config = _config(flags)
     source = Worlds.open(config)
     # Sums depend on how torch splits them over threads: a collection keeps those that it began with.
     before = writer.stored_plan(writer.dataset_path(flags.out, source.name, kind)[0])
     config["threads"] = flags.threads or before.get("threads") or usable_cores()
     set_up_torch(config["threads"])
-    actors, policies = _actors(flags, kind, config["device"])
-    rows, size = flags.num_envs or _one_per_task(source), flags.size or SIZE.get(kind, _USUAL_SIZE)
+    actors, policies = [Actor(None)], [{"algo": None, "actions": "uniform"}]
+    if kind != "random":
+        actors, policies = map(list, zip(*(_actor(flags, path, config["device"]) for path in flags.runs), strict=True))
+    pools = source.tasks("train")
+    tasks = max(map(len, pools.values())) * len(pools)
+    rows = flags.num_envs or tasks * math.ceil(200 / tasks)  # one per task; where tasks are few, several
+    size = flags.size or SIZE.get(kind, _USUAL_SIZE)
     plan = {"kind": kind, "size": size, "num_envs": rows, "noise": flags.noise, "policies": policies}
     plan |= config | {"starts": flags.seed}
 
-    def play(world: "PooledWorld", out: "DatasetWriter") -> None:
-        collect(world, actors, out, size, flags.seed, _Report(size, out, len(actors)))
+    def play(world: PooledWorld, out: DatasetWriter) -> None:
+        before = sum(progress(out, len(actors)).steps)
+        if out.parts:
+            say(f"Going on after {before:,} transitions in {out.parts} parts.")
+        collect(world, actors, out, size, flags.seed, partial(_report, size, before))
 
     # Where episodes may end early there are more of them: a third of the time limit is measured on falls.
     return _Collection(source, kind, plan, policies, lambda: source.world("train", rows), 1.0 / 3.0, play)
 
 
-def _config(flags: RecordFlags) -> dict[str, Any]:
+def _report(size: int, before: int, now: Progress, seconds: float) -> None:
+    """A line after each round; ``seconds`` and ``before``, in transitions, of when this process began."""
+    done = sum(now.steps)
+    speed = (done - before) / max(seconds, 1e-9)
+    left = max(0, size - done) / max(speed, 1e-9)
+    say(
+        f"{done:,} of {size:,} transitions | {sum(now.episodes):,} episodes | return {now.returns:.3g} | "
+        f"success {100 * now.success:.1f} % | {speed:,.0f} steps/s | "
+        f"{f'{left / 60:.0f} min' if left >= 90 else f'{left:.0f} s'} left"
+    )
+
+
+def _config(flags: RecordFlags) -> Json:
     """The config of the source: the run's, or the flags'."""
     if flags.runs:
         configs = []
         for run in flags.runs:
             stored = RunFolder.open(run).config()
-            config = {name: value for name, value in stored.to_json().items() if name in _OF_RUN}
+            configs.append({name: value for name, value in stored.to_json().items() if name in _OF_RUN})
             if stored.task_seed is not None:  # an offline learner plays the tasks of its data
-                config["seed"] = stored.task_seed
-            configs.append(config)
-        first, last = configs[0], configs[-1]
-        if differ := [name for name in first if first[name] != last[name]]:
+                configs[-1]["seed"] = stored.task_seed
+        config, last = configs[0], configs[-1]
+        if differ := [name for name in config if config[name] != last[name]]:
             raise BidexError(
-                f"The two runs differ in {differ[0]}: {first[differ[0]]} and {last[differ[0]]}. Name runs on the same "
+                f"The two runs differ in {differ[0]}: {config[differ[0]]} and {last[differ[0]]}. Name runs on the same "
                 "tasks."
             )
-        config = first
     else:
         config = _OF_RUN | {"suite": flags.suite, "task": flags.task, "base": flags.base, "seed": flags.seed}
         if flags.suite is not None and flags.suite.endswith(".toml"):
@@ -236,34 +252,21 @@ def _config(flags: RecordFlags) -> dict[str, Any]:
     return config | {"device": resolve_device(flags.device, Worlds.open(config).on_gpu), "engine": flags.engine}
 
 
-def _actors(flags: RecordFlags, kind: str, device: str) -> "tuple[list[Actor], list[dict[str, Any]]]":
-    """Who acts, and the metadata of each."""
-    from bidex_meta.cli.policies import load_policy
-    from bidex_meta.data.collect import Actor, SamplingAgent
-
-    if kind == "random":
-        return [Actor(None)], [{"algo": None, "actions": "uniform"}]
-    actors, policies = [], []
-    for path in flags.runs:
-        folder = RunFolder.open(path)
-        algo = folder.config().algo
-        if learner_kind(algo).make.adapts:
-            raise BidexError(f"{algo} adapts to tasks: it has no one policy to record. Name a run of another learner.")
-        policy, steps = load_policy(folder, device, flags.checkpoint)
-        sampled = flags.actions == "sampled" and isinstance(policy, SamplingAgent)
-        actors.append(Actor(policy, sampled, flags.noise))
-        about = {"algo": algo, "run": folder.path.resolve().name, "steps": steps, "checkpoint": flags.checkpoint}
-        policies.append(about | {"actions": "sampled" if sampled else "mean", "noise": flags.noise})
-    return actors, policies
+def _actor(flags: RecordFlags, path: Path, device: str) -> tuple[Actor, Json]:
+    """A run's policy, and its metadata."""
+    folder = RunFolder.open(path)
+    algo = folder.config().algo
+    if learner_kind(algo).make.adapts:
+        raise BidexError(f"{algo} adapts to tasks: it has no one policy to record. Name a run of another learner.")
+    policy, steps = load_policy(folder, device, flags.checkpoint)
+    sampled = flags.actions == "sampled" and isinstance(policy, SamplingAgent)
+    about = {"algo": algo, "run": folder.path.resolve().name, "steps": steps, "checkpoint": flags.checkpoint}
+    about |= {"actions": "sampled" if sampled else "mean", "noise": flags.noise}
+    return Actor(policy, sampled, flags.noise), about
 
 
 def _demonstrations(flags: RecordFlags) -> _Collection:
     """Successful replays of a class's witness or scripted policy, with moving bases, as suites have them."""
-    from bidex_meta.data.collect import collect_successes, progress
-    from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted, ShiftedStarts
-    from bidex_meta.witness.scripts import script_of
-    from bidex_meta.witness.store import load_witness
-
     if flags.base == "fixed" or flags.engine == "warp" or flags.device not in ("auto", "cpu"):
         raise BidexError(
             "Witnesses are of moving bases and of C MuJoCo on the CPU. Leave --base, --engine, --device out."
@@ -275,69 +278,38 @@ def _demonstrations(flags: RecordFlags) -> _Collection:
     witness = {} if flags.script else {name: load_witness(name)}
     if flags.script:
         script_of(name)  # refuses a class without one
-    drawn: dict[str, Any] = {"noise": flags.noise}
-    drawn |= {"starts": "tasks"} if flags.starts == "tasks" else {"shift": flags.shift}
+    on_tasks = flags.starts == "tasks"
+    drawn: Json = {"noise": flags.noise, **({"starts": "tasks"} if on_tasks else {"shift": flags.shift})}
     plan = {"kind": "demonstrations", "task": name, "size": size, "num_envs": rows, "seed": flags.seed, **drawn}
     plan |= {"script": True} if flags.script else {}
 
-    def world() -> "PooledWorld":
-        if flags.starts == "tasks":
+    def world() -> PooledWorld:
+        if on_tasks:
             return source.world("train", rows)
         return ShiftedStarts(name, rows, flags.shift, flags.threads)  # pyright: ignore[reportAbstractUsage]
 
-    def agent(world: Any, seed: int) -> "Agent":
+    def agent(world: Any, seed: int) -> Agent:
         if flags.script:
             return Scripted(world, flags.noise, seed)
         return OpenLoopReplay(witness, [name], world.task_id, world.single_action_space.shape[0], flags.noise, seed)
 
-    def play(world: "PooledWorld", out: "DatasetWriter") -> None:
+    def play(world: PooledWorld, out: DatasetWriter) -> None:
         while (now := progress(out)).steps[0] < size:
             if not now.steps[0] and out.parts >= _PATIENCE:
-                raise _nothing_succeeds(_PATIENCE * rows, name, flags)
+                what, mend = (
+                    (f"episodes of {name}'s scripted policy", "")
+                    if flags.script
+                    else (f"replays of {name}'s witness", f" or {'play --starts witness' if on_tasks else '--shift'}")
+                )
+                raise BidexError(f"None of {_PATIENCE * rows} {what} succeeds. Lower --noise{mend}.")
             collect_successes(world, lambda seed: agent(world, seed), out, flags.seed)
             after = progress(out)
             stored = after.episodes[0] - now.episodes[0]
-            _say(f"{after.steps[0]:,} of {size:,} transitions | {stored} of {rows} replays succeed")
+            say(f"{after.steps[0]:,} of {size:,} transitions | {stored} of {rows} replays succeed")
 
     policy = {"algo": None, "actions": "script" if flags.script else "witness", **drawn}
-    kind = "demonstrations-tasks" if flags.starts == "tasks" else "demonstrations"
+    kind = "demonstrations-tasks" if on_tasks else "demonstrations"
     return _Collection(source, kind, plan, [policy], world, 1.0, play)
-
-
-def _nothing_succeeds(played: int, name: str, flags: RecordFlags) -> BidexError:
-    if flags.script:
-        return BidexError(f"None of {played} episodes of {name}'s scripted policy succeeds. Lower --noise.")
-    other = "play --starts witness" if flags.starts == "tasks" else "--shift"
-    return BidexError(f"None of {played} replays of {name}'s witness succeeds. Lower --noise or {other}.")
-
-
-def _one_per_task(source: Worlds) -> int:
-    """One environment per task; where tasks are few, several."""
-    pools = source.tasks("train")
-    tasks = max(map(len, pools.values())) * len(pools)
-    return tasks * math.ceil(200 / tasks)
-
-
-class _Report:
-    """Prints a line after each round."""
-
-    def __init__(self, size: int, out: "DatasetWriter", policies: int) -> None:
-        from bidex_meta.data.collect import progress
-
-        self._size, self._before = size, sum(progress(out, policies).steps)
-        if out.parts:
-            _say(f"Going on after {self._before:,} transitions in {out.parts} parts.")
-
-    def __call__(self, now: "Progress", seconds: float) -> None:
-        """Takes the progress, and the seconds since the collection began or was resumed."""
-        done = sum(now.steps)
-        speed = (done - self._before) / max(seconds, 1e-9)
-        left = max(0, self._size - done) / max(speed, 1e-9)
-        _say(
-            f"{done:,} of {self._size:,} transitions | {sum(now.episodes):,} episodes | return {now.returns:.3g} | "
-            f"success {100 * now.success:.1f} % | {speed:,.0f} steps/s | "
-            f"{f'{left / 60:.0f} min' if left >= 90 else f'{left:.0f} s'} left"
-        )
 
 
 def _publish_replay(flags: RecordFlags) -> None:
@@ -354,12 +326,7 @@ def _publish_replay(flags: RecordFlags) -> None:
 
 
 def _say_complete(folder: Path, name: str) -> None:
-
     found = open_dataset(folder)
     left = ", ".join(f"{count:,} {reason.replace('_', ' ')}" for reason, count in found.metadata["left_out"].items())
-    _say(f"{name}: {found.num_steps:,} transitions in {found.num_episodes:,} episodes. Left out: {left or 'nothing'}.")
-    _say(f"Look: bidex-meta data info {folder}   Check: bidex-meta data check {folder}")
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+    say(f"{name}: {found.num_steps:,} transitions in {found.num_episodes:,} episodes. Left out: {left or 'nothing'}.")
+    say(f"Look: bidex-meta data info {folder}   Check: bidex-meta data check {folder}")

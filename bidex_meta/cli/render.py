@@ -1,24 +1,22 @@
 """``bidex-meta render``: what a task looks like, or what a policy does."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
-
-from bidex_meta.cli.parsing import Switch, parse
+from bidex_meta.cli.parsing import LookFlags, Switch, parse
 from bidex_meta.config import Steps
-from bidex_meta.errors import BidexError, known_name
+from bidex_meta.errors import BidexError
 from bidex_meta.runs import video
 from bidex_meta.runs.atomic import check_writable, refuse_links
 from bidex_meta.runs.progress import counted
-from bidex_meta.utils.plugins import name_with_object, short_name
-from bidex_meta.utils.validation import Few, Pixels, Seed
+from bidex_meta.utils.plugins import short_name
+from bidex_meta.utils.validation import Few, Pixels
 
 
 @dataclass(frozen=True)
-class RenderFlags:
+class RenderFlags(LookFlags):
     """A picture of a task's start, or a film of an episode; of a run all classes beside each other.
 
     Example: bidex-meta render --task CatchUnderarm --policy random --out catch.mp4
@@ -26,27 +24,12 @@ class RenderFlags:
     bidex-meta render RUN --tiled puts a film of every class it was trained on into RUN/videos/.
     """
 
-    run: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = None
-    """Run folder whose policy is shown; the same as --policy RUN."""
-    task: str | None = None
-    """Task class; None: the run's first one."""
-    object: str | None = None
-    """With --task alone: another object of the class, of the shelf or an MJCF file (docs/objects.md); None: the run's,
-    or the class's own."""
     out: Path | None = None
     """File to write: .png for a picture, .mp4 for a film, .webp for one that web pages show; None, of a run: a film in
     its folder videos/."""
-    policy: str = "zero"
-    """zero, random, or a run folder."""
-    checkpoint: str = "last"
-    """Of a run: last, best (see `bidex-meta run --help`, --evaluate-every) or a file."""
-    suite: str | None = None
-    """Show the task as this suite has it; None: on its own, or as in the run."""
     tiled: Switch = False
     """All classes of the suite beside each other; where an episode ends the next one begins. A name is green from its
     first success to the end of the episode."""
-    seed: Seed = 0
-    """Seed of task and start."""
     steps: Steps | None = None
     """Steps to take, 60 a second; None: none for a picture, one episode for a film, with --tiled the longest one."""
     every: Few | None = None
@@ -63,14 +46,14 @@ class RenderFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Render and print where the file is.
-
-    Raises:
-        BidexError: Bad flags, a policy that does not fit, or no way to draw here.
-    """
+    """Render and print where the file is."""
     flags = parse(RenderFlags, arguments, "render")
-    policy = flags.policy if flags.run is None else str(flags.run)
-    out = _out(flags, policy)
+    out = flags.out
+    if out is None:
+        if flags.actor in ("zero", "random"):
+            raise BidexError("Name the file to write: --out film.mp4, or --out picture.png.")
+        name = "tiled" if flags.tiled else short_name(flags.task or "film")
+        out = Path(flags.actor) / "videos" / f"{name}.mp4"
     suffix = video.check_suffix(out)
     refuse_links(*([] if flags.out else [out.parent, out]))
     check_writable(out)
@@ -81,21 +64,34 @@ def main(arguments: Sequence[str]) -> None:
             raise BidexError(f"A film needs an even width and height, not {width} x {height}.")
         video.check_films()
     every = flags.every or (2 if flags.tiled else 1)
-    from bidex_meta.cli.policies import acting, looked_at, slots_of
+    from bidex_meta.cli.policies import acting, looked_at
+    from bidex_meta.evaluation.filming import film_row, film_tiles
+    from bidex_meta.tasks.base import CONTROL_RATE
 
-    source = looked_at(policy, flags.suite, flags.task, flags.seed, flags.object)
-    slots, task = slots_of(source), flags.task and name_with_object(flags.task, flags.object)
-    classes = source.task_classes()  # refuses what is not of ours
-    if not flags.tiled:
-        task = known_name(f"task of {source.name}", task or slots[0], classes)
+    source, slots, task = looked_at(flags, all_slots=flags.tiled)
     # One environment for each slot is enough to see one of them.
     world = source.world("train", len(slots))
-    agent = acting(policy, world, flags.seed, flags.checkpoint)
+    agent = acting(flags.actor, world, flags.seed, flags.checkpoint)
     if flags.points:
         world = _with_clouds(world)
-    rows = list(range(len(slots))) if flags.tiled else [world.slot_rows[slots.index(str(task))].start]
+    rows = list(range(len(slots))) if flags.tiled else [world.slot_rows[slots.index(task)].start]
+    longest = int(world.max_episode_steps[rows].max())
+    steps = flags.steps if flags.steps is not None else 0 if suffix == ".png" else longest
     look = {"width": width, "height": height, "camera": flags.camera}
-    _write(out, _frames(flags, agent, world, rows, every if suffix != ".png" else None, look), every)
+    if flags.tiled:
+        every = every if suffix != ".png" else max(steps, 1)
+        frames, count = film_tiles(agent, world, rows, steps, flags.seed, every, **look), steps // every + 1
+    elif suffix == ".png":  # the last one alone
+        frames, count = film_row(agent, world, rows[0], steps, flags.seed, None, **look), 1
+    else:
+        frames, count = film_row(agent, world, rows[0], steps, flags.seed, every, **look), steps // every + 1
+    frames = counted(frames, count, "frames")
+    write = {".mp4": video.write_video, ".webp": video.write_animation}.get(suffix)
+    if write is not None:
+        write(out, frames, CONTROL_RATE / every)
+    else:
+        for frame in frames:  # a tiled picture comes after the first frame
+            video.write_image(out, frame)
     world.close()
     print(out)
 
@@ -103,46 +99,8 @@ def main(arguments: Sequence[str]) -> None:
 def _with_clouds(world: Any) -> Any:
     """The world with clouds in its pictures."""
     from bidex_meta.evaluation.filming import CloudView
-    from bidex_meta.world import World
-    from bidex_meta.world.depth_sensor import PointsRule
+    from bidex_meta.world import PointsRule, World
 
     if not isinstance(world, World):
         raise BidexError("Point clouds are made of scenes of our own, not of Meta-World's. Leave --points out.")
     return CloudView(world, (world.points or PointsRule()).count)
-
-
-def _out(flags: RenderFlags, policy: str) -> Path:
-    if flags.out is not None:
-        return flags.out
-    if policy in ("zero", "random"):
-        raise BidexError("Name the file to write: --out film.mp4, or --out picture.png.")
-    name = "tiled" if flags.tiled else short_name(flags.task or "film")
-    return Path(policy) / "videos" / f"{name}.mp4"
-
-
-def _frames(
-    flags: RenderFlags, agent: Any, world: Any, rows: list[int], every: Few | None, look: dict[str, Any]
-) -> tuple[Iterator[Any], int]:
-    """The frames, and how many there will be at most; with ``every`` None the last one alone."""
-    from bidex_meta.evaluation.filming import film_row, film_tiles
-
-    longest = int(world.max_episode_steps[rows].max())
-    steps = flags.steps if flags.steps is not None else 0 if every is None else longest
-    if flags.tiled:
-        each = every or max(steps, 1)
-        frames = film_tiles(agent, world, rows, steps, flags.seed, each, **look)
-        return frames, steps // each + 1
-    return film_row(agent, world, rows[0], steps, flags.seed, every, **look), 1 if every is None else steps // every + 1
-
-
-def _write(out: Path, frames: tuple[Iterator[Any], int], every: int) -> None:
-    from bidex_meta.tasks.base import CONTROL_RATE
-
-    shown = counted(*frames, "frames")
-    if out.suffix.lower() == ".mp4":
-        video.write_video(out, shown, CONTROL_RATE / every)
-    elif out.suffix.lower() == ".webp":
-        video.write_animation(out, shown, CONTROL_RATE / every)
-    else:
-        for frame in shown:  # a tiled picture comes after the first frame
-            video.write_image(out, frame)

@@ -12,8 +12,10 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from bidex_meta.cli.parsing import RunPaths, named_runs, output, parse
-from bidex_meta.cli.tables import class_table, group_table
+from bidex_meta.cli.compare import class_table, group_table
+from bidex_meta.cli.parsing import RunPaths, parse
+from bidex_meta.cli.plot import named_runs, output
+from bidex_meta.cli.tables import NONE, Json
 from bidex_meta.config import flat, printed
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import History, estimates, read_groups, read_histories
@@ -43,11 +45,7 @@ class ReportFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Write the page and print where it is.
-
-    Raises:
-        BidexError: No run is named, or none has logged anything.
-    """
+    """Write the page and print where it is."""
     flags = parse(ReportFlags, arguments, "report")
     runs = named_runs(flags.runs, "report")
     out = output(flags.out, runs, "report.html")
@@ -58,11 +56,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def render(runs: Sequence[Run]) -> str:
-    """The page of some runs.
-
-    Raises:
-        BidexError: None of them has logged anything, or matplotlib or jinja2 is missing.
-    """
+    """The page of some runs; BidexError where none has logged anything, or matplotlib or jinja2 is missing."""
     try:
         from jinja2 import Environment, FileSystemLoader, StrictUndefined
     except ImportError:
@@ -70,13 +64,15 @@ def render(runs: Sequence[Run]) -> str:
     histories = read_histories(runs)
     short = [f"{_letter(place)} {history.label.partition(',')[0]}" for place, history in enumerate(histories)]
     named = list(zip(short, histories, strict=True))
-    curves = [(name, history.curves) for name, history in named]
-    names = _names(named)
+    curves, names = [(name, history.curves) for name, history in named], _names(named)
+    configs = [run.config() for run in runs]
+    algos = ", ".join(dict.fromkeys(config.algo for config in configs))
+    subjects = ", ".join(dict.fromkeys(Path(config.suite or config.task or "").stem for config in configs))
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
     return environment.get_template("report.html").render(
-        title=_title(runs),
+        title=f"{algos} on {subjects}",
         groups=[(name, history.label, len(history.runs)) for name, history in named],
         runs=[_run(run, names[run.path]) for run in runs],
         final=_final(runs, {run.path: name for name, history in named for run in history.runs}),
@@ -84,16 +80,9 @@ def render(runs: Sequence[Run]) -> str:
         speed=_picture(lambda: plots.draw_metrics(curves, _SPEED)),
         adaptation=list(_adaptation(runs, names)),
         differences=_differences(runs, names),
-        configs=[(names[run.path], printed(run.config())) for run in runs],
+        configs=[(names[run.path], printed(config)) for run, config in zip(runs, configs, strict=True)],
         films=list(_films(runs, names)),
     )
-
-
-def _title(runs: Sequence[Run]) -> str:
-    configs = [run.config() for run in runs]
-    algos = ", ".join(dict.fromkeys(config.algo for config in configs))
-    subjects = ", ".join(dict.fromkeys(Path(config.suite or config.task or "").stem for config in configs))
-    return f"{algos} on {subjects}"
 
 
 def _letter(place: int) -> str:
@@ -107,35 +96,32 @@ def _names(histories: Sequence[tuple[str, History]]) -> dict[Path, str]:
     for group, history in histories:
         for run in history.runs:
             config = run.config()
-            of_task = f", {config.task}" if config.task else ""
-            name = f"{group}{of_task}, seed {config.seed}"
+            name = f"{group}{f', {config.task}' if config.task else ''}, seed {config.seed}"
             twice = sum(known.split(" (")[0] == name for known in names.values())
             names[run.path] = f"{name} ({twice + 1})" if twice else name
     return names
 
 
-def _run(run: Run, name: str) -> dict[str, Any]:
+def _run(run: Run, name: str) -> Json:
     config, rows, versions = run.config(), run.metrics(), run.versions()
     speeds = [row["Perf/steps_per_second"] for row in rows if row.get("Perf/steps_per_second") is not None]
     hardware = ", ".join(versions.get("gpus") or []) or f"{versions.get('cpus', '?')} processors"
     git = versions.get("git") or {}
     return {
-        "name": name,
-        "path": str(run.path),
-        "on": config.suite or config.task,
+        "name": name, "path": str(run.path), "on": config.suite or config.task,
         "steps": f"{max((row['step'] for row in rows), default=0):,}",
         "hours": f"{training_seconds(rows) / 3600.0:.2f}",
-        "speed": f"{median(speeds):,.0f}" if speeds else "–",
+        "speed": f"{median(speeds):,.0f}" if speeds else NONE,
         "environments": f"{config.num_envs:,}",
         "device": f"{config.device} ({hardware})",
-        "commit": (git.get("commit") or "–")[:10] + ("+" if git.get("dirty") else ""),
-    }
+        "commit": (git.get("commit") or NONE)[:10] + ("+" if git.get("dirty") else ""),
+    }  # fmt: skip
 
 
-def _final(runs: Sequence[Run], short: dict[Path, str]) -> dict[str, Any]:
+def _final(runs: Sequence[Run], short: dict[Path, str]) -> Json:
     """Tables of the groups' final evaluations, and why runs are missing; ``short`` has the groups' names."""
     evaluated = [run for run in runs if run.evaluated]
-    found: dict[str, Any] = {"missing": len(runs) - len(evaluated), "reason": "", "picture": None, "tables": []}
+    found: Json = {"missing": len(runs) - len(evaluated), "reason": "", "picture": None, "tables": []}
     try:
         groups = [replace(group, label=short[group.paths[0]]) for group in read_groups(evaluated)]
     except BidexError as error:
@@ -157,17 +143,17 @@ def _adaptation(runs: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[s
                     yield names[run.path], picture
 
 
-def _differences(runs: Sequence[Run], names: dict[Path, str]) -> dict[str, Any]:
+def _differences(runs: Sequence[Run], names: dict[Path, str]) -> Json:
     """What of config and versions is not the same in all runs."""
     columns = [run.config().flat() | flat({"versions": run.versions()}) for run in runs]
     keys = dict.fromkeys(key for column in columns for key in column)
     differing = [key for key in keys if len({json.dumps(column.get(key)) for column in columns}) > 1]
-    cells = [[key, *(_cell(column.get(key)) for column in columns)] for key in differing]
+    cells = [[key, *map(_cell, (column.get(key) for column in columns))] for key in differing]
     return {"names": [names[run.path] for run in runs], "rows": cells}
 
 
 def _cell(value: object) -> str:
-    return "–" if value is None else value if isinstance(value, str) else json.dumps(value)
+    return NONE if value is None else value if isinstance(value, str) else json.dumps(value)
 
 
 def _films(runs: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[str, str, str | None]]:
@@ -187,8 +173,7 @@ def _films(runs: Sequence[Run], names: dict[Path, str]) -> Iterator[tuple[str, s
 
 def _picture(draw: Callable[[], Any]) -> str | None:
     """A figure as the address of an image; None where there is nothing to draw."""
-    missing = plots.missing()
-    if missing is not None:
+    if missing := plots.missing():
         raise BidexError(missing)
     try:
         return _data(plots.svg(draw()), "image/svg+xml")

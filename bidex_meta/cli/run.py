@@ -8,20 +8,19 @@ import math
 import signal
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from bidex_meta.cli import metatest, run_data, run_recording, watching
-from bidex_meta.cli.evaluate import conditions
+from bidex_meta.cli.evaluate import conditions, judged
 from bidex_meta.cli.policies import checkpoint, fitting
 from bidex_meta.cli.run_config import RunPlan, plan_run
-from bidex_meta.cli.tables import evaluation_table, print_table
+from bidex_meta.cli.tables import Json, print_table, say
 from bidex_meta.config import RunConfig, printed
+from bidex_meta.data.joined import join
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation.play import EVALUATION_SEED, RandomAgent
-from bidex_meta.evaluation.results import compare
 from bidex_meta.runs import Recorder, RunFolder, mend, training_seconds
 from bidex_meta.runs.atomic import write_json
 from bidex_meta.runs.folder import check_new, new_folder_name
@@ -31,17 +30,15 @@ from bidex_meta.train.launch import launch, resume_command
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.world.threads import set_up_torch
 
-Checkpoint = tuple[dict[str, Any], int]
+Checkpoint = tuple[Json, int]
 """State and environment steps."""
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Train and evaluate.
+    """Train and evaluate. After bad input nothing has been written.
 
-    Raises:
-        BidexError: Bad input. Nothing has been written then.
-        SystemExit: Another process was lost (exit code 1), or has reported what is wrong with the input (2); Ctrl-C
-            (130), SIGHUP (129) or the end of what reads stderr (141) came while it trained, which has saved then.
+    Raises SystemExit where another process was lost (exit code 1), or has reported what is wrong with the input (2);
+    where Ctrl-C (130), SIGHUP (129) or the end of what reads stderr (141) came while it trained, which has saved then.
     """
     try:
         distributed.init_from_environment()
@@ -60,9 +57,7 @@ def main(arguments: Sequence[str]) -> None:
 def run(plan: RunPlan) -> None:
     """Trains what was planned, from its last checkpoint where there is one, and evaluates it.
 
-    Raises:
-        LostProcess: Another process is gone before the training has begun.
-        SystemExit: As of :func:`main`.
+    Raises LostProcess where another process is gone before the training has begun, SystemExit as :func:`main`.
     """
     with contextlib.ExitStack() as held:  # the lock of the run's folder
         together(lambda: _check(plan, held))
@@ -71,15 +66,24 @@ def run(plan: RunPlan) -> None:
         config = plan.config
         # Sums depend on how torch splits them over threads: a resumed run must use the number it began with.
         set_up_torch(config.threads)
-        _announce(plan)
-        world = together(lambda: _make_world(plan))
+        rows = f"{launch().count} x {config.num_envs}" if launch().count > 1 else f"{config.num_envs}"
+        say(f"{config.algo} on {plan.source.name}, {rows} environments on {config.device}, seed {config.seed}")
+        say(f"Preset {config.preset}: {plan.preset_reason}.")
+        autoreset = plan.kind.autoreset(config.learner_values)
+        world: Any = together(lambda: plan.source.world("train", config.num_envs, autoreset))
+        if config.record:
+            world = together(lambda: run_recording.recorded(plan, world))
         learner = together(lambda: _make_learner(plan, world, fresh=loaded is None))
-        folder = _shared(together(lambda: _own_folder(plan, held)))
-        _say(f"Run folder: {folder.path}")
+        own = together(lambda: plan.folder or (_new_folder(plan, held) if launch().rank == 0 else None))
+        path = distributed.share(own and own.path)[0]  # process 0's
+        assert path is not None
+        folder = RunFolder(path)
+        say(f"Run folder: {folder.path}")
         try:
             if config.record:
                 together(lambda: run_recording.begin(world, folder.path, fresh=loaded is None))
-            _report_loss_when_waiting(folder)
+            waits = distributed.LostProcess("this one was asked to stop and waits for it")
+            distributed.on_loss(lambda: _report_loss(waits, folder))
             stopped = _train(plan, folder, world, learner, loaded)
             if config.record and launch().rank == 0:
                 run_recording.complete(plan, world)
@@ -89,7 +93,11 @@ def run(plan: RunPlan) -> None:
             raise SystemExit(1) from None
         world.close()
         if stopped:
-            _end_early(folder, learner, stopped)
+            command = resume_command(folder.path, launch().count)
+            say(f"Stopped after {learner.env_steps:,} steps and saved. Continue: {command}")
+            # A batch system's SIGTERM asks for a checkpoint and gets it; the others break off whatever calls this too.
+            if stopped != signal.SIGTERM:
+                raise SystemExit(128 + stopped)
         elif plan.flags.evaluate and launch().rank == 0:
             _evaluate(plan, folder, learner)
 
@@ -115,11 +123,7 @@ def _check(plan: RunPlan, held: contextlib.ExitStack) -> None:
 
 
 def _agree(plan: RunPlan, loaded: Checkpoint | None) -> RunPlan:
-    """The plan with process 0's config.
-
-    Raises:
-        BidexError: The processes were started with different flags, or see different checkpoints.
-    """
+    """The plan with process 0's config; refuses processes that have other flags, or see other checkpoints."""
     everyone = distributed.share((plan.config, loaded and loaded[1]))
 
     def check() -> None:
@@ -143,53 +147,28 @@ def _agree(plan: RunPlan, loaded: Checkpoint | None) -> RunPlan:
     return replace(plan, config=everyone[0][0])
 
 
-def _announce(plan: RunPlan) -> None:
-    config, processes = plan.config, launch().count
-    times = f"{processes} x " if processes > 1 else ""
-    _say(
-        f"{config.algo} on {plan.source.name}, {times}{config.num_envs} environments on {config.device}, "
-        f"seed {config.seed}"
-    )
-    _say(f"Preset {config.preset}: {plan.preset_reason}.")
-
-
-def _make_world(plan: RunPlan) -> Any:
-    config = plan.config
-    world = plan.source.world("train", config.num_envs, plan.kind.autoreset(config.learner_values))
-    return run_recording.recorded(plan, world) if config.record else world
-
-
 def _make_learner(plan: RunPlan, world: VectorWorld, fresh: bool) -> Any:
     """The learner with its data; a fresh one with the weights that it shall start from."""
     config = plan.config
     learner = plan.kind.make(world, config.learner, config.seed)
     if plan.kind.make.offline:
-        run_data.give_datasets(config.dataset, learner)
+        learner.learn_from(join(run_data.announced(config.dataset, "Reading"), world))
     if config.demonstrations:
-        run_data.give_demonstrations(config.demonstrations, learner)
+        demonstrations = run_data.announced(config.demonstrations, "Demonstrations:")
+        learner.learn_from_demonstrations(join(demonstrations, world, every=False))
     if fresh and config.start_from is not None:
         start = RunFolder.open(Path(config.start_from))
         state, step = checkpoint(start)
         with fitting(start.path):
             learner.start_from(state["learner"]["policy"])
-        _say(f"Starting from the policy of {config.start_from} at {step:,} steps.")
+        say(f"Starting from the policy of {config.start_from} at {step:,} steps.")
     return learner
 
 
-def _own_folder(plan: RunPlan, held: contextlib.ExitStack) -> RunFolder | None:
-    """The run's folder, made and locked where it is new; None in processes other than 0."""
-    if launch().rank > 0 or plan.folder is not None:
-        return plan.folder
+def _new_folder(plan: RunPlan, held: contextlib.ExitStack) -> RunFolder:
     folder = RunFolder.create(plan.config, plan.flags.run_dir, identity=plan.source.identity())
     held.enter_context(folder.locked())
     return folder
-
-
-def _shared(folder: RunFolder | None) -> RunFolder:
-    """Process 0's."""
-    path = distributed.share(folder and folder.path)[0]
-    assert path is not None
-    return RunFolder(path)
 
 
 def _train(plan: RunPlan, folder: RunFolder, world: VectorWorld, learner: Any, loaded: Checkpoint | None) -> int:
@@ -199,10 +178,10 @@ def _train(plan: RunPlan, folder: RunFolder, world: VectorWorld, learner: Any, l
         state, resume_step = loaded
         with fitting(folder.path):
             together(lambda: runner.resume(learner, world, state))
-        _say(f"Continuing at {resume_step:,} steps.")
+        say(f"Continuing at {resume_step:,} steps.")
     elif plan.folder is not None:
         resume_step = 0  # killed before its first checkpoint: the same seed takes it there again
-        _say("No checkpoint yet: starting from the beginning.")
+        say("No checkpoint yet: starting from the beginning.")
     seconds = math.inf if config.minutes is None else 60.0 * config.minutes
     train = partial(
         runner.train, learner, world, total_steps=config.steps, total_seconds=seconds, enough=_early_end(config)
@@ -214,41 +193,29 @@ def _train(plan: RunPlan, folder: RunFolder, world: VectorWorld, learner: Any, l
         folder.change_config(config)  # more steps, say; not before it is known that the run goes on
     rows = mend(folder.metrics_path, resume_step or 0)
     last = rows[-1] if rows and rows[-1]["step"] == resume_step else None
-    with (
-        Recorder(folder, config.steps, seconds, resume_step, config.logger) as record,
-        watching.watch(plan, folder, learner, record, len(rows)) as watch,
-    ):
+    with contextlib.ExitStack() as stack:
+        record, watch = stack.enter_context(Recorder(folder, config.steps, seconds, resume_step, config.logger)), None
+        if config.evaluate_every is not None or config.video_every is not None:
+            watch = watching.Watch(plan, folder, learner, record, len(rows))
+            stack.callback(watch.close)
         stopped = train(record=record, watch=watch, last=last, spent_seconds=training_seconds(rows))
     if not stopped and learner.env_steps < config.steps and config.minutes is not None:
-        _say(f"The {config.minutes:g} minutes are up after {learner.env_steps:,} steps.")
+        say(f"The {config.minutes:g} minutes are up after {learner.env_steps:,} steps.")
     return stopped
 
 
-def _early_end(config: RunConfig[Any]) -> Any:
+def _early_end(config: RunConfig) -> Any:
     """What ends the training early, by its metrics; None where nothing does."""
     if config.stop_at_return is None and config.stop_at_success is None and config.stop_at_score is None:
         return None
 
-    def reached(metrics: dict[str, Any]) -> bool:
+    def reached(metrics: Json) -> bool:
         tag = config.early_end(metrics)
         if tag is not None:
-            _say(f"Enough: {tag} is {metrics[tag]:.4g}.")
+            say(f"Enough: {tag} is {metrics[tag]:.4g}.")
         return tag is not None
 
     return reached
-
-
-def _end_early(folder: RunFolder, learner: Any, number: int) -> None:
-    # A batch system's SIGTERM asks for a checkpoint and gets it; the others break off whatever calls this too.
-    command = resume_command(folder.path, launch().count)
-    _say(f"Stopped after {learner.env_steps:,} steps and saved. Continue: {command}")
-    if number != signal.SIGTERM:
-        raise SystemExit(128 + number)
-
-
-def _report_loss_when_waiting(folder: RunFolder) -> None:
-    waits = distributed.LostProcess("this one was asked to stop and waits for it")
-    distributed.on_loss(lambda: _report_loss(waits, folder))
 
 
 def _report_loss(loss: Exception, folder: RunFolder | None = None) -> None:
@@ -258,34 +225,26 @@ def _report_loss(loss: Exception, folder: RunFolder | None = None) -> None:
         return
     count, which = launch().count, ", ".join(map(str, missing))
     gone = f"process {which} of {count} is gone or stuck" if which else f"one of {count} processes has ended"
-    left = "Training had not begun." if folder is None else _what_is_left(folder, count)
+    left = "Training had not begun."
+    if folder is not None:
+        step = folder.checkpoints.newest_step() if folder.checkpoints_path.is_dir() else None
+        saved = "There is no checkpoint yet" if step is None else f"The last checkpoint is at {step:,} steps"
+        left = f"{saved}, in {folder.checkpoints_path}. Continue: {resume_command(folder.path, count)}"
     print(f"bidex-meta: {gone} ({loss}). {left}", file=sys.stderr, flush=True)
-
-
-def _what_is_left(folder: RunFolder, processes: int) -> str:
-    step = folder.checkpoints.newest_step() if folder.checkpoints_path.is_dir() else None
-    saved = "There is no checkpoint yet" if step is None else f"The last checkpoint is at {step:,} steps"
-    return f"{saved}, in {folder.checkpoints_path}. Continue: {resume_command(folder.path, processes)}"
 
 
 def _evaluate(plan: RunPlan, folder: RunFolder, learner: Any) -> None:
     if plan.kind.make.adapts:
         _meta_test(plan, folder, learner)
         return
-    source, seed = plan.source, EVALUATION_SEED
-    episodes = plan.flags.episodes or source.default_episodes
-    _say(f"Evaluating: {episodes} episode{'s' * (episodes > 1)} of each task, and as many of a random policy.")
-    world = source.world()
-    trained = source.judge(learner, world, episodes, seed)
-    random = source.judge(RandomAgent(world.action_space), world, episodes, seed)
-    world.close()
-    above = {name: asdict(difference) for name, difference in compare(trained, random).items()}
-    result = {"run": str(folder.path), "steps": learner.env_steps, "split": "train", "seed": seed}
-    result |= {"policy": trained.to_json(), "random": random.to_json(), "return_above_random": above}
-    write_json(folder.evaluation_path, result | {"conditions": conditions(source)})
+    source, episodes = plan.source, plan.flags.episodes or plan.source.default_episodes
+    say(f"Evaluating: {episodes} episode{'s' * (episodes > 1)} of each task, and as many of a random policy.")
     title = f"{plan.config.algo} on {source.name}, {learner.env_steps:,} steps"
-    print_table(evaluation_table(title, trained, random))
-    _say(f"Again: bidex-meta evaluate {folder.path}   Curves: bidex-meta plot {folder.path}")
+    options = metatest.Options(episodes=episodes)
+    found, table = judged(source, learner, learner.env_steps, "train", options, random=True, title=title)
+    write_json(folder.evaluation_path, {"run": str(folder.path), **found, "conditions": conditions(source)})
+    print_table(table)
+    say(f"Again: bidex-meta evaluate {folder.path}   Curves: bidex-meta plot {folder.path}")
 
 
 def _meta_test(plan: RunPlan, folder: RunFolder, learner: Any) -> None:
@@ -293,14 +252,9 @@ def _meta_test(plan: RunPlan, folder: RunFolder, learner: Any) -> None:
     flags, source = plan.flags, plan.source
     options = metatest.Options(shots=flags.shots, rollouts=flags.rollouts, episodes=flags.episodes, tasks=flags.tasks)
     load = partial(plan.kind.make.load_policy, learner.policy_state_dict(), device)
-    result = metatest.meta_test(source, plan.config, load, options, metatest.splits_of(source, flags.split), _say)
+    result = metatest.meta_test(source, plan.config, load, options, metatest.splits_of(source, flags.split), say)
     report = {"steps": learner.env_steps, "seed": options.starts}
     report["splits"] = {split: each.to_json() for split, each in result.items()}
     write_json(folder.evaluation_path, report | {"conditions": conditions(source)})
     metatest.print_tables(f"{plan.config.algo} on {source.name}, {learner.env_steps:,} steps", result)
-    _say(f"More: bidex-meta evaluate {folder.path} --shots 3 --tasks 50   See bidex-meta plot --help for curves.")
-
-
-def _say(text: str) -> None:
-    if launch().rank == 0:
-        print(text, file=sys.stderr, flush=True)
+    say(f"More: bidex-meta evaluate {folder.path} --shots 3 --tasks 50   See bidex-meta plot --help for curves.")

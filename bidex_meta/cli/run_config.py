@@ -5,13 +5,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Generic, Literal
+from typing import Annotated, Generic, Literal
 
 import tyro
 
 from bidex_meta.cli import run_data
 from bidex_meta.cli.learners import LearnerKind, choose_preset, learner_kind, resolve_device
 from bidex_meta.cli.parsing import Switch, parse, peek, peek_all
+from bidex_meta.cli.tables import Json
 from bidex_meta.config import LearnerSettings, RunConfig
 from bidex_meta.data import part_files
 from bidex_meta.errors import BidexError, one_line
@@ -23,6 +24,8 @@ from bidex_meta.utils.validation import Count, Few, Shots
 from bidex_meta.worlds import Worlds
 
 _EXAMPLE = "MT4"  # a suite whose defaults `run --help` shows
+_WIDTH = 1200
+"""Numbers that a step of one environment holds at most: observations before and after, actions, what is computed."""
 
 
 @dataclass(frozen=True)
@@ -60,16 +63,11 @@ class RunFlags(Generic[LearnerSettings]):
 class RunPlan:
     """Everything decided before anything is made."""
 
-    flags: RunFlags[Any]
-    """As parsed."""
+    flags: RunFlags
     kind: LearnerKind
-    """The learner."""
-    config: RunConfig[Any]
-    """The resolved config as it is written to ``config.json``."""
-    folder: RunFolder | None
-    """The run to be resumed, if any."""
-    preset_reason: str
-    """Why this preset."""
+    config: RunConfig  # resolved, as it is written to config.json
+    folder: RunFolder | None  # the run to be resumed, if any
+    preset_reason: str  # why this preset
 
     @cached_property
     def source(self) -> Worlds:
@@ -78,11 +76,7 @@ class RunPlan:
 
 
 def plan_run(arguments: Sequence[str]) -> RunPlan:
-    """Parse in two stages: algo, preset and device first, since they decide what the other flags are and default to.
-
-    Raises:
-        BidexError: Bad flags, or flags that contradict the run to be resumed.
-    """
+    """Parse in two stages: algo, preset and device first, since they decide what the other flags are and default to."""
     resume = peek(arguments, "--resume")
     if resume and peek(arguments, "--run-dir"):
         raise BidexError("--resume goes on in the run's own folder. Leave --run-dir out, or start a new run there.")
@@ -106,18 +100,17 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     if folder and stored:
         default = replace(stored, learner=_stored_learner(type(kind.presets[preset]), stored, folder))
     else:
-        sizes = run_data.rows_and_steps(source) if make.offline else source.rows_and_steps(device, make.adapts)
+        # An offline learner takes sizes and names from its world.
+        offline = max(1, len(source.tasks("train"))), run_data.UPDATES
+        sizes = offline if make.offline else source.rows_and_steps(device, make.adapts)
         default = RunConfig(
             **{"suite": None, "task": None, **implied},
-            algo=kind.name,
-            learner=kind.presets[preset],
-            num_envs=sizes[0],
-            steps=sizes[1],
-            seed=0,
-            task_seed=run_data.task_seed(datasets),
-            threads=max(1, usable_cores() // launch().local_count),
-        )
-    flags = _parse(arguments, default)
+            algo=kind.name, learner=kind.presets[preset], num_envs=sizes[0], steps=sizes[1], seed=0,
+            task_seed=run_data.task_seed(datasets), threads=max(1, usable_cores() // launch().local_count),
+        )  # fmt: skip
+    # The learner's flags are among those of its config; lists begin empty, since flags add to them.
+    options: type[RunFlags] = RunFlags[type(default.learner)]  # pyright: ignore
+    flags = parse(options, arguments, "run", RunFlags(replace(default, dataset=(), demonstrations=())))
     run_data.check_offline(kind, flags.config.record, datasets, source)
     demonstrations = run_data.whole_paths(flags.config.demonstrations) or default.demonstrations
     config = replace(flags.config, dataset=dataset, demonstrations=demonstrations, algo=kind.name, preset=preset)
@@ -129,13 +122,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     return RunPlan(flags, kind, config, folder, reason)
 
 
-def _parse(arguments: Sequence[str], default: RunConfig[Any]) -> RunFlags[Any]:
-    """The flags, those of the learner's config among them; lists begin empty, since flags add to them."""
-    options: Any = RunFlags[type(default.learner)]
-    return parse(options, arguments, "run", RunFlags(replace(default, dataset=(), demonstrations=())))
-
-
-def _resolved(config: RunConfig[Any], source: Worlds, device: str, fresh: bool) -> RunConfig[Any]:
+def _resolved(config: RunConfig, source: Worlds, device: str, fresh: bool) -> RunConfig:
     """The config with names as they are written (``MT4`` where ``--suite mt4`` was given) and whole paths.
 
     A run may be resumed from another folder.
@@ -152,7 +139,7 @@ def _resolved(config: RunConfig[Any], source: Worlds, device: str, fresh: bool) 
         config,
         suite=suite,
         task=None if config.task is None else name,
-        object=_whole_path(config.object),
+        object=str(absolute(held)) if (held := config.object) and held.endswith(".xml") else held,
         start_from=None if config.start_from is None else str(absolute(config.start_from)),
         record_share=config.record / max(config.steps, 1) if fresh else config.record_share,
         processes=launch().count,
@@ -160,12 +147,7 @@ def _resolved(config: RunConfig[Any], source: Worlds, device: str, fresh: bool) 
     )
 
 
-def _whole_path(name: str | None) -> str | None:
-    """An object's name, of a file its whole path."""
-    return str(absolute(name)) if name is not None and name.endswith(".xml") else name
-
-
-def _check(flags: RunFlags[Any], config: RunConfig[Any], kind: LearnerKind) -> None:
+def _check(flags: RunFlags, config: RunConfig, kind: LearnerKind) -> None:
     """Refuses what does not go together, and what this machine has no room for."""
     if config.stop_at_score is not None and config.evaluate_every is None:
         raise BidexError("--stop-at-score is judged by evaluations while training. Add --evaluate-every 50, say.")
@@ -175,25 +157,13 @@ def _check(flags: RunFlags[Any], config: RunConfig[Any], kind: LearnerKind) -> N
     if config.record:
         part_files.hdf5()  # refuses it where it is not installed
     if config.device.startswith("cpu") and not flags.print_config:
-        _check_memory(config)
+        of_learner = kind.make.bytes_held(config.learner, config.num_envs, _WIDTH + 3 * config.points)
+        needed = launch().local_count * (of_learner + config.num_envs * (ROW_BYTES + config.points * POINT_BYTES))
+        what = f"--num-envs {config.num_envs} ({of_learner / 1e9:,.1f} GB of it the learner's)"
+        check_memory(needed, what, "Lower it, or the learner's layers, steps or replay.")
 
 
-_WIDTH = 1200
-"""Numbers that a step of one environment holds at most: observations before and after, actions, what is computed."""
-
-
-def _check_memory(config: RunConfig[Any]) -> None:
-    """Refuses a world, and what the learner says it holds (``bytes_held``), that this machine has no room for."""
-    held = getattr(config.learner, "bytes_held", None)
-    of_learner = 0 if held is None else held(config.num_envs, _WIDTH + 3 * config.points)
-    of_world = config.num_envs * (ROW_BYTES + config.points * POINT_BYTES)
-    what = f"--num-envs {config.num_envs} ({of_learner / 1e9:,.1f} GB of it the learner's)"
-    check_memory(
-        launch().local_count * (of_world + of_learner), what, "Lower it, or the learner's layers, steps or replay."
-    )
-
-
-def _stored_learner(config_class: Any, stored: RunConfig[dict[str, Any]], folder: RunFolder) -> Any:
+def _stored_learner(config_class: type, stored: RunConfig[Json], folder: RunFolder) -> object:
     values = {name: tuple(v) if isinstance(v, list) else v for name, v in stored.learner.items()}
     unknown = set(values) - {entry.name for entry in dataclasses.fields(config_class)}
     if unknown:
@@ -209,7 +179,7 @@ def _stored_learner(config_class: Any, stored: RunConfig[dict[str, Any]], folder
         raise BidexError(f"{folder.config_path}: learner: {one_line(error)}.") from None
 
 
-def _refuse_changes(stored: RunConfig[Any], config: RunConfig[Any], folder: RunFolder) -> None:
+def _refuse_changes(stored: RunConfig, config: RunConfig, folder: RunFolder) -> None:
     if stored.processes != config.processes:
         raise BidexError(
             f"{folder.path} has worlds of {stored.processes} process(es), not {config.processes}. "

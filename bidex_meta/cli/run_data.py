@@ -2,67 +2,48 @@
 
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
 
 from bidex_meta.cli.learners import ALGOS, LearnerKind, learner_kind
+from bidex_meta.cli.tables import Json
 from bidex_meta.data import Dataset, open_dataset
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.runs.versions import collect_versions
 from bidex_meta.train.launch import launch
 from bidex_meta.utils.files import absolute, expanded
+from bidex_meta.world.contract import VectorWorld
 from bidex_meta.worlds import Worlds
-
-if TYPE_CHECKING:
-    from bidex_meta.world.contract import VectorWorld
 
 UPDATES = 300_000
 """Updates of an offline run by default."""
 _FORM = ("suite", "task", "base", "object", "points")
 
 
-def dataset_metadata(
-    source: Worlds, world: "VectorWorld", kind: str, policies: Sequence[dict[str, Any]], **more: Any
-) -> dict[str, Any]:
-    """Our entry in the metadata of a data set.
+def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Sequence[Json], **more: object) -> Json:
+    """Our entry in the metadata of a data set of a world of some source, and ``more``; all ready for JSON.
 
-    Args:
-        source: Where its world came from.
-        world: The world.
-        kind: ``random``, ``medium``, ...
-        policies: Who acted, in the order of ``Episode.policy``.
-        more: Further entries.
-
-    Returns:
-        ``suite`` and ``suite_version``, or ``task``, ``base`` and ``object``, the others None; ``points`` of a cloud;
-        ``tasks``, names of the slots; ``reward_scales``, factor on the printed reward by slot; ``hides_goals``;
-        ``observation_groups``, [name, index ranges]; ``kind``, ``policies``, ``seed`` of the tasks, ``references``
-        ({class: {random, zero, expert}}, unscaled returns), ``versions`` and ``commit``; all ready for JSON.
+    ``policies`` are who acted, in the order of ``Episode.policy``. Returned are ``suite`` and ``suite_version``, or
+    ``task``, ``base`` and ``object``, the others None; ``points`` of a cloud; ``tasks``, names of the slots;
+    ``reward_scales``, factor on the printed reward by slot; ``hides_goals``; ``observation_groups``, [name, index
+    ranges]; ``kind`` (``random``, ``medium``, ...), ``policies``, ``seed`` of the tasks, ``references`` ({class:
+    {random, zero, expert}}, unscaled returns), ``versions`` and ``commit``.
     """
     alone, versions = source.class_name, collect_versions()
     names = {name.partition("/")[0] for name in world.task_names}
+    references = {name: known for name, known in source.references().items() if name in names}
     return {
         "suite": None if alone else source.name,
         "suite_version": source.suite.version if source.suite else None,
-        "task": alone,
-        "object": source.object,
-        "points": source.points,
+        "task": alone, "object": source.object, "points": source.points,
         "base": {None: "own", True: "moving", False: "fixed"}[source.moving_base] if alone else None,
         "tasks": list(world.task_names),
         "reward_scales": {slot.name: slot.reward_scale for slot in getattr(world, "slots", ())},
         "hides_goals": source.hides_goals,
         "observation_groups": [[g.name, [[p.start, p.stop] for p in g.where]] for g in world.observation_groups],
-        "kind": kind,
-        "policies": list(policies),
-        "seed": source.seed,
-        "references": {
-            name: {"random": known.random, "zero": known.zero, "expert": known.expert}
-            for name, known in source.references().items()
-            if name in names
-        },
-        "versions": versions,
-        "commit": (versions["git"] or {}).get("commit"),
+        "kind": kind, "policies": list(policies), "seed": source.seed,
+        "references": {n: {"random": k.random, "zero": k.zero, "expert": k.expert} for n, k in references.items()},
+        "versions": versions, "commit": (versions["git"] or {}).get("commit"),
         **more,
-    }
+    }  # fmt: skip
 
 
 def whole_paths(names: Sequence[str]) -> tuple[str, ...]:
@@ -75,12 +56,8 @@ def open_datasets(names: Sequence[str]) -> list[Dataset]:
     return [open_dataset(name) for name in names]
 
 
-def implied(datasets: Sequence[Dataset]) -> dict[str, Any]:
-    """Suite, or task, base and object, and points, of which all data sets are; empty where their metadata have none.
-
-    Raises:
-        BidexError: They differ.
-    """
+def implied(datasets: Sequence[Dataset]) -> Json:
+    """Suite, or task, base and object, and points, of which all data sets are; empty where their metadata have none."""
     forms = [tuple(dataset.metadata.get(name) or None for name in _FORM) for dataset in datasets]
     if not forms or forms[0][:2] == (None, None):
         return {}
@@ -103,17 +80,8 @@ def task_seed(datasets: Sequence[Dataset]) -> int | None:
     return datasets[0].metadata.get("seed") if datasets else None
 
 
-def rows_and_steps(source: Worlds) -> tuple[int, int]:
-    """Environments of the world from which an offline learner takes sizes and names, and updates."""
-    return max(1, len(source.tasks("train"))), UPDATES
-
-
 def check_offline(kind: LearnerKind, record: int, datasets: Sequence[Dataset], source: Worlds) -> None:
-    """Refuses a learner and data sets that do not go together.
-
-    Raises:
-        BidexError: Says what to add or leave out.
-    """
+    """Refuses a learner and data sets that do not go together."""
     if not kind.make.offline:
         if datasets:
             names = ", ".join(name for name in ALGOS if learner_kind(name).make.offline)
@@ -130,30 +98,22 @@ def check_offline(kind: LearnerKind, record: int, datasets: Sequence[Dataset], s
 
 
 def check_demonstrations(kind: LearnerKind, names: Sequence[str], source: Worlds) -> None:
-    """Refuses, from the data sets' metadata alone, what could not be imitated.
-
-    Raises:
-        BidexError: The learner takes none, there is no such data set, or it is of another class, of other bases or with
-            other goals shown.
-    """
+    """Refuses, by the metadata alone, what could not be imitated: of other classes or bases, or with other goals."""
     if names and not kind.make.imitates:
         takers = ", ".join(name for name in ALGOS if learner_kind(name).make.imitates)
         raise BidexError(f"{kind.name} imitates nothing; --demonstrations goes with {takers}. Leave one of them out.")
     for dataset in open_datasets(names):
-        _check_demonstration(dataset, source)
-
-
-def _check_demonstration(dataset: Dataset, source: Worlds) -> None:
-    classes = source.task_classes()
-    for slot in dataset.metadata["tasks"]:
-        known_name(f"class in {source.name} of", slot.partition("/")[0], classes)
-    _check_goals(dataset, source)
-    actions = max(task_class.action_size for task_class in classes.values())
-    if dataset.action_size != actions:
-        raise BidexError(
-            f"{dataset.name} has {dataset.action_size} actions, {source.name} here {actions}: its bases do not move "
-            f"alike. {'Add --base moving' if dataset.action_size > actions else 'Record it with the same bases'}."
-        )
+        classes = source.task_classes()
+        for slot in dataset.metadata["tasks"]:
+            known_name(f"class in {source.name} of", slot.partition("/")[0], classes)
+        _check_goals(dataset, source)
+        actions = max(task_class.action_size for task_class in classes.values())
+        if dataset.action_size != actions:
+            mend = "Add --base moving" if dataset.action_size > actions else "Record it with the same bases"
+            raise BidexError(
+                f"{dataset.name} has {dataset.action_size} actions, {source.name} here {actions}: its bases do not "
+                f"move alike. {mend}."
+            )
 
 
 def _check_goals(dataset: Dataset, source: Worlds) -> None:
@@ -167,22 +127,8 @@ def _check_goals(dataset: Dataset, source: Worlds) -> None:
         raise BidexError(f"{dataset.name} has point clouds, where {source.name} hides goals. Record without --points.")
 
 
-def give_datasets(names: Sequence[str], learner: Any) -> None:
-    """Reads the data sets and hands them to a fresh offline learner; errors as of ``join``."""
-    from bidex_meta.data.joined import join
-
-    learner.learn_from(join(_announced(names, "Reading"), learner.world))
-
-
-def give_demonstrations(names: Sequence[str], learner: Any) -> None:
-    """Reads demonstrations and hands them to a fresh learner; errors as of ``join``."""
-    from bidex_meta.data.joined import join
-
-    datasets = _announced(names, "Demonstrations:")
-    learner.learn_from_demonstrations(join(datasets, learner.world, every=False))
-
-
-def _announced(names: Sequence[str], what: str) -> list[Dataset]:
+def announced(names: Sequence[str], what: str) -> list[Dataset]:
+    """The data sets, after a line of what they are for."""
     datasets = open_datasets(names)
     steps, episodes = sum(dataset.num_steps for dataset in datasets), sum(dataset.num_episodes for dataset in datasets)
     print(f"{what} {steps:,} transitions of {episodes:,} episodes.", file=sys.stderr, flush=True)

@@ -1,30 +1,24 @@
 """What ``bidex-meta run --record`` adds: a collector around its world."""
 
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from bidex_meta.cli.run_config import RunPlan
 from bidex_meta.cli.run_data import dataset_metadata
+from bidex_meta.cli.tables import say
 from bidex_meta.data import part_files, writer
+from bidex_meta.data.collect import bytes_held
+from bidex_meta.data.collector import RunCollector, spread_environments
 from bidex_meta.runs.folder import new_folder_name
 from bidex_meta.train.launch import launch
 from bidex_meta.utils.memory import check_memory
-
-if TYPE_CHECKING:
-    from bidex_meta.data.collector import RunCollector
-    from bidex_meta.world.contract import PooledWorld
+from bidex_meta.world.contract import PooledWorld
 
 
-def recorded(plan: RunPlan, world: "PooledWorld") -> "RunCollector":
+def recorded(plan: RunPlan, world: PooledWorld) -> RunCollector:
     """The world with a collector around it, of as many environments as give the transitions that were asked for.
 
-    Raises:
-        BidexError: There is no room for them on the disk, or in memory for the running episodes.
+    Raises BidexError where there is no room for them on the disk, or in memory for the running episodes.
     """
-    from bidex_meta.data.collect import bytes_held
-    from bidex_meta.data.collector import RunCollector, spread_environments
-
     rows = spread_environments(world, plan.config.record_share)
     sizes = world.single_observation_space.shape[0], world.single_action_space.shape[0]
     needed = writer.estimated_bytes(plan.config.record, *sizes, 20.0)
@@ -34,26 +28,21 @@ def recorded(plan: RunPlan, world: "PooledWorld") -> "RunCollector":
     # A checkpoint copies the running episodes; each process of this machine has its own.
     held = 2 * launch().local_count * bytes_held(world, rows)
     check_memory(held, f"The running episodes of {len(rows):,} recorded rows", "Lower --record or --num-envs.")
-    _say(f"Recording {len(rows)} of {world.num_envs} rows, at most about {needed / 1e9:.2f} GB.")
+    say(f"Recording {len(rows)} of {world.num_envs} rows, at most about {needed / 1e9:.2f} GB.")
     return RunCollector(world, rows, launch().rank)  # pyright: ignore[reportAbstractUsage]
 
 
-def begin(collector: "RunCollector", folder: Path, fresh: bool) -> None:
+def begin(collector: RunCollector, folder: Path, fresh: bool) -> None:
     """Sets the data set's folder in the run's; a resumed run's checkpoint knows which parts stay."""
     collector.folder = folder / "replay"
     if fresh:
         collector.open(collector.folder)
 
 
-def complete(plan: RunPlan, collector: "RunCollector") -> None:
+def complete(plan: RunPlan, collector: RunCollector) -> None:
     """Makes a data set of what all processes collected."""
     policy = {"algo": plan.config.algo, "run": collector.folder.parent.name, "actions": "as in training"}
     about = dataset_metadata(plan.source, collector, "replay", [policy])
     name = writer.default_name(plan.source.name, "replay")
     writer.finish(collector.folder, name, collector.single_observation_space, collector.single_action_space, about)
-    _say(f"Recorded: {collector.folder}")
-
-
-def _say(text: str) -> None:
-    if launch().rank == 0:
-        print(text, file=sys.stderr, flush=True)
+    say(f"Recorded: {collector.folder}")

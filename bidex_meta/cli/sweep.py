@@ -10,7 +10,7 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +22,7 @@ import tyro
 from bidex_meta.cli.parsing import Switch, parse
 from bidex_meta.cli.run_config import plan_run
 from bidex_meta.cli.sweep_plan import PlannedRun, Sweep, read_sweep
-from bidex_meta.cli.tables import plain_table, print_table
+from bidex_meta.cli.tables import Json, plain_table, print_table, say
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import EXIT_FAILED, BidexError, one_line, shortened
 from bidex_meta.runs import RunFolder
@@ -61,12 +61,7 @@ class SweepFlags:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Check everything, then run it.
-
-    Raises:
-        BidexError: A bad file, a run that `bidex-meta run` would refuse, or a folder with a run of another config.
-        SystemExit: A run has failed (exit code 1).
-    """
+    """Check everything, then run it; exit code 1 where a run has failed."""
     flags = parse(SweepFlags, arguments, "sweep")
     sweep = read_sweep(flags.file, flags.out)
     cores = choose_cores(flags.cores, flags.workers)
@@ -90,23 +85,19 @@ def main(arguments: Sequence[str]) -> None:
             for name, job in submit(ready, sweep.out, flags.submit, sweep.slurm).items():
                 print(f"{name} is job {job.job_id}")
             if len(ready) < len(idle):
-                _say(f"{len(idle) - len(ready)} start from runs that have not ended: submit again when those have.")
+                say(f"{len(idle) - len(ready)} start from runs that have not ended: submit again when those have.")
             return
-        _say(f"{len(states) - len(left)} of {len(states)} runs are done; {len(cores)} at a time.")
-        failed = work(left, cores, _say)
+        say(f"{len(states) - len(left)} of {len(states)} runs are done; {len(cores)} at a time.")
+        failed = work(left, cores, say)
     _print([state_of(run) for run in runs])
     if failed:
-        _say(f"{failed} failed. Started again, the sweep tries them anew.")
+        say(f"{failed} failed. Started again, the sweep tries them anew.")
         raise SystemExit(EXIT_FAILED)
 
 
-def _configs(sweep: Sweep, file: Path) -> dict[tuple[str, ...], RunConfig[Any]]:
-    """The resolved config of each kind of run, by its words: seeds share it.
-
-    Raises:
-        BidexError: `bidex-meta run` would refuse one.
-    """
-    configs: dict[tuple[str, ...], RunConfig[Any]] = {}
+def _configs(sweep: Sweep, file: Path) -> dict[tuple[str, ...], RunConfig]:
+    """The resolved config of each kind of run, by its words: seeds share it."""
+    configs: dict[tuple[str, ...], RunConfig] = {}
     for run in sweep.runs:
         try:
             configs[run.words] = configs.get(run.words) or plan_run(run.begin[1:]).config
@@ -132,11 +123,7 @@ class State(NamedTuple):
 
 
 def state_of(run: PlannedRun) -> State:
-    """How far a run, of which the config is known, has come.
-
-    Raises:
-        BidexError: There is a run of another config in its folder, or files that cannot be read.
-    """
+    """How far a run, of which the config is known, has come; BidexError where its folder has one of another config."""
     rows, evaluated = [], False
     if exists(run.folder.config_path):
         wanted = run.config if run.after is None else replace(run.config, start_from=str(run.after.resolve()))
@@ -165,8 +152,7 @@ class Job:
     def __call__(self) -> None:
         """Begins or resumes the run in a process of its own, and waits for the end.
 
-        Raises:
-            BidexError: It failed: the last line of its log, which a file beside its folder keeps.
+        Raises BidexError where it failed: the last line of its log, which a file beside its folder keeps.
         """
         run = self.run
         while _locked(run) and not self.stopped:  # a process trains it that a killed sweep has left
@@ -175,14 +161,11 @@ class Job:
             return
         words = ["run", f"--resume={run.path}", *run.words] if exists(run.folder.config_path) else run.begin
         with _beside(run, "log").open("ab") as log:
-            self.process = subprocess.Popen(
-                [*self.command, *words],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                env={**os.environ, "OMP_NUM_THREADS": "1"},
-                start_new_session=True,  # Ctrl-C reaches the sweep alone, which then stops its runs
-            )
+            one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}
+            self.process = subprocess.Popen(  # Ctrl-C reaches the sweep alone, which then stops its runs
+                [*self.command, *words], stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=one_thread,
+                start_new_session=True,
+            )  # fmt: skip
         if self.stopped:
             self.process.terminate()
         code = self.process.wait()
@@ -249,16 +232,11 @@ def work(runs: Sequence[PlannedRun], cores: Sequence[int | None], say: Callable[
     return len(failed)
 
 
-def submit(runs: Sequence[PlannedRun], out: Path, where: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
+def submit(runs: Sequence[PlannedRun], out: Path, where: str, parameters: Json) -> dict[str, Any]:
     """Hands runs to submitit's executor ``slurm``, or ``local``: processes of this machine, all at once.
 
     ``parameters`` are the executor's, beside a day's time and a processor. What jobs print is in ``out/jobs/``.
-
-    Returns:
-        submitit's jobs by name; none of a run whose job of an earlier start waits or runs.
-
-    Raises:
-        BidexError: submitit is not installed, refuses the parameters, or there is no such cluster here.
+    Returns submitit's jobs by name; none of a run whose job of an earlier start waits or runs.
     """
     try:
         import submitit
@@ -284,13 +262,9 @@ def submit(runs: Sequence[PlannedRun], out: Path, where: str, parameters: Mappin
 
 
 def choose_cores(asked: str | None, workers: int | None) -> list[int | None]:
-    """A core for each worker, of those asked for (``1``, ``0,2-3``); None where the system binds no processes.
-
-    Raises:
-        BidexError: There is no such core, or there are fewer than workers.
-    """
-    cores = sorted(os.sched_getaffinity(0)) if sys.platform == "linux" else [None] * (os.cpu_count() or 1)
-    usable: list[int | None] = [*cores]
+    """A core for each worker, of those asked for (``1``, ``0,2-3``); None where the system binds no processes."""
+    linux = sys.platform == "linux"
+    usable: list[int | None] = [*sorted(os.sched_getaffinity(0))] if linux else [None] * (os.cpu_count() or 1)
     chosen = usable
     if asked is not None:
         try:
@@ -342,7 +316,3 @@ def _print(states: Sequence[State]) -> None:
     names = [each.state for each in states]
     counts = ", ".join(f"{names.count(name)} {name}" for name in ("done", "runs", "failed", "left"))
     print(counts + ("" if math.isnan(total) else f"; about {total:.2f} core-hours of training left"))
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)

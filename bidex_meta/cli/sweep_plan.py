@@ -5,10 +5,11 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 from msgspec import Meta
 
+from bidex_meta.cli.tables import Json
 from bidex_meta.config import RunConfig, flat
 from bidex_meta.errors import BidexError, shortened
 from bidex_meta.runs.folder import RunFolder
@@ -32,7 +33,7 @@ class _Shared:
     name: _Name
     suites: _Texts | None = None
     tasks: _Texts | None = None
-    overrides: dict[str, Any] = field(default_factory=dict)
+    overrides: Json = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,28 +47,22 @@ class _Arm(_Shared):
 class _File(_Shared):
     seeds: _Seeds
     algos: _Texts = ()
-    grid: dict[str, Any] = field(default_factory=dict)
+    grid: Json = field(default_factory=dict)
     arms: tuple[_Arm, ...] = ()
-    slurm: dict[str, Any] = field(default_factory=dict)
+    slurm: Json = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class PlannedRun:
     """A run that a sweep's file asks for."""
 
-    path: Path
-    """Its folder, which need not be there yet."""
-    arm: str
-    """What tables call it and its like on other seeds."""
-    subject: str
-    """The suite or class, as the file names it."""
+    path: Path  # its folder, which need not be there yet
+    arm: str  # what tables call it and its like on other seeds
+    subject: str  # the suite or class, as the file names it
     seed: int
-    words: tuple[str, ...]
-    """Flags of ``bidex-meta run``, without seed and folder."""
-    after: Path | None = None
-    """The folder of the run whose policy it starts from."""
-    config: RunConfig[Any] = field(default=None, compare=False)  # pyright: ignore
-    """What the words resolve to; added by the command, which checks them."""
+    words: tuple[str, ...]  # flags of ``bidex-meta run``, without seed and folder
+    after: Path | None = None  # the folder of the run whose policy it starts from
+    config: RunConfig = field(default=None, compare=False)  # pyright: ignore  # of the words; the command adds it
 
     @property
     def name(self) -> str:
@@ -91,15 +86,14 @@ class Sweep(NamedTuple):
 
     out: Path
     runs: list[PlannedRun]
-    slurm: dict[str, Any]  # parameters of submitit's executor
+    slurm: Json  # parameters of submitit's executor
 
 
 def read_sweep(path: Path, root: Path = Path("runs")) -> Sweep:
     """A sweep's file; ``root`` is where the sweep's folder lies.
 
-    Raises:
-        BidexError: The file cannot be read or is wrong, or two of its runs have one name. What ``bidex-meta run``
-            would refuse is not checked here.
+    Raises BidexError where the file is wrong, or two of its runs have one name; what ``bidex-meta run`` would refuse is
+    not checked here.
     """
     file = parse(read_toml(path, "a sweep"), _File, str(path), exact=True)
     arms = [*(_Arm(name=short_name(algo), algo=algo) for algo in file.algos), *file.arms]
@@ -130,7 +124,7 @@ def read_sweep(path: Path, root: Path = Path("runs")) -> Sweep:
     return Sweep(out, list(runs.values()), file.slurm)
 
 
-def _check_flags(path: Path, place: str, flags: dict[str, Any]) -> None:
+def _check_flags(path: Path, place: str, flags: Json) -> None:
     for flag in flat(flags):
         if flag.replace("-", "_") in _OWN:
             raise BidexError(f"{path}: {place}.{flag}: the file's other entries or the sweep decide that.")
@@ -172,7 +166,7 @@ def _combinations(file: _File, arm: _Arm) -> Iterator[tuple[str, list[str]]]:
         yield label, [word for flag, value in {**shared, **chosen, **own}.items() for word in _words(flag, value)]
 
 
-def _words(flag: str, value: Any) -> list[str]:
+def _words(flag: str, value: object) -> list[str]:
     """A value as words of the command line."""
     flag = flag.replace("_", "-")
     if isinstance(value, bool):
@@ -184,10 +178,10 @@ def _words(flag: str, value: Any) -> list[str]:
     return [f"--{flag}={_text(each)}" for each in (value if isinstance(value, list) else [value])]
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     return "x".join(map(_text, value)) if isinstance(value, list) else str(value)
 
 
-def _named(value: Any) -> str:
+def _named(value: object) -> str:
     """A value as a part of a folder's name: data sets and paths have slashes."""
     return re.sub(rf"[^{_IN_NAMES}]+", "-", _text(value).strip("/"))

@@ -1,29 +1,27 @@
 """``bidex-meta verify``: does a run's checkpoint still do what its recorded evaluation says?"""
 
 import json
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NotRequired, TypedDict
+from typing import NotRequired, TypedDict
 
 from bidex_meta.cli.evaluate import conditions
 from bidex_meta.cli.learners import learner_kind, resolve_device
 from bidex_meta.cli.metatest import TASKS, Options, meta_test
-from bidex_meta.cli.parsing import RunPath, Switch, parse
+from bidex_meta.cli.parsing import Engine, JsonSwitch, RunPath, parse
 from bidex_meta.cli.policies import checkpoint, policy_of
-from bidex_meta.cli.tables import agreement_table, print_table
+from bidex_meta.cli.tables import Json, percent, plain, print_table, ranged, say, titled
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import EXIT_FAILED, BidexError, one_line
-from bidex_meta.evaluation.agreement import DIFFERS, EQUAL, WITHIN, agreements, classes_of
+from bidex_meta.evaluation.agreement import DIFFERS, EQUAL, WITHIN, Agreement, agreements, classes_of
 from bidex_meta.runs import RunFolder, schemas
 from bidex_meta.utils.files import exists
 from bidex_meta.utils.validation import Environments, Few, Finite, Seed, Shots, Text, Whole
 from bidex_meta.utils.validation import parse as parse_content
 from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds
-
-Engine = Literal["auto", "c", "warp"]
 
 
 class _Row(TypedDict):
@@ -49,7 +47,7 @@ class _Conditions(TypedDict):
     device: NotRequired[Text]
     engine: NotRequired[Engine]
     num_envs: NotRequired[Environments | None]
-    packages: NotRequired[dict[str, Any]]
+    packages: NotRequired[Json]
     physics: NotRequired[Text | None]
     suite_version: NotRequired[Whole | None]
 
@@ -83,17 +81,11 @@ class VerifyFlags:
     """auto, c or warp; None: as the evaluation was made, on another device auto."""
     num_envs: Environments | None = None
     """Environments stepped together; None: as the evaluation was made."""
-    json: Switch = False
-    """Print JSON."""
+    json: JsonSwitch = False
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Verify a run and print a table or JSON.
-
-    Raises:
-        BidexError: There is nothing to compare with, or the checkpoint is not the one that was evaluated.
-        SystemExit: With exit code 1: something differs.
-    """
+    """Verify a run and print a table or JSON; exit code 1 where something differs."""
     flags = parse(VerifyFlags, arguments, "verify")
     folder = RunFolder.open(flags.run)
     config = folder.config()
@@ -106,7 +98,7 @@ def main(arguments: Sequence[str]) -> None:
     state, step = _checkpoint(folder, recorded["steps"])
     apart = others(then, conditions(worlds, num_envs))
     for line in apart:
-        _say(f"Conditions: {one_line(line)}.")
+        say(f"Conditions: {one_line(line)}.")
     again = _again(folder, config, worlds, recorded, num_envs, state)
     found = agreements(classes_of(recorded), classes_of(again))
     counts = {outcome: sum(each.outcome == outcome for each in found) for outcome in (EQUAL, WITHIN, DIFFERS)}
@@ -114,7 +106,7 @@ def main(arguments: Sequence[str]) -> None:
         report = {"run": str(folder.path), "steps": step, "conditions": apart, **counts}
         print(json.dumps(report | {"classes": {each.name: each.to_json() for each in found}}, indent=2))
     else:
-        print_table(agreement_table(f"{config.algo} on {worlds.name}, {step:,} steps, recorded and again", found))
+        _print_table(f"{config.algo} on {worlds.name}, {step:,} steps, recorded and again", found)
         verdict = f"{counts[EQUAL]} equal bit for bit, {counts[WITHIN]} within, {counts[DIFFERS]} differ"
         end = ": this run is not what its evaluation says" if counts[DIFFERS] else ""
         print(f"{len(found)} classes: {verdict}{end}")
@@ -122,15 +114,22 @@ def main(arguments: Sequence[str]) -> None:
         raise SystemExit(EXIT_FAILED)
 
 
-def recorded_evaluation(run: Path, named: Path | None = None) -> dict[str, Any]:
-    """The evaluation to compare with, all that is read of it checked.
+def _print_table(title: str, found: Sequence[Agreement]) -> None:
+    """A class a row."""
+    caption = "within: apart by no more than both 95 % intervals allow, over all classes together"
+    table = titled(title, caption, ["task", "outcome"], ("success", "again", "return [95 %]", "again"))
+    for each in found:
+        both = each.recorded, each.again
+        cells = [plain(each.name), each.outcome, *(percent(row["success"]) for row in both)]
+        cells += [ranged(row["return"], row.get("return_interval")) for row in both]
+        table.add_row(*cells, style="bold red" if each.outcome == DIFFERS else None)
+    print_table(table)
 
-    Args:
-        run: The run folder.
-        named: A file in the place of its ``evaluation.json``.
 
-    Raises:
-        BidexError: There is none, or it is damaged, or does not say how it was made.
+def recorded_evaluation(run: Path, named: Path | None = None) -> Json:
+    """The evaluation of a run folder, or another file of it, to compare with; all that is read of it checked.
+
+    Raises BidexError where there is none, or it is damaged, or does not say how it was made.
     """
     path = named or run / "evaluation.json"
     again = f"bidex-meta evaluate {run} --json > {path}"
@@ -143,7 +142,7 @@ def recorded_evaluation(run: Path, named: Path | None = None) -> dict[str, Any]:
     return found
 
 
-def _where(flags: VerifyFlags, then: Mapping[str, Any], config: RunConfig[Any]) -> RunConfig[Any]:
+def _where(flags: VerifyFlags, then: Json, config: RunConfig) -> RunConfig:
     """The run's config with device and engine to evaluate with."""
     on_gpu = Worlds.open(config.to_json()).on_gpu
     try:
@@ -156,12 +155,8 @@ def _where(flags: VerifyFlags, then: Mapping[str, Any], config: RunConfig[Any]) 
     return replace(config, device=device, engine=flags.engine or (then["engine"] if same else "auto"))
 
 
-def _checkpoint(folder: RunFolder, steps: int) -> tuple[dict[str, Any], int]:
-    """The checkpoint that was evaluated.
-
-    Raises:
-        BidexError: It is not there any more.
-    """
+def _checkpoint(folder: RunFolder, steps: int) -> tuple[Json, int]:
+    """The checkpoint that was evaluated."""
     for which in ("last", f"step_{steps}.pt", "best"):
         there = which == "last" or exists(folder.checkpoints.folder / (f"{which}.pt" if which == "best" else which))
         found = checkpoint(folder, which) if there else None
@@ -174,48 +169,37 @@ def _checkpoint(folder: RunFolder, steps: int) -> tuple[dict[str, Any], int]:
 
 
 def _again(
-    folder: RunFolder,
-    config: RunConfig[Any],
-    worlds: Worlds,
-    recorded: dict[str, Any],
-    num_envs: int | None,
-    state: dict[str, Any],
-) -> dict[str, Any]:
+    folder: RunFolder, config: RunConfig, worlds: Worlds, recorded: Json, num_envs: int | None, state: Json
+) -> Json:
     """The recorded evaluation, made again."""
+    load = partial(policy_of, folder, state, config.device)
     if learner_kind(config.algo).make.adapts != ("splits" in recorded):
         kind = "a meta-test" if "splits" in recorded else "no meta-test"
         raise BidexError(f"{folder.path}: the evaluation is {kind}, which is not how {config.algo} is judged.")
     if "splits" not in recorded:
         world = worlds.world(recorded.get("split", "train"), num_envs)
         episodes = recorded.get("policy", recorded)["episodes_per_task"]
-        found = worlds.judge(policy_of(folder, state, config.device), world, episodes, recorded["seed"])
+        found = worlds.judge(load(), world, episodes, recorded["seed"])
         world.close()
         return {"policy": found.to_json()}
     splits = {}
     for split, part in recorded["splits"].items():
         if split not in worlds.splits:
             raise BidexError(f"{worlds.name} has no {split} tasks, which the evaluation is of.")
+        before = part["before"]
         options = Options(
-            shots=part["shots"],
-            rollouts=part["rollouts"],
-            episodes=part["before"]["episodes_per_task"],
-            tasks=max(row.get("tasks", TASKS) for row in part["before"]["classes"].values()),
-            trials=part["trials"],
-            num_envs=num_envs,
-            seed=recorded["seed"],
-        )
-        load = lambda: policy_of(folder, state, config.device)  # noqa: E731
-        splits[split] = meta_test(worlds, config, load, options, [split], _say)[split].to_json()
+            shots=part["shots"], rollouts=part["rollouts"], trials=part["trials"], episodes=before["episodes_per_task"],
+            tasks=max(row.get("tasks", TASKS) for row in before["classes"].values()),
+            num_envs=num_envs, seed=recorded["seed"],
+        )  # fmt: skip
+        splits[split] = meta_test(worlds, config, load, options, [split], say)[split].to_json()
     return {"splits": splits}
 
 
-def recorded_conditions(evaluation: dict[str, Any], versions: dict[str, Any], config: RunConfig[Any]) -> dict[str, Any]:
+def recorded_conditions(evaluation: Json, versions: Json, config: RunConfig) -> Json:
     """The same of an evaluation as it was recorded; of an older one what its run was trained with.
 
-    Args:
-        evaluation: Of ``evaluation.json``.
-        versions: Of ``versions.json``, empty where there is none.
-        config: The run's.
+    Of the contents of ``evaluation.json`` and ``versions.json`` (empty where there is none), and the run's config.
     """
     found = {"device": config.device, "engine": config.engine, "num_envs": None}
     found |= {name: versions.get(name) for name in ("packages", "physics", "suite_version")}
@@ -224,7 +208,7 @@ def recorded_conditions(evaluation: dict[str, Any], versions: dict[str, Any], co
     return found | {"packages": packages if isinstance(packages, dict) else {}}
 
 
-def others(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
+def others(then: Json, now: Json) -> list[str]:
     """What differs between recorded conditions and those now, a text each; the last names what was not recorded."""
     packages = then["packages"]
     pairs = [(name, packages.get(name), version) for name, version in now["packages"].items()]
@@ -233,7 +217,3 @@ def others(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
     texts = [f"{name} {old} then, {new} now" for name, old, new in pairs if None not in (old, new) and old != new]
     unknown = [name for name, old, new in pairs if old is None and new is not None and name != "threads"]
     return texts + ([f"not recorded: {', '.join(unknown)}"] if unknown else [])
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)

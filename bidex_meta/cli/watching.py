@@ -2,7 +2,6 @@
 
 import math
 import random
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -14,6 +13,7 @@ from bidex_meta.agents import Agent
 from bidex_meta.cli import metatest
 from bidex_meta.cli.policies import slots_of
 from bidex_meta.cli.run_config import RunPlan
+from bidex_meta.cli.tables import say
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.filming import film_tiles
 from bidex_meta.evaluation.play import EVALUATION_SEED, evaluate
@@ -37,11 +37,7 @@ _FILM_EVERY, _MOST_FILM_STEPS = 2, 300
 
 
 def check(plan: RunPlan) -> None:
-    """Refuse what would fail in the middle of the training.
-
-    Raises:
-        BidexError: There are no pictures of such a suite, no way to draw here, no ffmpeg, or no such logger.
-    """
+    """Refuse what would fail in the middle of the training: films of what has none or cannot be drawn, a logger."""
     check_logger(plan.config.logger)
     if plan.config.video_every is not None:
         plan.source.task_classes()
@@ -49,31 +45,8 @@ def check(plan: RunPlan) -> None:
         gl_backend.prepare()
 
 
-@contextmanager
-def watch(
-    plan: RunPlan, folder: RunFolder, learner: Learner, record: Recorder, iterations: int
-) -> Iterator["Watch | None"]:
-    """What the config asks for, with its worlds closed at the end; None where it asks for nothing."""
-    if plan.config.evaluate_every is None and plan.config.video_every is None:
-        yield None
-        return
-    watched = Watch(plan, folder, learner, record, iterations)
-    try:
-        yield watched
-    finally:
-        watched.close()
-
-
 class Watch:
-    """Called after each iteration; every so many it evaluates or films.
-
-    Args:
-        plan: The run.
-        folder: Its folder.
-        learner: Its learner.
-        record: Takes the films.
-        iterations: Iterations that a resumed run has made before.
-    """
+    """Called after each iteration, of which a resumed run has made some before; every so many it evaluates or films."""
 
     def __init__(self, plan: RunPlan, folder: RunFolder, learner: Learner, record: Recorder, iterations: int) -> None:
         self._plan, self._folder, self._learner, self._record = plan, folder, learner, record
@@ -123,10 +96,8 @@ class Watch:
             if isinstance(world, PooledWorld):
                 first = zip(world.task_names, world.pools, strict=True)
                 world.set_tasks({name: pool[:tasks] for name, pool in first})
-        world = self._worlds["evaluation"]
-        return evaluate(
-            self._policy(self._device), world, episodes, seed=EVALUATION_SEED, references=source.references()
-        )
+        world, policy = self._worlds["evaluation"], self._policy(self._device)
+        return evaluate(policy, world, episodes, seed=EVALUATION_SEED, references=source.references())
 
     def _meta_test(self) -> dict[str, float]:
         """One shot on train tasks: test tasks must not choose the policy that is judged on them."""
@@ -143,18 +114,11 @@ class Watch:
                 self._worlds["film"] = worlds.world("train", len(slots_of(worlds)))
             world = self._worlds["film"]
             steps = min(_MOST_FILM_STEPS, int(world.max_episode_steps.max()))
-            frames = film_tiles(
-                self._policy("cpu"),
-                world,
-                range(world.num_envs),
-                steps,
-                self._plan.config.seed,
-                _FILM_EVERY,
-                **_FILM,
-            )
+            rows, seed = range(world.num_envs), self._plan.config.seed
+            frames = film_tiles(self._policy("cpu"), world, rows, steps, seed, _FILM_EVERY, **_FILM)
             self._record.film("training", frames, CONTROL_RATE / _FILM_EVERY, self._learner.env_steps)
         except (BidexError, OSError) as error:
-            print(f"No film at {self._learner.env_steps:,} steps: {error}", file=sys.stderr, flush=True)
+            say(f"No film at {self._learner.env_steps:,} steps: {error}")
 
 
 def played(pools: Mapping[str, Sequence[str]]) -> tuple[int, int]:
@@ -180,10 +144,9 @@ def _metrics(found: Evaluation) -> dict[str, float]:
         "Eval/success_rate": float(np.mean([result.success for result in classes.values()])),
         "Eval/mean_return": float(np.mean([result.mean_return for result in classes.values()])),
     }
-    scores = [result.score for result in classes.values()]
-    known = [score for score in scores if score is not None]
-    if len(known) == len(scores):
-        metrics["Eval/score"] = float(np.mean(known))
+    scores = [result.score for result in classes.values() if result.score is not None]
+    if len(scores) == len(classes):
+        metrics["Eval/score"] = float(np.mean(scores))
     for name, result in classes.items():
         metrics[f"Eval/success/{name}"], metrics[f"Eval/return/{name}"] = result.success, result.mean_return
     return metrics
@@ -192,5 +155,4 @@ def _metrics(found: Evaluation) -> dict[str, float]:
 def _better(found: dict[str, float], best: dict[str, float]) -> bool:
     """By success; where that is equal by the score, or the return where there is no score."""
     second = "Eval/score" if "Eval/score" in found and "Eval/score" in best else "Eval/mean_return"
-    names = ("Eval/success_rate", second)
-    return [found[name] for name in names] > [best[name] for name in names]
+    return [found[name] for name in ("Eval/success_rate", second)] > [best["Eval/success_rate"], best[second]]

@@ -1,18 +1,18 @@
 """``bidex-meta witness``: replays stored reference solutions."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from bidex_meta.cli.parsing import Switch, parse
-from bidex_meta.cli.tables import plain_table, print_table
+from bidex_meta.cli.parsing import JsonSwitch, Switch, parse
+from bidex_meta.cli.tables import Json, print_rows
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.runs import video
 from bidex_meta.runs.atomic import check_writable
 from bidex_meta.tasks import registry
+from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.utils.validation import Threads
+from bidex_meta.witness.replay import frames, replay
 from bidex_meta.witness.store import load_witness, witness_path
 
 
@@ -35,16 +35,11 @@ class WitnessFlags:
     """front, side, top or back."""
     threads: Threads | None = None
     """Threads of the physics; None: one per core."""
-    json: Switch = False
-    """Print JSON."""
+    json: JsonSwitch = False
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Replays the witnesses of one class or of all, and prints what they reach.
-
-    Raises:
-        BidexError: The flags contradict each other, there is no such class, or the film could not be written.
-    """
+    """Replays the witnesses of one class or of all, and prints what they reach."""
     flags = parse(WitnessFlags, arguments, "witness")
     if flags.all == (flags.task is not None):
         raise BidexError("witness: expected --task T or --all, got " + ("both." if flags.all else "neither."))
@@ -56,41 +51,23 @@ def main(arguments: Sequence[str]) -> None:
         check_writable(flags.out)
     rows = [_replay(name, flags) for name in names]
     if flags.out is not None:
-        _film(names[0], flags.out, flags)
-    if flags.json:
-        print(json.dumps(rows, indent=2))
-    else:
-        print_table(plain_table(list(rows[0]), [list(row.values()) for row in rows]))
+        pictures = frames(names[0], load_witness(names[0], flags.file), camera=flags.camera)
+        if video.check_suffix(flags.out) == ".mp4":
+            video.write_video(flags.out, pictures, CONTROL_RATE)
+        else:
+            *_, last = pictures
+            video.write_image(flags.out, last)
+    print_rows(rows, flags.json)
 
 
-def _replay(name: str, flags: WitnessFlags) -> dict[str, Any]:
-    """A row of the table."""
-    from bidex_meta.witness.replay import replay
-
+def _replay(name: str, flags: WitnessFlags) -> Json:
     if flags.file is None and not witness_path(name).is_file():
         keys = ("return", "first_success", "shifted", "steps", "deepest_mm", "rival")
         return {"task": name, "found": False, **dict.fromkeys(keys)}
     witness = load_witness(name, flags.file)
     result, rival = replay(name, witness, flags.threads), witness.made.get("rival")
     return {
-        "task": name,
-        "found": result.found,
-        "return": round(result.total, 3),
-        "first_success": result.first_success,
-        "shifted": result.succeeded,
-        "steps": len(witness.actions),
-        "deepest_mm": round(1000.0 * result.deepest, 1),
+        "task": name, "found": result.found, "return": round(result.total, 3), "first_success": result.first_success,
+        "shifted": result.succeeded, "steps": len(witness.actions), "deepest_mm": round(1000.0 * result.deepest, 1),
         "rival": None if rival is None else round(rival, 3),
-    }
-
-
-def _film(name: str, out: Path, flags: WitnessFlags) -> None:
-    from bidex_meta.tasks.base import CONTROL_RATE
-    from bidex_meta.witness.replay import frames
-
-    pictures = frames(name, load_witness(name, flags.file), camera=flags.camera)
-    if video.check_suffix(out) == ".mp4":
-        video.write_video(out, pictures, CONTROL_RATE)
-        return
-    *_, last = pictures
-    video.write_image(out, last)
+    }  # fmt: skip

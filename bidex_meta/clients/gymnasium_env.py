@@ -1,7 +1,4 @@
-"""A single environment as `gymnasium.Env` with NumPy arrays: `gymnasium.make("bidex-meta/CatchUnderarm-v1")`.
-
-For trying things out and for libraries of single environments; a world is faster. Copies and pickles continue exactly.
-"""
+"""A single environment as `gymnasium.Env` with NumPy arrays; copies and pickles continue exactly."""
 
 import gymnasium
 import numpy as np

@@ -1,20 +1,13 @@
-"""Gymnasium ids of every shipped suite and every task class.
+"""Gymnasium ids of every shipped suite (vector entry points alone) and every task class (both)."""
 
-Suites register a vector entry point only: a suite is a batch of different tasks. Task classes register both.
-"""
-
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium
+from gymnasium.vector import VectorEnv
 
 from bidex_meta.errors import BidexError, shortened
 from bidex_meta.suite import Suite, load_suite, suite_names
 from bidex_meta.tasks import registry
-
-if TYPE_CHECKING:
-    from gymnasium.vector import VectorEnv
-
-    from bidex_meta.world import World
 
 NAMESPACE = "bidex-meta"
 
@@ -61,7 +54,7 @@ def make_suite_world(
     render_mode: str | None = None,
     stagger: bool = False,
     **options: Any,
-) -> "World | VectorEnv":
+) -> VectorEnv:
     """The world of `gymnasium.make_vec("bidex-meta/MT4-v1", num_envs=...)`, environments over all classes.
 
     `seed` (None: 0) chooses tasks, starts and task draws; `benchmark_seed` the tasks instead, and the rest without a
@@ -84,7 +77,7 @@ def make_suite_world(
 
 def make_class_world(
     task_name: str, num_envs: int = 1, render_mode: str | None = None, stagger: bool = False, **options: Any
-) -> "World":
+) -> VectorEnv:
     """The world of `gymnasium.make_vec("bidex-meta/CatchUnderarm-v1", num_envs=...)`, as by `make_task_world`."""
     from bidex_meta.benchmark import make_task_world
 

@@ -16,16 +16,13 @@ def extra(name: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        raise BidexError(
-            f"Expected the extra {name!r}, but {error.name} is not installed. Add it: pip install 'bidex-meta[{name}]'."
-        ) from error
+        what = f"Expected the extra {name!r}, but {error.name} is not installed"
+        raise BidexError(f"{what}. Add it: pip install 'bidex-meta[{name}]'.") from error
 
 
 def check_training(world: VectorWorld, stagger: bool) -> None:
     """Raises BidexError for a world in another autoreset mode than SAME_STEP; sets whether it staggers."""
-    mode = world.metadata["autoreset_mode"]
-    if mode != AutoresetMode.SAME_STEP:
-        raise BidexError(
-            f"Expected a world in autoreset mode SAME_STEP, got {mode.name}; make it without autoreset_mode."
-        )
+    if (mode := world.metadata["autoreset_mode"]) != AutoresetMode.SAME_STEP:
+        what = f"Expected a world in autoreset mode SAME_STEP, got {mode.name}"
+        raise BidexError(f"{what}; make it without autoreset_mode.")
     set_stagger(world, stagger)

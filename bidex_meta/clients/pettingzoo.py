@@ -1,9 +1,8 @@
 """A task class as PettingZoo's parallel environment: fingers, hands or any of them as agents. Extra: `marl`."""
 
-from typing import Any
-
 import numpy as np
 import torch
+from gymnasium.spaces import Box, Space
 
 from bidex_meta.clients.gymnasium_env import TaskEnv
 from bidex_meta.clients.needs import extra
@@ -12,7 +11,6 @@ from bidex_meta.hands.units import Agents
 from bidex_meta.world.agent_views import agent_views
 
 with extra("marl"):
-    from gymnasium.spaces import Box, Space
     from pettingzoo import ParallelEnv
 
 
@@ -101,6 +99,4 @@ class HandsEnv(ParallelEnv):
         return {name: self._state[self._columns[name]] for name in self.agents}
 
 
-def parallel_env(task: str, agents: Agents = "hands", **options: Any) -> HandsEnv:
-    """`HandsEnv` under the name of PettingZoo's packages."""
-    return HandsEnv(task, agents, **options)
+parallel_env = HandsEnv  # under the name of PettingZoo's packages

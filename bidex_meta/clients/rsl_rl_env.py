@@ -25,7 +25,7 @@ class RslRlVecEnv(VecEnv):
     to no whole numbers from 0 on.
     """
 
-    def __init__(self, world: TaskWorld, policy: Sequence[str] = (), cfg: Any = None, stagger: bool = False) -> None:
+    def __init__(self, world: TaskWorld, policy: Sequence[str] = (), cfg: object = None, stagger: bool = False) -> None:
         check_training(world, stagger)
         self.world: Any = world
         self.num_envs, self.num_actions = world.num_envs, world.action_space.shape[1]
@@ -50,16 +50,14 @@ class RslRlVecEnv(VecEnv):
         given = torch.as_tensor(value, device=self.world.device)
         steps = given.to(torch.int64)
         if steps.shape != (self.num_envs,) or not bool(((given >= 0) & (given == steps)).all()):
-            raise BidexError(
-                f"episode_length_buf: expected whole numbers from 0 on, shape ({self.num_envs},), "
-                f"got {shortened(given.tolist())}. Give steps, one number for each environment."
-            )
+            what = f"whole numbers from 0 on, shape ({self.num_envs},), got {shortened(given.tolist())}"
+            raise BidexError(f"episode_length_buf: expected {what}. Give steps, one number for each environment.")
         self.get_observations()
         episodes = self.world.episodes
         episodes.counts = episodes.counts & (steps == episodes.elapsed)
         episodes.elapsed = steps.minimum(self.world.max_episode_steps - 1)
 
-    def reset(self, seed: int | None = None) -> tuple[TensorDict, dict[str, Any]]:
+    def reset(self, seed: int | None = None) -> tuple[TensorDict, Info]:
         """Starts episodes of all environments."""
         with torch.inference_mode(False):
             self._obs, self._log = self.world.reset(seed=seed)[0], EpisodeLog(self.world)
@@ -72,7 +70,7 @@ class RslRlVecEnv(VecEnv):
         policy = self._obs if self._policy is None else self._obs[:, self._policy]
         return TensorDict({"policy": policy, "critic": self._obs}, [self.num_envs])
 
-    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, Info]:
         """Takes actions (num_envs, a): observations, rewards and dones (num_envs,), extras."""
         with torch.inference_mode(False), torch.no_grad():  # the world outlives the runner's mode
             self._obs, reward, terminated, truncated, info = self.world.step(actions)

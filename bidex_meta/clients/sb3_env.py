@@ -1,5 +1,6 @@
 """A world as stable-baselines3's VecEnv: `PPO("MlpPolicy", SB3VecEnv(world))`. Extra: `sb3`."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -8,12 +9,13 @@ import torch
 from bidex_meta.clients.needs import check_training, extra
 from bidex_meta.world.contract import Info, VectorWorld
 
+_Rows = None | int | Iterable[int]
+
 with extra("sb3"):
-    from stable_baselines3.common.monitor import Monitor
-    from stable_baselines3.common.vec_env import VecEnv
+    from stable_baselines3.common import monitor, vec_env
 
 
-class SB3VecEnv(VecEnv):
+class SB3VecEnv(vec_env.VecEnv):
     """All environments of one world, NumPy arrays in and out; one seed of SB3's starts them all.
 
     `infos` at an end: `terminal_observation`, `TimeLimit.truncated` (cut: SB3 goes on with the value of that
@@ -54,21 +56,23 @@ class SB3VecEnv(VecEnv):
                     infos[row] |= {"episode": episode, "is_success": columns["success"][i]}
         return obs.cpu().numpy(), reward.cpu().numpy(), ended.cpu().numpy(), infos
 
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: _Rows = None) -> list[object]:
         """The world's attribute for each environment."""
         return [self.world.get_attr(attr_name)[i] for i in self._get_indices(indices)]
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+    def set_attr(self, attr_name: str, value: object, indices: _Rows = None) -> None:
         """Sets an attribute of the world."""
         setattr(self.world, attr_name, value)
 
-    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+    def env_method(
+        self, method_name: str, *method_args: object, indices: _Rows = None, **method_kwargs: object
+    ) -> list[object]:
         """Calls a method of the world once; its result for each environment."""
         return [getattr(self.world, method_name)(*method_args, **method_kwargs)] * len(list(self._get_indices(indices)))
 
-    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type, indices: _Rows = None) -> list[bool]:
         """True for `Monitor` alone: like it, `infos` reports whole episodes, and SB3 counts those in evaluations."""
-        return [wrapper_class is Monitor for _ in self._get_indices(indices)]
+        return [wrapper_class is monitor.Monitor for _ in self._get_indices(indices)]
 
     def close(self) -> None:
         """Frees the world."""

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 import torch
 from gymnasium.spaces import Box
 from torch import Tensor
@@ -58,7 +59,7 @@ class SkrlEnv(Wrapper):
     def state(self) -> None:
         """None: the policy sees what there is."""
 
-    def render(self, *args: Any, **kwargs: Any) -> Any:
+    def render(self, *args: object, **kwargs: object) -> np.ndarray:
         """A picture of one environment, (height, width, 3), uint8."""
         world: Any = self.world
         return world.render(*args, **kwargs)

@@ -1,7 +1,5 @@
 """A world as TorchRL's environment: `Collector(TorchRLEnv(world), policy, ...)`. Extra: `torchrl`."""
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
@@ -10,13 +8,12 @@ from bidex_meta.world.contract import VectorWorld
 
 with extra("torchrl"):
     from tensordict import TensorDict, TensorDictBase
-    from torchrl.data import Binary, Bounded, Composite, Unbounded
-    from torchrl.envs import EnvBase
+    from torchrl import data, envs
 
 _EPISODE = {"r": torch.float32, "l": torch.int64, "success": torch.bool}
 
 
-class TorchRLEnv(EnvBase):
+class TorchRLEnv(envs.EnvBase):
     """All environments of one world, batch size (num_envs,), each entry (num_envs, ...).
 
     `next` holds the observation that the step led to, also where an episode ended; the reset that TorchRL asks for then
@@ -32,22 +29,24 @@ class TorchRLEnv(EnvBase):
         self.world, self._world_seed = world, None
         low, high = torch.as_tensor(world.observation_space.low), torch.as_tensor(world.observation_space.high)
         bounded = bool(low.isfinite().all() and high.isfinite().all())
-        seen = Bounded(low, high, device=device) if bounded else Unbounded(low.shape, device=device)
+        seen = data.Bounded(low, high, device=device) if bounded else data.Unbounded(low.shape, device=device)
         column = torch.Size([rows, 1])
-        flag = Binary(1, column, dtype=torch.bool, device=device)
-        counters = {name: Unbounded(column, dtype=_EPISODE[name], device=device) for name in ("r", "l")}
-        episode = Composite({**counters, "success": flag}, shape=(rows,))
-        self.observation_spec = Composite(observation=seen, success=flag.clone(), episode=episode, shape=(rows,))
-        self.done_spec = Composite({name: flag.clone() for name in ("done", "terminated", "truncated")}, shape=(rows,))
-        self.action_spec = Bounded(-1.0, 1.0, torch.Size(world.action_space.shape), device=device)
-        self.reward_spec = Unbounded(column, device=device)
+        flag = data.Binary(1, column, dtype=torch.bool, device=device)
+        counters = {name: data.Unbounded(column, dtype=_EPISODE[name], device=device) for name in ("r", "l")}
+        episode = data.Composite({**counters, "success": flag}, shape=(rows,))
+        self.observation_spec = data.Composite(observation=seen, success=flag.clone(), episode=episode, shape=(rows,))
+        self.done_spec = data.Composite(
+            {name: flag.clone() for name in ("done", "terminated", "truncated")}, shape=(rows,)
+        )
+        self.action_spec = data.Bounded(-1.0, 1.0, torch.Size(world.action_space.shape), device=device)
+        self.reward_spec = data.Unbounded(column, device=device)
         self._obs = torch.zeros_like(low, device=device)
         self._begun = torch.zeros(rows, dtype=torch.bool, device=device)
 
     def _set_seed(self, seed: int | None) -> None:
         self._world_seed = seed
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
         asked = tensordict.get("_reset", None) if tensordict is not None else None
         mask = torch.ones_like(self._begun) if asked is None else asked.squeeze(-1)
         left = mask & ~self._begun  # what did not end in the last step
@@ -56,17 +55,17 @@ class TorchRLEnv(EnvBase):
             self._obs, _ = self.world.reset(seed=self._world_seed if options is None else None, options=options)
             self._world_seed = None if options is None else self._world_seed
         self._begun = self._begun & ~mask
-        return self._told(self._obs, {name: torch.zeros_like(mask, dtype=kind) for name, kind in _EPISODE.items()})
+        return self._entries(self._obs, {name: torch.zeros_like(mask, dtype=kind) for name, kind in _EPISODE.items()})
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         self._obs, reward, terminated, truncated, info = self.world.step(tensordict.get("action"))
         self._begun = terminated | truncated
-        told = self._told(info["final_obs"], info["so_far"], info["success"])
+        entries = self._entries(info["final_obs"], info["so_far"], info["success"])
         ends = {"reward": reward, "done": self._begun, "terminated": terminated, "truncated": truncated}
-        return told.update({name: value[:, None] for name, value in ends.items()})
+        return entries.update({name: value[:, None] for name, value in ends.items()})
 
-    def _told(self, obs: Tensor, episode: dict[str, Tensor], success: Tensor | None = None) -> TensorDict:
+    def _entries(self, obs: Tensor, episode: dict[str, Tensor], success: Tensor | None = None) -> TensorDict:
         so_far = TensorDict({name: episode[name][:, None] for name in _EPISODE}, self.batch_size)
         success = torch.zeros_like(self._begun) if success is None else success
-        told = {"observation": obs.clone(), "success": success[:, None], "episode": so_far}
-        return TensorDict(told, self.batch_size, device=self.device)
+        entries = {"observation": obs.clone(), "success": success[:, None], "episode": so_far}
+        return TensorDict(entries, self.batch_size, device=self.device)

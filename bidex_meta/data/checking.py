@@ -1,22 +1,20 @@
 """Checks and summaries of a data set.
 
-The check computes rewards again by the class's own formula (``TaskClass.reward_terms``), from the sensors that the
-observation shows and the variation that the episode stores. So it finds errors of a collector: shifted rows, wrong
-tasks or starts. A formula that reads more than the observation shows (the hand's point of most classes with tables, or
-the objects' states where point clouds take their place) cannot be computed again, and the check reports that.
+The check computes rewards again by the class's own formula, from the sensors that the observation shows and the
+variation that the episode stores: so it finds shifted environments, wrong tasks or starts. A formula that reads more
+(the hand's point of most classes with tables, objects' states where point clouds take their place) is reported.
 """
 
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from bidex_meta.data.dataset import Dataset
-from bidex_meta.data.episode import Episode
+from bidex_meta.data.part_files import Episode, Json
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.references import Reference
 from bidex_meta.tasks import registry
@@ -31,31 +29,22 @@ _TOLERANCE = 1e-5
 """Of a reward, beside the same share of its size: observations and, on a GPU, the formula are float32. Measured on the
 CPU: 2e-8."""
 _EXAMPLES = 5
+_Shown = dict[str, tuple[slice, float]]
 
 
 @dataclass
 class Findings:
-    """Result of a check.
+    """Result of a check."""
 
-    Attributes:
-        episodes: Episodes checked.
-        steps: Their transitions.
-        wrong: What is wrong, a line for each of the first few wrong episodes.
-        count: Number of wrong episodes.
-        recomputed: Transitions whose reward was computed again, by class.
-        largest: Largest difference between a stored reward and a computed one, in the formula's units, by class.
-        skipped: Why rewards of a class were not computed again, by class.
-        unsealed: Files without a digest.
-    """
-
-    episodes: int = 0
-    steps: int = 0
-    wrong: list[str] = field(default_factory=list)
-    count: int = 0
-    recomputed: dict[str, int] = field(default_factory=dict)
+    episodes: int = 0  # checked
+    steps: int = 0  # their transitions
+    wrong: list[str] = field(default_factory=list)  # what is wrong, a line for each of the first few wrong episodes
+    count: int = 0  # wrong episodes
+    recomputed: dict[str, int] = field(default_factory=dict)  # transitions whose reward was computed again, by class
     largest: dict[str, float] = field(default_factory=dict)
-    skipped: dict[str, str] = field(default_factory=dict)
-    unsealed: list[str] = field(default_factory=list)
+    """Largest difference between a stored reward and a computed one, in the formula's units, by class."""
+    skipped: dict[str, str] = field(default_factory=dict)  # why rewards of a class were not computed again
+    unsealed: list[str] = field(default_factory=list)  # files without a digest
 
 
 class _NotShown(Exception):
@@ -63,17 +52,9 @@ class _NotShown(Exception):
 
 
 class _ShownState(TaskState):
-    """The state as far as an observation shows it.
+    """The state as far as observations (n, d), float64, show it: ``shown`` are their entries."""
 
-    Args:
-        shown: Index range of each sensor in an observation, and the factor that it was shown with.
-        observations: (n, d), float64.
-        frozen: As of ``TaskClass.freeze``.
-    """
-
-    def __init__(
-        self, shown: Mapping[str, tuple[slice, float]], observations: Tensor, frozen: dict[str, Tensor]
-    ) -> None:
+    def __init__(self, shown: _Shown, observations: Tensor, frozen: dict[str, Tensor]) -> None:
         super().__init__(observations, {}, frozen)
         self._shown, self.clipped = shown, torch.zeros(len(observations), dtype=torch.bool)
 
@@ -91,15 +72,7 @@ class _ShownState(TaskState):
 
 
 def verify(dataset: Dataset, most: int | None = None) -> Findings:
-    """Checks every file's digest, and every episode.
-
-    Args:
-        dataset: The data set.
-        most: Episodes to check at most, from 1 on, evenly spread; None: all.
-
-    Raises:
-        BidexError: Files are missing or damaged.
-    """
+    """Checks all digests, and ``most`` episodes (None: all), evenly spread; BidexError for damaged files."""
     findings, formulas = Findings(unsealed=dataset.check_digests()), _Formulas(dataset)
     table = dataset.table
     for number, episode in _spread_episodes(dataset, most):
@@ -152,7 +125,7 @@ class _Formulas:
         # A suite's file, which says whether bases move, may have gone: the number of actions shows it.
         self._bases = {"own": (None,), "moving": (True,), "fixed": (False,)}.get(about.get("base") or "", (True, None))
         self._clouds = any(name in POINT_ENTRIES for name, _ in about.get("observation_groups", ()))
-        self._known: dict[str, tuple[TaskClass, dict[str, tuple[slice, float]]] | None] = {}
+        self._known: dict[str, tuple[TaskClass, _Shown] | None] = {}
 
     def check(self, episode: Episode, findings: Findings) -> Iterator[str]:
         """What is wrong with an episode's rewards; adds to ``findings`` what was computed."""
@@ -181,7 +154,7 @@ class _Formulas:
             step = int(late.nonzero()[0])
             yield f"reward {float(stored[step]):.6g} at step {step}, but the formula gives {float(reward[step]):.6g}"
 
-    def _of(self, name: str, findings: Findings) -> tuple[TaskClass, dict[str, tuple[slice, float]]] | None:
+    def _of(self, name: str, findings: Findings) -> tuple[TaskClass, _Shown] | None:
         if name not in self._known:
             self._known[name] = None
             try:
@@ -201,18 +174,12 @@ class _Formulas:
         raise BidexError(f"{name} has {sizes} actions here, the data {actions}")
 
     def _hidden(self, task: TaskClass) -> frozenset[int]:
-        """Entries of a class's observation that are zero because clouds take their place."""
         return frozenset(privileged_columns(compile_scene(task)) if self._clouds else ())
 
 
-def shown_sensors(task: TaskClass, hidden: frozenset[int] = frozenset()) -> dict[str, tuple[slice, float]]:
-    """Where a class's observation shows each sensor whole and unmapped, and the factor on it.
-
-    Args:
-        task: The class.
-        hidden: Entries that show nothing.
-    """
-    shown: dict[str, tuple[slice, float]] = {}
+def shown_sensors(task: TaskClass, hidden: frozenset[int] = frozenset()) -> _Shown:
+    """Where an observation shows each sensor whole and unmapped, and its factor; ``hidden`` entries show nothing."""
+    shown: _Shown = {}
     for block, where in task.layout:
         if block.sensors and not block.name.endswith("joint_position"):  # those are mapped from the joint's range
             start = where.start
@@ -232,29 +199,17 @@ def _size(block: Block, sensor: str) -> int:
 
 @dataclass(frozen=True)
 class ClassSummary:
-    """One slot of a data set.
+    """One slot of a data set."""
 
-    Attributes:
-        name: Class, or class and task.
-        episodes: Episodes.
-        steps: Transitions.
-        length: Mean length of an episode, steps.
-        returns: Unscaled returns: least, median, mean, largest.
-        success: Share of episodes that met their goal.
-        score: Mean normalised score (``evaluation.references``); None where a reference is missing.
-        tasks: Different tasks played.
-        broken: Episodes ended by broken physics.
-    """
-
-    name: str
+    name: str  # class, or class and task
     episodes: int
     steps: int
-    length: float
-    returns: tuple[float, float, float, float]
-    success: float
-    score: float | None
-    tasks: int
-    broken: int
+    length: float  # mean length of an episode, steps
+    returns: tuple[float, float, float, float]  # unscaled: least, median, mean, largest
+    success: float  # share of episodes that met their goal
+    score: float | None  # mean normalised score (``evaluation.references``); None where a reference is missing
+    tasks: int  # different ones played
+    broken: int  # episodes ended by broken physics
 
 
 def summary(dataset: Dataset) -> list[ClassSummary]:
@@ -284,13 +239,12 @@ def summary(dataset: Dataset) -> list[ClassSummary]:
     return summaries
 
 
-def coverage(dataset: Dataset, most: int = 2000) -> dict[str, Any]:
+def coverage(dataset: Dataset, most: int = 2000) -> Json:
     """How widely states and actions are spread, over at most so many episodes.
 
-    Returns:
-        ``observation_std`` by group of the observation: mean over its entries of the standard deviation over all
-        states; ``constant``: share of its entries that never change; ``action_std``: mean over actions;
-        ``action_at_bounds``: share of actions at -1 or 1.
+    ``observation_std`` by group of the observation: mean over its entries of the standard deviation over all states;
+    ``constant``: share of its entries that never change; ``action_std``: mean over actions; ``action_at_bounds``: share
+    of actions at -1 or 1.
     """
     d, a = dataset.observation_size, dataset.action_size
     count, taken = 0, 0

@@ -1,8 +1,8 @@
 """Plays policies and collects their episodes in rounds, each of which is one part of a data set and can be replayed.
 
-In a round every environment plays the same number of whole episodes of its task; a collection that stopped after so
-many steps would lack the long ones. All that a round draws follows from the collection's seed and the round's number.
-So a collection that was killed goes on with the first round whose part is missing, and ends with the same data.
+In a round every environment plays the same number of whole episodes: one that stopped after so many steps would lack
+the long ones. All draws of a round follow from the collection's seed and its number, so that a collection that was
+killed goes on with the first missing part, and ends with the same data.
 """
 
 import math
@@ -19,18 +19,15 @@ from torch import Tensor
 from bidex_meta.agents import Agent
 from bidex_meta.data import part_files
 from bidex_meta.data.collector import BROKEN, EpisodeCollector
-from bidex_meta.data.episode import Episode
+from bidex_meta.data.part_files import Episode
 from bidex_meta.data.writer import DatasetWriter
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import RandomAgent
 from bidex_meta.world.contract import PooledWorld
 
-PART_BYTES = 64_000_000
-"""Bytes of a part, about: what is played again after a kill at the worst moment."""
-FAILED = "unsuccessful_episodes"
-"""What is left out of demonstrations."""
-_SLACK = 1.05
-"""The last round is planned for a little more than is missing, since episodes differ in length."""
+PART_BYTES = 64_000_000  # bytes of a part, about: what is played again after a kill at the worst moment
+FAILED = "unsuccessful_episodes"  # what is left out of demonstrations
+_SLACK = 1.05  # the last round is planned for a little more than is missing, since episodes differ in length
 
 
 @runtime_checkable
@@ -44,33 +41,26 @@ class SamplingAgent(Agent, Protocol):
 
 @dataclass(frozen=True)
 class Actor:
-    """A policy as it acts in a collection.
+    """A policy as it acts in a collection."""
 
-    Attributes:
-        policy: An agent; None: uniform actions.
-        sampled: Whether actions are drawn from the policy's distribution, if it has one; else its mean action is taken.
-        noise: Standard deviation of Gaussian noise on the actions.
-    """
-
-    policy: Agent | None
+    policy: Agent | None  # None: uniform actions
     sampled: bool = False
-    noise: float = 0.0
+    """Whether actions are drawn from the policy's distribution, if it has one; else its mean action is taken."""
+    noise: float = 0.0  # standard deviation of Gaussian noise on the actions
 
     def acting(self, world: PooledWorld, seed: int) -> Callable[[Tensor], Tensor]:
         """A function from observations (N, d) to actions (N, a) that draws by the seed alone."""
         if self.policy is None:
             return RandomAgent(world.action_space, seed).eval_action
         policy: Agent = self.policy
+        drawing = policy if self.sampled and isinstance(policy, SamplingAgent) else None
         # A generator for each kind of draw: the policy's lives where its network does. With one seed the noise would be
         # the policy's own normals once more.
         inner = torch.Generator(world.device).manual_seed(seed)
         outer = torch.Generator().manual_seed(int(np.random.SeedSequence(seed).generate_state(1)[0]))
 
         def act(obs: Tensor) -> Tensor:
-            if self.sampled and isinstance(policy, SamplingAgent):
-                action = policy.sample_action(obs, inner)
-            else:
-                action = policy.eval_action(obs)
+            action = drawing.sample_action(obs, inner) if drawing else policy.eval_action(obs)
             if self.noise > 0.0:
                 action = action + self.noise * torch.randn(action.shape, generator=outer).to(action)
             return action.clamp(-1.0, 1.0)
@@ -80,29 +70,17 @@ class Actor:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a collection is, by policy; computed from its parts alone.
+    """How far a collection is, by policy; computed from its parts alone."""
 
-    Attributes:
-        rounds: Parts that are there.
-        steps: Transitions of each policy.
-        episodes: Episodes of each policy.
-        returns: Mean unscaled return over all episodes, NaN without any.
-        success: Share of them that succeeded, NaN without any.
-    """
-
-    rounds: int
-    steps: list[int]
-    episodes: list[int]
-    returns: float
-    success: float
+    rounds: int  # parts that are there
+    steps: list[int]  # transitions of each policy
+    episodes: list[int]  # of each policy
+    returns: float  # mean unscaled return over all episodes, NaN without any
+    success: float  # share of them that succeeded, NaN without any
 
 
 def progress(writer: DatasetWriter, policies: int = 1) -> Progress:
-    """The progress of a collection.
-
-    Raises:
-        BidexError: A part is damaged.
-    """
+    """The progress of a collection; raises BidexError where a part is damaged."""
     paths = part_files.parts_of(writer.folder, writer.process)
     tables = [part_files.read_table(path) for path in paths]
     owner, steps, returns, success = (
@@ -131,16 +109,10 @@ def collect(
 ) -> None:
     """Plays rounds until each actor has its share of ``size`` transitions; goes on where the writer's parts end.
 
-    Args:
-        world: In autoreset mode DISABLED.
-        actors: Who acts, in rounds of their own.
-        writer: Where episodes go; its parts are counted as rounds.
-        size: Transitions in all; the last episodes may make it a little more.
-        seed: Of all that is drawn.
-        report: Receives the progress after each round, and the seconds since the call.
-
-    Raises:
-        BidexError: A part is damaged, or no transition can be recorded.
+    ``world`` is in autoreset mode DISABLED; actors act in rounds of their own; the writer's parts count as rounds; the
+    last episodes may make it a little more than ``size``; all that is drawn follows from ``seed``. ``report`` receives
+    the progress after each round, and the seconds since the call. Raises BidexError where a part is damaged, or no
+    transition can be recorded.
     """
     began, share = time.monotonic(), math.ceil(size / len(actors))
     now = progress(writer, len(actors))
@@ -153,10 +125,8 @@ def collect(
         collector.policy, collector.active = which, rows
         _round(collector, actors[which], torch.from_numpy(rows), repeats, int(number >> np.uint64(1)))
         if writer.open_steps == 0:
-            raise BidexError(
-                f"Physics broke in the first step of all {int(rows.sum())} episodes: nothing can be recorded. "
-                "Check the policy's actions."
-            )
+            what = f"Physics broke in the first step of all {int(rows.sum())} episodes: nothing can be recorded"
+            raise BidexError(f"{what}. Check the policy's actions.")
         writer.left_out.update({name: count for name, count in collector.left_out.items() if name == BROKEN})
         collector.left_out.clear()
         writer.commit()
@@ -192,8 +162,6 @@ def _round(collector: EpisodeCollector, actor: Actor, rows: Tensor, repeats: int
     while bool((left > 0).any()):
         obs, _, _, _, info = collector.step(act(obs))
         ended = info["_final_obs"]
-        if not bool(ended.any()):
-            continue
         left = left - (ended & (left > 0)).long()
         again = ended & (left > 0)
         if bool(again.any()):
@@ -206,11 +174,8 @@ def _round(collector: EpisodeCollector, actor: Actor, rows: Tensor, repeats: int
 def collect_successes(world: PooledWorld, agent_of: Callable[[int], Agent], writer: DatasetWriter, seed: int) -> None:
     """Plays one round, an episode in every environment, and stores those that succeed as a part.
 
-    Args:
-        world: In autoreset mode DISABLED.
-        agent_of: Makes the agent of a round from a seed, once the world has been reset.
-        writer: Where episodes go; the round's draws follow from the seed and its number of parts.
-        seed: The collection's.
+    ``world`` is in autoreset mode DISABLED; ``agent_of`` makes the agent of a round from a seed, once the world has
+    been reset; the round's draws follow from the collection's seed and the writer's number of parts.
     """
 
     def sink(episode: Episode) -> None:

@@ -3,54 +3,43 @@
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from bidex_meta.data import part_files
-from bidex_meta.data.episode import Episode
+from bidex_meta.data.part_files import Episode
 from bidex_meta.data.writer import DatasetWriter
 from bidex_meta.errors import BidexError
 from bidex_meta.runs.atomic import write_json
 from bidex_meta.world.checked import clean
-from bidex_meta.world.contract import PooledWorld, TaskWorld, VectorWorld
+from bidex_meta.world.contract import Info, Options, PooledWorld, State, Step, TaskWorld, VectorWorld
 from bidex_meta.world.wrapper import PooledWorldWrapper
 
-_FIRST_ROOM = 64
-"""Steps of an episode that there is room for where the world has no time limit; doubled when one is longer."""
+_FIRST_ROOM = 64  # steps of an episode in a world without time limit; doubled when one is longer
 BROKEN, SHORTENED, CUT = "broken_transitions", "shortened_episodes", "cut_episodes"
 """What is left out: transitions in which physics broke; episodes that began after their first step, as those of a
 training world may; episodes that a reset cut."""
-_KEY = "recorder"
-"""Entry of a checkpoint's world state."""
+_KEY = "recorder"  # entry of a checkpoint's world state
 
 
 class EpisodeCollector(PooledWorldWrapper):
     """Collects whole episodes; it changes nothing of what the world does.
 
-    A transition in which physics broke is left out, and its episode ends as truncated before it. Only chosen
-    environments are kept in memory: a step of one takes 4 (d + a + 2) bytes.
-
-    Args:
-        world: In either autoreset mode. In DISABLED mode a frozen environment collects nothing until it is reset.
-        sink: Receives each episode when it has ended, those of one step by ascending environment.
-        rows: Which environments to collect from; None: all.
-
-    Attributes:
-        left_out: Counts of what was not collected, by reason.
-        policy: Number of the policy that acts, for the episodes that end.
-        active: Which of the chosen environments collect the episodes that begin, bool (rows,); all at first.
+    A transition in which physics broke is left out, and its episode ends as truncated before it. Only ``rows``, the
+    environments to collect from (None: all), are in memory: a step of one takes 4 (d + a + 2) bytes. ``sink`` receives
+    each episode when it has ended, those of one step by ascending environment. ``left_out`` counts what was not
+    collected, by reason; ``policy`` is the number of the one that acts; ``active``, bool (rows,), which environments
+    collect the episodes that begin: all at first.
     """
 
     def __init__(self, world: VectorWorld, sink: Callable[[Episode], None], rows: Sequence[int] | None = None) -> None:
         super().__init__(world)  # type: ignore[arg-type]  # without pools there are no variations
         chosen = range(world.num_envs) if rows is None else rows
         if len(set(chosen)) != len(chosen) or not all(0 <= row < world.num_envs for row in chosen):
-            raise BidexError(
-                f"Expected different rows of 0 to {world.num_envs - 1} to record, got {list(chosen)[:10]}."
-            )
+            most = world.num_envs - 1
+            raise BidexError(f"Expected different rows of 0 to {most} to record, got {list(chosen)[:10]}.")
         self.rows, self.policy, self._sink = list(chosen), 0, sink
         self.left_out: Counter[str] = Counter()
         self.active = np.ones(len(self.rows), bool)
@@ -72,19 +61,18 @@ class EpisodeCollector(PooledWorldWrapper):
         self._running, self._success = np.zeros(num, bool), np.zeros(num, bool)
         self._length, self._task = np.zeros(num, np.int64), np.zeros(num, np.int64)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
         """Starts episodes; those that run in these environments are left out."""
         obs, info = self.world.reset(seed=seed, options=options)
         mask = (options or {}).get("reset_mask")
         begun = np.ones(len(self.rows), bool) if mask is None else self._own(torch.as_tensor(mask))
         if begun.all() or not self._pools:
-            # Other tasks hold from a reset of all environments on.
-            self._pools = list(self.world.pools) if isinstance(self.world, PooledWorld) else []
+            self._read_pools()  # other tasks hold from a reset of all environments on
         self.left_out[CUT] += int((begun & self._running & (self._length > 0)).sum())
         self._begin(begun, self._own(obs))
         return obs, info
 
-    def step(self, action: Tensor, /) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+    def step(self, action: Tensor, /) -> Step:
         """Takes actions (N, a); see ``VectorWorld``."""
         taken = self._own(clean(torch.as_tensor(action, dtype=torch.float32))[0])
         result = obs, reward, terminated, _, info = self.world.step(action)
@@ -114,7 +102,6 @@ class EpisodeCollector(PooledWorldWrapper):
         return result
 
     def _own(self, of_all: Tensor) -> np.ndarray:
-        """The chosen environments' share of a tensor of all."""
         return of_all.to(self._where.device)[self._where].detach().cpu().numpy()
 
     def _begin_again(self, info: dict[str, Tensor], obs: Tensor) -> None:
@@ -169,7 +156,7 @@ class EpisodeCollector(PooledWorldWrapper):
         self._observations, self._actions = np.pad(self._observations, more), np.pad(self._actions, more)
         self._rewards = np.pad(self._rewards, [(0, 0), (0, 0), (0, room)])
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Restores the world's state; episodes that run there are not collected, since their beginning is unknown."""
         self.world.load_state_dict(state)
         self._forget()
@@ -177,31 +164,17 @@ class EpisodeCollector(PooledWorldWrapper):
     def collector_state(self) -> dict[str, Tensor]:
         """The running episodes, for a checkpoint: tensors, copied."""
         most = int(self._length.max(initial=0))
-        arrays = {
-            "observations": self._observations[:, : most + 1],
-            "actions": self._actions[:, :most],
-            "rewards": self._rewards[:, :, :most],
-            "running": self._running,
-            "success": self._success,
-            "length": self._length,
-            "task": self._task,
-            "rows": np.array(self.rows, np.int64),
-        }
+        arrays = {"observations": self._observations[:, : most + 1], "actions": self._actions[:, :most]}
+        arrays |= {"rewards": self._rewards[:, :, :most], "running": self._running, "success": self._success}
+        arrays |= {"length": self._length, "task": self._task, "rows": np.array(self.rows, np.int64)}
         return {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
 
     def load_collector_state(self, state: dict[str, Tensor]) -> None:
-        """Goes on with the episodes of ``collector_state``; the world must have been restored before.
-
-        Raises:
-            BidexError: Other environments were collected from, or observations and actions had other sizes.
-        """
+        """Goes on, in a restored world, with ``collector_state``; BidexError for other environments or sizes."""
         given = {name: value.numpy() for name, value in state.items()}
         self._forget()
-        fits = given["rows"].tolist() == self.rows and all(
-            given[name].shape[-1] == array.shape[-1]
-            for name, array in (("observations", self._observations), ("actions", self._actions))
-        )
-        if not fits:
+        sizes = [given[name].shape[-1] for name in ("observations", "actions")]
+        if given["rows"].tolist() != self.rows or sizes != [self._observations.shape[-1], self._actions.shape[-1]]:
             raise BidexError("The episodes in this checkpoint are of other rows or sizes. Start a new run.")
         most = given["actions"].shape[1]
         while self._actions.shape[1] < most:
@@ -210,22 +183,18 @@ class EpisodeCollector(PooledWorldWrapper):
         self._rewards[:, :, :most] = given["rewards"]
         self._running, self._success = given["running"].copy(), given["success"].copy()
         self._length, self._task = given["length"].copy(), given["task"].copy()
+        self._read_pools()
+
+    def _read_pools(self) -> None:
         self._pools = list(self.world.pools) if isinstance(self.world, PooledWorld) else []
 
 
 class RunCollector(EpisodeCollector):
-    """Collects from the training world of a run; killed and resumed, each episode is stored once.
+    """Collects from ``rows`` of the training world of a run; killed and resumed, each episode is stored once.
 
-    ``state_dict``, which a checkpoint calls, commits what was collected as a part. Its result holds the number of
-    parts and the running episodes. A run that goes on from it deletes later parts and plays them again.
-
-    Args:
-        world: In either autoreset mode.
-        rows: Environments to collect from.
-        process: Number of this process.
-
-    Attributes:
-        folder: The data set's folder: set by ``open``, or before ``load_state_dict``, which opens it.
+    ``state_dict``, which a checkpoint calls, commits what was collected as a part. Its result holds the number of parts
+    and the running episodes. A run that goes on from it deletes later parts and plays them again. ``folder``, the data
+    set's, is set by ``open``, or before ``load_state_dict``, which opens it.
     """
 
     folder: Path
@@ -248,19 +217,15 @@ class RunCollector(EpisodeCollector):
             write_json(folder / "data" / part_files.RECORDING, {"run": folder.parent.name})
             (folder / "data" / part_files.METADATA).unlink(missing_ok=True)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         """The world's state, the number of parts, and the running episodes."""
         self.writer.left_out.update(self.left_out)
         self.left_out.clear()
         self.writer.commit()
         return {**self.world.state_dict(), _KEY: {"parts": self.writer.parts, **self.collector_state()}}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes on from ``state_dict``.
-
-        Raises:
-            BidexError: Nothing was collected then.
-        """
+    def load_state_dict(self, state: State) -> None:
+        """Goes on from ``state_dict``; raises BidexError where nothing was collected then."""
         if _KEY not in state:
             raise BidexError("This checkpoint was saved without a recording. Start a new run to record one.")
         own = dict(state[_KEY])
@@ -278,12 +243,7 @@ class RunCollector(EpisodeCollector):
 
 
 def spread_environments(world: VectorWorld, share: float) -> list[int]:
-    """A share of a world's environments, evenly over its slots, at least one of each.
-
-    Args:
-        world: The world.
-        share: Above 0; 1 or more are all.
-    """
+    """A share, above 0 (1 or more: all), of a world's environments, evenly over its slots, at least one of each."""
     chosen: list[int] = []
     slots = world.task_id.tolist()
     for slot in range(world.num_tasks):

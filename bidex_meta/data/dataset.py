@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from msgspec import Meta
 
 from bidex_meta.data import other_formats, part_files, seals
-from bidex_meta.data.episode import Episode
+from bidex_meta.data.part_files import H5, Episode, Json
 from bidex_meta.errors import BidexError, shortened, unknown_name
 from bidex_meta.utils.files import expanded, is_file, read_bytes, read_json
 from bidex_meta.utils.memory import check_memory
@@ -22,13 +22,11 @@ from bidex_meta.utils.validation import Finite, Positive, Seed, Text, Whole, par
 if TYPE_CHECKING:
     from torch import Tensor
 
-_FOLDER = "BIDEX_DATA"
+_Range = tuple[Whole, Whole]
 _MOST_LISTED = 5000
 _OF_EPISODE = ("task", "task_index", "success", "broken", "return_unscaled", "row", "policy")
-"""Columns of the table that an episode has as attributes."""
 _CHECKED_AT_OPENING = 64_000_000
-"""Bytes of parts, about, whose digests are checked when a data set is opened: 0.03 s. The others follow when their
-episodes are read."""
+"""Bytes of parts, about, whose digests are checked at opening (0.03 s); the others follow when episodes are read."""
 
 
 @dataclass(frozen=True)
@@ -58,12 +56,9 @@ class _Collected:
     object: Text | None = None
     points: Whole | None = None
     seed: Seed | None = None
-    observation_groups: list[tuple[str, Annotated[list[tuple[Whole, Whole]], Meta(min_length=1)]]] = field(
-        default_factory=list
-    )
+    observation_groups: list[tuple[str, Annotated[list[_Range], Meta(min_length=1)]]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        """Refuses newer formats and empty ranges."""
         if self.format > part_files.FORMAT:
             raise BidexError(f"format: expected {part_files.FORMAT}, got {self.format}. Use a newer bidex-meta.")
         for name, ranges in self.observation_groups:
@@ -84,7 +79,7 @@ class _Metadata:
 
 def data_folder() -> Path:
     """Where data sets lie: the folder that BIDEX_DATA names, else ``data`` in the working folder."""
-    return expanded(os.environ.get(_FOLDER) or "data")
+    return expanded(os.environ.get("BIDEX_DATA") or "data")
 
 
 def dataset_names(folder: Path | None = None) -> list[str]:
@@ -95,14 +90,7 @@ def dataset_names(folder: Path | None = None) -> list[str]:
 
 
 def open_dataset(name_or_path: str | Path) -> "Dataset":
-    """A data set by its name in ``data_folder()``, or by its folder's path.
-
-    Args:
-        name_or_path: ``CatchUnderarm/random-v0``, or any folder that holds ``data/metadata.json``.
-
-    Raises:
-        BidexError: There is none, it is incomplete or damaged, or h5py is not installed.
-    """
+    """A data set by name in ``data_folder()``, or by folder; BidexError where it is missing, incomplete or damaged."""
     named = expanded(name_or_path)
     for folder in (named, data_folder() / named):
         for inner in (folder / "data", folder):
@@ -120,26 +108,21 @@ def open_dataset(name_or_path: str | Path) -> "Dataset":
 class Dataset:
     """Whole episodes on disk, as ``open_dataset`` returns it; only small tables stay in memory.
 
-    Attributes:
-        folder: The folder ``data`` of the data set.
-        content: All of ``metadata.json``, Minari's entries too.
-        metadata: Our entry of it (``commands.run_data.dataset_metadata``); of a data set from elsewhere only ``tasks``
-            and ``kind``.
+    ``folder`` is the folder ``data``, ``content`` all of ``metadata.json``, ``metadata`` our entry of it
+    (``commands.run_data.dataset_metadata``); of a data set from elsewhere only ``tasks`` and ``kind``.
     """
 
-    def __init__(self, folder: Path, content: dict[str, Any], sealed: bool = False) -> None:
+    def __init__(self, folder: Path, content: Json, sealed: bool = False) -> None:
         self.folder, self.content = folder, content
+        self.num_episodes: int = content["total_episodes"]
+        self.num_steps: int = content["total_steps"]
         self.name: str = content.get("dataset_id", folder.parent.name)
-        self.metadata: dict[str, Any] = content.get("bidex") or {"tasks": [self.name], "kind": "outside"}
+        self.metadata: Json = content.get("bidex") or {"tasks": [self.name], "kind": "outside"}
         self._paths = part_files.parts_of(folder) if "bidex" in content else [folder / part_files.MAIN]
         self._sealed = {folder / part_files.METADATA: sealed}
 
     def check_digests(self) -> list[str]:
-        """Checks the digest of every file, reading all of it; returns the names of files without one.
-
-        Raises:
-            BidexError: A file has changed since it was written.
-        """
+        """Names of the files without a digest; reads all files, and raises BidexError where one has changed."""
         if "bidex" not in self.content:
             return [part_files.METADATA, part_files.MAIN]
         for path in (*self._paths, self.folder / part_files.MAIN):
@@ -152,7 +135,6 @@ class Dataset:
 
     @cached_property
     def _tables(self) -> list[dict[str, np.ndarray]]:
-        """The table of each of ``_paths``."""
         if "bidex" not in self.content:
             return [self._outside_table()]
         size = sum(path.stat().st_size for path in self._paths if is_file(path))
@@ -162,32 +144,16 @@ class Dataset:
 
     @cached_property
     def table(self) -> dict[str, np.ndarray]:
-        """A row for every episode, in the order of ``episodes()``: columns of ``part_files.TABLE``, ``variation``.
-
-        Raises:
-            BidexError: Parts are missing or damaged.
-        """
+        """By episode, in their order: columns of ``part_files.TABLE``, ``variation``; BidexError for damage."""
         columns = {name: _joined([table[name] for table in self._tables]) for name in (*part_files.TABLE, "variation")}
         episodes, steps = len(columns["steps"]), int(columns["steps"].sum())
         if (self.num_episodes, self.num_steps) != (episodes, steps):
-            raise BidexError(
-                f"{self.folder}: expected {self.num_episodes} episodes of {self.num_steps} steps, found {episodes} of "
-                f"{steps}. Parts are missing: record it again, or bring them back."
-            )
+            what = f"expected {self.num_episodes} episodes of {self.num_steps} steps, found {episodes} of {steps}"
+            raise BidexError(f"{self.folder}: {what}. Parts are missing: record it again, or bring them back.")
         slots = len(self.metadata["tasks"])
         if ((columns["task"] < 0) | (columns["task"] >= slots)).any():
             raise BidexError(f"{self.folder}: expected tasks from 0 to {slots - 1}, found others. Record it again.")
         return columns
-
-    @property
-    def num_episodes(self) -> int:
-        """Episodes."""
-        return self.content["total_episodes"]
-
-    @property
-    def num_steps(self) -> int:
-        """Transitions over all episodes."""
-        return self.content["total_steps"]
 
     @property
     def observation_size(self) -> int:
@@ -201,14 +167,10 @@ class Dataset:
 
     @property
     def action_bounds(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Least and largest actions, (a,) each, of a data set from elsewhere; None: -1 and 1.
-
-        Raises:
-            BidexError: Its metadata have no finite ones.
-        """
-        return (
-            None if "bidex" in self.content else other_formats.action_bounds(self.content, self.name, self.action_size)
-        )
+        """Least and largest actions, (a,) each, if from elsewhere (BidexError without finite ones); None: ±1."""
+        if "bidex" in self.content:
+            return None
+        return other_formats.action_bounds(self.content, self.name, self.action_size)
 
     @cached_property
     def _sizes(self) -> tuple[int, int]:
@@ -218,17 +180,12 @@ class Dataset:
         groups = self.metadata.get("observation_groups", ())
         shown = max((stop for _, ranges in groups for _, stop in ranges), default=0)
         if shown > (size := first.observations.shape[1]):
-            raise BidexError(
-                f"{self.folder}: expected {shown} entries of an observation, found {size}. Record it again."
-            )
+            what = f"expected {shown} entries of an observation, found {size}"
+            raise BidexError(f"{self.folder}: {what}. Record it again.")
         return size, first.actions.shape[1]
 
     def episodes(self) -> Iterator[Episode]:
-        """All episodes, read one by one.
-
-        Raises:
-            BidexError: A file is damaged, or observations or actions of a data set from elsewhere are not flat.
-        """
+        """All episodes, read one by one; BidexError for a damaged file, or observations or actions not flat."""
         other_formats.check_spaces(self.content, self.name)
         number, sizes = 0, None
         for path, table in zip(self._paths, self._tables, strict=True):
@@ -247,8 +204,7 @@ class Dataset:
                     yield episode
                     number += 1
 
-    def _episode(self, group: Any, number: int) -> Episode:
-        """An episode of HDF5's group, its arrays as long as the table says."""
+    def _episode(self, group: H5, number: int) -> Episode:
         row = {name: column[number].item() for name, column in self.table.items() if name != "variation"}
         arrays = {
             ours: other_formats.numbers(group[name], name, self.name, row["steps"] + (name == "observations"))
@@ -269,18 +225,14 @@ class Dataset:
     def transitions(self) -> "dict[str, Tensor]":
         """All transitions in memory, in the order of the episodes, each tensor contiguous.
 
-        Returns:
-            ``observations`` (N, d), ``actions`` (N, a), ``rewards`` (N,), ``next_observations`` (N, d), all float32;
-            ``terminated`` (N,), bool: where a value must not be taken of the next observation; ``task`` (N,), int64.
-
-        Raises:
-            BidexError: They do not fit into the memory that is free.
+        ``observations`` (N, d), ``actions`` (N, a), ``rewards`` (N,), ``next_observations`` (N, d), all float32;
+        ``terminated`` (N,), bool: where a value must not be taken of the next observation; ``task`` (N,), int64. Raises
+        BidexError where they do not fit into the free memory.
         """
         import torch
 
-        what = f"The {self.num_steps:,} transitions of {self.name}"
-        check_memory(self.transition_bytes(), what, "Record fewer, or free memory.")
         n, d, a = self.num_steps, self.observation_size, self.action_size
+        check_memory(self.transition_bytes(), f"The {n:,} transitions of {self.name}", "Record fewer, or free memory.")
         tensors = {
             "observations": torch.zeros(n, d),
             "actions": torch.zeros(n, a),
@@ -293,28 +245,27 @@ class Dataset:
         start = 0
         for episode in self.episodes():
             where = slice(start, start + len(episode))
-            views["observations"][where] = episode.observations[:-1]
-            views["next_observations"][where] = episode.observations[1:]
+            now, after = episode.observations[:-1], episode.observations[1:]
+            views["observations"][where], views["next_observations"][where] = now, after
             for name in ("actions", "rewards", "terminated", "task"):
                 views[name][where] = getattr(episode, name)
             start = where.stop
         return tensors
 
     def _outside_table(self) -> dict[str, np.ndarray]:
-        """The table of a Minari data set from elsewhere: one task, no variation."""
-        steps, returns = [], []
+        found = []
         with part_files.reading(self.folder / part_files.MAIN) as file:
             for number in range(self.num_episodes):
                 rewards = other_formats.numbers(file[f"episode_{number}"]["rewards"], "rewards", self.name)
-                steps.append(len(rewards))
-                returns.append(rewards.sum(dtype=np.float64))
-        table = {name: np.zeros(len(steps), kind) for name, kind in part_files.TABLE.items()}
-        table["steps"][:], table["return"][:] = steps, returns
-        return table | {"return_unscaled": table["return"].copy(), "variation": np.zeros((len(steps), 0))}
+                found.append((len(rewards), rewards.sum(dtype=np.float64)))
+        table = {name: np.zeros(len(found), kind) for name, kind in part_files.TABLE.items()}
+        if found:
+            table["steps"][:], table["return"][:] = zip(*found, strict=True)
+        return table | {"return_unscaled": table["return"].copy(), "variation": np.zeros((len(found), 0))}
 
 
 def _joined(columns: list[np.ndarray]) -> np.ndarray:
-    """Columns of several parts in one; variations are filled up with NaN to the widest."""
+    """Variations are filled up with NaN to the widest."""
     if not columns:
         return np.zeros(0)
     if columns[0].ndim == 1:

@@ -1,42 +1,33 @@
-"""Data sets in memory as one, in the form of the world that a policy is learned for.
-
-Each observation of an episode is held once, in half of the memory that observations and next observations would take.
-"""
+"""Data sets in memory as one, each observation once, in the form of the world that a policy is learned for."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from bidex_meta.data.dataset import Dataset
-from bidex_meta.data.episode import Episode
+from bidex_meta.data.part_files import Episode
 from bidex_meta.errors import BidexError, unknown_name
 from bidex_meta.utils.memory import check_memory
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.world.depth_sensor import POINT_ENTRIES
+from bidex_meta.world.groups import Slot
 
 
 @dataclass(frozen=True)
 class Joined:
     """N transitions of E episodes, on the CPU."""
 
-    observations: Tensor
-    """All states, episode after episode, (N + E, d), float32."""
-    at: Tensor
-    """Row of each transition's observation, int64 (N,); the next row is its next observation."""
-    actions: Tensor
-    """(N, a), float32."""
-    rewards: Tensor
-    """(N,), float32, in the world's scale."""
-    terminated: Tensor
-    """Whether the episode came to a true end, bool (N,)."""
-    task: Tensor
-    """Slot of the world, int64 (N,)."""
-    left: Tensor
-    """Later transitions of the same episode, int64 (N,)."""
+    observations: Tensor  # all states, episode after episode, (N + E, d), float32
+    at: Tensor  # row of each transition's observation, int64 (N,); the next row is its next observation
+    actions: Tensor  # (N, a), float32
+    rewards: Tensor  # (N,), float32, in the world's scale
+    terminated: Tensor  # whether the episode came to a true end, bool (N,)
+    task: Tensor  # slot of the world, int64 (N,)
+    left: Tensor  # later transitions of the same episode, int64 (N,)
 
     def __len__(self) -> int:
         """Transitions, N."""
@@ -45,27 +36,17 @@ class Joined:
     def fingerprint(self) -> dict[str, float]:
         """Sums by which a checkpoint recognises the data that its run must go on with."""
         parts = {"rewards": self.rewards, "actions": self.actions, "task": self.task}
-        return {
-            "transitions": len(self),
-            **{name: float(part.sum(dtype=torch.float64)) for name, part in parts.items()},
-        }
+        sums = {name: float(part.sum(dtype=torch.float64)) for name, part in parts.items()}
+        return {"transitions": len(self), **sums}
 
 
 def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) -> Joined:
-    """Reads data sets for a world.
+    """Reads data sets, at least one, for a world, which is neither stepped nor reset.
 
     Slots are matched by name. Observations of a class recorded on its own get the world's padding and one-hot, and
-    rewards its scale; goals that the world hides become zero. Actions of a data set from elsewhere are mapped to
-    [-1, 1].
-
-    Args:
-        datasets: At least one.
-        world: It is neither stepped nor reset.
-        every: Whether each of the world's classes needs data.
-
-    Raises:
-        BidexError: Actions, states or clouds of another form, actions from elsewhere without bounds, classes that do
-            not match, or too little memory.
+    rewards its scale; goals that the world hides become zero; actions from elsewhere are mapped to [-1, 1]. With
+    ``every`` each of the world's classes needs data. Raises BidexError for actions, states or clouds of another form,
+    actions from elsewhere without bounds, classes that do not match, or too little memory.
     """
     ids = world.num_id_columns
     plain, actions = world.single_observation_space.shape[0] - ids, world.single_action_space.shape[0]
@@ -74,10 +55,8 @@ def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) ->
     slots = {form.slots[task] for form in forms for task in np.unique(form.dataset.table["task"])}
     missing = [name for slot, name in enumerate(world.task_names) if slot not in slots]
     if missing and every:
-        raise BidexError(
-            f"Expected data of every class, found none of {', '.join(missing)}. Add a data set, or name a suite of the "
-            "others alone."
-        )
+        what = f"Expected data of every class, found none of {', '.join(missing)}"
+        raise BidexError(f"{what}. Add a data set, or name a suite of the others alone.")
     needed = 4 * (steps + episodes) * (plain + ids) + steps * (4 * (actions + 1) + 1 + 3 * 8)
     check_memory(needed, f"The {steps:,} transitions", "Name fewer data sets, or record smaller ones.")
     fitted = (form.fitted(episode, ids) for form in forms for episode in form.dataset.episodes())
@@ -87,18 +66,7 @@ def join(datasets: Sequence[Dataset], world: VectorWorld, every: bool = True) ->
 def gathered(
     episodes: Iterable[tuple[Episode, int, np.ndarray]], steps: int, count: int, observations: int, actions: int
 ) -> Joined:
-    """Concatenates episodes.
-
-    Args:
-        episodes: Each with its slot, and observations (T + 1, d) in the world's form.
-        steps: Transitions of all.
-        count: Number of episodes.
-        observations: Entries of an observation, d.
-        actions: Actions, a.
-
-    Raises:
-        BidexError: They have fewer transitions.
-    """
+    """Episodes with slot, and observations (T + 1, d) in the world's form, as one; BidexError for too few steps."""
     states, acts, rewards = torch.zeros(steps + count, observations), torch.zeros(steps, actions), torch.zeros(steps)
     at, task, left = torch.zeros(3, steps, dtype=torch.int64).unbind()
     ends = torch.zeros(steps, dtype=torch.bool)
@@ -120,12 +88,9 @@ def gathered(
 class _Columns(NamedTuple):
     """Columns of an observation without its task id; padding stands before the cloud."""
 
-    state: np.ndarray
-    """Without the cloud, ascending."""
-    cloud: np.ndarray
-    """Of the point cloud, point after point."""
-    label: str
-    """Form of the cloud, for messages."""
+    state: np.ndarray  # without the cloud, ascending
+    cloud: np.ndarray  # of the point cloud, point after point
+    label: str  # form of the cloud, for messages
 
     @staticmethod
     def of(groups: Iterable[tuple[str, Sequence[tuple[int, int]]]], size: int) -> "_Columns":
@@ -140,27 +105,15 @@ class _Columns(NamedTuple):
 
 
 class _Form:
-    """How a data set's episodes become a world's.
-
-    Args:
-        dataset: The data set.
-        world: The world.
-        plain: Entries of the world's observation without its one-hot.
-        actions: The world's actions.
-
-    Attributes:
-        slots: The world's slot for each of the data set's.
-    """
+    """How a data set's episodes become a world's; ``slots`` are the world's; ``plain``: without one-hot."""
 
     def __init__(self, dataset: Dataset, world: VectorWorld, plain: int, actions: int) -> None:
         self.dataset, about = dataset, dataset.metadata
         names: list[str] = about["tasks"]
         self.slots = list(_slots(names, world, outside=about["kind"] == "outside"))
         if dataset.action_size != actions:
-            raise BidexError(
-                f"{dataset.name} has {dataset.action_size} actions, the world {actions}. Record it with the same bases "
-                "(--base), or learn for what it was recorded of."
-            )
+            what = f"{dataset.name} has {dataset.action_size} actions, the world {actions}"
+            raise BidexError(f"{what}. Record it with the same bases (--base), or learn for what it was recorded of.")
         shown = about.get("observation_groups", ())
         ids = sum(stop - start for name, parts in shown if name == "task_id" for start, stop in parts)
         self._width, self._own = plain, _Columns.of(shown, dataset.observation_size - ids)
@@ -168,7 +121,7 @@ class _Form:
         self._theirs = _Columns.of(seen, plain)
         self._bounds = dataset.action_bounds
         hide = getattr(world, "hides_goals", False) and not about.get("hides_goals", True)
-        slots: Sequence[Any] = getattr(world, "slots", ())  # of Meta-World's there are none
+        slots: Sequence[Slot] = getattr(world, "slots", ())  # of Meta-World's there are none
         self._hidden = [slots[slot].task_class.layout.goal_indices() if hide else [] for slot in self.slots]
         self._check_observations(world.num_tasks > 1 and len(names) == 1)
         own, theirs = about.get("reward_scales", {}), {slot.name: slot.reward_scale for slot in slots}
@@ -178,19 +131,15 @@ class _Form:
         ]
 
     def _check_observations(self, may_pad: bool) -> None:
-        """Refuses states and clouds of other sizes; ``may_pad``: whether the world's states may be wider."""
+        """``may_pad``: whether the world's states may be wider."""
         name, own, theirs = self.dataset.name, self._own, self._theirs
         if own.label != theirs.label:
-            raise BidexError(
-                f"{name} has point clouds: {own.label}, the world: {theirs.label}. Learn with the points that it was "
-                "recorded with (--points, or [points] in the suite's file)."
-            )
+            mend = "Learn with the points that it was recorded with (--points, or [points] in the suite's file)"
+            raise BidexError(f"{name} has point clouds: {own.label}, the world: {theirs.label}. {mend}.")
         here, there = len(own.state), len(theirs.state)
         if here > there or (here < there and not may_pad):
-            raise BidexError(
-                f"{name} has observations of {here} entries beside the task id and cloud, the world {there}. Learn for "
-                "what it was recorded of."
-            )
+            what = f"{name} has observations of {here} entries beside the task id and cloud, the world {there}"
+            raise BidexError(f"{what}. Learn for what it was recorded of.")
 
     def fitted(self, episode: Episode, ids: int) -> tuple[Episode, int, np.ndarray]:
         """An episode, its slot, and its observations in the world's form."""

@@ -1,27 +1,18 @@
 """Data sets from elsewhere, such as Minari's: which of their arrays can be read, and the range of their actions."""
 
 import json
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
+from bidex_meta.data.part_files import H5, Json
 from bidex_meta.errors import BidexError, shortened
 
 _SPACES = {"observations": "observation_space", "actions": "action_space"}
 """Arrays of several numbers a step, and the entries of their spaces."""
 
 
-def check_spaces(content: Mapping[str, Any], name: str) -> None:
-    """Refuses observations or actions that are not flat, where the metadata have their spaces.
-
-    Args:
-        content: All of ``metadata.json``.
-        name: The data set's.
-
-    Raises:
-        BidexError: One is anything else than a Box of one dimension.
-    """
+def check_spaces(content: Json, name: str) -> None:
+    """Raises BidexError where the spaces in ``metadata.json`` say that observations or actions are not flat."""
     for what, entry in _SPACES.items():
         space = _space(content, entry)
         kind, shape = space.get("type", "Box"), space.get("shape", [0])
@@ -29,18 +20,8 @@ def check_spaces(content: Mapping[str, Any], name: str) -> None:
             raise _not_flat(name, what, f"a Box of shape {shortened(shape)}" if kind == "Box" else f"{kind} ones")
 
 
-def numbers(stored: Any, what: str, name: str, length: int | None = None) -> np.ndarray:
-    """An episode's array as it is stored.
-
-    Args:
-        stored: HDF5's group or dataset.
-        what: Minari's name of the array: ``observations``, ``rewards``, ...
-        name: The data set's.
-        length: Required length; None: any.
-
-    Raises:
-        BidexError: It is a group, has another shape, or holds no numbers.
-    """
+def numbers(stored: H5, what: str, name: str, length: int | None = None) -> np.ndarray:
+    """An episode's array ``what`` (Minari's name); BidexError for another shape or ``length``, or no numbers."""
     if not hasattr(stored, "shape"):
         raise _not_flat(name, what, f"a group of {shortened(', '.join(stored))}")
     shape, kind = stored.shape or (), stored.dtype
@@ -51,17 +32,8 @@ def numbers(stored: Any, what: str, name: str, length: int | None = None) -> np.
     return np.asarray(stored[()])
 
 
-def action_bounds(content: Mapping[str, Any], name: str, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Least and largest actions, (a,) each, float64, which become -1 and 1 here.
-
-    Args:
-        content: All of ``metadata.json``.
-        name: The data set's.
-        size: Actions, a.
-
-    Raises:
-        BidexError: There are none, or not finite and rising ones.
-    """
+def action_bounds(content: Json, name: str, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Least and largest actions, (a,) each, float64, which become ±1; BidexError unless finite and rising."""
     space = _space(content, "action_space")
     try:
         low, high = (np.array(space[end], np.float64) for end in ("low", "high"))
@@ -70,14 +42,12 @@ def action_bounds(content: Mapping[str, Any], name: str, size: int) -> tuple[np.
     fits = low.shape == high.shape == (size,)
     if not fits or not np.isfinite([low, high]).all() or (low >= high).any():
         got = " to ".join(shortened(space.get(end)) for end in ("low", "high"))
-        raise BidexError(
-            f"Expected finite bounds of the {size} actions of {name}, which become -1 and 1, got {got}. Store it "
-            "with an action_space that has them."
-        )
+        what = f"Expected finite bounds of the {size} actions of {name}, which become -1 and 1, got {got}"
+        raise BidexError(f"{what}. Store it with an action_space that has them.")
     return low, high
 
 
-def _space(content: Mapping[str, Any], entry: str) -> dict[str, Any]:
+def _space(content: Json, entry: str) -> Json:
     """A space as Minari writes it, JSON within JSON; empty without one."""
     space = content.get(entry)
     try:

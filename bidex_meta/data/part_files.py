@@ -17,6 +17,7 @@ import os
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -24,51 +25,56 @@ from typing import Any
 import numpy as np
 
 from bidex_meta.data import seals
-from bidex_meta.data.episode import Episode
 from bidex_meta.errors import BidexError, one_line
 from bidex_meta.runs.atomic import sync_folder
 from bidex_meta.utils.files import is_file
 
+H5 = Any  # h5py's file, group, array or buffer: of an optional package without types
+Json = dict[str, Any]
+
 MAIN, METADATA, RECORDING = "main_data.hdf5", "metadata.json", "recording.json"
-FORMAT = 1
-"""Raised when older code could no longer read what is written."""
+FORMAT = 1  # raised when older code could no longer read what is written
 _PART = re.compile(r"part-(\d{1,4})-(\d{1,6})\.hdf5", re.ASCII)
-EPISODE_BYTES = 3800
-"""Bytes of an episode in HDF5 beside its numbers: measured 3,675 with five attributes."""
-ARRAYS = {
-    "observations": "observations",
-    "actions": "actions",
-    "rewards": "rewards",
-    "terminations": "terminated",
-    "truncations": "truncated",
-}
+EPISODE_BYTES = 3800  # bytes of an episode in HDF5 beside its numbers: measured 3,675 with five attributes
+ARRAYS = {"observations": "observations", "actions": "actions", "rewards": "rewards"}
+ARRAYS |= {"terminations": "terminated", "truncations": "truncated"}
 """Minari's names of an episode's arrays, and ours."""
-TABLE = {
-    "steps": np.int64,
-    "task": np.int64,
-    "task_index": np.int64,
-    "row": np.int64,
-    "policy": np.int64,
-    "success": np.bool_,
-    "broken": np.bool_,
-    "return": np.float64,
-    "return_unscaled": np.float64,
-}
+TABLE: dict[str, type] = dict.fromkeys(("steps", "task", "task_index", "row", "policy"), np.int64)
+TABLE |= {"success": np.bool_, "broken": np.bool_, "return": np.float64, "return_unscaled": np.float64}
 """Columns of the table of a part's episodes, beside ``variation`` (episodes, v), padded with NaN."""
 
 
-def hdf5() -> ModuleType:
-    """The package ``h5py``.
+@dataclass(frozen=True)
+class Episode:
+    """T transitions of one environment, from a start to an end."""
 
-    Raises:
-        BidexError: It is not installed.
-    """
+    observations: np.ndarray  # (T + 1, d), float32: the start, and the state after each transition
+    actions: np.ndarray  # (T, a), float32, clipped to [-1, 1]
+    rewards: np.ndarray  # (T,), float32, with the suite's scale of the class
+    terminated: np.ndarray  # (T,), bool: true at most for the last transition
+    truncated: np.ndarray  # (T,), bool: likewise, by time, or before a broken transition
+    task: int = 0  # slot of the world
+    task_name: str = ""  # its name: a class, or ``Class/task``
+    task_index: int = 0  # task of the slot's pool
+    variation: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (v,), float64: what that task freezes, if any
+    success: bool = False  # whether the goal was met after any transition
+    broken: bool = False  # whether physics broke in the next transition, which is left out
+    return_unscaled: float = 0.0  # sum of the rewards by the printed formula, before the suite's scale
+    row: int = 0  # environment of the process's world
+    policy: int = 0  # which of several policies acted, from 0 on
+
+    def __len__(self) -> int:
+        """Transitions, T."""
+        return len(self.rewards)
+
+
+def hdf5() -> ModuleType:
+    """The package ``h5py``; raises BidexError where it is not installed."""
     try:
         import h5py
     except ModuleNotFoundError:
-        raise BidexError(
-            "Expected h5py for data sets, but it is not installed. Add it: pip install 'bidex-meta[data]'."
-        ) from None
+        what = "Expected h5py for data sets, but it is not installed"
+        raise BidexError(f"{what}. Add it: pip install 'bidex-meta[data]'.") from None
     return h5py
 
 
@@ -96,19 +102,17 @@ def _files(folder: Path) -> Iterator[Path]:
 
 
 class _Disk(io.FileIO):
-    """A file for HDF5 that stores the system's first error instead of raising it.
+    """A file for HDF5 that stores the system's first error (``refused``) instead of raising it.
 
-    HDF5 would try again at each close, print tracebacks that nobody can catch, and crash at the end of the process.
-
-    Attributes:
-        refused: The first error.
+    HDF5 would try again at each close, print tracebacks that nobody can catch, and crash as the process ends.
     """
 
     refused: OSError | None = None
 
-    def write(self, data: Any, /) -> int:
+    def write(self, data: H5, /) -> int:
         """Writes all data."""
-        left, size = memoryview(data), len(data)
+        left = memoryview(data)
+        size = left.nbytes
         try:
             while len(left):
                 left = left[super().write(left) :]
@@ -133,15 +137,11 @@ class SealedFile:
         self._temporary = path.with_name(f".{path.name}")
         path.parent.mkdir(parents=True, exist_ok=True)
         self._disk = _Disk(self._temporary, "w+")
-        self._file: Any = h5.File(self._disk, "w", userblock_size=seals.BLOCK)
+        self._file: H5 = h5.File(self._disk, "w", userblock_size=seals.BLOCK)
 
     @contextmanager
-    def writing(self) -> Iterator[Any]:
-        """h5py's file, to be written into.
-
-        Raises:
-            OSError: The disk did not take it; the file is dropped.
-        """
+    def writing(self) -> Iterator[H5]:
+        """h5py's file, to be written into; raises OSError where the disk did not take it, and drops the file."""
         try:
             yield self._file
         finally:
@@ -176,32 +176,22 @@ class PartWriter:
 
     def __init__(self, path: Path) -> None:
         self._sealed = SealedFile(path)
-        self._rows: list[dict[str, Any]] = []
+        self._rows: list[Json] = []
         self._variations: list[np.ndarray] = []
         self.steps = 0
 
     def add(self, episode: Episode) -> None:
         """Writes an episode; errors as of ``SealedFile.writing``."""
-        row = {
-            "steps": len(episode),
-            "task": episode.task,
-            "task_index": episode.task_index,
-            "row": episode.row,
-            "policy": episode.policy,
-            "success": episode.success,
-            "broken": episode.broken,
-            "return": float(episode.rewards.astype(np.float64).sum()),
-            "return_unscaled": episode.return_unscaled,
-        }
+        row = {name: getattr(episode, name) for name in TABLE if name not in ("steps", "return")}
+        row |= {"steps": len(episode), "return": float(episode.rewards.astype(np.float64).sum())}
         named = {"total_steps": len(episode), "task_name": episode.task_name, "variation": episode.variation}
         with self._sealed.writing() as file:
             group = file.create_group(f"episode_{len(self._rows)}")
             for name, ours in ARRAYS.items():
                 group.create_dataset(name, data=getattr(episode, ours))
             group.create_group("infos")  # Minari prints its keys
-            group.attrs.update(
-                {name: row[name] for name in ("task", "task_index", "policy", "success", "broken")} | named
-            )
+            shown = ("task", "task_index", "policy", "success", "broken")
+            group.attrs.update({name: row[name] for name in shown} | named)
         self._rows.append(row)
         self._variations.append(np.asarray(episode.variation, np.float64))
         self.steps += len(episode)
@@ -240,12 +230,8 @@ def write_main(folder: Path, parts: Iterable[Path]) -> None:
 
 
 @contextmanager
-def reading(path: Path) -> Iterator[Any]:
-    """h5py's file, to be read.
-
-    Raises:
-        BidexError: It is no file, or whatever was read of it is damaged: all that h5py raises within.
-    """
+def reading(path: Path) -> Iterator[H5]:
+    """h5py's file, to be read; raises BidexError where it is no file, or what was read within is damaged."""
     h5 = hdf5()
     if not is_file(path):
         raise BidexError(f"Expected a part of a data set at {path}, found none. Record it again.")
@@ -256,17 +242,12 @@ def reading(path: Path) -> Iterator[Any]:
         raise
     except Exception as error:  # h5py raises all kinds; a group in the place of an array lacks its attributes
         reason = one_line(str(error).strip("'\"").split("(")[-1].rstrip(")"))[:200] or type(error).__name__
-        raise BidexError(
-            f"{path} is damaged or no part of a data set ({reason}). Delete it and record it again."
-        ) from None
+        what = f"{path} is damaged or no part of a data set ({reason})"
+        raise BidexError(f"{what}. Delete it and record it again.") from None
 
 
 def read_table(path: Path) -> dict[str, np.ndarray]:
-    """The table of a part's episodes, each column (episodes,), ``variation`` (episodes, v).
-
-    Raises:
-        BidexError: It is no part, or a damaged one.
-    """
+    """Columns of a part's episodes, (episodes,), ``variation`` (episodes, v); BidexError for a damaged one."""
     with reading(path) as file:
         table = {name: file["table"][name] for name in (*TABLE, "variation")}
         rows = table["steps"].shape[:1]

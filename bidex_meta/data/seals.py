@@ -1,26 +1,24 @@
 """Digests of a data set's files, so that no flipped bit is read in silence.
 
-The user block of a file of HDF5 holds the file's length and the CRC-32 of all that follows the block. In
-``metadata.json`` the last entry is the digest of all before it. CRC-32 finds every single flipped bit and all but one
-in four billion other damages; it is no protection against intent.
+The user block of a file of HDF5 holds the file's length and the CRC-32 of all that follows; the last entry of
+``metadata.json`` is the digest of all before it. It is no protection against intent.
 """
 
 import json
 import re
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 from bidex_meta.errors import BidexError
 from bidex_meta.utils.files import open_regular
 
-BLOCK = 512
-"""Bytes of the user block: the least that HDF5 takes."""
+BLOCK = 512  # bytes of the user block: the least that HDF5 takes
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _PIECE = 1 << 20
 _LAST = ',\n  "digest": '
-_MARK = "sealed"
-"""Entry in the metadata beside the digest: one flipped bit cannot remove both."""
+_MARK = "sealed"  # entry in the metadata beside the digest: one flipped bit cannot remove both
 
 
 def block(file: IO[bytes]) -> bytes:
@@ -37,11 +35,7 @@ def _line(length: int, digest: str) -> bytes:
 
 
 def check_file(path: Path) -> bool:
-    """Checks the digest of a file of HDF5, reading all of it; false for one without.
-
-    Raises:
-        BidexError: It is no file, or has changed since it was written.
-    """
+    """Checks a file's digest, reading all of it; false for one without. Raises BidexError where it has changed."""
     with open_regular(path, "a file of a data set") as file:
         first = file.read(BLOCK)
         if first.startswith(_HDF5):
@@ -52,10 +46,10 @@ def check_file(path: Path) -> bool:
     return True
 
 
-def sealed_text(content: dict[str, Any]) -> bytes:
+def sealed_text(content: Mapping[str, object], ours: Mapping[str, object]) -> bytes:
     """A data set's metadata, ours under ``bidex``, as JSON with one entry a line and a digest."""
-    content = content | {"bidex": content["bidex"] | {_MARK: True}}
-    rows = [f"  {json.dumps(name)}: {json.dumps(value)}" for name, value in content.items() if name != "digest"]
+    whole = {**content, "bidex": {**ours, _MARK: True}}
+    rows = [f"  {json.dumps(name)}: {json.dumps(value)}" for name, value in whole.items() if name != "digest"]
     text = ("{\n" + ",\n".join(rows)).encode()
     return text + _ending(text)
 
@@ -65,11 +59,7 @@ def _ending(text: bytes) -> bytes:
 
 
 def check_text(path: Path, data: bytes) -> bool:
-    """Checks the digest of metadata; false for those without.
-
-    Raises:
-        BidexError: They have changed since they were written.
-    """
+    """Checks the digest of metadata; false for those without. Raises BidexError where they have changed since."""
     text, found, _ = data.rpartition(_LAST.encode())
     if not found and not re.search(rb'"%s"\s*:\s*true' % _MARK.encode(), data):
         return False

@@ -10,14 +10,13 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Box
 
 from bidex_meta.data import part_files, seals
 from bidex_meta.data.dataset import data_folder
-from bidex_meta.data.episode import Episode
+from bidex_meta.data.part_files import Episode, Json
 from bidex_meta.errors import BidexError, shortened
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.atomic import check_writable, remove_leftovers, write_atomic, write_json
@@ -25,10 +24,8 @@ from bidex_meta.utils.files import absolute, exists, expanded, is_file, read_jso
 from bidex_meta.utils.plugins import short_name
 from bidex_meta.utils.validation import Threads, parse
 
-_MARGIN = 1.05
-"""What file systems take beside the files."""
-_MINARI = "0.5.0"
-"""The version of Minari whose layout is written."""
+_MARGIN = 1.05  # what file systems take beside the files
+_MINARI = "0.5.0"  # the version of Minari whose layout is written
 _NAME = re.compile(r"(?:[-\w]+/)*[-\w]+-v\d{1,4}", re.ASCII)
 """Names that Minari takes: words of letters, digits, - and _, parted by /, and a version such as -v0."""
 
@@ -41,28 +38,16 @@ class _Plan:
 
 
 def default_name(subject: str, kind: str) -> str:
-    """The name of a new data set: ``CatchUnderarm/random-v0``.
-
-    Args:
-        subject: A suite, a suite file's path, or a class.
-        kind: ``random``, ``medium``, ...
-    """
-    words = [re.sub(r"[^\w-]+", "-", word) for word in subject.split("/")]
-    if subject.endswith(".toml"):
-        words = [re.sub(r"[^\w-]+", "-", Path(subject).stem)]
+    """The name of a new data set of a suite, a suite file's path or a class: ``CatchUnderarm/random-v0``."""
     if ":" in subject:
-        words = [short_name(subject)]
+        return f"{short_name(subject)}/{kind}-v0"
+    parts = [Path(subject).stem] if subject.endswith(".toml") else subject.split("/")
+    words = [re.sub(r"[^\w-]+", "-", word) for word in parts]
     return f"{'/'.join(words)}/{kind}-v0"
 
 
 def dataset_path(out: Path | None, subject: str, kind: str) -> tuple[Path, str]:
-    """Folder and name of a new data set.
-
-    Args:
-        out: Its folder; None: ``default_name`` in the data folder.
-        subject: A suite or a class.
-        kind: ``random``, ``medium``, ...
-    """
+    """Folder and name of a new data set of a suite or class: ``out``, or ``default_name`` in the data folder."""
     root, usual = data_folder(), default_name(subject, kind)
     if out is None:
         return root / usual, usual
@@ -75,46 +60,26 @@ def dataset_path(out: Path | None, subject: str, kind: str) -> tuple[Path, str]:
 
 
 def check_name(name: str) -> None:
-    """Refuses a name that Minari would not take.
-
-    Raises:
-        BidexError: It would not.
-    """
+    """Raises BidexError for a name that Minari would not take."""
     if not _NAME.fullmatch(name):
         raise BidexError(f"Expected a name such as CatchUnderarm/random-v0, got {name!r}. Name another path by --out.")
 
 
 def check_room(folder: Path, needed: int, what: str) -> None:
-    """Refuses what does not fit on the disk.
-
-    Args:
-        folder: Where it goes; folders above it may be missing.
-        needed: Bytes.
-        what: What takes them, for the message.
-
-    Raises:
-        BidexError: There are fewer.
-    """
+    """Raises BidexError where ``needed`` bytes, of ``what``, do not fit on a folder's disk; it may be missing."""
     there = next(above for above in (folder.absolute(), *folder.absolute().parents) if exists(above))
     free = shutil.disk_usage(there).free
     if needed * _MARGIN > free:
-        raise BidexError(
-            f"{what} would take about {needed / 1e9:,.1f} GB, and {free / 1e9:,.1f} are free at {there}. Lower --size, "
-            "or name another path by --out."
-        )
+        told = f"{what} would take about {needed / 1e9:,.1f} GB, and {free / 1e9:,.1f} are free at {there}"
+        raise BidexError(f"{told}. Lower --size, or name another path by --out.")
 
 
 class DatasetWriter:
     """Writes episodes of one process into the parts of a data set.
 
-    Args:
-        folder: The data set's folder; its name within the data folder is how it is opened.
-        process: Number of this process; each has parts of its own.
-        keep: Parts of this process that stay; later ones are deleted.
-
-    Attributes:
-        parts: How many this process has committed.
-        left_out: Counts, by reason, of what was not stored since the last commit; the collector adds to it.
+    ``folder`` is the data set's: its name within the data folder is how it is opened. Each ``process`` has parts of its
+    own: ``keep`` of them stay, later ones are deleted; ``parts`` are committed. ``left_out`` counts, by reason, what
+    was not stored since the last commit; the collector adds to it.
     """
 
     def __init__(self, folder: Path, process: int = 0, keep: int = 0) -> None:
@@ -132,17 +97,19 @@ class DatasetWriter:
 
     def add(self, episode: Episode) -> None:
         """Writes an episode; it is lost unless ``commit`` follows."""
-        if self._part is None:
-            self._part = part_files.PartWriter(part_files.part_path(self.folder, self.process, self.parts))
-        self._part.add(episode)
+        self._open().add(episode)
 
     def commit(self) -> None:
         """Makes a part of what was added since the last one, if anything was."""
         if self._part is None and not self.left_out:
             return
-        part = self._part or part_files.PartWriter(part_files.part_path(self.folder, self.process, self.parts))
-        part.commit(dict(self.left_out))
+        self._open().commit(dict(self.left_out))
         self._part, self.parts, self.left_out = None, self.parts + 1, Counter()
+
+    def _open(self) -> part_files.PartWriter:
+        if self._part is None:
+            self._part = part_files.PartWriter(part_files.part_path(self.folder, self.process, self.parts))
+        return self._part
 
     def close(self) -> None:
         """Drops what was not committed."""
@@ -152,14 +119,11 @@ class DatasetWriter:
 
 
 @contextlib.contextmanager
-def claimed(folder: Path, plan: dict[str, Any]) -> Iterator[None]:
+def claimed(folder: Path, plan: Json) -> Iterator[None]:
     """Locks a folder against other processes, from before anything is written there to the end.
 
-    It creates the folder, and removes it again if nothing was written into it. Arguments and errors as of
-    ``has_begun``.
-
-    Raises:
-        BidexError: Another process records there.
+    It creates the folder, and removes it again if it stays empty. Arguments and errors as of ``has_begun``; and
+    BidexError where another process records there.
     """
     message = f"Another process records into {folder}. Wait for its end, or name another path by --out."
     missing = [above for above in (folder, *folder.parents) if not exists(above)]
@@ -181,19 +145,15 @@ def claimed(folder: Path, plan: dict[str, Any]) -> Iterator[None]:
                     above.rmdir()
 
 
-def begin(folder: Path, plan: dict[str, Any]) -> None:
+def begin(folder: Path, plan: Json) -> None:
     """Writes the plan of a collection; arguments and errors as of ``has_begun``."""
     if not has_begun(folder, plan):
         (folder / "data").mkdir(parents=True, exist_ok=True)
         write_json(folder / "data" / part_files.RECORDING, plan)
 
 
-def stored_plan(folder: Path) -> dict[str, Any]:
-    """The plan of a collection that has begun in a folder; empty without one.
-
-    Raises:
-        BidexError: The file holds something else.
-    """
+def stored_plan(folder: Path) -> Json:
+    """The plan of a collection that has begun in a folder, empty without one; BidexError for anything else."""
     path = folder / "data" / part_files.RECORDING
     if not is_file(path):
         return {}
@@ -202,15 +162,11 @@ def stored_plan(folder: Path) -> dict[str, Any]:
     return plan
 
 
-def has_begun(folder: Path, plan: dict[str, Any]) -> bool:
+def has_begun(folder: Path, plan: Json) -> bool:
     """Whether the same collection has begun here, so that the same command goes on with it.
 
-    Args:
-        folder: The data set's folder.
-        plan: Everything that decides what is collected, ready for JSON.
-
-    Raises:
-        BidexError: The folder holds a complete data set, the recording of something else, or something else.
+    ``plan`` is everything that decides what is collected, ready for JSON. Raises BidexError where the data set's folder
+    holds a complete data set, the recording of something else, or something else.
     """
     inner = folder / "data"
     path = inner / part_files.RECORDING
@@ -222,10 +178,8 @@ def has_begun(folder: Path, plan: dict[str, Any]) -> bool:
         differ = sorted(name for name in before.keys() | plan.keys() if before.get(name) != plan.get(name))
         if differ:
             old, new = (shortened(one.get(differ[0])) for one in (before, plan))
-            raise BidexError(
-                f"{folder} is a recording that has not ended, with {differ[0]} {old}, not {new}. "
-                "Give its own command to go on, or name another path by --out."
-            )
+            what = f"{folder} is a recording that has not ended, with {differ[0]} {old}, not {new}"
+            raise BidexError(f"{what}. Give its own command to go on, or name another path by --out.")
         return True
     if inner.is_dir():
         remove_leftovers(inner)  # of a collection that was killed as it began
@@ -235,24 +189,18 @@ def has_begun(folder: Path, plan: dict[str, Any]) -> bool:
     return False
 
 
-def finish(folder: Path, name: str, observations: Box, actions: Box, metadata: dict[str, Any]) -> None:
+def finish(folder: Path, name: str, observations: Box, actions: Box, metadata: Json) -> None:
     """Completes a data set: writes Minari's index over the parts of all processes, then the metadata.
 
-    Args:
-        folder: The data set's folder.
-        name: Its name, as Minari takes it: ``CatchUnderarm/random-v0``.
-        observations: Space of one observation, (d,).
-        actions: Space of one action, (a,).
-        metadata: Our entry; ``tasks`` must be there, ``left_out`` is added.
-
-    Raises:
-        BidexError: Minari would not take the name, or a part is damaged.
+    ``name`` is as Minari takes it, the spaces are of one observation (d,) and action (a,); ``metadata`` is our entry:
+    ``tasks`` must be there, ``left_out`` is added. Raises BidexError for another name, or a damaged part.
     """
     check_name(name)
     inner = folder / "data"
     parts = part_files.parts_of(inner)
     steps = [part_files.read_table(path)["steps"] for path in parts]
     part_files.write_main(inner, parts)
+    ours = {"format": part_files.FORMAT, **metadata, "left_out": left_out(inner)}
     content = {
         "total_episodes": sum(map(len, steps)),
         "total_steps": int(sum(of_part.sum() for of_part in steps)),
@@ -264,23 +212,13 @@ def finish(folder: Path, name: str, observations: Box, actions: Box, metadata: d
         "dataset_size": round(sum(path.stat().st_size for path in parts) / 1e6, 1),
         "algorithm_name": str(metadata.get("kind", "")),
         "requirements": [],
-        "bidex": {"format": part_files.FORMAT, **metadata, "left_out": left_out(inner)},
     }
-    _write_metadata(inner, content)
+    _write_metadata(inner, content, ours)
     (inner / part_files.RECORDING).unlink(missing_ok=True)
 
 
 def adopt(inner: Path, folder: Path, name: str) -> None:
-    """Publishes the files of a data set under another name: as links, or as copies on another disk.
-
-    Args:
-        inner: The folder ``data`` of the first one.
-        folder: The new data set's folder.
-        name: Its name.
-
-    Raises:
-        BidexError: There is something in the folder already, or Minari would not take the name.
-    """
+    """Publishes a folder ``data`` as another data set, by links, or copies elsewhere; BidexError as ``claimed``."""
     check_name(name)
     with claimed(folder, plan := {"kind": "replay", "of": str(inner.resolve())}):
         begin(folder, plan)
@@ -294,7 +232,7 @@ def adopt(inner: Path, folder: Path, name: str) -> None:
                 os.link(path, new / path.name)
             except OSError:
                 shutil.copyfile(path, new / path.name)
-        _write_metadata(new, content | {"dataset_id": name})
+        _write_metadata(new, content | {"dataset_id": name}, content["bidex"])
         (new / part_files.RECORDING).unlink()
 
 
@@ -307,25 +245,17 @@ def left_out(inner: Path) -> dict[str, int]:
     return dict(counts)
 
 
-def _write_metadata(inner: Path, content: dict[str, Any]) -> None:
-    write_atomic(inner / part_files.METADATA, lambda file: file.write(seals.sealed_text(content)))
+def _write_metadata(inner: Path, content: Json, ours: Json) -> None:
+    write_atomic(inner / part_files.METADATA, lambda file: file.write(seals.sealed_text(content, ours)))
 
 
 def _space(space: Box) -> str:
-    """A space as Minari writes it."""
     entries = {"type": "Box", "dtype": str(np.dtype(space.dtype)), "shape": list(space.shape)}
     return json.dumps(entries | {"low": space.low.tolist(), "high": space.high.tolist()})
 
 
 def estimated_bytes(steps: int, observation_size: int, action_size: int, episode_steps: float) -> int:
-    """Bytes on the disk, estimated.
-
-    Args:
-        steps: Transitions.
-        observation_size: Entries of an observation.
-        action_size: Actions.
-        episode_steps: Steps of an episode, on average.
-    """
+    """Bytes on the disk, estimated; ``episode_steps``: of an episode, on average."""
     episodes = math.ceil(steps / max(episode_steps, 1.0))
-    per_step = 4 * (observation_size + action_size + 1) + 2
-    return steps * per_step + episodes * (4 * observation_size + part_files.EPISODE_BYTES)
+    own = 4 * observation_size + part_files.EPISODE_BYTES
+    return steps * (4 * (observation_size + action_size + 1) + 2) + episodes * own

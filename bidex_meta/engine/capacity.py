@@ -4,9 +4,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 
-_HEADROOM = 1.5
-"""A trained policy holds what rough actions only brush against, and room is cheap: 0.10 to 0.18 MB a world in all."""
-
 
 @dataclass(frozen=True)
 class Capacity:
@@ -21,6 +18,9 @@ class Capacity:
 
 
 def room_for(seen: Sequence[Capacity]) -> Capacity:
-    """Room for worlds of several kinds: the most that any needed, and half as much again."""
-    contacts, convex, rows = (_HEADROOM * max(each) for each in zip(*map(astuple, seen), strict=True))
+    """Room for worlds of several kinds: the most that any needed, and half as much again.
+
+    A trained policy holds what rough actions only brush against, and room is cheap: 0.10 to 0.18 MB a world in all.
+    """
+    contacts, convex, rows = (1.5 * max(each) for each in zip(*map(astuple, seen), strict=True))
     return Capacity(16 * math.ceil(contacts / 16), max(2, math.ceil(convex)), 16 * math.ceil(rows / 16))

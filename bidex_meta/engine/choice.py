@@ -8,7 +8,6 @@ from bidex_meta.errors import BidexError, known_name, shortened
 from bidex_meta.utils.validation import whole_number
 
 ENGINES = ("auto", "c", "warp")
-_MOST_THREADS = 1024
 
 
 def choose_engine(
@@ -20,7 +19,7 @@ def choose_engine(
     device, C MuJoCo on a GPU, or an impossible number of threads.
     """
     if threads is not None:
-        threads = whole_number("threads", threads, 1, _MOST_THREADS)
+        threads = whole_number("threads", threads, 1, 1024)
     place, engine = _device(device), known_name("engine", engine, ENGINES)
     if engine == "c" and place.type != "cpu":
         raise BidexError(f"Expected device 'cpu' for the C engine, got {str(device)!r}; leave engine at 'auto'.")

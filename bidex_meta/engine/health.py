@@ -30,7 +30,7 @@ def quaternion_columns(model: mujoco.MjModel) -> np.ndarray:
 
 
 def checked_state(state: object, views: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The saved state of either engine with the shapes and types of the fields (``views``) of the one that takes it.
+    """The saved state of either engine, shaped as the fields (``views``) of the one that takes it.
 
     Raises BidexError for another model's or number of rows' state, or one with numbers that are not finite.
     """

@@ -34,18 +34,14 @@ _SENSOR_NAMES = (
     "FORCE TORQUE TOUCH"
 )
 _SENSORS = [int(mujoco.mjtSensor.__members__[f"mjSENS_{name}"]) for name in _SENSOR_NAMES.split()]
-# Normals of an egg's contacts were off those of C by 5e-3 rad (99th percentile) with C's 1e-6, by 1.5e-3 with this one;
-# with 1e-10 some contacts were lost.
-_CCD_TOLERANCE = 1e-8
 
 
 class WarpEngine:
     """Simulations of models of equal structure, in single precision. See ``Engine`` for the views.
 
     ``step`` and ``reset`` replay graphs and never wait for the device. Graphs hold pointers: write into arrays in
-    place, and call ``recapture`` after changing the model otherwise. On CUDA the graphs run on a stream of the engine's
-    own, between what was given to torch's current stream before and after the call: engines under different torch
-    streams overlap.
+    place, and call ``recapture`` after changing the model otherwise. On CUDA they run on a stream of the engine's own,
+    between what torch's current stream was given before and after the call.
 
     A world with a bad number is reported by ``unstable`` and stands at the model's reference pose until its reset: left
     alone, its NaNs would pass every broadphase test and take the room that its neighbours' contacts need.
@@ -86,7 +82,9 @@ class WarpEngine:
             raise BidexError(f"Expected sensors among {_SENSOR_NAMES}, got {', '.join(sorted(kinds))}.")
         self._m = _put_models([_adapted(model) for model in self._models], self._rows)
         self._m.opt.warn_overflow = 0  # unstable() reports it; printing from kernels wrecks the speed
-        self._m.opt.ccd_tolerance.fill_(_CCD_TOLERANCE)
+        # Normals of an egg's contacts were off those of C by 5e-3 rad (99th percentile) with C's 1e-6, by 1.5e-3 with
+        # this one; with 1e-10 some contacts were lost.
+        self._m.opt.ccd_tolerance.fill_(1e-8)
         self._m.opt.graph_conditional = not self._device.is_cuda or wp.is_conditional_graph_supported()
         room = {"nconmax": capacity.contacts, "nccdmax": capacity.convex, "njmax": capacity.rows}
         d = self._d = mjw.make_data(_adapted(self._models[0]), nworld=self.num, **room)

@@ -1,12 +1,13 @@
-"""Whether an evaluation that was made again says what the recorded one said, class by class."""
+"""Whether a repeated evaluation agrees with the recorded one, class by class."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from statistics import NormalDist
 
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.results import MANY_TASKS
+from bidex_meta.runs.atomic import Json
 
 EQUAL, WITHIN, DIFFERS = "equal", "within", "differs"
 _BITS = ("success", "return", "length", "episodes", "tasks", "unstable")
@@ -22,44 +23,36 @@ class Agreement:
     outcome: str
     """``equal``: each number is the same bit for bit; ``within``: success and return differ by no more than their
     intervals allow; ``differs``."""
-    recorded: dict[str, Any]
-    """Its row as it was recorded."""
-    again: dict[str, Any]
-    """Its row now."""
+    recorded: Json
+    """Its recorded results."""
+    again: Json
+    """Its results now."""
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Ready for JSON."""
         both = {name: [self.recorded[name], self.again[name]] for name in _MEASURES}
         return {"outcome": self.outcome, **both}
 
 
-def agreements(recorded: Mapping[str, Any], again: Mapping[str, Any]) -> list[Agreement]:
-    """Compares two evaluations of one policy, of the same tasks and starts.
+def agreements(recorded: Mapping[str, Json], again: Mapping[str, Json]) -> list[Agreement]:
+    """Compares two evaluations of one policy on the same tasks and starts, per class as in ``Evaluation.to_json``.
 
-    What differs in its last digits soon plays other episodes, so that the two are at worst independent samples: their
-    means may differ by the root of the sum of both half intervals' squares. These are widened so that of all measures
-    of all classes together one in twenty honest repetitions has any beyond (Bonferroni; simulated for twenty classes:
-    one in eighteen of 200 episodes a class, one in fourteen of 60, one in seven of 20).
-
-    Args:
-        recorded: Per class its row of ``Evaluation.to_json``.
-        again: The same of the second one.
-
-    Raises:
-        BidexError: They are not of the same classes.
+    At worst they are independent samples: means may differ by the root of the sum of both half intervals' squares,
+    widened so that of all measures of all classes one in twenty honest repetitions has any beyond (Bonferroni; by
+    simulation of twenty classes: one in eighteen of 200 episodes a class, one in fourteen of 60, one in seven of 20).
+    Raises BidexError where the classes differ.
     """
     if set(recorded) != set(again):
         raise BidexError(
             f"Expected the recorded evaluation to be of {', '.join(again)}, got {', '.join(recorded)}. Evaluate anew."
         )
-    from scipy.stats import norm
-
-    wider = float(norm.ppf(1 - 0.025 / (len(_MEASURES) * len(recorded))) / norm.ppf(0.975))
+    normal = NormalDist().inv_cdf
+    wider = normal(1 - 0.025 / (len(_MEASURES) * len(recorded))) / normal(0.975)
     return [Agreement(name, _outcome(row, again[name], wider), row, again[name]) for name, row in recorded.items()]
 
 
-def classes_of(evaluation: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Every row of an ``evaluation.json`` by the class's name; of a meta-test those of all splits and shots."""
+def classes_of(evaluation: Json) -> dict[str, Json]:
+    """The results in an ``evaluation.json`` by the class's name; of a meta-test those of all splits and shots."""
     if "splits" not in evaluation:
         return dict(evaluation.get("policy", evaluation)["classes"])
     rows = {}
@@ -70,16 +63,15 @@ def classes_of(evaluation: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     return rows
 
 
-def _outcome(recorded: dict[str, Any], again: dict[str, Any], wider: float) -> str:
-    shared = [name for name in _BITS if name in recorded]
-    if all(recorded[name] == again[name] for name in shared):
+def _outcome(recorded: Json, again: Json, wider: float) -> str:
+    if all(recorded[name] == again[name] for name in _BITS if name in recorded):
         return EQUAL
     if recorded.get("episodes", again["episodes"]) != again["episodes"]:
         return DIFFERS
     return WITHIN if all(_is_within(recorded, again, name, wider) for name in _MEASURES) else DIFFERS
 
 
-def _is_within(recorded: dict[str, Any], again: dict[str, Any], name: str, wider: float) -> bool:
+def _is_within(recorded: Json, again: Json, name: str, wider: float) -> bool:
     gap = abs(recorded[name] - again[name])
     own = _half(again, f"{name}_interval")
     halves = own, min(_half(recorded, f"{name}_interval"), _widest(recorded, again, name, own))
@@ -87,8 +79,8 @@ def _is_within(recorded: dict[str, Any], again: dict[str, Any], name: str, wider
     return gap <= rounding + wider * math.hypot(*halves)
 
 
-def _widest(recorded: dict[str, Any], again: dict[str, Any], name: str, own: float) -> float:
-    """Half the width that a recorded interval counts with at most: what episodes of this policy can give.
+def _widest(recorded: Json, again: Json, name: str, own: float) -> float:
+    """The most that half a recorded interval counts: what episodes of this policy can give.
 
     Of a success rate that follows from the rate, here half as wide again. Returns have the spread of those played now:
     of a thousand pairs of samples one is wider by more than the root of F's quantile, here twice that for heavy tails.
@@ -101,7 +93,7 @@ def _widest(recorded: dict[str, Any], again: dict[str, Any], name: str, own: flo
     return own and 2 * own * math.sqrt(f.ppf(0.999, count - 1, count - 1))
 
 
-def _half(row: dict[str, Any], name: str) -> float:
+def _half(row: Json, name: str) -> float:
     """Half the width of an interval, 0 where there is none: a single episode says nothing of others."""
     ends = row.get(name)
     return 0.0 if ends is None else (ends[1] - ends[0]) / 2

@@ -17,6 +17,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.gains import MEASURES, difference_over_runs, grouped
 from bidex_meta.evaluation.meta_test import meta_evaluate
 from bidex_meta.evaluation.results import ClassResult, Difference, Evaluation
+from bidex_meta.runs.atomic import Json
 from bidex_meta.world.contract import PooledWorld, TaskWorld
 
 
@@ -25,7 +26,6 @@ class Control:
     """The arms of one run: the same episodes in the same order."""
 
     before: Evaluation
-    """Without adaptation."""
     own: Evaluation
     """Adapted to data of the tasks themselves."""
     foreign: list[Evaluation]
@@ -45,19 +45,11 @@ def control(
     say: Callable[[str], None] = lambda line: None,
     **played: Any,
 ) -> Control:
-    """Play all arms.
+    """Play all arms; ``played`` goes to ``meta_evaluate``, whose errors are raised.
 
-    Args:
-        load: Makes the agent, a MetaLearningAgent; called anew for each arm, so that all draw the same numbers.
-        test_world: The held-out tasks, in autoreset mode DISABLED.
-        train_world: The train tasks of the same classes, with as many environments. Its pools are replaced.
-        shots: How often each arm adapts.
-        say: Called with the mean returns of each arm when it has been played, which may take minutes.
-        played: ``rollouts``, ``episodes_per_task``, ``trials``, ``max_adapt_steps``, ``seed`` and ``references`` of
-            ``meta_evaluate``.
-
-    Raises:
-        BidexError: The worlds hold other classes, or what ``meta_evaluate`` refuses.
+    ``load`` returns the agent, a MetaLearningAgent, anew for each arm, so that all draw the same numbers. The worlds,
+    in autoreset mode DISABLED, have as many environments and the same classes (else BidexError); ``train_world``'s
+    pools are replaced. ``say`` gets the mean returns of each arm when it has been played, which may take minutes.
     """
     if list(test_world.task_names) != list(train_world.task_names):
         raise BidexError(
@@ -81,23 +73,17 @@ def _returns(found: Evaluation) -> str:
     return ", ".join(f"{name} {result.mean_return:.4g}" for name, result in found.classes.items())
 
 
-def arms(runs: Sequence[Control], class_name: str, names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """What each arm reached in a class, and what own data gain above it, over all runs.
+def arms(runs: Sequence[Control], class_name: str, names: Sequence[str]) -> dict[str, Json]:
+    """Results of each arm in a class over all runs (one for each seed), and the gain of own data above it.
 
-    Args:
-        runs: One control for each seed, played alike.
-        class_name: The class.
-        names: Of the train tasks, in their order.
-
-    Returns:
-        By arm (``before``, ``own``, ``foreign`` for the mean of the following, then ``names``): ``return`` and
-        ``success``, means over runs; ``runs``, the mean return of each; ``own_minus`` by measure, a Difference over
-        runs, adaptations and episodes, or None where a measure is missing; none for ``own`` itself.
+    By arm (``before``, ``own``, ``foreign`` for the mean over the train tasks, then these by their ``names``):
+    ``return`` and ``success``, means over runs; ``runs``, the mean return of each; ``own_minus`` by measure, a
+    Difference over runs, adaptations and episodes, or None where a measure is missing; none for ``own`` itself.
     """
     by_arm = {"before": [[run.before] for run in runs], "own": [[run.own] for run in runs]}
     by_arm["foreign"] = [run.foreign for run in runs]
     by_arm |= {name: [[run.foreign[i]] for run in runs] for i, name in enumerate(names)}
-    found: dict[str, dict[str, Any]] = {}
+    found: dict[str, Json] = {}
     for arm, evaluations in by_arm.items():
         results = [[each.classes[class_name] for each in of_run] for of_run in evaluations]
         returns = [float(np.mean([each.mean_return for each in of_run])) for of_run in results]
@@ -107,9 +93,8 @@ def arms(runs: Sequence[Control], class_name: str, names: Sequence[str]) -> dict
             "runs": returns,
         }
         if arm != "own":
-            found[arm]["own_minus"] = {
-                measure: _own_minus(runs, results, class_name, of) for measure, of in MEASURES.items()
-            }
+            minus = {measure: _own_minus(runs, results, class_name, of) for measure, of in MEASURES.items()}
+            found[arm]["own_minus"] = minus
     return found
 
 

@@ -7,24 +7,19 @@ import numpy as np
 
 from bidex_meta.agents import Agent
 from bidex_meta.runs.video import tiled
-from bidex_meta.world.cloud import Cloud, beside, camera_of, draw
+from bidex_meta.world.cloud import Camera, Cloud, beside, camera_of, draw
 from bidex_meta.world.depth_sensor import CANDIDATES
 from bidex_meta.world.surfaces import sample
+from bidex_meta.world.world import World
 
 
 def film_row(
     agent: Agent, world: Any, row: int, steps: int, seed: int, every: int | None = 1, **look: Any
 ) -> Iterator[np.ndarray]:
-    """The states before and after so many steps; fewer where the episode ends.
+    """Frames of environment ``row`` before and after at most so many steps; fewer where the episode ends.
 
-    Args:
-        agent: The policy.
-        world: A world that draws, in autoreset mode DISABLED.
-        row: Index of the environment.
-        steps: Steps at most.
-        seed: Of the start.
-        every: Steps from one frame to the next; None: the last state alone.
-        look: ``width``, ``height``, ``camera`` of ``World.render``.
+    The world is in autoreset mode DISABLED. ``every``: steps from one frame to the next; None: the last state alone.
+    ``look``: arguments of ``render``.
     """
     obs, _ = world.reset(seed=seed)
     agent.reset(obs.new_ones(len(obs), dtype=bool))
@@ -40,18 +35,10 @@ def film_row(
 def film_tiles(
     agent: Agent, world: Any, rows: Sequence[int], steps: int, seed: int, every: int = 1, **look: Any
 ) -> Iterator[np.ndarray]:
-    """So many steps of several environments beside each other; each begins its next episode when one ends.
+    """So many steps of several environments, tiles beside each other; each begins its next episode when one ends.
 
-    An environment's name is green from its first success on, until its episode ends.
-
-    Args:
-        agent: The policy.
-        world: A world that draws, in autoreset mode DISABLED.
-        rows: Indices of the environments, one for each tile.
-        steps: Steps.
-        seed: Of the starts.
-        every: Steps from one frame to the next.
-        look: As in ``film_row``; the size is that of a tile.
+    An environment's name is green from its first success on, until its episode ends. The world is in autoreset mode
+    DISABLED; the size is that of a tile.
     """
     names = [world.task_names[int(world.task_id[row])] for row in rows]
     obs, _ = world.reset(seed=seed)
@@ -75,14 +62,11 @@ def film_tiles(
 class CloudView:
     """A world whose pictures have the environment's point cloud beside them: from its camera, then from the side.
 
-    The cloud is made of the physics' state, whatever observations show. Everything but ``render`` is the world's own.
-
-    Args:
-        world: One that draws, of scenes of our own.
-        count: Points of a cloud.
+    The cloud, of ``count`` points, is that of the physics' state, whatever observations show. Everything but ``render``
+    is the world's own.
     """
 
-    def __init__(self, world: Any, count: int) -> None:
+    def __init__(self, world: World, count: int) -> None:
         self._world, self._count = world, count
         self._clouds: dict[int, Cloud] = {}
         for part in world.parts:
@@ -97,7 +81,7 @@ class CloudView:
         cloud, eye = self._cloud(row)
         return np.concatenate((picture, *(draw(cloud, each, width, height) for each in (eye, beside(eye)))), axis=1)
 
-    def _cloud(self, row: int) -> tuple[np.ndarray, Any]:
+    def _cloud(self, row: int) -> tuple[np.ndarray, Camera]:
         slot = int(self._world.task_id[row])
         part, member = next((p, m) for p in self._world.parts for m in p.group.members if m.slot == slot)
         if slot not in self._clouds:

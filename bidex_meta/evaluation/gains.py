@@ -1,29 +1,26 @@
-"""What adaptation gained: one policy's episodes minus the same episodes of another, with intervals.
+"""Gains of adaptation: one policy's episodes minus another's of the same tasks and starts, with intervals.
 
-The episodes are paired: the same task and the same start, so that only the policies differ. They come in groups, one
-for each adaptation (a task, or one of several trials of it): all episodes of a group follow the same adaptation and
-share its luck. So the bootstrap resamples the adaptations and, within each, the episodes. Of few groups that is too
-narrow: of five adaptations whose luck outweighs that of their ten episodes a nominal 95 % held the truth in 81 to 88 %
-of simulated cases, of three runs in 82 %; where adaptations do not differ it is rather too wide. With a single
-adaptation it resamples the episodes alone: its interval says nothing of what another adaptation would have given. Of
-several runs (seeds) it resamples the runs first.
+The bootstrap resamples runs (seeds), adaptations (a task, or one of several trials of it: its episodes share its luck)
+and, within each, episodes. Of few adaptations that is too narrow: with five, whose luck outweighs that of their ten
+episodes, a nominal 95 % held the truth in 81 to 88 % of simulated cases, with three runs in 82 %; where adaptations do
+not differ it is rather too wide. With a single one the interval does not cover what another adaptation would give.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 
 from bidex_meta.evaluation.results import ClassResult, Difference, Evaluation
 from bidex_meta.evaluation.statistics import BOOTSTRAP_SEED, RESAMPLES
+from bidex_meta.runs.atomic import Json
 
 MEASURES: dict[str, Callable[[ClassResult], np.ndarray | None]] = {
     "return": lambda result: result.returns,
     "success": lambda result: result.successes,
     "score": lambda result: result.scores,
 }
-"""What is compared: per episode, None where a class does not have it."""
+"""Measures by name: per episode, None where a class does not have it."""
 
 _BATCH = 200
 """Resamples at a time; bounds memory."""
@@ -38,22 +35,15 @@ class Gains:
     aggregate: dict[str, Difference | None]
     """Mean over classes. Returns of different classes have different scales: of several classes quote the score."""
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """The same, ready for JSON."""
-        return {
-            "classes": {name: _json(of_class) for name, of_class in self.classes.items()},
-            "aggregate": _json(self.aggregate),
-        }
+        return asdict(self)
 
 
 def paired_gains(after: Evaluation, before: Evaluation, adaptations: Mapping[str, np.ndarray]) -> Gains:
-    """``after`` minus ``before``, episode by episode.
+    """``after`` minus ``before``, the same episodes (tasks and starts, in the same order) of two policies.
 
-    Args:
-        after: The episodes of one policy.
-        before: The same episodes (tasks and starts, in the same order) of another.
-        adaptations: Per class the number of the adaptation that each episode belongs to, shape ``(episodes,)``; each
-            number stands there equally often.
+    ``adaptations``: per class the number of each episode's adaptation, ``(episodes,)``; all have as many episodes.
     """
     classes: dict[str, dict[str, Difference | None]] = {name: {} for name in after.classes}
     aggregate: dict[str, Difference | None] = {}
@@ -71,12 +61,10 @@ def paired_gains(after: Evaluation, before: Evaluation, adaptations: Mapping[str
             means.append(float(of_class.mean()))
             resampled.append(_resampled_means(of_class[None], generator))
             classes[name][measure] = _difference(means[-1], resampled[-1])
-        if len(means) < len(classes):  # a mean over some of the classes would pass for one over all
-            aggregate[measure] = None
-            continue
         known = [sample for sample in resampled if sample is not None]
         together = np.mean(known, axis=0) if len(known) == len(classes) else None
-        aggregate[measure] = _difference(float(np.mean(means)), together)
+        # A mean over some of the classes would pass for one over all.
+        aggregate[measure] = _difference(float(np.mean(means)), together) if len(means) == len(classes) else None
     return Gains(classes, aggregate)
 
 
@@ -86,11 +74,7 @@ def grouped(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
 
 
 def difference_over_runs(differences: Sequence[np.ndarray]) -> Difference:
-    """Mean of paired differences of several runs, and its interval over runs, adaptations and episodes.
-
-    Args:
-        differences: For each run (adaptations, episodes of each), the same numbers of both in all.
-    """
+    """Mean of paired differences of several runs, each (adaptations, episodes of each), and its interval over all."""
     values = np.stack(differences)
     return _difference(float(values.mean()), _resampled_means(values, np.random.default_rng(BOOTSTRAP_SEED)))
 
@@ -114,7 +98,3 @@ def _difference(value: float, resampled: np.ndarray | None) -> Difference:
         return Difference(value, None)
     low, high = np.percentile(resampled, [2.5, 97.5])
     return Difference(value, (float(low), float(high)))
-
-
-def _json(measures: dict[str, Difference | None]) -> dict[str, Any]:
-    return {name: None if difference is None else asdict(difference) for name, difference in measures.items()}

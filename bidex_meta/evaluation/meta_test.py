@@ -1,19 +1,14 @@
-"""The meta-test: what does adaptation gain, from the meta-learned parameters, after 0, 1, ..., K shots?
+"""The meta-test: the gain of adaptation from the meta-learned parameters after 0, 1, ..., K shots (docs/meta-test.md).
 
-The protocol. From what was meta-learned (``agent.init()``) the agent is evaluated as by ``bidex_meta.evaluation.play``;
-then, ``shots`` times, it plays ``rollouts`` whole exploring episodes of each task, adapts, and is evaluated again.
-Every evaluation plays the same episodes (tasks and starts): what differs between two shots is the policy alone, and an
-agent that does not change gains exactly 0. Starts of adaptation are others than those of evaluation, and others in each
-shot.
-
-Every (class, task) is played equally often, however early its episodes end. Meta-World's ``metalearning_evaluation``
-takes the first episodes that finish of each class instead, of which the easy tasks' are most.
+Every evaluation plays the same episodes (tasks and starts), so that an agent that does not change gains exactly 0;
+starts of adaptation are others, in each shot. Every (class, task) is played equally often, however early its episodes
+end; Meta-World's ``metalearning_evaluation`` takes the first episodes that finish, of which the easy tasks' are most.
 """
 
 import hashlib
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -26,18 +21,19 @@ from bidex_meta.evaluation.play import EVALUATION_SEED, check_world, play_tasks,
 from bidex_meta.evaluation.portions import Portions, task_of_row
 from bidex_meta.evaluation.references import Reference, references_of
 from bidex_meta.evaluation.results import Evaluation, results_by_class
+from bidex_meta.runs.atomic import Json
 from bidex_meta.utils.validation import whole_number
 from bidex_meta.world.contract import TaskWorld
 
 MAX_ADAPT_STEPS = 150
-"""Steps after which an episode is long enough to adapt to, where nobody says otherwise."""
+"""Steps after which an episode is long enough to adapt to, by default."""
 
 _ADAPTS = ("init", "adapt_action", "step", "adapt")
 
 
 @dataclass(frozen=True)
 class MetaEvaluation:
-    """What ``meta_evaluate`` found."""
+    """The results of ``meta_evaluate``."""
 
     by_shot: list[Evaluation]
     """After 0, 1, ..., K shots (or those of them that were asked for): the same episodes in the same order."""
@@ -52,7 +48,7 @@ class MetaEvaluation:
     adapt_steps: list[int]
     """Transitions that each shot adapted to, over all tasks."""
     split: str = ""
-    """Which tasks these are, in the caller's word."""
+    """Name of these tasks."""
 
     @property
     def before(self) -> Evaluation:
@@ -65,10 +61,10 @@ class MetaEvaluation:
         return self.by_shot[-1]
 
     def gains(self, shot: int = -1) -> Gains:
-        """What the evaluation after some shot is above that without adaptation; the last shot by default."""
+        """The evaluation after some shot above that without adaptation; the last shot by default."""
         return paired_gains(self.by_shot[shot], self.before, self.adaptations)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Everything but the single episodes, ready for JSON."""
         by_shot = [found.to_json() for found in self.by_shot]
         return {
@@ -101,14 +97,14 @@ def meta_evaluate(
     evaluated: Collection[int] | None = None,
     split: str = "",
 ) -> MetaEvaluation:
-    """Evaluate an agent before and after adaptation to each task of a world.
+    """Evaluate an agent as ``evaluate`` does, ``shots`` times after exploring episodes of each task and adaptation.
 
     Environments that play the same task share one adaptation. Where the world has fewer environments than tasks times
     ``rollouts``, its pools of tasks are played in portions (``world.set_tasks``), or a shot takes several rounds. The
     world must be reset afterwards.
 
     Args:
-        agent: A MetaLearningAgent; any Agent if ``shots`` is 0. Its ``assign``, if it has one, is told the tasks.
+        agent: A MetaLearningAgent; any Agent if ``shots`` is 0.
         world: A world in autoreset mode DISABLED whose environments keep their tasks.
         shots: How often it adapts, one after the other.
         rollouts: Episodes of each task in a shot; None: one in each environment that plays it.
@@ -118,23 +114,19 @@ def meta_evaluate(
         max_adapt_steps: Episodes of adaptation are cut (``truncated``) after so many steps.
         seed: Of all starts; without adaptation, and with all tasks in the world at once, those of ``evaluate``.
         references: As in ``evaluate``.
-        adapt_world: Where episodes of adaptation are played, if not on ``world``: of as many environments and tasks,
-            so that adaptation to other tasks' data has the same starts (``bidex_meta.evaluation.control_arms``).
+        adapt_world: Where to play episodes of adaptation instead, with the same starts: of as many environments, tasks.
         evaluated: After how many shots to evaluate (0: before all); None: always.
-        split: Kept in the result.
+        split: Name of the tasks, for the result.
 
-    Raises:
-        BidexError: A number out of range, a world that cannot be used, or an agent that cannot adapt.
+    Raises BidexError for a number out of range, a world that cannot be used, or an agent that cannot adapt.
     """
-    _check(agent, world, adapt_world, shots, episodes_per_task, max_adapt_steps)
-    kept = [shot for shot in range(shots + 1) if evaluated is None or shot in evaluated]
-    if not kept:
+    worlds = [world] if adapt_world is None else [world, adapt_world]
+    _check(agent, worlds, shots, episodes_per_task, max_adapt_steps)
+    found = {s: list[dict[str, np.ndarray]]() for s in range(shots + 1) if evaluated is None or s in evaluated}
+    if not found:
         raise BidexError(f"Expected evaluated to hold a number from 0 to {shots} shots, got {evaluated}.")
-    portions = Portions(world, rollouts, tasks, trials)
-    field = world if adapt_world is None else adapt_world
-    found: dict[int, list[dict[str, np.ndarray]]] = {shot: [] for shot in kept}
-    adapt_steps = [0] * shots
-    with portions.applied_to([world] if adapt_world is None else [world, adapt_world]) as numbered:
+    portions, field, adapt_steps = Portions(world, rollouts, tasks, trials), worlds[-1], [0] * shots
+    with portions.applied_to(worlds) as numbered:
         for number in numbered:
             learner = _begin(agent, world, field)
             for shot in range(shots + 1):
@@ -175,9 +167,10 @@ def _begin(agent: Agent, world: TaskWorld, field: TaskWorld) -> MetaLearningAgen
             "data to adapt to; they differ. Give both the same num_envs and pools of one length (set_tasks)."
         )
     learner = cast(MetaLearningAgent, agent)
-    for method, arguments in (("assign", (shared,)), ("init", ())):
-        if hasattr(agent, method):  # a plain agent has neither, one written for Meta-World no ``assign``
-            getattr(agent, method)(*arguments)
+    if hasattr(learner, "assign"):  # one written for Meta-World has none, a plain agent neither
+        learner.assign(shared)
+    if hasattr(learner, "init"):
+        learner.init()
     return learner
 
 
@@ -217,9 +210,7 @@ def _explore(agent: MetaLearningAgent, world: TaskWorld, obs: Tensor, playing: T
     return int(steps)
 
 
-def _check(
-    agent: Any, world: TaskWorld, adapt_world: TaskWorld | None, shots: int, episodes_per_task: int, max_steps: int
-) -> None:
+def _check(agent: Agent, worlds: Sequence[TaskWorld], shots: int, episodes_per_task: int, max_steps: int) -> None:
     whole_number("shots", shots, 0)
     whole_number("max_adapt_steps", max_steps, 1)
     lacking = [name for name in _ADAPTS if not callable(getattr(agent, name, None))]
@@ -228,13 +219,10 @@ def _check(
             f"Expected an agent that adapts (bidex_meta.agents.MetaLearningAgent), but {type(agent).__name__} has no "
             f"{', '.join(lacking)}. Give such an agent, or shots=0."
         )
-    for each in [world] if adapt_world is None else [world, adapt_world]:
-        check_world(each, episodes_per_task)
-    if adapt_world is not None:
-        sizes = [
-            (w.num_envs, w.single_observation_space.shape, w.single_action_space.shape) for w in (world, adapt_world)
-        ]
-        if sizes[0] != sizes[1]:
-            raise BidexError(
-                f"Expected adapt_world with num_envs, observations and actions of world, {sizes[0]}, got {sizes[1]}."
-            )
+    for world in worlds:
+        check_world(world, episodes_per_task)
+    sizes = [(w.num_envs, w.single_observation_space.shape, w.single_action_space.shape) for w in worlds]
+    if sizes[0] != sizes[-1]:
+        raise BidexError(
+            f"Expected adapt_world with num_envs, observations and actions of world, {sizes[0]}, got {sizes[-1]}."
+        )

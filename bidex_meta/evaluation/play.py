@@ -1,10 +1,8 @@
-"""How good is a policy: success and return per class, over a fixed number of episodes of every task.
+"""Success and return of a policy per class, over a fixed number of whole episodes of every task, by the mean action.
 
-The protocol: each environment keeps to one task of its slot and is not reset by itself (autoreset DISABLED). Every
-task is played ``episodes_per_task`` times, whole episodes, by the mean action; a task that ends early is not played
-more often, so easy tasks cannot crowd out hard ones. An episode is a success if ``info["success"]`` was true at any
-step; its return is the sum of the unscaled reward. An episode in which the physics broke is no success and counts with
-the return of random actions, or its own if that is lower (``bidex_meta.evaluation.references``).
+A task that ends early is not played more often, so that easy tasks cannot crowd out hard ones. An episode is a success
+if ``info["success"]`` was true at any step; its return is the sum of the unscaled reward. An episode of broken physics
+is no success and counts with the return of random actions, or its own if that is lower.
 """
 
 from collections.abc import Mapping
@@ -23,7 +21,7 @@ from bidex_meta.utils.validation import whole_number
 from bidex_meta.world.contract import TaskWorld
 
 EVALUATION_SEED = 1_000_000
-"""Seed of the starts in evaluation: not a seed anybody trains with, so that they are new to the policy."""
+"""Seed of the starts in evaluation: nobody trains with it, so that they are new to the policy."""
 
 
 def evaluate(
@@ -36,18 +34,12 @@ def evaluate(
 ) -> Evaluation:
     """Play every task of ``world`` ``episodes_per_task`` times and report per class.
 
-    Args:
-        agent: The policy.
-        world: A world in autoreset mode DISABLED with at least one environment for each task. Environments that share
-            a task share its episodes.
-        episodes_per_task: Episodes of each task.
-        seed: Passed to the world's reset; None keeps the world's own.
-        references: Per class name, what the normalised score and broken episodes are measured against; left out, those
-            that the installation stores of the world's classes. ``{}``: none.
+    The world is in autoreset mode DISABLED, with at least one environment for each task; those that share a task share
+    its episodes. Without ``seed`` its own goes on. ``references``, by class, are what the normalised score and broken
+    episodes are measured against; by default those that the installation stores of the world's classes.
 
-    Raises:
-        BidexError: The world resets by itself or lacks environments, ``episodes_per_task`` is not positive, or torch's
-            default precision is not single.
+    Raises BidexError where the world resets by itself or lacks environments, ``episodes_per_task`` is not positive, or
+    torch's default precision is not single.
     """
     check_precision()
     check_world(world, episodes_per_task)
@@ -57,11 +49,10 @@ def evaluate(
 
 
 def play_tasks(agent: Agent, world: TaskWorld, episodes_per_task: int, seed: int | None) -> dict[str, np.ndarray]:
-    """``episodes_per_task`` episodes of every task, as ``evaluate`` plays them.
+    """``episodes_per_task`` episodes of every task, as ``evaluate`` plays them, as arrays ``(episodes,)``.
 
-    Returns:
-        Arrays ``(episodes,)``: ``slot``, ``task`` (index in the slot's pool), ``return``, ``success``, ``length``,
-        ``unstable``. The same world and seed give the same slots, tasks and starts in the same order.
+    They are ``slot``, ``task`` (index in the slot's pool), ``return``, ``success``, ``length`` and ``unstable``. The
+    same world and seed give the same slots, tasks and starts in the same order.
     """
     obs, _ = world.reset(seed=seed)
     tasks = world.task_index.clone()
@@ -79,28 +70,22 @@ def play_tasks(agent: Agent, world: TaskWorld, episodes_per_task: int, seed: int
 
 
 def check_world(world: TaskWorld, episodes_per_task: int) -> None:
-    """Refuses a world that cannot be evaluated on.
-
-    Raises:
-        BidexError: The world resets by itself or its names are not unique, or ``episodes_per_task`` is not positive.
-    """
+    """Raises BidexError where a world cannot be evaluated on."""
     whole_number("episodes_per_task", episodes_per_task, 1, 1_000_000)
-    if not isinstance(getattr(world, "metadata", None), Mapping):
+    if not hasattr(world, "metadata") or not isinstance(world.metadata, Mapping):
         raise BidexError(f"Expected a world to evaluate on, as Benchmark.make_world makes it, got {shortened(world)}.")
     mode = world.metadata.get("autoreset_mode")
     if mode != AutoresetMode.DISABLED:
-        raise BidexError(
-            f"Evaluation needs a world in autoreset mode DISABLED, but this one is in {getattr(mode, 'name', mode)}."
-        )
+        name = mode.name if isinstance(mode, AutoresetMode) else mode
+        raise BidexError(f"Evaluation needs a world in autoreset mode DISABLED, but this one is in {name}.")
     if len(set(world.task_names)) != len(world.task_names):
-        raise BidexError(f"Results are kept by name, but the world's names are not unique: {world.task_names}.")
+        raise BidexError(f"Results are stored by name, but the world's names are not unique: {world.task_names}.")
 
 
 def quota(world: TaskWorld, episodes_per_task: int) -> torch.Tensor:
-    """Episodes each environment has to play, ``(num_envs,)``: those of a task are split over its environments.
+    """Episodes each environment has to play, ``(num_envs,)``; those of a task are split over its environments.
 
-    Raises:
-        BidexError: A task has none.
+    Raises BidexError where it has none.
     """
     tasks = world.task_index
     shares = torch.zeros_like(tasks)
@@ -113,8 +98,7 @@ def quota(world: TaskWorld, episodes_per_task: int) -> torch.Tensor:
                     f"No environment plays task {task} of {name}: {world.num_envs} are too few for "
                     f"{sum(world.num_slot_tasks)} tasks. Use num_envs={needed}, or several times that."
                 )
-            share, extra = divmod(episodes_per_task, len(rows))
-            shares[rows] = share
+            shares[rows], extra = divmod(episodes_per_task, len(rows))
             shares[rows[:extra]] += 1
     return shares
 
@@ -143,11 +127,7 @@ def _play(agent: Agent, world: TaskWorld, obs: torch.Tensor, playing: torch.Tens
 
 
 class ZeroAgent:
-    """Does nothing: action 0 everywhere.
-
-    Args:
-        action_space: The world's batched action space, shape ``(num_envs, action)``.
-    """
+    """Does nothing: action 0 everywhere. Spaces are the world's batched one, ``(num_envs, action)``."""
 
     def __init__(self, action_space: Box):
         self._shape = action_space.shape
@@ -161,12 +141,7 @@ class ZeroAgent:
 
 
 class RandomAgent:
-    """Uniform actions, the same on every device.
-
-    Args:
-        action_space: The world's batched action space, a Box of shape ``(num_envs, action)``.
-        seed: Of this agent's own generator.
-    """
+    """Uniform actions in the world's batched space, ``(num_envs, action)``, the same on every device."""
 
     def __init__(self, action_space: Box, seed: int = 0):
         self._low = torch.as_tensor(action_space.low)

@@ -1,13 +1,13 @@
-"""What an evaluation found: per class the episodes, and numbers made of them."""
+"""Results of an evaluation: per class the episodes, and statistics of them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from bidex_meta.evaluation.references import Reference, counted_returns
-from bidex_meta.evaluation.statistics import Interval, aggregate, bootstrap_interval, mean, mean_difference
+from bidex_meta.evaluation.statistics import Estimate, aggregate, bootstrap_interval, mean, mean_difference
+from bidex_meta.runs.atomic import Json
 
 MANY_TASKS = 10
 """From so many tasks on, intervals resample tasks instead of episodes."""
@@ -18,7 +18,7 @@ class ClassResult:
     """The episodes of one class; arrays of shape ``(episodes,)``, in the order they were played."""
 
     returns: np.ndarray
-    """Sum of the unscaled reward, float64; of broken episodes what they count with."""
+    """Sum of the unscaled reward, float64; of broken episodes as ``counted_returns``."""
     successes: np.ndarray
     """Success at any step, float64 0 or 1; 0 of broken episodes."""
     lengths: np.ndarray
@@ -28,7 +28,7 @@ class ClassResult:
     unstable: int
     """Episodes that ended because the physics broke."""
     reference: Reference | None = None
-    """What the normalised score and broken episodes are measured against, where it is known."""
+    """For the normalised score and broken episodes, where it is known."""
 
     @property
     def episodes(self) -> int:
@@ -47,10 +47,7 @@ class ClassResult:
 
     @property
     def score(self) -> float | None:
-        """100 · (R − R_floor) / (R_expert − R_floor), the floor the better of random and zero actions.
-
-        None where a reference is missing.
-        """
+        """Mean normalised score; None where a reference is missing."""
         scores = self.scores
         return None if scores is None else float(scores.mean())
 
@@ -62,13 +59,12 @@ class ClassResult:
     def drawn(self, values: np.ndarray) -> np.ndarray:
         """``values`` (episodes,) as a bootstrap may resample them: means of tasks; of few tasks as they are.
 
-        Episodes of a task are alike; where a class draws no starts (doors, Switch) a policy's are all the same, and
-        counted singly they would feign precision.
+        Episodes of a task are alike (without drawn starts all the same) and, one by one, would feign precision.
         """
         names, task = np.unique(self.tasks, return_inverse=True)
         return values if len(names) < MANY_TASKS else np.bincount(task, values) / np.bincount(task)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Numbers of this class, ready for JSON."""
         return {
             "success": self.success,
@@ -85,14 +81,14 @@ class ClassResult:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What ``evaluate`` found."""
+    """The results of ``evaluate``."""
 
     classes: dict[str, ClassResult]
     """Per class, by name, in the world's order of slots."""
     episodes_per_task: int
     """Episodes of every task."""
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Everything but the single episodes, ready for JSON."""
         return {
             "episodes_per_task": self.episodes_per_task,
@@ -104,19 +100,8 @@ class Evaluation:
         }
 
 
-@dataclass(frozen=True)
-class Difference:
-    """Mean return of one policy above another's, in one class."""
-
-    value: float
-    """Difference of the means."""
-    interval: Interval | None
-    """95 % bootstrap interval, both policies' tasks (of few tasks: episodes) resampled; None with fewer than two."""
-
-    @property
-    def excludes_zero(self) -> bool:
-        """Whether the interval lies on one side of zero."""
-        return self.interval is not None and (self.interval[0] > 0 or self.interval[1] < 0)
+Difference = Estimate
+"""Mean return of one policy above another's in a class; tasks of both (of few tasks: episodes) are resampled."""
 
 
 def results_by_class(
@@ -125,14 +110,9 @@ def results_by_class(
     references: Mapping[str, Reference] | None = None,
     compared: Sequence[dict[str, np.ndarray]] = (),
 ) -> dict[str, ClassResult]:
-    """Episodes by the names of their slots, broken ones as they count.
+    """Results of episodes of ``play_tasks`` by the names of their slots, broken ones as ``counted_returns``.
 
-    Args:
-        names: Of the slots.
-        episodes: As ``play_tasks`` gives them.
-        references: By name.
-        compared: Episodes of the policies that this one is compared with: where there is no reference, a broken episode
-            counts with the worst finished one of all of them.
+    ``compared``: episodes of the policies that this one is compared with.
     """
     classes = {}
     for slot, name in enumerate(names):
@@ -153,12 +133,7 @@ def results_by_class(
 
 
 def compare(a: Evaluation, b: Evaluation) -> dict[str, Difference]:
-    """Mean return of ``a`` minus that of ``b`` for every class both have, with a bootstrap interval.
-
-    Args:
-        a: For example the trained policy.
-        b: For example a random one, over the same tasks.
-    """
+    """Mean return of ``a`` minus that of ``b`` for every class both have, with a bootstrap interval."""
     differences = {}
     for name in (name for name in a.classes if name in b.classes):
         ours, theirs = (result.drawn(result.returns) for result in (a.classes[name], b.classes[name]))

@@ -14,15 +14,11 @@ FINGERS = ("ff", "mf", "rf", "lf", "th")
 CENTRE_OF_MASS = (0.0016, 0.0081, 0.2917)
 """The hand's centre of mass in the mount frame at zero pose, metres: where a moving base is driven
 (docs/figures.md, base)."""
-LINEAR_DAMPING = (501.0, 501.0, 501.0)
-"""Damping of a moving base, N s/m: 5.011 kg times the original's 100 per second."""
-ANGULAR_DAMPING = (2.60, 2.65, 1.12)
-"""Damping of a moving base about its own axes, N m s/rad: the hand's inertia times 100 per second
-(docs/figures.md, base)."""
-FORCE_PER_SCALE = 100_000.0 / 60.0
-"""Newton per unit of action and of a class's translation scale (docs/figures.md, base)."""
-TORQUE_PER_SCALE = 1_000.0 / 60.0
-"""Newton metre per unit of action and of a class's orientation scale."""
+LINEAR_DAMPING, ANGULAR_DAMPING = (501.0, 501.0, 501.0), (2.60, 2.65, 1.12)
+"""Damping of a moving base, N s/m, and about its own axes, N m s/rad: the hand's 5.011 kg and inertia times the
+original's 100 per second (docs/figures.md, base)."""
+FORCE_PER_SCALE, TORQUE_PER_SCALE = 100_000.0 / 60.0, 1_000.0 / 60.0
+"""N and N m per unit of action and of a class's translation and orientation scale (docs/figures.md, base)."""
 DISTAL_PER_MIDDLE = 0.00805 / 0.00705
 """Distal over middle joint angle when the coupling tendon is at rest (docs/figures.md, hand joints)."""
 

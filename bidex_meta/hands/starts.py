@@ -76,11 +76,9 @@ def noisy_joints(draws: Tensor, scale: float) -> Tensor:
 def make_room(joints: Tensor, position: Tensor, axis: Tensor, radius: float, half: float) -> tuple[Tensor, Tensor]:
     """Lifts an egg off the palm and opens the fingers that noise would push into it.
 
-    The egg is a spheroid; its distance to the palm's plane and to the capsules of the four fingers is bounded from
-    below by its support in the direction of its centre.
-
     Joint angles, rad, (n, 24); the egg's centre and long axis (unit) in the mount frame, (n, 3); its short and long
     semi-axis. Returns the joints with opened fingers and the egg's shift in the mount frame, (n, 3). Lengths in metres.
+    The distance to the palm's plane and the fingers' capsules is bounded by the spheroid's support towards its centre.
     """
     axes = _palm_axes(joints)
     centre = _in_palm(position, joints, axes)
@@ -123,7 +121,9 @@ def make_room_for(joints: Tensor, position: Tensor, points: Tensor, radii: Tenso
 
 
 def _in_palm(position: Tensor, joints: Tensor, axes: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-    relative = position - constant(_WRIST, position) - _PALM_OFFSET * _wrist_z(joints)
+    a = joints[:, 0]
+    z = torch.stack((a.sin(), torch.zeros_like(a), a.cos()), dim=1)  # of the wrist
+    relative = position - constant(_WRIST, position) - _PALM_OFFSET * z
     return torch.stack([dot(relative, a) for a in axes], dim=1)
 
 
@@ -161,11 +161,6 @@ def _meets_metacarpal(cup: Tensor, centre: Tensor, support: _Support) -> Tensor:
     length = norm(high - low)
     along = (high - low) / length[:, None]
     return _gap(centre, support, low, along, length) < _METACARPAL_RADIUS - _SLACK
-
-
-def _wrist_z(joints: Tensor) -> Tensor:
-    a = joints[:, 0]
-    return torch.stack((a.sin(), torch.zeros_like(a), a.cos()), dim=1)
 
 
 def _palm_axes(joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:

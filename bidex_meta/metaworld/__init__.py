@@ -32,8 +32,7 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"{name} has Meta-World's own classes. Here there is {_ABSENT[name]}.")
     if name.startswith(_CLASSES):
         raise AttributeError(f"{name} is not here: MT1(name) shows the goal and ML1(name) hides it.")
-    from metaworld import wrappers
-
+    wrappers = mended().wrappers
     if name.startswith("_") or not hasattr(wrappers, name):
         raise AttributeError(f"bidex_meta.metaworld has no {name!r}; docs/metaworld.md says what it has.")
     return getattr(wrappers, name)

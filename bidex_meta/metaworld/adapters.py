@@ -5,14 +5,15 @@ does not say which environments share a task, and calls ``reset`` before and dur
 """
 
 from collections import namedtuple
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, cast
 
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from torch import Tensor
 
-from bidex_meta.agents import Agent, Timestep
+from bidex_meta.agents import Agent, MetaLearningAgent, Timestep
 from bidex_meta.errors import BidexError
 from bidex_meta.world.contract import Info, Options, PooledWorld
 
@@ -27,8 +28,10 @@ class ForMetaWorld:
     numbers the task of each environment from 0 on, None: each has its own.
     """
 
-    def __init__(self, agent: Agent, device: str | torch.device = "cpu", task_of_row: Any = None):
-        self._agent: Any = agent
+    def __init__(
+        self, agent: Agent, device: str | torch.device = "cpu", task_of_row: Sequence[int] | np.ndarray | None = None
+    ):
+        self._agent = cast(MetaLearningAgent, agent)
         self._device = torch.device(device)
         self._task_of_row = None if task_of_row is None else self._tensor(np.asarray(task_of_row, np.int64))
         self._begins = True
@@ -56,13 +59,14 @@ class ForMetaWorld:
             self._agent.reset(torch.ones(len(obs), dtype=torch.bool, device=self._device))
             self._begins = False
         action, outputs = self._agent.adapt_action(obs)
-        return _array(action), {name: _array(value) for name, value in outputs.items()}
+        return _array(action), {k: _array(v) if isinstance(v, Tensor) else v for k, v in outputs.items()}
 
-    def step(self, timestep: Any) -> None:
+    def step(self, timestep: tuple) -> None:
         """Takes in one transition of every environment: Meta-World's Timestep, or its first six entries."""
         obs, action, reward, terminated, truncated, outputs = timestep[:6]
         tensors = [self._tensor(value) for value in (obs, action, reward, terminated, truncated)]
-        self._agent.step(Timestep._make([*tensors, {k: self._tensor(v) for k, v in outputs.items()}, None, None]))
+        outputs = {k: self._tensor(v) if isinstance(v, np.ndarray) else v for k, v in outputs.items()}
+        self._agent.step(Timestep._make([*tensors, outputs, None, None]))
         self.reset(np.logical_or(terminated, truncated))  # these go on with their next episodes
 
     def adapt(self) -> None:
@@ -70,9 +74,7 @@ class ForMetaWorld:
         self._agent.adapt()
         self._begins = True
 
-    def _tensor(self, value: Any) -> Any:
-        if not isinstance(value, np.ndarray):
-            return value
+    def _tensor(self, value: np.ndarray) -> Tensor:
         tensor = torch.from_numpy(value.copy())  # an environment may write into its array again
         return tensor.to(self._device, torch.float32 if tensor.is_floating_point() else tensor.dtype)
 
@@ -129,8 +131,7 @@ class FromMetaWorld:
 class MetaWorldEnvs(VectorEnv):
     """A world in NumPy arrays, with resets in the same step and the attributes and methods that Meta-World calls.
 
-    Raises BidexError for a world in another autoreset mode than DISABLED: episodes are started here, since success may
-    end them.
+    Raises BidexError unless its autoreset mode is DISABLED: episodes are started here, since success may end them.
     """
 
     def __init__(self, world: PooledWorld):
@@ -154,7 +155,7 @@ class MetaWorldEnvs(VectorEnv):
         self._lengths.zero_()
         return obs.cpu().numpy(), {}
 
-    def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
         """Advances every environment by actions (num_envs, a) in [-1, 1].
 
         Returns observations (num_envs, d), of ended ones those of the next episode; rewards, terminated, truncated, and
@@ -169,7 +170,7 @@ class MetaWorldEnvs(VectorEnv):
         self._returns += reward.double()
         self._lengths += 1
         episode = {"r": self._returns.cpu().numpy().copy(), "l": self._lengths.cpu().numpy().copy()}
-        ended_info: dict[str, Any] = {"success": success.cpu().numpy(), "final_obs": obs.cpu().numpy().copy()}
+        ended_info: Info = {"success": success.cpu().numpy(), "final_obs": obs.cpu().numpy().copy()}
         ended_info["final_info"] = {"episode": episode, "success": ended_info["success"]}
         ended_info |= {"_final_info": ended.cpu().numpy(), "_final_obs": ended.cpu().numpy()}
         if bool(ended.any()):
@@ -197,24 +198,24 @@ class MetaWorldEnvs(VectorEnv):
         self.world.set_tasks(chosen)
         self._samples += 1
 
-    def get_attr(self, name: str) -> tuple[Any, ...]:
+    def get_attr(self, name: str) -> tuple[object, ...]:
         """An attribute for each environment."""
         value = getattr(self, name)
         return tuple(value) if name == "task_name" else (value,) * self.num_envs
 
-    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+    def call(self, name: str, *args: object, **kwargs: object) -> tuple[object, ...]:
         """Calls a method (or reads an attribute) once; its result for each environment."""
         value = getattr(self, name)
         return (value(*args, **kwargs),) * self.num_envs if callable(value) else self.get_attr(name)
 
-    def set_attr(self, name: str, values: Any) -> None:
+    def set_attr(self, name: str, values: object) -> None:
         """Sets an attribute."""
         setattr(self, name, values)
 
-    def close_extras(self, **kwargs: Any) -> None:
+    def close_extras(self, **kwargs: object) -> None:
         """Frees the world."""
         self.world.close()
 
 
-def _array(value: Any) -> Any:
-    return value.detach().cpu().numpy() if isinstance(value, Tensor) else value
+def _array(value: Tensor) -> np.ndarray:
+    return value.detach().cpu().numpy()

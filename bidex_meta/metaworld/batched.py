@@ -1,10 +1,6 @@
-"""Meta-World's MT suites as a world, for checks on tasks, rewards and physics that no one here wrote.
-
-Our learners, evaluation and checkpoints run on it unchanged. Environments are stepped one after the other.
-"""
+"""Meta-World's MT suites as a world, stepped one by one: tasks, rewards and physics that no one here wrote."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -60,10 +56,7 @@ class MetaWorldWorld(ForeignWorld):
         self.set_tasks({name: range(TASKS_PER_CLASS) for name in self.task_names})
 
     def set_tasks(self, pools: Mapping[str, Sequence[int] | np.ndarray]) -> None:
-        """Replaces the pools of some classes by numbers of tasks, (n,) or (n, 1), from the next full reset on.
-
-        Raises BidexError for an unknown class, an empty pool, a wrong shape or a number out of range.
-        """
+        """Replaces pools by numbers of tasks, (n,) or (n, 1), from the next full reset on; else BidexError."""
         chosen = dict(self._pools)
         for name, pool in pools.items():
             if name not in self.task_names:
@@ -71,9 +64,8 @@ class MetaWorldWorld(ForeignWorld):
             numbers = np.asarray(pool)
             flat = numbers.size > 0 and numbers.shape in ((len(pool),), (len(pool), 1))
             if not flat or not (numbers.min() >= 0 and numbers.max() < TASKS_PER_CLASS):  # false for NaN
-                raise BidexError(
-                    f"Expected tasks of {name} from 0 to {TASKS_PER_CLASS - 1}, (n,) or (n, 1), got {numbers.tolist()}."
-                )
+                what = f"Expected tasks of {name} from 0 to {TASKS_PER_CLASS - 1}, (n,) or (n, 1)"
+                raise BidexError(f"{what}, got {numbers.tolist()}.")
             chosen[name] = [int(number) for number in numbers.flatten()]
         self._pools = chosen
         self._set_pool_sizes([len(chosen[name]) for name in self.task_names])
@@ -87,7 +79,7 @@ class MetaWorldWorld(ForeignWorld):
         for row in mask.nonzero().squeeze(1).tolist():
             self._obs[row, :OBSERVATION_SIZE] = torch.from_numpy(self._singles[row].start(self._task(row)))
 
-    def _task(self, row: int) -> Any:
+    def _task(self, row: int) -> object:
         name = self.task_names[self.task_id[row]]
         return self._tasks[name][self._pools[name][self.task_index[row]]]
 
@@ -107,27 +99,20 @@ class MetaWorldWorld(ForeignWorld):
 
     def state_dict(self) -> State:
         """All that decides the world's future: tensors and plain values, copied."""
-        return {
-            **super().state_dict(),
-            "suite": self.suite,
-            "task_seed": self._task_seed,
-            "pools": {name: list(pool) for name, pool in self._pools.items()},
-            "actions": self._actions.clone(),
-        }
+        own = {"suite": self.suite, "task_seed": self._task_seed, "actions": self._actions.clone()}
+        return {**super().state_dict(), **own, "pools": {name: list(pool) for name, pool in self._pools.items()}}
 
     def load_state_dict(self, state: State) -> None:
         """Restores a ``state_dict``; raises BidexError for one of another suite, seed or size.
 
-        Meta-World's environments keep part of their state in Python attributes and in the model, so each running
-        episode is played again from its start: exact, and a fraction of a second for each.
+        Each running episode is played again from its start, exactly: Meta-World keeps part of its state in Python.
         """
         state = self._upgraded(state)
         fits(state, self.state_dict())
         here, there = (self.suite, self._task_seed), (state["suite"], state["task_seed"])
         if here != there:
-            raise BidexError(
-                f"Expected the state of a world of (suite, seed) = {here}, got {there}; build the world with the same."
-            )
+            what = f"Expected the state of a world of (suite, seed) = {here}, got {there}"
+            raise BidexError(f"{what}; build the world with the same.")
         self.set_tasks(state["pools"])
         self._restore(state)
         self._actions = state["actions"].clone()
@@ -138,7 +123,7 @@ class MetaWorldWorld(ForeignWorld):
             for action in self._actions[row, : int(self.episodes.length[row])].numpy():
                 self._singles[row].step(action)
 
-    def close_extras(self, **kwargs: Any) -> None:
+    def close_extras(self, **kwargs: object) -> None:
         """Frees the environments."""
         for single in self._singles:
             single.close()

@@ -28,10 +28,7 @@ def metalearning_evaluation(agent: MetaLearningAgent, eval_envs: Any, *args: Any
 
 @contextmanager
 def known_to_metaworld(envs: Any) -> Iterator[None]:
-    """Adds the classes in `envs.get_attr("task_name")` to the names that `metaworld.evaluation` looks up.
-
-    Replaces its module's attribute, not the dict, which other modules of Meta-World's share.
-    """
+    """Adds an ``envs``' classes to the names in `metaworld.evaluation` (a copy: others share its dict)."""
     module: Any = library
     before = module.ALL_V3_ENVIRONMENTS
     ours: dict[str, Any] = {name: type(name, (), {}) for name in envs.get_attr("task_name")}

@@ -1,6 +1,8 @@
 """Meta-World's library, fixed for MuJoCo 4: its tasks and its environments, one at a time."""
 
 import functools
+from importlib import import_module
+from types import ModuleType
 from typing import Any
 
 import mujoco
@@ -19,18 +21,14 @@ _WARNINGS = ("BADQPOS", "BADQVEL", "BADQACC", "CONTACTFULL", "CNSTRFULL")
 _BROKEN = [int(getattr(mujoco.mjtWarning, f"mjWARN_{kind}")) for kind in _WARNINGS]
 
 
-def mended() -> Any:
+def mended() -> ModuleType:
     """Meta-World's module, its environments fixed in this process; raises ModuleNotFoundError without it.
 
-    Meta-World 3.0.0 (its newest release without an upper bound on MuJoCo) sets the hand's weld by eleven numbers for
-    the whole row of ``eq_data``; since MuJoCo 3.17 that row is twelve wide, so no environment could be made. Here the
-    eleven go to the first eleven entries, as they were meant; the twelfth stays as the model was compiled.
+    Meta-World 3.0.0 sets the hand's weld by eleven numbers for a whole row of ``eq_data``, which is twelve wide since
+    MuJoCo 3.17: no environment could be made. Here they go to its first eleven entries.
     """
-    import metaworld
-    from metaworld.sawyer_xyz_env import SawyerMocapBase
-
-    SawyerMocapBase.reset_mocap_welds = _reset_mocap_welds
-    return metaworld
+    import_module("metaworld.sawyer_xyz_env").SawyerMocapBase.reset_mocap_welds = _reset_mocap_welds
+    return import_module("metaworld")
 
 
 def _reset_mocap_welds(self: Any) -> None:
@@ -39,25 +37,23 @@ def _reset_mocap_welds(self: Any) -> None:
 
 
 @functools.cache
-def _library() -> Any:
+def _library() -> ModuleType:
     try:
         library = mended()
     except ModuleNotFoundError as error:
-        raise BidexError(
-            f"Expected Meta-World for a suite metaworld/..., but {error.name} is not installed. "
-            "Mend: pip install metaworld==3.0.0"
-        ) from None
+        what = f"Expected Meta-World for a suite metaworld/..., but {error.name} is not installed"
+        raise BidexError(f"{what}. Mend: pip install metaworld==3.0.0") from None
     # MuJoCo would print each broken environment to stderr and a log file; Single.step reports it.
     mujoco.set_mju_user_warning(lambda message: None)
     return library
 
 
 @functools.lru_cache(maxsize=8)  # drawing them resets each class fifty times: seconds
-def make_tasks(suite: str, seed: int) -> dict[str, tuple[Any, ...]]:
+def make_tasks(suite: str, seed: int) -> dict[str, tuple[object, ...]]:
     """Meta-World's own fifty tasks of each class of a suite, e.g. ``"metaworld/MT3"``, goal visible.
 
-    Those of MT10 are ``metaworld.MT10(seed)``'s, those of MT3 ``metaworld.MT1(name, seed)``'s. Meta-World restores
-    NumPy's global generator. Raises BidexError for an unknown suite, or where Meta-World is not installed.
+    Those of MT10 are ``metaworld.MT10(seed)``'s, others ``metaworld.MT1(name, seed)``'s. Raises BidexError for an
+    unknown suite, or without Meta-World.
     """
     names, library, seed = metaworld_classes(suite), _library(), seed % 2**32  # the range of NumPy's old generator
     whole = suite == "metaworld/MT10"
@@ -72,16 +68,13 @@ class Single:
     def __init__(self, name: str) -> None:
         self._env = _library().ALL_V3_ENVIRONMENTS[name]()
 
-    def start(self, task: Any) -> np.ndarray:
+    def start(self, task: object) -> np.ndarray:
         """Begins an episode of a task; the observation, (39,), float64, with the goal in the last three entries."""
         self._env.set_task(task)
         return self._env.reset()[0]
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
-        """Advances 1/80 s by an action (4,), float32, in [-1, 1]: displacement of the hand (× 0.01 m), gripper.
-
-        Returns observation (39,), reward in [0, 10] by the formula "v2", success, and whether the physics broke.
-        """
+        """Advances 1/80 s by an action (4,): observation (39,), reward in [0, 10], success, broken physics."""
         obs, reward, _, _, info = self._env.step(action)
         # MuJoCo goes on from its default state after a bad number; only its counters tell.
         broken = bool(np.any(self._env.data.warning.number[_BROKEN]))

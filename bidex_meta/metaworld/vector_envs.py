@@ -12,18 +12,20 @@ from typing import Any, Literal
 import gymnasium
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 
-from bidex_meta.benchmark import Benchmark
+from bidex_meta.benchmark import Benchmark, Task
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.metaworld.benchmarks import ML1, MT1, CustomML, CustomMT
+from bidex_meta.metaworld.library import mended
 from bidex_meta.suite import suite_names
 from bidex_meta.tasks import registry
 from bidex_meta.world.single_env import AnyTask, EnvRecipe
 
+Option = Any  # a keyword of Meta-World's functions; ``make_env`` and ``SuiteEnv`` have their types
 _STRATEGIES = {"sync": SyncVectorEnv, "async": AsyncVectorEnv}
 
 
 def make_mt_envs(
-    name: str, seed: int | None = None, num_tasks: int | None = None, **options: Any
+    name: str, seed: int | None = None, num_tasks: int | None = None, **options: Option
 ) -> gymnasium.Env | VectorEnv:
     """Environments that show their goals and draw a task at each reset: one of a class, or one of each of a suite's.
 
@@ -45,7 +47,7 @@ def make_ml_envs(
     meta_batch_size: int | None = None,
     total_tasks_per_cls: int | None = None,
     split: str = "train",
-    **options: Any,
+    **options: Option,
 ) -> VectorEnv:
     """Environments of a class or meta suite that hide their goals, each with an equal share of its class's tasks.
 
@@ -61,7 +63,7 @@ make_ml_envs_train = partial(make_ml_envs, terminate_on_success=False, task_sele
 make_ml_envs_test = partial(make_ml_envs, terminate_on_success=True, task_select="pseudorandom", split="test")
 
 
-def make_split(suite: str, split: str, seed: int, env_name: str | None = None, **options: Any) -> VectorEnv:
+def make_split(suite: str, split: str, seed: int, env_name: str | None = None, **options: Option) -> VectorEnv:
     """The environments of `gymnasium.make_vec("bidex-meta/ML20-train-v1", vector_strategy=...)`.
 
     For the ids of ML1 `env_name` replaces the suite, as in Meta-World; with another suite it raises BidexError. Options
@@ -82,7 +84,7 @@ def make_custom(
     train_envs: Sequence[str] | None = None,
     test_envs: Sequence[str] | None = None,
     num_envs: int | None = None,
-    **options: Any,
+    **options: Option,
 ) -> VectorEnv:
     """The environments of the ids `custom-mt-envs` (`envs_list`) and `custom-ml-envs` (`train_envs`, `test_envs`).
 
@@ -96,7 +98,7 @@ def make_custom(
     return _meta(CustomML(train_envs, test_envs, seed), seed, **options)
 
 
-def _multi_task(benchmark: Benchmark, seed: int | None, num_tasks: int | None = None, **options: Any) -> VectorEnv:
+def _multi_task(benchmark: Benchmark, seed: int | None, num_tasks: int | None = None, **options: Option) -> VectorEnv:
     if benchmark.suite.kind != "multi-task":
         raise BidexError(f"{benchmark.name} hides its goals: make_ml_envs({benchmark.name!r}) makes its environments.")
     if "meta_batch_size" in options or "total_tasks_per_cls" in options:
@@ -112,7 +114,7 @@ def _meta(
     meta_batch_size: int | None = None,
     total_tasks_per_cls: int | None = None,
     split: str = "train",
-    **options: Any,
+    **options: Option,
 ) -> VectorEnv:
     if benchmark.suite.kind != "meta":
         raise BidexError(f"{benchmark.name} shows its goals: make_mt_envs({benchmark.name!r}) makes its environments.")
@@ -121,10 +123,8 @@ def _meta(
     classes = benchmark.train_classes if split == "train" else benchmark.test_classes
     size = len(classes) if meta_batch_size is None else meta_batch_size
     if size < 1 or size % len(classes):
-        raise BidexError(
-            f"meta_batch_size: expected a multiple of {len(classes)}, the classes of {benchmark.name}'s {split} split; "
-            f"got {size}."
-        )
+        what = f"a multiple of {len(classes)}, the classes of {benchmark.name}'s {split} split"
+        raise BidexError(f"meta_batch_size: expected {what}; got {size}.")
     places = [
         (env_class.recipe, share)
         for name, env_class in classes.items()
@@ -148,7 +148,7 @@ def make_env(
     reward_normalization_method: Literal["gymnasium", "exponential"] | None = None,
     normalize_observations: bool = False,
     reward_alpha: float = 0.001,
-    **options: Any,
+    **options: Option,
 ) -> gymnasium.Env:
     """One environment in Meta-World's wrappers, by Meta-World's keywords: it draws its tasks itself.
 
@@ -157,8 +157,7 @@ def make_env(
     whether the episode ended. `task_select`: `"random"` draws a task at each reset, `"pseudorandom"` takes them in
     turn, at `sample_tasks()`. Other options are those of `SuiteEnv`.
     """
-    from metaworld import wrappers  # not needed by the package's other names
-
+    wrappers = mended().wrappers  # not needed by the package's other names
     env: Any = recipe.make_class()(**options)
     if seed is not None:
         env.seed(seed)
@@ -185,11 +184,11 @@ def make_env(
 
 
 def _make_vector(
-    places: Sequence[tuple[EnvRecipe, list[Any]]],
+    places: Sequence[tuple[EnvRecipe, list[Task]]],
     seed: int | None = None,
     vector_strategy: str = "sync",
     autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
-    **options: Any,
+    **options: Option,
 ) -> SyncVectorEnv | AsyncVectorEnv:
     make = _STRATEGIES[known_name("vector_strategy", vector_strategy, _STRATEGIES)]
     makers = [
@@ -199,7 +198,7 @@ def _make_vector(
     return make(makers, autoreset_mode=autoreset_mode)
 
 
-def _split_tasks(tasks: Sequence[Any], envs: int) -> list[list[Any]]:
+def _split_tasks(tasks: Sequence[Task], envs: int) -> list[list[Task]]:
     """The tasks of a class over its environments; raises BidexError where they do not divide evenly."""
     if len(tasks) % envs:
         fitting = len(tasks) - len(tasks) % envs
@@ -210,7 +209,7 @@ def _split_tasks(tasks: Sequence[Any], envs: int) -> list[list[Any]]:
     return [list(tasks[i::envs]) for i in range(envs)]
 
 
-def _tasks(benchmark: Benchmark, split: str, name: str) -> list[Any]:
+def _tasks(benchmark: Benchmark, split: str, name: str) -> list[Task]:
     tasks = benchmark.train_tasks if split == "train" else benchmark.test_tasks
     return [task for task in tasks if task.env_name == name]
 

@@ -11,15 +11,12 @@ from bidex_meta.errors import BidexError, one_line
 from bidex_meta.utils.files import exists
 
 TEMPORARY_SUFFIX = ".tmp"
+Json = dict[str, Any]
+"""An object of JSON."""
 
 
 def write_atomic(path: Path, write: Callable[[IO[bytes]], object]) -> None:
-    """Call ``write`` on a temporary file beside ``path``, force it to the disk and rename it over ``path``.
-
-    Args:
-        path: The file to create or replace.
-        write: Receives the open binary file.
-    """
+    """Call ``write`` on a temporary file beside ``path``, force it to the disk and rename it over ``path``."""
     # Same folder, since a rename is atomic only within one file system.
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=TEMPORARY_SUFFIX, dir=path.parent)
     try:
@@ -38,7 +35,7 @@ def write_atomic(path: Path, write: Callable[[IO[bytes]], object]) -> None:
     sync_folder(path.parent)
 
 
-def write_json(path: Path, content: Any) -> None:
+def write_json(path: Path, content: object) -> None:
     """Write ``content`` as indented JSON, atomically."""
     write_atomic(path, lambda file: file.write((json.dumps(content, indent=2) + "\n").encode()))
 
@@ -50,35 +47,23 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def refuse_links(*paths: Path) -> None:
-    """Refuses links where a run keeps its own files: what is written or deleted there would be somebody else's.
-
-    Raises:
-        BidexError: One is a link.
-    """
-    for path in paths:
-        if path.is_symlink():
-            raise BidexError(
-                f"{path} is a link, and what a run writes stays in its folder. Put a folder or file there."
-            )
+    """Raises BidexError for links among a run's own files: what is written or deleted there would be another's."""
+    for path in (path for path in paths if path.is_symlink()):
+        raise BidexError(f"{path} is a link, and what a run writes stays in its folder. Put a folder or file there.")
 
 
 def check_writable(path: Path) -> None:
-    """Makes sure, before long work, that ``path`` can be written at its end; leaves everything as it was.
+    """Raises BidexError, before long work, where ``path`` is no file or cannot be written at the end of it.
 
-    Args:
-        path: A file to be made or replaced; folders above it may be missing.
-
-    Raises:
-        BidexError: It is no file, or cannot be written: the name is too long, the folder is not ours, the disk is full.
+    The name may be too long, the folder not ours, the disk full; folders above it may be missing, and stay so.
     """
     if exists(path) and not path.is_file():
         raise BidexError(f"Expected a file to write at {path}, but there is something else. Name another.")
-    missing = [folder for folder in path.parents if not exists(folder)]
-    made: list[Path] = []
+    created: list[Path] = []
     try:
-        for folder in reversed(missing):
+        for folder in reversed([folder for folder in path.parents if not exists(folder)]):
             folder.mkdir()
-            made.append(folder)
+            created.append(folder)
         # As long a name as the file's own will have while it is written.
         handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=TEMPORARY_SUFFIX, dir=path.parent)
         try:
@@ -87,10 +72,10 @@ def check_writable(path: Path) -> None:
             os.close(handle)
             os.unlink(name)
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or one_line(error)
+        reason = (error.strerror if isinstance(error, OSError) else None) or one_line(error)
         raise BidexError(f"{path} cannot be written: {reason}. Name another place, or make room.") from None
     finally:
-        for folder in reversed(made):
+        for folder in reversed(created):
             folder.rmdir()
 
 

@@ -1,8 +1,7 @@
-"""Checkpoints: ``step_<N>.pt`` (the last few), ``last.pt`` and ``best.pt``.
+"""Checkpoints: ``step_<N>.pt`` (the last few), ``last.pt`` and ``best.pt``; written atomically, read without any code.
 
-Written atomically and read without unpickling code. Each is sealed by a format number and a digest of every number and
-tensor in it: ``torch.load`` checks no checksum, so a flipped bit would be loaded as another weight. Files of format 1,
-which had no seal, are still held to the checksums that every zip archive carries.
+Each has a format number and a digest of every number and tensor in it: ``torch.load`` checks no checksum, so a flipped
+bit would be loaded as another weight. Files of format 1, without a digest, have the checksums of a zip archive.
 """
 
 import hashlib
@@ -10,6 +9,7 @@ import re
 import shutil
 import sys
 import zipfile
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -17,24 +17,22 @@ from bidex_meta.errors import BidexError, one_line, shortened
 from bidex_meta.runs.atomic import refuse_links, remove_leftovers, write_atomic
 from bidex_meta.utils.files import exists, is_file, open_regular
 
+State = dict[str, Any]
+"""Nested dicts and lists of tensors, numbers and strings; nothing that needs code to be read back."""
 _STEP_FILE = re.compile(r"step_(\d{1,18})\.pt", re.ASCII)
 FORMAT = 2
-"""Goes up when older code could not read a checkpoint; 1 had no seal."""
+"""Goes up when older code could not read a checkpoint; 1 had no digest."""
 _DEEPEST = 100
 
 
+@dataclass(frozen=True)
 class Checkpoints:
-    """The checkpoints of one run.
+    """The checkpoints of one run."""
 
-    Args:
-        folder: Where they lie; made by the first ``save``.
-        keep: How many ``step_<N>.pt`` are kept. More than one, so that a file damaged after it was written
-            (a full disk, a failing one) does not end the run.
-    """
-
-    def __init__(self, folder: Path, keep: int = 3):
-        self.folder = folder
-        self.keep = keep
+    folder: Path
+    """Created by the first ``save``."""
+    keep: int = 3
+    """How many ``step_<N>.pt`` stay: several, so that a file damaged after it was written does not end the run."""
 
     @property
     def last(self) -> Path:
@@ -46,27 +44,16 @@ class Checkpoints:
         """The policy that did best in an evaluation while training; exists if there was one."""
         return self.folder / "best.pt"
 
-    def save(self, state: dict[str, Any], step: int) -> None:
-        """Write ``step_<step>.pt`` and ``last.pt``, then forget the oldest.
-
-        Args:
-            state: Nested dicts and lists of tensors, numbers and strings; nothing that needs code to be read back.
-            step: Environment steps so far; ``load`` returns it.
-        """
-        import torch
-
-        refuse_links(self.folder)
-        self.folder.mkdir(exist_ok=True)
-        remove_leftovers(self.folder)
-        path, content = self.folder / f"step_{step}.pt", _sealed({"step": step, "state": state})
-        write_atomic(path, lambda file: torch.save(content, file))
+    def save(self, state: State, step: int) -> None:
+        """Write ``step_<step>.pt`` and ``last.pt`` after ``step`` environment steps, then delete the oldest."""
+        path = self.folder / f"step_{step}.pt"
+        self._write(path, {"step": step, "state": state})
         self._follow(path)
 
     def finish(self, step: int) -> None:
         """Does what a :meth:`save` that was killed left undone.
 
-        Args:
-            step: Of the checkpoint that was loaded. Where a newer one is there, which was then damaged, all stay.
+        ``step`` is of the checkpoint that was loaded. Where a newer one is there, which was then damaged, all stay.
         """
         if not self.folder.is_dir():
             return
@@ -79,40 +66,31 @@ class Checkpoints:
         if behind or len(self._step_files()) > self.keep:
             self._follow(path)
 
+    def _write(self, path: Path, content: State) -> None:
+        refuse_links(self.folder)
+        self.folder.mkdir(exist_ok=True)
+        remove_leftovers(self.folder)
+        content = {**content, "format": FORMAT, "digest": _digest(content)}
+        write_atomic(path, lambda file: _torch().save(content, file))
+
     def _follow(self, newest: Path) -> None:
-        """Makes ``last.pt`` a copy of the newest, then forgets the oldest."""
+        """Makes ``last.pt`` a copy of the newest, then deletes the oldest."""
         with newest.open("rb") as source:
             write_atomic(self.last, lambda file: shutil.copyfileobj(source, file))
         for old in self._step_files()[self.keep :]:
             old.unlink(missing_ok=True)
 
-    def save_best(self, policy: dict[str, Any], step: int, found: dict[str, float]) -> None:
-        """Write ``best.pt``: a policy alone, from which no training continues.
-
-        Args:
-            policy: Entry ``learner.policy`` of a checkpoint.
-            step: Environment steps so far.
-            found: What was found of it; ``found_of_best`` returns it.
-        """
-        import torch
-
-        refuse_links(self.folder)
-        self.folder.mkdir(exist_ok=True)
-        remove_leftovers(self.folder)
-        content = _sealed({"step": step, "state": {"learner": {"policy": policy}}, "found": found})
-        write_atomic(self.best, lambda file: torch.save(content, file))
+    def save_best(self, policy: State, step: int, found: dict[str, float]) -> None:
+        """Write ``best.pt``: a policy alone (entry ``learner.policy`` of a checkpoint), and its results."""
+        self._write(self.best, {"step": step, "state": {"learner": {"policy": policy}}, "found": found})
 
     def found_of_best(self) -> dict[str, float] | None:
-        """What was found of the policy in ``best.pt``; None where there is none that can be read."""
+        """The results of the policy in ``best.pt``; None where there is none that can be read."""
         content = _read(self.best, "none is known") if exists(self.best) else None
         return None if content is None else content.get("found")
 
-    def load_one(self, path: Path) -> tuple[dict[str, Any], int]:
-        """A certain checkpoint as ``load`` gives it.
-
-        Raises:
-            BidexError: There is no such file, or it cannot be read.
-        """
+    def load_one(self, path: Path) -> tuple[State, int]:
+        """A certain checkpoint as ``load`` gives it; raises BidexError where it is missing or cannot be read."""
         if not is_file(path):
             there = ", ".join(sorted(found.name for found in self.folder.glob("*.pt"))) or "none"
             raise BidexError(f"There is no {path}. Checkpoints in {self.folder}: {there}.")
@@ -127,13 +105,11 @@ class Checkpoints:
         files = self._step_files()
         return int(files[0].stem.removeprefix("step_")) if files else None
 
-    def load(self) -> tuple[dict[str, Any], int] | None:
+    def load(self) -> tuple[State, int] | None:
         """The newest readable checkpoint as ``(state, step)`` with tensors on the CPU; None where there is none yet.
 
-        A damaged file is passed over with a line on stderr, which names the one that is taken in its place.
-
-        Raises:
-            BidexError: There are checkpoints, but none of them can be read.
+        A damaged file is passed over with a line on stderr, which names the one that is taken in its place. Raises
+        BidexError where none of them can be read.
         """
         # last.pt comes last: a process that died between the two renames leaves it older than the newest step_<N>.pt.
         candidates = [path for path in [*self._step_files(), self.last] if exists(path)]
@@ -156,7 +132,13 @@ class Checkpoints:
         return [path for _, path in sorted(found, reverse=True)]
 
 
-def _read(path: Path, then: str = "trying an older one") -> dict[str, Any] | None:
+def _torch():
+    import torch  # not at the top: `bidex-meta list` starts without it
+
+    return torch
+
+
+def _read(path: Path, then: str = "trying an older one") -> State | None:
     try:
         return _opened(path)
     except Exception as error:  # torch raises a dozen kinds for a damaged file; each means "try the one before"
@@ -169,24 +151,12 @@ def _reason(error: Exception) -> str:
     return kind + one_line(error)[:100].rstrip(".")
 
 
-def _sealed(content: dict[str, Any]) -> dict[str, Any]:
-    """Content to be saved, with its format and digest."""
-    return {**content, "format": FORMAT, "digest": _digest(content)}
-
-
-def _opened(path: Path) -> dict[str, Any]:
-    """A sealed file's content, read from a file without running any code of it; at least ``step`` and ``state``.
-
-    Raises:
-        BidexError: It is no regular file, or of a newer format.
-        Exception: torch's own, of a dozen kinds, where the file is damaged or something else.
-    """
-    import torch
-
+def _opened(path: Path) -> State:
+    """A file's content, at least ``step`` and ``state``; torch raises a dozen kinds of errors where it is damaged."""
     with open_regular(path, "a checkpoint") as file:
         _check_archive(file)
         # weights_only: a checkpoint from somebody else must not be able to run code.
-        content = torch.load(file, map_location="cpu", weights_only=True)
+        content = _torch().load(file, map_location="cpu", weights_only=True)
     if not isinstance(content, dict) or not isinstance(content.get("state"), dict):
         raise ValueError("it holds no training's state")
     if type(content.get("step")) is not int or content["step"] < 0:
@@ -211,16 +181,15 @@ def _check_archive(file: IO[bytes]) -> None:
     file.seek(0)
 
 
-def _digest(content: dict[str, Any]) -> str:
+def _digest(content: State) -> str:
     found = hashlib.blake2b(digest_size=32)
     _feed(content, found, 0)
     return found.hexdigest()
 
 
-def _feed(value: Any, found: Any, depth: int) -> None:
+def _feed(value: object, found: "hashlib.blake2b", depth: int) -> None:
     """Feeds a hash with a value, its type and its shape, so that no two contents look alike."""
-    import torch
-
+    torch = _torch()
     if depth > _DEEPEST:
         raise ValueError(f"it is nested more than {_DEEPEST} deep")
     if isinstance(value, torch.Tensor):

@@ -23,7 +23,7 @@ from typing import Any
 
 from bidex_meta.config import RunConfig, read_config
 from bidex_meta.errors import BidexError
-from bidex_meta.runs.atomic import TEMPORARY_SUFFIX, check_writable, refuse_links, remove_leftovers, write_json
+from bidex_meta.runs.atomic import TEMPORARY_SUFFIX, Json, check_writable, refuse_links, remove_leftovers, write_json
 from bidex_meta.runs.checkpoints import Checkpoints
 from bidex_meta.runs.metrics import last_rows, read_metrics
 from bidex_meta.runs.schemas import read_evaluation, read_versions
@@ -31,41 +31,48 @@ from bidex_meta.runs.versions import collect_versions
 from bidex_meta.utils.files import exists, is_file, read_json
 from bidex_meta.utils.plugins import name_with_object, short_name
 
+AnyConfig = RunConfig[Any]
+"""A run's config, its learner's settings in whichever form."""
 _ENTRIES = ("checkpoints", "videos", "metrics.jsonl", "versions.json", "config.json", "replay", "wandb", "wandb-id")
-"""What stands in a run folder before its first iteration has ended, beside TensorBoard's file."""
+"""In a run folder before its first iteration has ended, beside TensorBoard's file."""
 _EVENTS = "events.out.tfevents."
 _MOST_LOOKED_AT = 2000
 """Entries that are looked at to find runs below a folder that is none."""
 
 
+class _Part:
+    """The path of a part of a run folder."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, folder: "RunFolder", kind: type["RunFolder"]) -> Path:
+        return folder.path / self._name
+
+
 @dataclass(frozen=True)
 class RunFolder:
-    """One run on disk. Made by ``create`` or ``open``."""
+    """One run on disk, from ``create`` or ``open``."""
 
     path: Path
 
     @classmethod
     def create(
-        cls,
-        config: RunConfig[Any],
-        path: Path | None = None,
-        root: Path = Path("runs"),
-        identity: dict[str, Any] | None = None,
+        cls, config: AnyConfig, path: Path | None = None, root: Path = Path("runs"), identity: Json | None = None
     ) -> "RunFolder":
         """Make a new, complete run folder: after this call only metrics, checkpoints and videos are added.
 
-        Args:
-            config: The resolved config; its ``suite`` (or ``task``), ``algo`` and ``seed`` name the folder.
-            path: The folder itself, instead of one under ``root`` named after the config.
-            root: Where runs are collected.
-            identity: What tells the run's worlds from others of their name; kept in ``versions.json``.
-
-        Raises:
-            BidexError: ``path`` exists and is not empty.
+        It is ``path``, or one under ``root`` named after the resolved config. ``identity`` distinguishes the run's
+        worlds from others of their name; it goes into ``versions.json``. Raises BidexError where ``path`` is not empty.
         """
-        folder = cls(_new_folder(config, root) if path is None else _given_folder(path))
-        for made in (folder.checkpoints_path, folder.videos_path):
-            made.mkdir(exist_ok=True)  # there where a start was killed before its config stood
+        if path is None:
+            path = _new_folder(config, root)
+        else:
+            check_new(path)
+            path.mkdir(parents=True, exist_ok=True)
+        folder = cls(path)
+        for part in (folder.checkpoints_path, folder.videos_path):
+            part.mkdir(exist_ok=True)  # there where a start was killed before its config stood
         folder.metrics_path.touch()
         write_json(folder.path / "versions.json", collect_versions() | (identity or {}))
         write_json(folder.config_path, config.to_json())  # last: a folder with a config.json is a complete one
@@ -73,11 +80,7 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: Path) -> "RunFolder":
-        """An existing run.
-
-        Raises:
-            BidexError: There is no readable ``config.json``.
-        """
+        """An existing run; raises BidexError where there is no ``config.json``."""
         folder = cls(Path(path))
         if not is_file(folder.config_path):
             near = sorted(map(str, _runs_below(folder.path)))[:3]
@@ -87,43 +90,20 @@ class RunFolder:
             raise BidexError(f"{path} is not a run folder: it has no config.json.{hint}")
         return folder
 
-    @property
-    def config_path(self) -> Path:
-        """``config.json``."""
-        return self.path / "config.json"
-
-    @property
-    def metrics_path(self) -> Path:
-        """``metrics.jsonl``."""
-        return self.path / "metrics.jsonl"
-
-    @property
-    def checkpoints_path(self) -> Path:
-        """``checkpoints/``."""
-        return self.path / "checkpoints"
-
-    @property
-    def videos_path(self) -> Path:
-        """``videos/``."""
-        return self.path / "videos"
+    config_path = _Part("config.json")
+    metrics_path = _Part("metrics.jsonl")
+    checkpoints_path = _Part("checkpoints")
+    videos_path = _Part("videos")
+    evaluation_path = _Part("evaluation.json")  # when it has ended and was evaluated
 
     @property
     def checkpoints(self) -> Checkpoints:
         """The run's checkpoints."""
         return Checkpoints(self.checkpoints_path)
 
-    def config(self) -> RunConfig[dict[str, Any]]:
-        """The resolved config.
-
-        Raises:
-            BidexError: ``config.json`` cannot be read, is not valid JSON, or not a run's.
-        """
+    def config(self) -> RunConfig[Json]:
+        """The resolved config; raises BidexError where ``config.json`` cannot be read, or is not a run's."""
         return read_config(self.config_path)
-
-    @property
-    def evaluation_path(self) -> Path:
-        """``evaluation.json``, which stands there when a run has ended and was evaluated."""
-        return self.path / "evaluation.json"
 
     @property
     def again(self) -> str:
@@ -135,7 +115,7 @@ class RunFolder:
         """Whether there is an ``evaluation.json``."""
         return is_file(self.evaluation_path)
 
-    def metrics(self) -> list[dict[str, Any]]:
+    def metrics(self) -> list[Json]:
         """The rows of ``metrics.jsonl`` that can be read."""
         return read_metrics(self.metrics_path)
 
@@ -145,41 +125,29 @@ class RunFolder:
         rows = last_rows(self.metrics_path)
         return self.config().goal(rows[-1] if rows else {"step": 0})
 
-    def versions(self) -> dict[str, Any]:
+    def versions(self) -> Json:
         """``versions.json``; empty where there is none."""
         return read_versions(self.path)
 
-    def evaluation(self) -> dict[str, Any]:
-        """The final evaluation, or the meta-test of what adapts.
-
-        Raises:
-            BidexError: There is none, or ``evaluation.json`` holds something else.
-        """
+    def evaluation(self) -> Json:
+        """The final evaluation, or the meta-test of learners that adapt; raises BidexError where there is none."""
         if not exists(self.evaluation_path):
             raise BidexError(f"{self.path} has no evaluation.json. Let the run end, or write one: {self.again}")
         return read_evaluation(self.evaluation_path, self.again)
 
-    def change_config(self, config: RunConfig[Any]) -> None:
+    def change_config(self, config: AnyConfig) -> None:
         """Replace ``config.json``, atomically, where it says something else."""
         if read_json(self.config_path, "a run's config") != config.to_json():
             write_json(self.config_path, config.to_json())
 
     def finish(self, step: int | None) -> None:
-        """Clears away what a process that was killed in this folder left half done; only where it is locked.
-
-        Args:
-            step: Of the checkpoint that the run goes on from, if any.
-        """
+        """Clears away what a killed process left half done in a locked folder; ``step`` is the loaded checkpoint's."""
         remove_leftovers(self.path)
         if step is not None:
             self.checkpoints.finish(step)
 
     def check_own(self) -> None:
-        """Makes sure that the run can go on here, before anything is built.
-
-        Raises:
-            BidexError: A part of it is a link that leads elsewhere, or the folder cannot be written.
-        """
+        """Raises BidexError, before anything is built, where a part is a link or the folder cannot be written."""
         refuse_links(self.checkpoints_path, self.videos_path, self.metrics_path, self.path / "wandb-id")
         for folder in (self.path, self.checkpoints_path):
             if folder == self.path or folder.exists():
@@ -187,13 +155,9 @@ class RunFolder:
 
     @contextlib.contextmanager
     def locked(self, message: str | None = None) -> Iterator[None]:
-        """Keeps other processes from training in this folder; the lock dies with its process, and leaves no file.
+        """Keeps other processes from training here; the lock ends with its process, and leaves no file.
 
-        Args:
-            message: Error of another process that tries; None: that a process trains here.
-
-        Raises:
-            BidexError: Another process does.
+        Raises BidexError, with this message, where another process holds it.
         """
         handle = os.open(self.path, os.O_RDONLY)
         try:
@@ -233,33 +197,25 @@ def _torn_start(path: Path) -> bool:
     try:
         entries = list(path.iterdir())
         found = [entry for entry in entries if not entry.name.endswith(TEMPORARY_SUFFIX)]
-        folders = [entry for entry in found if entry.name in _ENTRIES[:2]]
-        known = all(
-            (entry.name in _ENTRIES or entry.name.startswith(_EVENTS)) and not entry.is_symlink() for entry in found
-        )
-        # A file that was to be written alone: the first look at whether the folder can be written was killed.
-        known = known and (bool(found) or all(_is_own_leftover(entry) for entry in entries))
-        empty = not any(any(folder.iterdir()) for folder in folders)
+        known = all(entry.name in _ENTRIES or entry.name.startswith(_EVENTS) for entry in found)
+        # Where only a temporary file is there, it is of the config: the check whether it can be written was killed.
+        known = known and (bool(found) or all(entry.name.startswith(".config.json.") for entry in entries))
+        known = known and not any(entry.is_symlink() for entry in found or entries)
+        empty = not any(any(entry.iterdir()) for entry in found if entry.name in _ENTRIES[:2])
         return bool(entries) and known and empty and all(e.stat().st_size == 0 for e in found if e.name == _ENTRIES[2])
     except OSError:
         return False
 
 
-def _is_own_leftover(path: Path) -> bool:
-    return path.name.startswith(".config.json.") and path.name.endswith(TEMPORARY_SUFFIX) and not path.is_symlink()
-
-
-def new_folder_name(config: RunConfig[Any], root: Path = Path("runs")) -> Path:
-    """Where a run is kept that is given no folder, by its config and the present time."""
+def new_folder_name(config: AnyConfig, root: Path = Path("runs")) -> Path:
+    """The folder of a run that is given none, by its config and the present time."""
     # A suite may be a path to a TOML file, task and algo package.module:Class.
-    subject = short_name(Path(config.suite or str(config.task)).stem)
-    subject = name_with_object(subject, config.object)
+    subject = name_with_object(short_name(Path(config.suite or str(config.task)).stem), config.object)
     now = datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S")
-    algo = short_name(config.algo)
-    return root / subject / algo / f"{now}_seed{config.seed}"
+    return root / subject / short_name(config.algo) / f"{now}_seed{config.seed}"
 
 
-def _new_folder(config: RunConfig[Any], root: Path) -> Path:
+def _new_folder(config: AnyConfig, root: Path) -> Path:
     base = new_folder_name(config, root)
     base.parent.mkdir(parents=True, exist_ok=True)
     path, count = base, 1
@@ -272,18 +228,11 @@ def _new_folder(config: RunConfig[Any], root: Path) -> Path:
             path = base.with_name(f"{base.name}_{count}")
 
 
-def _given_folder(path: Path) -> Path:
-    check_new(path)
-    path.mkdir(parents=True, exist_ok=True)
-    return path
-
-
 def check_new(path: Path) -> None:
-    """Makes sure that a run can begin in a folder.
+    """Raises BidexError where a run cannot begin in a folder.
 
-    Raises:
-        BidexError: There is something in it other than a run that failed or was killed before it had learned anything;
-            another process trains there; or it cannot be made or written.
+    It holds something other than a run that ended before it had learned anything, another process trains there, or it
+    cannot be written.
     """
     if exists(path) and not (path.is_dir() and (_torn_start(path) or not any(path.iterdir()))):
         raise BidexError(

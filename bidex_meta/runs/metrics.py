@@ -7,10 +7,9 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from bidex_meta.errors import BidexError
-from bidex_meta.runs.atomic import write_atomic
+from bidex_meta.runs.atomic import Json, write_atomic
 from bidex_meta.runs.writers import Writer, make_writer
 from bidex_meta.utils.files import bounded, exists, open_regular, read_bytes
 
@@ -20,29 +19,20 @@ _TAIL = 65_536
 
 
 class MetricsWriter:
-    """Appends to ``metrics.jsonl`` in the run folder, and tells a logger.
+    """Appends to ``metrics.jsonl`` in the run folder, and to a logger of ``bidex_meta.runs.writers``.
 
-    Args:
-        folder: The run folder.
-        resume_step: Of the checkpoint a resumed run starts from. Whatever was logged after it is dropped from
-            both, since the resumed run logs it again. None for a new run.
-        logger: Name in ``bidex_meta.runs.writers``.
+    Of a resumed run, both lose what was logged after ``resume_step``, its checkpoint's: it is logged again.
     """
 
     def __init__(self, folder: Path, resume_step: int | None = None, logger: str = "tensorboard"):
         path = folder / "metrics.jsonl"
         if resume_step is not None:
-            drop_after(path, resume_step)
+            _keep(path, [line for line, row in _lines(path) if row is not None and row["step"] <= resume_step])
         self._file = path.open("a")
         self.writer: Writer = make_writer(logger, folder, resume_step)
 
     def log(self, metrics: Mapping[str, float], step: int) -> None:
-        """Write one line, and one point of the logger per value.
-
-        Args:
-            metrics: Tag to number; a value that is not finite stands as null in the JSON.
-            step: Environment steps so far.
-        """
+        """Write one line, where a value that is not finite stands as null, and one point of the logger per value."""
         values = {tag: float(value) for tag, value in metrics.items()}
         finite = {tag: value if math.isfinite(value) else None for tag, value in values.items()}
         self._file.write(json.dumps({"step": step, "time": round(time.time(), 3), **finite}) + "\n")
@@ -59,19 +49,15 @@ class MetricsWriter:
         self.writer.close()
 
 
-def read_metrics(path: Path) -> list[dict[str, Any]]:
+def read_metrics(path: Path) -> list[Json]:
     """The lines of a ``metrics.jsonl``, without those that cannot be read, such as a last one torn by a crash.
 
-    Args:
-        path: The file.
-
-    Raises:
-        BidexError: There is no such file, or something else in its place.
+    Raises BidexError where there is no such file.
     """
-    return [row for _, row in _lines(path) if row is not None]
+    return [row for _, row in _lines(path, missing=False) if row is not None]
 
 
-def last_rows(path: Path) -> list[dict[str, Any]]:
+def last_rows(path: Path) -> list[Json]:
     """The last lines of a ``metrics.jsonl`` that can be read, without reading all of a long file; errors as there."""
     with open_regular(path, "a run's metrics", _MOST_BYTES) as file:
         file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL))
@@ -79,8 +65,8 @@ def last_rows(path: Path) -> list[dict[str, Any]]:
     return [row for row in rows if row is not None]  # a first one that was cut in two cannot be read
 
 
-def training_seconds(rows: Sequence[Mapping[str, Any]]) -> float:
-    """Wall time of the training, in seconds and over all resumes, that the lines of a ``metrics.jsonl`` tell of.
+def training_seconds(rows: Sequence[Json]) -> float:
+    """Wall time of the training, over all resumes, by the lines of a ``metrics.jsonl``.
 
     Of runs that did not yet log it: the time of the iterations alone, without that of checkpoints.
     """
@@ -90,18 +76,17 @@ def training_seconds(rows: Sequence[Mapping[str, Any]]) -> float:
     return max(logged, default=sum(unlogged))
 
 
-def mend(path: Path, step: int) -> list[dict[str, Any]]:
+def mend(path: Path, step: int) -> list[Json]:
     """The lines up to ``step`` of the run that goes on from there, whatever has become of its metrics.
 
-    What stands in the file's place without being one, and a file with lines that cannot be read beside a torn last one,
-    is kept as ``metrics.jsonl.damaged``, and reported: a good checkpoint shall not wait for its metrics.
+    Where they are no file, or lines before the last cannot be read, all stay as ``metrics.jsonl.damaged``, which is
+    reported: a good checkpoint shall not wait for its metrics.
     """
-    if not exists(path):
-        return []
     try:
         lines = _lines(path)
     except BidexError as error:
-        _set_aside(path, str(error))
+        print(f"{error} It is kept as {path.name}.damaged, and metrics begin anew.", file=sys.stderr)
+        path.rename(path.with_name(f"{path.name}.damaged"))
         return []
     bad = sum(row is None for _, row in lines[:-1])
     if bad:
@@ -112,29 +97,19 @@ def mend(path: Path, step: int) -> list[dict[str, Any]]:
     return [row for _, row in lines if row is not None and row["step"] <= step]
 
 
-def drop_after(path: Path, step: int) -> None:
-    """Keep only the lines of ``path`` with a step up to ``step``, as they are; a missing file becomes an empty one."""
-    lines = _lines(path) if exists(path) else []
-    _keep(path, [line for line, row in lines if row is not None and row["step"] <= step])
-
-
 def _keep(path: Path, lines: Sequence[bytes]) -> None:
     write_atomic(path, lambda file: file.write(b"".join(line + b"\n" for line in lines)))
 
 
-def _set_aside(path: Path, reason: str) -> None:
-    damaged = path.with_name(f"{path.name}.damaged")
-    print(f"{reason} It is kept as {damaged.name}, and metrics begin anew.", file=sys.stderr)
-    path.rename(damaged)
-
-
-def _lines(path: Path) -> list[tuple[bytes, dict[str, Any] | None]]:
-    """Every line that is not empty, and what it says; None where it cannot be read."""
+def _lines(path: Path, missing: bool = True) -> list[tuple[bytes, Json | None]]:
+    """Every line that is not empty, and its numbers by name, None where it cannot be read; the file may be missing."""
+    if missing and not exists(path):
+        return []
     lines = read_bytes(path, "a run's metrics", _MOST_BYTES).split(b"\n")
     return [(line, _row(line)) for line in lines if line.strip()]
 
 
-def _row(line: bytes) -> dict[str, Any] | None:
+def _row(line: bytes) -> Json | None:
     """A line's numbers by name; None where it holds anything else."""
     try:
         row = bounded(json.loads(line, parse_constant=lambda _: None))

@@ -1,4 +1,4 @@
-"""How training, or filming, goes, on stderr: a live table in a terminal, a plain line every few seconds elsewhere."""
+"""Progress of training or filming, on stderr: a live table in a terminal, a plain line every few seconds elsewhere."""
 
 import contextlib
 import math
@@ -12,6 +12,7 @@ from rich.live import Live
 from rich.markup import escape
 from rich.progress import track
 from rich.table import Table
+from typing_extensions import override
 
 from bidex_meta.utils.streams import silence
 
@@ -23,21 +24,18 @@ _RETURN = "Train/return/"
 
 
 class PlainConsole(Console):
-    """Leaves it to whoever prints what to do where nobody reads it; rich would end the process."""
+    """Raises BrokenPipeError where nobody reads what is printed; rich would end the process."""
 
+    @override
     def on_broken_pipe(self) -> None:
-        """Goes on with the error that is being handled."""
-        raise
+        raise  # the error that is being handled
 
 
 class Progress:
-    """Shows steps per second, time left, mean return and success, and both per task.
+    """Shows steps per second, time left, mean return and success, and both per task, on stderr or ``stream``.
 
-    Args:
-        total_steps: Environment steps of the whole run.
-        total_seconds: Training time of the whole run; what is up comes from the metric ``Perf/training_time``.
-        start_step: Where this process begins (a resumed run); its speed counts from there.
-        stream: Where to write; stderr by default, so that stdout keeps to results.
+    Steps and seconds in all are those of the whole run; its training time is the metric ``Perf/training_time``. Speed
+    counts from ``start_step`` on, where this process began.
     """
 
     def __init__(
@@ -47,7 +45,7 @@ class Progress:
         self._total, self._total_seconds = total_steps, total_seconds
         self._start_step = start_step
         self._start_time = time.monotonic()
-        self._last_line = -float("inf")
+        self._last_line = -math.inf
         self._shown: dict[str, float] = {}
         self._live = Live(console=self._console, auto_refresh=False) if self._console.is_terminal else None
 
@@ -58,15 +56,9 @@ class Progress:
             self._live.start()
 
     def update(self, metrics: Mapping[str, float], step: int) -> None:
-        """Show what is new.
+        """Show the metrics of an iteration; those of earlier ones stay, since it may end no episode.
 
-        Args:
-            metrics: Tags of this iteration; those of earlier ones stay shown (an iteration may end no episode).
-            step: Environment steps so far.
-
-        Raises:
-            BrokenPipeError: It cannot be shown: the reader has ended, the terminal is gone. What is shown later goes
-                nowhere.
+        Raises BrokenPipeError where the reader has ended or the terminal is gone; later output goes nowhere.
         """
         self._shown.update({tag: value for tag, value in metrics.items() if value == value})
         try:
@@ -80,37 +72,28 @@ class Progress:
             raise BrokenPipeError(f"progress cannot be shown: {error.strerror or error}") from error
 
     def close(self) -> None:
-        """Leave the terminal as it was found, the last table standing; where it is gone, quietly."""
+        """Restore the terminal, the last table standing; quietly where it is gone."""
         if self._live is not None:
             with contextlib.suppress(OSError):
                 self._live.stop()
 
     def _tasks(self) -> list[str]:
-        prefixes = (_SUCCESS, _RETURN)
-        names = [tag[len(prefix) :] for tag in self._shown for prefix in prefixes if tag.startswith(prefix)]
-        return list(dict.fromkeys(names))
+        starts = (_SUCCESS, _RETURN)
+        return list(dict.fromkeys(tag[len(s) :] for tag in self._shown for s in starts if tag.startswith(s)))
 
     def _line(self, step: int) -> str:
-        parts = [self._speed(step), *self._overall()]
-        parts += [f"{name} {_percent(self._shown.get(_SUCCESS + name))}" for name in self._tasks()]
-        return " | ".join(parts)
+        tasks = [f"{name} {_percent(self._shown.get(_SUCCESS + name))}" for name in self._tasks()]
+        return " | ".join([*self._overall(step), *tasks])
 
     def _table(self, step: int) -> Table:
-        title = "  ".join([self._speed(step), *self._overall()])
-        table = Table(title=title, title_justify="left", title_style="bold")
+        table = Table(title="  ".join(self._overall(step)), title_justify="left", title_style="bold")
         table.add_column("task")
         for column in ("success", "return"):
             table.add_column(column, justify="right")
         for name in self._tasks():
-            table.add_row(
-                escape(name), _percent(self._shown.get(_SUCCESS + name)), _number(self._shown.get(_RETURN + name))
-            )
+            success, mean_return = self._shown.get(_SUCCESS + name), self._shown.get(_RETURN + name)
+            table.add_row(escape(name), _percent(success), _number(mean_return))
         return table
-
-    def _speed(self, step: int) -> str:
-        seconds = self._seconds_left(step)
-        left = _duration(seconds) if seconds < math.inf else "?"
-        return f"{step:,} / {self._total:,} steps  {self._rate(step):,.0f} steps/s  {left} left"
 
     def _rate(self, step: int) -> float:
         return (step - self._start_step) / max(time.monotonic() - self._start_time, 1e-9)
@@ -121,29 +104,28 @@ class Progress:
         by_steps = 0.0 if steps <= 0 else steps / rate if rate > 0 else math.inf
         return min(by_steps, self._total_seconds - self._shown.get("Perf/training_time", 0.0))
 
-    def _overall(self) -> list[str]:
+    def _overall(self, step: int) -> list[str]:
+        seconds = self._seconds_left(step)
+        left = _duration(seconds) if seconds < math.inf else "?"
+        speed = f"{step:,} / {self._total:,} steps  {self._rate(step):,.0f} steps/s  {left} left"
         mean_return, success = self._shown.get("Train/mean_return"), self._shown.get("Train/success_rate")
-        return [f"return {_number(mean_return)}", f"success {_percent(success)}"]
+        return [speed, f"return {_number(mean_return)}", f"success {_percent(success)}"]
 
 
 def counted(items: Iterable[Item], total: int, what: str, stream: TextIO | None = None) -> Iterator[Item]:
-    """The items, with how far it is on stderr: a bar in a terminal, a plain line every few seconds elsewhere.
+    """The items, their number of at most ``total`` reported on stderr: a bar in a terminal, plain lines elsewhere.
 
-    Args:
-        items: What is made one after the other.
-        total: How many there will be at most.
-        what: Their name in the plural.
-        stream: Where to write instead.
+    ``what`` is their name in the plural.
     """
     console = PlainConsole(file=stream or sys.stderr)
     if console.is_terminal:
         yield from track(items, description=what, total=total, console=console, transient=True)
         return
-    said = time.monotonic()
+    reported = time.monotonic()
     for number, item in enumerate(items, start=1):
         yield item
-        if time.monotonic() - said >= _PLAIN_SECONDS:
-            said = time.monotonic()
+        if time.monotonic() - reported >= _PLAIN_SECONDS:
+            reported = time.monotonic()
             console.print(f"{number} of {total} {what}", highlight=False, markup=False)
 
 

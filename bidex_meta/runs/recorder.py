@@ -1,13 +1,13 @@
-"""The one object a training loop writes to: metrics, checkpoints, films and progress."""
+"""The object that a training loop writes to: metrics, checkpoints, films and progress."""
 
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 import numpy as np
 
+from bidex_meta.runs.checkpoints import State
 from bidex_meta.runs.folder import RunFolder
 from bidex_meta.runs.metrics import MetricsWriter
 from bidex_meta.runs.progress import Progress
@@ -17,12 +17,7 @@ from bidex_meta.runs.video import write_video
 class Recorder:
     """Records a training run. Use as a context manager, so that files are closed and the terminal is restored.
 
-    Args:
-        folder: The run folder.
-        total_steps: Environment steps of the whole run, for the progress display.
-        total_seconds: Training time of the whole run, for the same.
-        resume_step: Step of the checkpoint the run continues from; None for a new run.
-        logger: ``tensorboard``, ``wandb`` or ``none``.
+    Steps and seconds in all are for the progress display; ``resume_step`` is of the checkpoint the run continues from.
     """
 
     def __init__(
@@ -40,51 +35,28 @@ class Recorder:
         self._progress = Progress(total_steps, total_seconds, start_step=resume_step or 0)
 
     def log(self, metrics: Mapping[str, float], step: int) -> None:
-        """Write metrics and renew the progress display.
-
-        Args:
-            metrics: Tag to number, e.g. ``{"Train/mean_return": 3.2, "Train/success/HandOver": 0.1}``.
-            step: Environment steps so far.
-        """
+        """Write metrics by tag after ``step`` environment steps, and renew the progress display."""
         self._metrics.log(metrics, step)
         self._progress.update(metrics, step)
 
-    def save(self, state: dict[str, Any], step: int) -> None:
-        """Write a checkpoint, atomically.
-
-        Args:
-            state: Everything that is needed to continue; see ``Checkpoints.save``.
-            step: Environment steps so far.
-        """
+    def save(self, state: State, step: int) -> None:
+        """Write a checkpoint, atomically; see ``Checkpoints.save``."""
         self._metrics.flush()
         self._checkpoints.save(state, step)
 
     def film(self, name: str, frames: Iterable[np.ndarray], fps: float, step: int) -> Path:
-        """Write ``videos/<name>_<step>.mp4``, and tell the logger.
-
-        Args:
-            name: What is seen.
-            frames: ``(height, width, 3)`` uint8 each, height and width even.
-            fps: Frames per second.
-            step: Environment steps so far.
-        """
+        """Write ``videos/<name>_<step>.mp4`` and log it; frames ``(height, width, 3)``, uint8, both even."""
         path, kept = self._videos / f"{name}_{step}.mp4", list(frames)
         write_video(path, kept, fps)
         self._metrics.writer.film(f"Film/{name}", path, kept, fps, step)
         return path
 
-    def close(self) -> None:
-        """Close files and the progress display."""
-        self._progress.close()
-        self._metrics.close()
-
     def __enter__(self) -> "Recorder":
-        """Start the progress display."""
         self._progress.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """Close."""
-        self.close()
+        self._progress.close()
+        self._metrics.close()

@@ -1,11 +1,12 @@
 """What ``evaluation.json`` and ``versions.json`` of a run folder must hold; entries beyond these are free."""
 
 from pathlib import Path
-from typing import Annotated, Any, NotRequired, TypedDict
+from typing import Annotated, NotRequired, TypedDict
 
 from msgspec import Meta
 
 from bidex_meta.errors import BidexError
+from bidex_meta.runs.atomic import Json
 from bidex_meta.utils.files import exists, read_json
 from bidex_meta.utils.validation import Finite, Text, Whole, parse
 
@@ -48,35 +49,22 @@ class _Versions(TypedDict):
     git: NotRequired[_Git | None]
 
 
-def read_versions(folder: Path) -> dict[str, Any]:
-    """A run's ``versions.json``; empty where it has none.
-
-    Raises:
-        BidexError: The file cannot be read, or holds something else.
-    """
+def read_versions(folder: Path) -> Json:
+    """A run's ``versions.json``, checked; empty where it has none."""
     path = folder / "versions.json"
     return check_versions(read_json(path, "a run's versions"), str(path)) if exists(path) else {}
 
 
-def check_versions(content: Any, where: str) -> dict[str, Any]:
-    """The same versions; ``where`` for messages.
-
-    Raises:
-        BidexError: Names the first entry that is not what it must be.
-    """
+def check_versions(content: Json, where: str) -> Json:
+    """The same versions; raises BidexError, which begins with ``where``, for the first entry of a wrong type."""
     parse(content, _Versions, where)
     return content
 
 
-def read_evaluation(path: Path, again: str) -> dict[str, Any]:
+def read_evaluation(path: Path, again: str) -> Json:
     """An evaluation, or a meta-test, as ``run`` and ``evaluate --json`` write it.
 
-    Args:
-        path: Its file.
-        again: How to write it anew, for messages.
-
-    Raises:
-        BidexError: The file cannot be read, or holds something else.
+    Raises BidexError, with ``again`` as the command that writes it anew, where it cannot be read or is something else.
     """
     try:
         return check_evaluation(read_json(path, "an evaluation"), str(path))
@@ -84,12 +72,8 @@ def read_evaluation(path: Path, again: str) -> dict[str, Any]:
         raise BidexError(f"{error} Write it anew: {again}") from None
 
 
-def check_evaluation(content: Any, where: str) -> dict[str, Any]:
-    """The same evaluation; ``where`` for messages.
-
-    Raises:
-        BidexError: Names the first entry that is not what it must be.
-    """
+def check_evaluation(content: Json, where: str) -> Json:
+    """The same evaluation; raises BidexError, which begins with ``where``, for the first entry of a wrong type."""
     parse(content, _Evaluation, where)
     if "splits" not in content and "policy" not in content:
         parse(content, _Classes, where)

@@ -1,4 +1,4 @@
-"""A run as one file of JSON: what is left of it for tables and pictures when its folder, with the weights, is gone.
+"""A run as one file of JSON, for tables and pictures when its folder, with the weights, is gone.
 
 ::
 
@@ -13,12 +13,13 @@
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, TypedDict
+from typing import Annotated, Literal, TypedDict
 
 from msgspec import Meta
 
 from bidex_meta.config import RunConfig, config_of
 from bidex_meta.errors import BidexError
+from bidex_meta.runs.atomic import Json
 from bidex_meta.runs.folder import RunFolder
 from bidex_meta.runs.schemas import check_evaluation, check_versions
 from bidex_meta.utils.files import read_json
@@ -32,86 +33,33 @@ class _File(TypedDict):
     format: Annotated[int, Meta(ge=FORMAT, le=FORMAT)]
     name: Text
     arm: Text
-    suite: dict[str, Any] | None
-    config: dict[str, Any]
-    versions: dict[str, Any]
+    suite: Json | None
+    config: Json
+    versions: Json
     engine: Literal["c", "warp"]
     steps: Whole
     seconds: NonNegative
     parameters: Whole | None
     curves: dict[str, list[Finite | None]]
-    evaluation: dict[str, Any]
-
-
-class Run(Protocol):
-    """What tables, curves and reports ask of a run, be it a folder or a file."""
-
-    @property
-    def path(self) -> Path:
-        """The folder or the file."""
-        ...
-
-    @property
-    def again(self) -> str:
-        """The command that writes its evaluation anew, for messages."""
-        ...
-
-    @property
-    def evaluated(self) -> bool:
-        """Whether there is an evaluation."""
-        ...
-
-    @property
-    def videos_path(self) -> Path:
-        """Where its films lie, if it has any."""
-        ...
-
-    def config(self) -> RunConfig[dict[str, Any]]:
-        """The resolved config; see :meth:`RunFolder.config`."""
-        ...
-
-    def metrics(self) -> list[dict[str, Any]]:
-        """Logged rows, each with ``step``, rising; of a file thinned."""
-        ...
-
-    @property
-    def goal(self) -> int:
-        """Steps that it trains for; see :attr:`RunFolder.goal`."""
-        ...
-
-    def versions(self) -> dict[str, Any]:
-        """What it was made with."""
-        ...
-
-    def evaluation(self) -> dict[str, Any]:
-        """The final evaluation; see :meth:`RunFolder.evaluation`."""
-        ...
+    evaluation: Json
 
 
 @dataclass(frozen=True)
 class StoredRun:
-    """A run as one file of JSON. Made by ``open``."""
+    """A run as one file of JSON, created by ``open``; methods as those of :class:`RunFolder`."""
 
     path: Path
 
     @classmethod
     def open(cls, path: Path) -> "StoredRun":
-        """An existing file.
-
-        Raises:
-            BidexError: It cannot be read, or is no run.
-        """
+        """An existing file; raises BidexError where it cannot be read, or is no run."""
         stored = cls(Path(path))
         _ = stored.content
         return stored
 
     @cached_property
-    def content(self) -> dict[str, Any]:
-        """All of the file, checked.
-
-        Raises:
-            BidexError: It cannot be read, or is no run.
-        """
+    def content(self) -> Json:
+        """All of the file, checked; errors as of ``open``."""
         found = read_json(self.path, "a run's data")
         parse(found, _File, str(self.path))
         config_of(found["config"], f"{self.path}: config")
@@ -121,17 +69,17 @@ class StoredRun:
         steps = curves.get("step", [])
         if not steps or not all(type(step) is int for step in steps) or steps != sorted(steps):
             raise BidexError(f"{self.path}: curves.step: expected rising whole numbers. Collect the run again.")
-        odd = [tag for tag, column in curves.items() if len(column) != len(steps)]
-        if odd:
-            raise BidexError(
-                f"{self.path}: curves.{odd[0]}: expected {len(steps)} values as in curves.step, got "
-                f"{len(curves[odd[0]])}. Collect the run again."
-            )
+        for tag, column in curves.items():
+            if len(column) != len(steps):
+                raise BidexError(
+                    f"{self.path}: curves.{tag}: expected {len(steps)} values as in curves.step, got {len(column)}. "
+                    "Collect the run again."
+                )
         return found
 
     @property
     def again(self) -> str:
-        """As in :class:`Run`."""
+        """The command that writes it anew, for messages."""
         return f"python -m tools.collect RUN --into {self.path.parent}"
 
     @property
@@ -141,7 +89,7 @@ class StoredRun:
 
     @property
     def videos_path(self) -> Path:
-        """As in :class:`Run`: a folder that is not there."""
+        """A folder that is not there."""
         return self.path.with_suffix("") / "videos"
 
     @property
@@ -149,36 +97,35 @@ class StoredRun:
         """What its study calls it."""
         return self.content["arm"]
 
-    def config(self) -> RunConfig[dict[str, Any]]:
-        """As in :class:`Run`; paths of own suites and of other runs are names alone."""
+    def config(self) -> RunConfig[Json]:
+        """The resolved config; paths of own suites and of other runs are names alone."""
         return config_of(self.content["config"], f"{self.path}: config")
 
-    def metrics(self) -> list[dict[str, Any]]:
-        """As in :class:`Run`: means over stretches of about equal length, at their ends."""
+    def metrics(self) -> list[Json]:
+        """Means over stretches of about equal length, at their ends."""
         curves = self.content["curves"]
         return [dict(zip(curves, row, strict=True)) for row in zip(*curves.values(), strict=True)]
 
     @property
     def goal(self) -> int:
-        """As in :class:`Run`: what has not come to its end is never collected, so that fewer steps were its end."""
+        """Steps that it trained for: unfinished runs are never collected, so that fewer steps were its end."""
         config, steps = self.config(), self.content["steps"]
         return steps if config.minutes is not None else min(steps, config.steps)
 
-    def versions(self) -> dict[str, Any]:
-        """As in :class:`Run`."""
+    def versions(self) -> Json:
+        """Packages, machine and git state."""
         return self.content["versions"]
 
-    def evaluation(self) -> dict[str, Any]:
-        """As in :class:`Run`."""
+    def evaluation(self) -> Json:
+        """The final evaluation."""
         return self.content["evaluation"]
 
 
-def open_run(path: Path) -> RunFolder | StoredRun:
-    """A run by its folder, or by its file of JSON.
+Run = RunFolder | StoredRun
 
-    Raises:
-        BidexError: It is neither.
-    """
+
+def open_run(path: Path) -> Run:
+    """A run by its folder, or by its file of JSON; raises BidexError where it is neither."""
     # A folder may be called so too.
     if path.suffix == ".json" and not path.is_dir():
         return StoredRun.open(path)

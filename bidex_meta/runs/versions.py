@@ -1,34 +1,42 @@
 """What a result depends on beside its config: the versions of everything, the machine and the state of the source."""
 
+import contextlib
 import os
 import platform
 import subprocess
 import sys
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+
+from bidex_meta.runs.atomic import Json
 
 _PACKAGES = ("bidex-meta", "mujoco", "mujoco-warp", "warp-lang", "torch", "gymnasium", "metaworld", "numpy", "scipy")
 
 
-def collect_versions() -> dict[str, Any]:
+def collect_versions() -> Json:
     """Python, packages (None where not installed), machine, GPUs and git state, ready for JSON."""
+    import torch
+
     return {
         "python": sys.version.split()[0],
         "packages": package_versions(),
         "platform": platform.platform(),
         "cpus": os.cpu_count(),
-        "gpus": _gpus(),
+        "gpus": [torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())],
         "git": git_state(Path(__file__).parent),
     }
 
 
 def package_versions() -> dict[str, str | None]:
     """Of all packages that results depend on; None where one is not installed."""
-    return {name: _installed(name) for name in _PACKAGES}
+    versions: dict[str, str | None] = dict.fromkeys(_PACKAGES)
+    for name in _PACKAGES:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            versions[name] = metadata.version(name)
+    return versions
 
 
-def git_state(folder: Path) -> dict[str, Any] | None:
+def git_state(folder: Path) -> Json | None:
     """Commit and whether anything was changed since; None where ``folder`` is not tracked by git.
 
     An installed package inside somebody's project lies in *their* repository without being tracked: that commit
@@ -46,16 +54,3 @@ def _git(folder: Path, *arguments: str) -> str:
     except (OSError, subprocess.TimeoutExpired):
         return ""
     return done.stdout.strip() if done.returncode == 0 else ""
-
-
-def _installed(name: str) -> str | None:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return None
-
-
-def _gpus() -> list[str]:
-    import torch
-
-    return [torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())]

@@ -1,10 +1,11 @@
 """Pictures and films from rendered frames. PNG and WebP need nothing extra, MP4 the extra ``video``."""
 
 import errno
+import io
 import math
 from collections.abc import Iterable, Sequence
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,11 +19,7 @@ _BACK, _INK, _DONE = (24, 26, 30), (215, 218, 224), (110, 220, 130)
 
 
 def check_suffix(path: Path) -> str:
-    """The ending of ``path`` in lower case.
-
-    Raises:
-        BidexError: It is another than these three.
-    """
+    """The ending of ``path`` in lower case; raises BidexError for another than these three."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise BidexError(f"A picture ends in .png, a film in .mp4 or .webp, but {path.name!r} in none of them.")
@@ -30,63 +27,40 @@ def check_suffix(path: Path) -> str:
 
 
 def write_image(path: Path, frame: np.ndarray) -> None:
-    """Write one frame as PNG.
-
-    Args:
-        path: The file; missing folders are made.
-        frame: ``(height, width, 3)`` uint8.
-    """
-    import imageio.v3 as imageio
-
+    """Write one frame ``(height, width, 3)``, uint8, as PNG; missing folders are created."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    picture = imageio.imwrite("<bytes>", frame, extension=".png")
+    picture = encoded([frame], "PNG")
     write_atomic(path, lambda file: file.write(picture))
 
 
 def check_films() -> None:
-    """Refuse MP4 where it cannot be written.
+    """Raises BidexError where MP4 cannot be written, since imageio-ffmpeg is missing."""
+    if find_spec("imageio_ffmpeg") is None:
+        raise BidexError("Films need imageio-ffmpeg: pip install 'bidex-meta[video]', or write .webp.")
 
-    Raises:
-        BidexError: imageio-ffmpeg is missing.
-    """
-    try:
-        import imageio_ffmpeg  # noqa: F401
-    except ImportError:
-        raise BidexError("Films need imageio-ffmpeg: pip install 'bidex-meta[video]', or write .webp.") from None
+
+def encoded(frames: Iterable[np.ndarray], kind: str, **options: int) -> bytes:
+    """Frames ``(height, width, 3)``, uint8, in a format of Pillow's with its options; several as an animation."""
+    from PIL import Image
+
+    out, pictures = io.BytesIO(), (Image.fromarray(frame) for frame in frames)
+    animation = {} if kind == "PNG" else {"save_all": True, "append_images": pictures, "loop": 0}
+    next(pictures).save(out, kind, **animation, **options)
+    return out.getvalue()
 
 
 def write_animation(path: Path, frames: Iterable[np.ndarray], fps: float, quality: int = 60) -> None:
-    """Write frames as an animated WebP that plays for ever, as web pages show it without a player.
-
-    Args:
-        path: The file; missing folders are made.
-        frames: ``(height, width, 3)`` uint8 each.
-        fps: Frames per second.
-        quality: Of the pictures, 0 to 100; smaller makes smaller files.
-    """
-    from PIL import Image
-
+    """Write frames ``(height, width, 3)``, uint8, as a WebP that plays for ever on web pages; ``quality`` 0 to 100."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    pictures = (Image.fromarray(frame) for frame in frames)
-    options: dict[str, Any] = {"duration": round(1000 / fps), "loop": 0, "quality": quality, "method": 6}
-    first = next(pictures)
-    write_atomic(path, lambda file: first.save(file, "WEBP", save_all=True, append_images=pictures, **options))
+    film = encoded(frames, "WEBP", duration=round(1000 / fps), quality=quality, method=6)
+    write_atomic(path, lambda file: file.write(film))
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
-    """Write frames as an MP4 (H.264), one at a time, so that a long film needs no memory.
+    """Write frames as an MP4 (H.264), one at a time, so that a long film needs no memory; returns their number.
 
-    Args:
-        path: The file; missing folders are made.
-        frames: ``(height, width, 3)`` uint8 each; height and width even, as H.264 demands.
-        fps: Frames per second.
-
-    Returns:
-        How many frames were written.
-
-    Raises:
-        BidexError: imageio-ffmpeg is missing.
-        OSError: It cannot be written; what was there before stays.
+    Frames are ``(height, width, 3)``, uint8, height and width even. Raises BidexError where imageio-ffmpeg is missing,
+    and OSError where the file cannot be written; what was there before stays.
     """
     check_films()
     import imageio
@@ -110,15 +84,15 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
 def _whole(path: Path) -> bool:
     """Whether an MP4 ends in the table of its frames, which is written last: imageio does not say how ffmpeg ended."""
     with path.open("rb") as file:
-        end, place, kind = file.seek(0, 2), 0, b""
-        while place < end:
-            file.seek(place)
+        end, offset, kind = file.seek(0, 2), 0, b""
+        while offset < end:
+            file.seek(offset)
             size, kind = int.from_bytes(file.read(4)), file.read(4)
             size = int.from_bytes(file.read(8)) if size == 1 else size  # 1: a length of eight bytes follows
             if size < 8:
                 return False
-            place += size
-        return place == end and kind == b"moov"
+            offset += size
+        return offset == end and kind == b"moov"
 
 
 def grid(count: int) -> tuple[int, int]:
@@ -128,24 +102,18 @@ def grid(count: int) -> tuple[int, int]:
 
 
 def tiled(pictures: Sequence[np.ndarray], names: Sequence[str], done: Sequence[bool]) -> np.ndarray:
-    """One picture of all.
+    """Pictures of one shape ``(height, width, 3)``, uint8, side by side with their names, in green where ``done``.
 
-    Args:
-        pictures: Each ``(height, width, 3)`` uint8, of one size.
-        names: Under each.
-        done: Whose name is written in green.
-
-    Returns:
-        ``(rows * (height + 20), columns * width, 3)`` uint8.
+    Returns ``(rows * (height + 20), columns * width, 3)``, uint8.
     """
     height, width, _ = pictures[0].shape
     columns, rows = grid(len(pictures))
     whole = np.empty((rows * (height + _STRIP), columns * width, 3), np.uint8)
     whole[:] = _BACK
-    for place, picture in enumerate(pictures):
-        top, left = place // columns * (height + _STRIP), place % columns * width
+    for number, picture in enumerate(pictures):
+        top, left = number // columns * (height + _STRIP), number % columns * width
         whole[top : top + height, left : left + width] = picture
-        whole[top + height : top + height + _STRIP, left : left + width] = _label(names[place], width, done[place])
+        whole[top + height : top + height + _STRIP, left : left + width] = _label(names[number], width, done[number])
     return whole
 
 

@@ -26,9 +26,7 @@ class Solver:
     """What a class asks of the contact solver beyond the common profile (bidex_meta/hands/README.md).
 
     Attributes:
-        iterations: Newton iterations at most.
-        line_search: Steps of a line search at most.
-        integrator: MuJoCo's integrator.
+        iterations: Newton iterations at most; ``line_search``: steps of a line search at most.
         cone: Friction cones: an elliptic one is exact, a pyramid costs a quarter to a third less and slips a little.
         impratio: How much stiffer friction is than the normal force: a held object creeps the less.
         time_step: Seconds: a whole number to a control step. Contacts and limits are as stiff as it allows.
@@ -66,10 +64,8 @@ class TaskClass(ABC):
     A class has no state: what a task freezes is in ``frozen``, what an episode draws is in ``draws``.
 
     Attributes:
-        name: Name of the class, e.g. ``CatchUnderarm``.
-        summary: What it asks for, one line.
-        formula: The printed reward, in the words of the reward terms' docstring.
-        solved: When it counts as solved, one line.
+        name: Name of the class, e.g. ``CatchUnderarm``; ``summary``: what it asks for, one line.
+        formula: The printed reward; ``solved``: when it counts as solved, one line.
         deviations: What differs from the appendix on purpose, a line each.
         episode_steps: Time limit, control steps.
         right: Start pose of the right hand; ``left`` of the left one.

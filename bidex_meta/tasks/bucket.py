@@ -21,10 +21,8 @@ from bidex_meta.tasks.variation import component, join
 from bidex_meta.utils.maths import conjugate, multiply, norm, quaternion_from_rpy, rotate, uprightness, xyzw
 from bidex_meta.utils.validation import whole_number
 
-FLOOR, RIM = -0.049, 0.0445
-"""Heights of the inner floor and of the rim in the bucket's frame, metres (assets/objects/bucket.xml)."""
-MOUTH = 0.0345
-"""Height of its point on the axis just below the rim, metres: the site ``mouth``."""
+FLOOR, MOUTH, RIM = -0.049, 0.0345, 0.0445
+"""Heights of the inner floor, the site ``mouth`` and the rim in the frame of assets/objects/bucket.xml, metres."""
 _FLOOR_RADIUS, _RIM_RADIUS = 0.0255, 0.053
 """Inner radius at these heights, to the middle of a wall, metres."""
 

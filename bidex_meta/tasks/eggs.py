@@ -64,8 +64,7 @@ def lay_egg_on_hand(
 ) -> None:
     """Lifts an egg, or what a spheroid bounds, off the palm it lies on and opens the fingers that would stick in it.
 
-    Positions of the egg (n, 7) and joint angles of the hand (n, 24), which starts at ``pose``, are written in place.
-    ``radius`` and ``half`` are the short and the long semi-axis, metres.
+    Written in place: the egg (n, 7) and joint angles (n, 24) of the hand that starts at ``pose``. Semi-axes in metres.
     """
     quaternion = xyzw(constant(pose.quaternion, egg))
     inverse = conjugate(quaternion)
@@ -112,8 +111,7 @@ class EggTask(TaskClass):
     Attributes:
         starts: Nominal start of each egg, world, metres: of one that lies on the right hand, and of one on the left.
         goals: Centre of the box of each egg's goals, world, metres.
-        position_noise: Half width of the eggs' position noise at a start, metres.
-        joint_noise: Joint noise at a start, a share of each joint's range.
+        position_noise: Half width of the eggs' noise at a start, m; ``joint_noise``: a share of each joint's range.
         lies_on_hand: Whether an egg starts on a palm, so that room is cleared for it.
         alpha: Weight of the distance in the reward, per metre.
         floor: The episode fails when an egg's height falls to this, metres.

@@ -6,10 +6,8 @@ from functools import cached_property
 
 from bidex_meta.hands.hand import FINGERS, SIDES, hand
 
-VELOCITY_SCALE = 0.2
-"""Scale of joint velocities and of objects' angular velocities (docs/figures.md, observation)."""
-FORCE_SCALE = 10.0
-"""Scale of joint forces and of fingertip forces and torques (docs/figures.md, observation)."""
+VELOCITY_SCALE, FORCE_SCALE = 0.2, 10.0
+"""Scales of joint and objects' angular velocities, and of forces and torques (docs/figures.md, observation)."""
 CLIP = 5.0
 """Every entry is clipped to +-5 after its scale (docs/figures.md, control)."""
 _TIP_STATE = "per distal body: origin (m), quaternion (x, y, z, w), velocities (m/s, rad/s), world frame"

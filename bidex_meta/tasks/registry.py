@@ -28,6 +28,11 @@ def names() -> list[str]:
     return list(_MODULES)
 
 
+def module_of(name: str) -> str:
+    """Name of the module of a class in ``names``; it need not be imported yet."""
+    return f"bidex_meta.tasks.{_MODULES[name]}"
+
+
 def resolve(name: str, kind: str = "task class") -> str:
     """The name by which ``get`` knows a class, given in any case; ``package.module:Class`` stays as it is.
 
@@ -59,7 +64,7 @@ def get(name: str, moving_base: bool | None = None, **options: float | str) -> "
     if is_outside(name):
         task_class = _outside(name)
     elif (plain := name.removesuffix(_V2)) in _MODULES:
-        task_class = vars(importlib.import_module(f"bidex_meta.tasks.{_MODULES[plain]}"))[plain]
+        task_class = vars(importlib.import_module(module_of(plain)))[plain]
     else:
         raise unknown_name("task class", name, _MODULES)
     known = list(inspect.signature(task_class).parameters)[1:]

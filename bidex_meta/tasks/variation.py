@@ -38,9 +38,7 @@ class VariationSpace:
 def join(*parts: VariationSpace) -> VariationSpace:
     """One space of the components of several, in their order."""
     return VariationSpace(
-        names=sum((p.names for p in parts), ()),
-        low=sum((p.low for p in parts), ()),
-        high=sum((p.high for p in parts), ()),
+        sum((p.names for p in parts), ()), sum((p.low for p in parts), ()), sum((p.high for p in parts), ())
     )
 
 

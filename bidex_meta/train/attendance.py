@@ -8,6 +8,8 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
+from typing_extensions import override
+
 from bidex_meta.train.launch import hangup
 
 _BEAT_SECONDS = 0.5
@@ -20,11 +22,10 @@ _JOIN_SECONDS = 10.0
 
 
 class Attendance(threading.Thread):
-    """Counts up in the store twice a second, so that the others see that this process lives, whatever it is doing.
+    """Counts up in torchrun's store twice a second, to show the other processes of ``count`` that this one lives.
 
-    It may wait, deep inside a collective operation, for one that does not live. So if a signal asked it to end, it has
-    not done so for 12 seconds and another is missing, the thread calls ``on_loss`` and ends the process. torchrun keeps
-    the ``store``, so that it outlives each of the ``count`` processes.
+    It may wait in a collective operation for one that does not live. So if a signal asked it to end, it has not done so
+    for 12 seconds and another is missing, the thread calls ``on_loss`` and ends the process.
     """
 
     def __init__(self, store: Any, rank: int, count: int):
@@ -42,10 +43,7 @@ class Attendance(threading.Thread):
         self.start()
 
     def report(self) -> list[int] | None:
-        """Reports to the others that this process ends because one is lost, and returns the missing ones' numbers.
-
-        None where another process was quicker and will report it.
-        """
+        """Reports the end of this process to the others, and returns the lost ones; None where another reports them."""
         self._closed.set()
         try:
             self._store.set(f"reported {self._rank}", "")
@@ -54,14 +52,14 @@ class Attendance(threading.Thread):
             return []  # the store is gone too
 
     def close(self) -> None:
-        """No longer takes part; returns when the thread has ended, or waits for a store that no longer answers."""
+        """Ends the thread; returns when it has ended, or waits for a store that no longer answers."""
         self._closed.set()
         self.join(_JOIN_SECONDS)
         if threading.current_thread() is threading.main_thread():
             signal.set_wakeup_fd(-1)
 
+    @override
     def run(self) -> None:
-        """The thread's work."""
         asked_at = None
         while not self._closed.wait(_BEAT_SECONDS):
             try:
@@ -95,9 +93,9 @@ class Attendance(threading.Thread):
 
 
 def end_patiently() -> None:
-    """Leaves ten seconds between SIGTERM and the end of the process, where nobody else handles that signal.
+    """Leaves ten seconds between SIGTERM and the end of the process, unless another handler takes over.
 
-    torchrun sends it to all others as soon as one process is gone, which is just when they want to say so.
+    torchrun sends it to all others as soon as one process is gone, just when they report that.
     """
 
     def on_signal(number: int, frame: FrameType | None) -> None:

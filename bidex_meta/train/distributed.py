@@ -1,7 +1,6 @@
 """One run in several processes, started by torchrun and joined by torch.distributed: sums, broadcasts, agreement.
 
-Each process steps a world of its own. In a single process every function here returns its input unchanged, and nothing
-is sent.
+Each steps a world of its own. In a single process every function here returns its input, and nothing is sent.
 """
 
 import atexit
@@ -12,7 +11,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 import torch.distributed as dist
@@ -21,9 +20,10 @@ from torch.distributed.rendezvous import rendezvous
 
 from bidex_meta.errors import BidexError
 from bidex_meta.train.attendance import Attendance, end_patiently
+from bidex_meta.train.learner import State
 
-# How long one process may wait for another. A dead one closes its sockets and is noticed at once; this is for a machine
-# that no longer answers, and must exceed what process 0 needs to write a checkpoint.
+# A dead process closes its sockets and is noticed at once; this is for a machine that no longer answers, and must be
+# longer than process 0 takes to write a checkpoint.
 TIMEOUT = timedelta(minutes=5)
 
 Value = TypeVar("Value")
@@ -31,7 +31,7 @@ _attendance: Attendance | None = None
 
 
 class LostProcess(RuntimeError):
-    """A process of the run did not take part in a collective operation: it is dead, stuck or cut off."""
+    """A process of the run is missing in a collective operation: dead, stuck or cut off."""
 
 
 def rank() -> int:
@@ -45,12 +45,12 @@ def world_size() -> int:
 
 
 def is_main() -> bool:
-    """Whether this is process 0, which alone writes and speaks."""
+    """Whether this is process 0, which alone writes and prints."""
     return rank() == 0
 
 
 def own_seed(seed: int) -> int:
-    """A seed for what shall differ between processes (starts, sampled actions): ``seed`` itself in process 0."""
+    """A seed of this process alone (starts, sampled actions): ``seed`` itself in process 0."""
     if is_main():
         return seed
     # 32 bits: torch's CPU generator reads no more, so that seed + (rank << 32) would be the same in all processes.
@@ -78,7 +78,7 @@ def init_from_environment() -> None:
 
 
 def shut_down() -> None:
-    """Parts from the other processes once all have come here; each is on its own from then on."""
+    """Leaves the other processes once all have come here."""
     if _joined():
         with _collective():
             dist.barrier()
@@ -94,10 +94,10 @@ def _end_threads() -> None:
 
 
 def _leave() -> None:
-    """Ends what still runs beside the main thread, in a process that ends without :func:`shut_down`.
+    """Ends all threads in a process that ends without :func:`shut_down`.
 
-    A thread that asks for the interpreter when it has gone (the attendance, back from the store; gloo's own, dropping
-    its last tensor) is unwound through C++ that may not throw: "terminate called without an active exception".
+    One that asks for the interpreter when it is gone (the attendance, gloo's own) is unwound through C++ that may not
+    throw: "terminate called without an active exception".
     """
     _end_threads()
     # With NCCL this might wait for a process that is lost.
@@ -111,22 +111,22 @@ def report_loss() -> list[int] | None:
 
 
 def on_loss(function: Callable[[], None]) -> None:
-    """Has ``function`` called before a process ends that cannot stop when asked, since it waits for a lost one."""
+    """Calls ``function`` before a process ends that cannot stop when asked, since it waits for a lost one."""
     if _attendance is not None:
         _attendance.on_loss = function
 
 
 def all_sum(x: Tensor) -> Tensor:
-    """Sum of ``x`` (any shape, the same in all processes) over the processes."""
+    """Sum of ``x``, of one shape in all processes, over the processes."""
     return _reduced(x, dist.ReduceOp.SUM)
 
 
 def all_max(x: Tensor) -> Tensor:
-    """The largest of each entry of ``x`` (any shape, the same in all processes) over the processes."""
+    """Maximum of each entry of ``x``, likewise."""
     return _reduced(x, dist.ReduceOp.MAX)
 
 
-def _reduced(x: Tensor, operation: Any) -> Tensor:
+def _reduced(x: Tensor, operation: dist.ReduceOp.RedOpType) -> Tensor:
     if world_size() == 1:
         return x
     total = x.detach().clone()
@@ -179,38 +179,35 @@ def share(value: Value) -> list[Value]:
     """The values of all processes, in all processes: small ones, that pickle can copy."""
     if world_size() == 1:
         return [value]
-    values: list[Any] = [None] * world_size()
+    values = [value] * world_size()
     with _collective():
         dist.all_gather_object(values, value)
     return values
 
 
-def gather(state: dict[str, Any]) -> list[dict[str, Any]] | None:
+def gather(state: State) -> list[State] | None:
     """The states of all processes, in process 0, tensors on the CPU; None in the others."""
     if world_size() == 1:
         return [state]
     data = io.BytesIO()
     if not is_main():
         torch.save(state, data)
-    found: list[Any] | None = [None] * world_size() if is_main() else None
+    parts = [b""] * world_size() if is_main() else None
     with _collective():
-        dist.gather_object(data.getvalue(), found)
-    if found is None:
+        dist.gather_object(data.getvalue(), parts)
+    if parts is None:
         return None
-    return [state] + [torch.load(io.BytesIO(part), map_location="cpu", weights_only=True) for part in found[1:]]
+    return [state] + [torch.load(io.BytesIO(part), map_location="cpu", weights_only=True) for part in parts[1:]]
 
 
 def together(function: Callable[[], Value]) -> Value:
-    """``function()``, where bad input in any process ends all of them and only the first of those concerned reports it.
-
-    The first process with a BidexError raises it, the others SystemExit.
-    """
+    """``function()``; with BidexError in any process, the first of these raises it and all others SystemExit."""
     error, value = None, None
     try:
         value = function()
     except BidexError as caught:
         error = caught
-    failed = [i for i, met in enumerate(share(error is not None)) if met]
+    failed = [i for i, is_bad in enumerate(share(error is not None)) if is_bad]
     if error is not None and rank() == failed[0]:
         raise error
     if failed:

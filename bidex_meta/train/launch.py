@@ -31,8 +31,7 @@ def launch() -> Launch:
 
 def hangup() -> tuple[signal.Signals, ...]:
     """SIGHUP, which comes when the terminal closes; nothing where it is ignored (``nohup``), and on Windows."""
-    number = getattr(signal, "SIGHUP", None)
-    return () if number is None or signal.getsignal(number) == signal.SIG_IGN else (number,)
+    return () if os.name != "posix" or signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else (signal.SIGHUP,)
 
 
 def resume_command(path: Path, processes: int) -> str:

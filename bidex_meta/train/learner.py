@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 AutoresetMode = Literal["SAME_STEP", "DISABLED"]
 State = dict[str, Any]
-"""Tensors, numbers, texts, None, and dicts and lists of these: a part of a checkpoint."""
+"""A part of a checkpoint: tensors, numbers, texts, None, and dicts and lists of these."""
 Parts = dict[str, Any]
 """What goes into a checkpoint, by name: modules, optimisers, generators, tensors, and dicts and lists of these."""
 
@@ -36,29 +36,28 @@ class LearnerConfig(Checked):
 
 
 class Learner(ABC):
-    """Base of all learners, made on a world in the mode that :meth:`autoreset_mode` returns.
+    """Base of all learners, of a world in the mode that :meth:`autoreset_mode` returns.
 
-    ``config`` is an instance of the dataclass of its presets; ``seed`` is of all that is random, the world's first
-    reset among it.
+    ``config`` is an instance of the dataclass of its presets; ``seed`` is of everything random, the world's first reset
+    too.
     """
 
     name: ClassVar[str] = "learner"
     """Its name in messages."""
     presets: ClassVar[Mapping[str, Any]] = {}
-    """Configs by name, all of one dataclass. ``auto`` takes ``laptop`` on a CPU and ``paper`` on a GPU, or the first
-    where one of them is missing."""
+    """Configs by name, all of one dataclass. ``auto``: ``laptop`` on a CPU, ``paper`` on a GPU, else the first."""
     task_presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
-    """More presets where it learns a single task class, by that class; they go before those of the same name."""
+    """Presets where it learns a single task class, by that class; they go before those of the same name."""
     adapts: ClassVar[bool] = False
     """Whether its policy adapts to tasks: ``load_policy`` returns a :class:`bidex_meta.agents.MetaLearningAgent`, which
-    explores by a generator of its own, seeded alike by each call. The meta-test reads ``max_adapt_steps`` (longest
-    episode of adaptation) and ``tasks_per_class`` (tasks of a meta-batch) of its config, where they are there."""
+    explores by its own generator, seeded alike by each call. The meta-test reads ``max_adapt_steps`` (longest episode
+    of adaptation) and ``tasks_per_class`` (tasks of a meta-batch) of its config, if there."""
     independent_adaptation: ClassVar[bool] = False
-    """Whether each environment adapts from its own episodes alone, also where several play the same task."""
+    """Whether each environment adapts from its own episodes alone, even where several play the same task."""
     offline: ClassVar[bool] = False
     """Whether it learns from data sets (:meth:`learn_from`) and never steps the world."""
     imitates: ClassVar[bool] = False
-    """Whether it takes demonstrations beside what it learns by playing (:meth:`learn_from_demonstrations`)."""
+    """Whether it takes demonstrations while it learns by playing (:meth:`learn_from_demonstrations`)."""
     per_process: tuple[str, ...] = ()
     """Entries of ``state_dict`` that differ from process to process; the others are equal in all."""
     env_steps: int
@@ -84,7 +83,7 @@ class Learner(ABC):
 
     @abstractmethod
     def state_dict(self) -> State:
-        """What is needed to continue bit for bit, beside the world's state; ``policy`` is :meth:`policy_state_dict`."""
+        """All to continue bit for bit, beside the world's state; entry ``policy`` is :meth:`policy_state_dict`."""
 
     @abstractmethod
     def load_state_dict(self, state: State) -> None:
@@ -92,7 +91,7 @@ class Learner(ABC):
 
     @abstractmethod
     def policy_state_dict(self) -> State:
-        """What :meth:`load_policy` needs."""
+        """The policy, for :meth:`load_policy`."""
 
     @classmethod
     @abstractmethod

@@ -1,38 +1,26 @@
 """The training loop of every learner: iterate, log, save; and stop cleanly at a signal.
 
-In a run of several processes (:mod:`bidex_meta.train.distributed`) all make the same iterations and stop together;
-process 0 writes for all.
+Several processes (:mod:`bidex_meta.train.distributed`) do the same iterations and stop together; process 0 writes.
 """
 
 import math
+import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any, Protocol
 
 from bidex_meta.errors import BidexError
+from bidex_meta.runs.recorder import Recorder
 from bidex_meta.train.distributed import any_process, gather, is_main, rank, world_size
 from bidex_meta.train.launch import hangup
-from bidex_meta.train.learner import Learner
+from bidex_meta.train.learner import Learner, State
 from bidex_meta.world.contract import VectorWorld
 
 # The most of a run's time that may go into checkpoints.
 _SAVING_SHARE = 0.02
-
-
-class Record(Protocol):
-    """Where metrics and checkpoints go."""
-
-    def log(self, metrics: dict[str, float], step: int) -> None:
-        """Takes the metrics of one iteration that ended at environment step ``step``."""
-        ...
-
-    def save(self, state: dict[str, Any], step: int) -> None:
-        """Writes a checkpoint, atomically."""
-        ...
 
 
 def train(
@@ -40,40 +28,36 @@ def train(
     world: VectorWorld,
     *,
     total_steps: int,
-    record: Record | None,
+    record: Recorder | None,
     total_seconds: float = math.inf,
     spent_seconds: float = 0.0,
     checkpoint_seconds: float = 60.0,
     watch: Callable[[], dict[str, float]] | None = None,
-    enough: Callable[[Mapping[str, Any]], bool] | None = None,
-    last: Mapping[str, Any] | None = None,
+    enough: Callable[[Mapping[str, float]], bool] | None = None,
+    last: Mapping[str, float] | None = None,
 ) -> int:
     """Trains until ``total_steps`` environment steps are done or ``total_seconds`` are up, whichever comes first.
 
-    Both include those of a run that is resumed (``spent_seconds``). Time counts from the first world step to the end of
-    an iteration, with checkpoints: the iteration in which it is up is the last one, and there is at least one. Metrics
-    get it as ``Perf/training_time``.
-
-    SIGINT, SIGTERM or SIGHUP, in any process, finishes the current iteration, saves and returns; so does the end of the
-    printed output's reader (BrokenPipeError of ``record``, ``watch`` or ``enough``). A second SIGINT or SIGTERM acts at
-    once. SIGHUP stays ignored where it was.
+    Both include those of a run that is resumed (``spent_seconds``). Time, which metrics get as ``Perf/training_time``,
+    counts from the first world step to the end of an iteration, with checkpoints; there is at least one iteration.
+    SIGINT, SIGTERM or SIGHUP (unless ignored), in any process, finishes the iteration, saves and returns; so does a
+    BrokenPipeError of ``record``, ``watch`` or ``enough``. A second SIGINT or SIGTERM acts at once.
 
     Args:
-        learner: Made on ``world``.
+        learner: On ``world``.
         world: Its state is saved beside the learner's.
         total_steps: Environment steps in all.
-        record: Where metrics and checkpoints go; in process 0 only, as ``watch`` and ``last``.
+        record: Receives metrics and checkpoints; in process 0 only, as ``watch`` and ``last``.
         total_seconds: Training time in all.
         spent_seconds: Training time of a resumed run before.
-        checkpoint_seconds: Least time between two checkpoints, and never less than 50 times what the last one took to
-            save: a replay makes them large. 0 saves after every iteration. One more is always saved at the end.
+        checkpoint_seconds: Least time between two checkpoints, and never less than 50 times what the last one took (a
+            replay makes them large). 0 saves after every iteration. One more is always saved at the end.
         watch: Evaluates the learner after each iteration without changing it; adds metrics, and no training time.
         enough: Whether metrics of an iteration end the training, by process 0's; None in no process or in all.
         last: Metrics of the iteration before a resumed run: where they were enough, nothing is trained.
 
-    Returns the number of the signal that ended the training early, SIGPIPE's where nobody reads what is printed, 0 if
-    none did; where another process got it, SIGTERM's. Raises LostProcess where another process is gone; what was saved
-    stays as it is.
+    Returns the number of the signal that ended the training early (SIGPIPE where nobody reads the output, SIGTERM where
+    another process got it), else 0. Raises LostProcess where another process is gone; checkpoints stay as they are.
     """
     if enough is not None and any_process(is_main() and last is not None and enough(last)):
         return 0  # it was stopped between its last iteration and the end of its evaluation
@@ -103,7 +87,7 @@ def train(
                     record.log(metrics, learner.env_steps)
                 reached = enough is not None and is_main() and enough(metrics)
             except BrokenPipeError:
-                stop.ask(getattr(signal, "SIGPIPE", signal.SIGTERM))
+                stop.ask(signal.SIGPIPE if os.name == "posix" else signal.SIGTERM)
             if enough is not None and any_process(reached):
                 break
             if any_process(is_main() and time.monotonic() - saved_at >= pause):
@@ -117,16 +101,16 @@ def train(
         return stop.number if stopped else 0
 
 
-def _save(learner: Learner, world: VectorWorld, record: Record | None) -> None:
+def _save(learner: Learner, world: VectorWorld, record: Recorder | None) -> None:
     state = checkpoint(learner, world)
     if record is not None and state is not None:
         record.save(state, learner.env_steps)
 
 
-def checkpoint(learner: Learner, world: VectorWorld) -> dict[str, Any] | None:
-    """The state of a run: ``{"learner": ..., "env": ...}``, tensors and plain values only; all processes must call it.
+def checkpoint(learner: Learner, world: VectorWorld) -> State | None:
+    """The state of a run: ``{"learner": ..., "env": ...}``; all processes must call it.
 
-    Process 0 gets its own state with, under ``others``, what differs in each of the others; they get None.
+    Process 0 gets its own state with, under ``others``, the entries that differ in each of the others; they get None.
     """
     state = {"learner": learner.state_dict(), "env": world.state_dict()}
     if world_size() == 1:
@@ -136,11 +120,8 @@ def checkpoint(learner: Learner, world: VectorWorld) -> dict[str, Any] | None:
     return None if parts is None else {**state, "others": parts[1:]}
 
 
-def resume(learner: Learner, world: VectorWorld, state: dict[str, Any]) -> None:
-    """Restores a :func:`checkpoint`; training then continues bit for bit (CPU, same number of threads).
-
-    Raises BidexError for one of another number of processes.
-    """
+def resume(learner: Learner, world: VectorWorld, state: State) -> None:
+    """Restores a :func:`checkpoint` of as many processes; training continues bit for bit (CPU, as many threads)."""
     parts = [state, *state.get("others", [])]
     if len(parts) != world_size():
         raise BidexError(f"The checkpoint is of {len(parts)} processes, but here are {world_size()}. Start as many.")
@@ -150,12 +131,11 @@ def resume(learner: Learner, world: VectorWorld, state: dict[str, Any]) -> None:
 
 
 class _Stop(threading.Event):
-    """A request to stop, and the signal that brought it."""
+    """A request to stop, and the first signal that brought it."""
 
     number: int = signal.SIGTERM
 
     def ask(self, number: int) -> None:
-        """Stores the first number only."""
         if not self.is_set():
             self.number = number
             self.set()
@@ -165,21 +145,19 @@ class _Stop(threading.Event):
 def _stop_requests() -> Iterator["_Stop"]:
     """Turns the first SIGINT, SIGTERM or SIGHUP into a set event, then restores the first two's old handlers.
 
-    A terminal that closes may send SIGHUP twice, its shell's and its own: later ones are ignored. On leaving all are
-    restored.
+    A terminal that closes may send SIGHUP twice, its shell's and its own: later ones are ignored until the end.
     """
     stop = _Stop()
     if threading.current_thread() is not threading.main_thread():
-        # Python lets only the main thread set handlers; elsewhere signals stay the caller's business.
-        yield stop
+        yield stop  # Python lets only the main thread set handlers
         return
     numbers = (signal.SIGINT, signal.SIGTERM, *hangup())
     # None stands for a handler that was not set from Python and cannot be put back.
     old = {number: signal.getsignal(number) or signal.SIG_DFL for number in numbers}
 
-    def restore(numbers: tuple[int, ...]) -> None:
+    def restore(numbers: Iterable[signal.Signals]) -> None:
         for number in numbers:
-            signal.signal(number, old[signal.Signals(number)])
+            signal.signal(number, old[number])
 
     def on_signal(number: int, frame: FrameType | None) -> None:
         stop.ask(number)

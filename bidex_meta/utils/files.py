@@ -8,6 +8,7 @@ import os
 import stat
 import tomllib
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -41,18 +42,16 @@ def absolute(path: str | Path) -> Path:
 
 def is_file(path: Path) -> bool:
     """Whether there is a regular file; false, not an error, for a path that cannot be one."""
-    try:
+    with suppress(OSError, ValueError):
         return path.is_file()
-    except (OSError, ValueError):
-        return False
+    return False
 
 
 def exists(path: Path) -> bool:
     """Whether there is anything, a link that leads nowhere too; false for a path that cannot be one."""
-    try:
+    with suppress(OSError, ValueError):
         return os.path.lexists(path)
-    except (OSError, ValueError):
-        return False
+    return False
 
 
 def open_regular(path: Path, what: str, most: int | None = None) -> IO[bytes]:

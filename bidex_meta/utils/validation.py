@@ -69,7 +69,7 @@ def check_fields(settings: object, name: str, as_flags: bool = False) -> None:
 
 
 def check_rising(settings: object, name: str, *fields: str) -> None:
-    """Raises BidexError for the first pair of numbers of which the second is smaller than the first."""
+    """Raises BidexError for the first pair of numbers that falls."""
     for field in fields:
         low, high = getattr(settings, field)
         if low > high:
@@ -179,7 +179,7 @@ def _message(error: msgspec.ValidationError, content: object, kind: object, fiel
 
 # Our words for msgspec's.
 _WORDS = {"a table": "object", "a list": "array", "a whole number": "int", "a number": "float", "a text": "str"}
-_WORDS["true or false"] = "bool"
+_WORDS |= {"true or false": "bool"}
 
 
 def _choices(hint: object) -> list[object]:

@@ -11,8 +11,8 @@ from bidex_meta.viewer.playback import Stage
 from bidex_meta.world.rendering import CAMERAS, GHOST
 
 _TYPE = mujoco.mjtGeom
-_SHOWN_GROUPS = 3
-"""Groups from here on are hidden, as in MuJoCo's own viewer."""
+_Handle = Any  # viser's, of an optional extra
+_SHOWN_GROUPS = 3  # groups from here on are hidden, as in MuJoCo's own viewer
 
 
 def visible(model: mujoco.MjModel) -> list[int]:
@@ -65,25 +65,21 @@ def shape(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Browser:
-    """A ``Screen`` as a web server; raises BidexError where viser is missing.
-
-    ``host`` 0.0.0.0 lets other machines in; if ``port`` is in use, the next free one is taken.
-    """
+    """A ``Screen`` as a web server (``host`` 0.0.0.0: for all), on the next free port; BidexError without viser."""
 
     def __init__(self, stage: Stage, host: str = "127.0.0.1", port: int = 8080, speed: float = 1.0) -> None:
         try:
             viser = import_module("viser")
         except ImportError:
-            raise BidexError(
-                "The view in the browser needs viser: pip install 'bidex-meta[viewer]'. Or film it: bidex-meta render."
-            ) from None
+            what = "The view in the browser needs viser: pip install 'bidex-meta[viewer]'"
+            raise BidexError(f"{what}. Or film it: bidex-meta render.") from None
         self.paused, self.speed = False, speed
         self._asked: list[str] = []
-        self._server: Any = viser.ViserServer(host=host, port=port, label="bidex-meta", verbose=False)
+        self._server = viser.ViserServer(host=host, port=port, label="bidex-meta", verbose=False)
         self.address = f"http://{host}:{self._server.get_port()}"
         self._server.scene.set_up_direction("+z")
-        self._shapes: dict[int, Any] = {}
-        self._ghosts: list[Any] = []
+        self._shapes: dict[int, _Handle] = {}
+        self._ghosts: list[_Handle] = []
         self._add_controls(stage)
         self._set_the_scene(stage)
 

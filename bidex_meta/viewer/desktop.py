@@ -1,7 +1,6 @@
 """MuJoCo's own viewer, in a window."""
 
 import sys
-from typing import Any
 
 import mujoco
 
@@ -25,7 +24,7 @@ class Desktop:
         try:
             from mujoco.viewer import launch_passive
 
-            self._viewer: Any = launch_passive(
+            self._viewer = launch_passive(
                 self._model, self._data, key_callback=self._asked.append, show_left_ui=False, show_right_ui=False
             )
         except Exception as error:  # the window library raises errors of many kinds
@@ -63,6 +62,7 @@ class Desktop:
                 getattr(self._data, name)[:] = getattr(now, name)
             mujoco.mj_forward(self._model, self._data)
             scene = self._viewer.user_scn
+            assert scene is not None
             scene.ngeom = 0
             add_ghosts(stage.ghosts(), scene)
         status = stage.status()

@@ -14,10 +14,7 @@ from bidex_meta.world.rendering import Ghost, ghosts, simulation
 
 
 class Stage:
-    """Episodes one after the other, in all environments of a world in autoreset mode DISABLED, one of each slot.
-
-    ``row`` is the environment that is shown, may be set; ``names`` has the class of each.
-    """
+    """Episodes in all environments of a world in mode DISABLED, one a slot; ``row``, which may be set, is shown."""
 
     def __init__(self, world: World, agent: Agent, row: int = 0, seed: int = 0) -> None:
         self.names: list[str] = [world.task_names[int(slot)] for slot in world.task_id]
@@ -99,8 +96,7 @@ class Stage:
         }
 
 
-_PICTURES = 30
-"""Pictures a second at most: more would only delay the browser."""
+_PICTURES = 30  # pictures a second at most: more would only delay the browser
 
 
 class Screen(Protocol):

@@ -1,7 +1,6 @@
 """Hand controller: moves both hands to points in closed loop, for scripted policies.
 
-A script reads the mean of each sensor over all copies of the start and acts alike in each of them. The recorded actions
-replay without the script.
+A script reads sensors' means over all copies of the start; its recorded actions replay without it.
 """
 
 import torch
@@ -12,8 +11,7 @@ from bidex_meta.utils.maths import conjugate, multiply, quaternion_from_rpy, rot
 from bidex_meta.witness.replay import Simulator
 from bidex_meta.witness.store import quantised
 
-GAIN = 8.0
-"""Speed of a hand over its distance to its target, and of its turn over its angle to its target, 1/s."""
+GAIN = 8.0  # speed of a hand over its distance to its target, and of its turn over its angle to its target, 1/s
 _KNUCKLES, _MIDDLES = ("FFJ2", "MFJ2", "RFJ2", "LFJ2"), ("FFJ1", "MFJ1", "RFJ1", "LFJ1")
 
 Point = tuple[float, float, float]
@@ -30,8 +28,7 @@ def rest_action(size: int) -> Tensor:
 class HandController:
     """Moves both hands of a class to points, from the present state of a simulator of copies of one start.
 
-    ``noise`` is the standard deviation of Gaussian noise on each action, to which the script reacts. ``actions`` (each
-    (action_size,)), ``rewards`` and ``success`` are of the first copy's steps so far.
+    ``noise``: standard deviation on each action; ``actions``, ``rewards``, ``success``: of the first copy's steps.
     """
 
     def __init__(self, simulator: Simulator, noise: float = 0.0, generator: torch.Generator | None = None):
@@ -87,10 +84,7 @@ class HandController:
         self._held[side] = multiply(turn, self.orientation(f"{side}/mount_quaternion"))
 
     def lead(self, right: Point, left: Point, steps: int = 1, speed: float = 0.6) -> None:
-        """Moves the hands' points towards two points (world, metres) at most at ``speed`` (m/s).
-
-        Takes ``steps`` control steps, but none after the end of the episode.
-        """
+        """Moves the hands' points towards two points (world, metres), at most at ``speed`` (m/s), until its end."""
         for _ in range(min(steps, self.episode_steps - len(self.actions))):
             action, half = self._rest.clone(), len(self._rest) // 2
             for i, (side, goal) in enumerate(zip(SIDES, (right, left), strict=True)):

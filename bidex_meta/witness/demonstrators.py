@@ -1,7 +1,6 @@
 """Witnesses and scripted policies as agents, and the shifted starts from which demonstrations begin."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,15 +11,13 @@ from bidex_meta.witness.replay import SEED, Simulator, task_slot
 from bidex_meta.witness.scripts import script_of
 from bidex_meta.witness.store import Witness
 from bidex_meta.world import World
+from bidex_meta.world.contract import Info, Options
 from bidex_meta.world.part import base_rotations
 from bidex_meta.world.wrapper import PooledWorldWrapper
 
 
 class ActionSequences:
-    """Plays a sequence of ``sequences`` (n, steps, action) in each environment from the start of an episode on.
-
-    After its end the last action is repeated. ``which`` is the sequence of each environment, int64 (num_envs,).
-    """
+    """Plays ``sequences`` (n, steps, action), ``which`` of them in each environment, and repeats the last action."""
 
     def __init__(self, sequences: Tensor, which: Tensor):
         self._sequences, self._which, self._step = sequences, which, torch.zeros_like(which)
@@ -44,9 +41,8 @@ class ActionSequences:
 class OpenLoopReplay(ActionSequences):
     """Plays the witness of each environment's class, without observations; a class without one gets zero actions.
 
-    ``task_names`` are the classes of the world's slots, ``task_id`` the slot of each environment, int64 (num_envs,),
-    ``actions`` the size of the world's actions, which may be padded; ``noise`` is the standard deviation of Gaussian
-    noise on them.
+    ``task_names`` are the classes of the world's slots, ``task_id`` the slot of each environment, ``actions`` the size
+    of the world's actions, which may be padded; ``noise`` is a standard deviation.
     """
 
     def __init__(
@@ -77,9 +73,8 @@ class OpenLoopReplay(ActionSequences):
 class Scripted(ActionSequences):
     """Plays a class's script, computed at the start of each episode in a copy of the environment with full state.
 
-    The copy has the world's physics, so its actions have the same effect here; about a second for 500 steps. ``world``
-    is of one class with moving bases, on C MuJoCo, in autoreset mode DISABLED; ``noise`` is the standard deviation of
-    Gaussian noise on its actions, to which the script reacts. Raises BidexError for a class without a script.
+    ``world`` is of one class with moving bases, on C MuJoCo, in autoreset mode DISABLED; the script reacts to the noise
+    (standard deviation) on its actions. Raises BidexError for a class without a script.
     """
 
     def __init__(self, world: World, noise: float = 0.0, seed: int = 0):
@@ -102,10 +97,7 @@ class Scripted(ActionSequences):
 
 
 class ShiftedStarts(PooledWorldWrapper):
-    """A world of one class's task 0 whose environments all begin at its witness's start.
-
-    Each object and fixture is shifted in the plane by up to ``shift`` metres, evenly over the disc.
-    """
+    """A class's task 0 from its witness's start, objects and fixtures shifted over a disc of ``shift`` metres."""
 
     world: World
 
@@ -113,7 +105,7 @@ class ShiftedStarts(PooledWorldWrapper):
         super().__init__(World([task_slot(name)], rows, autoreset_mode="DISABLED", seed=SEED, threads=threads))
         self._shift = shift
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
         """Starts episodes of all environments, shifted by the seed; raises BidexError for options."""
         if options:
             raise BidexError("Shifted starts begin all environments together. Leave options out.")

@@ -13,12 +13,9 @@ from bidex_meta.witness.store import Witness
 from bidex_meta.world import Slot, World
 from bidex_meta.world.part import judge
 
-SUITE, SEED = "MT20", 0
-"""Witnesses are about task 0 of each class of this suite and seed."""
-SHIFT = 1e-4
-"""How far the objects' start is shifted to see whether a witness succeeds by more than luck, metres."""
-SHIFTED = 10
-"""Shifted starts of a replay."""
+SUITE, SEED = "MT20", 0  # witnesses are about task 0 of each class of this suite and seed
+SHIFT = 1e-4  # how far the objects' start is shifted to see whether a witness succeeds by more than luck, metres
+SHIFTED = 10  # shifted starts of a replay
 
 State = dict[str, Tensor]
 

@@ -19,8 +19,8 @@ from bidex_meta.utils.validation import Finite, Whole, parse
 if TYPE_CHECKING:
     from torch import Tensor
 
-LEVELS = 127
-"""Actions are whole multiples of 1/127, so that a byte holds one exactly."""
+Json = dict[str, Any]
+LEVELS = 127  # actions are whole multiples of 1/127, so that a byte holds one exactly
 _MOST_BYTES, _MOST_STEPS = 50_000_000, 100_000
 _Made = TypedDict("_Made", {"return": Finite, "first_success": Whole | None, "rival": Finite | None}, total=False)
 
@@ -29,9 +29,8 @@ _Made = TypedDict("_Made", {"return": Finite, "first_success": Whole | None, "ri
 class Witness:
     """Recorded actions that solve a task, and their record."""
 
-    actions: np.ndarray
-    """Actions (T, action_size), float32, multiples of 1/127."""
-    made: dict[str, Any]
+    actions: np.ndarray  # actions (T, action_size), float32, multiples of 1/127
+    made: Json
     """Return, step of the first success, return of the best unsuccessful episode (``rival``), settings, versions."""
 
 
@@ -46,10 +45,7 @@ def witness_path(name: str) -> Path:
 
 
 def load_witness(name: str, path: Path | None = None) -> Witness:
-    """The witness of a class, or the one in a file.
-
-    Raises BidexError where there is none, it is damaged, or its actions are not of the class's size.
-    """
+    """A class's witness, or one in a file; BidexError for none, a damaged one or actions of another size."""
     if path is None:
         path = witness_path(name)
         if not path.is_file():
@@ -59,14 +55,12 @@ def load_witness(name: str, path: Path | None = None) -> Witness:
         raise BidexError(f"Expected a witness file such as {witness_path(name)}, got {path}, which is no file.")
     witness, size = _read(path), registry.get(name, moving_base=True).action_size
     if witness.actions.shape[1] != size:
-        raise BidexError(
-            f"{path}: expected actions of shape (steps, {size}), as {name} has, got {witness.actions.shape}. Give a "
-            f"witness of {name}, or leave --file out."
-        )
+        what = f"expected actions of shape (steps, {size}), as {name} has, got {witness.actions.shape}"
+        raise BidexError(f"{path}: {what}. Give a witness of {name}, or leave --file out.")
     return witness
 
 
-def save_witness(path: Path, actions: np.ndarray, made: dict[str, Any]) -> Path:
+def save_witness(path: Path, actions: np.ndarray, made: Json) -> Path:
     """Writes a witness; actions (T, action_size) must be multiples of 1/127."""
     path.parent.mkdir(parents=True, exist_ok=True)
     levels = np.rint(actions * LEVELS).astype(np.int8)
@@ -88,8 +82,7 @@ def _read(path: Path) -> Witness:
         reason = one_line(error)[:150].rstrip(".")
         raise BidexError(f"Expected a witness at {path}, but {reason}. Copy the file again.") from None
     if levels.dtype != np.int8 or levels.ndim != 2 or not 1 <= len(levels) <= _MOST_STEPS:
-        raise BidexError(
-            f"{path}: expected actions as bytes, (steps, actions), got {levels.dtype} of shape {levels.shape}."
-        )
+        what = f"got {levels.dtype} of shape {levels.shape}"
+        raise BidexError(f"{path}: expected actions as bytes, (steps, actions), {what}.")
     parse(made, _Made, str(path))
     return Witness(levels.astype(np.float32) / LEVELS, made)

@@ -1,7 +1,4 @@
-"""What a config names, resolved once: `Worlds.open(config)`, whichever kind it is.
-
-Opening reads a suite file at most; torch and physics are imported when a world is made or evaluated in.
-"""
+"""What a config names, resolved once: `Worlds.open(config)`, which does not load torch and physics."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -9,16 +6,17 @@ from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from bidex_meta.errors import known_name
+from bidex_meta.evaluation.references import Reference, references
+from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.suite import METAWORLD_SUITES, SPLITS, Suite, load_suite, suite_names
 from bidex_meta.tasks import registry
 
 if TYPE_CHECKING:
     from bidex_meta.agents import Agent
-    from bidex_meta.evaluation.references import Reference
-    from bidex_meta.evaluation.results import Evaluation
     from bidex_meta.tasks.base import TaskClass
     from bidex_meta.world.contract import PooledWorld
 
+Json = Mapping[str, Any]
 Base = Literal["own", "moving", "fixed"]
 _SIZES_AND_STEPS = {"cpu": (1024, 20_000_000), "gpu": (8192, 200_000_000)}
 # Whole episodes of all environments make one meta-batch: with fewer environments there are more of them.
@@ -32,42 +30,37 @@ class WorldConfig:
     suite: str | None = None
     task: str | None = None
     base: Base = "own"
-    points: int = 0
-    """Points of the cloud in place of objects' states; 0: as the suite has it."""
+    points: int = 0  # points of the cloud in place of objects' states; 0: as the suite has it
     object: str | None = None
-    seed: int = 0
-    """Of starts, and of tasks without ``task_seed``."""
-    task_seed: int | None = None
-    """Of tasks and starts instead."""
+    seed: int = 0  # of starts, and of tasks without ``task_seed``
+    task_seed: int | None = None  # of tasks and starts instead
     device: str = "cpu"
     threads: int | None = None
     engine: str = "auto"
 
     @staticmethod
-    def of(config: "Mapping[str, Any] | WorldConfig") -> "WorldConfig":
+    def of(config: "Json | WorldConfig") -> "WorldConfig":
         """The entries of a run's config that are of worlds; others are left out."""
         if isinstance(config, WorldConfig):
             return config
         return WorldConfig(**{field.name: config[field.name] for field in fields(WorldConfig) if field.name in config})
 
 
+Identity = dict[str, str | int | None]
+
+
 class Worlds(ABC):
     """The worlds that a config names, and what holds for all of them; ``name`` is as the user wrote it."""
 
-    hides_goals: bool = False
-    """Whether it is a meta suite, whose goals have to be found out."""
+    hides_goals: bool = False  # whether it is a meta suite, whose goals have to be found out
     suite: Suite | None = None
-    class_name: str | None = None
-    """The class, where it is a single one."""
+    class_name: str | None = None  # the class, where it is a single one
     object: str | None = None
-    moving_base: bool | None = None
-    """Whether the bases of a single class move; None: as it has them."""
-    on_gpu: ClassVar[bool] = True
-    """Whether a GPU is of use to its worlds."""
+    moving_base: bool | None = None  # whether the bases of a single class move; None: as it has them
+    on_gpu: ClassVar[bool] = True  # whether a GPU is of use to its worlds
     preset: ClassVar[tuple[str, str] | None] = None
     """A preset for such worlds alone, which goes before others where a learner has it; and, in words, why."""
-    default_episodes: ClassVar[int] = 4
-    """Episodes of each task in an evaluation where none are given."""
+    default_episodes: ClassVar[int] = 4  # episodes of each task in an evaluation where none are given
 
     def __init__(self, name: str, config: WorldConfig) -> None:
         self.name, self.config = name, config
@@ -76,11 +69,8 @@ class Worlds(ABC):
         self.points = config.points
 
     @staticmethod
-    def open(config: Mapping[str, Any] | WorldConfig) -> "Worlds":
-        """Those of a config: its ``suite``, or without one the class ``task`` on its own, in any case.
-
-        Raises BidexError for an unknown suite or task, with the nearest name; or a faulty suite file.
-        """
+    def open(config: Json | WorldConfig) -> "Worlds":
+        """Those of a config's ``suite``, or its class ``task``, in any case; BidexError for unknown or faulty ones."""
         from bidex_meta.worlds import external, own
 
         config = WorldConfig.of(config)
@@ -96,14 +86,10 @@ class Worlds(ABC):
 
     @abstractmethod
     def world(self, split: str = "train", rows: int | None = None, mode: str = "DISABLED") -> "PooledWorld":
-        """A fresh world of one split, ``train`` or ``test``.
+        """A fresh world of a split, ``train`` or ``test``, in autoreset mode SAME_STEP to train, DISABLED to evaluate.
 
-        Args:
-            split: Which.
-            rows: Environments over all tasks; one per task by default (a few per class where it is Meta-World's).
-            mode: Autoreset mode: SAME_STEP to train in, DISABLED to evaluate in.
-
-        Raises BidexError for a missing split, too few environments, or a device or engine that it does not run on.
+        ``rows`` are its environments over all tasks, by default one per task (of Meta-World's a few per class). Raises
+        BidexError for a missing split, too few environments, or a device or engine that it does not run on.
         """
 
     @abstractmethod
@@ -120,10 +106,7 @@ class Worlds(ABC):
         return [split for split in ("train", "test") if self.tasks(split)]
 
     def rows_and_steps(self, device: str, adapts: bool) -> tuple[int, int]:
-        """Environments of a training world, and steps of a run over all of them, where none are given.
-
-        ``adapts``: whether the learner adapts to tasks.
-        """
+        """Environments of a training world, and steps of a run over all of them, of a learner that adapts or not."""
         if not device.startswith("cpu"):
             return _SIZES_AND_STEPS["gpu"]
         return _ADAPTING_SIZE_AND_STEPS if adapts else _SIZES_AND_STEPS["cpu"]
@@ -133,7 +116,7 @@ class Worlds(ABC):
         """Whether the hands move as in the shipped suites, and as where references were measured."""
         return all(task_class.moving_base for task_class in self.task_classes().values())
 
-    def identity(self) -> dict[str, Any]:
+    def identity(self) -> Identity:
         """What distinguishes its worlds from others of the same name, ready for JSON.
 
         ``physics``: twelve letters of the classes' physics (``bidex_meta.engine.models``), None where they are not
@@ -141,17 +124,12 @@ class Worlds(ABC):
         """
         return {"physics": physics_of(self.task_classes()), "suite_version": None}
 
-    def references(self) -> "dict[str, Reference]":
+    def references(self) -> dict[str, Reference]:
         """References of the normalised score and of broken episodes; none where the bases do not move as there."""
-        from bidex_meta.evaluation.references import references
-
         return references() if self.moving_bases else {}
 
-    def judge(self, agent: "Agent", world: "PooledWorld", episodes: int | None, seed: int) -> "Evaluation":
-        """Evaluates a policy on all tasks of a split, beside the references, with a seed for the starts.
-
-        ``world`` is in mode DISABLED; ``episodes`` of each task, None takes ``default_episodes``.
-        """
+    def judge(self, agent: "Agent", world: "PooledWorld", episodes: int | None, seed: int) -> Evaluation:
+        """Evaluates a policy on all tasks of a split (mode DISABLED), ``default_episodes`` or so many of each."""
         from bidex_meta.evaluation.play import evaluate
 
         episodes = self.default_episodes if episodes is None else episodes
@@ -171,11 +149,12 @@ def suites_to_run() -> list[str]:
     return [*suite_names(), *METAWORLD_SUITES]
 
 
-def listed() -> list[dict[str, Any]]:
-    """A row of ``bidex-meta list suites`` for each suite, shipped or Meta-World's."""
-    suites = [load_suite(name) for name in suite_names()]
-    classes = [[[entry.name for entry in s.split_classes(split)] for split in SPLITS] for s in suites]
-    rows: list[Any] = [(s.name, s.kind, *names, s.description) for s, names in zip(suites, classes, strict=True)]
+def listed() -> list[dict[str, object]]:
+    """An entry of ``bidex-meta list suites`` for each suite, shipped or Meta-World's."""
+    rows: list[tuple[object, ...]] = []
+    for suite in map(load_suite, suite_names()):
+        classes = ([entry.name for entry in suite.split_classes(split)] for split in SPLITS)
+        rows.append((suite.name, suite.kind, *classes, suite.description))
     summary = "Meta-World's own environments, to run our learners on (only run and evaluate know them)"
     rows += [(name, "multi-task", list(classes), [], summary) for name, classes in METAWORLD_SUITES.items()]
     return [dict(zip(("name", "kind", "train_classes", "test_classes", "summary"), row, strict=True)) for row in rows]

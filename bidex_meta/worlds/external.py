@@ -1,21 +1,18 @@
 """Worlds of other libraries' environments, on the CPU in C MuJoCo: Meta-World's suites, Gymnasium's humanoid."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.references import Reference
+from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.suite import metaworld_classes
 from bidex_meta.utils.memory import check_memory
-from bidex_meta.worlds.base import WorldConfig, Worlds
+from bidex_meta.worlds.base import Identity, WorldConfig, Worlds
 
 if TYPE_CHECKING:
-    from bidex_meta.agents import Agent
-    from bidex_meta.evaluation.references import Reference
-    from bidex_meta.evaluation.results import Evaluation
-    from bidex_meta.tasks.base import TaskClass
-    from bidex_meta.world.contract import PooledWorld
+    from bidex_meta.worlds.base import Agent, PooledWorld, TaskClass
 
-HUMANOID = "gymnasium/Humanoid-v5"
-"""How a run names it (``--task``)."""
+HUMANOID = "gymnasium/Humanoid-v5"  # how a run names it (``--task``)
 
 # Of each of Meta-World's classes; 2 M steps are the budget of published results.
 _TRAINING_SIZE, _TRAINING_STEPS = 4, 2_000_000
@@ -42,11 +39,11 @@ class Foreign(Worlds):
         """As in ``Worlds``: refused."""
         raise BidexError(f"Pictures and references are made of classes of our own, got {self.name}. Name another.")
 
-    def identity(self) -> dict[str, Any]:
+    def identity(self) -> Identity:
         """As in ``Worlds``: the physics is the library's, known by its package's version."""
         return {"physics": None, "suite_version": None}
 
-    def references(self) -> "dict[str, Reference]":
+    def references(self) -> dict[str, Reference]:
         """As in ``Worlds``: none."""
         return {}
 
@@ -74,14 +71,13 @@ class MetaWorldSuite(Foreign):
 
     def tasks(self, split: str) -> dict[str, list[str]]:
         """As in ``Worlds``."""
-        numbers = [str(number) for number in range(_TASKS)]
-        return dict.fromkeys(self.class_names, numbers) if split == "train" else {}
+        return {name: list(map(str, range(_TASKS))) for name in self.class_names} if split == "train" else {}
 
     def rows_and_steps(self, device: str, adapts: bool) -> tuple[int, int]:
         """As in ``Worlds``."""
         return _TRAINING_SIZE * len(self.class_names), _TRAINING_STEPS * len(self.class_names)
 
-    def judge(self, agent: "Agent", world: "PooledWorld", episodes: int | None, seed: int) -> "Evaluation":
+    def judge(self, agent: "Agent", world: "PooledWorld", episodes: int | None, seed: int) -> Evaluation:
         """As in ``Worlds``: the fifty tasks of each class a few at a time, as many as the world has environments."""
         from bidex_meta.metaworld.batched import evaluate_all_tasks
 
@@ -89,7 +85,7 @@ class MetaWorldSuite(Foreign):
 
 
 class HumanoidTask(Foreign):
-    """``clients/humanoid_world.py``, a single class with one task."""
+    """``worlds/humanoid.py``, a single class with one task."""
 
     default_episodes = _HUMANOIDS
     class_name = HUMANOID

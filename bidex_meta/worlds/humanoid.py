@@ -1,12 +1,9 @@
-"""Gymnasium's Humanoid-v5 as a world, on ``mujoco.batch``, for the comparison of the paper's appendix C.
-
-Its constants are those of Gymnasium 1.x (``envs/mujoco/humanoid_v5.py``); starts, actions and steps give its numbers
-bit for bit, to single precision.
-"""
+"""Gymnasium 1.x's Humanoid-v5 as a world, on ``mujoco.batch``, bit for bit to single precision (paper, appendix C)."""
 
 from collections.abc import Mapping
 from pathlib import Path
 
+import gymnasium
 import mujoco
 import numpy as np
 import torch
@@ -38,7 +35,7 @@ class HumanoidWorld(ForeignWorld):
     velocities, actuators' forces and contact forces. An action of [-1, 1] is its motors' range, [-0.4, 0.4]. The reward
     is 1.25 times the speed of the centre of mass along x (m/s), and 5 while it is up, less the price of control and
     contact; it falls (terminated) when the torso leaves 1 to 2 m, and an episode lasts 1,000 steps of 15 ms. There is
-    no success. All tasks are alike: a variation has no numbers. Keywords as of ``bidex_meta.World``.
+    no success. Keywords as of ``bidex_meta.World``.
     """
 
     def __init__(
@@ -50,9 +47,8 @@ class HumanoidWorld(ForeignWorld):
         threads: int | None = None,
         stagger: bool = True,
     ) -> None:
-        import gymnasium.envs.mujoco as home
-
-        model = mujoco.MjModel.from_xml_path(str(Path(home.__file__).parent / "assets" / "humanoid.xml"))
+        file = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "humanoid.xml"
+        model = mujoco.MjModel.from_xml_path(str(file))
         num_state = (model.nq - 2) + model.nv + (model.nbody - 1) * 22 + (model.nv - 6)
         super().__init__([NAME], num_envs, Sizes(num_state, model.nu, EPISODE_STEPS), seed, autoreset_mode, stagger)
         self._model, self._data = model, mujoco.MjData(model)
@@ -68,10 +64,7 @@ class HumanoidWorld(ForeignWorld):
         self.set_tasks({NAME: np.zeros((1, 0))})
 
     def set_tasks(self, pools: Mapping[str, np.ndarray]) -> None:
-        """Replaces the pool, ``Humanoid-v5`` to an array (n, 0), of which only n counts.
-
-        Raises BidexError for an unknown class, an empty pool or a wrong shape.
-        """
+        """Replaces the pool by an array (n, 0), of which only n counts; BidexError for another class or shape."""
         for name, pool in pools.items():
             if name != NAME:
                 raise unknown_name("class", name, [NAME])
@@ -132,13 +125,8 @@ class HumanoidWorld(ForeignWorld):
 
     def state_dict(self) -> State:
         """All that decides the world's future: tensors and plain values, copied."""
-        return {
-            **super().state_dict(),
-            "tasks": self.num_slot_tasks[0],
-            "engine": self._engine.state_dict(),
-            "x": self._x.clone(),
-            "contact": self._contact.clone(),
-        }
+        own = {"tasks": self.num_slot_tasks[0], "engine": self._engine.state_dict()}
+        return {**super().state_dict(), **own, "x": self._x.clone(), "contact": self._contact.clone()}
 
     def load_state_dict(self, state: State) -> None:
         """Restores a ``state_dict``; raises BidexError for one of another size."""

@@ -2,21 +2,18 @@
 
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 from bidex_meta.errors import BidexError
 from bidex_meta.suite import Split, Suite, load_suite
 from bidex_meta.tasks import registry
 from bidex_meta.utils.plugins import name_with_object
-from bidex_meta.worlds.base import WorldConfig, Worlds, physics_of
+from bidex_meta.worlds.base import Identity, WorldConfig, Worlds, physics_of
 
 if TYPE_CHECKING:
-    from bidex_meta.benchmark import Benchmark
-    from bidex_meta.tasks.base import TaskClass
-    from bidex_meta.world.contract import PooledWorld
+    from bidex_meta.worlds.base import PooledWorld, TaskClass
 
-_TASKS_ALONE = 50
-"""Tasks that ``make_task_world`` draws for a class on its own."""
+_TASKS_ALONE = 50  # that ``make_task_world`` draws for a class on its own
 
 
 class OwnSuite(Worlds):
@@ -31,7 +28,7 @@ class OwnSuite(Worlds):
         self.hides_goals = self.suite.kind == "meta"
 
     @cached_property
-    def benchmark(self) -> "Benchmark":
+    def benchmark(self):
         """The suite with its classes and the tasks that the config's seed draws."""
         from bidex_meta.benchmark import Benchmark
 
@@ -47,10 +44,9 @@ class OwnSuite(Worlds):
 
     def tasks(self, split: str) -> dict[str, list[str]]:
         """As in ``Worlds``: the names that the file lists, else numbers."""
-        pools = {}
-        for entry in self.suite.split_classes(cast(Split, split)):
-            names = [task.name for task in entry.tasks if task.split == split]
-            pools[entry.name] = names or [str(number) for number in range(self.suite.tasks_per_class or 0)]
+        drawn = list(map(str, range(self.suite.tasks_per_class or 0)))
+        classes = self.suite.split_classes(cast(Split, split))
+        pools = {c.name: [task.name for task in c.tasks if task.split == split] or [*drawn] for c in classes}
         if self.suite.task_id == "class":
             return pools
         return {f"{name}/{task}": [task] for name, pool in pools.items() for task in pool}
@@ -59,7 +55,7 @@ class OwnSuite(Worlds):
         """As in ``Worlds``."""
         return self.benchmark.task_classes()
 
-    def identity(self) -> dict[str, Any]:
+    def identity(self) -> Identity:
         """As in ``Worlds``; of the classes of both splits."""
         classes = self.benchmark.task_classes("train") | self.benchmark.task_classes("test")
         return {"physics": physics_of(classes), "suite_version": self.suite.version}
@@ -84,22 +80,13 @@ class SingleClass(Worlds):
 
         if split != "train":
             raise BidexError(f"A run on the task {self.name} alone has no {split} split. Leave --split out.")
-        return make_task_world(
-            self.class_name,
-            rows or _TASKS_ALONE,
-            self.device,
-            self.seed,
-            mode,
-            self.threads,
-            moving_base=self.moving_base,
-            engine=self.engine,
-            points=self.points,
-            object=self.object,
-        )
+        named = {"moving_base": self.moving_base, "engine": self.engine, "points": self.points, "object": self.object}
+        rows = rows or _TASKS_ALONE
+        return make_task_world(self.class_name, rows, self.device, self.seed, mode, self.threads, **named)
 
     def tasks(self, split: str) -> dict[str, list[str]]:
         """As in ``Worlds``."""
-        return {self.name: [str(number) for number in range(_TASKS_ALONE)]} if split == "train" else {}
+        return {self.name: list(map(str, range(_TASKS_ALONE)))} if split == "train" else {}
 
     def task_classes(self) -> "dict[str, TaskClass]":
         """As in ``Worlds``."""

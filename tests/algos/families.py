@@ -23,29 +23,18 @@ class PointClass:
     """A task class of :class:`PointGoals`."""
 
     name: str = "PointGoals"
-    steps: int = 20
-    """Time limit."""
-    scale: float = 1.0
-    """Factor of the reward."""
-    count: int = 8
-    """Goals in the pool, :func:`circle` of them."""
+    steps: int = 20  # time limit
+    scale: float = 1.0  # of the reward
+    count: int = 8  # goals in the pool, :func:`circle` of them
 
 
 class PointGoals(FakePools):
     """A point in the plane moves by ``speed`` times the action; reward minus its distance to the row's goal.
 
-    A goal holds until ``set_tasks``: row j of a class has goal j modulo the pool's size, over all its episodes.
-    Episodes start within 0.1 of the origin, drawn by seed, class, row and episode alone, and end by the time limit.
-    Observations are the position and the goal, (N, 4), the goal masked by zeros unless visible. Success: within 0.1
-    of the goal. As in the real world a finished row is frozen in mode DISABLED, keeps its flags and earns 0 until it
-    is reset.
-
-    The best policy goes to the goal in each coordinate at once (:meth:`best`). One that cannot know the goal does best
-    to stay where it is: about -1 a step. ``rows``: rows over all classes, split evenly; ``goal_visible``: whether the
-    observation shows the goal; ``classes``: the task classes; ``seed``: of the starts; ``autoreset_mode``: DISABLED or
-    SAME_STEP; ``end_at_goal``: whether reaching the goal ends an episode truly; ``unstable``: (step, row) pairs where
-    physics breaks, steps of the world counted from its making; ``garbage``: what the reward holds there, against the
-    contract.
+    Row j of a class has goal j modulo the pool's size. Episodes start within 0.1 of the origin, by seed, class, row and
+    episode alone. Observations are the position and the goal (N, 4), zeros unless visible. Success: within 0.1 of it.
+    One that cannot know the goal does best to stay: about -1 a step. ``rows`` are split evenly over the classes;
+    ``end_at_goal``: a true end; ``unstable``: (step, row) where physics breaks; ``garbage``: the reward there.
     """
 
     speed = 0.2
@@ -91,16 +80,13 @@ class PointGoals(FakePools):
         return obs, reward, terminated, truncated, info
 
     def best(self, obs: Tensor) -> Tensor:
-        """The best action (N, 2) for observations (N, 4) that show the goal."""
         return ((obs[:, 2:] - obs[:, :2]) / self.speed).clamp(-1.0, 1.0)
 
 
 class Recall(FakePools):
     """Two tasks, 1 and -1. The first reward of an episode is the task, the last one is paid for an action of its sign.
 
-    Between them nothing is earned. Observations show the last step, (N, 1). Success: the last action had that sign.
-    Without memory of the first reward half of the episodes succeed, with it all of them. ``rows``: rows; ``steps``:
-    steps per episode.
+    Observations show the last step (N, 1). Without memory of the first reward half of the episodes succeed, else all.
     """
 
     def __init__(self, rows: int = 32, steps: int = 60):

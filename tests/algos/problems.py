@@ -12,9 +12,13 @@ from torch import Tensor
 from tests.algos.toy import ToyWorld, nearness
 from tests.fake_world import FakeWorld
 
+OFF_POLICY: dict[str, Any] = {
+    "hidden": (32, 32), "replay_steps": 200, "cut_share": 0.3, "warmup_steps": 4, "batch_size": 128, "gamma": 0.8,
+    "tau": 0.05, "learning_rate": 3e-3, "critic_learning_rate": 5e-3, "autocast": "off",
+}  # fmt: skip
+
 
 def one_step_bandit(target: float = 0.6, rows: int = 32) -> ToyWorld:
-    """Episodes of one step that end truly. The best action is ``target`` in each entry and pays 1."""
     return ToyWorld([nearness(target)], rows=rows, horizon=1, terminal=True)
 
 
@@ -27,10 +31,7 @@ def opposite_bandits(target: float = 0.5, scale: float = 1.0, rows: int = 32) ->
 
 
 class _TimedWorld(FakeWorld):
-    """What LQR and PointMass share: one task, episodes that a time limit alone ends, reset within the step.
-
-    Rows begin at different times of their first episode. A subclass gives ``_draw`` (states of new episodes (N, s)).
-    """
+    """One task, episodes that a time limit alone ends; rows begin at different times of their first one."""
 
     kept = ("state",)
 
@@ -76,13 +77,11 @@ class LQR(_TimedWorld):
         return -cost, self.state.abs().amax(1) < 0.1, self.never
 
     def optimum(self, gamma: float) -> tuple[np.ndarray, np.ndarray]:
-        """P and K: the best discounted return from x is -x·Px, by the actions -Kx."""
         a, b = np.sqrt(gamma) * self.a, np.sqrt(gamma) * self.b
         p = scipy.linalg.solve_discrete_are(a, b, self.q, self.r)
         return p, np.linalg.solve(self.r + b.T @ p @ b, b.T @ p @ a)
 
     def best(self, gamma: float) -> Callable[[Tensor], Tensor]:
-        """The best policy, observations to actions."""
         k = torch.from_numpy(self.optimum(gamma)[1]).float()
         return lambda obs: -obs @ k.T
 
@@ -90,9 +89,7 @@ class LQR(_TimedWorld):
 class PointMass(_TimedWorld):
     """A point in the plane moves by 0.1 times the action; reward minus its distance to the goal, drawn for the episode.
 
-    Position and goal are uniform in [-0.5, 0.5]. The best action goes towards the goal in each coordinate at once, as
-    far as it can, whatever the discount. Success: within 0.05 at the end. ``rows``: rows; ``horizon``: steps per
-    episode; ``goal_visible``: whether the observation (position, goal) shows the goal or zeros.
+    Position and goal are uniform in [-0.5, 0.5]; the best action goes to the goal in each coordinate as far as it can.
     """
 
     speed = 0.1
@@ -116,15 +113,11 @@ class PointMass(_TimedWorld):
         return -distance, distance < 0.05, self.never
 
     def best(self, obs: Tensor) -> Tensor:
-        """The best action (N, 2) for observations that show the goal."""
         return ((obs[:, 2:] - obs[:, :2]) / self.speed).clamp(-1.0, 1.0)
 
 
 def discounted_return(world: LQR | PointMass, policy: Callable[[Tensor], Tensor], gamma: float, steps: int) -> float:
-    """Mean over rows of the discounted return of ``policy`` from the starts of seed 1; no episode ends.
-
-    Leaves ``world`` somewhere else: call it with one that nobody trains on.
-    """
+    """Mean discounted return of ``policy`` from the starts of seed 1, in a world that nobody trains on: none ends."""
     world.max_episode_steps.fill_(10**9)
     obs, _ = world.reset(seed=1)
     total = torch.zeros(world.num_envs)
@@ -142,7 +135,6 @@ def trained(kind: Any, world: Any, config: Any, iterations: int) -> Any:
 
 
 def errors(learner: Any, *targets: float) -> list[float]:
-    """Mean distance of the action from each task's target."""
     obs, _ = learner.world.reset(seed=1)
     action = learner.eval_action(obs)
     return [float((action[learner.world.task_id == k] - target).abs().mean()) for k, target in enumerate(targets)]

@@ -18,13 +18,11 @@ _DEADLOCK_SECONDS = 500
 
 
 def in_two_processes(function: Callable[[int], Any], folder: Path) -> list[Any]:
-    """What ``function(rank)`` returns in each; it joins the other itself."""
     assert exit_codes(function, folder) == [0, 0]
     return [torch.load(folder / f"{rank}.pt", weights_only=False) for rank in range(2)]
 
 
 def exit_codes(function: Callable[[int], Any], folder: Path) -> list[int | None]:
-    """How two processes end that call ``function(rank)``, which joins the other itself."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -50,7 +48,6 @@ def _one(function: Callable[[int], Any], rank: int, port: int, folder: Path) -> 
 
 
 def same(a: Any, b: Any) -> bool:
-    """Whether two nested states are equal bit for bit."""
     if isinstance(a, dict):
         return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
     if isinstance(a, list | tuple):

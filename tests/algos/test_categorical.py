@@ -13,24 +13,12 @@ from torch.testing import assert_close
 from bidex_algos.nets.inputs import TaskEmbedding
 from bidex_algos.nets.networks import MLP
 from bidex_algos.offpolicy.brc import ResidualMLP
-from bidex_algos.offpolicy.categorical import Atoms
-from bidex_algos.offpolicy.return_scale import ReturnBound
+from bidex_algos.offpolicy.categorical import Atoms, ReturnBound
 from bidex_algos.replay import Replay, Stretches
 from tests.algos.toy import ToyWorld, nearness
 
 
-def test_a_distribution_is_projected_as_by_hand() -> None:
-    atoms = Atoms(-2.0, 2.0, 5)  # -2 -1 0 1 2
-    probs = torch.tensor([[0.0, 0.0, 0.5, 0.5, 0.0], [0.1, 0.2, 0.3, 0.2, 0.2], [0.0, 0.0, 0.0, 0.0, 1.0]])
-    # 0.25 + Z / 2: halves at 0.25 and 0.75. No bootstrap: all at 1.5. Beyond the end: all at 2.
-    out = atoms.projected(probs, torch.tensor([0.25, 1.5, 3.0]), torch.tensor([0.5, 0.0, 1.0]))
-    expected = [[0.0, 0.0, 0.375 + 0.125, 0.125 + 0.375, 0.0], [0.0, 0.0, 0.0, 0.5, 0.5], [0.0, 0.0, 0.0, 0.0, 1.0]]
-    assert_close(out, torch.tensor(expected))
-    assert_close(atoms.mean(out), torch.tensor([0.5, 1.5, 2.0]))
-
-
 def slow_projection(low: float, high: float, probs: np.ndarray, shift: float, factor: float) -> np.ndarray:
-    """Each atom's mass in its turn, given to its two neighbours by their distance, in float64."""
     values = np.linspace(low, high, len(probs))
     out = np.zeros(len(probs))
     for value, mass in zip(values, probs, strict=True):
@@ -91,7 +79,6 @@ class Diary:
         return 100 * t + torch.arange(ROWS)[:, None].float()
 
     def slow(self, t: int, row: int, n: int, gamma: float) -> tuple[float, int, float | None]:
-        """Sum of rewards, steps taken, and the observation after them (None after a true end), step by step."""
         total, taken = 0.0, 0
         while True:
             step = self.entries[t]
@@ -137,7 +124,6 @@ def test_a_stretch_that_begins_with_broken_physics_has_no_weight() -> None:
 
 
 def bound_after(gamma: float, rewards: list[list[float]], **ends: list[list[bool]]) -> ReturnBound:
-    """What one row of each of two tasks leaves; ``ends`` names terminated, truncated, broken."""
     bound = ReturnBound(ToyWorld([nearness(0.0), nearness(0.0)], rows=1), gamma, 1e9)
     for t, reward in enumerate(rewards):
         flags = [torch.tensor(ends[name][t] if name in ends else [False] * 2) for name in ("terminated", "truncated")]

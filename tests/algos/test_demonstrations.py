@@ -7,8 +7,7 @@ import pytest
 import torch
 from torch.distributions import Normal
 
-from bidex_algos.onpolicy.demonstrations import Demonstrations, imitation
-from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
+from bidex_algos.onpolicy.mtppo import MTPPO, Demonstrations, MTPPOConfig, imitation
 from bidex_meta.errors import BidexError
 from tests.algos.toy import ToyWorld, nearness
 from tests.offline.stored import as_data, noisy, played
@@ -24,7 +23,6 @@ def world(rewards: Any = None) -> ToyWorld:
 
 
 def shown(action: float = 0.4, seed_rows: int = 8, only: int | None = None) -> Any:
-    """Data of a policy that does ``action``, of both tasks or of one alone."""
     found = played(ToyWorld(NOTHING, rows=seed_rows), noisy(lambda obs: torch.full((len(obs), 2), action), 0.02), 9)
     return as_data([episode for episode in found if only in (None, episode.task)])
 

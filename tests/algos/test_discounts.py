@@ -5,9 +5,11 @@ from typing import Any
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from bidex_algos.advantages import discounts
+from bidex_algos.advantages import discounts, explained_variance, gae, successor_values, task_moments
 from bidex_algos.meta.promp import PRESETS as PROMP
 from bidex_algos.meta.promp import ProMP
 from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
@@ -36,7 +38,6 @@ OF_TASKS = torch.tensor([0.5, 0.8, 0.9])
 
 
 def paying(gammas: tuple[float | None, ...] = GAMMAS, horizon: int = 3, **options: Any) -> ToyWorld:
-    """Each class pays 1 a step; its first action adds a little, so that advantages differ."""
     rewards = [lambda action: 1.0 + 0.1 * action[:, 0]] * len(gammas)
     world = ToyWorld(rewards, rows=5, horizon=horizon, **options)
     world.gammas = gammas
@@ -79,19 +80,6 @@ def test_advantages_and_targets_are_those_by_hand(kind: str):
     assert_close(batch.targets, learner._in_critic_units(returns, batch.task_id), rtol=1e-3, atol=1e-3)
 
 
-def test_each_class_is_worth_what_its_own_discount_says():
-    # 1 a step for ever is worth 1 / (1 - gamma).
-    world = ToyWorld([lambda action: torch.ones(len(action))] * 3, rows=8, horizon=1)
-    world.gammas = (0.5, None, 0.9)
-    learner = MTPPO(world, replace(PPO, learning_rate=1e-4), seed=0)
-    for _ in range(60):
-        learner.iterate()
-    obs, _ = world.reset(seed=1)
-    values = learner._final_value(obs, world.task_id)
-    worth = [float(values[world.task_id == k].detach().mean()) for k in range(3)]
-    assert worth == pytest.approx([2.0, 5.0, 10.0], rel=0.1)
-
-
 @pytest.mark.parametrize("kind", REPLAYING)
 def test_bootstraps_and_returns_of_a_replay_are_those_by_hand(kind: str):
     make, config = KINDS[kind]
@@ -130,3 +118,62 @@ def test_a_learner_with_one_discount_for_all_refuses_such_a_world():
     world.gammas = (0.9, None)
     with pytest.raises(BidexError, match=r"promp: has one discount .* gives PointGoals one of its own"):
         ProMP(world, replace(PROMP["laptop"], hidden=(8,)), seed=0)
+
+
+def draws(seed: int, steps: int, rows: int):
+    g = torch.Generator().manual_seed(seed)
+
+    def normal() -> torch.Tensor:
+        return torch.randn(steps, rows, generator=g, dtype=torch.float64)
+
+    def flags(p: float) -> torch.Tensor:
+        return torch.rand(steps, rows, generator=g) < p
+
+    return normal, flags
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**31), st.integers(1, 9), st.integers(1, 5), st.floats(0, 1), st.floats(0, 1))
+def test_gae_is_the_sum_of_its_definition(seed: int, steps: int, rows: int, gamma: float, lam: float):
+    normal, flags = draws(seed, steps, rows)
+    rewards, values, final, last = normal(), normal(), normal(), normal()[0]
+    terminated, truncated, valid = flags(0.2), flags(0.2), ~flags(0.15)
+    ended = terminated | truncated | ~valid
+    following = successor_values(values, last, ended, final)
+    got = gae(rewards, values, following, terminated, ended, gamma, lam, valid)
+    for n in range(rows):
+        for t in range(steps):
+            total, discount = 0.0, 1.0
+            for k in range(t, steps):
+                if not valid[k, n]:
+                    break
+                after = final[k, n] if ended[k, n] else (values[k + 1, n] if k + 1 < steps else last[n])
+                after = 0.0 if terminated[k, n] else after
+                total += discount * (rewards[k, n] + gamma * after - values[k, n])
+                discount *= gamma * lam
+                if ended[k, n]:
+                    break
+            assert_close(got[t, n], torch.as_tensor(total, dtype=torch.float64), rtol=1e-9, atol=1e-9)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**31), st.integers(1, 4))
+def test_task_moments_are_those_of_the_valid_entries(seed: int, num_tasks: int):
+    normal, flags = draws(seed, 6, 8)
+    x, valid = normal(), flags(0.8)
+    task_id = torch.arange(8) % num_tasks
+    mean, var, count = task_moments(x.masked_fill(~valid, float("nan")), task_id, num_tasks, valid)
+    for k in range(num_tasks):
+        own = x[valid & (task_id == k)]
+        assert count[k] == len(own)
+        if len(own):
+            assert_close(mean[k], own.mean())
+            assert_close(var[k], own.var(correction=0))
+
+
+def test_explained_variance():
+    task_id, valid = torch.tensor([0, 0, 1]), torch.ones(50, 3, dtype=torch.bool)
+    returns = torch.randn(50, 3)
+    values = returns.clone()
+    values[:, 2] = 7.0
+    assert_close(explained_variance(values, returns, task_id, 2, valid), torch.tensor([1.0, 0.0]), atol=1e-5, rtol=0)

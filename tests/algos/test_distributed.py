@@ -26,6 +26,7 @@ from bidex_meta.train.runner import checkpoint, resume, train
 from tests.algos.families import PointClass, PointGoals
 from tests.algos.problems import opposite_bandits
 from tests.algos.ranks import exit_codes, in_two_processes, same
+from tests.algos.test_runner import Notes
 from tests.algos.toy import ToyWorld, nearness
 
 CONFIG = MTPPOConfig(hidden=(32, 32), rollout_steps=8, learning_rate_range=(1e-5, 2e-3), autocast="off")
@@ -64,7 +65,6 @@ def make_learner(world: ToyWorld, config: Any) -> Learner:
 
 
 def facts(learner: Learner) -> dict[str, torch.Tensor]:
-    """What one update decides."""
     named = [*learner.policy.named_parameters("policy"), *learner.critic.named_parameters("critic")]
     found = {name: p.detach().clone() for name, p in named}
     if isinstance(learner, MTPPO):
@@ -75,7 +75,6 @@ def facts(learner: Learner) -> dict[str, torch.Tensor]:
 
 
 def in_precision(learner: Learner, dtype: torch.dtype) -> Learner:
-    """Casts the networks and the rollout; the running statistics are float64 anyway."""
     learner.policy.actor.to(dtype), learner.critic.to(dtype)
     for name, value in vars(learner.rollout).items():
         if isinstance(value, torch.Tensor) and value.is_floating_point():
@@ -92,7 +91,6 @@ def update(learner: Learner) -> dict[str, Any]:
 
 
 def one_update(rank: int, dtype: torch.dtype, config: Any) -> Callable[[], dict[str, Any]]:
-    """An update on all rows in a process on its own; what is returned makes one on half of them in each of two."""
     whole = make_learner(toy(2 * ROWS, BROKEN), config)
     first, _ = whole.world.reset(seed=0)
     whole.policy.observations.update(first)
@@ -110,27 +108,12 @@ def one_update(rank: int, dtype: torch.dtype, config: Any) -> Callable[[], dict[
     return in_two
 
 
-class Notes:
-    def __init__(self, after: Any = lambda iteration: None):
-        self.metrics: list[dict[str, float]] = []
-        self.saved: list[tuple[int, dict[str, Any]]] = []
-        self.after = after
-
-    def log(self, metrics: dict[str, float], step: int) -> None:
-        self.metrics.append(metrics)
-        self.after(len(self.metrics))
-
-    def save(self, state: dict[str, Any], step: int) -> None:
-        self.saved.append((step, state))
-
-
 def make(rank: int) -> tuple[MTPPO, ToyWorld]:
     world = toy(unstable=((2, 5), (3, 20), (3, 21)) if rank == 1 else ())
     return MTPPO(world, CONFIG, seed=0), world
 
 
 def training(rank: int) -> dict[str, Any]:
-    """Four iterations at a stretch, and two and two with a checkpoint between."""
     notes = Notes()
     learner, world = make(rank)
     train(learner, world, total_steps=4 * ITERATION, record=notes)
@@ -147,7 +130,6 @@ def training(rank: int) -> dict[str, Any]:
 
 
 def stopping(rank: int) -> tuple[int, int, list[int]]:
-    """A signal to process 1 in the second iteration."""
     learner, world = make(rank)
     notes = Notes(lambda iteration: os.kill(os.getpid(), signal.SIGTERM) if (rank, iteration) == (1, 2) else None)
     stopped = train(learner, world, total_steps=100 * ITERATION, record=notes)
@@ -155,7 +137,6 @@ def stopping(rank: int) -> tuple[int, int, list[int]]:
 
 
 def out_of_time(rank: int) -> list[tuple[int, int]]:
-    """No time but for the first iteration, in process 0 and then in process 1 alone."""
     found = []
     for late in range(2):
         learner, world = make(rank)
@@ -166,8 +147,6 @@ def out_of_time(rank: int) -> list[tuple[int, int]]:
 
 
 def bad_input(rank: int) -> str:
-    """What is raised where process 1 alone meets bad input."""
-
     def work() -> int:
         if rank == 1:
             raise BidexError("no such thing")
@@ -189,7 +168,6 @@ def rl2(goals: int = 8) -> RL2:
 
 
 def mtsac_moves() -> torch.Tensor:
-    """How an iteration moves all weights."""
     learner, moved = mtsac(PLAIN_SAC), []
     for _ in range(2):
         weights = [*learner.policy.parameters(), *learner.critic.parameters(), learner.log_alpha]
@@ -200,7 +178,6 @@ def mtsac_moves() -> torch.Tensor:
 
 
 def rl2_tells() -> torch.Tensor:
-    """What the third iteration measures."""
     learner = rl2(goals=3)
     told = [learner.iterate() for _ in range(3)][-1]
     names = ("Loss/surrogate", "Loss/value", "Policy/kl", "Policy/clip_fraction", "Policy/std")
@@ -215,7 +192,6 @@ STEPS = {"mtppo": 4 * ITERATION, "mtsac": 2 * 3 * SAC.steps_per_iteration * 8, "
 
 
 def three_iterations(make: Callable[[], Any]) -> dict[str, Any]:
-    """At a stretch, and two and one with a checkpoint between."""
     one, again = make(), make()
     metrics = [one.iterate() for _ in range(2)]
     state = distributed.share(checkpoint(one, one.world))[0]
@@ -228,7 +204,6 @@ def three_iterations(make: Callable[[], Any]) -> dict[str, Any]:
 
 
 def everything(rank: int) -> dict[str, Any]:
-    """One start of two processes for all tests, since importing torch takes longer than the rest."""
     updates = {dtype: one_update(rank, dtype, ONE_BATCH) for dtype in (torch.float64, torch.float32)}
     updates |= {
         c: one_update(rank, torch.float64, c) for c in (SURGERY, CONFLICT_AVERSE, LOSS_WEIGHTS, TRUST_REGION, *TEAMS)
@@ -255,7 +230,6 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
 
 
 def distances(update: dict[str, Any]) -> dict[str, float]:
-    """Relative distance, for each fact, of the update in two processes from that in one."""
     whole, half = update["whole"]["facts"], update["half"]["facts"]
     return {name: float((half[name] - whole[name]).norm() / whole[name].norm()) for name in whole}
 
@@ -335,7 +309,6 @@ def test_bad_input_in_one_ends_both_and_is_said_once(found):
 
 
 def leave(rank: int) -> None:
-    """Ends as after bad input, with the other threads as busy as they can be."""
     attendance._BEAT_SECONDS = 0.0
     distributed.init_from_environment()
     for _ in range(20):

@@ -14,23 +14,18 @@ from bidex_algos.offpolicy.brc import BRC, BRCConfig
 from bidex_algos.offpolicy.fasttd3 import FastTD3, FastTD3Config
 from bidex_algos.replay import Transitions
 from bidex_meta.train import distributed
-from tests.algos.problems import LQR, opposite_bandits, trained
+from tests.algos.problems import LQR, OFF_POLICY, opposite_bandits, trained
 from tests.algos.ranks import in_two_processes, same
 from tests.algos.test_categorical import slow_projection
 from tests.algos.toy import ToyWorld, nearness
 
-SHARED: dict[str, Any] = {
-    "hidden": (32, 32), "critic_hidden": (32, 32), "replay_steps": 200, "cut_share": 0.3, "warmup_steps": 4,
-    "updates_per_step": 2, "batch_size": 128, "gamma": 0.8, "tau": 0.1, "learning_rate": 3e-3,
-    "critic_learning_rate": 5e-3, "autocast": "off", "atoms": 51,
-}  # fmt: skip
+SHARED = OFF_POLICY | {"critic_hidden": (32, 32), "updates_per_step": 2, "tau": 0.1, "atoms": 51}
 FAST = FastTD3Config(**SHARED | {"updates_per_step": 4}, critic_layer_norm=False, n_steps=1, squash_price=0.0)
 SMALL = BRCConfig(**SHARED, n_steps=1, task_embedding=4, init_alpha=0.01, target_entropy_per_action=-2.0)
 both = pytest.mark.parametrize(("kind", "config"), [(FastTD3, FAST), (BRC, SMALL)], ids=["fasttd3", "brc"])
 
 
 def a_draw() -> Transitions:
-    """Three transitions of each of two tasks, some of several steps."""
     generator = torch.Generator().manual_seed(1)
     obs, following = torch.randn(2, 6, 3, generator=generator)
     ends, steps = torch.tensor([False, True, False, False, True, False]), torch.tensor([1, 2, 3, 1, 1, 3])
@@ -38,7 +33,6 @@ def a_draw() -> Transitions:
 
 
 def shaken(learner: Any) -> None:
-    """Target networks with distributions that differ."""
     noise = torch.Generator().manual_seed(3)
     with torch.no_grad():
         for weight in learner.target_critic.parameters():
@@ -46,13 +40,11 @@ def shaken(learner: Any) -> None:
 
 
 def distributions(learner: Any, obs: Tensor, actions: Tensor) -> Tensor:
-    """Of both target critics, (2, 6, atoms), in float64."""
     x = torch.cat([obs, actions], dim=1)
     return torch.stack([net(x).detach().double().softmax(1) for net in learner.target_critic.nets])
 
 
 def projected(learner: Any, draw: Transitions, rewards: Tensor, following: Tensor, bonus: Tensor) -> Tensor:
-    """Target distributions, one transition after the other."""
     rows = []
     for i in range(6):
         factor = 0.0 if draw.terminated[i] else 0.7 ** int(torch.as_tensor(draw.steps)[i])
@@ -147,15 +139,6 @@ def test_distributions_begin_narrow_about_zero(kind: Any, config: Any) -> None:
     deviation = ((probs * learner.critic.atoms.values.square()).sum(2) - mean.square()).sqrt()
     assert_close(deviation, torch.full((2, 8), 2.0), rtol=0.05, atol=0)
     assert mean.abs().max() < 0.5
-
-
-@pytest.mark.parametrize("lower", [True, False])
-def test_the_actor_climbs_the_lower_critic_or_their_mean(lower: bool) -> None:
-    values = torch.tensor([[1.0, 5.0], [3.0, 2.0]])
-    expected = torch.tensor([1.0, 2.0] if lower else [2.0, 3.5])
-    fast = FastTD3(opposite_bandits(rows=1), replace(FAST, clipped_double_q=lower), seed=0)
-    brc = BRC(opposite_bandits(rows=1), replace(SMALL, clipped_double_q=lower), seed=0)
-    assert torch.equal(fast._climbed(values), expected) and torch.equal(brc._pooled(values), expected)
 
 
 @pytest.mark.parametrize("one", [True, False])

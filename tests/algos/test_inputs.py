@@ -25,7 +25,6 @@ from bidex_meta.errors import BidexError
 from bidex_meta.world.contract import ObservationGroup, plain_groups
 from tests.algos.families import PointGoals
 from tests.algos.problems import opposite_bandits
-from tests.algos.toy import ToyWorld
 
 PPO = MTPPOConfig(hidden=(16, 16), learning_rate=3e-3, autocast="off")
 SAC = MTSACConfig(hidden=(16, 16), replay_steps=60, cut_share=0.3, warmup_steps=4, batch_size=64, autocast="off")
@@ -59,20 +58,6 @@ class PointNet(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return self.net(x.unflatten(-1, (self.points, 3))).amax(-2)
-
-
-class FirstWorld(ToyWorld):
-    """Opposite bandits whose one-hot comes first."""
-
-    def __init__(self) -> None:
-        super().__init__(opposite_bandits().rewards)
-        self.observation_groups = (
-            ObservationGroup("task_id", (slice(0, 2),)),
-            ObservationGroup("state", (slice(2, 3),)),
-        )
-
-    def _observe(self) -> Tensor:
-        return super()._observe().roll(2, dims=1)
 
 
 @pytest.mark.parametrize("ranges", [[], [(1, 3)], [(0, 1), (1, 4)], [(0, 1), (3, 4)], [(3, 4), (0, 2)]])
@@ -154,17 +139,6 @@ def mtsac(world: Any, seed: int = 0, **more: Any) -> MTSAC:
 
 
 LEARNERS = pytest.mark.parametrize("make", [mtppo, mttrpo, mtsac])
-
-
-@pytest.mark.parametrize("options", [{"policy_heads": True}, {"task_embedding": 4}], ids=["heads", "embedding"])
-def test_opposite_tasks_are_learned_wherever_the_id_stands(options: dict[str, Any]) -> None:
-    learner = mtppo(FirstWorld(), **options)
-    for _ in range(60):
-        learner.iterate()
-    obs, _ = learner.world.reset(seed=1)
-    action = learner.eval_action(obs)
-    for k, target in enumerate((0.5, -0.5)):
-        assert (action[learner.world.task_id == k] - target).abs().max() < 0.15
 
 
 @LEARNERS

@@ -11,8 +11,7 @@ from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig
 from tests.algos.families import Recall
-from tests.algos.problems import LQR, PointMass, discounted_return, one_step_bandit, opposite_bandits, trained
-from tests.algos.toy import ToyWorld, nearness
+from tests.algos.problems import LQR, OFF_POLICY, PointMass, discounted_return, opposite_bandits, trained
 
 GAMMA = 0.8
 SHARED: dict[str, Any] = {"hidden": (32, 32), "rollout_steps": 16, "gamma": GAMMA, "init_std": 0.5, "autocast": "off"}
@@ -22,16 +21,9 @@ both = pytest.mark.parametrize(("learner_type", "config"), [(MTPPO, PPO), (MTTRP
 
 
 def mean_actions(learner: Any) -> list[float]:
-    """Mean action in each task."""
     obs, _ = learner.world.reset(seed=1)
     action = learner.eval_action(obs)
     return [float(action[learner.world.task_id == k].mean()) for k in range(learner.world.num_tasks)]
-
-
-@both
-def test_a_one_step_bandit(learner_type: Any, config: Any):
-    [mean] = mean_actions(trained(learner_type, one_step_bandit(0.6), config, 25))
-    assert mean == pytest.approx(0.6, abs=0.1)
 
 
 @both
@@ -58,10 +50,7 @@ PAID_ALIKE = MTPPOConfig(
     hidden=(32, 32), rollout_steps=8, learning_rate=1e-3, learning_rate_range=(1e-4, 4e-3), std_range=(0.05, 1.0),
     autocast="off",
 )  # fmt: skip
-SAC = MTSACConfig(
-    hidden=(32, 32), replay_steps=200, cut_share=0.3, warmup_steps=4, batch_size=128, gamma=0.8, tau=0.05,
-    learning_rate=3e-3, critic_learning_rate=5e-3, init_alpha=0.01, autocast="off",
-)  # fmt: skip
+SAC = MTSACConfig(**OFF_POLICY, init_alpha=0.01)
 WAYS: list[tuple[Any, Any, dict[str, Any], int, float]] = [
     (MTPPO, PAID_ALIKE, {"value_heads": False}, 40, 1000.0),
     (MTPPO, PAID_ALIKE, {"policy_heads": True}, 40, 1000.0),
@@ -79,17 +68,6 @@ def test_two_tasks_that_only_the_one_hot_tells_apart(
 ):
     learner = trained(learner_type, opposite_bandits(0.5, scale), replace(config, **options), iterations)
     assert mean_actions(learner) == pytest.approx([0.5, -0.5], abs=0.2)
-
-
-@both
-def test_without_the_one_hot_there_is_nothing_between_the_two(learner_type: Any, config: Any):
-    class Blind(ToyWorld):
-        def _observe(self) -> torch.Tensor:
-            return super()._observe() * torch.tensor([1.0, 0.0, 0.0])
-
-    blind = replace(config, value_heads=False)
-    means = mean_actions(trained(learner_type, Blind([nearness(0.5), nearness(-0.5)]), blind, 30))
-    assert means == pytest.approx([0.0, 0.0], abs=0.25)
 
 
 # RL² plays the default chunk (whole trials) and, so that the test is known to be able to fail, one of 25 steps.

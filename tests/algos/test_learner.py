@@ -5,7 +5,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bidex_algos.learner import as_numbers, check_finite
 from bidex_algos.meta.maml import PRESETS as MAML_PRESETS
 from bidex_algos.meta.promp import PRESETS as PROMP_PRESETS
 from bidex_algos.meta.promp import ProMP, ProMPConfig
@@ -87,18 +86,3 @@ def test_another_kind_of_policy_is_refused():
     learner = MTSAC(PointGoals(rows=16, autoreset_mode="SAME_STEP"), config, seed=0)
     with pytest.raises(BidexError, match="of the same kind"):
         learner.start_from(trained().policy_state_dict())
-
-
-def test_scalars_of_any_type_become_numbers():
-    assert as_numbers({"a": torch.tensor(3), "b": torch.tensor(0.5), "c": torch.tensor(True)}) == {
-        "a": 3.0, "b": 0.5, "c": 1.0
-    }  # fmt: skip
-    assert as_numbers({}) == {}
-
-
-@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_a_loss_that_is_not_finite_ends_the_training_with_a_remedy(bad: float):
-    metrics = {"Loss/a": 1.0, "Loss/b": bad}
-    check_finite(metrics, ["Loss/a", "Loss/missing"], "mtppo", 5, "rest")
-    with pytest.raises(FloatingPointError, match="mtppo: the loss is not finite after 5 steps; lower the rate"):
-        check_finite(metrics, ["Loss/a", "Loss/b"], "mtppo", 5, "lower the rate")

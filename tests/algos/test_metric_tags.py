@@ -30,7 +30,6 @@ OF_AGENTS = {"ippo": "mtppo", "mappo": "mtppo", "happo": "mtppo", "hatrpo": "mtt
 
 
 def told(algo: str, variants: list[dict[str, Any]]) -> set[str]:
-    """Tags of some iterations on a toy, names of tasks as ``<task>``."""
     kind, tags = learner_kind(algo), set()
     for options in variants:
         config = kind.presets["laptop"]
@@ -52,7 +51,6 @@ def told(algo: str, variants: list[dict[str, Any]]) -> set[str]:
 
 
 def listed() -> dict[str, set[str]]:
-    """The page's tags of each learner."""
     page: dict[str, set[str]] = {algo: set() for algo in VARIANTS}
     text = (ROOT / "docs" / "metrics.md").read_text(encoding="utf-8").partition("## What the run adds")[0]
     for row in re.findall(r"^\| (`.*?) \| (.*?) \|", text, re.MULTILINE):

@@ -11,9 +11,12 @@ from torch.distributions import Normal
 from bidex_algos.multiagent.happo import HAPPO, HAPPOConfig
 from bidex_algos.multiagent.hatrpo import HATRPO, HATRPOConfig
 from bidex_algos.multiagent.ippo import IPPO, IPPOConfig
+from bidex_algos.multiagent.maddpg import MADDPG, MADDPGConfig
 from bidex_algos.multiagent.mappo import MAPPO, MAPPOConfig
+from bidex_algos.offpolicy.ddpg import DDPG, DDPGConfig
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig
+from bidex_algos.replay import Transitions
 from bidex_algos.rollout import collect
 from bidex_meta.errors import BidexError
 from tests.algos.problems import LQR, opposite_bandits
@@ -31,7 +34,6 @@ every = pytest.mark.parametrize("kind", KINDS)
 
 
 def weights_of(learner: Any) -> Tensor:
-    """All weights of actor and critic in one order."""
     actor = learner.policy.actor
     net, log_std = (actor.nets[0], actor.log_stds[0]) if hasattr(actor, "nets") else (actor.mean, actor.log_std)
     return torch.cat([p.detach().flatten() for p in (*net.parameters(), log_std, *learner.critic.parameters())])
@@ -63,7 +65,6 @@ def test_hatrpo_of_one_agent_is_mt_trpo() -> None:
 
 @pytest.mark.parametrize("max_factor", [0.0, 1.1])
 def test_the_factor_is_the_product_of_the_ratios_before(max_factor: float) -> None:
-    """Against torch.distributions on networks called one by one; agents are moved by hand between their turns."""
     config = HAPPOConfig(agents="a=action/2;b=action/3+action/0;c=action/1", max_factor=max_factor, **SMALL)
     learner = HAPPO(ToyWorld([nearness(0.3)], actions=4), config, seed=0)
     learner.iterate()
@@ -114,7 +115,6 @@ LARGE: dict[str, Any] = {
 
 
 def exclusive_or(action: Tensor) -> Tensor:
-    """A matrix game: 1 if one agent alone goes (its action is positive), else 0."""
     return (action > 0).sum(1).eq(1).float()
 
 
@@ -175,7 +175,6 @@ def test_ippos_critics_see_no_more_than_their_agents() -> None:
 
 
 def test_ippo_estimates_apart() -> None:
-    """With critics alike it says of each agent what MAPPO says of all, cut episodes and all."""
     learners = [make(LQR(rows=8, horizon=5), config, seed=0) for make, config in (KINDS["ippo"], KINDS["mappo"])]
     ippo, mappo = learners
     first, second = ippo.critic.nets
@@ -196,7 +195,6 @@ def test_ippo_estimates_apart() -> None:
 @pytest.mark.parametrize("popart", [True, False])
 @every
 def test_popart_keeps_values_when_statistics_change(kind: str, popart: bool) -> None:
-    """Returns grow and move away from 0: the critic's units change, what it says in units of reward does not."""
     make, config = KINDS[kind]
     learner = make(opposite_bandits(scale=1000.0), replace(config, popart=popart), seed=0)
     learner.iterate()
@@ -220,3 +218,57 @@ def test_bad_configs_are_one_line() -> None:
         HAPPOConfig(agents="thumbs")
     with pytest.raises(BidexError, match="200 mini-batches need as many samples"):
         HAPPO(LQR(rows=2), HAPPOConfig(agents=PAIR, num_minibatches=200, **SMALL), seed=0)
+
+
+CROSSED = "a=action/1;b=action/0"
+REPLAYED: dict[str, Any] = {
+    "hidden": (32, 32), "autocast": "off", "batch_size": 128, "learning_rate": 2e-3, "critic_learning_rate": 3e-3,
+    "warmup_steps": 8, "replay_steps": 200, "policy_heads": False, "tau": 0.05, "squash_price": 0.0,
+}  # fmt: skip
+
+
+def rosenbrock(action: Tensor) -> Tensor:
+    first, second = action.unbind(1)
+    return 1.0 - 2.0 * (second - first.square()).square() - (first - 0.5).square()
+
+
+def test_two_agents_find_a_coupled_optimum() -> None:
+    world = ToyWorld([rosenbrock], rows=32, horizon=1, terminal=True)
+    learner = MADDPG(world, MADDPGConfig(agents=CROSSED, **REPLAYED), seed=0)
+    for _ in range(25):
+        learner.iterate()
+    obs, _ = world.reset(seed=1)
+    assert learner.eval_action(obs).mean(0).tolist() == pytest.approx([0.5, 0.25], abs=0.1)
+
+
+@pytest.mark.parametrize("heads", [False, True])
+def test_one_agent_is_ddpg(heads: bool) -> None:
+    options = REPLAYED | {"policy_heads": heads, "squash_price": 0.5}
+    one, other = (
+        DDPG(opposite_bandits(), DDPGConfig(**options), seed=1),
+        MADDPG(opposite_bandits(), MADDPGConfig(agents="single", **options), seed=1),
+    )
+    for _ in range(3):
+        told = [learner.iterate() for learner in (one, other)]
+        assert told[0]["Loss/critic"] == pytest.approx(told[1]["Loss/critic"], abs=1e-5)
+    weights = [torch.cat([p.detach().flatten() for p in each.policy.actor.parameters()]) for each in (one, other)]
+    torch.testing.assert_close(*weights, rtol=0, atol=1e-5)
+
+
+def test_an_agent_climbs_beside_what_the_others_did() -> None:
+    """Its slope is that of a critic fed with the replay's actions of the others, by autograd on one agent alone."""
+    learner = MADDPG(opposite_bandits(), MADDPGConfig(agents=CROSSED, **REPLAYED), seed=0)
+    for _ in range(3):
+        learner.iterate()
+    draw: Transitions = learner.replay.take(learner.replay.draw(1, learner.batch_per_task, learner.generator)[0])
+    obs, actor = learner.policy.observations(draw.obs), learner.policy.actor
+    count = len(obs)
+    net = actor.nets[0]  # agent a, whose action is the second
+    joint = torch.stack([draw.actions[:, 0], torch.tanh(net(obs))[:, 0]], 1)
+    expected = torch.autograd.grad(-learner.critic(obs, joint, learner.task_of_draw)[0].mean(), net.head.weight)[0]
+    seen: list[Tensor] = []
+    learner.adams["actor"].step = lambda: seen.append(net.head.weight.grad.clone())  # type: ignore[method-assign]
+    learner.config.__dict__["max_grad_norm"] = 1e9
+    counts = torch.full((2,), count / 2)
+    learner._policy_step(obs, draw, torch.ones(count), counts)
+    torch.testing.assert_close(seen[0], expected, rtol=1e-3, atol=1e-5)

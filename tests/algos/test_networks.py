@@ -1,8 +1,12 @@
+import math
+from typing import Any
+
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch.distributions import Independent, Normal, kl_divergence
+from torch import Tensor
+from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution, kl_divergence
 from torch.func import grad
 from torch.testing import assert_close
 
@@ -10,6 +14,8 @@ from bidex_algos.nets import products
 from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import MLP, GaussianActor, gaussian_entropy, gaussian_kl, gaussian_log_prob, use_bfloat16
 from bidex_algos.nets.normalise import ObservationNormaliser, RunningStats, TaskNormaliser
+from bidex_algos.nets.point_net import PointNet, _largest_of
+from bidex_algos.nets.policy import SquashedActor, sample_squashed
 from bidex_algos.nets.products import Linear, affine, stacked_affine
 from bidex_meta.world.contract import plain_groups
 
@@ -48,18 +54,6 @@ def test_initial_weights_follow_the_seed_and_leave_the_global_generator_alone():
     weight = nets[0].mean.head.weight
     assert_close(weight @ weight.T, 1e-4 * torch.eye(3), atol=1e-8, rtol=1e-4)
     assert_close(nets[0].log_std.exp(), torch.full((3,), 0.8))
-
-
-def test_a_head_sees_its_own_task_alone():
-    actor = GaussianActor(TASKS_LAST, (8,), 3, 0.8, torch.Generator().manual_seed(0), heads=2)
-    x = torch.cat([torch.randn(4, 3), torch.eye(2).repeat(2, 1)], dim=1)
-    mean, log_std = actor(x), actor.log_std_of(x)
-    with torch.no_grad():
-        actor.mean.head.bias[3:] += 1.0  # the second head's
-        actor.log_std[1] += 1.0
-    assert_close(actor(x) - mean, torch.tensor([0.0, 1.0, 0.0, 1.0])[:, None].expand(4, 3))
-    assert_close(actor.log_std_of(x) - log_std, torch.tensor([0.0, 1.0, 0.0, 1.0])[:, None].expand(4, 3))
-    assert mean.shape == log_std.shape == (4, 3)
 
 
 def test_the_output_layer_stays_float32_under_autocast():
@@ -148,7 +142,6 @@ ROWS, INPUTS, OUTPUTS = 8, 6, 5
 
 @pytest.fixture(params=["own", "onednn"])
 def chosen(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Rows of the products that oneDNN makes, in whichever way the machine would choose."""
     made: list[int] = []
     computed = products._onednn
 
@@ -189,7 +182,6 @@ def test_values_and_gradients_are_those_of_double_precision(chosen, shape, biase
 
 
 def test_gradients_have_gradients(chosen) -> None:
-    """What MAML's outer loop and TRPO's curvature need, by autograd and by ``torch.func``."""
     x, first, second = drawn(ROWS, INPUTS), drawn(INPUTS, INPUTS, seed=1), drawn(OUTPUTS, INPUTS, seed=2)
 
     def stepped(product, x, first, second):
@@ -203,16 +195,6 @@ def test_gradients_have_gradients(chosen) -> None:
     expected = torch.autograd.grad(stepped(torch.nn.functional.linear, *doubles), doubles[1:])
     for one, other in zip(found, expected, strict=True):
         assert_close(one.double(), other, rtol=1e-3, atol=1e-3)
-
-
-@pytest.mark.parametrize("view", ["rows", "columns", "expanded", "middle"])
-def test_operands_are_without_gaps(view) -> None:
-    """What soft modules and MOORE hand on: slices of stacks, which oneDNN would multiply by its slowest code."""
-    x = torch.arange(60.0).view(4, 3, 5)
-    given = {"rows": x[0], "columns": x[0].t(), "expanded": x[0, :1].expand(3, 5), "middle": x[:, 1]}[view]
-    dense = products._dense(given)
-    assert torch.equal(dense, given) and (dense.is_contiguous() or dense.t().is_contiguous())
-    assert (dense.data_ptr() == given.data_ptr()) == (view in ("rows", "columns"))
 
 
 def test_layers_side_by_side(chosen) -> None:
@@ -237,15 +219,6 @@ def test_small_products_other_types_and_what_is_turned_off_are_pytorchs(chosen, 
     assert chosen == made
 
 
-def test_the_layer_is_pytorchs_to_rounding(chosen) -> None:
-    torch.manual_seed(0)
-    layer = Linear(INPUTS, OUTPUTS)
-    own = torch.nn.Linear(INPUTS, OUTPUTS)
-    own.load_state_dict(layer.state_dict())
-    x = drawn(ROWS, INPUTS)
-    assert_close(layer(x), own(x))
-
-
 @pytest.mark.parametrize(("processor", "capability", "faster"), [
     ("vendor_id : AuthenticAMD", "AVX512", True),
     ("vendor_id : AuthenticAMD", "AVX2", False),
@@ -260,3 +233,96 @@ def test_it_is_chosen_on_amds_processors_alone(monkeypatch, processor, capabilit
     assert products.is_faster_here.__wrapped__() is faster
     monkeypatch.setattr(products, "_onednn", lambda *_: torch.ops.mkldnn.no_such_operation(*_))
     assert products.is_faster_here.__wrapped__() is False
+
+
+def actor(heads: int = 1, init_std: float = 0.5, std_range: tuple[float, float] = (0.02, 2.0)) -> SquashedActor:
+    inputs, g = Inputs(plain_groups(5, 2)), torch.Generator().manual_seed(0)
+    return SquashedActor(inputs, (16,), 3, heads, init_std, std_range, g, "relu")
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**31), st.integers(1, 6))
+def test_the_density_agrees_with_torch_distributions(seed: int, actions: int):
+    g = torch.Generator().manual_seed(seed)
+    mean, log_std, noise = 0.7 * torch.randn(3, 5, actions, generator=g, dtype=torch.float64)
+    action, log_prob = sample_squashed(mean, log_std, noise)
+    # The one with the cached inverse: what torch computes from an action near 1 is itself inexact.
+    squashed = TransformedDistribution(Normal(mean, log_std.exp()), TanhTransform(cache_size=1))
+    expected = Independent(squashed, 1).log_prob(action)
+    assert_close(log_prob, expected, rtol=1e-6, atol=1e-6)
+
+
+def test_value_and_gradient_stay_finite_where_tanh_rounds_to_one():
+    mean = torch.tensor([[50.0, -50.0, 0.0]], requires_grad=True)
+    log_std = torch.zeros(1, 3, requires_grad=True)
+    action, log_prob = sample_squashed(mean, log_std, torch.ones(1, 3))
+    assert action[0, 0] == 1.0
+    # Far out the slope of tanh is 4 exp(-2|u|).
+    expected = -1.5 - 1.5 * math.log(2 * math.pi) + (2 * 51 - math.log(4)) + (2 * 49 - math.log(4)) + 0.8675617
+    assert_close(log_prob, torch.tensor([expected]), rtol=1e-5, atol=1e-4)
+    (log_prob + action.sum()).sum().backward()
+    assert mean.grad is not None and log_std.grad is not None
+    assert mean.grad.isfinite().all() and log_std.grad.isfinite().all()
+
+
+def test_the_actor_starts_at_zero_with_its_standard_deviation_and_keeps_the_bounds():
+    mean, log_std = actor()(torch.randn(100, 5, generator=torch.Generator().manual_seed(0)))
+    assert mean.abs().max() < 0.1
+    assert_close(log_std.exp(), torch.full((100, 3), 0.5), rtol=0.1, atol=0)
+    wild = actor()
+    with torch.no_grad():
+        wild.net.head.weight.mul_(1e6)
+    std = wild(torch.randn(100, 5))[1].exp()
+    assert 0.0199 < std.min() < 0.021 and 1.9 < std.max() < 2.001
+
+
+def net(points: int, channels: int = 3, **config: Any) -> PointNet:
+    generator = torch.Generator().manual_seed(0)
+    return PointNet(points * channels, generator, (8, 16), channels, **config)
+
+
+def clouds(points: int, channels: int = 3) -> Tensor:
+    return torch.randn(5, points, channels, generator=torch.Generator().manual_seed(1)) * 0.1
+
+
+def test_order_and_repetition_of_points_do_not_matter_but_for_the_centre() -> None:
+    made, cloud = net(40), clouds(40)
+    shuffled = cloud[:, torch.randperm(40, generator=torch.Generator().manual_seed(2))]
+    assert_close(made(cloud.flatten(1)), made(shuffled.flatten(1)))
+    twice = torch.cat((cloud, cloud), dim=1)
+    assert_close(made(cloud.flatten(1)), net(80)(twice.flatten(1)))
+    away = cloud + torch.tensor([1.0, -2.0, 0.5])
+    before, after = made(cloud.flatten(1)), made(away.flatten(1))
+    assert_close(after[:, :-3], before[:, :-3], atol=1e-4, rtol=1e-4)
+    assert_close(after[:, -3:] - before[:, -3:], torch.tensor([[1.0, -2.0, 0.5]]).expand(5, 3))
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_the_gradient_through_the_largest_points_is_that_through_all(channels: int) -> None:
+    made, cloud = net(40, channels), clouds(40, channels)
+    made(cloud.flatten(1)).square().sum().backward()
+    short = [weights.grad.clone() for weights in made.parameters() if weights.grad is not None]
+    made.zero_grad()
+    centre = cloud[..., :3].mean(dim=1, keepdim=True)
+    points = torch.cat(((cloud[..., :3] - centre) / 0.2, cloud[..., 3:]), dim=2)
+    features = made.shared(points).max(dim=1).values
+    features.square().sum().backward()
+    for mine, weights in zip(short, made.parameters(), strict=True):
+        assert_close(mine, weights.grad)
+    with torch.no_grad():
+        assert_close(made(cloud.flatten(1))[:, :-3], features.detach())
+
+
+@pytest.mark.parametrize("points", [1, 7, 100, 256])
+def test_the_largest_is_found_by_blocks(points: int) -> None:
+    values = torch.randn(3, points, 9, generator=torch.Generator().manual_seed(3))
+    assert torch.equal(_largest_of(values), values.argmax(dim=1))
+
+
+def test_points_read_leaves_points_out_evenly() -> None:
+    made, cloud = net(40, read=10), clouds(40)
+    changed = cloud.clone()
+    changed[:, 1::4] += 1.0
+    assert torch.equal(made(cloud.flatten(1)), made(changed.flatten(1)))
+    changed[:, 0] += 1.0
+    assert not torch.equal(made(cloud.flatten(1)), made(changed.flatten(1)))

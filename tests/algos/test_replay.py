@@ -27,7 +27,6 @@ def make(steps: int = 6, cut_share: float = 1.0) -> Replay:
 
 
 def add(replay: Replay, *, terminated: Any = (), truncated: Any = (), unstable: Any = (), bad: float = 0.0) -> None:
-    """One step; rows named in ``terminated``, ... end so. Final observations are those of the step and a half."""
     t = replay.added
 
     def flags(rows: Any) -> Tensor:
@@ -41,7 +40,6 @@ def add(replay: Replay, *, terminated: Any = (), truncated: Any = (), unstable: 
 
 
 def everything(replay: Replay) -> Tensor:
-    """Places of all transitions that can be drawn."""
     newest = range(replay.added - replay.filled, replay.added)
     return torch.tensor([step % replay.slots * ROWS + row for step in newest for row in range(ROWS)])
 

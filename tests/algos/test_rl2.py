@@ -7,11 +7,9 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from bidex_algos.meta.rl2 import RL2, RL2Config
-from bidex_algos.meta.rl2_agent import RL2Agent
+from bidex_algos.meta.rl2 import RL2, RL2Agent, RL2Config
 from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.nets.recurrent import RecurrentNet
-from bidex_meta import Benchmark
 from bidex_meta.agents import MetaLearningAgent, Timestep
 from bidex_meta.cli.learners import learner_kind
 from bidex_meta.errors import BidexError
@@ -33,7 +31,6 @@ def everyone(world: PointGoals) -> Tensor:
 
 
 def evaluated(agent: MetaLearningAgent, world: PointGoals) -> float:
-    """Mean return of one evaluation episode in each row."""
     obs, _ = world.reset()
     agent.reset(everyone(world))
     total = 0.0
@@ -44,7 +41,6 @@ def evaluated(agent: MetaLearningAgent, world: PointGoals) -> float:
 
 
 def adapted(agent: MetaLearningAgent, world: PointGoals) -> None:
-    """One shot: an exploring episode in each row."""
     obs, _ = world.reset()
     agent.reset(everyone(world))
     over = ~everyone(world)
@@ -160,28 +156,6 @@ def test_the_update_sees_what_the_rollout_saw():
         assert_close(batch.old_means[: len(played), row], played)
 
 
-def test_the_memory_lasts_for_a_trial_and_waits_unchanged():
-    learner = RL2(PointGoals(6, classes=UNEVEN), TINY, seed=0)
-    states: list[tuple[Tensor, Tensor, Tensor]] = []
-    step, world = learner.policy.step, learner.world
-
-    def spy(obs: Tensor, memory: Any) -> tuple[Tensor, Tensor]:
-        states.append((memory.state, memory.done, world.episodes.elapsed))
-        return step(obs, memory)
-
-    learner.policy.step = spy  # type: ignore[method-assign]
-    for _ in range(2):
-        states.clear()
-        learner.iterate()
-        assert len(states) == 3 * 7
-        assert not states[0][0].any() and not states[0][1].any()  # zero at the start of a trial
-        for t, (state, done, elapsed) in enumerate(states[1:], 1):
-            assert state.any(1).all()
-            waited = elapsed == states[t - 1][2]
-            assert torch.equal(state[waited], states[t - 1][0][waited])
-            assert done[elapsed == 0].all() and not done[(elapsed > 0) & (elapsed < world.max_episode_steps)].any()
-
-
 def test_rows_of_different_length_are_recorded_without_gaps():
     learner = RL2(PointGoals(6, classes=UNEVEN), replace(TINY, max_adapt_steps=5), seed=0)
     metrics = learner.iterate()
@@ -244,22 +218,6 @@ def test_without_rewards_nothing_that_the_policy_sees_tells_the_task():
     assert torch.equal(seen[0][0], seen[1][0]) and not torch.equal(seen[0][1], seen[1][1])
 
 
-def test_nor_in_a_world_of_hands():
-    benchmark = Benchmark("ML1-wide", seed=0)
-    seen = []
-    for order in ([0, 1, 2], [2, 0, 1]):
-        world = benchmark.make_world("train", num_envs=3, device="cpu", threads=1, autoreset_mode="DISABLED")
-        world.set_tasks({"CatchUnderarm": world.slots[0].tasks[order]})
-        learner = RL2(world, replace(TINY, blind_share=1.0, max_adapt_steps=4), seed=0)
-        learner._update = lambda batch: {}  # type: ignore[method-assign]
-        learner.iterate()
-        t = learner.trials
-        assert t.lengths.tolist() == [12, 12, 12]
-        seen.append((learner.policy.see(t.obs[:12], *t.previous(12)), t.rewards[:12].clone()))
-        world.close()
-    assert torch.equal(seen[0][0], seen[1][0]) and not torch.equal(seen[0][1], seen[1][1])
-
-
 def test_rewards_are_shown_but_for_blind_episodes():
     learner = RL2(PointGoals(400, classes=TEN), replace(SMALL, blind_share=0.3), seed=0)
     learner.iterate()
@@ -317,3 +275,99 @@ def test_the_run_makes_the_world_that_the_learner_asks_for():
         world = source.world("train", 3, learner_kind(algo).autoreset(learner))
         assert world.autoreset_mode.name == mode
         world.close()
+
+
+def agent_on(world: PointGoals) -> RL2Agent:
+    learner = RL2(PointGoals(8, classes=TEN), SMALL, seed=0)
+    learner.iterate()
+    agent = RL2.load_policy(learner.policy_state_dict())
+    agent.assign(torch.zeros(world.num_envs, dtype=torch.int64))
+    agent.init()
+    return agent
+
+
+def test_evaluation_episodes_start_from_what_adaptation_left():
+    world = PointGoals(4, classes=TEN)
+    agent = agent_on(world)
+    adapted(agent, world)
+    left = state_of(agent)
+    obs = torch.zeros(4, 4)
+    first = []
+    for _ in range(3):
+        agent.reset(everyone(world))
+        first.append(agent.eval_action(obs))
+        assert not torch.equal(agent.eval_action(obs), first[-1])  # the memory goes on within the episode
+    assert torch.equal(first[0], first[1]) and torch.equal(first[0], first[2])
+    assert torch.equal(state_of(agent), left)
+    # A second shot goes on from the first, not from an evaluation.
+    adapted(agent, world)
+    assert not torch.equal(state_of(agent), left)
+    agent.init()
+    agent.reset(everyone(world))
+    assert not state_of(agent).any()
+
+
+def test_reset_of_some_rows_leaves_the_others_in_their_episode():
+    agent = agent_on(PointGoals(4, classes=TEN))
+    obs, mask = torch.ones(4, 4), torch.tensor([True, False, True, False])
+    agent.reset(~mask | mask)
+    first = agent.eval_action(obs)
+    agent.reset(mask)
+    second = agent.eval_action(obs)
+    assert torch.equal(first[mask], second[mask]) and not (first[~mask] == second[~mask]).all(1).any()
+
+
+def test_the_agent_waits_with_rows_whose_episode_is_over():
+    world = PointGoals(6, classes=UNEVEN)
+    agent = agent_on(world)
+    obs, _ = world.reset()
+    agent.reset(everyone(world))
+    over = ~everyone(world)
+    for t in range(7):
+        action, aux = agent.adapt_action(obs)
+        obs, reward, terminated, truncated, _ = world.step(action)
+        before = state_of(agent)
+        agent.step(Timestep(obs, action, reward, terminated, truncated, aux, obs, ~over))
+        over = terminated | truncated
+        same = (state_of(agent) == before).all(1)
+        assert same.tolist() == [t >= 3] * 3 + [False] * 3
+    assert agent._learned is not None and agent._learned.done.all()
+
+
+def test_rows_that_play_no_episode_learn_nothing():
+    world = PointGoals(4, classes=TEN)
+    agent, some = agent_on(world), torch.tensor([True, False, True, False])
+    obs, _ = world.reset()
+    agent.reset(some)
+    action, aux = agent.adapt_action(obs)
+    obs, reward, terminated, truncated, _ = world.step(action)
+    agent.step(Timestep(obs, action, reward, terminated, truncated, aux, obs, some))
+    assert torch.equal(state_of(agent).any(1), some)
+    agent.reset(everyone(world))  # an evaluation
+    before = state_of(agent)
+    agent.reset(some)
+    action, aux = agent.adapt_action(obs)
+    agent.step(Timestep(obs, action, reward, terminated, truncated, aux, obs, some))
+    assert torch.equal((state_of(agent) != before).any(1), some)
+
+
+def test_the_agent_plays_the_trial_that_the_training_played():
+    learner = RL2(PointGoals(6, classes=UNEVEN), replace(TINY, blind_share=0.0), seed=0)
+    learner._update = lambda batch: {}  # type: ignore[method-assign]
+    learner.iterate()
+    t, agent = learner.trials, RL2Agent(learner.policy)
+    # Statistics have moved since: what the memory would be by the present ones.
+    previous = t.previous(len(t.obs) - 1)
+    for row in (0, 5):
+        agent.init()
+        n = int(t.lengths[row])
+        x = learner.policy.see(t.obs[:n], *(p[:n] for p in previous))[:, row]
+        _, expected = learner.policy.actor(x[:, None], torch.zeros(1, 8))
+        agent.reset(torch.ones(1, dtype=torch.bool))
+        for k in range(n):
+            _, aux = agent.adapt_action(t.obs[k, row][None])
+            told = (t.obs[k, row], t.actions[k, row], t.rewards[k, row], torch.tensor(False), t.ended[k, row])
+            agent.step(Timestep(*(x[None] for x in told), aux, None, torch.ones(1, dtype=torch.bool)))
+            if t.ended[k, row]:
+                agent.reset(torch.ones(1, dtype=torch.bool))
+        assert_close(state_of(agent), expected.detach())

@@ -10,18 +10,14 @@ from tests.fake_world import FakeWorld
 
 
 def nearness(target: float, scale: float = 1.0) -> Callable[[Tensor], Tensor]:
-    """Reward scale * (1 - mean squared distance of the clamped action from ``target``)."""
     return lambda action: scale * (1.0 - (action - target).square().mean(-1))
 
 
 class ToyWorld(FakeWorld):
-    """Rows of several bandits; observations are a noise column and the one-hot.
+    """Bandits, ``rows`` a task; observations are a noise column and the one-hot, but not the clock.
 
-    The clock is not observed, so the last state of an episode looks like any other. ``rewards``: one function a task,
-    of the clamped actions (rows, a) to rewards (rows,); ``rows``: rows per task; ``horizon``: steps per episode;
-    ``terminal``: whether the end of an episode is a true end instead of a time limit; ``unstable``: (step, row) pairs
-    where physics breaks, counted from the first step; ``garbage``: what reward and final observation hold there,
-    against the contract.
+    ``rewards``: of each task, of clamped actions (rows, a); ``terminal``: whether episodes end truly at ``horizon``;
+    ``unstable``: (step, row) where physics breaks; ``garbage``: what reward and final observation hold there.
     """
 
     def __init__(

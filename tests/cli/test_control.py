@@ -5,9 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
-from bidex_meta.cli import learners, main
+from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import meta_test as metatest
 from bidex_meta.evaluation.control_arms import arms, control
@@ -15,10 +14,12 @@ from bidex_meta.evaluation.gains import difference_over_runs
 from bidex_meta.evaluation.meta_test import meta_evaluate
 from bidex_meta.evaluation.play import play_tasks
 from bidex_meta.worlds.own import OwnSuite
+from tests.cli.conftest import FINDER
 from tests.fakes import change
 from tests.points import Finder, PointWorld, Still, ring
 
 NORTH, EAST, WEST = np.array([[0.0, 1.0]]), np.array([[1.0, 0.0]]), np.array([[-1.0, 0.0]])
+TASKS = OwnSuite.tasks
 PLAYED: Any = {"rollouts": 6, "episodes_per_task": 5, "trials": 3}
 
 
@@ -30,11 +31,8 @@ def world(*goals, rows=18):
 def test_only_what_adapts_to_the_task_gains_above_others_data(rows):
     said = []
     found = control(Finder, world(NORTH, rows=rows), world(EAST, WEST, rows=rows), seed=4, say=said.append, **PLAYED)
-    assert (
-        len(said) == 3
-        and said[0].startswith("before: Near -")
-        and said[2].startswith("adapted to data of train task 2")
-    )
+    assert len(said) == 3 and said[0].startswith("before: Near -")
+    assert said[2].startswith("adapted to data of train task 2")
     assert len(found.foreign) == 2 and len(found.own.classes["Near"].returns) == 3 * 5
     by_arm = arms([found], "Near", ["east", "west"])
     assert list(by_arm) == ["before", "own", "foreign", "east", "west"]
@@ -89,53 +87,42 @@ def test_the_interval_knows_that_runs_differ():
 
 
 @pytest.fixture
-def runs(tmp_path, monkeypatch, capsys):
+def runs(tmp_path, monkeypatch, finder):
     def points(source, split="train", rows=None, mode="DISABLED"):
         goals = ring(1) if split == "test" else ring(3, 1.0)
         return PointWorld(rows or 6, {"CatchUnderarm": goals}, mode=mode)
 
     monkeypatch.setattr(OwnSuite, "world", points)
-    monkeypatch.setitem(learners.ALGOS, "finder", "tests.adapting_learner:Learner")
+    monkeypatch.setattr(OwnSuite, "tasks", TASKS)
     monkeypatch.setattr(PointWorld, "state_dict", dict, raising=False)
-    threads, paths = torch.get_num_threads(), []
-    for seed in ("0", "1"):
-        paths.append(str(tmp_path / seed))
-        flags = ["--suite", "ML1", "--algo", "finder", "--num-envs", "24", "--steps", "24", "--threads", "1"]
-        flags += ["--no-evaluate", "--device", "cpu", "--seed", seed]
-        assert main(["run", *flags, "--run-dir", paths[-1]]) == 0
-    capsys.readouterr()
-    yield paths
-    torch.set_num_threads(threads)
+    paths = [str(tmp_path / seed) for seed in "01"]
+    for path in paths:
+        assert main(["run", *FINDER, "--suite", "ML1", "--no-evaluate", "--seed", path[-1], "--run-dir", path]) == 0
+    return paths
 
 
-def test_the_command_shows_all_arms_of_all_runs(runs, capsys):
+def test_the_command_shows_all_arms_of_all_runs(runs, shown):
     flags = ["--trials", "3", "--episodes", "4"]
-    assert main(["control", *runs, *flags]) == 0
-    shown = capsys.readouterr().out
-    assert "2 runs, 24 episodes an arm" in shown
+    table = shown("control", *runs, *flags)
+    assert "2 runs, 24 episodes an arm" in table
     for label in ("its own data", "train tasks' data, mean", "data of original", "data of left", "data of right"):
-        assert label in shown
-    assert main(["control", *runs, *flags, "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+        assert label in table
+    found = json.loads(shown("control", *runs, *flags, "--json"))
     assert found["episodes"] == {"CatchUnderarm": 24} and len(found["runs"]) == 2
     assert (found["shots"], found["trials"]) == (1, 3) and found["rollouts"] > 0
     by_arm = found["classes"]["CatchUnderarm"]
     assert by_arm["before"]["own_minus"]["return"]["interval"][0] > 0 and len(by_arm["own"]["runs"]) == 2
 
 
-def test_runs_that_are_no_seeds_of_one_experiment_are_refused(runs, capsys):
-    def refusal(*arguments):
-        assert main(["control", *arguments]) == 2
-        return capsys.readouterr().err
-
-    change(runs[1], steps=48)
-    assert "differ in steps" in refusal(*runs)
-    change(runs[1], steps=24, start_from="/runs/1")
-    assert "differ in started" in refusal(*runs)
-    change(runs[1], start_from=None, suite="MT4")
-    assert "but MT4 shows them" in refusal(runs[1])
-    change(runs[1], algo="mtppo")
-    assert "does not adapt" in refusal(runs[1])
-    assert "Name the run folders" in refusal()
-    assert "both have seed 0. Name one run for each seed." in refusal(runs[0], runs[0])
-    assert "--trials" in refusal(*runs, "--trials", "0")
+def test_runs_that_are_no_seeds_of_one_experiment_are_refused(runs, refused):
+    for entries, named, expected in (
+        ({"steps": 48}, runs, "differ in steps"),
+        ({"steps": 24, "start_from": "/runs/1"}, runs, "differ in started"),
+        ({"start_from": None, "suite": "MT4"}, runs[1:], "but MT4 shows them"),
+        ({"algo": "mtppo"}, runs[1:], "does not adapt"),
+        ({}, [], "Name the run folders"),
+        ({}, [runs[0], runs[0]], "both have seed 0. Name one run for each seed."),
+        ({}, [*runs, "--trials", "0"], "--trials"),
+    ):
+        change(runs[1], **entries)
+        assert expected in refused("control", *named)

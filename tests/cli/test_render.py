@@ -5,9 +5,8 @@ import pytest
 from bidex_meta.cli import main, policies
 from bidex_meta.tasks import registry
 from bidex_meta.worlds.own import OwnSuite, SingleClass
-from tests.cli.test_run import run, toy, toy_worlds
-
-__all__ = ["toy_worlds"]
+from tests.cli.conftest import toy
+from tests.cli.test_run import run
 
 
 @pytest.fixture
@@ -95,17 +94,3 @@ def test_a_tile_of_a_row_that_ends_goes_on_and_its_name_is_green_while_solved():
     assert done[0] == [False, False] and [True, True] in done[1:5]
     ends = next(i for i in range(1, 8) if numbers[i] != numbers[i - 1])
     assert done[ends] == [False, False]
-
-
-def test_tiles_are_wider_than_high_with_a_name_under_each():
-    import numpy as np
-
-    from bidex_meta.runs.video import grid, tiled
-
-    assert [grid(n) for n in (1, 2, 4, 5, 20)] == [(1, 1), (2, 1), (2, 2), (3, 2), (5, 4)]
-    pictures = [np.full((30, 80, 3), 10 * i, np.uint8) for i in range(3)]
-    whole = tiled(pictures, ["A", "B", "C"], [False, True, False])
-    assert whole.shape == (2 * 50, 2 * 80, 3)
-    assert (whole[:30, 80:] == 10).all() and (whole[50:80, :80] == 20).all()
-    grey, green = whole[30:50, :80].astype(int), whole[30:50, 80:].astype(int)
-    assert (green[..., 1] - green[..., 0]).max() > 80 > (grey[..., 1] - grey[..., 0]).max()

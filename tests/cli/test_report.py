@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from bidex_meta.cli import main
 from bidex_meta.cli import report as page
 from bidex_meta.runs import RunFolder
 from tests.fakes import evaluated_run, log
@@ -50,17 +49,17 @@ def runs(tmp_path: Path) -> list[Path]:
     return paths
 
 
-def report(paths, capsys, *more: str) -> str:
-    assert main(["report", *map(str, paths), *more]) == 0
-    return Path(capsys.readouterr().out.strip()).read_text()
+@pytest.fixture
+def report(shown):
+    return lambda paths, *more: Path(shown("report", *paths, *more).strip()).read_text()
 
 
-def test_the_page_holds_everything_itself_and_no_markup_of_names(runs, capsys, tmp_path, monkeypatch):
+def test_the_page_holds_everything_itself_and_no_markup_of_names(runs, report, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (runs[0] / "videos" / "training_500.mp4").write_bytes(b"old")
     (runs[0] / "videos" / "training_1000.mp4").write_bytes(b"new film")
     (runs[0] / "videos" / "tiled.mp4").write_bytes(b"tiles")
-    text = report(runs, capsys)
+    text = report(runs)
     tags = Tags(text)
     names = {tag for tag, _ in tags.elements}
     assert not names & {"script", "link", "iframe", "b"}
@@ -74,11 +73,10 @@ def test_the_page_holds_everything_itself_and_no_markup_of_names(runs, capsys, t
     assert "&lt;b&gt;&amp;" in text
 
 
-def test_its_numbers_are_those_of_compare(runs, capsys, tmp_path):
+def test_its_numbers_are_those_of_compare(runs, report, shown, tmp_path):
     out = tmp_path / "new" / "page.html"
-    cells = Tags(report(runs, capsys, "--out", str(out))).cells
-    assert main(["compare", *map(str, runs), "--json"]) == 0
-    for letter, group in zip("AB", json.loads(capsys.readouterr().out), strict=True):
+    cells = Tags(report(runs, "--out", str(out))).cells
+    for letter, group in zip("AB", json.loads(shown("compare", *runs, "--json")), strict=True):
         iqm = group["success_iqm"]
         ends = iqm["interval"]
         told = f"{100 * iqm['value']:.1f}" + (f" [{100 * ends[0]:.1f}, {100 * ends[1]:.1f}]" if ends else "")
@@ -88,38 +86,36 @@ def test_its_numbers_are_those_of_compare(runs, capsys, tmp_path):
     assert "num_envs" not in cells  # the same in all
 
 
-def test_runs_without_an_evaluation_and_of_one_seed(runs, capsys):
+def test_runs_without_an_evaluation_and_of_one_seed(runs, report):
     (runs[1] / "evaluation.json").unlink()
-    text = report(runs, capsys, "--out", str(runs[0] / "r.html"))
+    text = report(runs, "--out", str(runs[0] / "r.html"))
     assert "1 run has no evaluation.json" in text
-    alone = report(runs[:1], capsys)
+    alone = report(runs[:1])
     assert (runs[0] / "report.html").is_file()
     assert "Differences of configs" not in alone and "Adaptation" not in alone
     (runs[0] / "evaluation.json").write_text('{"policy": {"classes": {}}, "steps": 10}')
-    assert "No table: " in report(runs[:1], capsys)
+    assert "No table: " in report(runs[:1])
 
 
-def test_a_meta_test_is_drawn(runs, capsys):
+def test_a_meta_test_is_drawn(runs, report):
     measures = {"success": 0.5, "return": 2.0, "score": None, "success_interval": [0.4, 0.6], "return_interval": None}
     shots = {"classes": {"A": measures}}
     splits = {"train": {"before": shots, "after": shots, "by_shot": [shots, shots]}}
     (runs[0] / "evaluation.json").write_text(json.dumps({"splits": splits}))
-    assert "over shots" in report(runs[:1], capsys)
+    assert "over shots" in report(runs[:1])
 
 
-def test_large_films_are_named_alone(runs, monkeypatch, capsys):
+def test_large_films_are_named_alone(runs, monkeypatch, report):
     monkeypatch.setattr(page, "FILM_BYTES", 4)
     (RunFolder.open(runs[0]).videos_path / "a.mp4").write_bytes(b"12345")
-    text = report(runs[:1], capsys)
+    text = report(runs[:1])
     assert "too large for this page" in text and "<video" not in text
 
 
-def test_nothing_to_show_is_one_line(runs, capsys, monkeypatch):
-    assert main(["report"]) == 2
+def test_nothing_to_show_is_one_line(runs, refused, monkeypatch):
+    assert "Name the run folders" in refused("report")
     log(runs[0])
-    assert main(["report", str(runs[0])]) == 2
-    assert "holds nothing yet" in capsys.readouterr().err
+    assert "holds nothing yet" in refused("report", runs[0])
     log(runs[0], *ROWS)
     monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
-    assert main(["report", str(runs[0])]) == 2
-    assert "bidex-meta[plot]" in capsys.readouterr().err
+    assert "bidex-meta[plot]" in refused("report", runs[0])

@@ -19,17 +19,11 @@ from bidex_meta.cli.sweep_plan import PlannedRun, read_sweep
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.runs import RunFolder
+from tests.cli.test_sweep_plan import FILE
 from tests.fakes import run_config
 from tests.pages import ROOT
 from tools import collect
 
-FILE = """
-name = "tiny"
-tasks = ["HandOver"]
-algos = ["ppo"]
-seeds = [0, 1]
-overrides = { steps = 6, num_envs = 8 }
-"""
 FAKE = (sys.executable, str(Path(__file__).with_name("fake_run.py")))
 CORES = os.sched_getaffinity(0) if sys.platform == "linux" else {0}
 CONFIG = run_config(task="HandOver", algo="ppo", steps=6)
@@ -59,14 +53,9 @@ def planned() -> list[PlannedRun]:
     return [replace(run, config=CONFIG) for run in read_sweep(Path("sweep.toml")).runs]
 
 
-def done(run: PlannedRun) -> bool:
-    return state(run).state == "done"
-
-
-def test_all_runs_end_in_order_and_on_their_core(file: Path, tmp_path: Path, capsys) -> None:
+def test_all_runs_end_in_order_and_on_their_core(file: Path, tmp_path: Path, shown) -> None:
     core = max(CORES)
-    assert main(["sweep", str(file), "--cores", str(core)]) == 0
-    out = capsys.readouterr().out
+    out = shown("sweep", file, "--cores", core)
     assert out.count(" done ") == 2 and "2 done, 0 runs, 0 failed, 0 left" in out
     begun = starts(tmp_path)
     assert [len(each) for each in begun.values()] == [1, 1]
@@ -75,20 +64,18 @@ def test_all_runs_end_in_order_and_on_their_core(file: Path, tmp_path: Path, cap
     if sys.platform == "linux":
         assert first["cores"] == second["cores"] == [core]
         assert os.sched_getaffinity(0) == CORES, "the sweep itself stays free"
-    assert main(["sweep", str(file)]) == 0 and starts(tmp_path) == begun, "nothing is run twice"
-    assert main(["sweep", str(file), "--dry-run"]) == 0
+    shown("sweep", file)
+    assert starts(tmp_path) == begun and not shown("sweep", file, "--dry-run"), "nothing is run twice"
 
 
-def test_a_run_that_its_return_ended_is_done_at_the_steps_it_made(
-    file: Path, tmp_path: Path, monkeypatch, capsys
-) -> None:
+def test_a_run_that_its_return_ended_is_done_at_the_steps_it_made(file: Path, tmp_path, monkeypatch, shown) -> None:
     file.write_text(FILE.replace("steps = 6", "steps = 6, stop_at_return = 4"))
     config = replace(CONFIG, stop_at_return=4.0)
     monkeypatch.setattr("bidex_meta.cli.sweep._configs", lambda sweep, _: {r.words: config for r in sweep.runs})
-    assert main(["sweep", str(file)]) == 0
-    assert "2 done, 0 runs, 0 failed, 0 left" in capsys.readouterr().out
+    assert "2 done, 0 runs, 0 failed, 0 left" in shown("sweep", file)
     begun = starts(tmp_path)
-    assert main(["sweep", str(file)]) == 0 and starts(tmp_path) == begun, "and not trained further"
+    shown("sweep", file)
+    assert starts(tmp_path) == begun, "and not trained further"
     run = read_sweep(file).runs[0]
     found = state(run, config)
     assert (found.state, found.step, found.goal) == ("done", 4, 4)
@@ -123,17 +110,15 @@ def test_an_arm_starts_from_another_on_the_same_subject_seed_and_value(tmp_path:
     for run in runs:
         assert run.after is not None and run.after.name == run.name.replace("-on-", "-ppo-")
         assert f"--start-from={run.after}" in run.begin
-    path.write_text(
-        FILE + STARTING.replace('"on"', '"on"\noverrides = { num_envs = 4 }') + "[grid]\nnum_envs = [8, 16]\n"
-    )
-    with pytest.raises(BidexError, match=r"'ppo', of which there are 2 runs on HandOver"):
-        read_sweep(path)
-    path.write_text(FILE + STARTING.replace('"ppo"\n', '"ppo"\ntasks = ["Switch"]\n', 1))
-    with pytest.raises(BidexError, match=r"'ppo', of which there are 0 runs on Switch"):
-        read_sweep(path)
-    path.write_text(FILE + STARTING.replace('start_from = "ppo"', 'start_from = "on"'))
-    with pytest.raises(BidexError, match="'on', of which there are 0 runs on HandOver above it"):
-        read_sweep(path)
+    own = STARTING.replace('"on"', '"on"\noverrides = { num_envs = 4 }')
+    for text, told in (
+        (own + "[grid]\nnum_envs = [8, 16]\n", "'ppo', of which there are 2 runs on HandOver"),
+        (STARTING.replace('"ppo"\n', '"ppo"\ntasks = ["Switch"]\n', 1), "'ppo', of which there are 0 runs on Switch"),
+        (STARTING.replace('start_from = "ppo"', 'start_from = "on"'), "'on', of which there are 0 runs on HandOver"),
+    ):
+        path.write_text(FILE + text)
+        with pytest.raises(BidexError, match=told):
+            read_sweep(path)
 
 
 def test_what_starts_from_another_waits_for_it_and_fails_with_it(file: Path, tmp_path: Path, capsys) -> None:
@@ -179,7 +164,7 @@ def test_a_sweep_that_was_stopped_loses_no_run(file: Path, tmp_path: Path, how: 
     begun = [[start["resumed"] for start in each] for each in starts(tmp_path).values()]
     assert begun == [[False] if how == "sweep killed" else [False, True]] * 2
     for run in read_sweep(file).runs:
-        assert done(run) and [row["step"] for row in run.folder.metrics()] == [1, 2, 3, 4, 5, 6]
+        assert state(run).state == "done" and [row["step"] for row in run.folder.metrics()] == [1, 2, 3, 4, 5, 6]
 
 
 def _parent(process: Path) -> int | None:
@@ -236,25 +221,23 @@ def test_cores_that_are_not_there(asked: str | None, count: int | None, told: st
         queue.choose_cores(asked, count)
 
 
-def test_how_long_the_rest_takes(file: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+def test_how_long_the_rest_takes(file: Path, monkeypatch, shown) -> None:
     """At the run's own speed, else at the mean of those on its suite; where time ends it, that."""
     file.write_text(FILE.replace("[0, 1]", "[0, 1, 2]"))
     run = read_sweep(file).runs[0]
     run.path.mkdir(parents=True)
     (run.path / "config.json").write_text(json.dumps(CONFIG.to_json()))
     (run.path / "metrics.jsonl").write_text('{"step": 3, "Perf/training_time": 3600}\n')
-    assert main(["sweep", str(file), "--status"]) == 0
-    assert "0 done, 0 runs, 0 failed, 3 left; about 5.00 core-hours" in capsys.readouterr().out, "1 h of 2, and 2 · 2 h"
+    left = "0 done, 0 runs, 0 failed, 3 left; about 5.00 core-hours"
+    assert left in shown("sweep", file, "--status"), "1 h of 2, and 2 · 2 h"
     timed = replace(CONFIG, minutes=90.0)
     monkeypatch.setattr("bidex_meta.cli.sweep._configs", lambda sweep, _: {r.words: timed for r in sweep.runs})
-    assert main(["sweep", str(file), "--status"]) == 0
-    assert "about 3.50 core-hours" in capsys.readouterr().out, "0.5 h, and 2 · 1.5 h"
+    assert "about 3.50 core-hours" in shown("sweep", file, "--status"), "0.5 h, and 2 · 1.5 h"
 
 
-def test_submit_without_submitit_is_one_line(file: Path, monkeypatch, capsys) -> None:
+def test_submit_without_submitit_is_one_line(file: Path, monkeypatch, refused) -> None:
     monkeypatch.setitem(sys.modules, "submitit", None)
-    assert main(["sweep", str(file), "--submit", "slurm"]) == 2
-    assert "bidex-meta[slurm]" in capsys.readouterr().err
+    assert "bidex-meta[slurm]" in refused("sweep", file, "--submit", "slurm")
 
 
 def test_jobs_of_the_local_executor(file: Path, tmp_path: Path, monkeypatch, capsys) -> None:
@@ -263,7 +246,7 @@ def test_jobs_of_the_local_executor(file: Path, tmp_path: Path, monkeypatch, cap
     out.mkdir(parents=True)
     for job in queue.submit(runs, out, "local", {"timeout_min": 2}).values():
         assert job.result() is None
-    assert all(done(run) for run in runs)
+    assert all(state(run).state == "done" for run in runs)
     with pytest.raises(BidexError, match="submitit: "):
         queue.submit(runs, out, "local", {"timeout": 2})
     assert queue.Job(runs[0], FAKE).checkpoint().function.run == runs[0]

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from bidex_meta.cli import main
-from bidex_meta.cli.sweep_plan import read_sweep
+from bidex_meta.cli.parsing import peek_all
+from bidex_meta.cli.sweep_plan import PlannedRun, read_sweep
 from bidex_meta.errors import BidexError
 from tests.pages import ROOT
 
@@ -16,6 +16,18 @@ algos = ["ppo"]
 seeds = [0, 1]
 overrides = { steps = 6, num_envs = 8 }
 """
+
+
+@pytest.fixture
+def runs(tmp_path: Path):
+    """The runs of a file of this text."""
+
+    def read(text: str, *change: str) -> list[PlannedRun]:
+        path = tmp_path / "s.toml"
+        path.write_text(text.replace(*change) if change else text)
+        return read_sweep(path).runs
+
+    return read
 
 
 def test_seeds_are_outermost_and_words_are_those_of_run(tmp_path: Path) -> None:
@@ -42,62 +54,45 @@ def test_seeds_are_outermost_and_words_are_those_of_run(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
-def test_values_with_slashes_make_no_folders(tmp_path: Path) -> None:
-    path = tmp_path / "s.toml"
-    path.write_text(
-        FILE.replace('"ppo"', '"bc"') + '[grid]\ndataset = ["HandOver/medium-v0", "/data/mine", ["a/x", "b/x"]]\n'
-        "learner.gamma = [-0.5]\n"
+def test_values_with_slashes_make_no_folders(runs) -> None:
+    text = FILE.replace('"ppo"', '"bc"') + (
+        '[grid]\ndataset = ["HandOver/medium-v0", "/data/mine", ["a/x", "b/x"]]\nlearner.gamma = [-0.5]\n'
     )
-    runs = read_sweep(path).runs[:3]
-    told = ["HandOver-medium-v0", "data-mine", "a-xxb-x"]
-    assert [run.name for run in runs] == [f"HandOver-bc-dataset={each}-gamma=-0.5-seed0" for each in told]
-    assert [run.arm for run in runs] == [f"bc dataset={each} gamma=-0.5" for each in told]
-    assert all(run.path.parent == Path("runs/tiny") for run in runs)
-    path.write_text(path.read_text().replace('"/data/mine"', '"HandOver-medium-v0"'))
+    found = runs(text)[:3]
+    named = ["HandOver-medium-v0", "data-mine", "a-xxb-x"]
+    assert [run.name for run in found] == [f"HandOver-bc-dataset={each}-gamma=-0.5-seed0" for each in named]
+    assert [run.arm for run in found] == [f"bc dataset={each} gamma=-0.5" for each in named]
+    assert all(run.path.parent == Path("runs/tiny") for run in found)
     with pytest.raises(BidexError, match="two runs are called HandOver-bc-dataset=HandOver-medium-v0"):
-        read_sweep(path)
+        runs(text, '"/data/mine"', '"HandOver-medium-v0"')
 
 
-def test_a_flag_may_name_the_subject(tmp_path: Path) -> None:
-    path = tmp_path / "s.toml"
-    path.write_text(FILE.replace("steps = 6", 'steps = 6, demonstrations = "{subject}/script-v0"'))
-    run = read_sweep(path).runs[0]
+def test_a_flag_may_name_the_subject_and_several_data_sets_are_named_one_by_one(runs) -> None:
+    run = runs(FILE, "steps = 6", 'steps = 6, demonstrations = "{subject}/script-v0", dataset = ["a/x", "b/x"]')[0]
     assert run.subject == "HandOver" and "--demonstrations=HandOver/script-v0" in run.words
+    assert peek_all(run.words, "--dataset") == ["a/x", "b/x"]
 
 
-def test_several_data_sets_are_named_one_by_one_as_run_takes_them(tmp_path: Path) -> None:
-    from bidex_meta.cli.parsing import peek_all
-
-    path = tmp_path / "s.toml"
-    path.write_text(FILE.replace("steps = 6", 'steps = 6, dataset = ["a/x", "b/x"]'))
-    words = read_sweep(path).runs[0].words
-    assert peek_all(words, "--dataset") == ["a/x", "b/x"]
-
-
-def test_an_arm_that_sets_a_key_of_the_grid_is_not_run_once_a_value(tmp_path: Path) -> None:
-    path = tmp_path / "s.toml"
-    path.write_text(
+def test_an_arm_that_sets_a_key_of_the_grid_is_not_run_once_a_value(runs) -> None:
+    every = runs(
         FILE.replace("[0, 1]", "[0]") + "[grid]\nnum_envs = [8, 16]\nlearner.gamma = [0.8, 0.9]\n"
         '[[arms]]\nname = "x"\nalgo = "ppo"\noverrides = { num-envs = 4 }\n'
     )
-    runs = [run for run in read_sweep(path).runs if run.arm.startswith("x")]
-    assert [run.arm for run in runs] == ["x gamma=0.8", "x gamma=0.9"]
-    assert [word for word in runs[0].words if word.startswith("--num-envs")][-1] == "--num-envs=4"
-    assert len(read_sweep(path).runs) == 4 + 2
+    own = [run for run in every if run.arm.startswith("x")]
+    assert [run.arm for run in own] == ["x gamma=0.8", "x gamma=0.9"] and len(every) == 4 + 2
+    assert [word for word in own[0].words if word.startswith("--num-envs")][-1] == "--num-envs=4"
 
 
-def test_an_arm_may_leave_seeds_out(tmp_path: Path) -> None:
-    path = tmp_path / "s.toml"
-    path.write_text(
-        FILE + '[[arms]]\nname = "x"\nalgo = "ppo"\nseeds = [1]\n'
+def test_an_arm_may_leave_seeds_out(runs) -> None:
+    text = FILE + (
+        '[[arms]]\nname = "x"\nalgo = "ppo"\nseeds = [1]\n'
         '[[arms]]\nname = "y"\nalgo = "ppo"\nstart_from = "ppo"\nseeds = [0]\n'
     )
-    runs = read_sweep(path).runs
-    assert [(run.arm, run.seed) for run in runs] == [("ppo", 0), ("y", 0), ("ppo", 1), ("x", 1)]
-    assert runs[1].after == runs[0].path
-    path.write_text(path.read_text().replace('start_from = "ppo"', 'start_from = "x"'))
+    found = runs(text)
+    assert [(run.arm, run.seed) for run in found] == [("ppo", 0), ("y", 0), ("ppo", 1), ("x", 1)]
+    assert found[1].after == found[0].path
     with pytest.raises(BidexError, match="the arm 'x', of which there are 0 runs on HandOver"):
-        read_sweep(path)
+        runs(text, 'start_from = "ppo"', 'start_from = "x"')
 
 
 @pytest.mark.parametrize(
@@ -120,14 +115,12 @@ def test_an_arm_may_leave_seeds_out(tmp_path: Path) -> None:
         (("[0, 1]", "[0, 1"), "expected a sweep in TOML"),
     ],
 )
-def test_a_bad_file_is_one_line(tmp_path: Path, change: tuple[str, str], told: str) -> None:
-    file = tmp_path / "s.toml"
-    file.write_text(FILE.replace(*change))
+def test_a_bad_file_is_one_line(runs, change: tuple[str, str], told: str) -> None:
     with pytest.raises(BidexError, match=told):
-        read_sweep(file)
+        runs(FILE, *change)
 
 
-def test_what_run_would_refuse_is_told_before_anything_begins(tmp_path: Path, monkeypatch, capsys) -> None:
+def test_what_run_would_refuse_is_told_before_anything_begins(tmp_path: Path, monkeypatch, refused) -> None:
     monkeypatch.chdir(tmp_path)
     for change, told in (
         (('["ppo"]', '["ppoo"]'), "ppoo on HandOver: Unknown algo 'ppoo'"),
@@ -136,18 +129,16 @@ def test_what_run_would_refuse_is_told_before_anything_begins(tmp_path: Path, mo
         (("steps = 6", "learner = { gamma = 3.0 }"), "gamma"),
     ):
         Path("s.toml").write_text(FILE.replace(*change))
-        assert main(["sweep", "s.toml"]) == 2
-        error = capsys.readouterr().err
+        error = refused("sweep", "s.toml")
         assert told in error and error.count("\n") == 1 and not Path("runs").exists()
 
 
-def test_the_sweeps_of_the_repository_are_what_run_takes(tmp_path: Path, monkeypatch, capsys) -> None:
+def test_the_sweeps_of_the_repository_are_what_run_takes(tmp_path: Path, monkeypatch, shown) -> None:
     monkeypatch.chdir(tmp_path)
     # Data sets are recorded before; which, the files say.
     monkeypatch.setattr("bidex_meta.cli.run_data.open_datasets", lambda names: [])
     monkeypatch.setattr("bidex_meta.cli.run_data.check_offline", lambda *_: None)
     for path in sorted((ROOT / "results" / "sweeps").glob("*.toml")):
         if "seeds" in path.read_text():
-            assert main(["sweep", str(path), "--dry-run"]) == 0
-            assert f"--run-dir=runs/{path.stem}/" in capsys.readouterr().out
+            assert f"--run-dir=runs/{path.stem}/" in shown("sweep", path, "--dry-run")
     assert not (tmp_path / "runs").exists()

@@ -5,9 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
-from bidex_meta.cli import learners, main
+from bidex_meta.cli import main
 from bidex_meta.cli.evaluate import conditions
 from bidex_meta.cli.verify import others, recorded_conditions
 from bidex_meta.errors import BidexError
@@ -15,31 +14,15 @@ from bidex_meta.evaluation.agreement import agreements, classes_of
 from bidex_meta.evaluation.results import ClassResult
 from bidex_meta.runs import RunFolder
 from bidex_meta.worlds import Worlds
-from bidex_meta.worlds.own import OwnSuite
-from tests.cli.test_metatest import COUNTS, points
-from tests.fakes import ToyWorld, run_config
+from tests.fakes import run_config
 
 SMALL = ["--suite", "MT4", "--num-envs", "6", "--threads", "1", "--device", "cpu", "--learner.hidden", "8"]
 
 
-@pytest.fixture(autouse=True)
-def threads():
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.fixture
-def run(monkeypatch, tmp_path) -> Path:
-    monkeypatch.setattr(OwnSuite, "world", lambda source, split="train", rows=None, mode="DISABLED": _toy(rows, mode))
+def run(toy_worlds, tmp_path) -> Path:
     assert main(["run", *SMALL, "--steps", "96", "--run-dir", str(tmp_path / "r"), "--episodes", "4"]) == 0
     return tmp_path / "r"
-
-
-def _toy(rows, mode):
-    world = ToyWorld(rows or 6, mode)
-    world.state_dict = dict  # type: ignore[method-assign]
-    return world
 
 
 def verify(capsys, *arguments):
@@ -106,13 +89,8 @@ def test_conditions_that_changed_are_told(run, capsys):
     changed(run, older)
     code, shown = verify(capsys, run)
     assert code == 0 and "2 equal" in shown.out
-    for told in (
-        "mujoco 3.9.9 then, ",
-        "physics 0123456789ab then, ",
-        "suite version 0 then, 1 now",
-        "cuda:0 then, cpu",
-    ):
-        assert told in shown.err
+    texts = "mujoco 3.9.9 then, ", "physics 0123456789ab then, ", "suite version 0 then, 1 now", "cuda:0 then, cpu"
+    assert all(told in shown.err for told in texts)
     changed(run, lambda found: found.pop("conditions"))  # of an older run: that of versions.json
     (run / "versions.json").write_text(json.dumps({"packages": versions["packages"]}))
     code, shown = verify(capsys, run)
@@ -148,14 +126,8 @@ def test_no_evaluation_and_another_file(run, capsys, tmp_path):
     assert code == 0 and "2 equal" in shown.out
 
 
-def test_a_learner_that_adapts(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(OwnSuite, "world", points)
-    pools = {split: {name: [""] * count for name, count in counts.items()} for split, counts in COUNTS.items()}
-    monkeypatch.setattr(OwnSuite, "tasks", lambda source, split: pools[split])
-    monkeypatch.setitem(learners.ALGOS, "finder", "tests.adapting_learner:Learner")
-    flags = ["--suite", "ML4", "--algo", "finder", "--num-envs", "24", "--steps", "24", "--threads", "1"]
-    path = tmp_path / "r"
-    assert main(["run", *flags, "--device", "cpu", "--run-dir", str(path)]) == 0
+def test_a_learner_that_adapts(adapted, tmp_path, capsys):
+    path = adapted
     code, shown = verify(capsys, path)
     assert code == 0 and "6 classes: 6 equal bit for bit" in shown.out and "Near (test, shot 1)" in shown.out
     capsys.readouterr()

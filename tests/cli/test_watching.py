@@ -11,9 +11,7 @@ from bidex_meta.cli import main, watching
 from bidex_meta.runs import RunFolder, read_metrics
 from bidex_meta.runs.writers import LOGGERS, Writer
 from bidex_meta.utils import gl_backend
-from tests.cli.test_run import final, run, same, toy_worlds
-
-__all__ = ["toy_worlds"]
+from tests.cli.test_run import final, run, same
 
 
 @pytest.fixture(autouse=True)
@@ -77,22 +75,18 @@ def test_a_resumed_run_may_be_looked_at_otherwise(toy_worlds, tmp_path):
     assert ["Eval/success_rate" in row for row in learned(tmp_path / "r")] == [False, False, True, True]
 
 
-def test_the_best_policy_is_kept_and_judged(toy_worlds, tmp_path, monkeypatch, capsys):
+def test_the_best_policy_is_kept_and_judged(toy_worlds, tmp_path, monkeypatch, shown, refused):
     path, marks = tmp_path / "r", iter([0.25, 0.75, 0.75, 0.5])
     monkeypatch.setattr(watching.Watch, "_judge", lambda watch: None)
     monkeypatch.setattr(watching, "_metrics", lambda found: {"Eval/success_rate": next(marks), "Eval/mean_return": 1.0})
     assert run("--steps", 96, "--run-dir", path, "--no-evaluate", "--evaluate-every", 1) == 0
     steps = {}
-    for which in ("last", "best", "step_96.pt", str(path / "checkpoints" / "best.pt")):
-        capsys.readouterr()
-        assert main(["evaluate", str(path), "--json", "--episodes", "1", "--checkpoint", which]) == 0
-        steps[which] = json.loads(capsys.readouterr().out)["steps"]
+    for which in ("last", "best", "step_96.pt", path / "checkpoints" / "best.pt"):
+        steps[which] = json.loads(shown("evaluate", path, "--json", "--episodes", 1, "--checkpoint", which))["steps"]
     assert list(steps.values()) == [96, 48, 96, 48]
-    assert main(["evaluate", str(path), "--checkpoint", "worst.pt"]) == 2
-    assert "There is no worst.pt. Checkpoints in" in capsys.readouterr().err
+    assert "There is no worst.pt. Checkpoints in" in refused("evaluate", path, "--checkpoint", "worst.pt")
     (path / "checkpoints" / "best.pt").unlink()
-    assert main(["evaluate", str(path), "--checkpoint", "best"]) == 2
-    assert "--evaluate-every" in capsys.readouterr().err
+    assert "--evaluate-every" in refused("evaluate", path, "--checkpoint", "best")
 
 
 def test_few_tasks_are_played_ten_times_in_all_and_many_once():

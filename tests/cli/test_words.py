@@ -11,13 +11,30 @@ from pathlib import Path
 import pytest
 
 from bidex_meta.cli import COMMANDS, main
+from bidex_meta.cli.learners import ALGOS, learner_kind
+from bidex_meta.tasks import registry
 
 
-def test_lists_of_suites_need_no_torch():
-    heavy = {"torch", "mujoco", "metaworld", "scipy", "tensorboard"}
-    code = f"import sys; from bidex_meta.cli import main; main(['list', 'suites']); print({heavy} & set(sys.modules))"
+@pytest.mark.parametrize("words", [["--help"], ["list", "suites"], ["list", "tasks"], ["list", "algos"]])
+def test_help_and_lists_need_no_torch(words):
+    heavy = {"torch", "mujoco", "metaworld", "scipy", "tensorboard", "bidex_algos.learner"}
+    code = f"import sys; from bidex_meta.cli import main; main({words}); print({heavy} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "metaworld/MT10" in done.stdout and done.stdout.rstrip().endswith("set()")
+    named = {"--help": list(COMMANDS), "suites": ["metaworld/MT10"], "tasks": registry.names(), "algos": list(ALGOS)}
+    assert all(name in done.stdout for name in named[words[-1]]) and done.stdout.rstrip().endswith("set()")
+
+
+def test_lists_read_from_source_are_as_the_classes_say(shown):
+    suites = {row["name"]: row for row in json.loads(shown("list", "suites", "--json"))}
+    assert suites["ML4"]["test_classes"] == ["TwoCatchUnderarm"]
+    for row in json.loads(shown("list", "tasks", "--json")):
+        task = registry.get(row["name"])
+        assert (row["observation"], row["action"]) == (task.observation_size, task.action_size)
+        assert (row["episode_steps"], row["summary"]) == (task.episode_steps, task.summary)
+    for row in json.loads(shown("list", "algos", "--json")):
+        kind = learner_kind(row["name"])
+        assert row["presets"] == list(kind.presets) and "arXiv" in row["summary"]
+        assert (kind.make.__doc__ or "").startswith(row["summary"])
 
 
 def test_names_are_taken_in_any_case_and_kept_as_they_are_written(capsys):

@@ -181,6 +181,7 @@ def test_sb3_seeds_options_and_attributes() -> None:
     assert env.get_attr("task_name", [0, 7]) == ["CatchUnderarm", "TwoCatchUnderarm"]
     assert env.env_method("get_attr", "num_tasks", indices=[0]) == [(4,) * 8]
     assert env.render_mode == "rgb_array" and env.env_is_wrapped(object, [1]) == [False]
+    assert all(env.env_is_wrapped(import_module("stable_baselines3.common.monitor").Monitor))
     env.set_attr("note", 1)
     assert env.get_attr("note", 0) == [1]
     env.set_options({"env_idx": 1})
@@ -235,73 +236,16 @@ def test_torchrl_specs_seeds_and_part_resets() -> None:
     assert world.episodes.length.tolist() == [0, 0, 0, 1, 1, 1, 1, 1]
 
 
+@pytest.mark.parametrize("client", CLIENTS)
+def test_no_first_episode_is_shortened_unless_asked(client: str) -> None:
+    world = class_world("CatchUnderarm", 4)
+    env = adapt(client, world)
+    env.get_observations() if client == "rsl_rl" else env.reset()
+    assert world.episodes.counts.all() and not world.episodes.elapsed.any()
+
+
 STEPS = 75
 """An episode of CatchUnderarm in which nothing is done."""
-
-
-def catch() -> Any:
-    return class_world("CatchUnderarm", 4)
-
-
-class Still:
-    """A model that does nothing."""
-
-    def predict(self, obs: np.ndarray, state: Any = None, **kwargs: Any) -> tuple[np.ndarray, Any]:
-        return np.zeros((len(obs), 52), np.float32), state
-
-
-def by_sb3(wrap: Callable[[Any], Any] = lambda env: env, stagger: bool = False) -> list[int]:
-    env = wrap(adapt("sb3", catch(), stagger=stagger))
-    evaluate: Any = import_module("stable_baselines3.common.evaluation").evaluate_policy
-    return evaluate(Still(), env, n_eval_episodes=6, return_episode_rewards=True)[1]
-
-
-def by_sb3s_monitor() -> list[int]:
-    monitor = pytest.importorskip("stable_baselines3.common.vec_env").VecMonitor
-    with pytest.warns(UserWarning, match="already wrapped"):  # whose numbers are the same
-        return by_sb3(monitor)
-
-
-def by_sb3_with_stagger() -> list[int]:
-    return by_sb3(stagger=True)
-
-
-def by_rsl_rl() -> list[int]:
-    env = adapt("rsl_rl", catch())
-    logger: Any = import_module("rsl_rl.utils.logger").Logger(None, {"algorithm": {}}, {}, 4, False, 1, 0, "cpu")
-    logger.writer = object()  # it counts where it writes
-    env.get_observations()
-    for _ in range(2 * STEPS):
-        _, reward, dones, extras = env.step(torch.zeros(4, 52))
-        logger.process_env_step(reward, dones, extras)
-    return list(logger.lenbuffer)
-
-
-def by_skrl() -> list[int]:
-    base = pytest.importorskip("skrl.agents.torch.base")
-
-    class Counts(base.Agent):
-        act = pre_interaction = post_interaction = update = None
-
-    env, agent = adapt("skrl", catch()), Counts(cfg=base.AgentCfg(), models={})
-    agent.write_interval = 1
-    names = ("observations", "states", "actions", "next_observations", "next_states", "timestep", "timesteps")
-    other: Any = dict.fromkeys(names)
-    env.reset()
-    for _ in range(2 * STEPS):
-        _, reward, terminated, truncated, infos = env.step(torch.zeros(4, 52))
-        agent.record_transition(rewards=reward, terminated=terminated, truncated=truncated, infos=infos, **other)
-    return [steps for (steps,) in agent._track_timesteps]
-
-
-def by_torchrl() -> list[int]:
-    envs = pytest.importorskip("torchrl.envs")
-    env, lengths = envs.TransformedEnv(adapt("torchrl", catch()), envs.StepCounter()), []
-    state = env.reset()
-    for _ in range(2 * STEPS):
-        step, state = env.step_and_maybe_reset(state.set("action", torch.zeros(4, 52)))
-        lengths += step["next", "step_count"][step["next", "done"]].tolist()
-    return lengths
 
 
 def counted_by_gymnasium(env: Any, shape: tuple[int, ...], steps: int) -> list[int]:
@@ -312,7 +256,7 @@ def counted_by_gymnasium(env: Any, shape: tuple[int, ...], steps: int) -> list[i
 
 
 def by_gymnasium() -> list[int]:
-    return counted_by_gymnasium(RecordEpisodeStatistics(catch().to_numpy()), (4, 52), 2 * STEPS)
+    return counted_by_gymnasium(RecordEpisodeStatistics(class_world("CatchUnderarm", 4).to_numpy()), (4, 52), 2 * STEPS)
 
 
 def by_gymnasiums_ids() -> list[int]:
@@ -336,17 +280,6 @@ def by_metaworlds_wrappers() -> list[int]:
     env: Any = bidex_meta.metaworld.make_mt_envs("CatchUnderarm", seed=0)
     env.reset(seed=0)
     return [int(e["episode"]["l"]) for _ in range(STEPS) if "episode" in (e := env.step(np.zeros(52, np.float32))[-1])]
-
-
-def by_pettingzoo() -> list[int]:
-    pytest.importorskip("pettingzoo")
-    env = import_module("bidex_meta.clients.pettingzoo").parallel_env("CatchUnderarm")
-    env.reset(seed=0)
-    still, steps = {name: np.zeros(26, np.float32) for name in env.agents}, 0
-    while env.agents:
-        env.step(still)
-        steps += 1
-    return [steps]
 
 
 STATISTICS = [function for name, function in list(globals().items()) if name.startswith("by_")]

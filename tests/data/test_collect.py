@@ -5,6 +5,7 @@ import shutil
 import signal
 import traceback
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -193,25 +194,10 @@ def test_minari_opens_and_samples_it(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert theirs.spec.action_space.shape == (2,)
     assert list(minari.list_local_datasets()) == ["Points/test-v0"]
     # The other way round: what Minari wrote itself.
-    its = minari.create_dataset_from_buffers(
-        "other/mine-v0",
-        [_buffer(episode) for episode in ours.episodes()],
-        observation_space=theirs.spec.observation_space,
-        action_space=theirs.spec.action_space,
-    )
+    spaces = {name: getattr(theirs.spec, name) for name in ("observation_space", "action_space")}
+    buffer: Any = import_module("minari.data_collector.episode_buffer").EpisodeBuffer
+    columns = [{name: getattr(e, own) for name, own in part_files.ARRAYS.items()} for e in ours.episodes()]
+    its = minari.create_dataset_from_buffers("other/mine-v0", [buffer(**each, infos={}) for each in columns], **spaces)
     again = open_dataset(tmp_path / "other" / "mine-v0")
     assert again.num_steps == its.total_steps and again.metadata["kind"] == "outside"
     assert all(torch.equal(again.transitions()[n], t) for n, t in ours.transitions().items() if n != "task")
-
-
-def _buffer(episode: Any) -> Any:
-    from minari.data_collector.episode_buffer import EpisodeBuffer
-
-    return EpisodeBuffer(
-        observations=episode.observations,
-        actions=episode.actions,
-        rewards=list(episode.rewards),
-        terminations=list(episode.terminated),
-        truncations=list(episode.truncated),
-        infos={},
-    )

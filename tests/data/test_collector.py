@@ -43,15 +43,7 @@ def actions(seed: int, step: int, num: int) -> torch.Tensor:
     resets=st.lists(st.tuples(st.integers(0, 30), st.lists(st.booleans(), min_size=5, max_size=5)), max_size=6),
     commits=st.sets(st.integers(0, 30), max_size=5),
 )
-def test_what_is_stored_is_what_a_plain_loop_saw(
-    seed: int,
-    steps: int,
-    mode: str,
-    breaks_at: list[tuple[int, int]],
-    late: list[int],
-    resets: list[tuple[int, list[bool]]],
-    commits: set[int],
-) -> None:
+def test_what_is_stored_is_what_a_plain_loop_saw(seed, steps, mode, breaks_at, late, resets, commits):
     """Over resets, time limits and broken rows; two processes write into one data set."""
     masks = dict(resets)
     with tempfile.TemporaryDirectory() as place:
@@ -117,27 +109,21 @@ def test_rows_are_spread_over_slots_and_checked() -> None:
 def test_a_run_that_goes_on_stores_each_episode_once(tmp_path: Path) -> None:
     """Saved after 12 steps, ended after 20, taken up at 12: as one that was never ended."""
 
-    def drive(recorder: RunCollector, steps: range) -> None:
-        for step in steps:
+    def drive(recorder: RunCollector, *steps: int) -> dict[str, Any]:
+        for step in range(*steps):
             recorder.step(actions(3, step, 5))
+        return recorder.state_dict()
 
-    whole = RunCollector(rough(breaks_at=((9, 1),)), range(5))
-    whole.open(tmp_path / "whole")
-    whole.reset(seed=1)
-    drive(whole, range(30))
-    whole.state_dict()
-    first = RunCollector(rough(breaks_at=((9, 1),)), range(5))
-    first.open(tmp_path / "torn")
-    first.reset(seed=1)
-    drive(first, range(12))
-    state = first.state_dict()
-    drive(first, range(12, 20))
-    first.state_dict()  # a part that the checkpoint above does not know
-    second = RunCollector(rough(breaks_at=((9, 1),)), range(5))
+    whole, first, second = (RunCollector(rough(breaks_at=((9, 1),)), range(5)) for _ in range(3))
+    for recorder, name in ((whole, "whole"), (first, "torn")):
+        recorder.open(tmp_path / name)
+        recorder.reset(seed=1)
+    drive(whole, 30)
+    state = drive(first, 12)
+    drive(first, 12, 20)  # a part that the checkpoint above does not know
     second.folder = tmp_path / "torn"
     second.load_state_dict(state)
-    drive(second, range(12, 30))
-    second.state_dict()
+    drive(second, 12, 30)
     for name in ("whole", "torn"):
         complete(tmp_path / name, whole)
     a, b = (list(open_dataset(tmp_path / name).episodes()) for name in ("whole", "torn"))
@@ -150,36 +136,20 @@ def test_a_run_that_goes_on_stores_each_episode_once(tmp_path: Path) -> None:
         other.load_state_dict(state)
 
 
-def _one_of_two(rank: int, folder: str) -> int:
-    """What a process of a run does: records, saves with the other, and process 0 makes the index."""
-    from bidex_meta.train import distributed
-
-    distributed.init_from_environment()
-    recorder = RunCollector(rough(seed=rank, breaks_at=((3, rank),)), [0, 2, 4], rank)
-    recorder.open(Path(folder))
-    recorder.reset(seed=rank)
-    for step in range(20):
-        recorder.step(actions(rank, step, 5))
-        if step % 8 == 7:
-            recorder.state_dict()
-    recorder.state_dict()
-    distributed.together(lambda: None)
-    if rank == 0:
-        complete(Path(folder), recorder)
-    return recorder.writer.parts
-
-
 def test_two_processes_write_one_data_set(tmp_path: Path) -> None:
-    from tests.algos.ranks import in_two_processes
-
-    parts = in_two_processes(partial(_one_of_two, folder=str(tmp_path / "set")), tmp_path)
-    seen = []
+    seen, worlds = [], []
     for rank in range(2):
-        plain = Plain(rough(seed=rank, breaks_at=((3, rank),)))
-        plain.reset(seed=rank)
+        make = partial(rough, seed=rank, breaks_at=((3, rank),))
+        recorder, plain = RunCollector(make(), [0, 2, 4], rank), Plain(make())
+        recorder.open(tmp_path / "set")
+        recorder.reset(seed=rank), plain.reset(seed=rank)
         for step in range(20):
-            plain.step(actions(rank, step, 5))
+            recorder.step(actions(rank, step, 5)), plain.step(actions(rank, step, 5))
+            if step % 8 == 7 or step == 19:
+                recorder.state_dict()
+        worlds.append(recorder)
         seen += [episode for episode in plain.whole if episode.row in (0, 2, 4)]
-    found = open_dataset(tmp_path / "set")
-    stored = list(found.episodes())
-    assert parts == [3, 3] and len(stored) == len(seen) > 10 and all(map(same, stored, seen))
+    complete(tmp_path / "set", worlds[0])
+    stored = list(open_dataset(tmp_path / "set").episodes())
+    assert [recorder.writer.parts for recorder in worlds] == [3, 3]
+    assert len(stored) == len(seen) > 10 and all(map(same, stored, seen))

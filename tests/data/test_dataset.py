@@ -62,9 +62,7 @@ def test_every_flipped_bit_is_found(folder: Path) -> None:
     assert not unlike(open_dataset(folder), whole) and learned(open_dataset(folder)) == 33
 
 
-def test_a_part_is_held_to_its_digest_before_its_episodes_are_read(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_part_is_held_to_its_digest_before_its_episodes_are_read(folder, monkeypatch):
     """Of a set too large to be read at once when it is opened."""
     monkeypatch.setattr("bidex_meta.data.dataset._CHECKED_AT_OPENING", 8000)
     path = part_files.parts_of(folder)[-1]
@@ -294,9 +292,7 @@ def limit(monkeypatch: pytest.MonkeyPatch) -> Any:
     assert unraisable == []
 
 
-def test_a_disk_that_fills_while_it_is_recorded_loses_no_part(
-    limit: Callable[[int | None], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_fills_while_it_is_recorded_loses_no_part(limit, monkeypatch):
     """At whatever byte it ends; with room again the same command goes on to the same data."""
     monkeypatch.setattr("bidex_meta.data.collect.PART_BYTES", 20_000)
     with quick_folder() as place:

@@ -73,9 +73,7 @@ def test_actions_without_a_range_are_refused(space: Space | None, tmp_path: Path
         ("observations", Box(0, 255, (4, 4, 3), np.uint8), np.zeros((3, 4, 4, 3)), "a Box of shape|an array of shape"),
     ],
 )
-def test_what_is_no_row_of_numbers_is_one_line(
-    what: str, space: Space, values: Any, found: str, told: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_no_row_of_numbers_is_one_line(what, space, values, found, told, tmp_path, capsys):
     """Whether the metadata tell it or the arrays alone."""
     spaces = {"observations": STATE, "actions": Box(-1.0, 1.0, (2,), np.float32)} | {what: space if told else None}
     written(tmp_path, spaces["observations"], spaces["actions"], **{what: values})

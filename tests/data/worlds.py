@@ -32,24 +32,13 @@ def printed(capsys: pytest.CaptureFixture[str], *words: object, code: int = 0) -
 
 
 class Rough(PointWorld):
-    """Points whose episodes end early or by time, break at given steps, and may begin within.
+    """Points whose episodes end early or by time, break at (step, row) pairs, and may begin within.
 
-    Args:
-        breaks_at: (step, row) pairs, steps of the world counted from its making.
-        brittle: Whether steps break that follow from the seed, the row, its episode and the step, about one in 23: the
-            same in whatever process they are played.
-        late: Elapsed step at which the first episode of each row begins in SAME_STEP mode.
-        given: As ``PointWorld``.
+    ``brittle``: about one step in 23 breaks, by seed, row, episode and step alone; ``late``: elapsed step at which the
+    first episode of each row begins in SAME_STEP mode.
     """
 
-    def __init__(
-        self,
-        *given: Any,
-        breaks_at: tuple[tuple[int, int], ...] = (),
-        brittle: bool = False,
-        late: tuple[int, ...] = (),
-        **more: Any,
-    ):
+    def __init__(self, *given: Any, breaks_at: Any = (), brittle: bool = False, late: Any = (), **more: Any):
         super().__init__(*given, **more)
         self.unstable, self._brittle, self._late = breaks_at, brittle, late
 
@@ -68,10 +57,7 @@ def rough(num_envs: int = 5, mode: str = "SAME_STEP", **more: Any) -> Rough:
 
 @dataclass
 class Plain:
-    """What a plain loop sees of a world: each row's running episode as lists, and those that were whole.
-
-    It asks the world for nothing but what ``reset`` and ``step`` return, and ``task_index`` and ``pools``.
-    """
+    """What a plain loop sees of a world: each row's running episode as lists, and those that were whole."""
 
     world: Any
     whole: list[Episode] = field(default_factory=list)

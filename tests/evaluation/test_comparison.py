@@ -16,6 +16,13 @@ def groups(*paths: Path):
     return read_groups([RunFolder.open(path) for path in paths])
 
 
+def evaluated_at(path: Path, steps: int) -> Path:
+    """The run, with steps in its evaluation."""
+    found = json.loads((path / "evaluation.json").read_text())
+    (path / "evaluation.json").write_text(json.dumps({**found, "steps": steps}))
+    return path
+
+
 def test_runs_that_differ_in_the_seed_alone_are_one_group(tmp_path: Path):
     paths = [evaluated_run(tmp_path, seed, {"A": 0.5, "B": seed / 10}, gamma=0.9) for seed in (2, 1)]
     other = evaluated_run(tmp_path, 1, {"A": 0.1, "B": 0.1}, gamma=0.8)
@@ -122,36 +129,27 @@ def test_the_table_shows_each_class_under_its_own_name(tmp_path: Path, capsys: p
 
 
 def test_an_evaluation_that_is_torn_or_of_fewer_steps_is_refused(tmp_path: Path):
-    path = evaluated_run(tmp_path, 0, {"A": 0.5})
-    found = json.loads((path / "evaluation.json").read_text())
-    (path / "evaluation.json").write_text(json.dumps({"steps": 1016, **found}))
+    path = evaluated_at(evaluated_run(tmp_path, 0, {"A": 0.5}), 1016)
     assert groups(path)[0].steps == 1000
-    (path / "evaluation.json").write_text(json.dumps({"steps": 500, **found}))
     with pytest.raises(BidexError, match="is of 500 steps, but the run goes on to 1,000"):
-        groups(path)
+        groups(evaluated_at(path, 500))
     (path / "evaluation.json").write_text("")
     with pytest.raises(BidexError, match="expected an evaluation in JSON"):
         groups(path)
 
 
 def test_a_run_that_time_ended_is_of_the_steps_it_made(tmp_path: Path):
-    path = evaluated_run(tmp_path, 0, {"A": 0.5})
-    change(path, steps=10**9, minutes=4.0)
-    found = json.loads((path / "evaluation.json").read_text())
-    (path / "evaluation.json").write_text(json.dumps({"steps": 1000, **found}))
-    [group] = groups(path)
+    path = change(evaluated_run(tmp_path, 0, {"A": 0.5}), steps=10**9, minutes=4.0)
+    [group] = groups(evaluated_at(path, 1000))
     assert (group.steps, group.hours) == (1000, 0.5)
-    (path / "evaluation.json").write_text(json.dumps({"steps": 500, **found}))
     with pytest.raises(BidexError, match="is of 500 steps, but the run goes on to 1,000"):
-        groups(path)
+        groups(evaluated_at(path, 500))
 
 
 def test_steps_are_the_mean_over_seeds_that_time_ended_with_their_range(tmp_path: Path, capsys):
     paths = [change(evaluated_run(tmp_path, seed, {"A": 0.5}), steps=10**9, minutes=4.0) for seed in range(3)]
     for path, steps in zip(paths, (1000, 1600, 4000), strict=True):
-        found = json.loads((path / "evaluation.json").read_text())
-        (path / "evaluation.json").write_text(json.dumps({"steps": steps, **found}))
-        (path / "metrics.jsonl").write_text(json.dumps({"step": steps}) + "\n")
+        log(evaluated_at(path, steps), {"step": steps})
     [group] = groups(*paths)
     assert (group.steps, group.steps_range) == (2200, (1000, 4000))
     assert main(["compare", *map(str, paths)]) == 0
@@ -162,16 +160,10 @@ def test_steps_are_the_mean_over_seeds_that_time_ended_with_their_range(tmp_path
 
 
 def test_a_run_that_a_return_or_score_ended_is_of_the_steps_it_made(tmp_path: Path):
-    path = evaluated_run(tmp_path, 0, {"A": 0.5})
-    found = json.loads((path / "evaluation.json").read_text())
-    (path / "evaluation.json").write_text(json.dumps({"steps": 1000, **found}))
+    path = evaluated_at(evaluated_run(tmp_path, 0, {"A": 0.5}), 1000)
     rows = [{"step": 500, "Train/mean_return": 2.0, "Eval/score": None}, {"step": 1000, "Train/mean_return": 8.5}]
 
-    def log(**last: float):
-        rows[-1] |= last
-        RunFolder.open(path).metrics_path.write_text("".join(json.dumps(row) + "\n" for row in rows))
-
-    log()
+    log(path, *rows)
     change(path, steps=10**9, stop_at_return=8.0)
     assert groups(path)[0].steps == 1000
     for ends in ({"stop_at_return": 9.0}, {"stop_at_score": 33.0}, {"evaluate_every": 10}):
@@ -181,13 +173,13 @@ def test_a_run_that_a_return_or_score_ended_is_of_the_steps_it_made(tmp_path: Pa
         with pytest.raises(BidexError, match="is of 1,000 steps, but the run goes on to 1,000,000,000"):
             groups(path)
     change(path, stop_at_return=None, stop_at_success=0.8, evaluate_every=None)
-    log(**{"Train/success_rate": 0.79})
+    log(path, rows[0], {**rows[1], "Train/success_rate": 0.79})
     with pytest.raises(BidexError, match="goes on"):
         groups(path)
-    log(**{"Train/success_rate": 0.8})
+    log(path, rows[0], {**rows[1], "Train/success_rate": 0.8})
     assert groups(path)[0].steps == 1000
     change(path, stop_at_success=None, stop_at_score=33.0)
-    log(**{"Eval/score": 34.0})
+    log(path, rows[0], {**rows[1], "Eval/score": 34.0})
     assert groups(path)[0].steps == 1000
 
 

@@ -181,12 +181,9 @@ def test_trials_adapt_a_task_anew_with_other_episodes():
     assert len({near.returns[found.adaptations["Near"] == trial].mean() for trial in range(4)}) == 4
 
 
-def test_only_the_first_tasks_of_each_pool():
-    found = meta_evaluate(Still(), world(20, 5, 5), 1, tasks=2, rollouts=5, episodes_per_task=1)
-    assert found.before.classes["Near"].tasks.tolist() == [0, 1]
-
-
-def test_json_is_complete():
+def test_json_is_complete_and_of_the_first_tasks_alone_if_asked():
+    few = meta_evaluate(Still(), world(20, 5, 5), 1, tasks=2, rollouts=5, episodes_per_task=1)
+    assert few.before.classes["Near"].tasks.tolist() == [0, 1]
     references = {"Near": Reference(-10.0, 0.0), "Far": Reference(-20.0, 0.0)}
     found = meta_evaluate(Finder(), world(), 3, rollouts=2, references=references, split="test").to_json()
     json.dumps(found, allow_nan=False)

@@ -20,10 +20,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "references"
 
 
-def test_without_a_file_nothing_is_known(folder: Path) -> None:
-    assert references.load("random") == {} == references.references()
-
-
 @pytest.mark.parametrize("base", ["own", "moving"])
 def test_scores_of_another_day_are_told_by_todays_references(folder: Path, base: str) -> None:
     for kind, value in (("random", 1.0), ("expert", 5.0)):
@@ -48,24 +44,13 @@ def test_storing_keeps_the_other_classes_and_how_each_was_made(folder: Path) -> 
     }
 
 
-def test_a_score_needs_both_ends_and_an_expert_above_random_actions(folder: Path) -> None:
-    low = {"HandOver": {"return": 0.4}, "Switch": {"return": 9.0}, "PushBlock": {"return": 5.0}}
-    references.store(folder / "random.json", low, {})
-    references.store(folder / "expert.json", {"HandOver": {"return": 30.0}, "PushBlock": {"return": 4.0}}, {})
-    assert references.references() == {
-        "HandOver": Reference(0.4, 30.0),
-        "Switch": Reference(9.0),
-        "PushBlock": Reference(5.0),
-    }
-
-
 def test_an_expert_that_doing_nothing_beats_gives_no_score(folder: Path) -> None:
-    returns: dict[references.Kind, float] = {"random": 1.0, "zero": 3.0, "expert": 2.0}
-    for kind, value in returns.items():
-        references.store(
-            folder / f"{kind}.json", {"A": {"return": value}, "B": {"return": value + (kind == "expert") * 2}}, {}
-        )
-    assert references.references() == {"A": Reference(1.0, None, 3.0), "B": Reference(1.0, 4.0, 3.0)}
+    assert references.load("random") == {} == references.references()
+    known = {"random": {"A": 1.0, "B": 1.0, "C": 5.0}, "zero": {"A": 3.0, "B": 3.0}, "expert": {"A": 2.0, "B": 4.0}}
+    for kind, returns in known.items():
+        references.store(folder / f"{kind}.json", {name: {"return": value} for name, value in returns.items()}, {})
+    expected = {"A": Reference(1.0, None, 3.0), "B": Reference(1.0, 4.0, 3.0), "C": Reference(5.0)}
+    assert references.references() == expected
 
 
 def test_every_class_has_an_expert_that_beats_doing_nothing_and_doing_anything() -> None:
@@ -106,11 +91,6 @@ def test_references_do_not_go_into_a_file_of_something_else(tmp_path: Path) -> N
         with pytest.raises(BidexError, match="file of references"):
             references.store(tmp_path / "notes", {"HandOver": {"return": 1.0}}, {})
         assert (tmp_path / "notes").read_text() == text
-
-
-def test_an_unknown_baseline_names_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["baseline", "randon"]) == 2
-    assert "Did you mean 'random'?" in capsys.readouterr().err
 
 
 def test_a_suite_with_fixed_bases_neither_has_nor_makes_references(

@@ -79,13 +79,10 @@ def test_the_zero_of_the_score_is_the_better_of_random_and_zero_actions() -> Non
     assert Reference(1.0).scores(np.array([5.0])) is None
 
 
-def test_broken_episodes_count_with_the_random_return_or_their_own_if_lower() -> None:
+def test_broken_episodes_count_with_the_random_return_or_the_worst_finished_one_or_their_own_if_lower() -> None:
     returns, broken = np.array([5.0, 0.0, -9.0, 7.0]), np.array([False, True, True, True])
     counted = counted_returns(returns, broken, Reference(-4.0, 10.0, 3.0), np.array([5.0]))
     assert counted.tolist() == [5.0, -4.0, -9.0, -4.0]
-
-
-def test_without_a_reference_they_count_with_the_worst_finished_episode() -> None:
     returns, broken = np.array([5.0, 2.0, 9.0, 1.0]), np.array([False, False, True, True])
     assert counted_returns(returns, broken, None, returns[~broken]).tolist() == [5.0, 2.0, 2.0, 1.0]
     assert counted_returns(returns, np.ones(4, bool), None, np.zeros(0)).tolist() == returns.tolist()
@@ -114,14 +111,8 @@ def test_rows_that_break_change_no_other_episode_and_are_counted() -> None:
 
 
 def test_a_success_before_the_break_is_none() -> None:
-    episodes = {
-        "slot": np.zeros(2, int),
-        "task": np.arange(2),
-        "return": np.array([3.0, 4.0]),
-        "success": np.array([True, True]),
-        "length": np.array([9, 4]),
-        "unstable": np.array([False, True]),
-    }
+    episodes = {"slot": np.zeros(2, int), "task": np.arange(2), "return": np.array([3.0, 4.0])}
+    episodes |= {"success": np.array([True, True]), "length": np.array([9, 4]), "unstable": np.array([False, True])}
     found = results_by_class(["A"], episodes)["A"]
     assert found.successes.tolist() == [1.0, 0.0] and found.returns.tolist() == [3.0, 3.0] and found.unstable == 1
 

@@ -157,16 +157,13 @@ def test_refusals_name_the_mend():
 
 
 @pytest.mark.parametrize("algo", ["maml", "promp", "rl2"])
-def test_our_learners_in_both_evaluations(algo):
+def test_our_learners_in_their_evaluation(algo):
     kind = learner_kind(algo)
-    config = replace(kind.presets["laptop"], hidden=(8,), max_adapt_steps=20)
     place = Benchmark("ML1").make_world("test", 12, device="cpu", autoreset_mode="DISABLED", threads=1)
+    config = replace(kind.presets["laptop"], hidden=(8,), max_adapt_steps=20)
     state = kind.make(place, config, seed=0).policy_state_dict()
-    found = meta_evaluate(kind.make.load_policy(state, "cpu"), place, 1, episodes_per_task=1, max_adapt_steps=20)
-    changed = found.after.classes["CatchUnderarm"].returns != found.before.classes["CatchUnderarm"].returns
-    assert found.adapt_steps == [12 * 20] and changed.all()
     agent, envs = ForMetaWorld(kind.make.load_policy(state, "cpu")), MetaWorldEnvs(place)
     with known_to_metaworld(envs):
         keywords: dict[str, Any] = {"num_evals": 1, "adaptation_episodes": 1, "evaluation_episodes": 2}
-        theirs_found = theirs.metalearning_evaluation(agent, envs, **keywords)  # type: ignore[arg-type]
-    assert list(theirs_found[2]) == ["CatchUnderarm"] and np.isfinite(theirs_found[1])
+        found = theirs.metalearning_evaluation(agent, envs, **keywords)  # type: ignore[arg-type]
+    assert list(found[2]) == ["CatchUnderarm"] and np.isfinite(found[1])

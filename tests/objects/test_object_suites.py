@@ -17,16 +17,17 @@ from bidex_meta.worlds import Worlds
 FOUR = ["CatchUnderarm-egg", "CatchUnderarm-block", "CatchUnderarm-gelatin_box", "CatchUnderarm-tennis_ball"]
 
 
+def body(geom: str) -> str:
+    return f"<mujoco><worldbody><body><geom {geom}/></body></worldbody></mujoco>"
+
+
 def test_four_objects_share_a_world_and_are_told_apart() -> None:
     benchmark = Benchmark("MT1-objects", seed=0)
     assert list(benchmark.train_classes) == FOUR and len(benchmark.train_tasks) == 200
     world = benchmark.make_world(num_envs=8, device="cpu", threads=1)
     assert world.task_names == FOUR and world.reset(seed=0)[0].shape == (8, 422 + 4)
-    masses = {}
-    for part in world.parts:
-        for member in part.group.members:
-            body = member.scene.model.body("object/object")
-            masses[world.task_names[member.slot]] = float(body.mass[0])
+    members = [member for part in world.parts for member in part.group.members]
+    masses = {world.task_names[m.slot]: float(m.scene.model.body("object/object").mass[0]) for m in members}
     assert masses == pytest.approx(dict(zip(FOUR, (0.0754, 0.0709, 0.097, 0.058), strict=True)), abs=1e-4)
     assert len(world.parts) == 3  # block and box differ in numbers alone and share an engine
 
@@ -61,13 +62,9 @@ def test_success_is_told_by_object(tmp_path: Path) -> None:
     assert list(classes) == FOUR and all(classes[name]["episodes"] == 1 for name in FOUR)
 
 
-def test_a_class_on_its_own_with_an_object_trains_and_is_evaluated(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_class_on_its_own_with_an_object_trains_and_is_evaluated(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "puck.xml").write_text(
-        '<mujoco><worldbody><body><geom type="cylinder" size="0.03 0.01" mass="0.1"/></body></worldbody></mujoco>'
-    )
+    (tmp_path / "puck.xml").write_text(body('type="cylinder" size="0.03 0.01" mass="0.1"'))
     run = ["run", "--task", "catchunderarm", "--object", "puck.xml", "--algo", "ppo", "--num-envs", "4"]
     assert main([*run, "--steps", "64", "--threads", "1", "--no-evaluate", "--logger", "none"]) == 0
     (folder,) = (tmp_path / "runs" / "CatchUnderarm-puck" / "ppo").iterdir()
@@ -83,9 +80,7 @@ def test_a_class_on_its_own_with_an_object_trains_and_is_evaluated(
 def test_a_suite_names_files_beside_it(tmp_path: Path) -> None:
     text = (load_suite("MT1-objects").file).read_text().replace('"tennis_ball"', '"own/stone.xml"')
     (tmp_path / "own").mkdir()
-    (tmp_path / "own" / "stone.xml").write_text(
-        '<mujoco><worldbody><body><geom type="sphere" size="0.03"/></body></worldbody></mujoco>'
-    )
+    (tmp_path / "own" / "stone.xml").write_text(body('type="sphere" size="0.03"'))
     (tmp_path / "stones.toml").write_text(text)
     assert list(Benchmark(tmp_path / "stones.toml").train_classes)[3] == "CatchUnderarm-stone"
 

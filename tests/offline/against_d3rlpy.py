@@ -40,7 +40,6 @@ class Scripted:
 
     @torch.no_grad()
     def eval_action(self, obs: Tensor) -> Tensor:
-        """Actions (N, a) in [-1, 1]."""
         return self._policy(obs).clamp(-1.0, 1.0)
 
     def reset(self, env_mask: Tensor) -> None:
@@ -51,11 +50,7 @@ def against(
     data: Joined, world: Any, judge: Callable[[Any], float], python: str, updates: int, seeds: int = 3,
     algos: Sequence[str] = ALGOS
 ) -> dict[str, Any]:  # fmt: skip
-    """What both reach: per algo ``ours`` and ``theirs`` (a number a seed), means, intervals, ``overlap``.
-
-    ``data``: the transitions; ``world``: what they were recorded of; ``judge``: the score of an agent; ``python``:
-    interpreter that has d3rlpy; ``updates``: Gradient steps; ``seeds``: runs of each; ``algos``: which learners.
-    """
+    """What both reach: per algo ``ours`` and ``theirs`` (a number a seed), intervals, ``overlap``."""
     found = {}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "data.npz"
@@ -85,7 +80,6 @@ def against(
 
 
 def _train(command: Sequence[Any]) -> None:
-    """Runs d3rlpy on one thread, in an environment that does not know ours."""
     others = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     done = subprocess.run(
         [*map(str, command)], env=others | {"OMP_NUM_THREADS": "1"}, stderr=subprocess.STDOUT, stdout=subprocess.PIPE,
@@ -96,13 +90,11 @@ def _train(command: Sequence[Any]) -> None:
 
 
 def _interval(values: Sequence[float]) -> tuple[float, float]:
-    """95 % t-interval of the mean."""
     half = scipy.stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values))
     return float(np.mean(values) - half), float(np.mean(values) + half)
 
 
 def main() -> None:
-    """The command line above."""
     parser = argparse.ArgumentParser()
     parser.add_argument("dataset")
     parser.add_argument("--python", required=True)

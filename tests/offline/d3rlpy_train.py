@@ -13,7 +13,6 @@ import numpy as np
 
 
 def main(path: str, algo: str, updates: int, seed: int, out: str) -> None:
-    """Trains, and saves the policy: raw observations to actions."""
     d3rlpy.seed(seed)
     stored = np.load(path)
     # Told, not left to be guessed: actions at their bounds look like whole numbers.

@@ -12,7 +12,6 @@ from bidex_meta.data.joined import Joined, gathered
 
 
 def played(world: Any, policy: Callable[[Tensor], Tensor], steps: int) -> list[Episode]:
-    """Whole episodes of so many vector steps in SAME_STEP mode; the first ones, which may be shortened, too."""
     obs, _ = world.reset(seed=7)
     rows: list[list[tuple[Any, ...]]] = [[] for _ in range(world.num_envs)]
     found = []
@@ -32,14 +31,12 @@ def played(world: Any, policy: Callable[[Tensor], Tensor], steps: int) -> list[E
 
 
 def as_data(episodes: list[Episode]) -> Joined:
-    """The same as a learner takes it."""
     taken = ((episode, episode.task, episode.observations) for episode in episodes)
     sizes = episodes[0].observations.shape[1], episodes[0].actions.shape[1]
     return gathered(taken, sum(map(len, episodes)), len(episodes), *sizes)
 
 
 def noisy(best: Callable[[Tensor], Tensor], std: float, shift: float = 0.0) -> Callable[[Tensor], Tensor]:
-    """A policy with normal noise and a constant error."""
     generator = torch.Generator().manual_seed(3)
 
     def act(obs: Tensor) -> Tensor:

@@ -91,7 +91,6 @@ def test_only_what_succeeds_is_kept_and_a_recording_goes_on(
 def test_on_all_tasks_they_show_more(
     sets: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The witness knows one task; what it does by chance in others is kept where it succeeds."""
     played = load_witness("CatchAbreast")
     monkeypatch.setattr("bidex_meta.witness.store.load_witness", lambda name: played)
     words = ["record", "demonstrations", "--task", "Switch", "--threads", "1", "--starts", "tasks"]

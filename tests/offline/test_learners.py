@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from bidex_algos.offline.batches import Batches, return_deviation
+from bidex_algos.offline.base import Batches, return_deviation
 from bidex_algos.offline.bc import BC, BCConfig
-from bidex_algos.offline.bcq import BCQ, BCQConfig, best_of
+from bidex_algos.offline.bcq import BCQ, BCQConfig
 from bidex_algos.offline.iql import IQL, IQLConfig, expectile_loss
 from bidex_algos.offline.td3bc import TD3BC, TD3BCConfig
 from bidex_meta.data.joined import Joined
@@ -46,7 +46,6 @@ def learned(name: str, world: Any, data: Joined, iterations: int, **options: Any
 
 
 def bad_bandit() -> tuple[Any, Joined]:
-    """The best action is 0.6, the data's -0.2 with a deviation of 0.4."""
     world = one_step_bandit(0.6)
     return world, as_data(played(world, noisy(lambda obs: torch.full((len(obs), 2), -0.2), 0.4), 40))
 
@@ -135,15 +134,6 @@ def test_td3bc_actor_loss_by_hand() -> None:
     values = learner.critic.nets[0](torch.cat([obs, actions], 1))[:, 0]
     by_hand = imitation - 2.5 * values.sum() / values.abs().sum()
     assert_close(loss, by_hand)
-
-
-def test_bcq_takes_the_best_mixed_candidate() -> None:
-    values = torch.randn(2, 12, generator=torch.Generator().manual_seed(0))
-    wanted = []
-    for state in range(4):
-        mixed = [0.75 * min(pair) + 0.25 * max(pair) for pair in values[:, 3 * state : 3 * state + 3].T.tolist()]
-        wanted.append(max(mixed))
-    assert_close(best_of(values, 3, 0.75), torch.tensor(wanted))
 
 
 def test_bcq_acts_as_a_loop_over_candidates_and_changes_them_little(point: tuple[Joined, float]) -> None:

@@ -72,7 +72,6 @@ def test_a_run_on_data_sets_is_evaluated_resumed_and_reported(folder: Path, caps
 def test_a_policy_from_data_is_recorded_on_the_tasks_of_its_data(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Whatever the seeds of the runs are, so that two of them make one data set."""
     printed(capsys, "record", "random", "--suite", "MT4", *FEW, "--size", "60", "--seed", "4")
     runs = [folder / name for name in ("a", "b")]
     for seed, run in enumerate(runs, 1):
@@ -84,7 +83,6 @@ def test_a_policy_from_data_is_recorded_on_the_tasks_of_its_data(
 
 
 def test_gymnasiums_humanoid_is_learned_without_being_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Its data set tells the task, and no suite."""
     few = ["--size", "60", "--num-envs", "4", "--threads", "1", "--device", "cpu"]
     printed(capsys, "record", "random", "--task", HUMANOID, *few)
     name = f"{HUMANOID}/random-v0"
@@ -116,7 +114,6 @@ def test_what_does_not_go_together_is_refused(folder: Path, capsys: pytest.Captu
 
 
 def stored(folder: Path, name: str, episodes: list[Any], tasks: list[str], **about: Any) -> Dataset:
-    """A data set of some episodes."""
     begin(folder / name, {"kind": "test"})
     writer = DatasetWriter(folder / name)
     for episode in episodes:
@@ -130,7 +127,6 @@ def stored(folder: Path, name: str, episodes: list[Any], tasks: list[str], **abo
 
 
 def alone(slot: int, size: int) -> list[Any]:
-    """Episodes of one of two bandits as if recorded alone: so many entries, no one-hot."""
     world = opposite_bandits(rows=2)
     found = [e for e in played(world, noisy(lambda obs: torch.zeros(len(obs), 2), 0.3), 9) if e.task == slot]
     for episode in found:
@@ -191,14 +187,12 @@ def test_goals_that_the_world_hides_are_zero_as_it_shows_them(tmp_path: Path) ->
 
 
 def clouds(points: int, kind: str, state: int, ids: int) -> list[Any]:
-    """Groups of an observation [state | cloud | one-hot], as metadata have them."""
     first, last = state, state + points * {"points": 3, "kind_points": 4}[kind]
     found = [["state", [[0, first]]], [kind, [[first, last]]], ["task_id", [[last, last + ids]]]]
     return found if ids else found[:2]
 
 
 def test_a_class_recorded_alone_keeps_its_cloud_in_its_place(tmp_path: Path) -> None:
-    """A state of two entries is padded to three; the clouds of two points stand behind it."""
     world = opposite_bandits(rows=2)
     world.single_observation_space = Box(-np.inf, np.inf, (3 + 6 + 2,), np.float32)
 
@@ -227,7 +221,6 @@ def test_a_class_recorded_alone_keeps_its_cloud_in_its_place(tmp_path: Path) -> 
 
 
 def test_data_sets_imply_what_they_were_recorded_of():
-    """Suite, task, base, object and points of a run come from the data; other objects are other data."""
     told = {"suite": None, "task": "CatchUnderarm", "base": "moving"}
     mug, egg = (SimpleNamespace(metadata=told | {"object": n, "points": p}) for n, p in (("mug", 64), (None, 0)))
     assert implied([mug, mug]) == {"task": "CatchUnderarm", "base": "moving", "object": "mug", "points": 64}

@@ -46,15 +46,9 @@ class Eggs(Oracle):
 
     entering = None
 
-    def __init__(
-        self,
-        alpha: float,
-        floor: float,
-        anchors: dict[str, tuple[float, float, float]] | None = None,
-        bodies: dict[str, str] | None = None,
-    ) -> None:
+    def __init__(self, alpha: float, floor: float, anchors: dict | None = None, numbers: str = "") -> None:
         self.alpha, self.floor, self.anchors = alpha, floor, anchors or {}
-        self.body_of_goal = bodies or {"goal": "object/object"}
+        self.body_of_goal = {f"goal{i}": f"object{i}/object" for i in numbers or ("",)}
 
     def goals(self, data: mujoco.MjData, task: Task) -> dict[str, Goal]:
         return {goal: _goal(task, goal) for goal in self.body_of_goal}
@@ -78,12 +72,10 @@ class Eggs(Oracle):
         parts = {}
         for goal, body in self.body_of_goal.items():
             centre, turn = _goal(task, goal)
-            spot = (
-                (2.5, centre[1], self.floor + rng.uniform(-0.05, 0.05))
-                if low
-                else centre + rng.uniform(-0.025, 0.025, 3)
-            )
-            parts[body.removesuffix("/object")] = pose(np.array(spot), turn * Rotation.from_rotvec(rng.normal(size=3)))
+            spot = centre + rng.uniform(-0.025, 0.025, 3)
+            if low:
+                spot = np.array((2.5, centre[1], self.floor + rng.uniform(-0.05, 0.05)))
+            parts[body.removesuffix("/object")] = pose(spot, turn * Rotation.from_rotvec(rng.normal(size=3)))
         return parts
 
 
@@ -102,8 +94,7 @@ class ReOrientation(Oracle):
         goals = self.goals(data, task)
         (d_1, r_1), (d_2, r_2) = (_errors(data, body, goals[goal]) for goal, body in self.body_of_goal.items())
         terms = {"left": -10 * d_1, "right": -10 * d_2, "target": -1.5 * (r_1 + r_2)}
-        edges = (r_1 - 0.2, r_2 - 0.2, d_1 - 0.1, d_2 - 0.1)
-        return within(terms, *edges)
+        return within(terms, r_1 - 0.2, r_2 - 0.2, d_1 - 0.1, d_2 - 0.1)
 
     def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
         """Both cubes in the air, turned and moved a little off their goals."""
@@ -136,8 +127,7 @@ class LiftUnderarm(Oracle):
         position, turn = frame(data, "object/object")
         d_target = length(position - self.goals(data, task)["goal"][0])
         terms = linear(data, left, right, 3 * (0.985 - d_target), 0.2)
-        edges = (d_target - 0.05, tilt(turn) - np.pi / 6)
-        return within(terms, *edges)
+        return within(terms, d_target - 0.05, tilt(turn) - np.pi / 6)
 
     def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
         centre, turn = self.goals(data, task)["goal"]
@@ -182,8 +172,7 @@ class SwingCup(Oracle):
         (position, turn), (place, goal) = frame(data, "cup/object"), self.goals(data, task)["goal"]
         d_r = rotation_distance(turn, goal)
         terms = linear(data, left, right, 1 / (abs(d_r) + 0.1) * 5, -1.0)
-        edges = (d_r - np.pi / 4, length(position - place) - 0.2)
-        return within(terms, *edges)
+        return within(terms, d_r - np.pi / 4, length(position - place) - 0.2)
 
     def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
         centre, turn = self.goals(data, task)["goal"]
@@ -239,14 +228,9 @@ class OpenPenCap(Oracle):
 
     def judge(self, data: mujoco.MjData, task: Task) -> Judgement:
         body, cap = self.points(data).values()
-        d_left, d_right = reach(data, body, cap)
+        left, right = (float(np.exp(-10 * distance)) for distance in reach(data, body, cap))
         d_target = length(body - cap)
-        terms = {
-            "left": float(np.exp(-10 * d_left)),
-            "right": float(np.exp(-10 * d_right)),
-            "target": d_target * 5,
-            "constant": -0.8,
-        }
+        terms = {"left": left, "right": right, "target": d_target * 5, "constant": -0.8}
         return within(terms, 0.3 - d_target)
 
     def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
@@ -337,7 +321,7 @@ FORMULAS: dict[str, Oracle] = {
     "HandOver": Eggs(50.0, 0.2),
     "CatchUnderarm": Eggs(50.0, 0.1),
     "CatchOver2Underarm": Eggs(20.0, 0.3, {"right/mount": (0, 0, 0.5), "left/mount": (0, -0.8, 0.5)}),
-    "TwoCatchUnderarm": Eggs(50.0, 0.2, bodies={"goal1": "object1/object", "goal2": "object2/object"}),
+    "TwoCatchUnderarm": Eggs(50.0, 0.2, numbers="12"),
     "CatchAbreast": Eggs(50.0, 0.2, {"right/palm": (-0.3, -0.55, 0.5), "left/palm": (-0.3, -1.15, 0.5)}),
     "LiftUnderarm": LiftUnderarm(),
     "DoorOpenOutward": Door(opens=True, side=-0.04),

@@ -52,13 +52,19 @@ def kept(data: mujoco.MjData) -> float:
     return np.pi / 4 - tilt(frame(data, "bucket/object")[1])
 
 
-class PushBlock(Oracle):
+class Bodies(Oracle):
+    """The points of the tables are the origins of these bodies."""
+
+    bodies: ClassVar[tuple[str, str]] = ("block1", "block2")
+
+    def points(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
+        return {f"{name} position": data.body(f"{name}/object").xpos.copy() for name in self.bodies}
+
+
+class PushBlock(Bodies):
     """Equation 12."""
 
     places: ClassVar = {"block1": (-0.2, -0.2, 0.625), "block2": (-0.2, 0.2, 0.625)}
-
-    def points(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
-        return {f"block{i} position": data.body(f"block{i}/object").xpos.copy() for i in (1, 2)}
 
     def judge(self, data: mujoco.MjData, task: Task) -> Judgement:
         first, second = self.points(data).values()
@@ -73,14 +79,11 @@ class PushBlock(Oracle):
         }
 
 
-class StackBlock(Oracle):
+class StackBlock(Bodies):
     """Equation 18. Block 1 comes to lie on block 2 (docs/figures.md, decisions)."""
 
     body_of_goal: ClassVar = {"goal": "block1/object"}
     entering: ClassVar = {"target_x", "target_y"}
-
-    def points(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
-        return {f"block{i} position": data.body(f"block{i}/object").xpos.copy() for i in (1, 2)}
 
     def targets(self, task: Task) -> tuple[np.ndarray, np.ndarray]:
         bottom = np.array((task["target_x"], task["target_y"], 0.625))
@@ -94,8 +97,7 @@ class StackBlock(Oracle):
         g_1, g_2 = (length(p - t) for p, t in zip((first, second), self.targets(task), strict=True))
         terms = linear(data, first, second, (0.24 - (g_1 + g_2)) * 2, 1.5)
         x, y, z = first - second
-        edges = [g_1 - 0.03, g_2 - 0.03, abs(z - 0.05) - 0.01, np.hypot(x, y) - 0.03]
-        return within(terms, *edges)
+        return within(terms, g_1 - 0.03, g_2 - 0.03, abs(z - 0.05) - 0.01, np.hypot(x, y) - 0.03)
 
     def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
         top, bottom = self.targets(task)
@@ -149,23 +151,19 @@ class PourWater(Oracle):
         return parts
 
 
-class GraspAndPlace(Oracle):
+class GraspAndPlace(Bodies):
     """The original's formula with one hand point a hand (docs/figures.md, classes).
 
     Success: the block's centre in the bucket, which is upright.
     """
 
-    def points(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
-        return {f"{name} position": data.body(f"{name}/object").xpos.copy() for name in ("bucket", "block")}
+    bodies = ("bucket", "block")
 
     def judge(self, data: mujoco.MjData, task: Task) -> Judgement:
         bucket, block = self.points(data).values()
-        d_left, d_right = reach(data, block, bucket)
-        terms = {
-            "left": float(np.exp(-10 * d_left)),
-            "right": float(np.exp(-10 * d_right)),
-            "target": 2 * float(np.exp(-10 * length(bucket - block))),
-        }
+        distances = (*reach(data, block, bucket), length(bucket - block))
+        left, right, near = (float(np.exp(-10 * distance)) for distance in distances)
+        terms = {"left": left, "right": right, "target": 2 * near}
         surely, perhaps = inside(data, block)
         upright = kept(data)
         return Judgement(terms, surely and upright > 0, False, 0.0 if surely != perhaps else abs(upright))

@@ -8,7 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bidex_meta.tasks import registry
-from tests.tasks.formulas import FORMULAS, TRAVEL, StackBlock
+from tests.tasks.formulas import FORMULAS, TRAVEL
+from tests.tasks.formulas_of_blocks import PushBlock, StackBlock
 from tests.tasks.oracle import Goal, Task, about_z, pose, shifted, start
 from tests.tasks.worlds import Lens, engine_of, observe, scene_of, set_pose, task_of, world_of
 
@@ -66,7 +67,12 @@ def pot(at: Start) -> list[State]:
 
 
 def leaves(first: float, second: float) -> Parts:
-    return {f"object/hinge{i}": np.array([angle]) for i, angle in ((1, first), (2, second))}
+    return {"object/hinge1": np.array([first]), "object/hinge2": np.array([second])}
+
+
+def both(first: np.ndarray, second: np.ndarray, yaw: float = 0.0) -> Parts:
+    """Two blocks at places, turned by a yaw."""
+    return {"block1": pose(first, about_z(yaw)), "block2": pose(second, about_z(yaw))}
 
 
 def doors_open(at: Start) -> list[State]:
@@ -107,7 +113,7 @@ def scissors(at: Start) -> list[State]:
 
 def switches(at: Start) -> list[State]:
     def pressed(first: float, second: float) -> Parts:
-        return {f"switch{i}/hinge": np.array([share * TRAVEL]) for i, share in ((1, first), (2, second))}
+        return {"switch1/hinge": np.array([first * TRAVEL]), "switch2/hinge": np.array([second * TRAVEL])}
 
     return [
         State("both", pressed(0.85, 0.82), True),
@@ -117,16 +123,12 @@ def switches(at: Start) -> list[State]:
 
 
 def cubes_pushed(at: Start) -> list[State]:
-    one, two = (np.array(place) for place in FORMULAS["PushBlock"].places.values())
-
-    def put(first: np.ndarray, second: np.ndarray) -> Parts:
-        return {f"block{i}": pose(place, about_z(0.5)) for i, place in ((1, first), (2, second))}
-
+    one, two = (np.array(place) for place in PushBlock.places.values())
     return [
-        State("both 8 cm off", put(shifted(one, 0.08, 0, 0), shifted(two, 0, 0.08, 0)), True),
-        State("one at its start", put(one, shifted(two, 0.2, 0, 0))),
-        State("one 12 cm off", put(shifted(one, 0, 0.12, 0), two)),
-        State("exchanged", put(two, one)),
+        State("both 8 cm off", both(shifted(one, 0.08, 0, 0), shifted(two, 0, 0.08, 0), 0.5), True),
+        State("one at its start", both(one, shifted(two, 0.2, 0, 0), 0.5)),
+        State("one 12 cm off", both(shifted(one, 0, 0.12, 0), two, 0.5)),
+        State("exchanged", both(two, one, 0.5)),
     ]
 
 
@@ -163,15 +165,11 @@ def cubes_turned(at: Start) -> list[State]:
 
 def stack(at: Start) -> list[State]:
     top, bottom = StackBlock().targets(at.task)
-
-    def put(first: np.ndarray, second: np.ndarray) -> Parts:
-        return {f"block{i}": pose(place, Rotation.identity()) for i, place in ((1, first), (2, second))}
-
     return [
-        State("stacked, both 2 cm off", put(shifted(top, 0.02, 0, 0), shifted(bottom, 0.02, 0, 0)), True),
-        State("held above", put(shifted(top, 0, 0, 0.02), bottom)),
-        State("exchanged", put(bottom, top)),
-        State("stacked 5 cm away", put(shifted(top, 0.05, 0, 0), shifted(bottom, 0.05, 0, 0))),
+        State("stacked, both 2 cm off", both(shifted(top, 0.02, 0, 0), shifted(bottom, 0.02, 0, 0)), True),
+        State("held above", both(shifted(top, 0, 0, 0.02), bottom)),
+        State("exchanged", both(bottom, top)),
+        State("stacked 5 cm away", both(shifted(top, 0.05, 0, 0), shifted(bottom, 0.05, 0, 0))),
     ]
 
 

@@ -24,23 +24,11 @@ def test_every_class_has_a_section_with_all_that_a_newcomer_asks() -> None:
     for name, section in found.items():
         task = registry.get(name, True)
         assert section.startswith(f"\n{task.summary}.\n")
-        for fact in (
-            "observation, action",
-            "episode",
-            "reward",
-            "success",
-            "variation",
-            "ML mask",
-            "deviations",
-            "witness",
-        ):
+        facts = "observation, action|episode|reward|success|variation|ML mask|deviations|witness"
+        for fact in facts.split("|"):
             assert len(re.findall(rf"^\| {fact} \| \S.* \|$", section, flags=re.M)) == 1, (name, fact)
         assert f"| {task.episode_steps} steps |" in section
         assert all(f"{component} " in section for component in task.variation_space.names)
-
-
-def test_sizes_are_those_of_the_tables() -> None:
-    for name, section in sections().items():
         observation, action = SIZES[name, True]
         assert f"| observation, action | {observation}, {action} |" in section, name
 

@@ -61,10 +61,10 @@ def test_the_next_task_moves_the_goal(stage):
 
 
 class Screen:
-    paused, speed = False, 1.0
+    paused, speed, shown, closed = False, 1.0, 0, False
 
     def __init__(self, looks):
-        self.looks, self.shown, self.closed = looks, 0, False
+        self.looks = looks
 
     def is_open(self):
         self.looks -= 1

@@ -5,36 +5,12 @@ import torch
 
 from bidex_meta.benchmark import make_task_world
 from bidex_meta.errors import BidexError
-from bidex_meta.hands.hand import hand
 from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.utils.maths import conjugate, multiply, xyzw
 from bidex_meta.witness.controller import GAIN, HandController
 from bidex_meta.witness.demonstrators import Scripted
 from bidex_meta.witness.replay import Simulator
 from bidex_meta.witness.scripts import SCRIPTS, script_of
-
-
-@pytest.fixture(scope="module")
-def hands() -> HandController:
-    return HandController(Simulator("StackBlock", 1, threads=1))
-
-
-def test_a_hand_goes_where_it_is_led_and_the_other_stays(hands: HandController) -> None:
-    right, left = hands.at("right"), hands.at("left")
-    goal = right + torch.tensor([0.03, -0.04, 0.05], dtype=right.dtype)
-    hands.lead(tuple(goal.tolist()), tuple(left.tolist()), steps=40)
-    assert float((hands.at("right") - goal).norm()) < 0.005 > float((hands.at("left") - left).norm())
-    assert len(hands.actions) == len(hands.rewards) == len(hands.success) == 40
-
-
-def test_bent_fingers_are_those_of_the_joint_table(hands: HandController) -> None:
-    hands.bend("right", 0.8, 0.4)
-    here = [tuple(hands.at(side).tolist()) for side in ("right", "left")]
-    hands.lead(*here, steps=20)
-    names = [f"right/{hand().joints[i]}_position" for i in hand().index("FFJ2", "LFJ2", "THJ4", "MFJ1")]
-    *straight, middle = (float(hands.where(name)) for name in names)
-    assert straight == pytest.approx([0.8, 0.8, 0.0], abs=0.1)
-    assert middle > 0.1, "it also has its coupled distal joint to bend"
 
 
 def test_a_class_without_a_script_is_refused() -> None:

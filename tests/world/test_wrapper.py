@@ -10,8 +10,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode
-from gymnasium.wrappers import RecordEpisodeStatistics, RecordVideo
+from gymnasium.wrappers import RecordVideo
 from gymnasium.wrappers import vector as wrap
 
 import bidex_meta  # noqa: F401
@@ -82,11 +81,6 @@ def test_sb3_counts_episodes_of_the_single_environment() -> None:
     own = zip(monitor.get_episode_rewards(), monitor.get_episode_lengths(), strict=True)
     assert len(told) > 2 and told == [(pytest.approx(r, abs=1e-6), n) for r, n in own]
     assert len(learner.ep_success_buffer) == len(told)
-
-
-def test_statistics_of_the_single_environment() -> None:
-    steps, info = episode(RecordEpisodeStatistics(single()))
-    assert info["episode"]["l"] == steps and "is_success" in info
 
 
 def test_video_of_the_single_environment(films: dict[str, list[np.ndarray]], tmp_path: Path) -> None:
@@ -162,12 +156,3 @@ def test_other_wrappers_of_the_numpy_form() -> None:
     listed = wrap.DictInfoToList(suite_world("MT4", 8).to_numpy())
     listed.reset(seed=0)
     assert len(listed.step(np.zeros((8, 52), np.float32))[-1]) == 8
-
-
-def test_gymnasiums_own_vector_of_single_environments_takes_all() -> None:
-    env = gymnasium.make_vec(ID, num_envs=2, vectorization_mode="sync")
-    assert env.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
-    env = wrap.NormalizeObservation(wrap.RecordEpisodeStatistics(env))
-    env.reset(seed=0)
-    infos = [env.step(env.action_space.sample())[-1] for _ in range(76)]
-    assert any("episode" in info and info["is_success"].dtype == bool for info in infos)

@@ -8,9 +8,7 @@ import pytest
 import torch
 
 from bidex_meta.cli import main, watching
-from bidex_meta.errors import BidexError
 from bidex_meta.runs import RunFolder
-from bidex_meta.worlds import Worlds
 from bidex_meta.worlds.external import HUMANOID
 from bidex_meta.worlds.humanoid import NAME, HumanoidWorld
 
@@ -71,17 +69,7 @@ def test_what_is_of_hands_is_refused(flags: str, told: str, tmp_path: Path, caps
 
 @pytest.mark.parametrize("more", [["--tiled"], []])
 @pytest.mark.parametrize("named", [["--task", HUMANOID], ["--suite", "metaworld/MT10"]])
-def test_there_are_no_pictures_of_it(
-    named: list[str], more: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_there_are_no_pictures_of_it(named, more, tmp_path, capsys):
     assert main(["render", *named, *more, "--out", str(tmp_path / "a.png")]) == 2
     error = capsys.readouterr().err
     assert f"got {named[1]}. Name another." in error and error.count("\n") == 1
-
-
-def test_no_other_split() -> None:
-    source = Worlds.open({"task": HUMANOID})
-    assert source.splits == ["train"] and source.references() == {}
-    for ask in (lambda: source.world("test"), source.task_classes):
-        with pytest.raises(BidexError, match=HUMANOID):
-            ask()

@@ -113,32 +113,22 @@ class Adapter:
         slopes = {name: torch.cat([part[name] for part in parts]) for name in own}
         if self.first_order:
             slopes = {name: slope.detach() for name, slope in slopes.items()}
-        return params | {name: params[name] - self._size(name) * slopes[name] for name in own}
+        rate, factors = self.learning_rate, self.step_sizes
+        sizes = {name: rate if factors is None else rate * factors[name] for name in own}
+        return params | {name: params[name] - sizes[name] * slopes[name] for name in own}
 
     def _moved(self, names: list[str]) -> list[str]:
-        """Of these parameters those that an inner step moves."""
         return [name for name in names if name.startswith(self._prefix)]
 
-    def _size(self, name: str) -> float | Tensor:
-        """Size of an inner step of a parameter."""
-        return self.learning_rate if self.step_sizes is None else self.learning_rate * self.step_sizes[name]
-
     def _slopes(self, params: Params, batch: TaskBatch, own: list[str]) -> Params:
-        """Gradients of the tasks' inner losses by the parameters named; no task's loss knows another's parameters."""
 
         def loss(moved: Params) -> Tensor:
-            log_prob = self._log_prob(params | moved, batch)
-            if self.objective == "ratio":
-                gain = torch.exp(log_prob - _old_log_prob(batch)) * batch.advantages
-            else:
-                gain = log_prob * batch.advantages
-            return -weighted_mean(gain, batch.weights).sum()
+            means, log_stds = self.distribution(params | moved, batch.obs)
+            log_prob = gaussian_log_prob(batch.actions, means, log_stds[:, None])
+            followed = torch.exp(log_prob - _old_log_prob(batch)) if self.objective == "ratio" else log_prob
+            return -weighted_mean(followed * batch.advantages, batch.weights).sum()
 
         return grad(loss)({name: params[name] for name in own})
-
-    def _log_prob(self, params: Params, b: TaskBatch) -> Tensor:
-        means, log_stds = self.distribution(params, b.obs)
-        return gaussian_log_prob(b.actions, means, log_stds[:, None])
 
     def ratio_and_kl(self, params: Params, batch: TaskBatch) -> tuple[Tensor, Tensor]:
         """Likelihood ratios of each transition (M, B), and the mean KL from the policies that sampled (M,)."""
@@ -153,7 +143,6 @@ def _old_log_prob(b: TaskBatch) -> Tensor:
 
 
 def _parts(params: Params, batch: TaskBatch) -> Iterator[tuple[Params, TaskBatch]]:
-    """Tasks to be differentiated together: on a CPU as many as its caches hold, elsewhere all."""
     tasks, transitions = batch.weights.shape
     size = max(1, _TRANSITIONS_AT_ONCE // transitions) if batch.obs.device.type == "cpu" else tasks
     for k in range(0, tasks, size):

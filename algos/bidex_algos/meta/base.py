@@ -1,12 +1,7 @@
 """What the gradient-based meta-learners share: meta-batches of tasks, stages of adaptation, checkpoints.
 
-They differ in the outer step alone. An iteration::
-
-    draw tasks; every task starts from the meta-parameters
-    for each stage k = 0 ... inner_steps:
-        every environment plays one episode by its task's parameters          D_k
-        theta_k+1 = theta_k + inner_learning_rate * gradient on D_k   (not after the last)
-    outer step of the meta-parameters on D_0 ... D_K
+They differ in the outer step alone. In an iteration every task starts from the meta-parameters; in each stage k = 0 ...
+inner_steps every environment plays an episode by its task's parameters, which, but after the last, take an inner step.
 """
 
 from abc import abstractmethod
@@ -16,17 +11,118 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.learner import Learner, as_numbers
-from bidex_algos.meta.adaptation import Objective, TaskBatch, detached
+from bidex_algos.meta.adaptation import Adapter, Objective, Params, TaskBatch, detached
 from bidex_algos.meta.config import MetaConfig, OuterConfig
-from bidex_algos.meta.meta_policy import MetaPolicy, make_meta_policy
 from bidex_algos.meta.stage import Outcome, Stage, TaskRows, moments, task_batch
-from bidex_algos.nets.normalise import RunningStats
+from bidex_algos.nets.inputs import Inputs
+from bidex_algos.nets.networks import GaussianActor
+from bidex_algos.nets.normalise import ObservationNormaliser, RunningStats
 from bidex_algos.nets.shape import Shape
 from bidex_algos.rollout import may_look
+from bidex_meta.agents import Timestep
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import world_size
 from bidex_meta.train.learner import AutoresetMode, Parts, State
 from bidex_meta.world.contract import PooledWorld
+
+
+class MetaPolicy(nn.Module):
+    """A Gaussian actor with adapted copies, one a task; follows the protocol of adapting agents (bidex_meta.agents).
+
+    Its own parameters are the meta-parameters. Before the first ``adapt`` every task plays by them. ``seed`` is that of
+    the exploring actions.
+    """
+
+    def __init__(
+        self, observations: ObservationNormaliser, actor: GaussianActor, config: MetaConfig, objective: Objective,
+        seed: int = 0
+    ):  # fmt: skip
+        super().__init__()
+        self.observations, self.actor, self.config = observations, actor, config
+        self.adapter = Adapter(
+            actor, config.inner_learning_rate, objective, config.std_range, config.first_order, config.adapted,
+            config.step_sizes
+        )  # fmt: skip
+        self.step_sizes = self.adapter.step_sizes  # among the weights of a checkpoint, where there are such
+        self.seed = seed
+        self.generator: torch.Generator | None = None
+        self.rows: TaskRows | None = None
+        self.adapted: Params | None = None
+        self.stage = Stage()
+        self.elapsed: Tensor | None = None
+
+    def assign(self, task_of_row: Tensor | None) -> None:
+        """The task (N,) of each environment; those of one task share what they learn. None: each has its own."""
+        self.rows = None if task_of_row is None else TaskRows(task_of_row)
+        self.init()
+
+    def init(self) -> None:
+        """Back to the meta-parameters; all adaptation and its data are forgotten."""
+        self.adapted, self.stage, self.elapsed = None, Stage(), None
+
+    @torch.no_grad()
+    def adapt_action(self, obs: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Sampled actions (N, a), not clamped, for raw observations (N, d); and their means."""
+        if self.generator is None or self.generator.device != obs.device:
+            self.generator = torch.Generator(obs.device).manual_seed(self.seed)
+        mean, log_std = self._distribution(self.observations(obs))
+        noise = torch.randn(mean.shape, generator=self.generator, device=mean.device)
+        return mean + log_std.exp() * noise, {"mean": mean}
+
+    @torch.no_grad()
+    def step(self, timestep: Timestep) -> None:
+        """Takes in one transition of every environment."""
+        terminated, truncated = timestep.terminated.bool(), timestep.truncated.bool()
+        valid = torch.ones_like(terminated) if timestep.valid is None else timestep.valid
+        elapsed = torch.zeros_like(terminated, dtype=torch.int64) if self.elapsed is None else self.elapsed
+        ended = terminated | truncated | ~valid
+        self.stage.add(
+            obs=self.observations(timestep.observation.float()), actions=timestep.action.float(),
+            means=timestep.aux_policy_outputs["mean"], rewards=timestep.reward.float().masked_fill(~valid, 0.0),
+            terminated=terminated, ended=ended, valid=valid, elapsed=elapsed
+        )  # fmt: skip
+        self.elapsed = (elapsed + 1).masked_fill(ended, 0)
+
+    def adapt(self) -> None:
+        """One inner step of each task on all transitions since the last one; without any, nothing happens."""
+        if len(self.stage) == 0:
+            return
+        rows = self._rows(self.stage.obs[0])
+        params = self.adapter.meta(rows.count) if self.adapted is None else self.adapted
+        params = detached(params)  # nobody differentiates this step
+        log_std = params["log_std"].clamp(*self.adapter.log_std_range)
+        batch = task_batch(self.stage, rows, log_std, self.config)
+        self.adapted = detached(self.adapter.adapt(params, batch))
+        self.stage, self.elapsed = Stage(), None
+
+    @torch.no_grad()
+    def eval_action(self, obs: Tensor) -> Tensor:
+        """Mean actions of the adapted policies for raw observations (N, d), clamped to [-1, 1]: (N, a)."""
+        return self._distribution(self.observations(obs))[0].clamp(-1.0, 1.0)
+
+    def reset(self, env_mask: Tensor) -> None:
+        """Nothing to forget between episodes."""
+
+    def _distribution(self, obs: Tensor) -> tuple[Tensor, Tensor]:
+        """Means (N, a) and logarithms of standard deviations, (N, a) or (a,), for normalised observations (N, d)."""
+        if self.adapted is None:
+            return self.actor(obs), self.actor.log_std.clamp(*self.adapter.log_std_range)
+        rows = self._rows(obs)
+        means, log_std = self.adapter.distribution(self.adapted, rows.by_task(obs))
+        return rows.by_row(means), log_std[rows.task_of_row]
+
+    def _rows(self, obs: Tensor) -> TaskRows:
+        if self.rows is None or len(self.rows.task_of_row) != len(obs):
+            self.rows = TaskRows(torch.arange(len(obs), device=obs.device))
+        return self.rows
+
+
+def make_meta_policy(
+    config: MetaConfig, objective: Objective, inputs: Inputs, actions: int, init: torch.Generator, seed: int = 0
+) -> MetaPolicy:
+    """A policy with fresh weights of ``init``, a CPU generator; no inner step moves the encoders of ``inputs``."""
+    actor = GaussianActor(inputs, config.hidden, actions, config.init_std, init, config.activation)
+    return MetaPolicy(ObservationNormaliser(inputs, config.normalise_observations), actor, config, objective, seed)
 
 
 class MetaLearner(Learner):
@@ -39,6 +135,7 @@ class MetaLearner(Learner):
     objective: ClassVar[Objective]
     """What its inner step follows."""
     adapts = True
+    going_on = ("obs", "elapsed", "steps_with_tasks", *Learner.going_on)
 
     def __init__(self, world: PooledWorld, config: OuterConfig, seed: int):
         if world_size() > 1:
@@ -50,7 +147,13 @@ class MetaLearner(Learner):
         self.steps_with_tasks = 0
         # What can be drawn from; the world's own pools will be those of a meta-batch.
         self.pools = [pool.copy() for pool in world.pools]
-        self._check_rows()
+        counts = torch.bincount(world.task_id, minlength=world.num_tasks).tolist()
+        for name, count, pool in zip(world.task_names, counts, self.pools, strict=True):
+            if count < (tasks := min(config.tasks_per_class, len(pool))):
+                raise BidexError(
+                    f"{self.name}: {name} has {count} environments for {tasks} tasks of a meta-batch. Use num_envs of "
+                    f"at least {tasks * world.num_tasks}, or lower tasks_per_class."
+                )
         self.tasks_generator = torch.Generator().manual_seed(seed)
         self.rows = TaskRows(world.task_id)
         self.adam = torch.optim.Adam(self.policy.actor.parameters(), lr=config.outer_learning_rate)
@@ -63,16 +166,6 @@ class MetaLearner(Learner):
         """Whole episodes wait for each other, slices of them go on."""
         return "DISABLED" if config.slice_steps is None else "SAME_STEP"
 
-    def _check_rows(self) -> None:
-        rows = torch.bincount(self.world.task_id, minlength=self.world.num_tasks).tolist()
-        for name, count, pool in zip(self.world.task_names, rows, self.pools, strict=True):
-            tasks = min(self.config.tasks_per_class, len(pool))
-            if count < tasks:
-                raise BidexError(
-                    f"{self.name}: {name} has {count} environments for {tasks} tasks of a meta-batch. Use num_envs of "
-                    f"at least {tasks * self.world.num_tasks}, or lower tasks_per_class."
-                )
-
     @abstractmethod
     def _outer(self, batches: list[TaskBatch]) -> dict[str, Tensor]:
         """Moves the meta-parameters by what the stages showed; returns scalars to be logged."""
@@ -82,7 +175,6 @@ class MetaLearner(Learner):
         return {"adam": self.adam}
 
     def _descend(self, loss: Tensor) -> Tensor:
-        """One step of Adam of the meta-parameters; the norm of the meta-gradient before it was shortened, a scalar."""
         self.adam.zero_grad()
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.policy.actor.parameters(), self.config.max_grad_norm)
@@ -90,16 +182,13 @@ class MetaLearner(Learner):
         return norm
 
     def _iterate(self) -> dict[str, float]:
-        """One meta-batch: samples, adapts, learns."""
         if self.config.slice_steps is None or self.obs is None or self.steps_with_tasks >= self.config.max_adapt_steps:
             self._draw_tasks()
         adapter = self.policy.adapter
         adapter.project()
         params = detached(adapter.meta(self.rows.count))
         seen = RunningStats((self.policy.observations.measured.size,)).to(self.device)
-        batches: list[TaskBatch] = []
-        reported: dict[str, float] = {}
-        steps = 0
+        batches, reported, steps = list[TaskBatch](), dict[str, float](), 0
         for k in range(self.config.inner_steps + 1):
             with self._collecting():
                 stage, outcome = self._sample(params, seen)
@@ -112,15 +201,12 @@ class MetaLearner(Learner):
         reported |= as_numbers(self._outer(batches))
         self.policy.observations.merge(seen.mean, seen.var, seen.count)
         self.env_steps += steps
-        if self.policy.step_sizes is not None:
-            reported["Policy/inner_learning_rate"] = self.config.inner_learning_rate * float(
-                self.policy.step_sizes.mean()
-            )
+        if (sizes := self.policy.step_sizes) is not None:
+            reported["Policy/inner_learning_rate"] = self.config.inner_learning_rate * float(sizes.mean())
         reported["Policy/std"] = float(self.policy.actor.log_std.detach().clamp(*adapter.log_std_range).exp().mean())
         return reported
 
     def _draw_tasks(self) -> None:
-        """New tasks for every class, without repetition, and new episodes."""
         chosen = {}
         for name, pool in zip(self.world.task_names, self.pools, strict=True):
             order = torch.randperm(len(pool), generator=self.tasks_generator)[: self.config.tasks_per_class]
@@ -135,11 +221,13 @@ class MetaLearner(Learner):
     def _sample(self, params: dict[str, Tensor], seen: RunningStats) -> tuple[Stage, Outcome]:
         """A whole episode, or a slice, in every environment; raw observations go into ``seen``, clipped ones on."""
         policy, rows, stage = self.policy, self.rows, Stage()
-        if self.config.slice_steps is None:
-            horizon = min(int(self.world.max_episode_steps.max()), self.config.max_adapt_steps)
-        else:
-            horizon = self.config.slice_steps
-        obs = self._begin()
+        longest = min(int(self.world.max_episode_steps.max()), self.config.max_adapt_steps)
+        horizon = self.config.slice_steps or longest
+        obs = self.obs
+        if obs is None or self.config.slice_steps is None:
+            self.elapsed = torch.zeros_like(self.elapsed)
+            first = self.env_steps == 0 and self.steps_with_tasks == 0
+            obs = self._first_observations() if first else self.world.reset()[0]
         running = torch.ones_like(self.elapsed, dtype=torch.bool)
         earned, success = torch.zeros(len(running), device=self.device), torch.zeros_like(running)
         steps = torch.zeros_like(self.elapsed[0])
@@ -172,28 +260,19 @@ class MetaLearner(Learner):
         self.steps_with_tasks += len(stage)
         return stage, Outcome(earned, success, steps)
 
-    def _begin(self) -> Tensor:
-        """Observations to start a stage from."""
-        if self.obs is not None and self.config.slice_steps is not None:
-            return self.obs
-        self.elapsed = torch.zeros_like(self.elapsed)
-        if self.env_steps == 0 and self.steps_with_tasks == 0:
-            return self._first_observations()
-        return self.world.reset()[0]
-
     def _reported(self, outcome: Outcome, k: int) -> dict[str, float]:
-        """Return and success of a stage per class: of the last stage as such, of the first as ``before``."""
         last = k == self.config.inner_steps
         if k > 0 and not last:
             return {}
         reported: dict[str, float] = {}
-        for what, values in (("return", outcome.earned), ("success", outcome.success.float())):
+        for what, whole, values in (
+            ("return", "mean_return", outcome.earned), ("success", "success_rate", outcome.success.float())
+        ):  # fmt: skip
             sums = torch.zeros(self.world.num_tasks, device=self.device).index_add(0, self.world.task_id, values)
             means = (sums / torch.bincount(self.world.task_id, minlength=self.world.num_tasks)).tolist()
-            tag = f"Train/{what}" if last else f"Before/{what}"
-            reported |= {f"{tag}/{name}": mean for name, mean in zip(self.world.task_names, means, strict=True)}
-            whole = {"return": "mean_return", "success": "success_rate"}[what]
-            reported[f"{'Train' if last else 'Before'}/{whole}"] = sum(means) / len(means)
+            tag = "Train" if last else "Before"
+            reported |= {f"{tag}/{what}/{name}": mean for name, mean in zip(self.world.task_names, means, strict=True)}
+            reported[f"{tag}/{whole}"] = sum(means) / len(means)
         return reported
 
     @classmethod
@@ -215,20 +294,11 @@ class MetaLearner(Learner):
         return {**self._optimisers(), "generator": self.generator, "tasks_generator": self.tasks_generator}
 
     def _place(self) -> State:
-        return {
-            "rows": self.rows.task_of_row,
-            "obs": self.obs,
-            "elapsed": self.elapsed,
-            "steps_with_tasks": self.steps_with_tasks,
-            **super()._place(),
-        }
+        return {"rows": self.rows.task_of_row, **super()._place()}
 
     def _go_on_from(self, state: State) -> None:
         super()._go_on_from(state)
         self.rows = TaskRows(state["rows"].to(self.device))
-        self.obs = None if state["obs"] is None else state["obs"].to(self.device, copy=True)
-        self.elapsed = state["elapsed"].to(self.device, copy=True)
-        self.steps_with_tasks = int(state["steps_with_tasks"])
 
     def _check_size(self, state: State) -> None:
         self._expect("", f"{len(state['elapsed'])} environments", f"{self.world.num_envs} environments")

@@ -1,10 +1,10 @@
 """What can be set about every gradient-based meta-learner; imports no torch, so that a command line can show it."""
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from bidex_algos.meta.adaptation import Adapted, StepSizeKind
-from bidex_algos.nets.architecture import network_bytes
+from bidex_algos.nets.architecture import Options, network_bytes
 from bidex_algos.nets.networks import Activation, Layers
 from bidex_meta.train.learner import LearnerConfig
 from bidex_meta.utils.validation import Count, Fraction, Positive, check_rising
@@ -73,20 +73,19 @@ class OuterConfig(MetaConfig):
 
 # Table 48 of the Bi-DexHands appendix (ProMP), but for its outer step: eight steps of running episodes, and an inner
 # step which moves the weights too little to matter.
-TABLE_48: dict[str, Any] = {
+TABLE_48: Options = {
     "hidden": (2048, 1024, 512), "activation": "elu", "init_std": 1.0, "slice_steps": 8, "inner_steps": 1,
     "inner_learning_rate": 3e-4, "gamma": 0.9, "lam": 0.95, "normalise_observations": False,
 }  # fmt: skip
 
-# For what MT-PPO's preset laptop has learned on the same tasks (--start-from): its network and discount. Inner steps of
-# 0.1 lost more than they gained. Before any meta-training (seed 0) five shots of 100 episodes moved the return on
-# ML1-wide's held-out task, 8, by +2.2 with inner steps of 0.05, whether all layers move or the head alone, by +0.8 with
-# 0.02; a trace of 0.95 by +1.7, of 0.7 by 0.0, of 0.5 by -1.7 (4 to 6 trials, intervals of about 1.2 to either side).
-TUNED: dict[str, Any] = {
+# For what MT-PPO's preset laptop has learned on the same tasks (--start-from): its network and discount. Before any
+# meta- training (seed 0) five shots of 100 episodes moved the return on ML1-wide's held-out task, 8, by +2.2 with inner
+# steps of 0.05 (0.02: +0.8; 0.1: less than 0), of all layers or the head alone; a trace of 0.95 by +1.7, of 0.7 by 0.0.
+TUNED: Options = {
     "hidden": (256, 256, 128), "activation": "elu", "std_range": (0.05, 1.5), "adapted": "head",
     "inner_learning_rate": 0.05, "gamma": 0.93, "lam": 0.9,
 }  # fmt: skip
 
 # The same where the test tasks are of classes that nobody has trained on (ML4, ML20): smaller steps and whole episodes.
 # docs/results/ml20.md: adapted to the first 150 of its 500 steps LiftUnderarm lost 317 of return, to all it gained 352.
-UNSEEN: dict[str, Any] = TUNED | {"inner_learning_rate": 0.01, "max_adapt_steps": 500, "tasks_per_class": 1}
+UNSEEN: Options = TUNED | {"inner_learning_rate": 0.01, "max_adapt_steps": 500, "tasks_per_class": 1}

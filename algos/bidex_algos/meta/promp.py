@@ -1,15 +1,8 @@
 """ProMP: proximal meta-policy search (Rothfuss et al. 2019) on a batch of tasks at once.
 
-The outer step, repeated ``outer_epochs`` times on one meta-batch with stages D_0 ... D_K::
-
-    theta_0 = theta
-    theta_k+1 = theta_k + inner_learning_rate * grad of mean over D_k of ratio(theta_k) * advantage      k < K
-    maximise over theta, the mean over tasks of
-        mean over D_K of min(ratio(theta_K) * advantage, clipped ratio * advantage)
-        - kl_weight * sum over k < K of KL(policy that sampled D_k || theta_k)
-
-The ratio, unlike the log-likelihood, has the right second derivative: it gives the policy before adaptation credit for
-the data that adaptation needs (their section 4).
+As ``maml.py``, but inner steps follow ratio * advantage, whose second derivative gives the policy before adaptation
+credit for the data that adaptation needs (their section 4), and the outer step, ``outer_epochs`` times on a meta-batch,
+raises PPO's clipped objective on D_K minus kl_weight * sum over k < K of KL(policy that sampled D_k || theta_k).
 """
 
 from dataclasses import dataclass
@@ -20,7 +13,7 @@ from torch import Tensor
 from bidex_algos.meta.adaptation import TaskBatch, weighted_mean
 from bidex_algos.meta.base import MetaLearner
 from bidex_algos.meta.config import TABLE_48, TUNED, UNSEEN, OuterConfig
-from bidex_algos.step_size import factor_of
+from bidex_algos.onpolicy.ppo import factor_of
 from bidex_meta.utils.validation import Count, NonNegative, Positive, check_rising
 
 
@@ -51,15 +44,10 @@ class ProMPConfig(OuterConfig):
 
 
 PRESETS: dict[str, ProMPConfig] = {
-    # Table 48 of the Bi-DexHands appendix to the letter. It names no KL weight: ProMP's own 5e-4. "Desired kl" is read
-    # by the original and used nowhere; here the outer step size follows it from 3e-4 on, as in PPO's tables.
+    # Table 48 of the Bi-DexHands appendix, with ProMP's own KL weight. "Desired kl" is read by the original and used
+    # nowhere; here the outer step size follows it from 3e-4 on, as in PPO's tables.
     "paper": ProMPConfig(
-        **TABLE_48,
-        outer_epochs=3,
-        outer_learning_rate=3e-4,
-        desired_kl=0.016,
-        clip=0.2,
-        kl_weight=5e-4,
+        **TABLE_48, outer_epochs=3, outer_learning_rate=3e-4, desired_kl=0.016, clip=0.2, kl_weight=5e-4,
         max_grad_norm=1.0,
     ),
     # Outer steps that learn from nothing are too large for what is learned already: of 1e-3 five made a KL of 1.1 and
@@ -67,7 +55,7 @@ PRESETS: dict[str, ProMPConfig] = {
     "tuned": ProMPConfig(**TUNED, outer_learning_rate=1e-4, desired_kl=0.0125),
     "unseen": ProMPConfig(**UNSEEN, outer_learning_rate=1e-4, desired_kl=0.0125),
     "laptop": ProMPConfig(),
-}
+}  # fmt: skip
 
 
 class ProMP(MetaLearner):
@@ -78,30 +66,20 @@ class ProMP(MetaLearner):
     config: ProMPConfig
 
     def _outer(self, batches: list[TaskBatch]) -> dict[str, Tensor]:
-        measured = []
-        for epoch in range(self.config.outer_epochs):
+        measured, cfg, group = [], self.config, self.adam.param_groups[0]  # not that of learned step sizes
+        for epoch in range(cfg.outer_epochs):
             surrogate, inner_kl, outer_kl = self._objective(batches)
-            if epoch > 0:  # before the first step it is 0 by construction
-                self._follow(outer_kl)
-            norm = self._descend(self.config.kl_weight * inner_kl - surrogate)
+            if epoch > 0 and cfg.desired_kl is not None:  # before the first step it is 0 by construction
+                low, high = cfg.outer_learning_rate_range
+                group["lr"] = min(max(group["lr"] * float(factor_of(outer_kl.detach(), cfg.desired_kl)), low), high)
+            norm = self._descend(cfg.kl_weight * inner_kl - surrogate)
             measured.append(torch.stack([-surrogate, inner_kl, outer_kl, norm]).detach())
         means = torch.stack(measured).mean(0)
         names = ("Loss/surrogate", "Policy/inner_kl", "Policy/outer_kl", "Policy/gradient_norm")
-        reported = dict(zip(names, means, strict=True))
-        return reported | {
-            "Policy/outer_learning_rate": torch.tensor(self.adam.param_groups[0]["lr"], device=self.device)
-        }
-
-    def _follow(self, kl: Tensor) -> None:
-        """Adapts the step size to the KL that the steps so far have made."""
-        if self.config.desired_kl is None:
-            return
-        low, high = self.config.outer_learning_rate_range
-        for group in self.adam.param_groups[:1]:  # not that of learned step sizes
-            group["lr"] = min(max(group["lr"] * float(factor_of(kl.detach(), self.config.desired_kl)), low), high)
+        rate = torch.tensor(group["lr"], device=self.device)
+        return {**dict(zip(names, means, strict=True)), "Policy/outer_learning_rate": rate}
 
     def _objective(self, batches: list[TaskBatch]) -> tuple[Tensor, Tensor, Tensor]:
-        """Clipped objective, summed KL before adaptation, and KL after it: means over tasks, scalars."""
         adapter, clip = self.policy.adapter, self.config.clip
         params = adapter.meta(self.rows.count)
         inner_kl = torch.zeros((), device=self.device)

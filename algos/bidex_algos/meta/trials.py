@@ -1,7 +1,6 @@
-"""Trials: a few whole episodes of one task in each environment, played with one memory.
+"""Trials: a few whole episodes of one task in each environment, played with one memory; episodes begin together.
 
-All environments start the next episode together; one whose episode is over waits, its memory untouched. Waiting is not
-recorded: slot t holds what the memory saw at its t-th step.
+A row whose episode is over waits, its memory untouched. Waiting is not recorded: slot t holds the memory's t-th step.
 """
 
 from dataclasses import dataclass
@@ -85,16 +84,10 @@ class Trials:
         slot = torch.arange(slots or len(self.obs), device=self.lengths.device)
         return slot[:, None] < self.lengths
 
-    def last(self, slots: int) -> Tensor:
-        """Which of the first ``slots`` slots hold the last step of a trial, bool (slots, N)."""
-        slot = torch.arange(slots, device=self.lengths.device)
-        return slot[:, None] == self.lengths - 1
-
     def previous(self, slots: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """What the memory was fed beside the observation: last action, last reward, whether it was shown, end.
+        """What the memory was fed beside the observation: last action (slots, N, a), last reward, whether shown, end.
 
-        Returns of the first ``slots`` slots: (slots, N, a), then (slots, N) each. The slot after the last step counts
-        as a step of the same episode: its value is what the time limit cut off.
+        The slot after the last step counts as of the same episode: its value is what the time limit cut off.
         """
         after = [x[: slots - 1] for x in (self.actions, self.rewards, self.shown & self.valid, self.ended)]
         action, reward, known, done = (torch.cat([torch.zeros_like(x[:1]), x]) for x in after)
@@ -103,8 +96,8 @@ class Trials:
     def discounts(self, slots: int, gamma: float) -> Tensor:
         """Discount of what follows each of the first ``slots`` transitions, (slots, N): gamma within an episode.
 
-        At a time limit the next episode follows at the next step. After a true end the row counts as standing still,
-        unrewarded, until its time limit: else a policy that earns little would end its episode to begin anew.
+        After a true end a row stands still, unrewarded, until its time limit: else to end an episode would be to begin
+        anew.
         """
         left = self.left[:slots].masked_fill(~self.terminated[:slots], 0)
         return gamma ** (1.0 + left.float())
@@ -141,14 +134,12 @@ def play(
             elapsed = elapsed + playing
             left = trials.limits - elapsed
             ended = terminated | truncated | ~valid | (left <= 0)
-
             # A waiting row writes into its next slot, and so leaves there the observation that its last step led to.
             at = trials.lengths
             trials.obs[at, rows], trials.actions[at, rows], trials.rewards[at, rows] = obs, action, reward
             trials.shown[at, rows], trials.valid[at, rows], trials.ended[at, rows] = shown, valid, ended
             trials.terminated[at, rows], trials.left[at, rows] = terminated, left
             trials.lengths += playing
-
             memory = memory.replaced(playing, Memory(state, action, reward, shown & valid, ended))
             obs = torch.where(playing[:, None], next_obs, obs)
             earned, whole = earned + reward, whole & (valid | ~playing)
@@ -185,10 +176,6 @@ class Batch:
         """Steps of a chunk, C."""
         return len(self.weights) // len(self.actor_states)
 
-    def chunk_weights(self) -> Tensor:
-        """Sum of the weights of each chunk (S,)."""
-        return self.weights.unflatten(0, (-1, self.size)).sum(1)[self.chunk, self.row]
-
     def take(self, x: Tensor, chosen: Tensor) -> Tensor:
         """The chosen chunks, int64 (B,), of a tensor (T, N, ...): (C, B, ...)."""
         chunks = x.unflatten(0, (-1, self.size)).transpose(1, 2)
@@ -215,8 +202,7 @@ def make_batch(
     # The only wait for the device: how many steps the longest trial has.
     slots, size = in_chunks(int(t.lengths.max()), config.chunk)
     previous = t.previous(slots)
-    means, values = [], []
-    actor_states, critic_states = [], []
+    means, values, actor_states, critic_states = [], [], [], []
     actor_state = critic_state = policy.fresh_memory(len(task_id)).state
     for begin in range(0, slots, size):
         part = slice(begin, begin + size)
@@ -230,7 +216,8 @@ def make_batch(
     old_means = torch.cat(means)
 
     values = return_stats.restore(torch.cat(values), task_id)
-    filled, last = t.filled(slots), t.last(slots)
+    filled = t.filled(slots)
+    last = torch.arange(slots, device=task_id.device)[:, None] == t.lengths - 1
     valid = t.valid[:slots] & filled
     # What follows the trial's last slot is never asked for.
     next_values = torch.cat([values[1:], values[-1:]])

@@ -13,14 +13,13 @@ import tyro
 from torch import Tensor, nn
 
 from bidex_algos.multiagent.team import TeamActor
+from bidex_algos.nets.architecture import ArchitectureConfig, Options
 from bidex_algos.nets.inputs import Inputs
-from bidex_algos.nets.networks import MLP, autocast, gaussian_log_prob, use_bfloat16
-from bidex_algos.nets.normalise import ObservationNormaliser
+from bidex_algos.nets.networks import MLP, autocast, gaussian_log_prob
 from bidex_algos.nets.policy import GaussianPolicy
 from bidex_algos.nets.shape import Shape
 from bidex_algos.onpolicy.base import Batch, OnPolicy, OnPolicyConfig, check_samples
-from bidex_algos.onpolicy.ppo import PPOConfig
-from bidex_algos.step_size import AdaptiveAdam
+from bidex_algos.onpolicy.ppo import AdaptiveAdam, PPOConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.hands.units import partition_line
 from bidex_meta.train.distributed import sum_gradients
@@ -33,11 +32,11 @@ Partition = Annotated[str, tyro.conf.arg(aliases=("--agents",))]
 """A partition of the hands' units, on the command line by a short name too."""
 
 
-def keep_partition(config: Any) -> None:
+def keep_partition(config: ArchitectureConfig) -> None:
     """Puts a file's partition in the place of its path, for checkpoints; a BidexError where it is none."""
     if config.architecture != "shared":
         raise BidexError(f"{config.algo}: each agent has a plain network; architecture must be shared.")
-    object.__setattr__(config, "agents", partition_line(config.agents))
+    object.__setattr__(config, "agents", partition_line(vars(config)["agents"]))
 
 
 @dataclass(frozen=True)
@@ -102,19 +101,19 @@ class InTurnConfig(LearnerConfig):
             )
 
 
-PAPER: dict[str, Any] = {
+PAPER: Options = {
     "hidden": (1024, 1024, 512), "popart": True, "rollout_steps": 8, "gamma": 0.96, "lam": 0.95,
     "normalise_observations": False, "huber_delta": 10.0, "value_clip": 0.2,
 }  # fmt: skip
 """What Tables 44 (HAPPO) and 45 (MAPPO) of the Bi-DexHands appendix agree on, in their columns for other tasks than
 LiftUnderarm; B.2.1 and B.2.4 have the clipped value."""
 
-PAPER_PPO: dict[str, Any] = PAPER | {
+PAPER_PPO: Options = PAPER | {
     "num_minibatches": 1, "epochs": 5, "clip": 0.2, "adaptive_learning_rate": False, "entropy_weight": 0.0,
 }  # fmt: skip
 """The same with the two tables' passes and clip."""
 
-LIFT: dict[str, Any] = {"rollout_steps": 20, "epochs": 10}
+LIFT: Options = {"rollout_steps": 20, "epochs": 10}
 """Both tables' column for LiftUnderarm, where it differs."""
 
 
@@ -165,7 +164,8 @@ class MultiAgent(OnPolicy):
     def __init__(self, world: VectorWorld, config: MultiAgentConfig, seed: int):
         self.views = agent_views(world.observation_groups, int(world.single_action_space.shape[0]), config.agents)
         self.kl_share = 1.0 / len(self.views)
-        check_samples(self.name, config, world.num_envs)
+        minibatches = config.num_minibatches
+        check_samples(self.name, config.rollout_steps, world.num_envs, minibatches)
         super().__init__(world, config, seed)
         rate, eps = config.critic_learning_rate, config.adam_eps
         self.critic_adam = torch.optim.Adam(self.critic.parameters(), lr=rate, eps=eps, fused=True)
@@ -177,13 +177,11 @@ class MultiAgent(OnPolicy):
         views, inputs = agent_views(shape.groups, shape.actions, config.agents), Inputs(shape.groups)
         heads, share = shape.num_id_columns if config.policy_heads else 1, vars(config).get("share_parameters", False)
         actor = TeamActor(views, config, inputs, init, heads, share)
-        observations = ObservationNormaliser(inputs, config.normalise_observations)
-        policy: Any = TeamPolicy(observations, actor, use_bfloat16(config.autocast, device))  # type: ignore[arg-type]
-        return policy.to(device)
+        return TeamPolicy.made_of(actor, config, inputs, shape, device).to(device)
 
-    def _critics(self) -> list[Any]:
+    def _critics(self) -> list[MLP]:
         """The networks of the critic: one for all, or one an agent."""
-        return [self.critic]
+        return [self.critic]  # type: ignore[list-item]
 
     def _merge_returns(self, mean: Tensor, var: Tensor, count: Tensor) -> None:
         stats = self.return_stats
@@ -196,7 +194,6 @@ class MultiAgent(OnPolicy):
             keep_values(self._critics(), (old_mean, old_std), after)
 
     def _old_values(self, batch: Batch) -> Tensor:
-        """What the critic says of a batch before it is moved, where the loss asks for it."""
         if not self.config.value_clip:
             return batch.targets
         with torch.no_grad():
@@ -216,13 +213,11 @@ class MultiAgent(OnPolicy):
         return (weights.view(-1, *[1] * (loss.dim() - 1)) * loss).sum()
 
     def _critic_step(self) -> None:
-        """One step along the gradients that are there, each network's shortened."""
         for critic in self._critics():
             nn.utils.clip_grad_norm_(critic.parameters(), self.config.max_grad_norm)
         self.critic_adam.step()
 
     def _critic_epochs(self, batch: Batch, epochs: int, num_minibatches: int, weight: float = 1.0) -> Tensor:
-        """Fits the critic to its targets; the mean loss over all mini-batches, a scalar."""
         old_values, losses = self._old_values(batch), list[Tensor]()
         parameters = list(self.critic.parameters())
         for _, index, count in self._mini_batches(batch.weights, epochs, num_minibatches):
@@ -241,9 +236,9 @@ class MultiAgent(OnPolicy):
 class OwnAdams(MultiAgent):
     """Agents whose networks have an optimiser each, whose step size follows their share of the KL."""
 
-    config: Any
+    config: MultiAgentPPOConfig
 
-    def __init__(self, world: VectorWorld, config: Any, seed: int):
+    def __init__(self, world: VectorWorld, config: MultiAgentPPOConfig, seed: int):
         super().__init__(world, config, seed)
         own, given = self.policy.actor.parameters_of, (config, self.device, config.adam_eps, self.kl_share)
         self.adams = [AdaptiveAdam(own(k), *given) for k in range(len(self.policy.actor.nets))]
@@ -253,11 +248,11 @@ class OwnAdams(MultiAgent):
 
 
 class Sequential(MultiAgent):
-    """Agents that are updated one after another, in a random order (Kuba et al. 2022).
+    """Agents that are updated one after another, in a random order (Kuba et al. 2022), alike in all processes.
 
-    Each sees the advantage times the ratio, new over old, of all that were before it. The order is drawn alike in all
-    processes. All of them learn from the same samples, so that the same few can earn from every one: with twelve agents
-    the largest products grew to 20,000 (HAPPO) and 130,000 within an update. ``max_factor`` bounds them.
+    Each sees the advantage times the ratios, new over old, of all before it. All learn from the same samples, so that
+    the same few can earn from every one: with twelve agents products grew to 20,000 within an update. ``max_factor``
+    bounds them.
     """
 
     config: Any
@@ -284,12 +279,10 @@ class Sequential(MultiAgent):
 
     @torch.no_grad()
     def _ratio(self, agent: int, share: AgentBatch) -> Tensor:
-        """The ratio (B,) of an agent's present policy over the sampling one."""
         mean, log_std = self._distribution(agent, share)
         return torch.exp(gaussian_log_prob(share.actions, mean, log_std) - share.old_log_probs)
 
     def _distribution(self, agent: int, share: AgentBatch) -> tuple[Tensor, Tensor]:
-        """Mean (B, a_i) and logarithm of the standard deviation of an agent's present policy, (a_i,) or (B, a_i)."""
         with autocast(self.device, self.low_precision):
             return self.policy.actor.distribution_of(agent, share.seen, share.task)
 

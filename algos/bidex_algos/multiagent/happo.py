@@ -1,11 +1,7 @@
 """HAPPO: agents that take PPO's update one after another (Kuba et al. 2022; appendix B.2.3).
 
-For each agent, in an order drawn anew in each iteration::
-
-    M = A x product of the ratios, new policy over old, of the agents before it
-    PPO's clipped surrogate with M in the place of the advantage A: some epochs of mini-batches
-
-Then the critic of all. Each agent's step is to the gain of all, whatever the others did before it.
+Each agent, in an order drawn anew in each iteration, climbs PPO's clipped surrogate with the advantage times the ratios
+of the agents before it, so that its step is to the gain of all; then the critic of all learns.
 """
 
 from dataclasses import dataclass, replace
@@ -51,7 +47,6 @@ class HAPPO(OwnAdams, Sequential):
     config: HAPPOConfig
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
-        """All agents in turn, then the critic; returns means over agents and mini-batches of what it measured."""
         cfg = self.config
         measured = [self._agent_epochs(agent, share) for agent, share in self._in_turn(batch)]
         value = self._critic_epochs(batch, cfg.epochs, cfg.num_minibatches, cfg.value_loss_weight)
@@ -61,7 +56,6 @@ class HAPPO(OwnAdams, Sequential):
         return reported | {"Policy/lr": rate}
 
     def _agent_epochs(self, agent: int, share: AgentBatch) -> Tensor:
-        """Some passes over the batch by one agent; the means of surrogate loss, KL and share of clipped ratios (3,)."""
         cfg, adam, parameters = self.config, self.adams[agent], self.policy.actor.parameters_of(agent)
         measured: list[Tensor] = []
         for first, index, count in self._mini_batches(share.weights, cfg.epochs, cfg.num_minibatches):

@@ -1,7 +1,6 @@
 """HATRPO: agents that take TRPO's step one after another (Kuba et al. 2022; appendix B.2.2).
 
-For each agent, in an order drawn anew in each iteration, MT-TRPO's step on its own parameters, within its share of the
-trust region, with the advantage times the ratios of the agents before it. Then the critic of all.
+As HAPPO, with MT-TRPO's step on each agent's own parameters, within its share of the trust region.
 """
 
 from dataclasses import dataclass, replace
@@ -47,7 +46,6 @@ class HATRPO(Sequential):
     config: HATRPOConfig  # type: ignore[assignment]
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
-        """All agents in turn, then the critic; returns means over agents of what it measured."""
         steps = [self._agent_step(agent, share) for agent, share in self._in_turn(batch)]
         reported = {name: torch.stack([step[name] for step in steps]).mean() for name in steps[0]}
         return reported | {

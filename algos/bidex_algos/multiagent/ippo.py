@@ -4,15 +4,15 @@ MAPPO but for the critics: each agent has its own values, returns and advantages
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 from torch import Tensor, nn
 
-from bidex_algos.multiagent import mappo as mappo_config
 from bidex_algos.multiagent.base import LIFT
 from bidex_algos.multiagent.mappo import MAPPO, MAPPOConfig
+from bidex_algos.multiagent.mappo import PRESETS as MAPPO_PRESETS
 from bidex_algos.multiagent.team import TeamCritic
-from bidex_algos.nets.networks import autocast
+from bidex_algos.nets.networks import MLP, autocast
+from bidex_algos.nets.policy import of_head
 from bidex_meta.errors import BidexError
 from bidex_meta.world.agent_views import agent_views
 from bidex_meta.world.contract import VectorWorld
@@ -28,11 +28,9 @@ class IPPOConfig(MAPPOConfig):
             raise BidexError("ippo: popart needs a critic for each agent; leave popart or share_parameters off.")
 
 
-_MAPPO = mappo_config.PRESETS["paper"]
-
 PRESETS: dict[str, IPPOConfig] = {
     # There is no table for IPPO: MAPPO's. B.2.1 has a policy and a critic for each agent.
-    "paper": IPPOConfig(**{**vars(_MAPPO), "share_parameters": False}),
+    "paper": IPPOConfig(**vars(replace(MAPPO_PRESETS["paper"], share_parameters=False))),
     "laptop": IPPOConfig(),
 }
 TASK_PRESETS = {"LiftUnderarm": {"paper": replace(PRESETS["paper"], **LIFT)}}
@@ -54,13 +52,12 @@ class IPPO(MAPPO):
     def _make_critic(self, heads: int) -> nn.Module:
         return TeamCritic(self.views, self.config, heads, self.initial, self.config.share_parameters)
 
-    def _critics(self) -> list[Any]:
-        return list(self.critic.nets)
+    def _critics(self) -> list[MLP]:
+        return [*self.critic.nets]  # type: ignore[list-item]
 
     def _critic(self, obs: Tensor, task_id: Tensor) -> Tensor:
         """Values (B, agents); of one agent alone (B,)."""
         with autocast(self.device, self.low_precision):
             out = self.critic(obs)
-        if self.config.value_heads:
-            out = out.gather(1, task_id[:, None, None].expand(-1, 1, out.shape[2]))
-        return out.squeeze(1) if self.num_critics > 1 else out.view(-1)
+        out = of_head(out, task_id) if self.config.value_heads else out.squeeze(1)
+        return out if self.num_critics > 1 else out.view(-1)

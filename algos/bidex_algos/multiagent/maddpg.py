@@ -1,17 +1,10 @@
 """MADDPG: DDPG of several agents with a critic that sees everything (Lowe et al. 2017; appendix B.2.5).
 
-For each update of :class:`~bidex_algos.offpolicy.ddpg.DDPG`::
-
-    y    = r + gamma (1 - terminated) Q'(x', mu'_1(o'_1), ..., mu'_n(o'_n))
-    Q    towards y
-    mu_i up on Q(x, a_1, ..., mu_i(o_i), ..., a_n), the others' actions from the replay; for each agent i
-
-The original has a critic for each agent, since rewards may differ. Here they are shared, so that all critics would have
-the same targets: there is one.
+Each agent i climbs Q(x, a_1, ..., mu_i(o_i), ..., a_n), the others' actions from the replay; all else is DDPG's. The
+original has a critic for each agent, since rewards may differ; here they are shared, so that all would be alike.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,11 +12,9 @@ from torch import Tensor
 from bidex_algos.multiagent.base import Partition, keep_partition
 from bidex_algos.multiagent.team import Team
 from bidex_algos.nets.inputs import Inputs
-from bidex_algos.nets.networks import use_bfloat16
-from bidex_algos.nets.normalise import ObservationNormaliser
 from bidex_algos.nets.policy import DeterministicPolicy
 from bidex_algos.nets.shape import Shape
-from bidex_algos.offpolicy.ddpg import DDPG, DDPGConfig, of_paper
+from bidex_algos.offpolicy.ddpg import DDPG, OF_PAPER, DDPGConfig
 from bidex_algos.replay import Transitions
 from bidex_meta.world.agent_views import AgentView, agent_views
 from bidex_meta.world.contract import VectorWorld
@@ -43,14 +34,14 @@ class MADDPGConfig(DDPGConfig):
 
 
 # There is no table for MADDPG (B.2.5 describes it): DDPG's preset of this name.
-PRESETS: dict[str, MADDPGConfig] = {"paper": MADDPGConfig(**of_paper()), "laptop": MADDPGConfig()}
+PRESETS: dict[str, MADDPGConfig] = {"paper": MADDPGConfig(**OF_PAPER), "laptop": MADDPGConfig()}
 
 
 class DeterministicTeam(Team):
     """All agents as one actor without a distribution, in the place of a ``DeterministicActor``."""
 
     def __init__(
-        self, views: tuple[AgentView, ...], config: Any, groups: Inputs, generator: torch.Generator, heads: int
+        self, views: tuple[AgentView, ...], config: MADDPGConfig, groups: Inputs, generator: torch.Generator, heads: int
     ):
         super().__init__(views, config, [heads * len(view.actions) for view in views], 0.01, generator)
         self.heads, self.one_hot = heads, groups.columns(*["task_id"] * (heads > 1))
@@ -87,7 +78,6 @@ class MADDPG(DDPG):
         self.owner = torch.tensor(owner, device=self.device)
 
     def _policy_step(self, obs: Tensor, draw: Transitions, weights: Tensor, counts: Tensor) -> None:
-        """One step of every agent up the critic, the others' actions as they were, on normalised observations."""
         raw, share = self.policy.raw(obs), weights / counts.sum().clamp_min(1.0)
         actions, losses = torch.tanh(raw), []
         for agent, view in enumerate(self.views):
@@ -108,5 +98,4 @@ class MADDPG(DDPG):
         views, inputs = agent_views(shape.groups, shape.actions, config.agents), Inputs(shape.groups)
         heads = shape.num_id_columns if config.policy_heads else 1
         actor = DeterministicTeam(views, config, inputs, init, heads)
-        observations = ObservationNormaliser(inputs, config.normalise_observations)
-        return DeterministicPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
+        return DeterministicPolicy.made_of(actor, config, inputs, shape, device).to(device)

@@ -1,7 +1,7 @@
 """MAPPO: PPO of several agents with one critic that sees everything (Yu et al. 2022; appendix B.2.4).
 
-An iteration is MT-PPO's, and with one agent the update is too: in each mini-batch every agent climbs its own clipped
-surrogate, the critic its targets. The advantage is of all agents together, normalised per task like the returns.
+As MT-PPO, and with one agent the same: in each mini-batch every agent climbs its own clipped surrogate. The advantage
+is of all agents together, normalised per task like the returns.
 """
 
 from dataclasses import dataclass, replace
@@ -43,7 +43,6 @@ class MAPPO(OwnAdams):
     config: MAPPOConfig
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
-        """One pass after another: returns the means over all mini-batches and agents of what it measured."""
         cfg, actor = self.config, self.policy.actor
         old_values = self._old_values(batch)
         old_log_std = actor.log_std_of(batch.obs).detach().expand(batch.actions.shape)
@@ -65,7 +64,6 @@ class MAPPO(OwnAdams):
         return {**dict(zip(NAMES, torch.stack(measured).mean(0), strict=True)), "Policy/lr": rate}
 
     def _gradients(self, b: Batch, count: Tensor, old_log_std: Tensor, old_values: Tensor) -> Tensor:
-        """Puts the gradients of a mini-batch into the parameters; ``count`` samples are in it, over all processes."""
         cfg, actor = self.config, self.policy.actor
         weights = b.weights / count
         losses = self._agent_losses(b, weights, old_log_std)
@@ -87,7 +85,6 @@ class MAPPO(OwnAdams):
         return sum_gradients([*actor.parameters(), *self.critic.parameters()], torch.stack(numbers))
 
     def _agent_losses(self, b: Batch, weights: Tensor, old_log_std: Tensor) -> list[PolicyLoss]:
-        """The loss of each agent; ``b`` has old log-densities and, of several critics, advantages (B, agents)."""
         actor, task = self.policy.actor, self.policy.actor.one_hot(b.obs)
         with autocast(self.device, self.low_precision):
             means = actor.means(b.obs)

@@ -2,14 +2,16 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import cast
 
 import torch
 from torch import Tensor, nn
 
+from bidex_algos.nets.architecture import NetworkConfig
 from bidex_algos.nets.inputs import Columns, Inputs, with_task_embedding
 from bidex_algos.nets.networks import MLP, head_of, row_of, stacked_forward
 from bidex_algos.nets.point_net import with_point_net
+from bidex_algos.onpolicy.base import OnPolicyConfig
 from bidex_meta.world.agent_views import AgentView
 
 
@@ -20,7 +22,7 @@ class Team(nn.Module):
     """
 
     def __init__(
-        self, views: Sequence[AgentView], config: Any, outputs: Sequence[int], output_gain: float,
+        self, views: Sequence[AgentView], config: NetworkConfig, outputs: Sequence[int], output_gain: float,
         generator: torch.Generator, share: bool = False
     ):  # fmt: skip
         super().__init__()
@@ -57,8 +59,7 @@ class Team(nn.Module):
         return [found[i] for i in range(len(self.net_of))]
 
     def _family(self, family: list[int], x: Tensor) -> Tensor:
-        """Outputs (M, B, outputs) of the agents of one form for what they see (M, B, inputs)."""
-        nets: list[Any] = [self.nets[self.net_of[i]] for i in family]
+        nets = [cast(MLP, self.nets[self.net_of[i]]) for i in family]
         if self.share:
             return nets[0](x.flatten(0, 1)).unflatten(0, x.shape[:2])
         if not nets[0].encoder.identity:  # encoders are each agent's own
@@ -85,21 +86,21 @@ class TeamActor(Team):
     """
 
     def __init__(
-        self, views: Sequence[AgentView], config: Any, groups: Inputs, generator: torch.Generator, heads: int = 1,
-        share: bool = False
+        self, views: Sequence[AgentView], config: OnPolicyConfig, groups: Inputs, generator: torch.Generator,
+        heads: int = 1, share: bool = False
     ):  # fmt: skip
         super().__init__(views, config, [heads * len(view.actions) for view in views], 0.01, generator, share)
         self.heads, self.one_hot = heads, groups.columns(*["task_id"] * (heads > 1))
         order = torch.tensor([action for view in views for action in view.actions])
         self._order: Tensor
+        self._taken: Tensor
         self.register_buffer("_order", order.argsort(), persistent=False)
+        self.register_buffer("_taken", order, persistent=False)
         self._sizes = [len(view.actions) for view in views]
         sizes = [len(views[self.net_of.index(k)].actions) for k in range(len(self.nets))]
         self.log_stds = nn.ParameterList(
             torch.full((n,) if heads == 1 else (heads, n), math.log(config.init_std)) for n in sizes
         )
-        self._taken: Tensor
-        self.register_buffer("_taken", order, persistent=False)
 
     @property
     def own(self) -> list[Tensor]:
@@ -151,7 +152,12 @@ class TeamCritic(Team):
     """A critic for each agent, on what it sees, with ``heads`` outputs; other arguments as for :class:`Team`."""
 
     def __init__(
-        self, views: Sequence[AgentView], config: Any, heads: int, generator: torch.Generator, share: bool = False
+        self,
+        views: Sequence[AgentView],
+        config: NetworkConfig,
+        heads: int,
+        generator: torch.Generator,
+        share: bool = False,
     ):
         super().__init__(views, config, [heads] * len(views), 1.0, generator, share)
 

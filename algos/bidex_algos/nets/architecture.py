@@ -1,47 +1,66 @@
-"""Which network stands between observation and output."""
+"""Which network stands between observation and output, and the critics of actions that are made of it."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
+import torch
+from torch import Tensor, nn
+
+from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.multitask import Moore, PaCo, SoftModules
-from bidex_algos.nets.networks import MLP, Activation, Layers
+from bidex_algos.nets.networks import MLP, Activation, Layers, MakeNetwork
 from bidex_meta.errors import BidexError
 from bidex_meta.train.learner import LearnerConfig
 from bidex_meta.utils.validation import Count, Whole, Widths
 
-MakeNetwork = Callable[..., Any]
-"""Takes the arguments of :class:`~bidex_algos.nets.networks.MLP`."""
-
+Options = dict[str, Any]
+"""Fields of a config by name."""
 Architecture = Literal["shared", "multi_head", "soft_modules", "paco", "moore"]
 _TRUNKS: dict[str, MakeNetwork] = {"soft_modules": SoftModules, "paco": PaCo, "moore": Moore}
 
 
 @dataclass(frozen=True)
 class ArchitectureConfig(LearnerConfig):
-    """How actor and critics share weights between tasks. A config derived from it has ``hidden`` and the heads too."""
+    """Layers of actor and critics, and how they share weights between tasks."""
 
     architecture: Architecture = "shared"
     """shared: one trunk for all tasks. multi_head: that with policy_heads and value_heads. soft_modules, paco, moore:
     other trunks, each with or without heads; for MT suites, whose observations show the task."""
     modules: Count = 4
     """Modules of a layer of soft_modules, parameter sets of paco, experts of moore."""
+    hidden: Layers = (256, 256)
+    """Widths of the hidden layers, of actor and critics alike."""
+    activation: Activation = "relu"
+    """Non-linearity of the hidden layers."""
 
     @property
     def shares_a_trunk(self) -> bool:
         """Whether the trunk is the plain one."""
         return self.architecture in ("shared", "multi_head")
 
+
+@dataclass(frozen=True)
+class NetworkConfig(ArchitectureConfig):
+    """Networks of actor and critics; raises BidexError where the layers do not fit the architecture."""
+
+    policy_heads: bool = False
+    """Give the actor an output layer per task; the world must show the task's one-hot."""
+    task_embedding: Whole = 0
+    """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
+    point_widths: Widths = (32, 64)
+    """Widths of the layers that all points of a point cloud share (PointNet), where the world shows one."""
+    points_read: Whole = 0
+    """Points of a cloud that they read, evenly out of all; 0: all."""
+
     def __post_init__(self) -> None:
         super().__post_init__()
-        config: Any = self
         if self.architecture == "multi_head":
             for heads in ("policy_heads", "value_heads"):
                 object.__setattr__(self, heads, True)  # so that a checkpoint's config has them too
         if self.shares_a_trunk:
             return
-        if config.task_embedding:
+        if self.task_embedding:
             raise BidexError(
                 f"{self.algo}: task_embedding goes with architecture shared or multi_head, got {self.architecture}, "
                 "which has task weights of its own. Leave task_embedding off."
@@ -60,24 +79,6 @@ class ArchitectureConfig(LearnerConfig):
                 )
 
 
-@dataclass(frozen=True)
-class NetworkConfig(ArchitectureConfig):
-    """Networks of actor and critics."""
-
-    hidden: Layers = (256, 256)
-    """Widths of the hidden layers, of actor and critics alike."""
-    activation: Activation = "relu"
-    """Non-linearity of the hidden layers."""
-    policy_heads: bool = False
-    """Give the actor an output layer per task; the world must show the task's one-hot."""
-    task_embedding: Whole = 0
-    """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
-    point_widths: Widths = (32, 64)
-    """Widths of the layers that all points of a point cloud share (PointNet), where the world shows one."""
-    points_read: Whole = 0
-    """Points of a cloud that they read, evenly out of all; 0: all."""
-
-
 def network_of(config: ArchitectureConfig) -> MakeNetwork:
     """The constructor of a config's networks."""
     trunk = _TRUNKS.get(config.architecture)
@@ -88,3 +89,35 @@ def network_bytes(hidden: tuple[int, ...], width: int, copies: int) -> int:
     """Bytes of a network's layers on observations of a width, with gradient and Adam's two moments, so many times."""
     widths = (width, *hidden)
     return 4 * 4 * copies * sum(a * b for a, b in zip(widths, hidden, strict=False))
+
+
+class Critics(nn.Module):
+    """``count`` networks of observation and action, alike but for their initial weights.
+
+    ``inputs`` are the groups of both together, ``heads`` the outputs of each, one per task or 1. Two against
+    overestimation (Fujimoto et al. 2018), or one.
+    """
+
+    def __init__(
+        self, inputs: Inputs, heads: int, config: ArchitectureConfig, layer_norm: bool, generator: torch.Generator,
+        count: int = 2
+    ):  # fmt: skip
+        super().__init__()
+        self.heads, network = heads, network_of(config)
+        given = inputs, config.hidden, heads, 1.0, generator, config.activation, layer_norm
+        self.nets = nn.ModuleList(network(*given) for _ in range(count))
+
+    def forward(self, obs: Tensor, actions: Tensor, task_id: Tensor) -> Tensor:
+        """Values of each action: normalised observations (B, d), actions (B, a), tasks (B,) to (count, B)."""
+        x = torch.cat([obs, actions], dim=1)
+        all_values = torch.stack([net(x) for net in self.nets])
+        if self.heads == 1:
+            return all_values.squeeze(2)
+        return all_values.gather(2, task_id.expand(len(self.nets), -1)[..., None]).squeeze(2)
+
+
+@torch.no_grad()
+def follow(target: nn.Module, network: nn.Module, tau: float) -> None:
+    """Moves a target network a share ``tau`` of the way to its network (Polyak averaging)."""
+    for behind, ahead in zip(target.parameters(), network.parameters(), strict=True):
+        behind.lerp_(ahead, tau)

@@ -43,8 +43,8 @@ MakeEncoder = Callable[[int, torch.Generator], nn.Module]
 class Inputs:
     """How a network reads an observation, before it has weights. A ``BidexError`` names a group that is not there.
 
-    Groups enter as they are, by the encoder of their name, or, ``hidden``, not at all; of ``unscaled`` ones running
-    statistics change nothing but for the clip. A network reads the task from ``task_id``.
+    Groups enter as they are, by an encoder, or, ``hidden``, not at all; ``unscaled`` ones are normalised by no
+    statistics.
     """
 
     groups: tuple[ObservationGroup, ...]
@@ -68,9 +68,8 @@ class Inputs:
     def columns(self, *names: str) -> Columns:
         """The columns of some groups."""
         ranges = {group.name: group.where for group in self.groups}
-        for name in names:
-            if name not in ranges:
-                raise unknown_name("observation group", name, ranges)
+        for name in set(names) - ranges.keys():
+            raise unknown_name("observation group", name, ranges)
         return Columns(part for name in names for part in ranges[name])
 
     def extended(self, name: str, size: int) -> "Inputs":
@@ -97,8 +96,8 @@ class Inputs:
 class GroupEncoder(nn.Module):
     """Makes of observations (..., d) what the layers of a network compute with (..., size).
 
-    Groups without an encoder come first, in the order of their columns, then what the encoders give, in the order of
-    the groups. Without any encoder it is the identity and has no weights.
+    Groups without an encoder come first, in the order of their columns, then those with one; without any encoder it is
+    the identity and has no weights.
     """
 
     def __init__(self, inputs: int | Inputs, generator: torch.Generator):
@@ -106,9 +105,8 @@ class GroupEncoder(nn.Module):
         inputs = Inputs.of(inputs)
         names = [group.name for group in inputs.groups if group.name not in inputs.hidden]
         encoded = {name: inputs.columns(name) for name in names if name in inputs.encoders}
-        self.columns = nn.ModuleDict(encoded)
         made: dict[str, Any] = {n: inputs.encoders[n](columns.size, generator) for n, columns in encoded.items()}
-        self.groups = nn.ModuleDict(made)
+        self.columns, self.groups = nn.ModuleDict(encoded), nn.ModuleDict(made)
         self.plain = inputs.columns(*(name for name in names if name not in encoded))
         self.size = self.plain.size + sum(encoder.size for encoder in made.values())
         self.identity = self.plain.size == inputs.width

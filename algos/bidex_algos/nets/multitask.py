@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from bidex_algos.nets.inputs import GroupEncoder, Inputs
-from bidex_algos.nets.networks import ACTIVATIONS, Activation, linear
+from bidex_algos.nets.networks import ACTIVATIONS, Activation, Headed, linear
 from bidex_algos.nets.products import affine, stacked_affine
 
 
@@ -68,8 +68,7 @@ class PlainNorm(nn.Module):
 def gram_schmidt(vectors: Tensor) -> Tensor:
     """Makes vectors (K, batch, n) orthonormal, each environment of the batch for itself; the first keeps its direction.
 
-    Each is freed of those before it twice: where two are almost parallel the first time leaves rounding errors that are
-    large beside what remains.
+    Each is freed of those before it twice: where two are almost parallel the first time leaves large rounding errors.
     """
     found: list[Tensor] = []
     for vector in vectors:
@@ -79,14 +78,10 @@ def gram_schmidt(vectors: Tensor) -> Tensor:
     return torch.stack(found)
 
 
-class Moore(nn.Module):
+class Moore(Headed):
     """MOORE: a mixture of orthogonal experts (Hendawy et al. 2024).
 
-        U = [h_1(s), ..., h_K(s)]        K experts' representations of a state
-        V = Gram-Schmidt(U)              orthonormal, state by state, so that they span K directions
-        v = V w_k                        what task k takes of each
-        y = head(v)
-
+    y = head(V w_k), V the Gram-Schmidt basis of K experts' representations of a state, w_k what task k takes of each.
     The task's one-hot chooses w_k and is not fed to the experts. Heads of tasks are the paper's multi-head variant.
     Ours: the mixture is multiplied by the root of its width, so that its entries are as large as those of another
     layer, and goes through the config's non-linearity; w starts as a random direction of length 1.
@@ -108,11 +103,6 @@ class Moore(nn.Module):
         self.activation, self.scale = ACTIVATIONS[activation](), math.sqrt(hidden[-1])
         self.head = linear(hidden[-1], outputs, output_gain, generator)
 
-    @property
-    def output_bias(self) -> Tensor:
-        """Biases of the output (outputs,)."""
-        return self.head.bias
-
     def experts(self, x: Tensor) -> Tensor:
         """Orthonormal representations (K, batch, width), float32, of observations (batch, inputs)."""
         raw = self.body(self.encoder(x))
@@ -127,9 +117,7 @@ class Moore(nn.Module):
 
 
 class PaCo(nn.Module):
-    """PaCo: a task's parameters are a mixture of a few parameter sets (Sun et al. 2022).
-
-        theta_k = Phi w_k        Phi: K parameter sets, shared by all tasks; w_k: K numbers of task k
+    """PaCo: a task's parameters are a mixture of a few parameter sets, theta_k = Phi w_k (Sun et al. 2022).
 
     A layer is linear in its parameters, so that the composed layer's output is the mixture of the K layers' outputs;
     the non-linearity comes after. The task's one-hot chooses w_k and is not fed to the layers.
@@ -163,18 +151,13 @@ class PaCo(nn.Module):
             return mixed(weights, self.head(features.to(weights.dtype))) + self.output_bias
 
 
-class SoftModules(nn.Module):
+class SoftModules(Headed):
     """Soft modularisation: layers of modules, and for each task soft routes between them (Yang et al. 2020).
 
-        e     = f(s) * h(k)                          embeddings of state and task, entry by entry
-        p^1   = D^1 relu(e)                          logits of the routes from the first layer to the second
-        p^l+1 = D^l+1 relu(U^l p^l * e)              each further layer of routes depends on the one before
-        g_i   = sum_j softmax_j(p_ij) relu(W_j g_j)  module i takes its shares of the modules before it
-
-    The first of ``hidden`` is the width of f(s), which feeds the first layer; each further one is that of a layer of
-    modules. The task's one-hot enters by h alone. Ours: the head takes shares of the last layer, where the paper adds
-    its modules up; f is one layer; modules have the config's non-linearity. The paper's loss weights by temperature are
-    left out.
+    With e = f(s) * h(k), entry by entry: p^1 = D^1 relu(e), p^l+1 = D^l+1 relu(U^l p^l * e) are logits of the routes,
+    and module i takes g_i = sum_j softmax_j(p_ij) relu(W_j g_j). The first of ``hidden`` is the width of f(s), each
+    further one that of a layer of modules. Ours: the head takes shares of the last layer, where the paper adds its
+    modules up; f is one layer; modules have the config's non-linearity. The loss weights by temperature are left out.
     """
 
     def __init__(
@@ -194,11 +177,6 @@ class SoftModules(nn.Module):
         self.down = nn.ModuleList(linear(embedding, size, 1.0, generator) for size in routes)
         self.up = nn.ModuleList(linear(size, embedding, gain, generator) for size in routes[:-1])
         self.head = linear(hidden[-1], outputs, output_gain, generator)
-
-    @property
-    def output_bias(self) -> Tensor:
-        """Biases of the output (outputs,)."""
-        return self.head.bias
 
     def routes(self, x: Tensor, state: Tensor) -> list[Tensor]:
         """Shares (batch, modules that take, that give) between layers, sum 1; ``state`` embeds x as (batch, width)."""

@@ -1,13 +1,13 @@
 """Running statistics: of observations, and of returns per task."""
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from bidex_algos.nets.inputs import Inputs
 from bidex_meta.train.distributed import pool_moments
+from bidex_meta.train.learner import LearnerConfig
 
 
 class RunningStats(nn.Module):
@@ -16,15 +16,15 @@ class RunningStats(nn.Module):
     Where the count never grows beyond ``max_count``, older batches fade.
     """
 
+    mean: Tensor
+    var: Tensor
+    count: Tensor
+
     def __init__(self, shape: tuple[int, ...], max_count: float = math.inf):
         super().__init__()
         self.max_count = max_count
-        self.mean: Tensor
-        self.var: Tensor
-        self.count: Tensor
-        self.register_buffer("mean", torch.zeros(shape, dtype=torch.float64))
-        self.register_buffer("var", torch.ones(shape, dtype=torch.float64))
-        self.register_buffer("count", torch.zeros(shape, dtype=torch.float64))
+        for name, value in (("mean", 0.0), ("var", 1.0), ("count", 0.0)):
+            self.register_buffer(name, torch.full(shape, value, dtype=torch.float64))
 
     def merge(self, mean: Tensor, var: Tensor, count: Tensor | float) -> None:
         """Merges a batch's mean, (biased) variance and count; elements whose count is 0 stay as they are."""
@@ -47,8 +47,8 @@ class RunningStats(nn.Module):
     def restore(self, x: Tensor, element: Tensor) -> Tensor:
         """What :meth:`normalise` made ``x`` of, (..., n); 0 where the element has no statistics yet.
 
-        An untrained critic says numbers about 1, which may be a hundred times a return. As bootstraps of the first
-        rollout they would make the first statistics, and a hundred iterations would have to forget them.
+        An untrained critic says numbers about 1, which may be a hundred times a return: the first statistics would be
+        of these, and a hundred iterations would have to forget them.
         """
         return (x * self.std().float()[element] + self.mean.float()[element]) * (self.count > 0)[element]
 
@@ -62,9 +62,7 @@ class ObservationNormaliser(nn.Module):
 
     def __init__(self, inputs: int | Inputs, enabled: bool = True, clip: float = 10.0):
         super().__init__()
-        self.enabled = enabled
-        self.settled = False
-        self.clip = clip
+        self.enabled, self.settled, self.clip = enabled, False, clip
         inputs = Inputs.of(inputs)
         self.measured = inputs.columns(*(group.name for group in inputs.groups if group.name not in inputs.unscaled))
         self.stats = RunningStats((self.measured.size,))
@@ -100,11 +98,12 @@ class ObservationNormaliser(nn.Module):
         self.measured.write(self.scale, self.stats.std(floor=3e-3).reciprocal().float())
 
 
-def observation_normaliser(config: Any, inputs: Inputs, tasks: int) -> ObservationNormaliser:
+def observation_normaliser(config: LearnerConfig, inputs: Inputs, tasks: int) -> ObservationNormaliser:
     """What a config asks for by ``normalise_observations`` and ``normalise_per_task``, of so many tasks."""
-    if vars(config).get("normalise_per_task") and config.normalise_observations and tasks > 1:
+    options = vars(config)
+    if options.get("normalise_per_task") and options["normalise_observations"] and tasks > 1:
         return TaskNormaliser(inputs, tasks)
-    return ObservationNormaliser(inputs, config.normalise_observations)
+    return ObservationNormaliser(inputs, options["normalise_observations"])
 
 
 class TaskNormaliser(ObservationNormaliser):

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, cast
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -11,13 +11,12 @@ from torch import Tensor, nn
 from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.products import Linear
 from bidex_meta.errors import BidexError
+from bidex_meta.train.learner import LearnerConfig
 
 POINT_GROUPS = {"points": 3, "kind_points": 4}
 """Observation groups that are clouds, and the numbers of a point."""
-_SPREAD = 0.2
-"""What distances from a cloud's centre are divided by, metres: about a hand's length."""
-_CACHED = 1 << 19
-"""Numbers of a layer that a CPU computes at once."""
+_SPREAD = 0.2  # what distances from a cloud's centre are divided by, metres: about a hand's length
+_CACHED = 1 << 19  # numbers of a layer that a CPU computes at once
 
 
 class PointNet(nn.Module):
@@ -78,17 +77,19 @@ def _largest_of(values: Tensor) -> Tensor:
     return block * step + within
 
 
-def with_point_net(inputs: Inputs, config: Any) -> Inputs:
+def with_point_net(inputs: Inputs, config: LearnerConfig) -> Inputs:
     """The same with clouds, unscaled, read by a PointNet; a BidexError where the config has no ``point_widths``."""
+    options = vars(config)
     for group in inputs.groups:
         channels = POINT_GROUPS.get(group.name)
-        if channels is not None:
-            if "point_widths" not in vars(config):
-                raise BidexError(
-                    f"{config.algo} does not read point clouds. Take another learner, such as mtppo or mtsac, or leave "
-                    "--points (a suite's table [points]) out."
-                )
-            widths, read = tuple(config.point_widths), config.points_read
-            make = partial(PointNet, widths=widths, channels=channels, read=read)
-            inputs = inputs.encoded(group.name, make, scaled=False)
+        if channels is None:
+            continue
+        if "point_widths" not in options:
+            raise BidexError(
+                f"{config.algo} does not read point clouds. Take another learner, such as mtppo or mtsac, or leave "
+                "--points (a suite's table [points]) out."
+            )
+        widths, read = tuple(options["point_widths"]), options["points_read"]
+        make = partial(PointNet, widths=widths, channels=channels, read=read)
+        inputs = inputs.encoded(group.name, make, scaled=False)
     return inputs

@@ -1,8 +1,8 @@
 """The agents that evaluation and sampling use: observation statistics, actor and precision in one module."""
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -10,7 +10,15 @@ from torch.nn.functional import softplus
 
 from bidex_algos.nets.architecture import network_of
 from bidex_algos.nets.inputs import Inputs
-from bidex_algos.nets.networks import MLP, Activation, GaussianActor, autocast, gaussian_log_prob, use_bfloat16
+from bidex_algos.nets.networks import (
+    MLP,
+    Activation,
+    GaussianActor,
+    MakeNetwork,
+    autocast,
+    gaussian_log_prob,
+    use_bfloat16,
+)
 from bidex_algos.nets.normalise import ObservationNormaliser, observation_normaliser
 from bidex_algos.nets.shape import Shape
 
@@ -20,9 +28,13 @@ class ActorPolicy(nn.Module):
 
     def __init__(self, observations: ObservationNormaliser, actor: nn.Module, low_precision: bool):
         super().__init__()
-        self.observations = observations
-        self.actor = actor
-        self.low_precision = low_precision
+        self.observations, self.actor, self.low_precision = observations, actor, low_precision
+
+    @classmethod
+    def made_of(cls, actor: nn.Module, config: Any, inputs: Inputs, shape: Shape, device: torch.device) -> Self:
+        """That of an actor, with the statistics and the precision that a learner's config asks for."""
+        observations = observation_normaliser(config, inputs, shape.num_id_columns)
+        return cls(observations, actor, use_bfloat16(config.autocast, device))
 
     def reset(self, env_mask: Tensor) -> None:
         """Nothing to forget between episodes; the argument is part of the Agent protocol."""
@@ -34,11 +46,6 @@ class GaussianPolicy(ActorPolicy):
     actor: GaussianActor
 
     @torch.no_grad()
-    def mean(self, obs: Tensor) -> Tensor:
-        """Mean action of raw observations (N, d): float32 (N, a), not clamped."""
-        return self.distribution(obs)[0]
-
-    @torch.no_grad()
     def distribution(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         """Mean action (N, a) and logarithm of the standard deviation, (a,) or (N, a), of raw observations (N, d)."""
         obs = self.observations(obs)
@@ -47,7 +54,7 @@ class GaussianPolicy(ActorPolicy):
 
     def eval_action(self, obs: Tensor) -> Tensor:
         """Mean action of raw observations (N, d), clamped to [-1, 1]: (N, a)."""
-        return self.mean(obs).clamp(-1.0, 1.0)
+        return self.distribution(obs)[0].clamp(-1.0, 1.0)
 
     def sample_action(self, obs: Tensor, generator: torch.Generator) -> Tensor:
         """Actions drawn from the distribution for raw observations (N, d), clamped to [-1, 1]: (N, a)."""
@@ -56,16 +63,20 @@ class GaussianPolicy(ActorPolicy):
         return (mean + log_std.exp() * noise).clamp(-1.0, 1.0)
 
 
+def of_head(out: Tensor, head: Tensor) -> Tensor:
+    """Of outputs (B, heads, ...) those (B, ...) of the heads that int64 (B,) names."""
+    return out.gather(1, head.view(-1, *[1] * (out.dim() - 1)).expand(-1, 1, *out.shape[2:]))[:, 0]
+
+
 class DeterministicActor(nn.Module):
     """One action for each observation, squashed by tanh; arguments are those of :class:`GaussianActor`."""
 
     def __init__(
         self, inputs: int | Inputs, hidden: Sequence[int], actions: int, heads: int, generator: torch.Generator,
-        activation: Activation, network: Callable[..., Any] = MLP
+        activation: Activation, network: MakeNetwork = MLP
     ):  # fmt: skip
         super().__init__()
-        self.heads = heads
-        self.one_hot = Inputs.of(inputs).columns(*["task_id"] * (heads > 1))
+        self.heads, self.one_hot = heads, Inputs.of(inputs).columns(*["task_id"] * (heads > 1))
         self.net = network(inputs, hidden, heads * actions, 0.01, generator, activation)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -75,11 +86,9 @@ class DeterministicActor(nn.Module):
     def raw(self, x: Tensor) -> Tensor:
         """The same before the squashing: float32 (batch, a)."""
         out = self.net(x)
-        if self.heads > 1:
-            head = self.one_hot(x).argmax(1).view(-1, 1, 1)
-            out = out.unflatten(1, (self.heads, -1))
-            out = out.gather(1, head.expand(-1, 1, out.shape[2]))[:, 0]
-        return out
+        if self.heads == 1:
+            return out
+        return of_head(out.unflatten(1, (self.heads, -1)), self.one_hot(x).argmax(1))
 
 
 class DeterministicPolicy(ActorPolicy):
@@ -105,8 +114,7 @@ def gaussian_policy(
     """A policy with the networks of a learner's config, drawn from ``init``, a CPU generator."""
     heads, network = shape.num_id_columns if config.policy_heads else 1, network_of(config)
     actor = make(inputs, config.hidden, shape.actions, config.init_std, init, config.activation, heads, network)
-    observations = observation_normaliser(config, inputs, shape.num_id_columns)
-    return GaussianPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
+    return GaussianPolicy.made_of(actor, config, inputs, shape, device)
 
 
 def deterministic_policy(
@@ -115,15 +123,13 @@ def deterministic_policy(
     """The same without a distribution."""
     heads, network = shape.num_id_columns if config.policy_heads else 1, network_of(config)
     actor = DeterministicActor(inputs, config.hidden, shape.actions, heads, init, config.activation, network)
-    observations = observation_normaliser(config, inputs, shape.num_id_columns)
-    return DeterministicPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
+    return DeterministicPolicy.made_of(actor, config, inputs, shape, device)
 
 
 def squashed_log_prob(raw: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
     """Log-density of the action tanh(raw), where raw is drawn from N(mean, exp(log_std)^2).
 
-    It takes what was squashed: in float32 tanh rounds to 1 from 9 on, and the way back from an action of 1 is infinite.
-    All are (..., a); the result is summed over the last axis, (...).
+    Of what was squashed, (..., a), to (...): in float32 tanh rounds to 1 from 9 on, whose way back is infinite.
     """
     # log(1 - tanh(u)^2), written so that no difference of almost equal numbers occurs.
     log_slope = 2.0 * (math.log(2.0) - raw - softplus(-2.0 * raw))
@@ -145,11 +151,10 @@ class SquashedActor(nn.Module):
     def __init__(
         self, inputs: int | Inputs, hidden: Sequence[int], actions: int, heads: int, init_std: float,
         std_range: tuple[float, float], generator: torch.Generator, activation: Activation,
-        network: Callable[..., Any] = MLP
+        network: MakeNetwork = MLP
     ):  # fmt: skip
         super().__init__()
-        self.heads = heads
-        self.one_hot = Inputs.of(inputs).columns(*["task_id"] * (heads > 1))
+        self.heads, self.one_hot = heads, Inputs.of(inputs).columns(*["task_id"] * (heads > 1))
         low, high = (math.log(std) for std in std_range)
         self.middle, self.reach = 0.5 * (low + high), 0.5 * (high - low)
         self.net = network(inputs, hidden, heads * 2 * actions, 0.01, generator, activation)
@@ -160,11 +165,7 @@ class SquashedActor(nn.Module):
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and log standard deviation of normalised observations (batch, d): float32 (batch, a) each."""
         out = self.net(x).unflatten(1, (self.heads, 2, -1))
-        if self.heads == 1:
-            mean, log_std = out[:, 0].unbind(1)
-        else:
-            head = self.one_hot(x).argmax(1).view(-1, 1, 1, 1).expand(-1, 1, *out.shape[2:])
-            mean, log_std = out.gather(1, head)[:, 0].unbind(1)
+        mean, log_std = (out[:, 0] if self.heads == 1 else of_head(out, self.one_hot(x).argmax(1))).unbind(1)
         return mean, self.middle + self.reach * torch.tanh(log_std)
 
 
@@ -191,3 +192,14 @@ class SquashedPolicy(ActorPolicy):
     def sample_action(self, obs: Tensor, generator: torch.Generator) -> Tensor:
         """Actions drawn from the distribution for raw observations (N, d): (N, a) in [-1, 1]."""
         return self.sample(self.observations(obs), generator)[0]
+
+
+def squashed_policy(
+    config: Any, inputs: Inputs, shape: Shape, init: torch.Generator, device: torch.device,
+    network: MakeNetwork | None = None
+) -> SquashedPolicy:  # fmt: skip
+    """As :func:`gaussian_policy`, squashed."""
+    heads, network = shape.num_id_columns if config.policy_heads else 1, network or network_of(config)
+    sizes = config.hidden, shape.actions, heads
+    actor = SquashedActor(inputs, *sizes, config.init_std, config.std_range, init, config.activation, network)
+    return SquashedPolicy.made_of(actor, config, inputs, shape, device)

@@ -1,8 +1,7 @@
 """The products of layers with weights, by the faster of the two libraries that PyTorch computes them with on a CPU.
 
-PyTorch takes MKL, which runs AMD's processors without their AVX-512: its oneDNN, of the same precision, is more than
-twice as fast there (docs/results/speed.md). Elsewhere, and where a product is small, it is PyTorch's own choice.
-``torch.backends.mkldnn.flags(enabled=False)`` turns it off.
+PyTorch takes MKL, which runs AMD's processors without their AVX-512: oneDNN, of the same precision, is more than twice
+as fast there (docs/results/speed.md). ``torch.backends.mkldnn.flags(enabled=False)`` turns it off.
 """
 
 import platform

@@ -35,8 +35,7 @@ class RecurrentNet(nn.Module):
             for gate in weight.data.chunk(3):
                 nn.init.orthogonal_(gate, generator=generator)
         # The gates are reset, update, new. An update gate of 1/2 halves the memory, and its gradient, at each step.
-        update = self.gru.get_parameter("bias_ih_l0").data.chunk(3)[1]
-        update.copy_(torch.linspace(0.0, math.log(lasting), memory))
+        self.gru.get_parameter("bias_ih_l0").data.chunk(3)[1].copy_(torch.linspace(0.0, math.log(lasting), memory))
         self.head = MLP(hidden[-1] + memory, (), outputs, output_gain, generator)
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
@@ -60,13 +59,6 @@ class Memory:
     known: Tensor
     done: Tensor
 
-    @classmethod
-    def fresh(cls, rows: int, memory: int, actions: int, device: torch.device) -> "Memory":
-        """The memory at the start of a trial."""
-        flags = torch.zeros(2, rows, dtype=torch.bool, device=device)
-        state, action = (torch.zeros(rows, width, device=device) for width in (memory, actions))
-        return cls(state, action, torch.zeros(rows, device=device), flags[0], flags[1])
-
     def replaced(self, mask: Tensor, other: "Memory") -> "Memory":
         """The same with the rows of ``mask``, bool (N,), from another one."""
         pairs = zip(vars(self).values(), vars(other).values(), strict=True)
@@ -76,9 +68,8 @@ class Memory:
 class RecurrentPolicy(nn.Module):
     """A Gaussian policy whose memory is fed with observation, last action, last reward and end of episode.
 
-    Rewards of task classes differ by orders of magnitude, and which class is played is not known. One rule serves all:
-    asinh(reward / ``reward_unit``), linear below the unit and showing ratios above it, normalised by running
-    statistics. ``inputs`` gets a group ``last_step`` of what is fed beside the observation.
+    Rewards of unknown classes differ by orders of magnitude; one rule serves all: asinh(reward / ``reward_unit``),
+    normalised by running statistics. ``inputs`` gets a group ``last_step`` of what is fed beside the observation.
     """
 
     def __init__(
@@ -111,7 +102,10 @@ class RecurrentPolicy(nn.Module):
 
     def fresh_memory(self, rows: int) -> Memory:
         """The memory at the start of a trial of so many environments."""
-        return Memory.fresh(rows, self.memory, self.num_actions, self.log_std.device)
+        device = self.log_std.device
+        flags = torch.zeros(2, rows, dtype=torch.bool, device=device)
+        state, action = (torch.zeros(rows, width, device=device) for width in (self.memory, self.num_actions))
+        return Memory(state, action, torch.zeros(rows, device=device), flags[0], flags[1])
 
     @torch.no_grad()
     def update_statistics(self, obs: Tensor, rewards: Tensor) -> None:

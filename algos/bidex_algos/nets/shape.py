@@ -1,11 +1,10 @@
 """What a policy's networks must know of the world they were made for; a checkpoint keeps it."""
 
 from dataclasses import dataclass
-from typing import Any
 
 from bidex_algos.nets.architecture import ArchitectureConfig
 from bidex_meta.errors import BidexError
-from bidex_meta.train.learner import State
+from bidex_meta.train.learner import LearnerConfig, State
 from bidex_meta.world.contract import ObservationGroup, VectorWorld, plain_groups
 
 
@@ -53,7 +52,7 @@ class Shape:
 _OF_SEVERAL = ("task_embedding", "normalise_per_task")
 
 
-def check_options(name: str, config: Any, world: VectorWorld, shape: Shape) -> None:
+def check_options(name: str, config: LearnerConfig, world: VectorWorld, shape: Shape) -> None:
     """Options that tell tasks apart need the one-hot of the tasks. Raises BidexError: the world does not show one."""
     wanted = [option for option in (*_OF_SEVERAL, "policy_heads") if vars(config).get(option)]
     if world.num_tasks == 1:

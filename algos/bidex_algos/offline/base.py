@@ -15,11 +15,9 @@ from torch import Tensor, nn
 
 from bidex_algos.advantages import discounts
 from bidex_algos.learner import Learner, as_numbers
-from bidex_algos.nets.architecture import NetworkConfig, network_bytes
+from bidex_algos.nets.architecture import Critics, NetworkConfig, Options, network_bytes
 from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import Autocast, autocast, use_bfloat16
-from bidex_algos.offline.batches import Batches, return_deviation
-from bidex_algos.offpolicy.critics import Critics
 from bidex_algos.replay import Transitions
 from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
@@ -73,14 +71,65 @@ class CriticConfig(OfflineConfig):
     per_task_rewards: bool = True
     """Divide rewards by the standard deviation of their task's discounted returns in the data."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0.0 <= self.gamma < 1.0:
-            raise BidexError(f"{self.algo}: gamma must lie in [0, 1), got {self.gamma}.")
 
-
-PAPER: dict[str, Any] = {"value_heads": False, "critic_layer_norm": False, "per_task_rewards": False}
+PAPER: Options = {"value_heads": False, "critic_layer_norm": False, "per_task_rewards": False}
 """What the preset ``paper`` leaves out of all learners with critics: Table 46 and the methods' papers know none."""
+
+
+class Batches:
+    """Transitions on a device, in batches of ``per_task`` of each of ``num_tasks`` tasks."""
+
+    def __init__(self, data: Joined, num_tasks: int, per_task: int, device: torch.device):
+        self._per_task, self._device = per_task, device
+        self._observations, self._at, self._actions, self._rewards, self._terminated = (
+            each.to(device) for each in (data.observations, data.at, data.actions, data.rewards, data.terminated)
+        )
+        self._of_task = torch.argsort(data.task, stable=True).to(device)
+        self._count = torch.bincount(data.task, minlength=num_tasks).to(device)
+        self._first = self._count.cumsum(0) - self._count
+        self.fingerprint = data.fingerprint()
+
+    def draw(self, batches: int, generator: torch.Generator) -> Tensor:
+        """Places of transitions, uniform within each task: int64 (batches, num_tasks * per_task), task after task."""
+        shape = (batches, len(self._count), self._per_task)
+        # The remainder of a number this large favours no transition by more than 1 in 2^40 / transitions.
+        drawn = torch.randint(2**40, shape, generator=generator, device=self._device) % self._count[:, None]
+        return self._of_task[self._first[:, None] + drawn].flatten(1)
+
+    def take(self, places: Tensor) -> Transitions:
+        """The transitions at ``places`` (B,)."""
+        at = self._at[places]
+        return Transitions(
+            obs=self._observations.index_select(0, at), actions=self._actions.index_select(0, places),
+            rewards=self._rewards[places], next_obs=self._observations.index_select(0, at + 1),
+            terminated=self._terminated[places]
+        )  # fmt: skip
+
+    def chunks(self) -> tuple[Tensor, ...]:
+        """All states, some at a time, (n, d) each."""
+        return self._observations.split(65_536)
+
+
+def return_deviation(data: Joined, num_tasks: int, gamma: Tensor | float) -> Tensor:
+    """Standard deviation of each task's discounted returns, from every state to the end of its episode: (num_tasks,).
+
+    An episode that was cut by time counts up to there; 1 where all returns are equal; ``gamma`` for all or
+    (num_tasks,). The steps that a sum spans are doubled until it spans the longest episode.
+    """
+    returns = data.rewards.double()
+    factor = torch.as_tensor(gamma, dtype=torch.float64).cpu().expand(num_tasks)[data.task]
+    span, longest = 1, int(data.left.max()) + 1
+    while span < longest:
+        inside = data.left[:-span] >= span
+        behind = factor[:-span] ** span * returns[span:]
+        # One sum of both, not in place: what stands behind must still be of the shorter span.
+        returns = torch.cat([returns[:-span] + torch.where(inside, behind, 0.0), returns[-span:]])
+        span *= 2
+    count = torch.bincount(data.task, minlength=num_tasks)
+    mean = torch.zeros(num_tasks, dtype=torch.float64).index_add_(0, data.task, returns) / count
+    square = (returns - mean[data.task]).square()
+    deviation = (torch.zeros(num_tasks, dtype=torch.float64).index_add_(0, data.task, square) / count).sqrt()
+    return torch.where(deviation > 1e-8, deviation, 1.0).float()
 
 
 class Offline(Learner):
@@ -93,6 +142,8 @@ class Offline(Learner):
     offline = True
     num_critics: ClassVar[int] = 2
     discounts_by_class = True
+    critic: Critics
+    target_critic: Critics
 
     def __init__(self, world: VectorWorld, config: Any, seed: int):
         super().__init__(world, config, seed)
@@ -102,7 +153,6 @@ class Offline(Learner):
         self.task_of_draw = torch.arange(world.num_tasks, device=self.device).repeat_interleave(self.batch_per_task)
         self.adams = {"actor": self._adam(self.policy.actor.parameters(), config.learning_rate)}
         self.reward_scale = torch.ones(world.num_tasks, device=self.device)
-        self.critic: Any = None
         if self.num_critics:
             self.critic = self._make_critics()
             self.target_critic = copy.deepcopy(self.critic)
@@ -116,30 +166,27 @@ class Offline(Learner):
         self._batches = Batches(data, tasks, self.batch_per_task, self.device)
         for chunk in self._batches.chunks():
             self.policy.observations.update(chunk)
-        if self.critic is not None and self.config.per_task_rewards:
-            every = torch.arange(tasks, device=self.device)
-            self.reward_scale = return_deviation(data, tasks, discounts(self.world, self.config.gamma, every))
-            self.reward_scale = self.reward_scale.to(self.device)
+        if self.num_critics and self.config.per_task_rewards:
+            gamma = discounts(self.world, self.config.gamma, torch.arange(tasks, device=self.device))
+            self.reward_scale = return_deviation(data, tasks, gamma).to(self.device)
 
     @abstractmethod
     def _update(self, draw: Transitions) -> dict[str, Tensor]:
         """One update of all networks by a batch, task after task; returns scalars to be logged, as means."""
 
-    def _make_critics(self) -> Any:
-        """Fresh critics of observation and action together."""
+    def _make_critics(self) -> Critics:
         heads = self.world.num_tasks if self.config.value_heads else 1
         judged = self.inputs.extended("action", self.shape.actions)
         return self._critics(judged, heads, self.num_critics)
 
     def _critics(self, inputs: Inputs, heads: int, count: int) -> Critics:
-        return Critics(inputs, heads, self.config, self.initial, count).to(self.device)
+        layer_norm = self.config.critic_layer_norm
+        return Critics(inputs, heads, self.config, layer_norm, self.initial, count).to(self.device)
 
     def _own_parts(self) -> Parts:
-        """Networks of its own, beside those of the base, by their names in a checkpoint."""
         return {}
 
     def _iterate(self) -> dict[str, float]:
-        """Some updates; the means of what they measured."""
         if self._batches is None:
             raise BidexError(f"{self.name}: has no data to learn from. Call learn_from first.")
         sums: dict[str, Tensor] = {}
@@ -153,18 +200,15 @@ class Offline(Learner):
                 counts[name] = counts.get(name, 0) + 1
         return as_numbers({name: total / counts[name] for name, total in sums.items()})
 
-    def _values(self, critic: Any, obs: Tensor, actions: Tensor) -> Tensor:
-        """The critics' values of a batch (count, B), in scaled units of reward."""
+    def _values(self, critic: nn.Module, obs: Tensor, actions: Tensor) -> Tensor:
         with autocast(self.device, self.low_precision):
             return critic(obs, actions, self.task_of_draw)
 
     def _bootstrapped(self, draw: Transitions, following: Tensor) -> Tensor:
-        """Targets (B,): scaled reward + gamma * ``following`` (B,), the value of the next state."""
         rewards = draw.rewards / self.reward_scale[self.task_of_draw]
         return rewards + self.gamma_of_draw * following.masked_fill(draw.terminated, 0.0)
 
     def _fit_critics(self, obs: Tensor, draw: Transitions, target: Tensor) -> dict[str, Tensor]:
-        """One step of all critics towards ``target`` (B,), of normalised observations (B, d)."""
         values = self._values(self.critic, obs, draw.actions)
         loss = (values - target).square().mean(1).sum()
         self._descend(loss, "critic", self.critic)
@@ -173,7 +217,6 @@ class Offline(Learner):
         return {"Loss/critic": loss.detach()} | reported
 
     def _descend(self, loss: Tensor, name: str, *modules: nn.Module) -> None:
-        """One step of the optimiser named, down ``loss``; weights of these modules alone get a slope."""
         weights = [weight for module in modules for weight in module.parameters()]
         self.adams[name].zero_grad()
         loss.backward(inputs=weights)
@@ -188,9 +231,9 @@ class Offline(Learner):
         return torch.randn(like.shape, generator=self.noise, device=self.device)
 
     def _parts(self) -> Parts:
-        critics = {} if self.critic is None else {"critic": self.critic, "target_critic": self.target_critic}
-        generators = {"generator": self.generator, "noise": self.noise}
-        return {**critics, **self._own_parts(), "adams": self.adams, **generators, "reward_scale": self.reward_scale}
+        critics = {"critic": self.critic, "target_critic": self.target_critic} if self.num_critics else {}
+        rest = {"generator": self.generator, "noise": self.noise, "reward_scale": self.reward_scale}
+        return {**critics, **self._own_parts(), "adams": self.adams, **rest}
 
     def _place(self) -> State:
         return super()._place() | {"data": self._batches and dict(self._batches.fingerprint)}

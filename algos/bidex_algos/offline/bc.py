@@ -2,12 +2,10 @@
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from bidex_algos.nets.networks import autocast
 from bidex_algos.nets.policy import DeterministicPolicy, deterministic_policy
-from bidex_algos.nets.shape import Shape
 from bidex_algos.offline.base import Offline, OfflineConfig
 from bidex_algos.replay import Transitions
 
@@ -28,13 +26,13 @@ class BC(Offline):
     config_type, presets = BCConfig, PRESETS
     config: BCConfig
     policy: DeterministicPolicy
+    policy_of = staticmethod(deterministic_policy)
     num_critics = 0
 
     def _update(self, draw: Transitions) -> dict[str, Tensor]:
         return self._fit_actor(self.policy.observations(draw.obs), draw)
 
     def _fit_actor(self, obs: Tensor, draw: Transitions) -> dict[str, Tensor]:
-        """One step of the actor, on normalised observations (B, d) of ``draw``."""
         with autocast(self.device, self.low_precision):
             actions = self.policy.actor(obs)
         imitation = (actions - draw.actions).square().mean()
@@ -43,11 +41,4 @@ class BC(Offline):
         return reported | {"Loss/imitation": imitation.detach()}
 
     def _actor_loss(self, imitation: Tensor, obs: Tensor, actions: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """The actor's loss and further metrics, for its actions (B, a) and their distance to the data's."""
         return imitation, {}
-
-    @classmethod
-    def _make_policy(
-        cls, config: BCConfig, shape: Shape, init: torch.Generator, device: torch.device
-    ) -> DeterministicPolicy:
-        return deterministic_policy(config, cls._inputs(config, shape), shape, init, device)

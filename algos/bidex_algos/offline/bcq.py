@@ -1,36 +1,30 @@
 """BCQ: values of actions that a model of the data proposes (Fujimoto et al. 2019; appendix B.3.1).
 
-G    down on |G(s, z) - a|^2 + KL, z the code of a                     the data's actions
-a'_j = G(s', z_j) + xi'(s', G(s', z_j)),  j = 1...n, |xi'| <= Phi
-y    = r + gamma (1 - terminated) max_j [w min_i + (1 - w) max_i] Q'_i(s', a'_j)
-Q_i  towards y
-xi   up on Q_1(s, a + xi(s, a)), a = G(s, z)
-Q', xi'  a small step towards Q, xi
+G down on |G(s, z) - a|^2 + KL, z the code of a; a'_j = G(s', z_j) + xi'(s', G(s', z_j)), j = 1...n, |xi'| <= Phi;
+Q_i towards r + gamma (1 - terminated) max_j [w min_i + (1 - w) max_i] Q'_i(s', a'_j); xi up on Q_1(s, a + xi(s, a)).
 """
 
 import copy
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from msgspec import Meta
 from torch import Tensor, nn
 
-from bidex_algos.nets.architecture import network_bytes, network_of
+from bidex_algos.nets.architecture import Critics, follow, network_bytes, network_of
 from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import MLP, Layers, autocast, use_bfloat16
 from bidex_algos.nets.normalise import observation_normaliser
 from bidex_algos.nets.policy import DeterministicActor
 from bidex_algos.nets.shape import Shape
 from bidex_algos.offline.base import PAPER, CriticConfig, Offline
-from bidex_algos.offpolicy.critics import Critics, follow
 from bidex_algos.replay import Transitions
 from bidex_meta.train.learner import Parts
 from bidex_meta.utils.validation import Count, Fraction, NonNegative, Positive
 from bidex_meta.world.contract import VectorWorld
 
-_FARTHEST = 0.5
-"""Codes are cut to this when actions are proposed: near the middle the model has seen most."""
+_FARTHEST = 0.5  # codes are cut to this when actions are proposed: near the middle the model has seen most
 _LOG_STD = (-4.0, 15.0)
 
 
@@ -102,10 +96,10 @@ class BCQPolicy(nn.Module):
     """
 
     def __init__(
-        self, config: BCQConfig, inputs: Inputs, shape: Shape, generator: torch.Generator, low_precision: bool
+        self, config: BCQConfig, inputs: Inputs, shape: Shape, generator: torch.Generator, device: torch.device
     ):
         super().__init__()
-        self.perturbation, self.low_precision = config.perturbation, low_precision
+        self.perturbation, self.low_precision = config.perturbation, use_bfloat16(config.autocast, device)
         self.observations = observation_normaliser(config, inputs, shape.num_id_columns)
         judged, heads = inputs.extended("action", shape.actions), shape.num_id_columns
         self.actor = DeterministicActor(
@@ -113,12 +107,12 @@ class BCQPolicy(nn.Module):
             network_of(config)
         )  # fmt: skip
         # A policy knows its task by the one-hot alone: without it, one value serves all.
-        self.critic = Critics(judged, heads if config.value_heads and heads else 1, config, generator)  # pyright: ignore[reportArgumentType]
+        judges = heads if config.value_heads and heads else 1
+        self.critic = Critics(judged, judges, config, config.critic_layer_norm, generator)
         self.model = ActionModel(inputs, config, shape.actions, generator)
         self.task = inputs.columns(*["task_id"] * (self.critic.heads > 1))
         self.codes: Tensor
-        codes = bounded(torch.randn(config.candidates, self.model.codes, generator=generator))
-        self.register_buffer("codes", codes)
+        self.register_buffer("codes", bounded(torch.randn(config.candidates, self.model.codes, generator=generator)))
 
     def propose(self, actor: nn.Module, obs: Tensor, codes: Tensor) -> Tensor:
         """Actions (B, a) of codes (B, z), changed by ``actor``, for normalised observations (B, d)."""
@@ -152,13 +146,14 @@ class BCQ(Offline):
     config_type, presets = BCQConfig, PRESETS
     config: BCQConfig
     policy: BCQPolicy
+    policy_of = BCQPolicy
 
     def __init__(self, world: VectorWorld, config: BCQConfig, seed: int):
         super().__init__(world, config, seed)
         self.target_actor = copy.deepcopy(self.policy.actor)
         self.adams["model"] = self._adam(self.policy.model.parameters(), config.vae_learning_rate)
 
-    def _make_critics(self) -> Any:
+    def _make_critics(self) -> Critics:
         return self.policy.critic
 
     def _update(self, draw: Transitions) -> dict[str, Tensor]:
@@ -171,7 +166,6 @@ class BCQ(Offline):
         return reported
 
     def _fit_model(self, obs: Tensor, actions: Tensor) -> dict[str, Tensor]:
-        """One step of the model towards the data's actions (B, a)."""
         model = self.policy.model
         with autocast(self.device, self.low_precision):
             mean, log_std = model.encode(obs, actions)
@@ -183,7 +177,6 @@ class BCQ(Offline):
 
     @torch.no_grad()
     def _target(self, draw: Transitions, next_obs: Tensor) -> Tensor:
-        """What the critics shall say of the drawn transitions (B,); ``next_obs`` are normalised."""
         count = self.config.candidates
         many, task = next_obs.repeat_interleave(count, 0), self.task_of_draw.repeat_interleave(count)
         codes = bounded(self._normal(many.new_empty(len(many), self.policy.model.codes)))
@@ -192,7 +185,6 @@ class BCQ(Offline):
         return self._bootstrapped(draw, best_of(values, count, self.config.lower_weight))
 
     def _fit_actor(self, obs: Tensor) -> dict[str, Tensor]:
-        """One step of the changes up the first critic, at one proposal for each state."""
         policy = self.policy
         with autocast(self.device, self.low_precision):
             with torch.no_grad():
@@ -201,11 +193,6 @@ class BCQ(Offline):
         loss = -self._values(self.critic, obs, changed)[0].mean()
         self._descend(loss, "actor", policy.actor)
         return {"Loss/actor": loss.detach()}
-
-    @classmethod
-    def _make_policy(cls, config: BCQConfig, shape: Shape, init: torch.Generator, device: torch.device) -> BCQPolicy:
-        low_precision = use_bfloat16(config.autocast, device)
-        return BCQPolicy(config, cls._inputs(config, shape), shape, init, low_precision).to(device)
 
     def _parts(self) -> Parts:
         parts = super()._parts()

@@ -1,23 +1,21 @@
 """IQL: values without an action that the data do not hold (Kostrikov et al. 2022; appendix B.3.3).
 
-V   down on |t - 1(u < 0)| u^2,   u = min_i Q'_i(s, a) - V(s)        t-expectile of the data's actions
-pi  up on   min(exp(beta u), bound) log pi(a | s)
-Q_i towards r + gamma (1 - terminated) V(s')
-Q'  a small step towards Q
+V down on |t - 1(u < 0)| u^2, u = min_i Q'_i(s, a) - V(s): the t-expectile of the data's actions; pi up on
+min(exp(beta u), bound) log pi(a | s); Q_i towards r + gamma (1 - terminated) V(s').
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated
 
 import torch
 from msgspec import Meta
 from torch import Tensor
 
+from bidex_algos.nets.architecture import follow
 from bidex_algos.nets.networks import GaussianActor, autocast, gaussian_log_prob
 from bidex_algos.nets.policy import GaussianPolicy, gaussian_policy
-from bidex_algos.nets.shape import Shape
 from bidex_algos.offline.base import PAPER, CriticConfig, Offline
-from bidex_algos.offpolicy.critics import follow
 from bidex_algos.replay import Transitions
 from bidex_meta.train.learner import Parts
 from bidex_meta.utils.validation import NonNegative, Positive, check_rising
@@ -63,6 +61,7 @@ class IQL(Offline):
     config_type, presets = IQLConfig, PRESETS
     config: IQLConfig
     policy: GaussianPolicy
+    policy_of = staticmethod(partial(gaussian_policy, make=BoundedMean))
 
     def __init__(self, world: VectorWorld, config: IQLConfig, seed: int):
         super().__init__(world, config, seed)
@@ -86,11 +85,9 @@ class IQL(Offline):
         return reported
 
     def _worth(self, obs: Tensor) -> Tensor:
-        """Values of states (B,), of normalised observations (B, d)."""
         return self._values(self.value, obs, obs[:, :0])[0]
 
     def _fit_actor(self, obs: Tensor, actions: Tensor, advantage: Tensor) -> dict[str, Tensor]:
-        """One step of the actor towards the data's actions (B, a), by the advantage (B,) of each."""
         weight = (self.config.beta * advantage).exp().clamp_max(self.config.max_weight)
         with autocast(self.device, self.low_precision):
             mean, log_std = self.policy.actor(obs), self.policy.actor.log_std_of(obs)
@@ -99,12 +96,6 @@ class IQL(Offline):
         self._descend(loss, "actor", self.policy.actor)
         std = log_std.detach().exp().mean()
         return {"Loss/actor": loss.detach(), "Policy/std": std, "Policy/weight": weight.mean()}
-
-    @classmethod
-    def _make_policy(
-        cls, config: IQLConfig, shape: Shape, init: torch.Generator, device: torch.device
-    ) -> GaussianPolicy:
-        return gaussian_policy(config, cls._inputs(config, shape), shape, init, device, BoundedMean)
 
     def _own_parts(self) -> Parts:
         return {"value": self.value}

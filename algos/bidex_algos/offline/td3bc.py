@@ -1,9 +1,6 @@
 """TD3+BC: TD3 on stored transitions, with an actor that stays near the data (Fujimoto and Gu 2021; appendix B.3.2).
 
-y  = r + gamma (1 - terminated) min_i Q'_i(s', mu'(s') + clip(noise, -c, c))
-Q_i  towards y
-mu   down on (mu(s) - a)^2 - lambda Q_1(s, mu(s)),    lambda = alpha / mean |Q_1(s, mu(s))|
-mu', Q'  a small step towards mu, Q                    mu and the targets at every second update
+TD3's targets and delay; mu down on (mu(s) - a)^2 - lambda Q_1(s, mu(s)), lambda = alpha / mean |Q_1(s, mu(s))|.
 """
 
 import copy
@@ -12,10 +9,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from bidex_algos.nets.architecture import follow
 from bidex_algos.nets.networks import autocast
 from bidex_algos.offline.base import PAPER, CriticConfig
 from bidex_algos.offline.bc import BC
-from bidex_algos.offpolicy.critics import follow
 from bidex_algos.replay import Transitions
 from bidex_meta.train.learner import Parts
 from bidex_meta.utils.validation import Count, NonNegative
@@ -64,7 +61,6 @@ class TD3BC(BC):
 
     @torch.no_grad()
     def _target(self, draw: Transitions, next_obs: Tensor) -> Tensor:
-        """What the critics shall say of the drawn transitions (B,); ``next_obs`` are normalised."""
         with autocast(self.device, self.low_precision):
             action = self.target_actor(next_obs)
         bound = self.config.target_bound

@@ -1,12 +1,8 @@
 """What the off-policy learners share: a replay per task, updates after each step, critics, targets, checkpoints.
 
-They differ in how the actor explores, in what the critics shall say, and in the actor's update. An iteration is
-``steps_per_iteration`` times::
-
-    one step in every environment, with exploration (uniform actions at first); into the replay
-    updates_per_step times: draw equally many transitions of each task; the learner's update
-
-Rewards are divided by the running deviation of their task's discounted return, so that no task outweighs another.
+They differ in how the actor explores, in what the critics shall say, and in the actor's update. An iteration is some
+times one step in every environment, then ``updates_per_step`` updates on equally many transitions of each task. Rewards
+are divided by the running deviation of their task's discounted return, so that no task outweighs another.
 """
 
 import copy
@@ -14,18 +10,17 @@ import math
 from abc import abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.advantages import discounts
+from bidex_algos.advantages import discounts, task_moments
 from bidex_algos.learner import Learner, as_numbers
-from bidex_algos.nets.architecture import NetworkConfig, network_bytes
+from bidex_algos.nets.architecture import Critics, NetworkConfig, network_bytes
 from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import Autocast, autocast, use_bfloat16
-from bidex_algos.offpolicy.critics import Critics
-from bidex_algos.offpolicy.return_scale import ReturnScale
+from bidex_algos.nets.normalise import RunningStats
 from bidex_algos.replay import Stretches, Transitions, replay_within
 from bidex_algos.rollout import EpisodeStatistics
 from bidex_meta.train.distributed import all_sum, sum_gradients, world_size
@@ -88,12 +83,41 @@ class OffPolicyConfig(NetworkConfig):
         return int(replay) + network_bytes(self.hidden, width, 3)
 
 
+class ReturnScale:
+    """Running statistics of the discounted sum of rewards since an episode began.
+
+    Returns of a task fade after ``horizon`` newer ones; ``gamma`` is for all, or of each environment (N,).
+    """
+
+    def __init__(self, world: VectorWorld, gamma: float | Tensor, horizon: float):
+        self.gamma, self.task_id, self.num_tasks = gamma, world.task_id, world.num_tasks
+        self.stats = RunningStats((world.num_tasks,), max_count=horizon).to(world.device)
+        self.discounted = torch.zeros(world.num_envs, device=world.device)
+
+    def note(self, reward: Tensor, terminated: Tensor, truncated: Tensor, broken: Tensor) -> None:
+        """Takes one step of all environments: rewards (N,) and how it ended, bool (N,); broken ones do not count."""
+        self.discounted = self.gamma * self.discounted + reward
+        self._take(truncated & ~terminated, ~broken)
+        self.discounted = self.discounted.masked_fill(terminated | truncated | broken, 0.0)
+
+    def _take(self, cut: Tensor, valid: Tensor) -> None:
+        self.stats.merge(*task_moments(self.discounted[None], self.task_id, self.num_tasks, valid[None]))
+
+    def deviation(self) -> Tensor:
+        """The deviation of each task's returns, at least a tenth of their mean (num_tasks,)."""
+        # Where all returns are about the same, their deviation alone would blow them up.
+        return (self.stats.std().square() + (0.1 * self.stats.mean).square()).sqrt().float()
+
+    def parts(self) -> Parts:
+        """What a checkpoint holds, by name."""
+        return {"return_stats": self.stats, "discounted": self.discounted}
+
+
 class OffPolicy(Learner):
     """An actor and critics that learn from a replay; the critics from the value of the next state by their targets.
 
-    Several processes have a replay each, and an update is of as many times more transitions: of each process B,
-    ``batch_per_task`` of each task, task after task (``task_of_draw``). ``gamma_of_rows`` and ``gamma_of_draw`` are
-    discounts of environments and of a draw. Raises BidexError where a task has no environments, or a replay no room.
+    Of several processes each has a replay and draws ``batch_per_task`` of each task, task after task
+    (``task_of_draw``). ``gamma_of_rows`` and ``gamma_of_draw`` are discounts of environments and of a draw.
     """
 
     config: OffPolicyConfig
@@ -125,9 +149,9 @@ class OffPolicy(Learner):
         self.returns = self.returns_type(world, self.gamma_of_rows, horizon)
         self.episodes = EpisodeStatistics(world.task_id, world.task_names)
 
-    def _make_critics(self, inputs: Inputs, heads: int) -> Any:
-        """Fresh critics of observation and action together, with so many outputs of values each."""
-        return Critics(inputs, heads, self.config, self.initial, self.num_critics)
+    def _make_critics(self, inputs: Inputs, heads: int) -> nn.Module:
+        layer_norm = self.config.critic_layer_norm
+        return Critics(inputs, heads, self.config, layer_norm, self.initial, self.num_critics)
 
     def _adam(self, parameters: Iterable[nn.Parameter], rate: float, decay: float | None = None) -> torch.optim.Adam:
         decay = self.config.weight_decay if decay is None else decay
@@ -143,15 +167,12 @@ class OffPolicy(Learner):
         """One update by a draw (B), whose weights (B,) are 0 for what teaches nothing; ``counts``: of all processes."""
 
     def _own_parts(self) -> Parts:
-        """Networks and parameters of its own, beside those of the base, by their names in a checkpoint."""
         return {}
 
     def _reported(self) -> dict[str, Tensor]:
-        """Scalars to be logged at the end of every iteration, before the first update too."""
         return {}
 
     def _iterate(self) -> dict[str, float]:
-        """Some vector steps, each followed by its updates."""
         unstable = torch.zeros((), dtype=torch.int64, device=self.device)
         measured: list[dict[str, Tensor]] = []
         for _ in range(self.config.steps_per_iteration):
@@ -171,8 +192,11 @@ class OffPolicy(Learner):
 
     @torch.no_grad()
     def _step(self) -> Tensor:
-        """One step in every environment; returns how many broke physics."""
-        actions = self._act(self.replay.obs)
+        rows, device = self.world.num_envs, self.device
+        if self.replay.added < self.config.warmup_steps:
+            actions = torch.rand(rows, self.shape.actions, generator=self.generator, device=device) * 2.0 - 1.0
+        else:
+            actions = self._explore(self.replay.obs)
         obs, reward, terminated, truncated, info = self.world.step(actions)
         self.replay.add(actions, reward, terminated, truncated, obs, info)
         self.returns.note(reward, terminated, truncated, info["unstable"])
@@ -180,18 +204,11 @@ class OffPolicy(Learner):
         self.episodes.update(info)
         return info["unstable"].sum()
 
-    def _act(self, obs: Tensor) -> Tensor:
-        if self.replay.added < self.config.warmup_steps:
-            return torch.rand(len(obs), self.shape.actions, generator=self.generator, device=self.device) * 2.0 - 1.0
-        return self._explore(obs)
-
     def _reward_scale(self) -> Tensor:
-        """What rewards of each task are divided by (num_tasks,); 1 unless ``per_task_rewards``."""
         scale = self.returns.deviation()
         return scale if self.config.per_task_rewards else torch.ones_like(scale)
 
     def _learn(self) -> list[dict[str, Tensor]]:
-        """The updates that follow one vector step; what each measured."""
         updates, tasks = self.config.updates_per_step, self.world.num_tasks
         places = self.replay.draw(updates, self.batch_per_task, self.generator)
         stretches = Stretches(self.replay, places, self.config.n_steps, self.gamma_of_draw)
@@ -200,13 +217,11 @@ class OffPolicy(Learner):
         counts = all_sum(weights.view(updates, tasks, -1).sum(2))
         return [self._update(stretches.take(i), weights[i], counts[i]) for i in range(updates)]
 
-    def _values(self, critic: Any, obs: Tensor, actions: Tensor) -> Tensor:
-        """The critics' values of a draw (num_critics, B), in scaled units of reward."""
+    def _values(self, critic: nn.Module, obs: Tensor, actions: Tensor) -> Tensor:
         with autocast(self.device, self.low_precision):
             return critic(obs, actions, self.task_of_draw)
 
     def _pooled(self, values: Tensor) -> Tensor:
-        """One value (B,) of those of all critics (num_critics, B)."""
         return values.amin(0)
 
     def _bootstrapped(self, draw: Transitions, following: Tensor) -> Tensor:
@@ -227,7 +242,6 @@ class OffPolicy(Learner):
         return dict(zip(["Loss/critic", "Train/weightless", *names], numbers, strict=True))
 
     def _critic_losses(self, obs: Tensor, actions: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-        """How far the critics are from the targets (num_critics, B), and the first one's values (B,)."""
         values = self._values(self.critic, obs, actions)
         return (values - target).square(), values[0].detach()
 
@@ -244,23 +258,15 @@ class OffPolicy(Learner):
         return numbers
 
     def _per_task(self, x: Tensor) -> Tensor:
-        """Sums (num_tasks,) of what a draw holds (B,)."""
         return x.view(self.world.num_tasks, -1).sum(1)
 
     def _parts(self) -> Parts:
-        return {
-            "critic": self.critic,
-            "target_critic": self.target_critic,
-            **self._own_parts(),
-            "adams": self.adams,
-            **self.returns.parts(),
-            "generator": self.generator,
-            "episodes": self.episodes,
-        }
+        networks = {"critic": self.critic, "target_critic": self.target_critic, **self._own_parts()}
+        statistics = {**self.returns.parts(), "generator": self.generator, "episodes": self.episodes}
+        return {**networks, "adams": self.adams, **statistics}
 
     def state_dict(self) -> State:
-        """A copy of everything but the world, as tensors and plain values (``torch.load(weights_only=True)``)."""
-        # The replay makes its own copy: two of it at once may not fit.
+        """As in the base; the replay makes its own copy, since two of it at once may not fit."""
         return super().state_dict() | {"replay": self.replay.state_dict()}
 
     def load_state_dict(self, state: State) -> None:

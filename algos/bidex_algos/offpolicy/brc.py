@@ -1,27 +1,22 @@
 """BRC: "bigger, regularised, categorical" (Nauman et al. 2025, arXiv 2505.23150): SAC on all tasks by one large critic.
 
-    a' = tanh(u), u ~ N(mean, std)(s')
-    y  = r + gamma (1 - terminated) (Z'(s', a') - alpha log pi(a'|s'))     Z': the mean of both critics' distributions
-    Z_i  towards y by cross-entropy: wide residual networks with layer norm, weights decay
-    pi   down on alpha log pi(a|s) - mean_i E Z_i(s, a)
-    rewards over their task's largest return, so that all tasks fill the same atoms (the paper's equation 2)
-
-The task enters by a learned vector of length 1. The critic has the capacity, the actor is small; no critic is
-pessimistic. All else is as in ``mtsac.py`` and ``categorical.py``; deviations stand in ``docs/learners/brc.md``.
+Targets are r + gamma (1 - terminated) (Z'(s', a') - alpha log pi(a'|s')), Z' the mean of both critics' distributions,
+which are wide residual networks; rewards are over their task's largest return (the paper's equation 2); the task enters
+by a learned vector of length 1. All else is as in ``mtsac.py`` and ``categorical.py``; see ``docs/learners/brc.md``.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor, nn
 
 from bidex_algos.advantages import discounts
-from bidex_algos.nets.inputs import Inputs, with_task_embedding
+from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import ACTIVATIONS, MLP, Activation, Layers, linear
-from bidex_algos.nets.point_net import with_point_net
-from bidex_algos.nets.shape import Shape
+from bidex_algos.nets.policy import squashed_policy
 from bidex_algos.offpolicy.categorical import Categorical, CategoricalConfig
 from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_algos.replay import Transitions
@@ -34,13 +29,9 @@ class ResidualBlock(nn.Module):
 
     def __init__(self, width: int, generator: torch.Generator, activation: Activation):
         super().__init__()
-        self.layers = nn.Sequential(
-            linear(width, width, math.sqrt(2.0), generator),
-            nn.LayerNorm(width),
-            ACTIVATIONS[activation](),
-            linear(width, width, math.sqrt(2.0), generator),
-            nn.LayerNorm(width),
-        )
+        first, second = (linear(width, width, math.sqrt(2.0), generator) for _ in range(2))
+        norms = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.layers = nn.Sequential(first, norms[0], ACTIVATIONS[activation](), second, norms[1])
 
     def forward(self, x: Tensor) -> Tensor:
         """Maps (batch, width) to (batch, width)."""
@@ -100,13 +91,10 @@ class BRCConfig(CategoricalConfig, MTSACConfig):
 
 
 PRESETS: dict[str, BRCConfig] = {
-    # The authors' code (github.com/naumix/BiggerRegularizedCategorical, 2025). train.py: batches of 1,024 in all, 2
-    # updates a vector step, critics 4,096 wide; there each task has one environment, 5,000 transitions of it come first
-    # and 1,000,000 are kept: here as many at 256 environments of each task. jaxrl/agent/brc_learner.py: 2 blocks, the
-    # actor 256 with 1, embedding of 32, steps of 3e-4, discount 0.99, tau 0.005, entropy -1/2 per action, one
-    # temperature from 0.1, 101 atoms to 10. jaxrl/networks.py: ReLU, log standard deviations from -10 to 2, which begin
-    # in the middle. Decay: AdamW's default there, 1e-4. No limit of the gradient (here a huge one), observations as
-    # they are.
+    # The authors' code (github.com/naumix/BiggerRegularizedCategorical, 2025): train.py, jaxrl/agent/brc_learner.py and
+    # jaxrl/networks.py. There each task has one environment, 5,000 transitions of it come first and 1,000,000 are kept:
+    # here as many at 256 environments of each task. Log standard deviations go from -10 to 2 and begin in the middle.
+    # Decay: AdamW's default there, 1e-4. No limit of the gradient (here a huge one), observations as they are.
     "paper": BRCConfig(
         hidden=(256, 256), critic_hidden=(4096, 4096, 4096), replay_steps=4000, warmup_steps=20, updates_per_step=2,
         batch_size=1024, gamma=0.99, n_steps=1, tau=0.005, learning_rate=3e-4, critic_learning_rate=3e-4,
@@ -123,17 +111,11 @@ class BRC(Categorical, MTSAC):
     name = "brc"
     config_type, presets = BRCConfig, PRESETS
     config: BRCConfig
-    actor_network = critic_network = ResidualMLP
-
-    @classmethod
-    def _inputs(cls, config: BRCConfig, shape: Shape) -> Inputs:
-        return with_task_embedding(
-            with_point_net(Inputs(shape.groups), config), cls._embedded(config, shape), unit=True
-        )
+    critic_network, unit_embeddings = ResidualMLP, True
+    policy_of = staticmethod(partial(squashed_policy, network=ResidualMLP))
 
     @torch.no_grad()
     def _target(self, draw: Transitions, next_obs: Tensor) -> Tensor:
-        """What the critics shall say of the drawn transitions (B, atoms); ``next_obs`` are normalised."""
         next_actions, log_prob = self.policy.sample(next_obs, self.generator)
         bonus = -self.log_alpha.exp()[self.task_of_draw] * log_prob
         return self._projected(draw, self._following(next_obs, next_actions), bonus)

@@ -1,29 +1,26 @@
 """What FastTD3 and BRC share: critics that give a distribution of the return, taught by cross-entropy.
 
-    Z      the return of (s, a), as probabilities of fixed values ("atoms"); Q = E Z
-    y = r + gamma (1 - terminated) Z'(s', a')    a distribution too, projected back on the atoms (C51)
-    Z_i    towards y, down on -sum_j y_j log p_ij
-
-Bellemare et al. 2017 (arXiv 1707.06887). A regression's gradient grows with the scale of a task's returns and its
-errors, a classification's does not. The price: the atoms span a fixed range, so that rewards must be scaled into it;
-what each task's rewards are divided by follows its largest return so far (``ReturnBound``).
+Z(s, a) has probabilities of fixed values ("atoms"); targets r + gamma (1 - terminated) Z'(s', a') are projected back on
+them (C51, Bellemare et al. 2017, arXiv 1707.06887). Unlike a regression's, its gradient does not grow with the scale of
+a task's returns; but rewards must be scaled into the atoms' range, by the task's largest return (``ReturnBound``).
 """
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from msgspec import Meta
 from torch import Tensor, nn
 
-from bidex_algos.nets.architecture import MakeNetwork, network_bytes, network_of
+from bidex_algos.nets.architecture import network_bytes, network_of
 from bidex_algos.nets.inputs import Inputs
-from bidex_algos.nets.networks import MLP, Layers, autocast
-from bidex_algos.offpolicy.base import OffPolicy, OffPolicyConfig
-from bidex_algos.offpolicy.return_scale import ReturnBound
+from bidex_algos.nets.networks import MLP, Layers, MakeNetwork, autocast
+from bidex_algos.offpolicy.base import OffPolicy, OffPolicyConfig, ReturnScale
 from bidex_algos.replay import Transitions
-from bidex_meta.train.learner import State
+from bidex_meta.train.distributed import all_max
+from bidex_meta.train.learner import Parts, State
 from bidex_meta.utils.validation import MOST, Positive
+from bidex_meta.world.contract import VectorWorld
 
 
 class Atoms(nn.Module):
@@ -73,11 +70,6 @@ class CategoricalConfig(OffPolicyConfig):
         return super().bytes_held(num_envs, width) + network_bytes((*self.critic_hidden, self.atoms), width, 2)
 
 
-FIRST_DEVIATION = 0.1
-"""Of the distributions before the first update, as a share of the values' bound; their mean is 0. From an even
-distribution, which is much wider, means move slowly: a cross-entropy pulls at them with its inverse variance."""
-
-
 class CategoricalCritics(nn.Module):
     """Networks of observation and action that give distributions; arguments as those of ``Critics``."""
 
@@ -89,11 +81,11 @@ class CategoricalCritics(nn.Module):
         self.heads = heads
         self.atoms = Atoms(-config.value_bound, config.value_bound, config.atoms)
         outputs, norm = heads * config.atoms, config.critic_layer_norm
-        nets = [
-            network(inputs, config.critic_hidden, outputs, 0.01, generator, config.activation, norm)
-            for _ in range(count)
-        ]
-        place = self.atoms.values / (FIRST_DEVIATION * config.value_bound)
+        given = inputs, config.critic_hidden, outputs, 0.01, generator, config.activation, norm
+        nets = [network(*given) for _ in range(count)]
+        # At first the mean is 0, the deviation a tenth of the bound: from an even distribution, which is much wider,
+        # means move slowly, since a cross-entropy pulls at them with its inverse variance.
+        place = self.atoms.values / (0.1 * config.value_bound)
         with torch.no_grad():
             for net in nets:
                 net.output_bias.view(heads, -1).copy_(-0.5 * place.square())
@@ -113,10 +105,51 @@ class CategoricalCritics(nn.Module):
         return self.atoms.mean(self.log_probs(obs, actions, task_id).exp())
 
 
+RECENT = 0.9
+"""Weight of a reward in the recent ones' mean over that of the next: about the last ten steps count."""
+
+
+class ReturnBound(ReturnScale):
+    """Beside the statistics the largest return of each task, without its sign: what a fixed range of values must hold.
+
+    The sum is discounted towards the episode's beginning, since its end is not known; both weigh any stretch of rewards
+    alike. At a time limit the episode is taken to go on as it went, or as it went most recently if that is more.
+    ``mass`` is the sum (N,), had all rewards been 1, ``recent`` both with a discount of at most :data:`RECENT` (2, N).
+    """
+
+    def __init__(self, world: VectorWorld, gamma: float | Tensor, horizon: float):
+        super().__init__(world, gamma, horizon)
+        self.bound = torch.zeros(world.num_tasks, device=world.device)
+        self.mass = torch.zeros(world.num_envs, device=world.device)
+        self.recent = torch.zeros(2, world.num_envs, device=world.device)
+        self.short = torch.as_tensor(gamma, device=world.device).clamp_max(RECENT)
+
+    def note(self, reward: Tensor, terminated: Tensor, truncated: Tensor, broken: Tensor) -> None:
+        """As in the base."""
+        self.mass = self.gamma * self.mass + 1.0
+        self.recent = self.short * self.recent + torch.stack([reward, torch.ones_like(reward)])
+        super().note(reward, terminated, truncated, broken)
+        over = terminated | truncated | broken
+        self.mass, self.recent = self.mass.masked_fill(over, 0.0), self.recent.masked_fill(over, 0.0)
+
+    def _take(self, cut: Tensor, valid: Tensor) -> None:
+        super()._take(cut, valid)
+        size, (rewards, mass), rest = self.discounted.abs(), self.recent, 1.0 - self.gamma
+        size = torch.where(cut, torch.maximum(size / (rest * self.mass), rewards.abs() / (rest * mass)), size)
+        size = size.masked_fill(~valid, 0.0)
+        self.bound = all_max(self.bound.scatter_reduce(0, self.task_id, size, "amax"))
+
+    def parts(self) -> Parts:
+        """As in the base."""
+        return super().parts() | {"return_bound": self.bound, "discounted_ones": self.mass, "recent": self.recent}
+
+
 class Categorical(OffPolicy):
     """The part of a learner with such critics that knows no actor; stands before the learner whose actor it takes."""
 
-    config: Any
+    config: CategoricalConfig
+    critic: CategoricalCritics
+    target_critic: CategoricalCritics
     per_process = (*OffPolicy.per_process, "discounted_ones", "recent")
     critic_network: ClassVar[type[MLP] | None] = None
     returns_type = ReturnBound
@@ -138,7 +171,6 @@ class Categorical(OffPolicy):
         return values.amin(0) if self.config.clipped_double_q else values.mean(0)
 
     def _following(self, next_obs: Tensor, next_actions: Tensor) -> Tensor:
-        """Distribution of the return (B, atoms) from where a draw leads, by the target critics."""
         probs = self._log_probs(self.target_critic, next_obs, next_actions).exp()
         if not self.config.clipped_double_q:
             return probs.mean(0)

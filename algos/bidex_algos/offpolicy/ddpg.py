@@ -1,34 +1,21 @@
 """DDPG: a deterministic actor that climbs its critic (Lillicrap et al. 2016; appendix B.1.3), on all tasks of a world.
 
-For each vector step of the world::
-
-    a = mu(s) + noise                            one step in every environment; into the replay
-    y = r + gamma (1 - terminated) Q'(s', mu'(s'))
-    Q   towards y                                on equally many transitions of each task
-    mu  up on Q(s, mu(s))
-    Q', mu'  a small step towards Q, mu
-
-A critic's slope drives actions into the corners of their box, where tanh has no slope that would bring them back: on
-two hands 86 % of all actions were beyond 0.99 after 0.4 M steps, and the policy stood still. ``squash_price`` on the
-square of what goes into tanh keeps them from there; 0 gives the original.
-
-The noise is normal and without memory. Its size differs from environment to environment of a task, so that some show
-what the policy does and others what lies far from it (the spread of Horgan et al. 2018); two equal numbers give the
-original.
+Q towards r + gamma (1 - terminated) Q'(s', mu'(s')), mu up on Q(s, mu(s)). A critic's slope drives actions into corners
+where tanh has no slope back (on two hands 86 % were beyond 0.99 after 0.4 M steps): ``squash_price`` keeps them out.
+The noise, normal, differs in size from environment to environment of a task (the spread of Horgan et al. 2018).
 """
 
 import copy
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
+from bidex_algos.nets.architecture import Options, follow
 from bidex_algos.nets.networks import autocast
 from bidex_algos.nets.policy import DeterministicPolicy, deterministic_policy
-from bidex_algos.nets.shape import Shape
 from bidex_algos.offpolicy.base import OffPolicy, OffPolicyConfig
-from bidex_algos.offpolicy.critics import follow
 from bidex_algos.replay import Transitions
 from bidex_meta.train.learner import Parts
 from bidex_meta.utils.validation import NonNegative, check_rising
@@ -49,23 +36,17 @@ class DDPGConfig(OffPolicyConfig):
         check_rising(self, self.algo, "exploration_std")
 
 
-def of_paper() -> dict[str, Any]:
-    """What DDPG and TD3 share of the preset ``paper``, by field.
-
-    The Bi-DexHands appendix describes both (B.1.3, B.1.4) and has no table for either. Table 43 (SAC, "other tasks")
-    has layers, step size, discount, Polyak 0.99, gradient norm, 5000 steps of replay and 1 epoch of 4 mini-batches of
-    32 (here of each task); Table 49 32 steps between two reports. The noise of 0.1 is Fujimoto et al.'s (2018, section
-    6.1).
-    """
-    return {
-        "hidden": (1024, 1024, 1024), "value_heads": False, "critic_layer_norm": False, "replay_steps": 5000,
-        "warmup_steps": 32, "steps_per_iteration": 32, "updates_per_step": 4, "batch_per_task": 32, "gamma": 0.96,
-        "tau": 0.01, "learning_rate": 3e-4, "critic_learning_rate": 3e-4, "max_grad_norm": 1.0,
-        "normalise_observations": False, "per_task_rewards": False, "exploration_std": (0.1, 0.1), "squash_price": 0.0,
-    }  # fmt: skip
-
-
-PRESETS: dict[str, DDPGConfig] = {"paper": DDPGConfig(**of_paper()), "laptop": DDPGConfig()}
+OF_PAPER: Options = {
+    "hidden": (1024, 1024, 1024), "value_heads": False, "critic_layer_norm": False, "replay_steps": 5000,
+    "warmup_steps": 32, "steps_per_iteration": 32, "updates_per_step": 4, "batch_per_task": 32, "gamma": 0.96,
+    "tau": 0.01, "learning_rate": 3e-4, "critic_learning_rate": 3e-4, "max_grad_norm": 1.0,
+    "normalise_observations": False, "per_task_rewards": False, "exploration_std": (0.1, 0.1), "squash_price": 0.0,
+}  # fmt: skip
+"""What DDPG and TD3 share of the preset ``paper``. The Bi-DexHands appendix describes both (B.1.3, B.1.4) and has no
+table for either. Table 43 (SAC, "other tasks") has layers, step size, discount, Polyak 0.99, gradient norm, 5000 steps
+of replay and 1 epoch of 4 mini-batches of 32 (here of each task); Table 49 32 steps between two reports. The noise of
+0.1 is Fujimoto et al.'s (2018, section 6.1)."""
+PRESETS: dict[str, DDPGConfig] = {"paper": DDPGConfig(**OF_PAPER), "laptop": DDPGConfig()}
 
 
 class DDPG(OffPolicy):
@@ -75,6 +56,7 @@ class DDPG(OffPolicy):
     config_type, presets = DDPGConfig, PRESETS
     config: DDPGConfig
     policy: DeterministicPolicy
+    policy_of = staticmethod(deterministic_policy)
     num_critics = 1
     delayed_targets: ClassVar[bool] = True
     """Whether targets take the actions of an actor that follows the actor, and all that follow move only when the actor
@@ -95,36 +77,30 @@ class DDPG(OffPolicy):
         return torch.randn(like.shape, generator=self.generator, device=self.device)
 
     def _update(self, draw: Transitions, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
-        """One update of the critic, of the actor when it is due, and of what follows them."""
         obs, next_obs = self.policy.observations(draw.obs), self.policy.observations(draw.next_obs)
         reported = self._fit_critics(obs, draw, self._target(draw, next_obs), weights, counts)
-        due = self._actor_is_due()
-        if due:
+        if due := self._actor_is_due():
             self._policy_step(obs, draw, weights, counts)
-        if due and self.delayed_targets:
-            follow(self.target_actor, self.policy.actor, self.config.tau)
+            if self.delayed_targets:
+                follow(self.target_actor, self.policy.actor, self.config.tau)
         if due or not self.delayed_targets:
             follow(self.target_critic, self.critic, self.config.tau)
         return reported
 
     def _actor_is_due(self) -> bool:
-        """Whether the actor learns in this update."""
         return True
 
     @torch.no_grad()
     def _target(self, draw: Transitions, next_obs: Tensor) -> Tensor:
-        """What the critics shall say of the drawn transitions (B,); ``next_obs`` are normalised."""
         following = self._values(self.target_critic, next_obs, self._target_action(next_obs))
         return self._bootstrapped(draw, self._pooled(following))
 
     def _target_action(self, next_obs: Tensor) -> Tensor:
-        """What a target assumes to be done (B, a) at normalised observations (B, d)."""
         actor = self.target_actor if self.delayed_targets else self.policy.actor
         with autocast(self.device, self.low_precision):
             return actor(next_obs)
 
     def _policy_step(self, obs: Tensor, draw: Transitions, weights: Tensor, counts: Tensor) -> None:
-        """One step of the actor up the critics, on normalised observations (B, d) of ``draw``."""
         raw = self.policy.raw(obs)
         value = self._climbed(self._values(self.critic, obs, torch.tanh(raw)))
         price = self.config.squash_price * raw.square().mean(1)
@@ -133,17 +109,10 @@ class DDPG(OffPolicy):
         self.actor_loss = self._descend(loss, loss.detach()[None], "actor", actor=actor)[0]
 
     def _climbed(self, values: Tensor) -> Tensor:
-        """What the actor climbs (B,): the first critic's values."""
         return values[0]
 
     def _reported(self) -> dict[str, Tensor]:
         return {"Loss/actor": self.actor_loss}
-
-    @classmethod
-    def _make_policy(
-        cls, config: DDPGConfig, shape: Shape, init: torch.Generator, device: torch.device
-    ) -> DeterministicPolicy:
-        return deterministic_policy(config, cls._inputs(config, shape), shape, init, device)
 
     def _own_parts(self) -> Parts:
         follows = {"target_actor": self.target_actor} if self.delayed_targets else {}

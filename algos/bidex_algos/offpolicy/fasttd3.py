@@ -1,13 +1,8 @@
 """FastTD3: TD3 with categorical critics and large batches (Seo et al. 2025, arXiv 2505.22642), on all tasks of a world.
 
-    a  = mu(s) + noise                           of another size in each environment ("mixed noise")
-    a' = mu(s') + clip(noise, -c, c)             the present actor's: none follows it
-    y  = r + gamma (1 - terminated) Z'(s', a')   of the critic with the lower mean, projected on the atoms
-    Z_i  towards y by cross-entropy; mu up on min_i E Z_i(s, mu(s)), at every second update; Z' at each
-    rewards over max(deviation, largest / bound) of their task's returns, so that values fit the atoms
-
-Few updates of many transitions follow each vector step, targets follow fast, returns may take several steps (n-step),
-weights decay. All else is as in ``td3.py`` and ``categorical.py``; deviations stand in ``docs/learners/fasttd3.md``.
+Few updates of many transitions follow each vector step; targets take the present actor's actions and follow fast, mu
+climbs min_i E Z_i, returns may take several steps, weights decay; rewards are over max(deviation, largest / bound) of
+their task's returns. All else is as in ``td3.py`` and ``categorical.py``; see ``docs/learners/fasttd3.md``.
 """
 
 from dataclasses import dataclass
@@ -36,12 +31,10 @@ class FastTD3Config(CategoricalConfig, TD3Config):
 
 
 PRESETS: dict[str, FastTD3Config] = {
-    # The authors' code (github.com/younggyoseo/FastTD3, fast_td3/hyperparams.py, 2025), since the paper has no table of
-    # all. Its class for several tasks (MTBenchArgs, MetaWorldMT10Args): replay 2,048 vector steps, discount 0.97, 8
-    # steps, bound 10, rewards scaled per task. The rest its defaults (BaseArgs): batches of 32,768 in all, 2 updates a
-    # vector step from the 10th on, 101 atoms, tau 0.1, steps of 3e-4, decay 0.1, noise of 0.001 to 0.4, smoothing 0.001
-    # cut at 0.5, delay 2, clipped double Q, embedding of 32; its 0 for the gradient's norm means no limit. Layers
-    # (fast_td3/fast_td3.py): 1024 and 512 halved twice, ReLU, no layer norm.
+    # The authors' code (github.com/younggyoseo/FastTD3, fast_td3/hyperparams.py and fast_td3.py, 2025), since the paper
+    # has no table of all: replay, discount, steps, bound and scaled rewards of its class for several tasks
+    # (MTBenchArgs, MetaWorldMT10Args), the rest its defaults (BaseArgs), whose 0 for the gradient's norm means no
+    # limit.
     "paper": FastTD3Config(
         hidden=(512, 256, 128), critic_hidden=(1024, 512, 256), critic_layer_norm=False, task_embedding=32,
         replay_steps=2048, warmup_steps=10, updates_per_step=2, batch_size=32_768, gamma=0.97, n_steps=8, tau=0.1,
@@ -49,8 +42,8 @@ PRESETS: dict[str, FastTD3Config] = {
         exploration_std=(0.001, 0.4), target_std=0.001, target_bound=0.5, policy_delay=2, squash_price=0.0,
     ),
     "laptop": FastTD3Config(),
-    # Meta-World's suites on one core: discount, steps and bound of the authors' class for them, narrower layers, and
-    # one update of fewer transitions, since a vector step is 4 rows of a class here instead of hundreds.
+    # Meta-World's suites on one core: discount, steps and bound of the authors' class for them, narrower layers, one
+    # update of fewer transitions: a vector step is 4 rows of a class here instead of hundreds.
     "metaworld": FastTD3Config(
         hidden=(256, 256, 128), critic_hidden=(256, 256, 128), replay_steps=100_000, warmup_steps=500,
         steps_per_iteration=500, updates_per_step=1, batch_per_task=256, gamma=0.97, n_steps=8, tau=0.05,
@@ -69,7 +62,6 @@ class FastTD3(Categorical, TD3):
 
     @torch.no_grad()
     def _target(self, draw: Transitions, next_obs: Tensor) -> Tensor:
-        """What the critics shall say of the drawn transitions (B, atoms); ``next_obs`` are normalised."""
         following = self._following(next_obs, self._target_action(next_obs))
         return self._projected(draw, following, torch.zeros_like(draw.rewards))
 

@@ -1,34 +1,20 @@
 """MT-SAC: soft actor-critic (Haarnoja et al. 2018) on all tasks of a world at once, with a temperature for each.
 
-For each vector step of the world::
-
-    a = tanh(u), u ~ N(mean, std)(s)             one step in every environment; into the replay
-    y = r + gamma (1 - terminated) (min_i Q'_i(s', a') - alpha_k log pi(a'|s'))
-    Q_i  towards y                               i = 1, 2; on equally many transitions of each task k
-    pi   down on alpha_k log pi(a|s) - min_i Q_i(s, a)
-    log alpha_k  down on -log alpha_k (log pi(a|s) + H)      the mean over task k alone
-    Q'_i  a small step towards Q_i
-
-The target entropy H is ``target_entropy_per_action`` times the number of actions: Haarnoja's -dim(A) by default. One
-temperature for all would be set by their mean entropy: a task that is solved and one that still explores need
-different ones ("disentangled alphas"). The loss of log alpha is linear in log alpha rather than in alpha, so that its
-gradient is the gap in entropy whatever alpha is. Deviations stand in ``docs/learners/mtsac.md``.
+Q_i towards r + gamma (1 - terminated) (min_i Q'_i(s', a') - alpha_k log pi(a'|s')); pi down on alpha_k log pi - min_i
+Q_i; log alpha_k down on -log alpha_k (log pi + H), the mean over task k alone: one temperature for all would be set by
+their mean entropy, though a task that is solved and one that still explores need different ones. The loss is linear in
+log alpha, so that its gradient is the gap in entropy whatever alpha is. Deviations: ``docs/learners/mtsac.md``.
 """
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.nets.architecture import network_of
-from bidex_algos.nets.networks import MLP, use_bfloat16
-from bidex_algos.nets.normalise import ObservationNormaliser
-from bidex_algos.nets.policy import SquashedActor, SquashedPolicy
-from bidex_algos.nets.shape import Shape
+from bidex_algos.nets.architecture import Options, follow
+from bidex_algos.nets.policy import SquashedPolicy, squashed_policy
 from bidex_algos.offpolicy.base import OffPolicy, OffPolicyConfig
-from bidex_algos.offpolicy.critics import follow
 from bidex_algos.replay import Transitions
 from bidex_meta.errors import BidexError
 from bidex_meta.train.learner import Parts
@@ -61,8 +47,7 @@ class MTSACConfig(OffPolicyConfig):
             )
 
 
-# What the published settings have in common: log standard deviations from -20 to 2, one step size for all, nothing
-# normalised.
+# What the published settings have in common, with log standard deviations from -20 to 2.
 _PLAIN = MTSACConfig(
     value_heads=False, critic_layer_norm=False, init_std=1.0, std_range=(2e-9, 7.4), learning_rate=3e-4,
     critic_learning_rate=3e-4, alpha_learning_rate=3e-4, max_grad_norm=1.0, normalise_observations=False,
@@ -70,27 +55,24 @@ _PLAIN = MTSACConfig(
 )  # fmt: skip
 
 PRESETS: dict[str, MTSACConfig] = {
-    # Table 43 of the Bi-DexHands appendix (SAC, "other tasks"; it has none for MT-SAC): layers, step size, discount,
-    # Polyak 0.99, gradient norm, entropy coefficient 0.2 (here where each temperature starts), reward scale 1, 5000
-    # steps of replay, 1 epoch of 4 mini-batches of 32 (here after every vector step, and of each task). From Table 49
-    # (SAC on Humanoid) only what Table 43 leaves out: 32 steps, here between two reports. Both are silent on
-    # non-linearity, bounds of the standard deviation, target entropy and warm-up, and learn no temperature.
+    # Table 43 of the Bi-DexHands appendix (SAC, "other tasks"; it has none for MT-SAC), with its entropy coefficient
+    # 0.2 where each temperature starts and its 4 mini-batches of 32 after every vector step, of each task. From Table
+    # 49 (SAC on Humanoid) 32 steps, here between two reports. Both are silent on non-linearity, bounds of the standard
+    # deviation, target entropy and warm-up, and learn no temperature.
     "paper": replace(
         _PLAIN, hidden=(1024, 1024, 1024), replay_steps=5000, warmup_steps=32, steps_per_iteration=32,
         updates_per_step=4, batch_per_task=32, gamma=0.96, tau=0.01, init_alpha=0.2,
     ),
     "laptop": MTSACConfig(),
-    # MT-SAC as Meta-World's baselines run it, with one environment of each task: 128 transitions of each task in an
-    # update, one update a vector step, 100,000 transitions of each task.
+    # MT-SAC as Meta-World's baselines run it, with one environment of each task.
     "metaworld": replace(
         _PLAIN, hidden=(400, 400, 400), replay_steps=100_000, warmup_steps=4000, steps_per_iteration=500,
         updates_per_step=1, batch_per_task=128, gamma=0.99, tau=0.005, adam_eps=1e-5, init_alpha=1.0,
     ),
 }  # fmt: skip
 
-# Table 49; its 2 epochs of one mini-batch are made after every vector step, as in ``paper``. Its replay of 40,000
-# counts vector steps, as everywhere here, and ends where ``replay_memory`` does.
-_TABLE_49: dict[str, Any] = {
+# Table 49; its 2 epochs of one mini-batch are made after every vector step; its replay of 40,000 counts vector steps.
+_TABLE_49: Options = {
     "replay_steps": 40_000, "steps_per_iteration": 32, "updates_per_step": 2, "batch_per_task": 64, "gamma": 0.99,
     "tau": 0.005, "learning_rate": 3e-4, "critic_learning_rate": 3e-4, "init_alpha": 0.2, "max_grad_norm": 1.0,
 }  # fmt: skip
@@ -109,7 +91,7 @@ class MTSAC(OffPolicy):
     config_type, presets = MTSACConfig, PRESETS
     config: MTSACConfig
     policy: SquashedPolicy
-    actor_network: ClassVar[type[MLP] | None] = None
+    policy_of = staticmethod(squashed_policy)
 
     def __init__(self, world: VectorWorld, config: MTSACConfig, seed: int):
         super().__init__(world, config, seed)
@@ -121,7 +103,6 @@ class MTSAC(OffPolicy):
         return self.policy.sample(self.policy.observations(obs), self.generator)[0]
 
     def _update(self, draw: Transitions, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
-        """One update of critics, actor, temperatures and target critics; losses, entropy and values."""
         obs, next_obs = self.policy.observations(draw.obs), self.policy.observations(draw.next_obs)
         reported = self._fit_critics(obs, draw, self._target(draw, next_obs), weights, counts)
         reported |= self._policy_step(obs, weights, counts)
@@ -130,13 +111,11 @@ class MTSAC(OffPolicy):
 
     @torch.no_grad()
     def _target(self, draw: Transitions, next_obs: Tensor) -> Tensor:
-        """What the critics shall say of the drawn transitions (B,); ``next_obs`` are normalised."""
         next_actions, log_prob = self.policy.sample(next_obs, self.generator)
         following = self._pooled(self._values(self.target_critic, next_obs, next_actions))
         return self._bootstrapped(draw, following - self.log_alpha.exp()[self.task_of_draw] * log_prob)
 
     def _policy_step(self, obs: Tensor, weights: Tensor, counts: Tensor) -> dict[str, Tensor]:
-        """One step of actor and temperatures, on normalised observations (B, d)."""
         weight = weights / counts.sum().clamp_min(1.0)
         actions, log_prob = self.policy.sample(obs, self.generator)
         alpha = self.log_alpha.detach().exp()[self.task_of_draw]
@@ -150,22 +129,11 @@ class MTSAC(OffPolicy):
         return dict(zip(["Loss/actor", "Policy/entropy"], numbers, strict=True))
 
     def _gap_that_counts(self, gap: Tensor) -> Tensor:
-        """The gap in entropy that each task's temperature follows, of the tasks' own (num_tasks,)."""
         return gap
 
     def _reported(self) -> dict[str, Tensor]:
         alphas = self.log_alpha.detach().exp()
         return {f"Policy/alpha/{name}": alpha for name, alpha in zip(self.world.task_names, alphas, strict=True)}
-
-    @classmethod
-    def _make_policy(
-        cls, config: MTSACConfig, shape: Shape, init: torch.Generator, device: torch.device
-    ) -> SquashedPolicy:
-        inputs, heads = cls._inputs(config, shape), shape.num_id_columns if config.policy_heads else 1
-        sizes, network = (config.hidden, shape.actions, heads), cls.actor_network or network_of(config)
-        actor = SquashedActor(inputs, *sizes, config.init_std, config.std_range, init, config.activation, network)
-        observations = ObservationNormaliser(inputs, config.normalise_observations)
-        return SquashedPolicy(observations, actor, use_bfloat16(config.autocast, device)).to(device)
 
     def _own_parts(self) -> Parts:
         return {"log_alpha": self.log_alpha}
@@ -174,8 +142,7 @@ class MTSAC(OffPolicy):
 class SAC(MTSAC):
     """Multi-task SAC (Haarnoja et al. 2018, arXiv 1812.05905) on a batched world.
 
-    The same learner with the presets of a single task; those of MT-SAC are made of Table 43, SAC's own, which has the
-    same numbers in all of its columns.
+    MT-SAC, whose presets are made of Table 43, SAC's own: it has the same numbers in all of its columns.
     """
 
     task_presets = TASK_PRESETS

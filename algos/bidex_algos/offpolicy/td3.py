@@ -1,18 +1,14 @@
 """TD3: DDPG with three changes (Fujimoto et al. 2018; Bi-DexHands' appendix B.1.4), on all tasks of a world at once.
 
-    a' = mu'(s') + clip(noise, -c, c)            targets are smoothed over actions,
-    y  = r + gamma (1 - terminated) min_i Q'_i(s', a')        taken from the lower of two critics,
-    mu, mu', Q'  at every second update          and the actor waits for the critics
-
-All else is as in ``ddpg.py``.
+Targets are smoothed over actions, a' = mu'(s') + clip(noise, -c, c), and taken from the lower of two critics; the actor
+and all targets wait for the critics, and move at every second update.
 """
 
 from dataclasses import dataclass
 
 from torch import Tensor
 
-from bidex_algos.offpolicy.ddpg import DDPG, DDPGConfig, of_paper
-from bidex_meta.train.learner import State
+from bidex_algos.offpolicy.ddpg import DDPG, OF_PAPER, DDPGConfig
 from bidex_meta.utils.validation import Count, NonNegative
 from bidex_meta.world.contract import VectorWorld
 
@@ -31,7 +27,7 @@ class TD3Config(DDPGConfig):
 
 # Smoothing and delay of "paper" are those of Fujimoto et al. (2018, section 6.1), as are the defaults.
 PRESETS: dict[str, TD3Config] = {
-    "paper": TD3Config(**of_paper()),
+    "paper": TD3Config(**OF_PAPER),
     "laptop": TD3Config(),
     # Meta-World's suites: discount, Polyak, layers, replay and batches are those of MT-SAC's preset of that name.
     "metaworld": TD3Config(
@@ -49,6 +45,7 @@ class TD3(DDPG):
     config_type, presets = TD3Config, PRESETS
     config: TD3Config
     num_critics = 2
+    going_on = ("updates", *DDPG.going_on)
 
     def __init__(self, world: VectorWorld, config: TD3Config, seed: int):
         super().__init__(world, config, seed)
@@ -62,10 +59,3 @@ class TD3(DDPG):
         action, bound = super()._target_action(next_obs), self.config.target_bound
         noise = self.config.target_std * self._normal(action)
         return (action + noise.clamp(-bound, bound)).clamp(-1.0, 1.0)
-
-    def _place(self) -> State:
-        return {"updates": self.updates, **super()._place()}
-
-    def _go_on_from(self, state: State) -> None:
-        super()._go_on_from(state)
-        self.updates = int(state["updates"])

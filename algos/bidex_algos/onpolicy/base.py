@@ -3,52 +3,39 @@
 from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from bidex_algos.advantages import (
-    discounts,
-    explained_variance,
-    gae,
-    normalise_per_task,
-    successor_values,
-    task_moments,
-)
+from bidex_algos import advantages as estimates
 from bidex_algos.learner import Learner, as_numbers
-from bidex_algos.nets.architecture import ArchitectureConfig, network_bytes, network_of
+from bidex_algos.nets.architecture import ArchitectureConfig, NetworkConfig, Options, network_bytes, network_of
 from bidex_algos.nets.networks import Activation, Autocast, Layers, autocast, gaussian_log_prob
 from bidex_algos.nets.normalise import RunningStats
-from bidex_algos.nets.policy import GaussianPolicy, gaussian_policy
-from bidex_algos.nets.shape import Shape
+from bidex_algos.nets.policy import GaussianPolicy, gaussian_policy, of_head
 from bidex_algos.onpolicy.ppo import mini_batches
 from bidex_algos.rollout import EpisodeStatistics, Rollout, collect
 from bidex_meta.errors import BidexError
 from bidex_meta.train.distributed import all_sum, world_size
 from bidex_meta.train.learner import Parts, State
-from bidex_meta.utils.validation import Count, Fraction, Positive, Whole, Widths, check_rising
+from bidex_meta.utils.validation import Count, Fraction, Positive, check_rising
 from bidex_meta.world.contract import VectorWorld
 
 
 @dataclass(frozen=True)
-class OnPolicyConfig(ArchitectureConfig):
+class _ValueHeads(ArchitectureConfig):
+    value_heads: bool = True
+    """Give the critic one output per task instead of one for all."""
+
+
+@dataclass(frozen=True)
+class OnPolicyConfig(NetworkConfig, _ValueHeads):
     """Networks, rollouts, statistics; the defaults are the preset ``laptop``."""
 
     hidden: Layers = (256, 256, 128)
     """Widths of the hidden layers, of actor and critic alike."""
     activation: Activation = "elu"
     """Non-linearity of the hidden layers."""
-    value_heads: bool = True
-    """Give the critic one output per task instead of one for all."""
-    policy_heads: bool = False
-    """Give the actor an output layer per task; the world must show the task's one-hot."""
-    task_embedding: Whole = 0
-    """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
-    point_widths: Widths = (32, 64)
-    """Widths of the layers that all points of a point cloud share (PointNet), where the world shows one."""
-    points_read: Whole = 0
-    """Points of a cloud that they read, evenly out of all; 0: all."""
     init_std: Positive = 0.8
     """Standard deviation of the actions at the start."""
     std_range: tuple[Positive, Positive] = (0.05, 1.5)
@@ -79,7 +66,7 @@ class OnPolicyConfig(ArchitectureConfig):
         return 4 * num_envs * width * self.rollout_steps + network_bytes(self.hidden, width, 2)
 
 
-TABLE_47: dict[str, Any] = {
+TABLE_47: Options = {
     "hidden": (2048, 1024, 512), "value_heads": False, "init_std": 0.8, "rollout_steps": 8, "num_minibatches": 4,
     "gamma": 0.96, "lam": 0.95, "max_grad_norm": 1.0, "normalise_observations": False,
 }  # fmt: skip
@@ -104,13 +91,13 @@ class Batch:
         return Batch(**{name: value.index_select(0, index) for name, value in vars(self).items()})
 
 
-def check_samples(name: str, config: Any, num_envs: int) -> None:
+def check_samples(name: str, rollout_steps: int, num_envs: int, num_minibatches: int) -> None:
     """Refuses a rollout of fewer samples than mini-batches."""
-    samples = config.rollout_steps * num_envs
-    if samples < config.num_minibatches:
+    samples = rollout_steps * num_envs
+    if samples < num_minibatches:
         raise BidexError(
-            f"{name}: {config.num_minibatches} mini-batches need as many samples, but {num_envs} environments x "
-            f"{config.rollout_steps} steps give {samples}. Raise num_envs or lower num_minibatches."
+            f"{name}: {num_minibatches} mini-batches need as many samples, but {num_envs} environments x "
+            f"{rollout_steps} steps give {samples}. Raise num_envs or lower num_minibatches."
         )
 
 
@@ -121,6 +108,8 @@ class OnPolicy(Learner):
     policy: GaussianPolicy
     discounts_by_class = True
     per_process = ("generator", "episodes", "obs")
+    going_on = ("obs", *Learner.going_on)
+    policy_of = staticmethod(gaussian_policy)
     num_critics = 1
 
     def __init__(self, world: VectorWorld, config: OnPolicyConfig, seed: int):
@@ -130,15 +119,14 @@ class OnPolicy(Learner):
         self.critic = self._make_critic(world.num_tasks if config.value_heads else 1).to(self.device)
         horizon = config.value_horizon * config.rollout_steps * world.num_envs * world_size() / world.num_tasks
         self.return_stats = RunningStats((self.num_critics * world.num_tasks,), max_count=horizon).to(self.device)
-        self.gamma = discounts(world, config.gamma, world.task_id)
+        self.gamma = estimates.discounts(world, config.gamma, world.task_id)
         sizes = self.shape.observations, self.shape.actions
         self.rollout = Rollout(config.rollout_steps, world.num_envs, *sizes, self.device, self.num_critics)
         self.episodes = EpisodeStatistics(world.task_id, world.task_names)
 
     def _make_critic(self, heads: int) -> nn.Module:
-        """The critic, with one output per task or one for all."""
-        make = network_of(self.config)
-        return make(self.inputs, self.config.hidden, heads, 1.0, self.initial, self.config.activation)
+        config = self.config
+        return network_of(config)(self.inputs, config.hidden, heads, 1.0, self.initial, config.activation)
 
     @abstractmethod
     def _update(self, batch: Batch) -> dict[str, Tensor]:
@@ -149,7 +137,6 @@ class OnPolicy(Learner):
         """The optimisers by their names in a checkpoint."""
 
     def _iterate(self) -> dict[str, float]:
-        """Collects one rollout and learns from it."""
         with self._collecting():
             if self.obs is None:
                 self.obs = self._first_observations()
@@ -174,12 +161,9 @@ class OnPolicy(Learner):
     def _critic(self, obs: Tensor, task_id: Tensor) -> Tensor:
         with autocast(self.device, self.low_precision):
             out = self.critic(obs)
-        if self.config.value_heads:
-            return out.gather(1, task_id[:, None]).squeeze(1)
-        return out.squeeze(1)
+        return of_head(out, task_id) if self.config.value_heads else out.squeeze(1)
 
     def _element(self, task_id: Tensor) -> Tensor:
-        """Where the returns of a task (B,) stand in the statistics: (B,), of several critics (B, critics)."""
         if self.num_critics == 1:
             return task_id
         return task_id[:, None] + self.world.num_tasks * torch.arange(self.num_critics, device=self.device)
@@ -191,24 +175,20 @@ class OnPolicy(Learner):
         return self.return_stats.normalise(returns, self._element(task_id)) if self.config.per_task_values else returns
 
     def _merge_returns(self, mean: Tensor, var: Tensor, count: Tensor) -> None:
-        """Takes a rollout's moments of returns into the statistics, which are the critic's units from now on."""
         self.return_stats.merge(mean, var, count)
 
     def _mini_batches(self, weights: Tensor, epochs: int, number: int) -> Iterator[tuple[bool, Tensor, Tensor]]:
-        """:func:`~bidex_algos.onpolicy.ppo.mini_batches` in the learner's own order."""
         return mini_batches(weights, epochs, number, self.generator)
 
     @torch.no_grad()
     def _prepare(self) -> tuple[Batch, Tensor]:
-        """Turns the rollout into a batch; also the explained variance per task (num_tasks,)."""
         r, cfg, num_tasks = self.rollout, self.config, self.world.num_tasks
         steps, rows = r.rewards.shape
         task_id = self.world.task_id
         flat_task_id = task_id.expand(steps, rows).reshape(-1)
         obs = self.policy.observations(r.obs).flatten(0, 1)
         if self.low_precision:
-            # Autocast would make this cast in every mini-batch; the result is the same.
-            obs = obs.bfloat16()
+            obs = obs.bfloat16()  # autocast would make this cast in every mini-batch; the result is the same
 
         # Several critics make several columns of a row, each like a row of its own.
         def each(x: Tensor) -> Tensor:
@@ -218,15 +198,14 @@ class OnPolicy(Learner):
         values, last_values = judged.view(steps, -1), self._final_value(r.last_obs, task_id).view(-1)
         rewards, terminated, ended, valid = map(each, (r.rewards, r.terminated, r.ended, r.valid))
         element, elements = self._element(task_id).reshape(-1), self.num_critics * num_tasks
-        next_values = successor_values(values, last_values, ended, r.final_values.flatten(1))
+        next_values = estimates.successor_values(values, last_values, ended, r.final_values.flatten(1))
         gamma = each(self.gamma[None]) if isinstance(self.gamma, Tensor) else self.gamma
-        advantages = gae(rewards, values, next_values, terminated, ended, gamma, cfg.lam, valid)
+        advantages = estimates.gae(rewards, values, next_values, terminated, ended, gamma, cfg.lam, valid)
         returns = advantages + values
-        explained = explained_variance(values, returns, element, elements, valid).view(-1, num_tasks).mean(0)
-        self._merge_returns(*task_moments(returns, element, elements, valid))
+        explained = estimates.explained_variance(values, returns, element, elements, valid)
+        self._merge_returns(*estimates.task_moments(returns, element, elements, valid))
         group = element if cfg.per_task_advantages else element // num_tasks * num_tasks
-        advantages = normalise_per_task(advantages, group, elements, valid)
-
+        advantages = estimates.normalise_per_task(advantages, group, elements, valid)
         actions, old_means = r.actions.flatten(0, 1), r.means.flatten(0, 1)
         batch = Batch(
             obs=obs, task_id=flat_task_id, actions=actions, old_means=old_means,
@@ -235,7 +214,7 @@ class OnPolicy(Learner):
             targets=self._in_critic_units(returns.reshape(judged.shape), flat_task_id),
             weights=r.valid.flatten().float()
         )  # fmt: skip
-        return batch, explained
+        return batch, explained.view(-1, num_tasks).mean(0)
 
     def _metrics(self, losses: dict[str, Tensor], explained: Tensor) -> dict[str, float]:
         tensors = dict(losses)
@@ -245,29 +224,11 @@ class OnPolicy(Learner):
             tensors[f"Value/explained_variance/{name}"] = value
         return self.episodes.metrics() | as_numbers(tensors)
 
-    @classmethod
-    def _make_policy(
-        cls, config: OnPolicyConfig, shape: Shape, init: torch.Generator, device: torch.device
-    ) -> GaussianPolicy:
-        return gaussian_policy(config, cls._inputs(config, shape), shape, init, device)
-
     def _parts(self) -> Parts:
-        return {
-            "critic": self.critic,
-            "return_stats": self.return_stats,
-            **self._optimisers(),
-            "generator": self.generator,
-            "episodes": self.episodes,
-        }
-
-    def _place(self) -> State:
-        return {"obs": self.obs, **super()._place()}
-
-    def _go_on_from(self, state: State) -> None:
-        super()._go_on_from(state)
-        self.obs = None if state["obs"] is None else state["obs"].to(self.device, copy=True)
+        shared = {"critic": self.critic, "return_stats": self.return_stats, **self._optimisers()}
+        return shared | {"generator": self.generator, "episodes": self.episodes}
 
     def _check_size(self, state: State) -> None:
         if state["obs"] is not None:
-            expected = tuple(self.rollout.last_obs.shape)
-            self._expect("(num_envs, observations) = ", tuple(state["obs"].shape), expected)
+            shapes = tuple(state["obs"].shape), tuple(self.rollout.last_obs.shape)
+            self._expect("(num_envs, observations) = ", *shapes)

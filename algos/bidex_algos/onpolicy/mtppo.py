@@ -1,25 +1,26 @@
 """MT-PPO: proximal policy optimisation (Schulman et al. 2017) on all tasks of a world at once.
 
-One policy reads the task's one-hot in its observation. An iteration collects ``rollout_steps`` steps in every
-environment, then makes ``epochs`` passes over them in shuffled mini-batches. What is done differently from Bi-DexHands'
-MTPPO, and why, stands in ``docs/learners/mtppo.md``.
+One policy reads the task's one-hot in its observation. What is done differently from Bi-DexHands' MTPPO, and why,
+stands in ``docs/learners/mtppo.md``.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
 
 import torch
 from torch import Tensor
 
-from bidex_algos.balancing import Balancing, balance_of
+from bidex_algos.balancing import Balance, Balancing, Famo, GradientBalance, conflict_averse, project_conflicting
+from bidex_algos.nets.architecture import Options
 from bidex_algos.nets.networks import autocast
+from bidex_algos.nets.policy import GaussianPolicy
 from bidex_algos.onpolicy.base import TABLE_47, Batch, OnPolicy, OnPolicyConfig, check_samples
-from bidex_algos.onpolicy.demonstrations import Demonstrations
-from bidex_algos.onpolicy.ppo import NAMES, PolicyLoss, PPOConfig, policy_loss
-from bidex_algos.step_size import AdaptiveAdams
+from bidex_algos.onpolicy.ppo import NAMES, AdaptiveAdams, PolicyLoss, PPOConfig, policy_loss
 from bidex_meta.data.joined import Joined
-from bidex_meta.train.distributed import sum_gradients, world_size
+from bidex_meta.errors import BidexError
+from bidex_meta.train.distributed import own_seed, sum_gradients, world_size
 from bidex_meta.train.learner import Parts, State
 from bidex_meta.utils.validation import BelowOne, Count, Finite, NonNegative, Positive, Whole
 from bidex_meta.world.contract import VectorWorld
@@ -67,9 +68,9 @@ PRESETS: dict[str, MTPPOConfig] = {
         value_loss_weight=2.0, entropy_weight=0.0,
     ),
     "laptop": MTPPOConfig(),
-    # Meta-World's multi-task suites: discount, trace and clip are those of the MTPPO that its authors publish
-    # (metaworld-algorithms). A rollout is 100 steps instead of their 10,000 and the networks are small: on MT3 one of
-    # 250 steps (ELU, 8 mini-batches) had learned less after 150 k steps: 24 against 42 % in training, one seed each.
+    # Meta-World's multi-task suites: discount, trace and clip of its authors' MTPPO (metaworld-algorithms). Networks
+    # are small, rollouts 100 steps instead of 10,000: of 250 (ELU, 8 mini-batches) MT3 was at 24 % after 150 k steps,
+    # not 42.
     "metaworld": MTPPOConfig(
         hidden=(256, 256, 128), activation="tanh", init_std=0.8, rollout_steps=100, num_minibatches=4, epochs=5,
         clip=0.2, gamma=0.99, lam=0.97, learning_rate=5e-4, desired_kl=0.02, std_range=(0.1, 1.5),
@@ -79,7 +80,7 @@ PRESETS: dict[str, MTPPOConfig] = {
 # Table 42, column "Other Tasks". What it does not name is as in Table 47.
 _SINGLE = replace(PRESETS["paper"], hidden=(1024, 1024, 512), gamma=0.96)
 # Table 50. What it does not name is as in Table 47 (``paper``) or as for hands (``laptop``, of narrower layers).
-_TABLE_50: dict[str, Any] = {
+_TABLE_50: Options = {
     "rollout_steps": 32, "epochs": 5, "num_minibatches": 4, "clip": 0.1, "learning_rate": 3e-4, "gamma": 0.99,
     "lam": 0.95, "init_std": 1.0, "desired_kl": 0.01, "max_grad_norm": 1.0, "entropy_weight": 0.0,
 }  # fmt: skip
@@ -95,6 +96,65 @@ TASK_PRESETS: dict[str, dict[str, MTPPOConfig]] = {
 }
 
 
+_DEMONSTRATED = 0xDE30  # tells their draws apart from the learner's, which are the same with and without
+
+
+class Demonstrations:
+    """Transitions to be imitated beside reinforcement; some tasks may have none.
+
+    A term of behaviour cloning, which fades, as in DAPG (Rajeswaran et al. 2018, arXiv 1709.10087, equation 6), with
+    normalised advantages in the place of their weight by the largest one.
+    """
+
+    def __init__(self, data: Joined, config: MTPPOConfig, seed: int, device: torch.device):
+        self._config, self.fingerprint = config, data.fingerprint()
+        self._obs = data.observations.index_select(0, data.at).to(device)
+        self._actions = data.actions.to(device)
+        counts = torch.bincount(data.task)
+        self._of_task = torch.argsort(data.task, stable=True).to(device)
+        self._first = (counts.cumsum(0) - counts)[counts > 0].to(device)
+        self._count = counts[counts > 0].to(device)
+        self.generator = torch.Generator(device).manual_seed(own_seed(seed) ^ _DEMONSTRATED)
+
+    def weight(self, env_steps: int) -> float:
+        """Weight of the term after so many environment steps: halved every ``demonstration_half_life``."""
+        return self._config.demonstration_weight * 0.5 ** (env_steps / self._config.demonstration_half_life)
+
+    def draw(self) -> tuple[Tensor, Tensor]:
+        """Raw observations (B, d) and actions (B, a), each task that has some equally often on average."""
+        size, device = (self._config.demonstration_batch,), self._obs.device
+        task = torch.randint(len(self._count), size, generator=self.generator, device=device)
+        # The remainder of a number this large favours none by more than 1 in 2^40 / transitions.
+        place = torch.randint(2**40, size, generator=self.generator, device=device) % self._count[task]
+        chosen = self._of_task[self._first[task] + place]
+        return self._obs[chosen], self._actions[chosen]
+
+    def loss(self, policy: GaussianPolicy) -> Tensor:
+        """Mean of (a - mean)^2 / (2 std^2), summed over actions; deviations, which rewards alone move, get no slope."""
+        raw, actions = self.draw()
+        obs = policy.observations(raw)
+        with autocast(raw.device, policy.low_precision):
+            means = policy.actor(obs)
+        return imitation(actions, means.float(), policy.actor.log_std_of(obs).detach())
+
+    def clone(self, policy: GaussianPolicy) -> None:
+        """Behaviour cloning before anything is played: statistics of observations, then steps of the mean alone."""
+        policy.observations.update(self._obs)
+        weights = list(policy.actor.parameters())
+        adam = torch.optim.Adam(weights, lr=1e-3)
+        for _ in range(self._config.demonstration_cloning):
+            adam.zero_grad()
+            loss = self.loss(policy) / world_size()
+            loss.backward()
+            sum_gradients(weights, loss.detach()[None])
+            adam.step()
+
+
+def imitation(actions: Tensor, means: Tensor, log_std: Tensor) -> Tensor:
+    """Half the mean squared distance, in standard deviations, of actions (B, a) from means (B, a): a scalar."""
+    return 0.5 * ((actions - means) / log_std.exp()).square().sum(-1).mean()
+
+
 class MTPPO(OnPolicy):
     """Multi-task PPO (Schulman et al. 2017, arXiv 1707.06347) on a batched world."""
 
@@ -105,10 +165,16 @@ class MTPPO(OnPolicy):
     demonstrations: Demonstrations | None = None
 
     def __init__(self, world: VectorWorld, config: MTPPOConfig, seed: int):
-        check_samples(self.name, config, world.num_envs)
+        check_samples(self.name, config.rollout_steps, world.num_envs, config.num_minibatches)
         super().__init__(world, config, seed)
         self.adams = AdaptiveAdams(self.policy.actor.parameters(), self.critic.parameters(), config, self.device)
-        self.balance = balance_of(config, world.num_tasks, self.device)
+        balances: dict[Balancing, Callable[[], Balance | None]] = {
+            "none": lambda: None,  # the losses are summed
+            "pcgrad": lambda: GradientBalance(project_conflicting),
+            "cagrad": lambda: GradientBalance(partial(conflict_averse, radius=config.cagrad_radius)),
+            "famo": lambda: Famo(world.num_tasks, config.famo_rate, config.famo_decay, self.device),
+        }
+        self.balance = balances[config.gradient_surgery]()
 
     def learn_from_demonstrations(self, data: Joined) -> None:
         """Takes what the policy shall imitate too; before the first iteration and before a checkpoint is loaded."""
@@ -122,22 +188,18 @@ class MTPPO(OnPolicy):
         return super()._iterate()
 
     def _imitated(self) -> float:
-        """Weight of the demonstrations in this update, 0 without any."""
         return 0.0 if self.demonstrations is None else self.demonstrations.weight(self.env_steps)
 
     def _critic_alone(self) -> bool:
-        """Whether the policy stays as it is in this iteration, and with it what it sees."""
         return self.env_steps < self.config.critic_first
 
     def _optimisers(self) -> Parts:
         return self.adams.parts() | (self.balance.parts() if self.balance is not None else {})
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
-        """PPO's update: returns the means over all mini-batches of what it measured."""
         cfg, actor, critic_alone = self.config, self.policy.actor, self._critic_alone()
         old_log_std = actor.log_std.detach().clone()
-        low, high = (math.log(std) for std in cfg.std_range)
-        measured: list[Tensor] = []
+        (low, high), measured = (math.log(std) for std in cfg.std_range), list[Tensor]()
         for first, index, count in self._mini_batches(batch.weights, cfg.epochs, cfg.num_minibatches):
             part = batch.select(index)
             measured.append(self._gradients(part, count, old_log_std))
@@ -146,11 +208,8 @@ class MTPPO(OnPolicy):
                 actor.log_std.clamp_(low, high)
                 if self.balance is not None:
                     self.balance.learn(lambda b=part, n=count: self._above_least(b, n, old_log_std))
-        names = list(NAMES)
-        if self.balance is not None:
-            names.append(self.balance.tag)
-        if self._imitated():
-            names.append("Loss/demonstrations")
+        names = [*NAMES, *([] if self.balance is None else [self.balance.tag])]
+        names += ["Loss/demonstrations"] * bool(self._imitated())
         means = torch.stack(measured).mean(0)
         reported = {**dict(zip(names, means, strict=True)), "Policy/lr": self.adams.rate}
         if self.demonstrations is not None:
@@ -158,7 +217,6 @@ class MTPPO(OnPolicy):
         return reported
 
     def _gradients(self, b: Batch, count: Tensor, old_log_std: Tensor) -> Tensor:
-        """Puts the gradients of a mini-batch into the parameters; ``count`` samples are in it, over all processes."""
         cfg, actor = self.config, self.policy.actor
         loss = self._loss(b, count, old_log_std)
         value = (b.weights / count * (self._critic(b.obs, b.task_id) - b.targets).square()).sum()
@@ -179,7 +237,6 @@ class MTPPO(OnPolicy):
         return sum_gradients([*actor.parameters(), *self.critic.parameters()], torch.stack(numbers))
 
     def _loss(self, b: Batch, count: Tensor, old_log_std: Tensor) -> PolicyLoss:
-        """The present actor's loss on a mini-batch."""
         actor = self.policy.actor
         with autocast(self.device, self.low_precision):
             means = actor(b.obs)
@@ -193,25 +250,27 @@ class MTPPO(OnPolicy):
         return -b.weights / count * (b.advantages + self.config.clip * b.advantages.abs())
 
     def _above_least(self, b: Batch, count: Tensor, old_log_std: Tensor) -> Tensor:
-        """How far each task's surrogate loss is above that, (num_tasks,)."""
         loss = self._loss(b, count, old_log_std)
         return self._per_task(-loss.earned - self._least(b, count), b.task_id)
 
     def _parts(self) -> Parts:
-        more = {} if self.demonstrations is None else {"demonstrated": self.demonstrations.generator}
-        return super()._parts() | more
+        own = self.demonstrations
+        return super()._parts() | ({} if own is None else {"demonstrated": own.generator})
 
     def _place(self) -> State:
-        more = {} if self.demonstrations is None else {"demonstrations": self.demonstrations.fingerprint}
-        return super()._place() | more
+        own = self.demonstrations
+        return super()._place() | ({} if own is None else {"demonstrations": own.fingerprint})
 
     def _check_size(self, state: State) -> None:
         super()._check_size(state)
-        if self.demonstrations is not None:
-            self.demonstrations.check(self.name, state.get("demonstrations"))
+        stored, own = state.get("demonstrations"), self.demonstrations
+        if own is not None and stored is not None and stored != own.fingerprint:
+            raise BidexError(
+                f"{self.name}: the checkpoint's demonstrations are others ({stored['transitions']:,.0f} transitions, "
+                f"here {own.fingerprint['transitions']:,.0f}). Resume with the run's own data set."
+            )
 
     def _per_task(self, x: Tensor, task_id: Tensor) -> Tensor:
-        """Sums (num_tasks,) of what each sample has (B,)."""
         return x.new_zeros(self.world.num_tasks).index_add(0, task_id, x)
 
 

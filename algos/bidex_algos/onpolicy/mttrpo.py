@@ -1,12 +1,8 @@
 """MT-TRPO: trust-region policy optimisation (Schulman et al. 2015) on all tasks of a world at once.
 
-One policy reads the task's one-hot in its observation. An update, in the order of the code below:
-
-1. g, the gradient of the surrogate, the mean of ratio x advantage;
-2. s = F^-1 g by conjugate gradients, F the Fisher matrix of means and standard deviations alike;
-3. the step sqrt(2 max_kl / s^T F s) s, whose KL is max_kl to second order;
-4. back along it until surrogate and KL, measured against the policy that sampled, are what was asked for;
-5. some epochs of mini-batches for the critic.
+An update goes along s = F^-1 g (conjugate gradients; g of the mean of ratio x advantage, F the Fisher matrix of means
+and deviations alike), sqrt(2 max_kl / s^T F s) s far, and back until surrogate and KL are what was asked for; then the
+critic learns in some epochs of mini-batches.
 """
 
 import math
@@ -78,7 +74,6 @@ def gaussian_step(
     weight = b.weights / all_sum(b.weights.sum()).clamp_min(1.0)
 
     def surrogate_and_kl() -> tuple[Tensor, Tensor]:
-        """This process's part of the surrogate objective and of the KL from the sampling policy, scalars."""
         mean, log_std = distribution()
         ratio = torch.exp(gaussian_log_prob(b.actions, mean, log_std) - b.old_log_probs)
         return (weight * ratio * gain).sum(), (weight * gaussian_kl(b.old_means, old_log_std, mean, log_std)).sum()
@@ -89,8 +84,8 @@ def gaussian_step(
         objective, kl = all_sum(torch.stack(surrogate_and_kl())).tolist()
         return objective, kl
 
-    stepped = trust_region_step(parameters, surrogate_and_kl()[0], own_kl, measure, config, max_kl, config.accept_ratio)
-    return stepped.reported("Policy/kl", weight.device)
+    surrogate, ratio = surrogate_and_kl()[0], config.accept_ratio
+    return trust_region_step(parameters, surrogate, own_kl, measure, config, max_kl, "Policy/kl", ratio)
 
 
 def kl_from_itself(
@@ -120,7 +115,6 @@ class MTTRPO(OnPolicy):
         return {"critic_adam": self.critic_adam}
 
     def _update(self, batch: Batch) -> dict[str, Tensor]:
-        """TRPO's update: returns what it measured, among it the KL after the step."""
         actor, cfg = self.policy.actor, self.config
 
         def distribution() -> tuple[Tensor, Tensor]:
@@ -147,7 +141,6 @@ class MTTRPO(OnPolicy):
         return kl_from_itself(distribution, batch.weights, self.world.num_envs, self.config.fisher_stride)
 
     def _critic_epochs(self, batch: Batch) -> Tensor:
-        """Fits the critic to its targets; the mean loss over all mini-batches, a scalar."""
         cfg, parameters = self.config, list(self.critic.parameters())
         losses: list[Tensor] = []
         for _, index, count in self._mini_batches(batch.weights, cfg.critic_epochs, cfg.num_minibatches):
@@ -164,8 +157,7 @@ class MTTRPO(OnPolicy):
 class TRPO(MTTRPO):
     """Multi-task TRPO (Schulman et al. 2015, arXiv 1502.05477) on a batched world.
 
-    The same learner with the presets of a single task. There is no table for TRPO: networks of Table 42, the rest as
-    for MT-TRPO.
+    MT-TRPO with the presets of a single task: networks of Table 42, the rest as there, since TRPO has no table.
     """
 
     presets = PRESETS | {"paper": replace(PRESETS["paper"], hidden=(1024, 1024, 512))}

@@ -1,15 +1,15 @@
-"""PPO's loss (Schulman et al. 2017, equations 7 and 9): of MT-PPO's transitions and of RL²'s chunks of trials."""
+"""PPO's loss (Schulman et al. 2017, equations 7 and 9), mini-batches, and Adam with a step size that follows the KL."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from bidex_algos.nets.networks import gaussian_entropy, gaussian_kl, gaussian_log_prob
 from bidex_meta.train.distributed import all_sum
-from bidex_meta.train.learner import LearnerConfig
+from bidex_meta.train.learner import LearnerConfig, Parts, State
 from bidex_meta.utils.validation import Count, Positive, check_rising
 
 
@@ -40,16 +40,13 @@ class PPOConfig(LearnerConfig):
 
 
 def mini_batches(
-    weights: Tensor,
-    epochs: int,
-    number: int,
-    generator: torch.Generator,
-    split: Callable[[Tensor, int], Sequence[Tensor]] = Tensor.chunk,
-) -> Iterator[tuple[bool, Tensor, Tensor]]:
+    weights: Tensor, epochs: int, number: int, generator: torch.Generator,
+    split: Callable[[Tensor, int], Sequence[Tensor]] = Tensor.chunk
+) -> Iterator[tuple[bool, Tensor, Tensor]]:  # fmt: skip
     """Passes over shuffled samples with ``weights`` (B,), in the order of PPO's epochs.
 
-    Divided by the count, which is of all processes, losses and gradients become means by being summed over them. Yields
-    whether it is the very first, the samples int64 (b,), and the sum of their weights, at least 1.
+    Yields whether it is the very first, the samples int64 (b,), and the sum of their weights over all processes, at
+    least 1.
     """
     for epoch in range(epochs):
         parts = split(torch.randperm(len(weights), generator=generator, device=weights.device), number)
@@ -93,3 +90,86 @@ def policy_loss(
         kl = (weights * gaussian_kl(old_means, old_log_std, means, log_std)).sum()
         outside = (weights * ((ratio - 1.0).abs() > clip)).sum()
     return PolicyLoss(-earned.sum(), entropy, kl, outside, earned)
+
+
+def factor_of(kl: Tensor, desired_kl: float) -> Tensor:
+    """What to multiply a step size by: 1 / 1.5 above twice the desired KL, 1.5 below half of it, else 1."""
+    return torch.where(kl < 0.5 * desired_kl, 1.5, torch.where(kl > 2.0 * desired_kl, 1.0 / 1.5, 1.0))
+
+
+class _Adam(torch.optim.Adam):
+    """Adam whose step size stays the tensor that it was given, so that adapting it reaches also a loaded optimiser."""
+
+    def load_state_dict(self, state_dict: State) -> None:
+        rates = [group["lr"] for group in self.param_groups]
+        super().load_state_dict(state_dict)
+        for group, rate in zip(self.param_groups, rates, strict=True):
+            group["lr"] = rate
+
+
+class AdaptiveAdam:
+    """Adam whose step size is divided by 1.5 above twice the desired KL, multiplied below half of it.
+
+    It is a tensor: no wait for the device. ``share``: the part of the config's ``desired_kl`` that is these
+    parameters'.
+    """
+
+    def __init__(
+        self, parameters: Iterable[nn.Parameter], config: PPOConfig, device: torch.device, eps: float = 1e-8,
+        share: float = 1.0
+    ):  # fmt: skip
+        self.desired_kl = share * config.desired_kl if config.adaptive_learning_rate else None
+        self.bounds, self.weights = config.learning_rate_range, list(parameters)
+        self.rate = torch.tensor(config.learning_rate, device=device)
+        self.actor = _Adam(self.weights, lr=self.rate, eps=eps, fused=True)
+
+    def zero_grad(self) -> None:
+        """Forgets the gradients."""
+        self.actor.zero_grad()
+
+    def descend(self, kl: Tensor | None, max_grad_norm: float) -> None:
+        """One step along gradients of at most this norm, its size adapted to the last one's KL (None: none yet)."""
+        self.follow(kl)
+        nn.utils.clip_grad_norm_(self.weights, max_grad_norm)
+        self.actor.step()
+
+    def follow(self, kl: Tensor | None) -> None:
+        """Adapts the step size to the KL of its last step, a scalar."""
+        if kl is not None and self.desired_kl is not None:
+            self.rate.mul_(factor_of(kl, self.desired_kl)).clamp_(*self.bounds)
+
+    def parts(self) -> Parts:
+        """Optimiser and step size, by their names in a checkpoint."""
+        return {"actor_adam": self.actor, "learning_rate": self.rate}
+
+
+class AdaptiveAdams(AdaptiveAdam):
+    """One for the actor, one for the critic: of ``critic_learning_rate``, fixed, or None, which follows the actor's."""
+
+    def __init__(
+        self, actor: Iterable[nn.Parameter], critic: Iterable[nn.Parameter], config: PPOConfig, device: torch.device
+    ):
+        super().__init__(actor, config, device)
+        fixed = config.critic_learning_rate
+        self.critic_rate = self.rate if fixed is None else torch.tensor(fixed, device=device)
+        self.critic_weights = list(critic)
+        self.critic = _Adam(self.critic_weights, lr=self.critic_rate, fused=True)
+
+    def zero_grad(self) -> None:
+        """Forgets the gradients of both."""
+        super().zero_grad()
+        self.critic.zero_grad()
+
+    def descend(self, kl: Tensor | None, max_grad_norm: float, apart: bool = True, critic_alone: bool = False) -> None:
+        """One step of both; ``apart``: each has a norm of its own; ``critic_alone``: the actor stays as it is."""
+        self.follow(None if critic_alone else kl)
+        actor, critic = self.weights, self.critic_weights
+        for weights in [actor, critic] if apart else [actor + critic]:
+            nn.utils.clip_grad_norm_(weights, max_grad_norm)
+        if not critic_alone:
+            self.actor.step()
+        self.critic.step()
+
+    def parts(self) -> Parts:
+        """Both optimisers and the step size, by their names in a checkpoint."""
+        return super().parts() | {"critic_adam": self.critic}
