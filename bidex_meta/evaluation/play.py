@@ -1,8 +1,8 @@
 """Success and return of a policy per class, over a fixed number of whole episodes of every task, by the mean action.
 
 A task that ends early is not played more often, so that easy tasks cannot crowd out hard ones. An episode is a success
-if ``info["success"]`` was true at any step; its return is the sum of the unscaled reward. An episode of broken physics
-is no success and counts with the return of random actions, or its own if that is lower.
+if it was solved at any step, or in its last steps, as the suite says; both are reported. Its return is the sum of the
+unscaled reward. An episode of broken physics is no success and counts with the return of random actions, or its own if that is lower.
 """
 
 from collections.abc import Mapping
@@ -16,6 +16,7 @@ from bidex_meta.agents import Agent
 from bidex_meta.errors import BidexError, shortened
 from bidex_meta.evaluation.references import Reference, references_of
 from bidex_meta.evaluation.results import Evaluation, results_by_class
+from bidex_meta.suite import HELD_STEPS
 from bidex_meta.utils.maths import check_precision
 from bidex_meta.utils.validation import whole_number
 from bidex_meta.world.contract import TaskWorld
@@ -51,8 +52,8 @@ def evaluate(
 def play_tasks(agent: Agent, world: TaskWorld, episodes_per_task: int, seed: int | None) -> dict[str, np.ndarray]:
     """``episodes_per_task`` episodes of every task, as ``evaluate`` plays them, as arrays ``(episodes,)``.
 
-    They are ``slot``, ``task`` (index in the slot's pool), ``return``, ``success``, ``length`` and ``unstable``. The
-    same world and seed give the same slots, tasks and starts in the same order.
+    They are ``slot``, ``task`` (index in the slot's pool), ``return``, ``success`` (by the suite's rule), ``once``
+    (solved at any step), ``at_end`` (solved in the last steps), ``length`` and ``unstable``. The same world and seed give the same slots, tasks and starts in the same order.
     """
     obs, _ = world.reset(seed=seed)
     tasks = world.task_index.clone()
@@ -105,17 +106,21 @@ def quota(world: TaskWorld, episodes_per_task: int) -> torch.Tensor:
 
 @torch.no_grad()
 def _play(agent: Agent, world: TaskWorld, obs: torch.Tensor, playing: torch.Tensor) -> dict[str, torch.Tensor]:
-    """An episode in each environment of ``playing``: return, success, length, unstable, each ``(those playing,)``."""
+    """An episode in each environment of ``playing``: see ``play_tasks``, each ``(those playing,)``."""
     running = playing.clone()
     returns = torch.zeros(world.num_envs, dtype=torch.float64, device=running.device)
     lengths = torch.zeros(world.num_envs, dtype=torch.int64, device=running.device)
-    success, unstable = torch.zeros_like(running), torch.zeros_like(running)
+    success, once, unstable = torch.zeros(3, world.num_envs, dtype=torch.bool, device=running.device).unbind()
+    held = torch.zeros_like(lengths)
     for _ in range(int(world.max_episode_steps.max())):
         obs, _, terminated, truncated, info = world.step(agent.eval_action(obs))
         gained = info["reward_unscaled"].double()
         returns += torch.where(running, gained, torch.zeros_like(gained))
         lengths += running
-        success |= running & info["success"]
+        solved = info.get("solved", info["success"])
+        once |= running & solved
+        held = torch.where(running, (held + 1) * solved, held)
+        success = torch.where(running, info["so_far"]["success"], success)
         unstable |= running & info["unstable"]
         running &= ~(terminated | truncated)
         if not bool(running.any()):
@@ -123,6 +128,7 @@ def _play(agent: Agent, world: TaskWorld, obs: torch.Tensor, playing: torch.Tens
     else:
         raise RuntimeError(f"{int(running.sum())} environments exceed their time limit; the world is at fault.")
     played = {"return": returns, "success": success, "length": lengths, "unstable": unstable}
+    played |= {"once": once, "at_end": held >= HELD_STEPS}
     return {key: value[playing] for key, value in played.items()}
 
 

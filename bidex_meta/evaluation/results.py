@@ -20,13 +20,16 @@ class ClassResult:
     returns: np.ndarray
     """Sum of the unscaled reward, float64; of broken episodes as ``counted_returns``."""
     successes: np.ndarray
-    """Success at any step, float64 0 or 1; 0 of broken episodes."""
+    """Success by the suite's rule, float64 0 or 1; 0 of broken episodes."""
     lengths: np.ndarray
     """Steps, int64."""
     tasks: np.ndarray
     """Index of the played task in the class's pool, int64."""
     unstable: int
     """Episodes that ended because the physics broke."""
+    once: float | None = None
+    """Share of episodes solved at any step; ``at_end``: in their last steps (``suite.HELD_STEPS``)."""
+    at_end: float | None = None
     reference: Reference | None = None
     """For the normalised score and broken episodes, where it is known."""
 
@@ -69,6 +72,8 @@ class ClassResult:
         return {
             "success": self.success,
             "success_interval": bootstrap_interval(mean, self.drawn(self.successes)),
+            "success_once": self.once,
+            "success_at_end": self.at_end,
             "return": self.mean_return,
             "return_interval": bootstrap_interval(mean, self.drawn(self.returns)),
             "length": float(self.lengths.mean()),
@@ -127,6 +132,8 @@ def results_by_class(
             lengths=own["length"],
             tasks=own["task"],
             unstable=int(broken.sum()),
+            once=float((own["once"] & ~broken).mean()),
+            at_end=float((own["at_end"] & ~broken).mean()),
             reference=reference,
         )
     return classes

@@ -14,7 +14,8 @@ reward 0, until a ``reset`` whose ``reset_mask`` names it.
 =====================  ====================  ===========================================================================
 key                    shape, type           meaning
 =====================  ====================  ===========================================================================
-success                (N,), bool            the goal is met in this state
+success                (N,), bool            the goal is met in this state; where success counts at the end, for the
+                                             last 15 steps
 unstable               (N,), bool            physics broke, or the action was not finite: reward 0, truncated, the
                                              transition teaches nothing; never in a frozen row
 reward_unscaled        (N,), float32         reward before the suite's scale of the class; 0 in a frozen row
@@ -22,14 +23,15 @@ final_obs              (N, d), float32       the observation that the transition
                                              before it
 _final_obs             (N,), bool            rows that ended in this step: there ``final_obs`` is the last of the
                                              episode; elsewhere it is the observation that the step returns
-so_far                 dict of (N,)          r (return, float32), l (length, int64), success (at any step, bool),
-                                             unscaled (return, float32), of the episode so far
+so_far                 dict of (N,)          r (return, float32), l (length, int64), success (by the suite's
+                                             rule, bool), unscaled (return, float32), of the episode so far
 counted                (N,), bool            rows whose episode ended and counts (shortened first ones do not)
 =====================  ====================  ===========================================================================
 
 For users of Gymnasium our worlds add its ``episode``, ``_episode``, ``final_info`` and ``_final_info``
 (``episodes.py``) where a row ended, and on the warp engine, which would have to wait for the answer, in every step:
-zero outside their masks. A world may add keys like these and ``reward_terms``; learners may not rely on them.
+zero outside their masks. ``solved`` says whether the goal is met in this state, whatever the rule. A world may add keys
+like these and ``reward_terms``; learners may not rely on them.
 
 Shortened first episodes: in SAME_STEP mode the first episode of each row, after the first reset and after each with a
 seed, may begin at a random elapsed step, so that rows do not end together; the time limit counts from there. A world
