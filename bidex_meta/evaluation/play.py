@@ -2,7 +2,8 @@
 
 A task that ends early is not played more often, so that easy tasks cannot crowd out hard ones. An episode is a success
 if it was solved at any step, or in its last steps, as the suite says; both are reported. Its return is the sum of the
-unscaled reward. An episode of broken physics is no success and counts with the return of random actions, or its own if that is lower.
+unscaled reward. An episode of broken physics is no success and counts with the return of random actions, or its own if
+that is lower.
 """
 
 from collections.abc import Mapping
@@ -53,7 +54,8 @@ def play_tasks(agent: Agent, world: TaskWorld, episodes_per_task: int, seed: int
     """``episodes_per_task`` episodes of every task, as ``evaluate`` plays them, as arrays ``(episodes,)``.
 
     They are ``slot``, ``task`` (index in the slot's pool), ``return``, ``success`` (by the suite's rule), ``once``
-    (solved at any step), ``at_end`` (solved in the last steps), ``length`` and ``unstable``. The same world and seed give the same slots, tasks and starts in the same order.
+    (solved at any step), ``at_end`` (solved in the last steps), ``length`` and ``unstable``. The same world and seed
+    give the same slots, tasks and starts in the same order.
     """
     obs, _ = world.reset(seed=seed)
     tasks = world.task_index.clone()
