@@ -54,6 +54,7 @@ COMMANDS: dict[str, Command] = {
     "play": Command("bidex_meta.cli.play_live", "a policy at work, live: in a window or in the browser"),
     "witness": Command("bidex_meta.cli.witness", "replay actions that solve a task"),
     "baseline": Command("bidex_meta.cli.baseline", "measure the references of the normalised score"),
+    "validity": Command("bidex_meta.cli.validity", "whether there is something to learn about a suite's tasks"),
     "plot": Command("bidex_meta.cli.plot", "learning curves of runs, as a picture"),
     "report": Command("bidex_meta.cli.report", "runs as one HTML page: tables, curves, films"),
     "completion": Command("bidex_meta.cli.completion", "a script that completes commands and flags in a shell"),

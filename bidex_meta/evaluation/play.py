@@ -163,3 +163,15 @@ class RandomAgent:
 
     def reset(self, env_mask: torch.Tensor) -> None:
         """Nothing is remembered."""
+
+
+class HeldAgent(RandomAgent):
+    """The same uniform action throughout, one for each environment."""
+
+    def __init__(self, action_space: Box, seed: int = 0):
+        super().__init__(action_space, seed)
+        self._held = super().eval_action(torch.zeros(1))
+
+    def eval_action(self, obs: torch.Tensor) -> torch.Tensor:
+        """The action ``(num_envs, action)``, on the device of ``obs``."""
+        return self._held.to(obs.device)

@@ -1,6 +1,6 @@
 """The reward of version 2: one formula for all classes, from how far a state is from solved."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -8,6 +8,16 @@ from torch import Tensor
 if TYPE_CHECKING:
     from bidex_meta.tasks.base import TaskClass
     from bidex_meta.tasks.state import TaskState
+
+
+class Hidden(NamedTuple):
+    """A part of a task that only goal entries show: success asks for each part on its own."""
+
+    names: tuple[str, ...]
+    """Components of the variation: coordinates of one point (metres, rad), or the draws of an orientation."""
+    tolerance: float
+    """Distance from it that success allows, or angle of rotations; of a choice by sign infinite."""
+    kind: Literal["point", "orientation", "sign"] = "point"
 
 
 class Error(NamedTuple):

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from bidex_meta.engine.capacity import Capacity
-from bidex_meta.tasks.aligned import Error, at_least, within
+from bidex_meta.tasks.aligned import Error, Hidden, at_least, within
 from bidex_meta.tasks.base import FAST, THIN
 from bidex_meta.tasks.goals import frozen_goal
 from bidex_meta.tasks.layout import goal_blocks, handle_blocks, object_blocks, point_block
@@ -88,8 +88,11 @@ class OpenScissors(ReachTask):
     def target(self, state: TaskState) -> Tensor:
         return 5.0 * (0.59 - _missing(state))
 
+    def hides(self) -> tuple[Hidden, ...]:
+        return (Hidden(("target_angle",), 0.04 if self.rules.wide else 0.1),)
+
     def errors(self, state: TaskState) -> list[Error]:
-        return [Error(_missing(state), 0.04 if self.rules.wide else 0.1)]
+        return [Error(_missing(state), self.hides()[0].tolerance)]
 
     def success(self, state: TaskState) -> Tensor:
         return within(self.errors(state))
@@ -160,6 +163,9 @@ class OpenPenCap(ReachTask):
 
     def target(self, state: TaskState) -> Tensor:
         return 5.0 * apart(state, *self.points)
+
+    def hides(self) -> tuple[Hidden, ...]:
+        return (Hidden(("gap",), 0.025),) if self.rules.wide else ()
 
     def errors(self, state: TaskState) -> list[Error]:
         gap = apart(state, *self.points)
@@ -244,6 +250,9 @@ class Switch(ReachTask):
         angles = state.frozen["angles"]
         missing = _rockers(state) - angles
         return {"goal_pose": pad(angles, (0, 5)), "goal_rotation_difference": pad(missing, (0, 2))}
+
+    def hides(self) -> tuple[Hidden, ...]:
+        return tuple(Hidden((f"switch{i}_angle",), 0.08) for i in (1, 2)) if self.rules.wide else ()
 
     def errors(self, state: TaskState) -> list[Error]:
         rockers = _rockers(state)

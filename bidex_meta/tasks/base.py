@@ -14,7 +14,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.hands.starts import noisy_joints
 from bidex_meta.suite import V1, Rules
-from bidex_meta.tasks.aligned import Error, aligned_terms
+from bidex_meta.tasks.aligned import Error, Hidden, aligned_terms
 from bidex_meta.tasks.layout import Block, Layout, both_hands
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace
@@ -202,6 +202,10 @@ class TaskClass(ABC):
     def errors(self, state: TaskState) -> list[Error]:
         """How far a state is from solved, for the reward of version 2: at least one error."""
         raise NotImplementedError
+
+    def hides(self) -> tuple[Hidden, ...]:
+        """What only goal entries show of a task, and how exactly success asks for it; nothing by default."""
+        return ()
 
     def guides(self, state: TaskState) -> list[Tensor]:
         """Distances (m), each (n,), that the reward of version 2 wants small beside the errors: hands to points."""

@@ -9,7 +9,7 @@ from torch.nn.functional import pad
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
-from bidex_meta.tasks.aligned import Error, at_least, within
+from bidex_meta.tasks.aligned import Error, Hidden, at_least, within
 from bidex_meta.tasks.base import FAST, THIN
 from bidex_meta.tasks.goals import frozen_goal
 from bidex_meta.tasks.layout import Block, goal_blocks, object_blocks, point_block
@@ -94,6 +94,9 @@ class GraspAndPlace(ReachTask):
     def freeze(self, variation: Tensor) -> dict[str, Tensor]:
         """``bucket``, ``block``: shifts and turns (n, 3); with wide variation ``goal``, of the bucket: pose (n, 7)."""
         return super().freeze(variation) | _bucket_goal(variation[:, 6:], self.objects[0])
+
+    def hides(self) -> tuple[Hidden, ...]:
+        return (Hidden(("goal_x", "goal_y"), 0.04),) if self.rules.wide else ()
 
     def errors(self, state: TaskState) -> list[Error]:
         inside = Error(apart(state, "bucket/position", "block/position"), 0.04)
@@ -229,6 +232,9 @@ class PourWater(ReachTask):
 
     def target(self, state: TaskState) -> Tensor:
         return 2.0 * (0.5 - _spout_off(state))
+
+    def hides(self) -> tuple[Hidden, ...]:
+        return (Hidden(("goal_x", "goal_y"), 0.04),) if self.rules.wide else ()
 
     def errors(self, state: TaskState) -> list[Error]:
         return [at_least(self._inside(state) / self.water, 1.0 / 3.0, 1.0 / 12.0), *_bucket_error(state)]

@@ -1,5 +1,6 @@
 """Classes of two cubes: appendix A.2.10, A.2.13 and A.2.16; docs/figures.md, classes."""
 
+import math
 from typing import ClassVar
 
 import mujoco
@@ -10,7 +11,7 @@ from torch.nn.functional import pad
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.poses import PALM_DOWN_AWAY, PALM_DOWN_BACK, PALM_UP_AWAY, PALM_UP_BACK, HandPose
 from bidex_meta.tasks import eggs
-from bidex_meta.tasks.aligned import Error, within
+from bidex_meta.tasks.aligned import Error, Hidden, within
 from bidex_meta.tasks.base import FAST, FIRM, TaskClass
 from bidex_meta.tasks.goals import frozen_goal
 from bidex_meta.tasks.layout import goal_blocks, object_blocks, point_block
@@ -111,6 +112,9 @@ class PushBlock(_TwoBlocks):
         goals = torch.cat((state.frozen["goal1"], state.frozen["goal2"]), dim=1)
         return {"goal_pose": pad(goals, (0, 1)), "goal_rotation_difference": torch.zeros_like(goals[:, :4])}
 
+    def hides(self) -> tuple[Hidden, ...]:
+        return tuple(Hidden((f"goal{i}_x", f"goal{i}_y"), 0.05) for i in (1, 2)) if self.rules.wide else ()
+
     def errors(self, state: TaskState) -> list[Error]:
         return self.off_by(state, 0.05 if self.rules.wide else 0.1)
 
@@ -186,6 +190,10 @@ class StackBlock(_TwoBlocks):
             return {"goal_pose": pad(goals, (0, 1)), "goal_rotation_difference": torch.zeros_like(goals[:, :4])}
         return {"goal_pose": state.frozen["goal"], "goal_rotation_difference": state.quaternion("block1/quaternion")}
 
+    def hides(self) -> tuple[Hidden, ...]:
+        target = Hidden(("target_x", "target_y"), 0.03)
+        return (target, Hidden(("order",), math.inf, "sign")) if self.rules.wide else (target,)
+
     def errors(self, state: TaskState) -> list[Error]:
         return self.off_by(state, 0.03)
 
@@ -258,6 +266,9 @@ class ReOrientation(TaskClass):
     def reward_terms(self, state: TaskState) -> dict[str, Tensor]:
         (first, first_angle), (second, second_angle) = self._distances(state)
         return {"left": -10.0 * first, "right": -10.0 * second, "target": -1.5 * (first_angle + second_angle)}
+
+    def hides(self) -> tuple[Hidden, ...]:
+        return (Hidden(("goal_u0", "goal_u1"), 0.2, "orientation"),)
 
     def errors(self, state: TaskState) -> list[Error]:
         return [Error(angle, 0.2) for _, angle in self._distances(state)]

@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.hand import SIDES
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, HandPose
-from bidex_meta.tasks.aligned import Error, at_least, within
+from bidex_meta.tasks.aligned import Error, Hidden, at_least, within
 from bidex_meta.tasks.base import FAST
 from bidex_meta.tasks.goals import frozen_goal
 from bidex_meta.tasks.layout import goal_blocks, handle_blocks, object_blocks
@@ -91,6 +91,9 @@ class _Door(ReachTask):
             return super().observe(state)
         leaves, missing = state.frozen["leaves"], _hinges(state) - state.frozen["leaves"]
         return {"goal_pose": pad(leaves, (0, 5)), "goal_rotation_difference": pad(missing, (0, 2))}
+
+    def hides(self) -> tuple[Hidden, ...]:
+        return tuple(Hidden((f"{side}_angle",), 0.15) for side in SIDES) if self.rules.wide else ()
 
     def errors(self, state: TaskState) -> list[Error]:
         if not self.rules.wide:

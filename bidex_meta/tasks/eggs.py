@@ -11,7 +11,7 @@ from torch import Tensor
 from bidex_meta.hands.hand import SIDES
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.hands.starts import make_room, noisy_joints
-from bidex_meta.tasks.aligned import Error, within
+from bidex_meta.tasks.aligned import Error, Hidden, within
 from bidex_meta.tasks.base import JITTER, JOINT_NOISE, LIGHT, TaskClass
 from bidex_meta.tasks.goals import frozen_goal, observe_goal, rotation_difference
 from bidex_meta.tasks.layout import Block, goal_blocks, object_blocks
@@ -191,6 +191,9 @@ class EggTask(TaskClass):
             translation, rotation = distances(state, f"object{i}", f"goal{i}")
             terms[f"pose{i}"] = torch.exp(-0.2 * (self.alpha * translation + rotation))
         return terms
+
+    def hides(self) -> tuple[Hidden, ...]:
+        return tuple(Hidden(tuple(f"goal{i}_{axis}" for axis in "xyz"), 0.03) for i in self.numbers)
 
     def errors(self, state: TaskState) -> list[Error]:
         return [Error(distances(state, f"object{i}", f"goal{i}")[0], 0.03) for i in self.numbers]

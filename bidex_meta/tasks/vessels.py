@@ -9,7 +9,7 @@ from torch.nn.functional import pad
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.hands.hand import hand
 from bidex_meta.hands.poses import PALM_LEFT_AHEAD, PALM_RIGHT_AHEAD, PALM_UP_AWAY, PALM_UP_BACK, HandPose
-from bidex_meta.tasks.aligned import Error, at_least, within
+from bidex_meta.tasks.aligned import Error, Hidden, at_least, within
 from bidex_meta.tasks.base import FAST, FIRM
 from bidex_meta.tasks.goals import frozen_goal, rotation_difference
 from bidex_meta.tasks.layout import goal_blocks, handle_blocks, object_blocks, point_block
@@ -76,6 +76,9 @@ class LiftUnderarm(OwnObjectClass):
 
     def target(self, state: TaskState) -> Tensor:
         return 3.0 * (0.985 - self._distance(state))
+
+    def hides(self) -> tuple[Hidden, ...]:
+        return (Hidden(("goal_x", "goal_y", "goal_height"), 0.05),)
 
     def errors(self, state: TaskState) -> list[Error]:
         return [Error(self._distance(state), 0.05)]
@@ -151,6 +154,9 @@ class BottleCap(OwnObjectClass):
             "goal_rotation_difference": pad(state["bottle/slide"] - slide, (0, 3)),
         }
 
+    def hides(self) -> tuple[Hidden, ...]:
+        return (Hidden(("cap_slide",), 0.005),) if self.rules.wide else ()
+
     def errors(self, state: TaskState) -> list[Error]:
         slide = state["bottle/slide"][:, 0]
         if self.rules.wide:
@@ -225,8 +231,11 @@ class SwingCup(OwnObjectClass):
     def target(self, state: TaskState) -> Tensor:
         return 5.0 / (_angle(state) + 0.1)
 
+    def hides(self) -> tuple[Hidden, ...]:
+        return (Hidden(("yaw_change",), math.radians(12.0) if self.rules.wide else 0.25 * math.pi),)
+
     def errors(self, state: TaskState) -> list[Error]:
-        return [Error(_angle(state), math.radians(12.0) if self.rules.wide else 0.25 * math.pi)]
+        return [Error(_angle(state), self.hides()[0].tolerance)]
 
     def success(self, state: TaskState) -> Tensor:
         moved = norm(state["cup/position"] - state.frozen["goal"][:, :3])
