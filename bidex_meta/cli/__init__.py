@@ -29,8 +29,7 @@ from bidex_meta.train.launch import hangup, launch
 from bidex_meta.utils.plugins import own_fault
 from bidex_meta.utils.streams import open_missing, silence, unread
 
-_LONGEST = 2000
-"""Letters of an error: what was given may be any text."""
+_LONGEST = 2000  # letters of an error: what was given may be any text
 
 
 class Command(NamedTuple):

@@ -29,21 +29,14 @@ class BenchFlags:
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="world")]
     """world: environment steps per second of the world and of its bare physics, and their ratio."""
-    suite: str = "MT4"
-    """Suite to measure."""
-    num_envs: Environments = 1024
-    """Environments stepped together."""
-    steps: Steps = 40
-    """Environment steps of each repeat."""
-    repeats: Few = 7
-    """Interleaved repeats; medians are reported."""
-    threads: Threads | None = None
-    """Threads of the physics on a CPU; None takes all cores."""
+    suite: str = "MT4"  # Suite to measure.
+    num_envs: Environments = 1024  # Environments stepped together.
+    steps: Steps = 40  # Environment steps of each repeat.
+    repeats: Few = 7  # Interleaved repeats; medians are reported.
+    threads: Threads | None = None  # Threads of the physics on a CPU; None takes all cores.
     device: Device = "cpu"
-    engine: str = "auto"
-    """auto, c or warp."""
-    seed: Seed = 0
-    """Seed of world and actions."""
+    engine: str = "auto"  # auto, c or warp.
+    seed: Seed = 0  # Seed of world and actions.
     json: JsonSwitch = False
 
 

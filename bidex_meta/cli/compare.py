@@ -19,8 +19,7 @@ class CompareFlags:
     Example: bidex-meta compare runs/MT4/mtppo/* runs/MT4/mttrpo/*
     """
 
-    runs: RunPaths
-    """Run folders, or files of results/data/."""
+    runs: RunPaths  # Run folders, or files of results/data/.
     json: JsonSwitch = False
     out: Path | None = None
     """Also draw success and score of the groups, with their intervals, into this picture (.png, .svg, .pdf)."""

@@ -32,8 +32,7 @@ class DataFlags:
     where that can be computed."""
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")] = ""
     """info, check: a data set's name or folder."""
-    episodes: Few | None = None
-    """check: at most so many episodes, evenly spread; None: all."""
+    episodes: Few | None = None  # check: at most so many episodes, evenly spread; None: all.
     json: JsonSwitch = False
 
 

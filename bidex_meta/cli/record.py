@@ -46,12 +46,9 @@ RUNS = {"random": 0, "medium": 1, "expert": 1, "medium-expert": 2, "replay": 1, 
 """Kinds of data sets, and how many runs each takes."""
 SIZE = {"medium-expert": 2_000_000, "demonstrations": 20_000}
 _USUAL_SIZE = 1_000_000
-_DEMONSTRATORS = {"witness": 32, "tasks": 200}
-"""Environments of demonstrations by default, by ``starts``."""
-_MOST_HELD = 1_200_000_000
-"""Bytes of running episodes beside the world."""
-_PATIENCE = 3
-"""Rounds of demonstrations that may all fail."""
+_DEMONSTRATORS = {"witness": 32, "tasks": 200}  # environments of demonstrations by default, by ``starts``
+_MOST_HELD = 1_200_000_000  # bytes of running episodes beside the world
+_PATIENCE = 3  # rounds of demonstrations that may all fail
 _OF_RUN = {"suite": None, "task": None, "base": "own", "object": None, "points": 0, "seed": None}
 """Entries of a run's config that decide which tasks are played."""
 
@@ -80,8 +77,7 @@ class RecordFlags:
     size: Steps = 0
     """Transitions; 0: 1e6, of medium-expert 2e6, of demonstrations 2e4. The last episodes are whole: there may be a few
     more."""
-    checkpoint: str = "last"
-    """Which policy of a run: last, best or a file."""
+    checkpoint: str = "last"  # Which policy of a run: last, best or a file.
     actions: Literal["sampled", "mean"] = "sampled"
     """sampled: drawn from the policy's distribution, where it has one; mean: its mean action."""
     noise: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
@@ -95,18 +91,14 @@ class RecordFlags:
     (about a second for 500 steps): seven classes have one, and it succeeds more often."""
     shift: Annotated[float, Meta(ge=0.0, le=0.1)] = 1e-4
     """demonstrations, --starts witness: how far the objects' start is shifted, metres."""
-    num_envs: Environments | None = None
-    """Environments stepped together; None: one per task, 200 at least."""
-    seed: Seed = 0
-    """Seed of starts and actions, and of random's tasks (a run keeps its own tasks)."""
+    num_envs: Environments | None = None  # Environments stepped together; None: one per task, 200 at least.
+    seed: Seed = 0  # Seed of starts and actions, and of random's tasks (a run keeps its own tasks).
     out: Path | None = None
     """Folder of the data set; None: NAME/KIND-v0 in the folder that BIDEX_DATA names, else in data/."""
     device: Device = "auto"
     engine: Engine = "auto"
-    threads: Threads | None = None
-    """Threads of torch and of the physics; None: one per core."""
-    estimate: Switch = False
-    """Print what it would take, and stop."""
+    threads: Threads | None = None  # Threads of torch and of the physics; None: one per core.
+    estimate: Switch = False  # Print what it would take, and stop.
 
 
 @dataclass(frozen=True)
@@ -114,17 +106,12 @@ class _Collection:
     """A data set to collect."""
 
     source: Worlds
-    name: str
-    """Kind in the data set's name."""
-    plan: Json
-    """What decides its content; it has ``kind``, ``size`` and ``num_envs``."""
-    policies: list[Json]
-    """Who acts, for the metadata."""
+    name: str  # kind in the data set's name
+    plan: Json  # what decides its content; it has ``kind``, ``size`` and ``num_envs``
+    policies: list[Json]  # who acts, for the metadata
     world: Callable[[], PooledWorld]
-    episode_share: float
-    """Mean length of an episode as a share of the time limit, at least."""
-    collect: Callable[[PooledWorld, DatasetWriter], None]
-    """Plays in the world until the writer has all transitions."""
+    episode_share: float  # mean length of an episode as a share of the time limit, at least
+    collect: Callable[[PooledWorld, DatasetWriter], None]  # plays in the world until the writer has all transitions
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -36,27 +36,21 @@ class RunFlags(Generic[LearnerSettings]):
     """
 
     config: Annotated[RunConfig[LearnerSettings], tyro.conf.arg(name="")]
-    run_dir: Path | None = None
-    """Folder of this run; None: runs/SUITE/ALGO/DATE_seedSEED."""
+    run_dir: Path | None = None  # Folder of this run; None: runs/SUITE/ALGO/DATE_seedSEED.
     resume: Path | None = None
     """Continue this run from its last checkpoint, with its own config; only --steps and --minutes may change, which
     count what it has done already, and --logger, --evaluate-every, --video-every and --stop-at-...."""
-    evaluate: bool = True
-    """Evaluate at the end."""
+    evaluate: bool = True  # Evaluate at the end.
     episodes: Few | None = None
     """Episodes of each task in that evaluation; None: 4, or 1 where a task fixes its start (metaworld/...); for
     learners that adapt, as many as --rollouts."""
     split: Literal["auto", "train", "test", "both"] = "auto"
     """Tasks of that evaluation where the learner adapts (maml, promp, rl2, ...). auto: both, on ML20 fifteen classes
     beside the five unseen ones."""
-    shots: Shots | None = None
-    """There: adapt so often, one after the other. None: 1."""
-    rollouts: Few | None = None
-    """There: episodes of each task in a shot. None: as in training, but 40 at most."""
-    tasks: Count | None = None
-    """There: the first so many tasks of each class. None: 5."""
-    print_config: Switch = False
-    """Print the resolved config as JSON and stop."""
+    shots: Shots | None = None  # There: adapt so often, one after the other. None: 1.
+    rollouts: Few | None = None  # There: episodes of each task in a shot. None: as in training, but 40 at most.
+    tasks: Count | None = None  # There: the first so many tasks of each class. None: 5.
+    print_config: Switch = False  # Print the resolved config as JSON and stop.
 
 
 @dataclass(frozen=True)

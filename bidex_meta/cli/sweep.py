@@ -30,8 +30,7 @@ from bidex_meta.runs.metrics import last_rows
 from bidex_meta.utils.files import exists, is_file, read_text
 from bidex_meta.utils.validation import Few
 
-COMMAND = (sys.executable, "-m", "bidex_meta.cli")
-"""What a run's words are given to."""
+COMMAND = (sys.executable, "-m", "bidex_meta.cli")  # what a run's words are given to
 
 
 @dataclass(frozen=True)
@@ -43,18 +42,13 @@ class SweepFlags:
     docs/sweeps.md explains the file.
     """
 
-    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE.toml")]
-    """The sweep."""
-    workers: Few | None = None
-    """Runs at a time, each on a core of its own; None: one, or one for each of --cores."""
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE.toml")]  # The sweep.
+    workers: Few | None = None  # Runs at a time, each on a core of its own; None: one, or one for each of --cores.
     cores: str | None = None
     """Cores that runs are bound to (Linux), such as 1 or 0,2-3; None: the first of those there are."""
-    out: Path = Path("runs")
-    """Where the sweep's folder lies: its runs are OUT/NAME/SUITE-ARM-seedN."""
-    status: Switch = False
-    """Print what is done, what runs, what is left and how long it takes, and stop."""
-    dry_run: Switch = False
-    """Check the file, print the commands of what is left, and stop."""
+    out: Path = Path("runs")  # Where the sweep's folder lies: its runs are OUT/NAME/SUITE-ARM-seedN.
+    status: Switch = False  # Print what is done, what runs, what is left and how long it takes, and stop.
+    dry_run: Switch = False  # Check the file, print the commands of what is left, and stop.
     submit: Literal["slurm", "local"] | None = None
     """Hand the runs to a cluster by submitit (extra slurm), with the parameters of the file's [slurm], instead of
     running them; local: submitit's executor on this machine."""

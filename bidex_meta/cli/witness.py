@@ -23,18 +23,12 @@ class WitnessFlags:
     Example: bidex-meta witness --task CatchUnderarm
     """
 
-    task: str | None = None
-    """Task class."""
-    all: Switch = False
-    """All classes."""
-    file: Path | None = None
-    """Replay this file, not the stored witness."""
-    out: Path | None = None
-    """Also write a film (.mp4) of the witness, or a picture (.png) of its last step."""
-    camera: str | None = None
-    """front, side, top or back."""
-    threads: Threads | None = None
-    """Threads of the physics; None: one per core."""
+    task: str | None = None  # Task class.
+    all: Switch = False  # All classes.
+    file: Path | None = None  # Replay this file, not the stored witness.
+    out: Path | None = None  # Also write a film (.mp4) of the witness, or a picture (.png) of its last step.
+    camera: str | None = None  # front, side, top or back.
+    threads: Threads | None = None  # Threads of the physics; None: one per core.
     json: JsonSwitch = False
 
 

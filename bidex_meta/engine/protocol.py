@@ -23,16 +23,11 @@ class Engine(Protocol):
     masked: bool
     """Whether the engine is of an accelerator's kind: resets are masked writes of full size, and nothing in a step may
     wait for a value or have a shape that depends on one."""
-    qpos: Tensor
-    """Shape (num, nq)."""
-    qvel: Tensor
-    """Shape (num, nv)."""
-    ctrl: Tensor
-    """Position targets, shape (num, nu)."""
-    xfrc_applied: Tensor
-    """World-frame force and torque at bodies' centres of mass, shape (num, nbody, 6)."""
-    sensordata: Tensor
-    """Shape (num, nsensordata)."""
+    qpos: Tensor  # shape (num, nq)
+    qvel: Tensor  # shape (num, nv)
+    ctrl: Tensor  # position targets, shape (num, nu)
+    xfrc_applied: Tensor  # world-frame force and torque at bodies' centres of mass, shape (num, nbody, 6)
+    sensordata: Tensor  # shape (num, nsensordata)
 
     def step(self, substeps: int, active: Tensor | None = None) -> None:
         """Advances all simulations, or those of the mask ``active`` (num,), and refreshes their sensors.

@@ -26,14 +26,11 @@ class Control:
     """The arms of one run: the same episodes in the same order."""
 
     before: Evaluation
-    own: Evaluation
-    """Adapted to data of the tasks themselves."""
-    foreign: list[Evaluation]
-    """Adapted to data of each train task."""
+    own: Evaluation  # adapted to data of the tasks themselves
+    foreign: list[Evaluation]  # adapted to data of each train task
     adaptations: dict[str, np.ndarray]
     """Per class which adaptation each episode followed, ``(episodes,)``, as in ``MetaEvaluation``."""
-    rollouts: int
-    """Episodes of each task in a shot."""
+    rollouts: int  # episodes of each task in a shot
 
 
 def control(

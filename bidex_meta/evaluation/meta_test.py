@@ -25,8 +25,7 @@ from bidex_meta.runs.atomic import Json
 from bidex_meta.utils.validation import whole_number
 from bidex_meta.world.contract import TaskWorld
 
-MAX_ADAPT_STEPS = 150
-"""Steps after which an episode is long enough to adapt to, by default."""
+MAX_ADAPT_STEPS = 150  # steps after which an episode is long enough to adapt to, by default
 
 _ADAPTS = ("init", "adapt_action", "step", "adapt")
 
@@ -39,16 +38,11 @@ class MetaEvaluation:
     """After 0, 1, ..., K shots (or those of them that were asked for): the same episodes in the same order."""
     adaptations: dict[str, np.ndarray]
     """Per class which adaptation (a trial of a task) each of its episodes followed, ``(episodes,)``, numbers from 0."""
-    rollouts: int
-    """Episodes of each task that a shot adapted to."""
-    trials: int
-    """Adaptations of each task, each from the start."""
-    max_adapt_steps: int
-    """Longest episode of adaptation."""
-    adapt_steps: list[int]
-    """Transitions that each shot adapted to, over all tasks."""
-    split: str = ""
-    """Name of these tasks."""
+    rollouts: int  # episodes of each task that a shot adapted to
+    trials: int  # adaptations of each task, each from the start
+    max_adapt_steps: int  # longest episode of adaptation
+    adapt_steps: list[int]  # transitions that each shot adapted to, over all tasks
+    split: str = ""  # name of these tasks
 
     @property
     def before(self) -> Evaluation:

@@ -9,26 +9,19 @@ from bidex_meta.evaluation.references import Reference, counted_returns
 from bidex_meta.evaluation.statistics import Estimate, aggregate, bootstrap_interval, mean, mean_difference
 from bidex_meta.runs.atomic import Json
 
-MANY_TASKS = 10
-"""From so many tasks on, intervals resample tasks instead of episodes."""
+MANY_TASKS = 10  # from so many tasks on, intervals resample tasks instead of episodes
 
 
 @dataclass(frozen=True)
 class ClassResult:
     """The episodes of one class; arrays of shape ``(episodes,)``, in the order they were played."""
 
-    returns: np.ndarray
-    """Sum of the unscaled reward, float64; of broken episodes as ``counted_returns``."""
-    successes: np.ndarray
-    """Success at any step, float64 0 or 1; 0 of broken episodes."""
-    lengths: np.ndarray
-    """Steps, int64."""
-    tasks: np.ndarray
-    """Index of the played task in the class's pool, int64."""
-    unstable: int
-    """Episodes that ended because the physics broke."""
-    reference: Reference | None = None
-    """For the normalised score and broken episodes, where it is known."""
+    returns: np.ndarray  # sum of the unscaled reward, float64; of broken episodes as ``counted_returns``
+    successes: np.ndarray  # success at any step, float64 0 or 1; 0 of broken episodes
+    lengths: np.ndarray  # steps, int64
+    tasks: np.ndarray  # index of the played task in the class's pool, int64
+    unstable: int  # episodes that ended because the physics broke
+    reference: Reference | None = None  # for the normalised score and broken episodes, where it is known
 
     @property
     def episodes(self) -> int:
@@ -83,10 +76,8 @@ class ClassResult:
 class Evaluation:
     """The results of ``evaluate``."""
 
-    classes: dict[str, ClassResult]
-    """Per class, by name, in the world's order of slots."""
-    episodes_per_task: int
-    """Episodes of every task."""
+    classes: dict[str, ClassResult]  # per class, by name, in the world's order of slots
+    episodes_per_task: int  # episodes of every task
 
     def to_json(self) -> Json:
         """Everything but the single episodes, ready for JSON."""

@@ -23,26 +23,19 @@ Axes = Any
 class Curve:
     """A metric against environment steps; arrays (points,)."""
 
-    steps: np.ndarray
-    """Environment steps, rising."""
-    mean: np.ndarray
-    """The metric, over several runs their mean."""
-    low: np.ndarray | None
-    """Lower end of the interval over runs; None of a single run."""
-    high: np.ndarray | None
-    """Upper end."""
+    steps: np.ndarray  # environment steps, rising
+    mean: np.ndarray  # the metric, over several runs their mean
+    low: np.ndarray | None  # lower end of the interval over runs; None of a single run
+    high: np.ndarray | None  # upper end
 
 
-Group = tuple[str, Mapping[str, Curve]]
-"""Runs that are drawn in one colour: their label, and curves by tag."""
-Bar = tuple[str, float, tuple[float, float] | None]
-"""A label, a value, and its interval where it is known."""
+Group = tuple[str, Mapping[str, Curve]]  # runs that are drawn in one colour: their label, and curves by tag
+Bar = tuple[str, float, tuple[float, float] | None]  # A label, a value, and its interval where it is known
 
 _COLUMNS = 4
 _MEASURES = ("return", "success")
 _STYLES = ("-", "--")
-_FEW = 60
-"""Evaluations up to which each is a dot: more of them would hide the dashes."""
+_FEW = 60  # evaluations up to which each is a dot: more of them would hide the dashes
 _COLOURS = {"train": "tab:blue", "test": "tab:orange"}
 _STEPS = "environment steps (millions)"
 _AGAIN = "Write one: bidex-meta evaluate RUN --shots 3 --json > {}"

@@ -15,8 +15,7 @@ from torch.func import grad
 
 from bidex_algos.nets.networks import GaussianActor, gaussian_kl, gaussian_log_prob, stacked_forward
 
-Adapted = Literal["all", "head"]
-"""Which parameters an inner step moves: all, or those of the mean's output layer."""
+Adapted = Literal["all", "head"]  # which parameters an inner step moves: all, or those of the mean's output layer
 StepSizeKind = Literal["fixed", "layer", "weight"]
 """Whether sizes of the inner step are learned, and of what; see :class:`StepSizes`."""
 
@@ -50,8 +49,7 @@ def _key(name: str) -> str:
     return name.replace(".", "/")
 
 
-Params = dict[str, Tensor]
-"""Parameters of an actor by name; stacked ones have a first axis of tasks."""
+Params = dict[str, Tensor]  # parameters of an actor by name; stacked ones have a first axis of tasks
 
 Objective = Literal["likelihood", "ratio"]
 """What the inner step follows: log-likelihood times advantage (MAML), or likelihood ratio times advantage (ProMP)."""

@@ -24,20 +24,14 @@ class MAMLConfig(OuterConfig):
 
     outer: Literal["trpo", "adam"] = "trpo"
     """How the meta-parameters move: a trust-region step, as in the paper, or one step of Adam."""
-    outer_learning_rate: Positive = 1e-3
-    """Adam's step size for the meta-parameters."""
-    max_grad_norm: Positive = 1.0
-    """Before a step of Adam, meta-gradients longer than this are shortened to it."""
+    outer_learning_rate: Positive = 1e-3  # Adam's step size for the meta-parameters.
+    max_grad_norm: Positive = 1.0  # Before a step of Adam, meta-gradients longer than this are shortened to it.
     max_kl: Positive = 0.01
     """Mean KL of the adapted policies from those that sampled that a trust-region step may not exceed."""
-    damping: NonNegative = 1e-2
-    """Added to the diagonal of the Fisher matrix."""
-    cg_iterations: Count = 10
-    """Conjugate-gradient iterations."""
-    backtracks: Count = 15
-    """Points that the line search tries."""
-    backtrack_factor: Fraction = 0.8
-    """By which the line search shortens the step."""
+    damping: NonNegative = 1e-2  # Added to the diagonal of the Fisher matrix.
+    cg_iterations: Count = 10  # Conjugate-gradient iterations.
+    backtracks: Count = 15  # Points that the line search tries.
+    backtrack_factor: Fraction = 0.8  # By which the line search shortens the step.
 
 
 PRESETS: dict[str, MAMLConfig] = {

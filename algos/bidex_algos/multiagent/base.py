@@ -52,14 +52,10 @@ class MultiAgentConfig(OnPolicyConfig):
     """How far a value may leave the old one before it earns nothing more; 0: as far as it likes."""
     popart: bool = False
     """When the statistics of returns change, move the critic's output layer so that its values stay as they were."""
-    max_grad_norm: Positive = 1.0
-    """Gradients longer than this are shortened to it: each agent's, and the critic's."""
-    critic_learning_rate: Positive = 1e-3
-    """Adam's step size of the critic."""
-    num_minibatches: Count = 4
-    """Mini-batches per epoch; each holds shuffled samples of all environments."""
-    adam_eps: NonNegative = 1e-8
-    """What Adam adds to its denominators."""
+    max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it: each agent's, and the critic's.
+    critic_learning_rate: Positive = 1e-3  # Adam's step size of the critic.
+    num_minibatches: Count = 4  # Mini-batches per epoch; each holds shuffled samples of all environments.
+    adam_eps: NonNegative = 1e-8  # What Adam adds to its denominators.
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -74,12 +70,9 @@ class MultiAgentConfig(OnPolicyConfig):
 class MultiAgentPPOConfig(PPOConfig, MultiAgentConfig):
     """What IPPO, MAPPO and HAPPO share; the defaults are the preset ``laptop``."""
 
-    critic_learning_rate: Positive = 1e-3
-    """Adam's step size of the critic."""
-    value_loss_weight: Finite = 1.0
-    """Factor of the value loss. Adam undoes it; it matters only beside max_grad_norm."""
-    entropy_weight: Finite = 0.0
-    """Factor of the entropy bonus."""
+    critic_learning_rate: Positive = 1e-3  # Adam's step size of the critic.
+    value_loss_weight: Finite = 1.0  # Factor of the value loss. Adam undoes it; it matters only beside max_grad_norm.
+    entropy_weight: Finite = 0.0  # Factor of the entropy bonus.
     desired_kl: Positive = 0.03
     """KL of the sampling policy from the current one, of all agents together, that the adaptive step sizes aim at; each
     agent's has an even share."""
@@ -113,8 +106,7 @@ PAPER_PPO: Options = PAPER | {
 }  # fmt: skip
 """The same with the two tables' passes and clip."""
 
-LIFT: Options = {"rollout_steps": 20, "epochs": 10}
-"""Both tables' column for LiftUnderarm, where it differs."""
+LIFT: Options = {"rollout_steps": 20, "epochs": 10}  # both tables' column for LiftUnderarm, where it differs
 
 
 @torch.no_grad()
