@@ -21,8 +21,7 @@ class CompareFlags:
 
     runs: RunPaths  # Run folders, or files of results/data/.
     json: JsonSwitch = False
-    out: Path | None = None
-    """Also draw success and score of the groups, with their intervals, into this picture (.png, .svg, .pdf)."""
+    out: Path | None = None  # Also draw the groups' success and score, with intervals, into this .png, .svg or .pdf.
 
 
 def main(arguments: Sequence[str]) -> None:

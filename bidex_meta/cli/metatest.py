@@ -14,8 +14,7 @@ from bidex_meta.utils.validation import Environments, Few, Seed, Shots
 from bidex_meta.worlds import Worlds
 
 TASKS = 5  # default tasks of each class, the first of its pool: all of ML1's, a tenth of ML20's
-_ROLLOUTS, _MOST_ROLLOUTS = 10, 40
-"""Episodes of each task in a shot where the run's config has none; the most that are taken from it."""
+_ROLLOUTS, _MOST_ROLLOUTS = 10, 40  # episodes of a task in a shot where the config has none; the most taken from it
 _ENVIRONMENTS = 1024  # environments stepped together at most, by default: half a GB for the world
 
 
@@ -27,8 +26,7 @@ class Options:
     """Episodes of each task; None: 4, or 1 where a task fixes its start (metaworld/...); for learners that adapt, as
     many as --rollouts."""
     shots: Shots | None = None  # Adapt so often, one after the other, to --rollouts episodes each; None: 1.
-    rollouts: Few | None = None
-    """Episodes of each task in a shot; None: as the run was trained, but 40 at most, else 10."""
+    rollouts: Few | None = None  # Episodes of each task in a shot; None: as the run was trained, 40 at most, else 10.
     tasks: Few | None = None  # Adapt to the first so many tasks of each class; None: 5.
     trials: Few | None = None
     """Adapt to each task so often, each time from the start and to other episodes; None: once, or as often as makes

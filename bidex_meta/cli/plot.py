@@ -22,8 +22,7 @@ class PlotFlags:
     """
 
     runs: RunPaths  # Run folders, or files of results/data/.
-    adaptation: Switch = False
-    """Against shots of adaptation, from the meta-test in the run's evaluation.json; of one run."""
+    adaptation: Switch = False  # Against shots of adaptation, from the meta-test in evaluation.json; of one run.
     evaluation: Path | None = None
     """The output of another `bidex-meta evaluate RUN --shots K --json`, instead of the run's evaluation.json."""
     out: Path | None = None  # The picture; None: curves.png or adaptation.png, in the run folder or, of several, here.

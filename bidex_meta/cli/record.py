@@ -68,12 +68,9 @@ class RecordFlags:
     a stored reference solution (see --starts)."""
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = ()
     """Run folders, as many as the kind takes."""
-    suite: str | None = None
-    """random: suite to play, a name or the path of a TOML file; otherwise the run's own is played."""
-    task: str | None = None
-    """random: class to play on its own, in place of a suite; demonstrations: class of the witness."""
-    base: Literal["own", "moving", "fixed"] = "own"
-    """With --task: whether the hands' bases move; own: as the class has it alone."""
+    suite: str | None = None  # random: suite to play, a name or path of a TOML file; otherwise the run's own is played.
+    task: str | None = None  # random: class to play on its own, not a suite; demonstrations: class of the witness.
+    base: Literal["own", "moving", "fixed"] = "own"  # With --task: whether bases move; own: as the class has it alone.
     size: Steps = 0
     """Transitions; 0: 1e6, of medium-expert 2e6, of demonstrations 2e4. The last episodes are whole: there may be a few
     more."""
@@ -93,8 +90,7 @@ class RecordFlags:
     """demonstrations, --starts witness: how far the objects' start is shifted, metres."""
     num_envs: Environments | None = None  # Environments stepped together; None: one per task, 200 at least.
     seed: Seed = 0  # Seed of starts and actions, and of random's tasks (a run keeps its own tasks).
-    out: Path | None = None
-    """Folder of the data set; None: NAME/KIND-v0 in the folder that BIDEX_DATA names, else in data/."""
+    out: Path | None = None  # Folder of the data set; None: NAME/KIND-v0 in the folder of BIDEX_DATA, else in data/.
     device: Device = "auto"
     engine: Engine = "auto"
     threads: Threads | None = None  # Threads of torch and of the physics; None: one per core.

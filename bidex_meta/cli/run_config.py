@@ -24,8 +24,7 @@ from bidex_meta.utils.validation import Count, Few, Shots
 from bidex_meta.worlds import Worlds
 
 _EXAMPLE = "MT4"  # a suite whose defaults `run --help` shows
-_WIDTH = 1200
-"""Numbers that a step of one environment holds at most: observations before and after, actions, what is computed."""
+_WIDTH = 1200  # numbers that a step of one environment holds at most: two observations, actions, what is computed
 
 
 @dataclass(frozen=True)

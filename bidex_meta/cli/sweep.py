@@ -44,8 +44,7 @@ class SweepFlags:
 
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE.toml")]  # The sweep.
     workers: Few | None = None  # Runs at a time, each on a core of its own; None: one, or one for each of --cores.
-    cores: str | None = None
-    """Cores that runs are bound to (Linux), such as 1 or 0,2-3; None: the first of those there are."""
+    cores: str | None = None  # Cores that runs are bound to (Linux), such as 1 or 0,2-3; None: the first there are.
     out: Path = Path("runs")  # Where the sweep's folder lies: its runs are OUT/NAME/SUITE-ARM-seedN.
     status: Switch = False  # Print what is done, what runs, what is left and how long it takes, and stop.
     dry_run: Switch = False  # Check the file, print the commands of what is left, and stop.

@@ -33,8 +33,7 @@ class Group:
     success: np.ndarray  # success rate, (seeds, classes)
     returns: np.ndarray  # mean return, (seeds, classes)
     scores: np.ndarray | None  # normalised score, (seeds, classes); None where a class has no reference
-    steps: int
-    """Environment steps of a seed, over all its runs; the mean over seeds, which differ where time ended the runs."""
+    steps: int  # environment steps of a seed, over all its runs: the mean over seeds, which may differ
     steps_range: tuple[int, int]  # fewest and most steps of a seed
     hours: float  # mean time of a seed's training, over all its runs, without evaluation
     paths: list[Path]  # its run folders, or files of JSON

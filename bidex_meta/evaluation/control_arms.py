@@ -28,8 +28,7 @@ class Control:
     before: Evaluation
     own: Evaluation  # adapted to data of the tasks themselves
     foreign: list[Evaluation]  # adapted to data of each train task
-    adaptations: dict[str, np.ndarray]
-    """Per class which adaptation each episode followed, ``(episodes,)``, as in ``MetaEvaluation``."""
+    adaptations: dict[str, np.ndarray]  # per class the adaptation that each episode followed, (episodes,)
     rollouts: int  # episodes of each task in a shot
 
 

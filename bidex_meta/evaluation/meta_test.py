@@ -34,8 +34,7 @@ _ADAPTS = ("init", "adapt_action", "step", "adapt")
 class MetaEvaluation:
     """The results of ``meta_evaluate``."""
 
-    by_shot: list[Evaluation]
-    """After 0, 1, ..., K shots (or those of them that were asked for): the same episodes in the same order."""
+    by_shot: list[Evaluation]  # after 0, 1, ..., K shots (or those asked for): the same episodes in the same order
     adaptations: dict[str, np.ndarray]
     """Per class which adaptation (a trial of a task) each of its episodes followed, ``(episodes,)``, numbers from 0."""
     rollouts: int  # episodes of each task that a shot adapted to

@@ -20,8 +20,7 @@ from bidex_meta.utils.maths import check_precision
 from bidex_meta.utils.validation import whole_number
 from bidex_meta.world.contract import TaskWorld
 
-EVALUATION_SEED = 1_000_000
-"""Seed of the starts in evaluation: nobody trains with it, so that they are new to the policy."""
+EVALUATION_SEED = 1_000_000  # seed of the starts in evaluation: nobody trains with it, so they are new to the policy
 
 
 def evaluate(

@@ -31,8 +31,7 @@ class Reference:
     """References of a class."""
 
     random: float  # mean return of uniform actions
-    expert: float | None = None
-    """Mean return of the best known policy; None where none is known that is above the floor."""
+    expert: float | None = None  # mean return of the best known policy; None where none is above the floor
     zero: float | None = None  # mean return of zero actions, where it is known
 
     @property

@@ -91,8 +91,7 @@ class Evaluation:
         }
 
 
-Difference = Estimate
-"""Mean return of one policy above another's in a class; tasks of both (of few tasks: episodes) are resampled."""
+Difference = Estimate  # mean return of one policy above another's in a class; tasks of both (few: episodes) resampled
 
 
 def results_by_class(

@@ -16,8 +16,7 @@ from torch.func import grad
 from bidex_algos.nets.networks import GaussianActor, gaussian_kl, gaussian_log_prob, stacked_forward
 
 Adapted = Literal["all", "head"]  # which parameters an inner step moves: all, or those of the mean's output layer
-StepSizeKind = Literal["fixed", "layer", "weight"]
-"""Whether sizes of the inner step are learned, and of what; see :class:`StepSizes`."""
+StepSizeKind = Literal["fixed", "layer", "weight"]  # whether sizes of the inner step are learned, and of what
 
 
 class StepSizes(nn.Module):

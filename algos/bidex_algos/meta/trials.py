@@ -28,12 +28,9 @@ class TrialConfig(LearnerConfig):
     value_heads: bool = True  # Give the critic one output per task class instead of one for all.
     init_std: Positive = 0.8  # Standard deviation of the actions at the start.
     std_range: tuple[Positive, Positive] = (0.05, 1.5)  # Bounds of the standard deviation of the actions.
-    episodes_per_trial: Count = 3
-    """Episodes of one task that the memory lasts for: those an evaluation plays to adapt, and one more."""
-    max_adapt_steps: Count = 150
-    """Steps after which an episode of a trial is cut, if its class's time limit has not ended it."""
-    blind_share: Fraction = 0.3
-    """Share of the episodes whose rewards the policy is not shown, as it is not in an evaluation."""
+    episodes_per_trial: Count = 3  # Episodes that the memory lasts for: those played to adapt, and one more.
+    max_adapt_steps: Count = 150  # Steps after which an episode of a trial is cut, if its time limit has not ended it.
+    blind_share: Fraction = 0.3  # Share of the episodes whose rewards the policy is not shown, as in an evaluation.
     reward_unit: Positive = 0.01
     """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
     gamma: Fraction = 0.93  # Discount per step, over all episodes of a trial.

@@ -46,12 +46,9 @@ class MultiAgentConfig(OnPolicyConfig):
     agents: Partition = "hands"
     """Who acts: hands (two agents), fingers (twelve: five fingers and the palm of each hand), single, a TOML file with
     a table [agents], or name=unit+unit;name=unit (docs/learners/multiagent.md)."""
-    huber_delta: Positive = 10.0
-    """Error of the critic, in its own units, beyond which its loss grows no faster than the error."""
-    value_clip: NonNegative = 0.0
-    """How far a value may leave the old one before it earns nothing more; 0: as far as it likes."""
-    popart: bool = False
-    """When the statistics of returns change, move the critic's output layer so that its values stay as they were."""
+    huber_delta: Positive = 10.0  # Error of the critic, in its units, beyond which its loss grows no faster than that.
+    value_clip: NonNegative = 0.0  # How far a value may leave the old one before it earns nothing more; 0: no bound.
+    popart: bool = False  # When the statistics of returns change, move the critic's output layer so that values stay.
     max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it: each agent's, and the critic's.
     critic_learning_rate: Positive = 1e-3  # Adam's step size of the critic.
     num_minibatches: Count = 4  # Mini-batches per epoch; each holds shuffled samples of all environments.

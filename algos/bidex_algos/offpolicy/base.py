@@ -51,8 +51,7 @@ class OffPolicyConfig(NetworkConfig):
     tau: Share = 0.02  # Share of the critics that enters the target critics in each update (1 - Polyak's factor).
     learning_rate: Positive = 3e-4  # Adam's step size for the actor.
     critic_learning_rate: Positive = 1e-3  # Adam's step size for the critics.
-    weight_decay: NonNegative = 0.0
-    """Share of its step size by which each step shortens all weights of actor and critics (AdamW)."""
+    weight_decay: NonNegative = 0.0  # Share of its step size by which a step shortens all weights (AdamW).
     adam_eps: NonNegative = 1e-8  # What Adam adds to its denominators.
     max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it, those of actor and critics apart.
     normalise_observations: bool = True

@@ -67,8 +67,7 @@ class BRCConfig(CategoricalConfig, MTSACConfig):
     n_steps: Count = 3  # Steps whose rewards a target takes as they came, before it asks for the value of what follows.
     tau: Share = 0.05  # Share of the critics that enters the target critics in each update (1 - Polyak's factor).
     clipped_double_q: bool = False  # Targets and actor take the critic that says less; off: the mean of both.
-    weight_decay: NonNegative = 1e-4
-    """Share of its step size by which each step shortens all weights of actor and critics (AdamW)."""
+    weight_decay: NonNegative = 1e-4  # Share of its step size by which a step shortens all weights (AdamW).
     target_entropy_per_action: Finite = -0.5
     """Entropy of the squashed policy that each temperature aims at, for each action; uniform actions have 0.69."""
     one_temperature: bool = False  # One temperature for all tasks, led by their mean entropy.

@@ -56,8 +56,7 @@ class Atoms(nn.Module):
 class CategoricalConfig(OffPolicyConfig):
     """The critics' distributions and layers, beside what all off-policy learners have."""
 
-    critic_hidden: Layers = (256, 256)
-    """Widths of the hidden layers of the critics; ``hidden`` is then the actor's alone."""
+    critic_hidden: Layers = (256, 256)  # Widths of the critics' hidden layers; ``hidden`` is then the actor's alone.
     atoms: Annotated[int, Meta(ge=2, le=MOST)] = 101  # Values that a distribution of the return gives probabilities to.
     value_bound: Positive = 10.0  # They lie evenly from minus this to this, in scaled rewards.
     clipped_double_q: bool = True  # Targets and actor take the critic that says less; off: the mean of both.

@@ -39,8 +39,7 @@ class MTPPOConfig(PPOConfig, OnPolicyConfig):
     """What becomes of the tasks' policy gradients. pcgrad: each loses what points against another task's (Yu et al.
     2020). cagrad: their sum is turned towards the task that it serves worst (Liu et al. 2021). famo: losses are weighed
     so that all fall at one rate (Liu et al. 2023)."""
-    cagrad_radius: BelowOne = 0.4
-    """How far cagrad's direction may leave the mean gradient, in lengths of that; 0: it is the mean."""
+    cagrad_radius: BelowOne = 0.4  # How far cagrad's direction may leave the mean gradient, in its lengths; 0: not.
     famo_rate: Positive = 0.025  # Adam's step size of famo's weights.
     famo_decay: NonNegative = 0.01  # By which these weights are drawn back to even ones.
     demonstration_weight: NonNegative = 0.1

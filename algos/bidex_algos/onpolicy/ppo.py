@@ -62,8 +62,7 @@ class PolicyLoss(NamedTuple):
         return [self.surrogate.detach(), value.detach(), self.kl, self.outside]
 
 
-NAMES: tuple[str, ...] = ("Loss/surrogate", "Loss/value", "Policy/kl", "Policy/clip_fraction")
-"""Tags of :meth:`PolicyLoss.numbers`."""
+NAMES = ("Loss/surrogate", "Loss/value", "Policy/kl", "Policy/clip_fraction")  # tags of :meth:`PolicyLoss.numbers`
 
 
 def policy_loss(
