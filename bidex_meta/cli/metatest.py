@@ -43,13 +43,9 @@ class Options:
 
 
 def meta_test(
-    worlds: Worlds,
-    config: RunConfig,
-    load: Callable[[], Agent],
-    options: Options,
-    splits: list[str],
-    say: Callable[[str], None] = lambda text: None,
-) -> dict[str, MetaEvaluation]:
+    worlds: Worlds, config: RunConfig, load: Callable[[], Agent], options: Options, splits: list[str],
+    say: Callable[[str], None] = lambda text: None
+) -> dict[str, MetaEvaluation]:  # fmt: skip
     """The meta-test on some splits of a run's worlds.
 
     ``load`` makes a MetaLearningAgent, anew for each split, so that neither depends on the other; of the config

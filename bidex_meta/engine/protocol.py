@@ -28,6 +28,8 @@ class Engine(Protocol):
     ctrl: Tensor  # position targets, shape (num, nu)
     xfrc_applied: Tensor  # world-frame force and torque at bodies' centres of mass, shape (num, nbody, 6)
     sensordata: Tensor  # shape (num, nsensordata)
+    _state: dict[str, Tensor]  # views of what a state holds
+    _mocap: list[Tensor]  # positions and quaternions of fixtures that may stand elsewhere, or nothing
 
     def step(self, substeps: int, active: Tensor | None = None) -> None:
         """Advances all simulations, or those of the mask ``active`` (num,), and refreshes their sensors.
@@ -37,7 +39,9 @@ class Engine(Protocol):
 
     def placement(self) -> Tensor:
         """What ``reset`` takes, of every simulation as it stands, a copy. Shape (num, nq + 7 nmocap)."""
-        ...
+        if not self._mocap:
+            return self.qpos.clone()
+        return torch.cat((self.qpos, torch.cat(self._mocap, dim=2).flatten(1)), dim=1)
 
     def body_poses(self) -> tuple[Tensor, Tensor]:
         """Positions (num, nbody, 3), metres, and rotation matrices (num, nbody, 3, 3) of all bodies, world frame.
@@ -67,7 +71,7 @@ class Engine(Protocol):
 
     def state_dict(self) -> dict[str, Tensor]:
         """Everything that decides the future of the simulations, copied."""
-        ...
+        return {name: value.clone() for name, value in self._state.items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Restores a ``state_dict``.
@@ -77,11 +81,9 @@ class Engine(Protocol):
 
     def model(self, row: int) -> mujoco.MjModel:
         """The model of a simulation, for pictures and checks."""
-        ...
 
     def data(self, row: int) -> mujoco.MjData:
         """A copy of a simulation's data, forwarded by C MuJoCo, for pictures and checks."""
-        ...
 
     def contact_depth(self, row: int) -> float:
         """Deepest penetration among a simulation's contacts, metres, 0 without contact."""

@@ -33,14 +33,9 @@ class Control:
 
 
 def control(
-    load: Callable[[], Agent],
-    test_world: TaskWorld,
-    train_world: PooledWorld,
-    shots: int = 1,
-    *,
-    say: Callable[[str], None] = lambda line: None,
-    **played: Any,
-) -> Control:
+    load: Callable[[], Agent], test_world: TaskWorld, train_world: PooledWorld, shots: int = 1, *,
+    say: Callable[[str], None] = lambda line: None, **played: Any
+) -> Control:  # fmt: skip
     """Play all arms; ``played`` goes to ``meta_evaluate``, whose errors are raised.
 
     ``load`` returns the agent, a MetaLearningAgent, anew for each arm, so that all draw the same numbers. The worlds,
@@ -95,11 +90,9 @@ def arms(runs: Sequence[Control], class_name: str, names: Sequence[str]) -> dict
 
 
 def _own_minus(
-    runs: Sequence[Control],
-    others: Sequence[Sequence[ClassResult]],
-    class_name: str,
-    of: Callable[[ClassResult], np.ndarray | None],
-) -> Difference | None:
+    runs: Sequence[Control], others: Sequence[Sequence[ClassResult]], class_name: str,
+    of: Callable[[ClassResult], np.ndarray | None]
+) -> Difference | None:  # fmt: skip
     """Own data minus the mean of others, episode by episode."""
     differences = []
     for run, of_run in zip(runs, others, strict=True):

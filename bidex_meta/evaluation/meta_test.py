@@ -75,21 +75,11 @@ class MetaEvaluation:
 
 
 def meta_evaluate(
-    agent: Agent,
-    world: TaskWorld,
-    shots: int = 1,
-    *,
-    rollouts: int | None = None,
-    episodes_per_task: int = 4,
-    tasks: int | None = None,
-    trials: int = 1,
-    max_adapt_steps: int = MAX_ADAPT_STEPS,
-    seed: int = EVALUATION_SEED,
-    references: Mapping[str, Reference] | None = None,
-    adapt_world: TaskWorld | None = None,
-    evaluated: Collection[int] | None = None,
-    split: str = "",
-) -> MetaEvaluation:
+    agent: Agent, world: TaskWorld, shots: int = 1, *, rollouts: int | None = None, episodes_per_task: int = 4,
+    tasks: int | None = None, trials: int = 1, max_adapt_steps: int = MAX_ADAPT_STEPS, seed: int = EVALUATION_SEED,
+    references: Mapping[str, Reference] | None = None, adapt_world: TaskWorld | None = None,
+    evaluated: Collection[int] | None = None, split: str = ""
+) -> MetaEvaluation:  # fmt: skip
     """Evaluate an agent as ``evaluate`` does, ``shots`` times after exploring episodes of each task and adaptation.
 
     Environments that play the same task share one adaptation. Where the world has fewer environments than tasks times

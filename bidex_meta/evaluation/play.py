@@ -24,13 +24,9 @@ EVALUATION_SEED = 1_000_000  # seed of the starts in evaluation: nobody trains w
 
 
 def evaluate(
-    agent: Agent,
-    world: TaskWorld,
-    episodes_per_task: int = 4,
-    *,
-    seed: int | None = None,
-    references: Mapping[str, Reference] | None = None,
-) -> Evaluation:
+    agent: Agent, world: TaskWorld, episodes_per_task: int = 4, *, seed: int | None = None,
+    references: Mapping[str, Reference] | None = None
+) -> Evaluation:  # fmt: skip
     """Play every task of ``world`` ``episodes_per_task`` times and report per class.
 
     The world is in autoreset mode DISABLED, with at least one environment for each task; those that share a task share

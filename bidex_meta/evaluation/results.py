@@ -95,11 +95,9 @@ Difference = Estimate  # mean return of one policy above another's in a class; t
 
 
 def results_by_class(
-    names: Sequence[str],
-    episodes: dict[str, np.ndarray],
-    references: Mapping[str, Reference] | None = None,
-    compared: Sequence[dict[str, np.ndarray]] = (),
-) -> dict[str, ClassResult]:
+    names: Sequence[str], episodes: dict[str, np.ndarray], references: Mapping[str, Reference] | None = None,
+    compared: Sequence[dict[str, np.ndarray]] = ()
+) -> dict[str, ClassResult]:  # fmt: skip
     """Results of episodes of ``play_tasks`` by the names of their slots, broken ones as ``counted_returns``.
 
     ``compared``: episodes of the policies that this one is compared with.

@@ -24,7 +24,7 @@ from bidex_meta.world.contract import VectorWorld
 
 @dataclass(frozen=True)
 class _ValueHeads(ArchitectureConfig):
-    value_heads: bool = True  # give the critic one output per task instead of one for all
+    value_heads: bool = True  # Give the critic one output per task instead of one for all.
 
 
 @dataclass(frozen=True)
