@@ -6,41 +6,29 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from msgspec import Meta
 
-from bidex_meta.agents import Agent
 from bidex_meta.cli.learners import learner_kind, resolve_device
 from bidex_meta.cli.parsing import Device, Engine, Switch, parse
-from bidex_meta.cli.policies import load_policy
-from bidex_meta.cli.run_data import dataset_metadata
 from bidex_meta.cli.tables import Json, say
 from bidex_meta.config import Steps
 from bidex_meta.data import open_dataset, part_files, writer
-from bidex_meta.data.collect import (
-    Actor,
-    Progress,
-    SamplingAgent,
-    bytes_held,
-    collect,
-    collect_successes,
-    progress,
-    resumed_writer,
-)  # fmt: skip
 from bidex_meta.data.writer import DatasetWriter
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.runs import RunFolder
 from bidex_meta.utils.files import absolute
 from bidex_meta.utils.memory import usable_cores
 from bidex_meta.utils.validation import Environments, Seed, Threads
-from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted, ShiftedStarts
-from bidex_meta.witness.scripts import script_of
 from bidex_meta.witness.store import load_witness
-from bidex_meta.world.contract import PooledWorld
-from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds
+
+if TYPE_CHECKING:  # what loads torch is imported where it is called: --help needs none
+    from bidex_meta.agents import Agent
+    from bidex_meta.data.collect import Actor, Progress
+    from bidex_meta.world.contract import PooledWorld
 
 RUNS = {"random": 0, "medium": 1, "expert": 1, "medium-expert": 2, "replay": 1, "demonstrations": 0}
 """Kinds of data sets, and how many runs each takes."""
@@ -105,9 +93,9 @@ class _Collection:
     name: str  # kind in the data set's name
     plan: Json  # what decides its content; it has ``kind``, ``size`` and ``num_envs``
     policies: list[Json]  # who acts, for the metadata
-    world: Callable[[], PooledWorld]
+    world: "Callable[[], PooledWorld]"
     episode_share: float  # mean length of an episode as a share of the time limit, at least
-    collect: Callable[[PooledWorld, DatasetWriter], None]  # plays in the world until the writer has all transitions
+    collect: "Callable[[PooledWorld, DatasetWriter], None]"  # plays in the world until the writer has all transitions
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -140,6 +128,9 @@ def _check(flags: RecordFlags, kind: str) -> None:
 
 def _record(flags: RecordFlags, collection: _Collection) -> None:
     """Collects a data set, or goes on with it."""
+    from bidex_meta.cli.run_data import dataset_metadata
+    from bidex_meta.data.collect import bytes_held, resumed_writer
+
     plan, size = collection.plan, collection.plan["size"]
     folder, name = writer.dataset_path(flags.out, collection.source.name, collection.name)
     with contextlib.ExitStack() as stack:
@@ -175,6 +166,9 @@ def _record(flags: RecordFlags, collection: _Collection) -> None:
 
 def _episodes(flags: RecordFlags, kind: str) -> _Collection:
     """Episodes of uniform actions, or of runs' policies."""
+    from bidex_meta.data.collect import Actor, collect, progress
+    from bidex_meta.world.threads import set_up_torch
+
     config = _config(flags)
     source = Worlds.open(config)
     # Sums depend on how torch splits them over threads: a collection keeps those that it began with.
@@ -191,7 +185,7 @@ def _episodes(flags: RecordFlags, kind: str) -> _Collection:
     plan = {"kind": kind, "size": size, "num_envs": rows, "noise": flags.noise, "policies": policies}
     plan |= config | {"starts": flags.seed}
 
-    def play(world: PooledWorld, out: DatasetWriter) -> None:
+    def play(world: "PooledWorld", out: DatasetWriter) -> None:
         before = sum(progress(out, len(actors)).steps)
         if out.parts:
             say(f"Going on after {before:,} transitions in {out.parts} parts.")
@@ -201,7 +195,7 @@ def _episodes(flags: RecordFlags, kind: str) -> _Collection:
     return _Collection(source, kind, plan, policies, lambda: source.world("train", rows), 1.0 / 3.0, play)
 
 
-def _report(size: int, before: int, now: Progress, seconds: float) -> None:
+def _report(size: int, before: int, now: "Progress", seconds: float) -> None:
     """A line after each round; ``seconds`` and ``before``, in transitions, of when this process began."""
     done = sum(now.steps)
     speed = (done - before) / max(seconds, 1e-9)
@@ -235,8 +229,11 @@ def _config(flags: RecordFlags) -> Json:
     return config | {"device": resolve_device(flags.device, Worlds.open(config).on_gpu), "engine": flags.engine}
 
 
-def _actor(flags: RecordFlags, path: Path, device: str) -> tuple[Actor, Json]:
+def _actor(flags: RecordFlags, path: Path, device: str) -> "tuple[Actor, Json]":
     """A run's policy, and its metadata."""
+    from bidex_meta.cli.policies import load_policy
+    from bidex_meta.data.collect import Actor, SamplingAgent
+
     folder = RunFolder.open(path)
     algo = folder.config().algo
     if learner_kind(algo).make.adapts:
@@ -250,6 +247,10 @@ def _actor(flags: RecordFlags, path: Path, device: str) -> tuple[Actor, Json]:
 
 def _demonstrations(flags: RecordFlags) -> _Collection:
     """Successful replays of a class's witness or scripted policy, with moving bases, as suites have them."""
+    from bidex_meta.data.collect import collect_successes, progress
+    from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted, ShiftedStarts
+    from bidex_meta.witness.scripts import script_of
+
     if flags.base == "fixed" or flags.engine == "warp" or flags.device not in ("auto", "cpu"):
         raise BidexError(
             "Witnesses are of moving bases and of C MuJoCo on the CPU. Leave --base, --engine, --device out."
@@ -266,17 +267,17 @@ def _demonstrations(flags: RecordFlags) -> _Collection:
     plan = {"kind": "demonstrations", "task": name, "size": size, "num_envs": rows, "seed": flags.seed, **drawn}
     plan |= {"script": True} if flags.script else {}
 
-    def world() -> PooledWorld:
+    def world() -> "PooledWorld":
         if on_tasks:
             return source.world("train", rows)
         return ShiftedStarts(name, rows, flags.shift, flags.threads)  # pyright: ignore[reportAbstractUsage]
 
-    def agent(world: Any, seed: int) -> Agent:
+    def agent(world: Any, seed: int) -> "Agent":
         if flags.script:
             return Scripted(world, flags.noise, seed)
         return OpenLoopReplay(witness, [name], world.task_id, world.single_action_space.shape[0], flags.noise, seed)
 
-    def play(world: PooledWorld, out: DatasetWriter) -> None:
+    def play(world: "PooledWorld", out: DatasetWriter) -> None:
         while (now := progress(out)).steps[0] < size:
             if not now.steps[0] and out.parts >= _PATIENCE:
                 what, mend = (
