@@ -129,15 +129,12 @@ def _resolved(config: RunConfig, source: Worlds, device: str, fresh: bool) -> Ru
     name = source.class_name or source.name
     suite = None if config.suite is None else str(absolute(name)) if name.endswith(".toml") else name
     return replace(
-        config,
-        suite=suite,
-        task=None if config.task is None else name,
+        config, suite=suite, task=None if config.task is None else name,
         object=str(absolute(held)) if (held := config.object) and held.endswith(".xml") else held,
         start_from=None if config.start_from is None else str(absolute(config.start_from)),
-        record_share=config.record / max(config.steps, 1) if fresh else config.record_share,
-        processes=launch().count,
+        record_share=config.record / max(config.steps, 1) if fresh else config.record_share, processes=launch().count,
         device=device,
-    )
+    )  # fmt: skip
 
 
 def _check(flags: RunFlags, config: RunConfig, kind: LearnerKind) -> None:

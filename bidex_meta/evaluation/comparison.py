@@ -188,17 +188,11 @@ def group_of(label: str, runs: Sequence[Run]) -> Group:
 
     scores = table("score")
     return Group(
-        label=label,
-        seeds=seeds,
-        classes=classes,
-        success=table("success"),
-        returns=table("return"),
-        scores=None if np.isnan(scores).any() else scores,
-        steps=round(sum(steps.values()) / len(steps)),
+        label=label, seeds=seeds, classes=classes, success=table("success"), returns=table("return"),
+        scores=None if np.isnan(scores).any() else scores, steps=round(sum(steps.values()) / len(steps)),
         steps_range=(min(steps.values()), max(steps.values())),
-        hours=float(np.mean([seconds[seed] for seed in seeds])) / 3600.0,
-        paths=[run.path for run in runs],
-    )
+        hours=float(np.mean([seconds[seed] for seed in seeds])) / 3600.0, paths=[run.path for run in runs],
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

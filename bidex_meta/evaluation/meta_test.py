@@ -61,17 +61,10 @@ class MetaEvaluation:
         """Everything but the single episodes, ready for JSON."""
         by_shot = [found.to_json() for found in self.by_shot]
         return {
-            "split": self.split,
-            "shots": len(self.adapt_steps),
-            "rollouts": self.rollouts,
-            "trials": self.trials,
-            "max_adapt_steps": self.max_adapt_steps,
-            "adapt_steps": self.adapt_steps,
-            "before": by_shot[0],
-            "after": by_shot[-1],
-            "gain": self.gains().to_json(),
-            "by_shot": by_shot,
-        }
+            "split": self.split, "shots": len(self.adapt_steps), "rollouts": self.rollouts, "trials": self.trials,
+            "max_adapt_steps": self.max_adapt_steps, "adapt_steps": self.adapt_steps, "before": by_shot[0],
+            "after": by_shot[-1], "gain": self.gains().to_json(), "by_shot": by_shot,
+        }  # fmt: skip
 
 
 def meta_evaluate(
@@ -127,12 +120,9 @@ def meta_evaluate(
     return MetaEvaluation(
         by_shot=[Evaluation(classes, episodes_per_task) for classes in by_class],
         adaptations={name: first["adaptation"][first["slot"] == i] for i, name in enumerate(world.task_names)},
-        rollouts=portions.rollouts,
-        trials=trials,
-        max_adapt_steps=max_adapt_steps,
-        adapt_steps=adapt_steps,
+        rollouts=portions.rollouts, trials=trials, max_adapt_steps=max_adapt_steps, adapt_steps=adapt_steps,
         split=split,
-    )
+    )  # fmt: skip
 
 
 def _seed(seed: int, *key: object) -> int:

@@ -60,16 +60,11 @@ class ClassResult:
     def to_json(self) -> Json:
         """Numbers of this class, ready for JSON."""
         return {
-            "success": self.success,
-            "success_interval": bootstrap_interval(mean, self.drawn(self.successes)),
-            "return": self.mean_return,
-            "return_interval": bootstrap_interval(mean, self.drawn(self.returns)),
-            "length": float(self.lengths.mean()),
-            "score": self.score,
-            "episodes": self.episodes,
-            "tasks": len(np.unique(self.tasks)),
-            "unstable": self.unstable,
-        }
+            "success": self.success, "success_interval": bootstrap_interval(mean, self.drawn(self.successes)),
+            "return": self.mean_return, "return_interval": bootstrap_interval(mean, self.drawn(self.returns)),
+            "length": float(self.lengths.mean()), "score": self.score, "episodes": self.episodes,
+            "tasks": len(np.unique(self.tasks)), "unstable": self.unstable,
+        }  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -111,12 +106,9 @@ def results_by_class(
         broken, reference = own["unstable"].astype(bool), (references or {}).get(name)
         classes[name] = ClassResult(
             returns=counted_returns(own["return"], broken, reference, np.concatenate(finished)),
-            successes=(own["success"] & ~broken).astype(np.float64),
-            lengths=own["length"],
-            tasks=own["task"],
-            unstable=int(broken.sum()),
-            reference=reference,
-        )
+            successes=(own["success"] & ~broken).astype(np.float64), lengths=own["length"], tasks=own["task"],
+            unstable=int(broken.sum()), reference=reference,
+        )  # fmt: skip
     return classes
 
 
