@@ -36,7 +36,6 @@ def main(arguments: Sequence[str]) -> None:
 
     choices = {"--suite": suites_to_run(), "--task": registry.names(), "--algo": list(ALGOS)}
     choices["--object"] = [EGG, *shelf()]
-
     app = tyro.extras.SubcommandApp()
     for name, command in COMMANDS.items():
         found = flags_of(importlib.import_module(command.module).main)

@@ -77,7 +77,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     stored = folder.config() if folder else None
 
     def given(name: str) -> str | None:
-        return peek(arguments, f"--{name}") or (stored and getattr(stored, name))
+        return peek(arguments, f"--{name}") or (stored and vars(stored)[name])
 
     dataset = run_data.whole_paths(peek_all(arguments, "--dataset")) or (stored.dataset if stored else ())
     datasets = run_data.open_datasets(dataset)
@@ -116,10 +116,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
 
 
 def _resolved(config: RunConfig, source: Worlds, device: str, fresh: bool) -> RunConfig:
-    """The config with names as they are written (``MT4`` where ``--suite mt4`` was given) and whole paths.
-
-    A run may be resumed from another folder.
-    """
+    """The config with names as they are written (``MT4`` of ``mt4``) and whole paths: a resume may be elsewhere."""
     if (config.suite is None) == (config.task is None):
         raise BidexError("Name what to train on: either --suite SUITE or --task TASK, for example --suite MT4.")
     if config.base != "own" and config.task is None:
@@ -141,7 +138,7 @@ def _check(flags: RunFlags, config: RunConfig, kind: LearnerKind) -> None:
     """Refuses what does not go together, and what this machine has no room for."""
     if config.stop_at_score is not None and config.evaluate_every is None:
         raise BidexError("--stop-at-score is judged by evaluations while training. Add --evaluate-every 50, say.")
-    asked = [name for name in ("split", "shots", "rollouts", "tasks") if getattr(flags, name) not in (None, "auto")]
+    asked = [name for name in ("split", "shots", "rollouts", "tasks") if vars(flags)[name] not in (None, "auto")]
     if asked and not kind.make.adapts:
         raise BidexError(f"--{asked[0]} is for learners that adapt (maml, promp, rl2), not {kind.name}. Leave it out.")
     if config.record:

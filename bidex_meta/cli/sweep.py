@@ -143,10 +143,7 @@ class Job:
         self.process: subprocess.Popen[bytes] | None = None
 
     def __call__(self) -> None:
-        """Begins or resumes the run in a process of its own, and waits for the end.
-
-        Raises BidexError where it failed: the last line of its log, which a file beside its folder keeps.
-        """
+        """Begins or resumes the run and waits for its end; BidexError, the last line of its log, where it failed."""
         run = self.run
         while _locked(run) and not self.stopped:  # a process trains it that a killed sweep has left
             time.sleep(1.0)

@@ -41,10 +41,7 @@ class CpuEngine(Engine):
     def __init__(
         self, models: Sequence[mujoco.MjModel], rows: Sequence[int], threads: int | None = None, refresh: bool = True
     ) -> None:
-        """Builds the batch: the distinct models, and for each simulation the index of its model.
-
-        Results do not depend on ``threads``; None takes all CPUs.
-        """
+        """Builds the batch; ``rows``: each simulation's model. ``threads`` (None: all CPUs) change no result."""
         self.num = len(rows)
         self._after_step = mujoco.mjtStage.mjSTAGE_VEL if refresh else mujoco.mjtStage.mjSTAGE_NONE
         # MuJoCo would print each broken row to stderr and to a log file in the working folder; unstable() reports it.

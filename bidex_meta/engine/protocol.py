@@ -51,10 +51,7 @@ class Engine(Protocol):
         ...
 
     def unstable(self) -> Tensor:
-        """Which simulations broke since their last reset, bool (num,).
-
-        Numbers out of bounds or not finite, or no room for contacts.
-        """
+        """Which broke (numbers out of bounds or not finite, no room for contacts) since their reset, bool (num,)."""
         ...
 
     def warnings(self) -> Tensor:
@@ -74,10 +71,7 @@ class Engine(Protocol):
         return {name: value.clone() for name, value in self._state.items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Restores a ``state_dict``.
-
-        Raises BidexError for a state of another model or number of rows, or with non-finite numbers.
-        """
+        """Restores a ``state_dict``; BidexError for one of another model or number of rows, or not finite."""
 
     def model(self, row: int) -> mujoco.MjModel:
         """The model of a simulation, for pictures and checks."""

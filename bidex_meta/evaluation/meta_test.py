@@ -186,7 +186,7 @@ def _explore(agent: MetaLearningAgent, world: TaskWorld, obs: Tensor, playing: T
 def _check(agent: Agent, worlds: Sequence[TaskWorld], shots: int, episodes_per_task: int, max_steps: int) -> None:
     whole_number("shots", shots, 0)
     whole_number("max_adapt_steps", max_steps, 1)
-    lacking = [name for name in _ADAPTS if not callable(getattr(agent, name, None))]
+    lacking = [name for name in _ADAPTS if not hasattr(agent, name)]
     if shots and lacking:
         raise BidexError(
             f"Expected an agent that adapts (bidex_meta.agents.MetaLearningAgent), but {type(agent).__name__} has no "

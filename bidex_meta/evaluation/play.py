@@ -78,10 +78,7 @@ def check_world(world: TaskWorld, episodes_per_task: int) -> None:
 
 
 def quota(world: TaskWorld, episodes_per_task: int) -> torch.Tensor:
-    """Episodes each environment has to play, ``(num_envs,)``; those of a task are split over its environments.
-
-    Raises BidexError where it has none.
-    """
+    """Episodes each environment has to play, (num_envs,); BidexError where a task has no environment."""
     tasks = world.task_index
     shares = torch.zeros_like(tasks)
     for slot, name in enumerate(world.task_names):

@@ -203,7 +203,6 @@ def make_batch(
         means.append(mean)
         values.append(of_task(value, task_id))
     old_means = torch.cat(means)
-
     values = return_stats.restore(torch.cat(values), task_id)
     filled = t.filled(slots)
     last = torch.arange(slots, device=task_id.device)[:, None] == t.lengths - 1
