@@ -60,14 +60,12 @@ class RecordFlags:
     task: str | None = None  # random: class to play on its own, not a suite; demonstrations: class of the witness.
     base: Literal["own", "moving", "fixed"] = "own"  # With --task: whether bases move; own: as the class has it alone.
     size: Steps = 0
-    """Transitions; 0: 1e6, of medium-expert 2e6, of demonstrations 2e4. The last episodes are whole: there may be a few
-    more."""
+    """Transitions; 0: 1e6, of medium-expert 2e6, of demonstrations 2e4; a few more, since episodes are whole."""
     checkpoint: str = "last"  # Which policy of a run: last, best or a file.
     actions: Literal["sampled", "mean"] = "sampled"
     """sampled: drawn from the policy's distribution, where it has one; mean: its mean action."""
     noise: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
-    """Standard deviation of Gaussian noise on a policy's actions, for those that have no distribution, or on a
-    witness's."""
+    """Standard deviation of Gaussian noise on the actions of a witness, or of a policy without a distribution."""
     starts: Literal["witness", "tasks"] = "witness"
     """demonstrations: replay the witness from its own start in its own task, objects shifted; or on all tasks of the
     class, from their starts, where it succeeds less often but shows more."""

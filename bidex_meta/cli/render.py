@@ -25,8 +25,7 @@ class RenderFlags(LookFlags):
     """
 
     out: Path | None = None
-    """File to write: .png for a picture, .mp4 for a film, .webp for one that web pages show; None, of a run: a film in
-    its folder videos/."""
+    """File: .png (picture), .mp4 (film) or .webp (film for web pages); None, of a run: a film in its videos/."""
     tiled: Switch = False
     """All classes of the suite beside each other; where an episode ends the next one begins. A name is green from its
     first success to the end of the episode."""

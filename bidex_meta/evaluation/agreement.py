@@ -20,8 +20,7 @@ class Agreement:
 
     name: str  # of the class; of a meta-test with split and shot
     outcome: str
-    """``equal``: each number is the same bit for bit; ``within``: success and return differ by no more than their
-    intervals allow; ``differs``."""
+    """``equal``: bit for bit; ``within``: success and return within what their intervals allow; ``differs``."""
     recorded: Json  # its recorded results
     again: Json  # its results now
 

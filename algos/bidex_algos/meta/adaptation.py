@@ -53,9 +53,7 @@ Params = dict[str, Tensor]  # parameters of an actor by name; stacked ones have 
 Objective = Literal["likelihood", "ratio"]
 """What the inner step follows: log-likelihood times advantage (MAML), or likelihood ratio times advantage (ProMP)."""
 
-_TRANSITIONS_AT_ONCE = 8_192
-"""What a CPU's caches hold of layers 64-64: of 40 tasks with 2,000 each, four at a time take two thirds of the time
-that all take."""
+_TRANSITIONS_AT_ONCE = 8_192  # what a CPU's caches hold of layers 64-64; all tasks at once take half as long again
 
 
 @dataclass

@@ -80,8 +80,7 @@ class InTurnConfig(LearnerConfig):
     """What HAPPO and HATRPO share. A config that is made of this and others puts its fields behind theirs."""
 
     max_factor: NonNegative = 4.0
-    """The most that the ratios of the agents before it, new policy over old, may multiply an agent's advantage with; 0:
-    as much as it comes to."""
+    """The most that the ratios of the agents before it may multiply an agent's advantage with; 0: no bound."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -153,8 +152,7 @@ class MultiAgent(OnPolicy):
     def __init__(self, world: VectorWorld, config: MultiAgentConfig, seed: int):
         self.views = agent_views(world.observation_groups, int(world.single_action_space.shape[0]), config.agents)
         self.kl_share = 1.0 / len(self.views)
-        minibatches = config.num_minibatches
-        check_samples(self.name, config.rollout_steps, world.num_envs, minibatches)
+        check_samples(self.name, config.rollout_steps, world.num_envs, config.num_minibatches)
         super().__init__(world, config, seed)
         rate, eps = config.critic_learning_rate, config.adam_eps
         self.critic_adam = torch.optim.Adam(self.critic.parameters(), lr=rate, eps=eps, fused=True)

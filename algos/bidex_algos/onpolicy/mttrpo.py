@@ -27,13 +27,9 @@ class MTTRPOConfig(OnPolicyConfig):
     """Everything that can be set about MT-TRPO; the defaults are the preset ``laptop``."""
 
     max_kl: Positive = 0.1  # Mean KL of the new policy from the sampling one that an update may not exceed.
-    damping: NonNegative = 0.1
-    """Added to the diagonal of the Fisher matrix, so that the step stays short along directions that the samples tell
-    nothing about."""
+    damping: NonNegative = 0.1  # Added to the Fisher matrix's diagonal: shortens steps that samples tell nothing of.
     cg_iterations: Count = 10  # Conjugate-gradient iterations.
-    fisher_stride: Count = 4
-    """Every so many-th sample goes into the Fisher matrix; it needs fewer than the gradient, and is multiplied once an
-    iteration."""
+    fisher_stride: Count = 4  # Every so many-th sample goes into the Fisher matrix; it needs fewer than gradients.
     backtracks: Count = 10  # Points that the line search tries.
     backtrack_factor: Fraction = 0.8  # By which the line search shortens the step.
     accept_ratio: Fraction = 0.1
