@@ -1,26 +1,21 @@
 """Losses of several tasks on the way to shared weights: CAGrad and FAMO against closed forms, and in MT-PPO."""
 
 import math
-from dataclasses import replace
 
 import hypothesis.strategies as st
-import numpy as np
 import pytest
 import torch
-from hypothesis import assume, example, given, settings
-from torch import Tensor, nn
+from hypothesis import example, given, settings
+from torch import Tensor
 from torch.testing import assert_close
 
 from bidex_algos.balancing import (
     Famo,
     conflict_averse,
-    per_task_gradients,
     project_conflicting,
     worst_served,
 )
-from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
-from bidex_algos.rollout import collect
-from tests.algos.problems import opposite_bandits
+from bidex_algos.onpolicy.mtppo import MTPPOConfig
 
 SMALL = MTPPOConfig(
     hidden=(32, 32), rollout_steps=8, learning_rate=1e-3, learning_rate_range=(1e-5, 2e-3), std_range=(0.05, 1.0),
@@ -31,37 +26,6 @@ seeds = st.integers(0, 2**31)
 
 def draw(seed: int, tasks: int, entries: int = 5) -> torch.Tensor:
     return torch.randn(tasks, entries, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def of_two(first: np.ndarray, second: np.ndarray, c: float) -> np.ndarray:
-    """CAGrad's direction for two gradients, from its primal: the best worst case within a ball about the mean.
-
-    Either one gradient alone is served worst at the best point of the ball, which then lies straight along it; or both
-    are served alike, on the cut of the ball with the plane <g_1 - g_2, d> = 0, and the best point there lies along what
-    the gradients have in that plane.
-    """
-    mean = (first + second) / 2
-    radius = c * np.linalg.norm(mean)
-    for one, other in ((first, second), (second, first)):
-        straight = mean + radius * one / np.linalg.norm(one)
-        if one @ straight <= other @ straight:
-            return straight
-    normal = (first - second) / np.linalg.norm(first - second)
-    centre = mean - (mean @ normal) * normal
-    along = first - (first @ normal) * normal
-    return centre + math.sqrt(radius**2 - (mean @ normal) ** 2) * along / np.linalg.norm(along)
-
-
-@settings(max_examples=60, deadline=None)
-@given(seeds, st.floats(0.05, 0.95), st.floats(-2, 2))
-def test_cagrad_of_two_gradients_is_the_closed_form(seed: int, c: float, size: float):
-    gradients = draw(seed, 2)
-    gradients[1] *= 10.0**size
-    assume(float(gradients.sum(0).norm()) > 1e-3)
-    found, apart = conflict_averse(gradients, c)
-    expected = 2 * of_two(gradients[0].numpy(), gradients[1].numpy(), c)
-    assert_close(found, torch.from_numpy(expected), rtol=1e-5, atol=1e-6 * float(gradients.norm()))
-    assert apart == float(gradients[0] @ gradients[1] < 0)
 
 
 @settings(max_examples=60, deadline=None)
@@ -125,35 +89,6 @@ def test_famo_leaves_out_a_task_without_samples():
     assert famo.logits[1] > famo.logits[0] == famo.logits[2]
 
 
-def test_famo_begins_as_the_plain_sum_where_tasks_have_as_much_to_gain():
-    found = []
-    for way in ("none", "famo"):
-        learner = MTPPO(opposite_bandits(rows=8), replace(SMALL, gradient_surgery=way, num_minibatches=1), seed=0)
-        learner.obs = learner._first_observations()
-        collect(
-            learner.world, learner.rollout, learner.obs, learner._sample, learner._final_value, learner.episodes
-        )  # no update yet: all ratios are 1
-        batch, _ = learner._prepare()
-        batch.advantages = batch.actions[:, 0].sign()  # as much to gain in each
-        learner._gradients(batch, batch.weights.sum(), learner.policy.actor.log_std.detach().clone())
-        found.append(torch.cat([p.grad.flatten() for p in learner.policy.actor.parameters() if p.grad is not None]))
-    assert found[0].norm() > 0
-    assert_close(*found)
-
-
-def test_no_ratio_earns_more_than_the_least_loss_says():
-    learner = MTPPO(opposite_bandits(rows=8), SMALL, seed=0)
-    learner.iterate()
-    batch, _ = learner._prepare()
-    old = learner.policy.actor.log_std.detach().clone()
-    with torch.no_grad():
-        for _ in range(20):
-            for weight in learner.policy.actor.parameters():
-                weight.add_(0.3 * torch.randn(weight.shape, generator=learner.generator))
-            above = learner._above_least(batch, batch.weights.sum(), old)
-            assert (above >= 0).all()
-
-
 def in_a_loop(gradients: Tensor) -> Tensor:
     total = torch.zeros_like(gradients[0])
     for i in range(len(gradients)):
@@ -171,19 +106,3 @@ def in_a_loop(gradients: Tensor) -> Tensor:
 def test_surgery_equals_the_loop_over_tasks(seed: int, tasks: int):
     gradients = torch.randn(tasks, 7, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     assert_close(project_conflicting(gradients)[0], in_a_loop(gradients))
-
-
-def test_two_that_conflict_lose_what_points_against_the_other():
-    found, apart = project_conflicting(torch.tensor([[1.0, 0.0], [-1.0, 1.0]]))
-    assert_close(found, torch.tensor([0.5, 0.5]) + torch.tensor([0.0, 1.0]))
-    assert apart == 1.0
-
-
-def test_gradients_per_task_are_those_of_each_loss():
-    layer = nn.Linear(3, 2)
-    x = torch.randn(2, 3)
-    losses = layer(x).square().sum(1)
-    found = per_task_gradients(losses, list(layer.parameters()))
-    for row, loss in zip(found, losses, strict=True):
-        one = torch.autograd.grad(loss, list(layer.parameters()), retain_graph=True)
-        assert_close(row, torch.cat([g.flatten() for g in one]))

@@ -9,6 +9,7 @@ from torch.distributions import Normal
 
 from bidex_algos.onpolicy.mtppo import MTPPO, Demonstrations, MTPPOConfig, imitation
 from bidex_meta.errors import BidexError
+from tests.algos.resume import resumed
 from tests.algos.toy import ToyWorld, nearness
 from tests.offline.stored import as_data, noisy, played
 
@@ -124,18 +125,13 @@ def test_the_critic_learns_alone_at_first_and_the_policy_stays_as_cloned() -> No
 @pytest.mark.parametrize("cloning", [0, 5])
 def test_a_resumed_run_goes_on_bit_for_bit_with_its_own_data_alone(cloning: int) -> None:
     config = replace(SMALL, demonstration_cloning=cloning, critic_first=12 * cloning)
-    straight, _ = trained(config, shown(), 4)
-    half, _ = trained(config, shown(), 2)
-    state = {"learner": half.state_dict(), "env": half.world.state_dict()}
-    resumed = MTPPO(world(), config, seed=9)
-    resumed.learn_from_demonstrations(shown())
-    resumed.load_state_dict(state["learner"])
-    resumed.world.load_state_dict(state["env"])
-    for _ in range(2):
-        resumed.iterate()
-    assert same(straight, resumed)
-    assert "demonstrated" in resumed.per_process and "demonstrated" not in MTPPO.per_process
-    other = MTPPO(world(), SMALL, seed=9)
-    other.learn_from_demonstrations(shown(seed_rows=2))
+
+    def make(seed: int, rows: int = 8) -> MTPPO:
+        learner = MTPPO(world(), config, seed)
+        learner.learn_from_demonstrations(shown(seed_rows=rows))
+        return learner
+
+    learner, _ = resumed(make, iterations=2)
+    assert "demonstrated" in learner.per_process and "demonstrated" not in MTPPO.per_process
     with pytest.raises(BidexError, match="demonstrations are others"):
-        other.load_state_dict(state["learner"])
+        make(9, rows=2).load_state_dict(learner.state_dict())

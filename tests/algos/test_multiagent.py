@@ -16,8 +16,6 @@ from bidex_algos.multiagent.mappo import MAPPO, MAPPOConfig
 from bidex_algos.offpolicy.ddpg import DDPG, DDPGConfig
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig
-from bidex_algos.replay import Transitions
-from bidex_algos.rollout import collect
 from bidex_meta.errors import BidexError
 from tests.algos.problems import LQR, opposite_bandits
 from tests.algos.toy import ToyWorld, nearness
@@ -174,24 +172,6 @@ def test_ippos_critics_see_no_more_than_their_agents() -> None:
     assert x.grad is not None and x.grad.ne(0).any(0).nonzero().flatten().tolist() == list(views[0].columns)
 
 
-def test_ippo_estimates_apart() -> None:
-    learners = [make(LQR(rows=8, horizon=5), config, seed=0) for make, config in (KINDS["ippo"], KINDS["mappo"])]
-    ippo, mappo = learners
-    first, second = ippo.critic.nets
-    second.load_state_dict(first.state_dict())
-    mappo.critic.load_state_dict(first.state_dict())
-    batches = []
-    for learner in learners:
-        learner.return_stats.count.fill_(1e-9)  # known, so that critics are asked, but for next to nothing
-        obs = learner._first_observations()
-        collect(learner.world, learner.rollout, obs, learner._sample, learner._final_value, learner.episodes)
-        batches.append(learner._prepare()[0])
-    assert mappo.rollout.final_values.count_nonzero() > 4
-    for name in ("advantages", "targets"):
-        own, shared = (getattr(batch, name) for batch in batches)
-        torch.testing.assert_close(own, shared[:, None].expand(-1, 2))
-
-
 @pytest.mark.parametrize("popart", [True, False])
 @every
 def test_popart_keeps_values_when_statistics_change(kind: str, popart: bool) -> None:
@@ -253,22 +233,3 @@ def test_one_agent_is_ddpg(heads: bool) -> None:
         assert told[0]["Loss/critic"] == pytest.approx(told[1]["Loss/critic"], abs=1e-5)
     weights = [torch.cat([p.detach().flatten() for p in each.policy.actor.parameters()]) for each in (one, other)]
     torch.testing.assert_close(*weights, rtol=0, atol=1e-5)
-
-
-def test_an_agent_climbs_beside_what_the_others_did() -> None:
-    """Its slope is that of a critic fed with the replay's actions of the others, by autograd on one agent alone."""
-    learner = MADDPG(opposite_bandits(), MADDPGConfig(agents=CROSSED, **REPLAYED), seed=0)
-    for _ in range(3):
-        learner.iterate()
-    draw: Transitions = learner.replay.take(learner.replay.draw(1, learner.batch_per_task, learner.generator)[0])
-    obs, actor = learner.policy.observations(draw.obs), learner.policy.actor
-    count = len(obs)
-    net = actor.nets[0]  # agent a, whose action is the second
-    joint = torch.stack([draw.actions[:, 0], torch.tanh(net(obs))[:, 0]], 1)
-    expected = torch.autograd.grad(-learner.critic(obs, joint, learner.task_of_draw)[0].mean(), net.head.weight)[0]
-    seen: list[Tensor] = []
-    learner.adams["actor"].step = lambda: seen.append(net.head.weight.grad.clone())  # type: ignore[method-assign]
-    learner.config.__dict__["max_grad_norm"] = 1e9
-    counts = torch.full((2,), count / 2)
-    learner._policy_step(obs, draw, torch.ones(count), counts)
-    torch.testing.assert_close(seen[0], expected, rtol=1e-3, atol=1e-5)

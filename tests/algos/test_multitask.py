@@ -14,7 +14,6 @@ from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.multitask import Moore, PaCo, SoftModules, gram_schmidt
 from bidex_algos.nets.networks import MLP
 from bidex_algos.offpolicy.fasttd3 import FastTD3Config
-from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_meta.errors import BidexError
 from bidex_meta.world.contract import ObservationGroup
@@ -55,15 +54,6 @@ def test_gradients_reach_every_weight_and_the_task_decides(name: str, layer_norm
     other = x.clone()
     other[:, 3:6] = torch.eye(3)[(TASKS + 1) % 3]
     assert not torch.isclose(network(other), out).all(1).any()
-
-
-@pytest.mark.parametrize("name", TRUNKS)
-def test_the_output_is_float32_and_near_in_low_precision(name: str):
-    network, x = made(name), observations()
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        low = network(x.bfloat16())
-    assert low.dtype == torch.float32
-    assert_close(low, network(x), rtol=0.1, atol=0.1)
 
 
 @settings(max_examples=30, deadline=None)
@@ -127,18 +117,6 @@ PPO = MTPPOConfig(
     hidden=(32, 32), rollout_steps=8, learning_rate=1e-3, learning_rate_range=(1e-4, 4e-3), std_range=(0.05, 1.0),
     autocast="off",
 )  # fmt: skip
-
-
-@pytest.mark.parametrize("architecture", TRUNKS)
-def test_the_squashed_actor_starts_with_its_deviation_in_every_task(architecture: str):
-    learner = MTSAC(
-        opposite_bandits(),
-        MTSACConfig(hidden=(32, 32), replay_steps=20, architecture=architecture, init_std=0.3),
-        seed=0,
-    )
-    obs, _ = learner.world.reset(seed=0)
-    _, log_std = learner.policy.actor(obs)
-    assert_close(log_std.exp(), torch.full_like(log_std, 0.3), rtol=0.05, atol=0)
 
 
 def test_multi_head_is_the_shared_trunk_with_both_heads():

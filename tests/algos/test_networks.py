@@ -13,10 +13,10 @@ from torch.testing import assert_close
 from bidex_algos.nets import products
 from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.networks import MLP, GaussianActor, gaussian_entropy, gaussian_kl, gaussian_log_prob, use_bfloat16
-from bidex_algos.nets.normalise import ObservationNormaliser, RunningStats, TaskNormaliser
-from bidex_algos.nets.point_net import PointNet, _largest_of
+from bidex_algos.nets.normalise import RunningStats, TaskNormaliser
+from bidex_algos.nets.point_net import PointNet
 from bidex_algos.nets.policy import SquashedActor, sample_squashed
-from bidex_algos.nets.products import Linear, affine, stacked_affine
+from bidex_algos.nets.products import affine, stacked_affine
 from bidex_meta.world.contract import plain_groups
 
 TASKS_LAST = Inputs(plain_groups(5, 2))
@@ -32,17 +32,6 @@ def test_gaussian_formulas_agree_with_torch_distributions(seed: int, actions: in
     assert_close(gaussian_log_prob(action, mean_p, log_p), p.log_prob(action))
     assert_close(gaussian_kl(mean_p, log_p, mean_q, log_q), kl_divergence(p, q))
     assert_close(gaussian_entropy(log_p).expand(5), p.entropy())
-
-
-def test_heads_are_chosen_in_float32_under_autocast():
-    actor = GaussianActor(TASKS_LAST, (8,), 3, 0.8, torch.Generator().manual_seed(0), heads=2)
-    with torch.no_grad():
-        actor.log_std += torch.linspace(0.0, 1.0, 6).view(2, 3)
-    obs = torch.cat([torch.randn(4, 3), torch.eye(2).repeat(2, 1)], dim=1)
-    expected = actor.log_std_of(obs)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        assert actor(obs).dtype == torch.float32
-        assert torch.equal(actor.log_std_of(obs), expected)
 
 
 def test_initial_weights_follow_the_seed_and_leave_the_global_generator_alone():
@@ -84,20 +73,6 @@ def test_running_stats_skip_empty_groups_and_forget_beyond_max_count():
     assert_close(stats.mean[1], torch.tensor(-9.0, dtype=torch.float64), atol=1e-3, rtol=0)
 
 
-def test_observations_are_normalised_and_task_ids_are_not():
-    obs = torch.cat([torch.randn(200, 2) * 50 + 7, torch.zeros(200, 1), torch.ones(200, 1)], dim=1)
-    normaliser = ObservationNormaliser(Inputs(plain_groups(4, 1)))
-    normaliser.update(obs)
-    out = normaliser(obs)
-    assert_close(out[:, :2].mean(0), torch.zeros(2), atol=1e-4, rtol=0)
-    assert_close(out[:, :2].std(0, correction=0), torch.ones(2), atol=1e-3, rtol=0)
-    assert torch.equal(out[:, 2:], obs[:, 2:])
-    assert normaliser(obs + 1e6)[:, :3].eq(10.0).all()
-    off = ObservationNormaliser(4, enabled=False)
-    off.update(obs)
-    assert torch.equal(off(obs), obs)
-
-
 def test_each_task_is_normalised_by_its_own_statistics():
     inputs = Inputs(plain_groups(5, 3))
     one_hot = torch.eye(3)[[0] * 200 + [2] * 100]  # of the second nothing is seen
@@ -115,49 +90,29 @@ def test_each_task_is_normalised_by_its_own_statistics():
     assert_close(halves(obs), normaliser(obs))
     unseen = torch.tensor([[3.0, -2.0, 0.0, 1.0, 0.0]])
     assert_close(normaliser(unseen), unseen)
-    again = TaskNormaliser(inputs, 3)
-    again.load_state_dict(normaliser.state_dict())
-    assert torch.equal(again(obs), normaliser(obs))
-
-
-CPU = torch.device("cpu")
 
 
 @pytest.mark.parametrize("tells", [(), ("_is_amx_tile_supported",), ("_is_avx512_bf16_supported",)])
 def test_auto_takes_bfloat16_where_the_processor_multiplies_it(tells: tuple[str, ...], monkeypatch: pytest.MonkeyPatch):
     for name in ("_is_amx_tile_supported", "_is_avx512_bf16_supported"):
         monkeypatch.setattr(torch.cpu, name, lambda told=name in tells: told, raising=False)
-    assert use_bfloat16("auto", CPU) == bool(tells)
-    assert use_bfloat16("on", CPU) and not use_bfloat16("off", CPU)
-
-
-def test_auto_is_float32_where_pytorch_cannot_tell(monkeypatch: pytest.MonkeyPatch):
-    for name in ("_is_amx_tile_supported", "_is_avx512_bf16_supported"):
-        monkeypatch.delattr(torch.cpu, name, raising=False)
-    assert not use_bfloat16("auto", CPU)
+    cpu = torch.device("cpu")
+    assert use_bfloat16("auto", cpu) == bool(tells)
+    assert use_bfloat16("on", cpu) and not use_bfloat16("off", cpu)
 
 
 ROWS, INPUTS, OUTPUTS = 8, 6, 5
 
 
-@pytest.fixture(params=["own", "onednn"])
-def chosen(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    made: list[int] = []
-    computed = products._onednn
-
-    def counted(x, weight, bias):
-        made.append(len(x))
-        return computed(x, weight, bias)
-
-    if request.param == "onednn":
+@pytest.fixture(params=[False, True], ids=["own", "onednn"])
+def chosen(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if request.param:
         try:
-            computed(torch.ones(2, 3), torch.ones(2, 3), None)
+            products._onednn(torch.ones(2, 3), torch.ones(2, 3), None)
         except (AttributeError, RuntimeError):
             pytest.skip("PyTorch without oneDNN's product")
-        monkeypatch.setattr(products, "_LEAST", 1)
-    monkeypatch.setattr(products, "is_faster_here", lambda: request.param == "onednn")
-    monkeypatch.setattr(products, "_onednn", counted)
-    return made
+    monkeypatch.setattr(products, "_LEAST", 1)
+    monkeypatch.setattr(products, "is_faster_here", lambda: request.param)
 
 
 def drawn(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -202,37 +157,6 @@ def test_layers_side_by_side(chosen) -> None:
     out = stacked_affine(x, weight, bias)
     assert_close(out, torch.stack([torch.nn.functional.linear(*each) for each in zip(x, weight, bias, strict=True)]))
     assert_close(stacked_affine(x, weight) + bias[:, None], out)
-
-
-@pytest.mark.filterwarnings("ignore:TF32")  # what flags() says of Intel's GPUs
-def test_small_products_other_types_and_what_is_turned_off_are_pytorchs(chosen, monkeypatch) -> None:
-    layer, x = Linear(INPUTS, OUTPUTS), drawn(ROWS, INPUTS)
-    layer(x)
-    made = list(chosen)
-    layer.double()(x.double())
-    with torch.backends.mkldnn.flags(enabled=False):
-        layer.float()(x)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        assert layer(x).dtype == torch.bfloat16
-    monkeypatch.setattr(products, "_LEAST", ROWS * INPUTS * OUTPUTS + 1)
-    layer(x)
-    assert chosen == made
-
-
-@pytest.mark.parametrize(("processor", "capability", "faster"), [
-    ("vendor_id : AuthenticAMD", "AVX512", True),
-    ("vendor_id : AuthenticAMD", "AVX2", False),
-    ("vendor_id : GenuineIntel", "AVX512", False),
-])  # fmt: skip
-def test_it_is_chosen_on_amds_processors_alone(monkeypatch, processor, capability, faster) -> None:
-    monkeypatch.setattr(products, "_processor", lambda: processor)
-    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: capability)
-    monkeypatch.setattr(torch.backends.mkl, "is_available", lambda: True)
-    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: True)
-    monkeypatch.setattr(products, "_onednn", lambda x, weight, bias: torch.nn.functional.linear(x, weight, bias))
-    assert products.is_faster_here.__wrapped__() is faster
-    monkeypatch.setattr(products, "_onednn", lambda *_: torch.ops.mkldnn.no_such_operation(*_))
-    assert products.is_faster_here.__wrapped__() is False
 
 
 def actor(heads: int = 1, init_std: float = 0.5, std_range: tuple[float, float] = (0.02, 2.0)) -> SquashedActor:
@@ -311,12 +235,6 @@ def test_the_gradient_through_the_largest_points_is_that_through_all(channels: i
         assert_close(mine, weights.grad)
     with torch.no_grad():
         assert_close(made(cloud.flatten(1))[:, :-3], features.detach())
-
-
-@pytest.mark.parametrize("points", [1, 7, 100, 256])
-def test_the_largest_is_found_by_blocks(points: int) -> None:
-    values = torch.randn(3, points, 9, generator=torch.Generator().manual_seed(3))
-    assert torch.equal(_largest_of(values), values.argmax(dim=1))
 
 
 def test_points_read_leaves_points_out_evenly() -> None:

@@ -9,11 +9,8 @@ from torch.testing import assert_close
 
 from bidex_algos.meta.rl2 import RL2, RL2Agent, RL2Config
 from bidex_algos.nets.normalise import RunningStats
-from bidex_algos.nets.recurrent import RecurrentNet
 from bidex_meta.agents import MetaLearningAgent, Timestep
-from bidex_meta.cli.learners import learner_kind
 from bidex_meta.errors import BidexError
-from bidex_meta.worlds import Worlds
 from tests.algos.families import PointClass, PointGoals, circle
 from tests.algos.ranks import same
 
@@ -85,52 +82,6 @@ def test_one_shot_closes_most_of_the_gap_to_a_policy_that_knows_the_goal():
     opposite.set_tasks({"PointGoals": circle(16, first=0.2 + math.pi)})
     adapted(agent, opposite)
     assert evaluated(agent, test) < before - 2.0
-
-
-def test_a_chunk_no_shorter_than_a_trial_is_the_whole_of_it():
-    learners = [RL2(PointGoals(6, classes=UNEVEN), replace(TINY, chunk=chunk), seed=0) for chunk in (None, 21, 1000)]
-    for learner in learners:
-        [learner.iterate() for _ in range(2)]
-        batch, _ = learner._prepare()
-        # Three episodes of 7 steps, and the observation after the last one.
-        assert len(learner.trials.obs) == len(batch.weights) == batch.size == 22
-        assert not batch.actor_states.any() and batch.row.tolist() == list(range(6))
-        assert same(learner.policy.state_dict(), learners[0].policy.state_dict())
-
-
-def test_a_new_memory_fades_slowly_and_its_gradient_with_it():
-    short, long = (RecurrentNet(2, (8,), 32, 1, 1.0, torch.Generator().manual_seed(0), lasting=n) for n in (1, 60))
-    gradients = []
-    for net in (short, long):
-        state = torch.zeros(1, 32, requires_grad=True)
-        _, last = net(torch.zeros(60, 1, 2), state)
-        gradients.append(torch.autograd.grad(last.sum(), state)[0].abs().max())
-    assert gradients[0] < 1e-3 and gradients[1] > 0.1
-
-
-def test_the_chunked_forward_equals_a_loop_by_hand():
-    generator = torch.Generator().manual_seed(0)
-    net = RecurrentNet(5, (6,), 7, 3, 1.0, generator, "tanh")
-    x, state = torch.randn(12, 4, 5, generator=generator), torch.randn(4, 7, generator=generator)
-    weights = [getattr(net.gru, name) for name in ("weight_ih_l0", "weight_hh_l0", "bias_ih_l0", "bias_hh_l0")]
-    h, by_hand = state, []
-    for t in range(12):
-        features = torch.tanh(net.encoder[0](x[t]))
-        a, b = (v.chunk(3, 1) for v in (features @ weights[0].T + weights[2], h @ weights[1].T + weights[3]))
-        r, z = torch.sigmoid(a[0] + b[0]), torch.sigmoid(a[1] + b[1])
-        h = (1 - z) * torch.tanh(a[2] + r * b[2]) + z * h
-        by_hand.append(net.head(torch.cat([features, h], 1)))
-    out, last = net(x, state)
-    assert_close(out, torch.stack(by_hand))
-    assert_close(last, h)
-    parts, between = [], state
-    for k in range(3):
-        part, between = net(x[4 * k : 4 * k + 4], between)
-        parts.append(part)
-    assert_close(torch.cat(parts), out)
-    before = torch.get_rng_state()
-    RecurrentNet(5, (6,), 7, 3, 1.0, generator)
-    assert torch.equal(before, torch.get_rng_state())
 
 
 def test_the_update_sees_what_the_rollout_saw():
@@ -205,19 +156,6 @@ def test_advantages_are_those_of_the_definition(end_at_goal: bool):
     assert bool(t.terminated[t.filled()].any()) == end_at_goal
 
 
-def test_without_rewards_nothing_that_the_policy_sees_tells_the_task():
-    seen = []
-    for first in (0.0, 1.0):
-        world = PointGoals(8, classes=TEN)
-        world.set_tasks({"PointGoals": circle(8, first)})
-        learner = RL2(world, replace(SMALL, blind_share=1.0), seed=0)
-        learner._update = lambda batch: {}  # type: ignore[method-assign]
-        learner.iterate()
-        t = learner.trials
-        seen.append((learner.policy.see(t.obs[:-1], *t.previous(len(t.obs) - 1)), t.rewards))
-    assert torch.equal(seen[0][0], seen[1][0]) and not torch.equal(seen[0][1], seen[1][1])
-
-
 def test_rewards_are_shown_but_for_blind_episodes():
     learner = RL2(PointGoals(400, classes=TEN), replace(SMALL, blind_share=0.3), seed=0)
     learner.iterate()
@@ -264,19 +202,6 @@ def test_bad_input_is_named():
         RL2(PointGoals(1), SMALL, seed=0)
 
 
-def test_the_run_makes_the_world_that_the_learner_asks_for():
-    source = Worlds.open({"suite": "ML1-wide", "threads": 1})
-    for algo, learner, mode in (
-        ("rl2", {}, "DISABLED"),
-        ("mtppo", {}, "SAME_STEP"),
-        ("promp", {"slice_steps": None}, "DISABLED"),
-        ("promp", {"slice_steps": 8}, "SAME_STEP"),
-    ):
-        world = source.world("train", 3, learner_kind(algo).autoreset(learner))
-        assert world.autoreset_mode.name == mode
-        world.close()
-
-
 def agent_on(world: PointGoals) -> RL2Agent:
     learner = RL2(PointGoals(8, classes=TEN), SMALL, seed=0)
     learner.iterate()
@@ -305,16 +230,6 @@ def test_evaluation_episodes_start_from_what_adaptation_left():
     agent.init()
     agent.reset(everyone(world))
     assert not state_of(agent).any()
-
-
-def test_reset_of_some_rows_leaves_the_others_in_their_episode():
-    agent = agent_on(PointGoals(4, classes=TEN))
-    obs, mask = torch.ones(4, 4), torch.tensor([True, False, True, False])
-    agent.reset(~mask | mask)
-    first = agent.eval_action(obs)
-    agent.reset(mask)
-    second = agent.eval_action(obs)
-    assert torch.equal(first[mask], second[mask]) and not (first[~mask] == second[~mask]).all(1).any()
 
 
 def test_the_agent_waits_with_rows_whose_episode_is_over():
