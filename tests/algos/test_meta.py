@@ -17,9 +17,8 @@ from bidex_algos.meta.promp import ProMP, ProMPConfig
 from bidex_algos.meta.stage import Stage, TaskRows, features, fitted, task_batch
 from bidex_algos.nets.networks import GaussianActor, gaussian_log_prob
 from bidex_algos.trust_region import flatten, write
-from bidex_meta.agents import Timestep
 from bidex_meta.errors import BidexError
-from tests.algos.families import PointClass, PointGoals, circle
+from tests.algos.families import PointClass, PointGoals, circle, played, shot
 
 SHARED: dict[str, Any] = {
     "hidden": (32, 32), "init_std": 0.5, "gamma": 0.99, "tasks_per_class": 8, "normalise_observations": False
@@ -143,31 +142,15 @@ def test_mamls_trust_region_holds_after_adaptation(max_kl: float):
     assert all(t["Loss/surrogate"] < 0 for t in told)
 
 
-def returns(learner: Any, shots: int = 1) -> list[float]:
+def returns(learner: Any) -> list[float]:
+    """Before the adaptation and after it, on goals between those of the training."""
     world = PointGoals(rows=80)
     world.set_tasks({"PointGoals": circle(8, first=np.pi / 8)})
     policy = learner.load_policy(learner.policy_state_dict())
     policy.assign(world.task_index)
-    found = []
-    for shot in range(shots + 1):
-        found.append(played(world, policy.eval_action, seed=9))
-        obs, _ = world.reset(seed=100 + shot)
-        for _ in range(20):
-            action, aux = policy.adapt_action(obs)
-            following, reward, terminated, truncated, _ = world.step(action)
-            policy.step(Timestep(obs, action, reward, terminated, truncated, aux, following))
-            obs = following
-        policy.adapt()
-    return found
-
-
-def played(world: PointGoals, act: Any, seed: int) -> float:
-    obs, _ = world.reset(seed=seed)
-    total = torch.zeros(world.num_envs)
-    for _ in range(20):
-        obs, reward, *_ = world.step(act(obs))
-        total += reward
-    return float(total.mean())
+    before = played(policy.eval_action, world, seed=9)
+    shot(policy, world, seed=100)
+    return [before, played(policy.eval_action, world, seed=9)]
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -179,7 +162,7 @@ def test_one_inner_step_closes_the_gap_to_a_policy_that_sees_the_goal(kind: Any,
     before, after = returns(learner)
     seeing = PointGoals(rows=80, goal_visible=True)
     seeing.set_tasks({"PointGoals": circle(8, first=np.pi / 8)})
-    best = played(seeing, seeing.best, seed=9)
+    best = played(seeing.best, seeing, seed=9)
     assert (after - before) / (best - before) > 0.4
 
 
@@ -231,10 +214,7 @@ def test_before_any_data_an_adapting_policy_is_the_meta_policy_and_init_goes_bac
     policy.assign(None)  # a task in each row
     policy.adapt()
     assert torch.equal(policy.eval_action(obs), learner.eval_action(obs))
-    action, aux = policy.adapt_action(obs)
-    following, reward, terminated, truncated, _ = learner.world.step(action)
-    policy.step(Timestep(obs, action, reward, terminated, truncated, aux, following))
-    policy.adapt()
+    shot(policy, learner.world)
     moved = policy.eval_action(obs)
     assert not torch.equal(moved, learner.eval_action(obs)) and moved.abs().max() <= 1.0
     policy.init()

@@ -26,17 +26,16 @@ def make(steps: int = 6, cut_share: float = 1.0) -> Replay:
     return replay
 
 
-def add(replay: Replay, *, terminated: Any = (), truncated: Any = (), unstable: Any = (), bad: float = 0.0) -> None:
+def add(replay: Replay, *, terminated: Any = (), truncated: Any = (), unstable: Any = ()) -> None:
     t = replay.added
 
     def flags(rows: Any) -> Tensor:
         return torch.tensor([row in rows for row in range(ROWS)])
 
-    reward = mark(t)[:, 0] + 0.5
-    final = mark(t + 0.5)
-    reward[flags(unstable)], final[flags(unstable)] = bad, bad
-    info = {"unstable": flags(unstable), "final_obs": final}
-    replay.add(-mark(t)[:, :1], reward, flags(terminated), flags(truncated) | flags(unstable), mark(t + 1), info)
+    info = {"unstable": flags(unstable), "final_obs": mark(t + 0.5)}
+    replay.add(
+        -mark(t)[:, :1], mark(t)[:, 0] + 0.5, flags(terminated), flags(truncated) | flags(unstable), mark(t + 1), info
+    )
 
 
 def everything(replay: Replay) -> Tensor:

@@ -1,6 +1,4 @@
-import math
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
@@ -11,7 +9,7 @@ from bidex_algos.meta.rl2 import RL2, RL2Agent, RL2Config
 from bidex_algos.nets.normalise import RunningStats
 from bidex_meta.agents import MetaLearningAgent, Timestep
 from bidex_meta.errors import BidexError
-from tests.algos.families import PointClass, PointGoals, circle
+from tests.algos.families import PointClass, PointGoals, circle, everyone, played, shot
 from tests.algos.ranks import same
 
 SMALL = RL2Config(
@@ -23,30 +21,9 @@ TEN = (PointClass(steps=10, count=16),)
 UNEVEN = (PointClass("Short", steps=3, count=3), PointClass("Long", steps=7, scale=100.0, count=2))
 
 
-def everyone(world: PointGoals) -> Tensor:
-    return torch.ones(world.num_envs, dtype=torch.bool)
-
-
 def evaluated(agent: MetaLearningAgent, world: PointGoals) -> float:
-    obs, _ = world.reset()
     agent.reset(everyone(world))
-    total = 0.0
-    for _ in range(int(world.max_episode_steps.max())):
-        obs, reward, *_ = world.step(agent.eval_action(obs))
-        total += float(reward.mean())
-    return total
-
-
-def adapted(agent: MetaLearningAgent, world: PointGoals) -> None:
-    obs, _ = world.reset()
-    agent.reset(everyone(world))
-    over = ~everyone(world)
-    for _ in range(int(world.max_episode_steps.max())):
-        action, aux = agent.adapt_action(obs)
-        following, reward, terminated, truncated, _ = world.step(action)
-        agent.step(Timestep(obs, action, reward, terminated, truncated, aux, following, ~over))
-        obs, over = following, terminated | truncated
-    agent.adapt()
+    return played(agent.eval_action, world)
 
 
 def state_of(agent: RL2Agent) -> Tensor:
@@ -63,48 +40,15 @@ def test_one_shot_closes_most_of_the_gap_to_a_policy_that_knows_the_goal():
     test, shown = PointGoals(80, classes=TEN), PointGoals(80, goal_visible=True, classes=TEN)
     test.set_tasks({"PointGoals": circle(16, first=0.2)})
     agent = RL2.load_policy(learner.policy_state_dict())
-    obs, _ = shown.reset()
-    best = 0.0
-    for _ in range(10):
-        obs, reward, *_ = shown.step(shown.best(obs))
-        best += float(reward.mean())
-    before = evaluated(agent, test)
+    best, before = played(shown.best, shown), evaluated(agent, test)
     assert before == pytest.approx(-10.0, abs=1.0)
-    adapted(agent, test)
+    shot(agent, test)
     after = evaluated(agent, test)
     assert (after - before) / (best - before) > 0.6
     # The second evaluation learns nothing from the first, and without adaptation all is as before.
     assert evaluated(agent, test) == pytest.approx(after, abs=0.3)
     agent.init()
     assert evaluated(agent, test) == pytest.approx(before, abs=0.3)
-    # A shot at the goals opposite misleads.
-    opposite = PointGoals(80, classes=TEN)
-    opposite.set_tasks({"PointGoals": circle(16, first=0.2 + math.pi)})
-    adapted(agent, opposite)
-    assert evaluated(agent, test) < before - 2.0
-
-
-def test_the_update_sees_what_the_rollout_saw():
-    learner = RL2(PointGoals(6, classes=UNEVEN), replace(TINY, blind_share=0.5), seed=0)
-    learner.iterate()
-    seen: list[tuple[Tensor, Tensor]] = []
-    step, world = learner.policy.step, learner.world
-
-    def spy(obs: Tensor, memory: Any) -> tuple[Tensor, Tensor]:
-        playing = ~world.episodes.finished
-        out = step(obs, memory)
-        seen.append((playing, out[0]))
-        return out
-
-    learner.policy.step = spy  # type: ignore[method-assign]
-    learner._update = lambda batch: {}  # type: ignore[method-assign]
-    learner.policy.update_statistics = lambda obs, rewards: None  # type: ignore[method-assign]
-    learner.iterate()
-    batch, _ = learner._prepare()
-    for row in range(6):
-        played = torch.stack([mean[row] for playing, mean in seen if playing[row]])
-        assert len(played) == learner.trials.lengths[row] == 3 * int(world.max_episode_steps[row])
-        assert_close(batch.old_means[: len(played), row], played)
 
 
 def test_rows_of_different_length_are_recorded_without_gaps():
@@ -188,7 +132,7 @@ def test_an_evaluation_leaves_the_training_alone():
         learner.iterate()
         if evaluate:
             test = PointGoals(3)
-            adapted(learner.agent, test)
+            shot(learner.agent, test)
             evaluated(learner.agent, test)
         learner.iterate()
         states.append(learner.state_dict())
@@ -214,7 +158,7 @@ def agent_on(world: PointGoals) -> RL2Agent:
 def test_evaluation_episodes_start_from_what_adaptation_left():
     world = PointGoals(4, classes=TEN)
     agent = agent_on(world)
-    adapted(agent, world)
+    shot(agent, world)
     left = state_of(agent)
     obs = torch.zeros(4, 4)
     first = []
@@ -225,7 +169,7 @@ def test_evaluation_episodes_start_from_what_adaptation_left():
     assert torch.equal(first[0], first[1]) and torch.equal(first[0], first[2])
     assert torch.equal(state_of(agent), left)
     # A second shot goes on from the first, not from an evaluation.
-    adapted(agent, world)
+    shot(agent, world)
     assert not torch.equal(state_of(agent), left)
     agent.init()
     agent.reset(everyone(world))
@@ -247,23 +191,6 @@ def test_the_agent_waits_with_rows_whose_episode_is_over():
         same = (state_of(agent) == before).all(1)
         assert same.tolist() == [t >= 3] * 3 + [False] * 3
     assert agent._learned is not None and agent._learned.done.all()
-
-
-def test_rows_that_play_no_episode_learn_nothing():
-    world = PointGoals(4, classes=TEN)
-    agent, some = agent_on(world), torch.tensor([True, False, True, False])
-    obs, _ = world.reset()
-    agent.reset(some)
-    action, aux = agent.adapt_action(obs)
-    obs, reward, terminated, truncated, _ = world.step(action)
-    agent.step(Timestep(obs, action, reward, terminated, truncated, aux, obs, some))
-    assert torch.equal(state_of(agent).any(1), some)
-    agent.reset(everyone(world))  # an evaluation
-    before = state_of(agent)
-    agent.reset(some)
-    action, aux = agent.adapt_action(obs)
-    agent.step(Timestep(obs, action, reward, terminated, truncated, aux, obs, some))
-    assert torch.equal((state_of(agent) != before).any(1), some)
 
 
 def test_the_agent_plays_the_trial_that_the_training_played():
