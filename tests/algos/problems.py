@@ -47,6 +47,9 @@ class _TimedWorld(FakeWorld):
     @abstractmethod
     def _draw(self) -> Tensor: ...
 
+    def _observe(self) -> Tensor:
+        return self.state.clone()
+
     def _start(self, mask: Tensor) -> None:
         self.state = torch.where(mask[:, None], self._draw(), self.state)
 
@@ -65,9 +68,6 @@ class LQR(_TimedWorld):
 
     def _draw(self) -> Tensor:
         return torch.rand(self.num_envs, 2, generator=self.generator) - 0.5
-
-    def _observe(self) -> Tensor:
-        return self.state.clone()
 
     def _advance(self, action: Tensor, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         a, b, q, r = (torch.from_numpy(m).float() for m in (self.a, self.b, self.q, self.r))
@@ -95,17 +95,11 @@ class PointMass(_TimedWorld):
 
     speed = 0.1
 
-    def __init__(self, rows: int = 32, horizon: int = 20, goal_visible: bool = True):
+    def __init__(self, rows: int = 32, horizon: int = 20):
         super().__init__(4, 2, rows, horizon)
-        self.goal_visible = goal_visible
 
     def _draw(self) -> Tensor:
         return torch.rand(self.num_envs, 4, generator=self.generator) - 0.5
-
-    def _observe(self) -> Tensor:
-        shown = self.state.clone()
-        shown[:, 2:] *= float(self.goal_visible)
-        return shown
 
     def _advance(self, action: Tensor, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         position, goal = self.state[:, :2] + self.speed * action, self.state[:, 2:]

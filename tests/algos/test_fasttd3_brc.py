@@ -49,8 +49,6 @@ def test_the_projection_is_that_of_a_slow_loop(
     assert_close(out.sum(), torch.tensor(1.0).double())
 
 
-# Returns of several steps.
-
 ROWS = 3
 
 
@@ -277,5 +275,4 @@ def test_wide_critics_are_counted_as_memory(kind: Any, config: Any) -> None:
 
 
 def test_one_task_needs_no_embedding() -> None:
-    assert LQR().num_id_columns == 0
     trained(BRC, LQR(rows=4), SMALL, 1)

@@ -48,14 +48,11 @@ def test_learned_step_sizes_are_no_part_of_what_another_run_begins_with():
         assert learner.policy.step_sizes is None or float(learner.policy.step_sizes.mean()) == 1.0
 
 
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        ({"hidden": (9,)}, r"hidden = \[9\], got \[8\]\. Add --learner\.hidden"),
-        ({"activation": "elu"}, "activation = elu, got tanh"),
-        ({"normalise_observations": False}, "normalise_observations = False, got True"),
-    ],
-)
+@pytest.mark.parametrize(("change", "expected"), [
+    ({"hidden": (9,)}, r"hidden = \[9\], got \[8\]\. Add --learner\.hidden"),
+    ({"activation": "elu"}, "activation = elu, got tanh"),
+    ({"normalise_observations": False}, "normalise_observations = False, got True"),
+])  # fmt: skip
 def test_another_form_is_refused(change, expected):
     learner = ProMP(PointGoals(rows=16), replace(PROMP, **change), seed=0)
     with pytest.raises(BidexError, match=expected):

@@ -35,10 +35,6 @@ def tiny(kind: Any, config: Any, tasks: int = 3) -> tuple[Any, Any]:
     return learner, batches
 
 
-def surrogate(learner: Any, batches: Any) -> Tensor:
-    return learner._objective(batches)[0]
-
-
 @pytest.mark.parametrize(
     ("inner_steps", "adapted", "sizes"),
     [(1, "all", "fixed"), (2, "all", "fixed"), (2, "head", "fixed"), (2, "all", "layer"), (2, "head", "weight")],
@@ -53,7 +49,7 @@ def test_second_order_gradients_agree_with_finite_differences(
     parameters = list(learner.policy.parameters())
     learned = {"fixed": 0, "layer": 5, "weight": len(flatten(learner.policy.actor.mean.head.parameters()))}[sizes]
     assert sum(p.numel() for p in parameters) == learned + sum(p.numel() for p in learner.policy.actor.parameters())
-    gradient = flatten(torch.autograd.grad(surrogate(learner, batches), parameters))
+    gradient = flatten(torch.autograd.grad(learner._objective(batches)[0], parameters))
     start = flatten(parameters).detach().clone()
     step = 1e-6
     for i in range(0, len(start), 3):
@@ -62,7 +58,7 @@ def test_second_order_gradients_agree_with_finite_differences(
             moved = start.clone()
             moved[i] += sign * step
             write(parameters, moved)
-            values.append(float(surrogate(learner, batches).detach()))
+            values.append(float(learner._objective(batches)[0].detach()))
         write(parameters, start)
         assert float(gradient[i]) == pytest.approx((values[0] - values[1]) / (2 * step), rel=1e-4, abs=1e-7)
 
@@ -73,7 +69,7 @@ def test_first_order_leaves_the_second_derivatives_out(kind: Any, config: Any):
     for first_order in (False, True):
         learner, batches = tiny(kind, replace(config, inner_learning_rate=0.3, first_order=first_order))
         parameters = list(learner.policy.actor.parameters())
-        gradients.append(flatten(torch.autograd.grad(surrogate(learner, batches), parameters)))
+        gradients.append(flatten(torch.autograd.grad(learner._objective(batches)[0], parameters)))
     assert (gradients[0] - gradients[1]).norm() > 1e-3 * gradients[0].norm()
     # The first-order gradient is that at the adapted parameters, as if they were given.
     adapter = learner.policy.adapter

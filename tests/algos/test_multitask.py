@@ -112,8 +112,6 @@ def test_pacos_layers_are_those_of_the_composed_parameters():
         assert_close(network(x)[task == TASKS], expected)
 
 
-# In the learners.
-
 PPO = MTPPOConfig(
     hidden=(32, 32), rollout_steps=8, learning_rate=1e-3, learning_rate_range=(1e-4, 4e-3), std_range=(0.05, 1.0),
     autocast="off",

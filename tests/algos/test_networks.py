@@ -145,6 +145,14 @@ def test_gradients_have_gradients(chosen) -> None:
         assert_close(one.double(), other, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.parametrize(("processor", "faster"), [("AuthenticAMD", True), ("GenuineIntel", False)])
+def test_onednn_is_chosen_on_amds_processors_alone(monkeypatch, processor, faster) -> None:
+    monkeypatch.setattr(products, "_processor", lambda: processor)
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX512")
+    monkeypatch.setattr(products, "_onednn", torch.nn.functional.linear)
+    assert products.is_faster_here.__wrapped__() is faster
+
+
 def actor(heads: int = 1, init_std: float = 0.5, std_range: tuple[float, float] = (0.02, 2.0)) -> SquashedActor:
     inputs, g = Inputs(plain_groups(5, 2)), torch.Generator().manual_seed(0)
     return SquashedActor(inputs, (16,), 3, heads, init_std, std_range, g, "relu")

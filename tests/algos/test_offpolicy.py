@@ -159,6 +159,17 @@ def test_mtsacs_target_is_that_of_the_definition() -> None:
     assert_close(target.double(), expected.double(), rtol=1e-4, atol=1e-4)
 
 
+def test_each_temperature_follows_the_entropy_of_its_own_task() -> None:
+    learner, draw = MTSAC(opposite_bandits(rows=6), replace(SAC, policy_heads=True, batch_per_task=3), seed=0), a_draw()
+    draw.obs[:, 1:] = torch.eye(2).repeat_interleave(3, 0)
+    with torch.no_grad():  # standard deviations of about 0.02 and 2 on either side of the target entropy
+        bias = learner.policy.actor.net.head.bias.view(2, 2, 2)
+        bias[0, 1], bias[1, 1] = -3.0, 3.0
+    before = learner.log_alpha.detach().clone()
+    learner._update(draw, torch.ones(6), torch.full((2,), 3.0))
+    assert (learner.log_alpha.detach() - before).tolist() == pytest.approx([3e-3, -3e-3], rel=1e-3)
+
+
 @pytest.mark.parametrize("target", [-2.0, 0.2])
 def test_the_policy_comes_to_the_entropy_asked_for(target: float):
     config = replace(SAC, target_entropy_per_action=target, alpha_learning_rate=2e-2)

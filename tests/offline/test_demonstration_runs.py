@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from bidex_meta.data import collect, open_dataset, writer
+from bidex_meta.cli import record
+from bidex_meta.data import open_dataset, writer
 from bidex_meta.runs import RunFolder
 from bidex_meta.witness.demonstrators import ShiftedStarts
 from bidex_meta.witness.replay import Simulator
@@ -57,7 +58,7 @@ def test_only_what_succeeds_is_kept_and_a_recording_goes_on(
     assert whole.num_steps >= 300 and bool(whole.table["success"].all())
     assert (whole.metadata["kind"], whole.metadata["base"]) == ("demonstrations", "moving")
     torn = [*RECORD, "--size", "300", "--out", sets / "sets" / "torn-v0"]
-    play, rounds = collect.collect_successes, []
+    play, rounds = record.collect_successes, []
 
     def once(*given: Any) -> None:
         if rounds:
@@ -65,7 +66,7 @@ def test_only_what_succeeds_is_kept_and_a_recording_goes_on(
         rounds.append(play(*given))
 
     with monkeypatch.context() as patch:
-        patch.setattr(collect, "collect_successes", once)
+        patch.setattr(record, "collect_successes", once)
         printed(capsys, *torn, code=130)
     asked, room = [], writer.check_room
     with monkeypatch.context() as patch:
@@ -87,7 +88,7 @@ def test_on_all_tasks_they_show_more(
     played = load_witness("CatchAbreast")
     words = ["record", "demonstrations", "--task", "Switch", "--threads", "1", "--starts", "tasks"]
     with monkeypatch.context() as patch:
-        patch.setattr("bidex_meta.witness.store.load_witness", lambda name: played)
+        patch.setattr(record, "load_witness", lambda name: played)
         assert "None of 12 replays" in printed(capsys, *words, "--num-envs", "4", "--size", "10", code=2)
     printed(capsys, *words, "--num-envs", "8", "--size", "1", "--out", sets / "sets" / "own-v0")
     kept = open_dataset("own-v0")
