@@ -69,28 +69,3 @@ def test_a_run_is_filmed_with_all_its_classes_beside_each_other(monkeypatch, toy
     ):
         assert main(["render", *flags]) == 2
         assert told in capsys.readouterr().err
-
-
-def test_a_tile_of_a_row_that_ends_goes_on_and_its_name_is_green_while_solved():
-    import numpy as np
-
-    from bidex_meta.evaluation import filming
-    from tests.fakes import Seeker, ToyWorld
-
-    world, agent, seen = ToyWorld(2, "DISABLED", slot_tasks=[1, 1]), Seeker(), []
-    world.max_episode_steps[:] = 5
-
-    def tiled(pictures, names, done):
-        seen.append((world.episodes.number.tolist(), list(done)))
-        return np.zeros((2, 2, 3), np.uint8)
-
-    original, filming.tiled = filming.tiled, tiled
-    try:
-        list(filming.film_tiles(agent, world, [0, 1], 7, seed=0, width=4, height=4))
-    finally:
-        filming.tiled = original
-    numbers, done = zip(*seen, strict=True)
-    assert len(seen) == 8 and numbers[0] != numbers[-1]
-    assert done[0] == [False, False] and [True, True] in done[1:5]
-    ends = next(i for i in range(1, 8) if numbers[i] != numbers[i - 1])
-    assert done[ends] == [False, False]

@@ -7,14 +7,10 @@ import numpy as np
 import pytest
 
 from bidex_meta.cli import main
-from bidex_meta.cli.evaluate import conditions
-from bidex_meta.cli.verify import others, recorded_conditions
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.agreement import agreements, classes_of
 from bidex_meta.evaluation.results import ClassResult
 from bidex_meta.runs import RunFolder
-from bidex_meta.worlds import Worlds
-from tests.fakes import run_config
 
 SMALL = ["--suite", "MT4", "--num-envs", "6", "--threads", "1", "--device", "cpu", "--learner.hidden", "8"]
 
@@ -194,12 +190,3 @@ def test_rows_that_cannot_agree():
     with pytest.raises(BidexError, match="of C0, got C0, C1"):
         agreements(rows, {"C0": rows["C0"]})
     assert list(classes_of({"classes": rows})) == ["C0", "C1"]
-
-
-def test_what_was_not_recorded_is_said_once():
-    now = conditions(Worlds.open({"suite": "metaworld/MT3", "device": "cpu", "threads": 1}))
-    assert "metaworld" in now["packages"] and now["physics"] is None
-    assert others(now, now) == []
-    assert others(recorded_conditions({}, {}, run_config(device="cpu")), now) == [
-        "not recorded: " + ", ".join(now["packages"])
-    ]

@@ -11,7 +11,8 @@ from bidex_meta.cli import main, watching
 from bidex_meta.runs import RunFolder, read_metrics
 from bidex_meta.runs.writers import LOGGERS, Writer
 from bidex_meta.utils import gl_backend
-from tests.cli.test_run import final, run, same
+from tests.algos.ranks import same
+from tests.cli.test_run import final, run
 
 
 @pytest.fixture(autouse=True)

@@ -8,7 +8,6 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.wrappers import RecordEpisodeStatistics as SingleStatistics
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from torch import Tensor
 
@@ -268,18 +267,6 @@ def by_gymnasiums_ids() -> list[int]:
         each.reset(seed=0)
         assert each.episodes.counts.all()  # type: ignore[attr-defined]
     return counted_by_gymnasium(RecordEpisodeStatistics(NumpyWorld(world, stagger=world.stagger)), (4, 52), STEPS)  # type: ignore[attr-defined, arg-type]
-
-
-def by_gymnasiums_single_environment() -> list[int]:
-    return counted_by_gymnasium(SingleStatistics(gymnasium.make("bidex-meta/CatchUnderarm-v1")), (52,), STEPS)
-
-
-def by_metaworlds_wrappers() -> list[int]:
-    import bidex_meta.metaworld
-
-    env: Any = bidex_meta.metaworld.make_mt_envs("CatchUnderarm", seed=0)
-    env.reset(seed=0)
-    return [int(e["episode"]["l"]) for _ in range(STEPS) if "episode" in (e := env.step(np.zeros(52, np.float32))[-1])]
 
 
 STATISTICS = [function for name, function in list(globals().items()) if name.startswith("by_")]

@@ -1,7 +1,6 @@
 """What is stored is what a plain loop saw."""
 
 import tempfile
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -134,22 +133,3 @@ def test_a_run_that_goes_on_stores_each_episode_once(tmp_path: Path) -> None:
     other.open(tmp_path / "other")
     with pytest.raises(BidexError, match="of other rows"):
         other.load_state_dict(state)
-
-
-def test_two_processes_write_one_data_set(tmp_path: Path) -> None:
-    seen, worlds = [], []
-    for rank in range(2):
-        make = partial(rough, seed=rank, breaks_at=((3, rank),))
-        recorder, plain = RunCollector(make(), [0, 2, 4], rank), Plain(make())
-        recorder.open(tmp_path / "set")
-        recorder.reset(seed=rank), plain.reset(seed=rank)
-        for step in range(20):
-            recorder.step(actions(rank, step, 5)), plain.step(actions(rank, step, 5))
-            if step % 8 == 7 or step == 19:
-                recorder.state_dict()
-        worlds.append(recorder)
-        seen += [episode for episode in plain.whole if episode.row in (0, 2, 4)]
-    complete(tmp_path / "set", worlds[0])
-    stored = list(open_dataset(tmp_path / "set").episodes())
-    assert [recorder.writer.parts for recorder in worlds] == [3, 3]
-    assert len(stored) == len(seen) > 10 and all(map(same, stored, seen))

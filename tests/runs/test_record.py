@@ -8,7 +8,7 @@ import pytest
 
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
-from bidex_meta.runs import MetricsWriter, Progress, RunFolder, read_metrics, training_seconds
+from bidex_meta.runs import MetricsWriter, Progress, RunFolder, read_metrics
 from bidex_meta.runs import progress as progress_module
 from bidex_meta.runs.metrics import last_rows
 from bidex_meta.runs.plots import Curve, draw_adaptation, draw_learning, read_evaluation, save, svg
@@ -103,13 +103,6 @@ def test_time_left_is_that_of_what_ends_first(rare_lines):
     assert "30 / 1,000,000,000,000,000 steps" in last and "0:00 left" in last
 
 
-def test_training_time_is_counted_over_resumes_and_known_of_older_runs():
-    older = [{"step": 1, "Perf/collection_time": 3.0, "Perf/learning_time": 1.0}, {"step": 2}]
-    assert training_seconds([]) == 0.0
-    assert training_seconds(older) == 4.0
-    assert training_seconds([*older, {"step": 3, "Perf/training_time": 6.0}]) == 6.0
-
-
 def test_progress_in_a_terminal_is_a_table(monkeypatch):
     class Terminal(io.StringIO):
         def isatty(self):
@@ -158,12 +151,6 @@ def test_a_file_without_a_meta_test_is_one_line(text, tmp_path):
     path.write_text(text)
     with pytest.raises(BidexError, match="holds no meta-test"):
         draw_adaptation(read_evaluation(path), path)
-
-
-def test_missing_matplotlib_names_the_extra(tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
-    with pytest.raises(BidexError, match=r"bidex-meta\[plot\]"):
-        draw_learning([])
 
 
 def test_picture_and_film_read_back(tmp_path):

@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from bidex_meta.tasks import registry
 from tools.bench import stability as physics
 from tools.bench.__main__ import main
 from tools.bench.capacity import capacity
@@ -54,13 +53,6 @@ def test_bench_capacity_counts_what_c_and_the_warp_engine_see() -> None:
     assert json.loads(json.dumps(result)) == result
 
 
-def test_stability_of_a_suite_takes_its_classes_of_both_splits_and_that_of_nothing_all() -> None:
-    names = [name for name, _ in physics.variants("ML4", None)]
-    assert names == ["CatchUnderarm", "HandOver", "CatchAbreast", "TwoCatchUnderarm"]
-    every = physics.variants(None, None)
-    assert sorted(every) == sorted([*((name, True) for name in registry.names()), ("HandOver", False)])
-
-
 def test_stability_does_not_hold_when_physics_breaks(monkeypatch: pytest.MonkeyPatch) -> None:
     rough = physics.rough_actions
 
@@ -72,23 +64,6 @@ def test_stability_does_not_hold_when_physics_breaks(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(physics, "rough_actions", broken)
     result = stability(task="CatchUnderarm", steps=16, num_envs=4, threads=1)["CatchUnderarm"]
     assert result["unstable"] == 4 and result["holds"] is False
-
-
-def test_rough_actions_are_half_uniform_half_held_extremes() -> None:
-    generator = torch.Generator().manual_seed(0)
-    held, left = torch.zeros(200, 5), torch.zeros(200, dtype=torch.int64)
-    actions = torch.stack([physics.rough_actions(held, left, generator).clone() for _ in range(120)])
-    uniform, extreme = actions[:, :100], actions[:, 100:]
-    assert abs(float(uniform.mean())) < 0.02 and abs(float(uniform.std()) - 3**-0.5) < 0.01
-    assert (uniform[1:] != uniform[:-1]).any(dim=2).all()
-    assert set(extreme.unique().tolist()) == {-1.0, 1.0}
-    lengths = []
-    for row in range(100):
-        changes = (extreme[1:, row] != extreme[:-1, row]).any(dim=1).nonzero().squeeze(1)
-        lengths += changes.diff().tolist()
-    assert min(lengths) >= 5
-    assert 35 < max(lengths) <= 80  # two holds in a row may draw the same signs
-    assert sum(length > 40 for length in lengths) < 0.1 * len(lengths)
 
 
 @pytest.mark.parametrize(("client", "package"), [("sb3", "stable_baselines3"), ("rsl-rl", "rsl_rl")])

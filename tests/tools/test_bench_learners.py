@@ -49,36 +49,6 @@ def test_bench_libraries_measures_every_architecture_in_turns(
     assert enabled == [False, True, True, False, False, True] * 4
 
 
-@pytest.mark.parametrize("value_heads", [True, False])
-def test_both_sides_learn_on_the_same_sizes(value_heads: bool) -> None:
-    pytest.importorskip("rsl_rl")
-    config = replace(TINY, value_heads=value_heads)
-    ours = bench.Ours(bench.Noise(16, 12, 3, 2, seed=0), config, seed=0)
-    theirs = bench.Theirs(bench.Noise(16, 12, 3, 2, seed=0), config)
-    sizes = [sorted(tuple(p.shape) for p in side.parameters() if p.shape[0] > 2) for side in (ours, theirs)]
-    assert sizes[0] == sizes[1]  # but for the critic's outputs: one a task, or one
-    assert len(ours.parameters()) == len(theirs.parameters())
-    for side in (ours, theirs):
-        before = [p.detach().clone() for p in side.parameters()]
-        whole, update = side.seconds()
-        assert 0.0 < update < whole < 60.0
-        for old, new in zip(before, side.parameters(), strict=True):
-            assert not torch.equal(old, new)
-    # Both saw the same.
-    kept, store = ours.learner.rollout, theirs.ppo.storage
-    assert torch.equal(kept.obs, store.observations["all"])
-    assert torch.equal(kept.ended, store.dones.squeeze(-1).bool())
-
-
-def test_noise_ends_rows_and_shows_their_task() -> None:
-    world = bench.Noise(1000, 12, 3, 4, seed=0)
-    obs, reward, terminated, truncated, _ = world.step(torch.zeros(1000, 3))
-    assert torch.equal(obs[:, -4:].argmax(1), world.task_id)
-    assert torch.equal(world.task_id.bincount(), torch.full((4,), 250))
-    assert 0 < terminated.sum() < 20 and 0 < truncated.sum() < 20 and not (terminated & truncated).any()
-    assert reward.std() > 0.9
-
-
 def test_adapting_together_gives_what_a_loop_gives():
     found = adapt(num_tasks=3, rollouts=2, steps=4, repeats=1)
     for name in ("point", "hands"):

@@ -11,7 +11,6 @@ from bidex_meta.evaluation.comparison import read_groups
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.stored import StoredRun, open_run
 from tests.fakes import change, evaluated_run, log
-from tests.pages import ROOT
 from tools import collect as tool
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
@@ -57,40 +56,6 @@ def test_tables_of_files_are_those_of_the_folders(tmp_path: Path, capsys: pytest
     assert COMMIT[:10] in (tmp_path / "r.html").read_text()
 
 
-def test_what_a_file_keeps(tmp_path: Path) -> None:
-    folder = RunFolder.open(evaluated(tmp_path, 0, 1 / 3))
-    content = tool.condensed(folder, "x", 7)
-    curves = content["curves"]
-    assert len(curves["step"]) == 60 and curves["step"][-1] == 1000 == content["steps"]
-    assert curves["Perf/training_time"][-1] == 1500.0 == content["seconds"]
-    # Each point is the mean of the stretch that ends with it.
-    first = curves["step"][0] // 2
-    assert curves["Train/success/A"][0] == pytest.approx((first + 1) / 2 / 500, rel=1e-3)
-    assert content["evaluation"]["policy"]["classes"]["A"]["success"] == 0.33333
-    assert (content["suite"], content["parameters"]) == ({"name": "MT4", "version": 1}, 7)
-    assert content["engine"] == "c"
-    path = tmp_path / "x.json"
-    path.write_text(tool.text(content))
-    assert json.loads(path.read_text()) == content
-    assert open_run(path).metrics()[-1] == {"step": 1000, **{t: c[-1] for t, c in curves.items() if t != "step"}}
-
-
-def test_no_folder_of_this_machine_stays(tmp_path: Path) -> None:
-    path, suite = evaluated(tmp_path, 0, 0.5), tmp_path / "own.toml"
-    suite.write_text((ROOT / "suites" / "MT4.toml").read_text().replace('"MT4"', '"own"'))
-    folder = RunFolder.open(path)
-    change(folder.path, suite=str(suite), start_from=str(tmp_path / "other"))
-    found = json.loads((path / "evaluation.json").read_text())
-    (path / "evaluation.json").write_text(json.dumps({"run": str(path), **found}))
-    content = tool.condensed(folder, "x", None)
-    assert str(tmp_path) not in json.dumps(content)
-    assert content["suite"]["name"] == "own" and "CatchUnderarm" in content["suite"]["file"]
-    assert content["config"]["suite"] == "own.toml"
-    change(folder.path, suite=None, task="HandOver", object=str(tmp_path / "mug.xml"))
-    content = tool.condensed(folder, "x", None)
-    assert str(tmp_path) not in json.dumps(content) and content["config"]["object"] == "mug.xml"
-
-
 def test_a_run_that_a_return_ended_is_kept_as_it_ended(tmp_path: Path) -> None:
     path = evaluated(tmp_path, 0, 0.5)
     folder = log(path, *({"step": 2 * i, "Train/mean_return": i / 50, "Train/return/A": 1.0} for i in range(1, 501)))
@@ -104,27 +69,6 @@ def test_a_run_that_a_return_ended_is_kept_as_it_ended(tmp_path: Path) -> None:
     change(folder.path, stop_at_return=10.5)
     with pytest.raises(BidexError, match="evaluated at 1,000 steps"):
         collect(path, into=tmp_path / "data")
-
-
-def test_a_run_of_changed_code_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    clean, changed = (evaluated(tmp_path, seed, 0.5, f"run{seed}") for seed in (0, 1))
-    (changed / "versions.json").write_text(json.dumps({"git": {"commit": COMMIT, "dirty": True}}))
-    collect(clean, changed, into=tmp_path / "data")
-    told = capsys.readouterr()
-    assert (
-        told.err
-        == f"{tmp_path / 'data' / 'run1.json'} was made by changed code: its commit alone does not make it again.\n"
-    )
-    assert len(told.out.split()) == 2
-
-
-@pytest.mark.parametrize(
-    "name, arm",
-    [("MT4-soft modules-seed0", "soft modules"), ("mt4_gamma_s12", "gamma"), ("2026-11-21_10-00-00_seed0", "mtppo"),
-     ("MT4", "mtppo"), ("again", "again")],
-)  # fmt: skip
-def test_an_arm_is_the_name_without_suite_and_seed(name: str, arm: str) -> None:
-    assert tool.arm_of(Path("runs") / name, {"suite": "MT4", "task": None, "algo": "mtppo"}) == arm
 
 
 def test_what_is_refused_leaves_nothing_written(tmp_path: Path) -> None:
@@ -157,17 +101,6 @@ def test_what_is_refused_leaves_nothing_written(tmp_path: Path) -> None:
     change(folder.path, seed=5)
     with pytest.raises(BidexError, match="is of another run than"):
         collect(good, into=into)
-
-
-def test_a_meta_test_of_test_tasks_alone_need_not_show_what_was_trained(tmp_path: Path) -> None:
-    run = evaluated(tmp_path, 0, 0.5)
-    rows = {"classes": {"C": {"success": 1.0, "return": 1.0, "score": None}}}
-    of_test = {"before": rows, "after": rows}
-    (run / "evaluation.json").write_text(json.dumps({"splits": {"test": of_test}}))
-    assert tool.condensed(RunFolder.open(run), "x", 7)["evaluation"]["splits"].keys() == {"test"}
-    (run / "evaluation.json").write_text(json.dumps({"splits": {"train": of_test, "test": of_test}}))
-    with pytest.raises(BidexError, match="of another run"):
-        tool.condensed(RunFolder.open(run), "x", 7)
 
 
 def test_a_damaged_file_is_refused(tmp_path: Path) -> None:

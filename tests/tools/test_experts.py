@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from bidex_meta.errors import BidexError
 from bidex_meta.witness.replay import Replay
 from tools import collect, experts
 
@@ -44,15 +43,3 @@ def test_the_expert_is_the_best_of_witness_script_and_runs(tmp_path: Path, monke
         "CatchAbreast": (20.0, "mtppo on MT4, 1,000 steps, seed 3"),
         "TwoCatchUnderarm": (7.0, "script"),
     }
-
-
-def test_a_run_on_fixed_bases_is_no_expert_of_a_suite(tmp_path: Path) -> None:
-    with pytest.raises(BidexError, match="moving bases"):
-        experts.best_known([], [evaluated_run(tmp_path / "a", "HandOver", None, {"HandOver": 30.0})])
-
-
-def test_a_meta_test_is_no_expert(tmp_path: Path) -> None:
-    run = evaluated_run(tmp_path / "a", None, "ML4", {})
-    (run / "evaluation.json").write_text(json.dumps({"splits": {}}))
-    with pytest.raises(BidexError, match="meta-test"):
-        experts.best_known([], [run])
