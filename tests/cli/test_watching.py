@@ -90,19 +90,6 @@ def test_the_best_policy_is_kept_and_judged(toy_worlds, tmp_path, monkeypatch, s
     assert "--evaluate-every" in refused("evaluate", path, "--checkpoint", "best")
 
 
-def test_few_tasks_are_played_ten_times_in_all_and_many_once():
-    from bidex_meta.suite import suite_names
-    from bidex_meta.worlds import Worlds
-    from bidex_meta.worlds.external import HUMANOID
-
-    shipped = {name: watching.played(Worlds.open({"suite": name}).tasks("train")) for name in suite_names()}
-    few = {"MT1": (1, 3), "ML1": (3, 4), "ML1-wide": (3, 4)}
-    assert shipped == dict.fromkeys(shipped, (10, 1)) | few
-    assert watching.played(Worlds.open({"suite": None, "task": "HandOver"}).tasks("train")) == (10, 1)
-    assert watching.played(Worlds.open({"suite": None, "task": HUMANOID}).tasks("train")) == (1, 10)
-    assert watching.played({"a": ["0"], "b": ["0"], "c": ["0"]}) == (1, 4)
-
-
 def test_equal_success_is_settled_by_the_score_or_the_return():
     def better(*numbers, name="Eval/score"):
         found = [{"Eval/success_rate": s, "Eval/mean_return": 9.0 - v, name: v} for s, v in numbers]
