@@ -5,7 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -176,7 +175,7 @@ def test_task_world_has_the_tasks_of_the_suites(asked: None) -> None:
         ({"seed": -1}, "seed: expected a whole number"),
     ],
 )
-def test_bad_worlds(arguments: dict[str, Any], message: str) -> None:
+def test_bad_worlds(arguments: dict[str, object], message: str) -> None:
     with pytest.raises(BidexError, match=message):
         Benchmark("MT4").make_world(**arguments)
 

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -173,7 +174,7 @@ def _parent(process: Path) -> int | None:
         return None
 
 
-def _wait(so: Any, seconds: float = 60.0) -> None:
+def _wait(so: Callable[[], object], seconds: float = 60.0) -> None:
     end = time.monotonic() + seconds
     while not so():
         assert time.monotonic() < end

@@ -13,6 +13,8 @@ from torch import Tensor
 
 from bidex_meta.clients.needs import extra
 from bidex_meta.errors import BidexError
+from bidex_meta.world import World
+from bidex_meta.world.contract import PooledWorld
 from bidex_meta.world.wrapper import NumpyWorld
 from tests.points import PointWorld, ring
 from tests.world.play import class_world, suite_world
@@ -22,7 +24,7 @@ ADAPTERS = {"sb3": ("stable_baselines3", "SB3VecEnv"), "rsl_rl": ("rsl_rl", "Rsl
 ADAPTERS |= {"skrl": ("skrl", "SkrlEnv"), "torchrl": ("torchrl", "TorchRLEnv")}
 
 
-def adapt(client: str, world: Any, **options: Any) -> Any:
+def adapt(client: str, world: PooledWorld, **options: object) -> Any:
     package, name = ADAPTERS[client]
     pytest.importorskip(package)
     return getattr(import_module(f"bidex_meta.clients.{client}_env"), name)(world, **options)
@@ -36,7 +38,7 @@ class Staggered(PointWorld):
     def _first_elapsed(self) -> Tensor:
         return torch.arange(self.num_envs) % 5 * self.stagger
 
-    def get_attr(self, name: str) -> tuple[Any, ...]:
+    def get_attr(self, name: str) -> tuple[object, ...]:
         return (getattr(self, name, None),) * self.num_envs
 
 
@@ -44,7 +46,7 @@ def points(mode: str = "SAME_STEP") -> Staggered:
     return Staggered(ROWS, {"Near": ring(3), "Far": 2 * ring(3)}, (8, 12), ends=True, breaks=(1, 30), mode=mode)
 
 
-def real() -> Any:
+def real() -> World:
     return suite_world("MT4", 8)
 
 
@@ -56,7 +58,7 @@ class Seen(NamedTuple):
     ends: list[tuple[int, bool]]  # row, and whether it was cut
 
 
-def own(world: Any, actions: Tensor) -> Seen:
+def own(world: PooledWorld, actions: Tensor) -> Seen:
     """The world itself."""
     seen = Seen([], [], [])
     world.reset()
@@ -71,7 +73,7 @@ def own(world: Any, actions: Tensor) -> Seen:
     return seen
 
 
-def of_sb3(world: Any, actions: Tensor) -> Seen:
+def of_sb3(world: PooledWorld, actions: Tensor) -> Seen:
     env, seen = adapt("sb3", world, stagger=True), Seen([], [], [])
     obs = env.reset()
     total = np.zeros(env.num_envs)
@@ -92,7 +94,7 @@ def of_sb3(world: Any, actions: Tensor) -> Seen:
     return seen
 
 
-def of_rsl_rl(world: Any, actions: Tensor) -> Seen:
+def of_rsl_rl(world: PooledWorld, actions: Tensor) -> Seen:
     env, seen = adapt("rsl_rl", world, stagger=True), Seen([], [], [])
     assert torch.equal(env.get_observations()["policy"], env.get_observations()["critic"])
     for action in actions:
@@ -107,7 +109,7 @@ def of_rsl_rl(world: Any, actions: Tensor) -> Seen:
     return seen
 
 
-def of_skrl(world: Any, actions: Tensor) -> Seen:
+def of_skrl(world: PooledWorld, actions: Tensor) -> Seen:
     env, seen = adapt("skrl", world, stagger=True), Seen([], [], [])
     obs, _ = env.reset()
     for action in actions:
@@ -124,7 +126,7 @@ def of_skrl(world: Any, actions: Tensor) -> Seen:
     return seen
 
 
-def of_torchrl(world: Any, actions: Tensor) -> Seen:
+def of_torchrl(world: PooledWorld, actions: Tensor) -> Seen:
     env, seen = adapt("torchrl", world, stagger=True), Seen([], [], [])
     state = env.reset()
     whole = world.episodes.counts.clone()
@@ -149,7 +151,7 @@ CLIENTS = {"sb3": of_sb3, "rsl_rl": of_rsl_rl, "skrl": of_skrl, "torchrl": of_to
 
 @pytest.mark.parametrize("client", CLIENTS)
 @pytest.mark.parametrize(("make", "steps", "least"), [(points, 260, 1000), (real, 150, 10)], ids=["points", "MT4"])
-def test_episodes_are_the_worlds_own(client: str, make: Callable[[], Any], steps: int, least: int) -> None:
+def test_episodes_are_the_worlds_own(client: str, make: Callable[[], PooledWorld], steps: int, least: int) -> None:
     world = make()
     generator = torch.Generator().manual_seed(0)
     actions = 2 * torch.rand(steps, *world.action_space.shape, generator=generator) - 1

@@ -2,9 +2,12 @@ import io
 import json
 import math
 import os
+import resource
 
+import imageio.v3 as imageio
 import numpy as np
 import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
@@ -18,8 +21,6 @@ CONFIG = RunConfig(suite="MT4", task=None, algo="mtppo", seed=3, learner={"hidde
 
 
 def board_points(folder, tag):
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
     events = EventAccumulator(str(folder))
     events.Reload()
     return [(event.step, event.value) for event in events.Scalars(tag)]
@@ -154,8 +155,6 @@ def test_a_file_without_a_meta_test_is_one_line(text, tmp_path):
 
 
 def test_picture_and_film_read_back(tmp_path):
-    import imageio.v3 as imageio
-
     frame = np.zeros((50, 70, 3), np.uint8)
     frame[:, :35, 0] = 255
     write_image(tmp_path / "a.png", frame)
@@ -169,8 +168,6 @@ def test_picture_and_film_read_back(tmp_path):
 @pytest.mark.skipif(os.name != "posix", reason="needs a limit of a file's size")
 @pytest.mark.parametrize("name", ["a.png", "a.webp", "a.mp4", "figure.png"])
 def test_a_disk_that_fills_leaves_what_was_there(name, tmp_path):
-    import resource
-
     path, frames = tmp_path / name, list(np.random.default_rng(0).integers(0, 256, (5, 200, 200, 3), np.uint8))
     path.write_text("earlier")
     figure = draw_learning([("mtppo", {"Train/return/Near": curve(2.0)})])
