@@ -105,18 +105,6 @@ def test_replayed_steps_are_plain_steps(suite: str, recorded: Callable[..., tupl
     assert len(count) == 4  # controls, transitions, starts, first observations
 
 
-def test_what_a_step_returned_stays(recorded: Callable[..., tuple[World, list[int]]]) -> None:
-    made, count = recorded("MT4", 8)
-    made.reset(seed=0)
-    actions = random_actions(made, 12)
-    play(made, actions[:6])
-    assert count
-    kept = play(made, actions[6:7])
-    copies = [{name: value.clone() for name, value in kept[0].items()}]
-    play(made, actions[7:])
-    assert_same(kept, copies)
-
-
 def test_a_reset_other_tasks_and_a_loaded_state_are_seen(recorded: Callable[..., tuple[World, list[int]]]) -> None:
     plain, (made, count) = suite_world("MT4", 8), recorded("MT4", 8)
     actions = random_actions(plain, 40)

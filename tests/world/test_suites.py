@@ -37,16 +37,6 @@ def test_one_world_steps_every_class_of_the_large_suites(suite: str, split: str,
     assert last["obs"].shape == obs.shape and last["obs"].isfinite().all() and (last["obs"] != obs).any(dim=1).all()
 
 
-def test_ml_and_evaluation_rows_keep_task_j_mod_n() -> None:
-    world = suite_world("ML4", 3 * 52)
-    world.reset(seed=0)
-    assert torch.equal(world.task_index, (torch.arange(52) % 50).repeat(3))
-    for small, expected in ((suite_world("ML1", 7), [0, 1, 2, 0, 1, 2, 0]), (suite_world("MT1", 8), [0] * 8)):
-        small.reset(seed=0)
-        small.episodes.elapsed = small.max_episode_steps - 1  # every row ends at once and begins anew
-        assert small.step(torch.zeros(small.num_envs, 52))[3].all() and small.task_index.tolist() == expected
-
-
 def test_mt_draws_every_task_equally_often_on_autoreset() -> None:
     world = suite_world("MT4", 64)
     world.reset(seed=0)
