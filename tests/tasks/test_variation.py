@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from bidex_meta.tasks import registry
+from bidex_meta.tasks.variation import VariationSpace
 from tests.tasks.worlds import each_case
 
 TURN = np.deg2rad(15)
@@ -95,3 +96,8 @@ def test_what_is_frozen_is_one_row_a_task(name: str, moving: bool) -> None:
     for pose, size in task.ghosts(frozen):
         assert pose.shape == (7, 7) and len(size) == 3
         np.testing.assert_allclose(pose[:, 3:].norm(dim=1).numpy(), 1.0, atol=1e-6)
+
+
+def test_a_lopsided_space_is_refused() -> None:
+    with pytest.raises(ValueError, match="one length"):
+        VariationSpace(("a", "b"), (0.0,), (1.0, 1.0))

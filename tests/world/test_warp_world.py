@@ -6,7 +6,7 @@ from torch import Tensor
 
 from bidex_meta import Benchmark
 from bidex_meta.world import World
-from tests.world.play import assert_same, flat, play, random_actions
+from tests.world.play import flat, play, random_actions
 from tests.world.test_masked import assert_steps_look_at_nothing
 
 ROWS = 6
@@ -15,22 +15,15 @@ CLASSES = ("CatchUnderarm", "BottleCap")
 pytestmark = [pytest.mark.timeout(900), pytest.mark.xdist_group("warp")]
 
 
-def make(engine: str, mode: str = "SAME_STEP") -> World:
+def make(engine: str) -> World:
     slots = [slot for slot in Benchmark("MT20").make_world(num_envs=20, device="cpu").slots if slot.name in CLASSES]
-    return World(
-        slots, ROWS, engine=engine, autoreset_mode=mode, observation="one-hot", task_sampling="uniform", threads=1
-    )
+    return World(slots, ROWS, engine=engine, observation="one-hot", task_sampling="uniform", threads=1)
 
 
 @pytest.fixture(scope="module")
 def world() -> World:
     """Reset it before use."""
     return make("warp")
-
-
-@pytest.fixture(scope="module")
-def evaluation_world() -> World:
-    return make("warp", "DISABLED")
 
 
 @pytest.fixture(scope="module")
@@ -77,32 +70,6 @@ def test_rows_that_end_start_anew_where_c_does(world: World, reference: World) -
     assert ended[:3].any(), "an egg was dropped"
 
 
-def test_a_reset_mask_starts_its_rows_alone(evaluation_world: World) -> None:
-    evaluation_world.reset(seed=0)
-    actions = random_actions(evaluation_world, 12)
-    play(evaluation_world, actions[:6])
-    before = flat(evaluation_world.step(actions[6]))["obs"]
-    mask = torch.arange(ROWS) % 2 == 0
-    after, _ = evaluation_world.reset(options={"reset_mask": mask})
-    assert torch.equal(after[~mask], before[~mask]) and not close(after[mask], before[mask], 1e-3)
-    assert (evaluation_world.episodes.elapsed == torch.where(mask, 0, 7)).all()
-
-
-def test_finished_rows_are_frozen(evaluation_world: World) -> None:
-    evaluation_world.reset(seed=0)
-    for action in random_actions(evaluation_world, 80):
-        last = flat(evaluation_world.step(action))
-    frozen = evaluation_world.episodes.finished
-    assert frozen[:3].all() and not frozen[3:].any()
-    states = [part.group.engine.state_dict() for part in evaluation_world.parts]
-    step = flat(evaluation_world.step(random_actions(evaluation_world, 1)[0]))
-    assert torch.equal(step["obs"][frozen], last["obs"][frozen]) and not step["reward"][frozen].any()
-    for part, before in zip(evaluation_world.parts, states, strict=True):
-        rows = part.group.take(frozen)
-        for name, value in part.group.engine.state_dict().items():
-            assert torch.equal(value[rows], before[name][rows]), name
-
-
 def test_a_broken_row_is_told_and_starts_anew(world: World) -> None:
     world.reset(seed=0)
     play(world, random_actions(world, 3))
@@ -117,13 +84,3 @@ def test_a_broken_row_is_told_and_starts_anew(world: World) -> None:
 
 def test_a_step_looks_at_no_number(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     assert_steps_look_at_nothing(world, monkeypatch)
-
-
-def test_a_saved_world_goes_on_as_it_would_have(world: World) -> None:
-    world.reset(seed=6)
-    actions = random_actions(world, 20)
-    play(world, actions[:10])
-    state = world.state_dict()
-    whole = play(world, actions[10:])
-    world.load_state_dict(state)
-    assert_same(whole, play(world, actions[10:]))
