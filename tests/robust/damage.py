@@ -120,13 +120,13 @@ def remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def draws(count: int, check: Callable[..., object], *strategies: st.SearchStrategy[Any]) -> None:
+def draws(count: int, strategy: st.SearchStrategy[Any], check: Callable[[Any], object]) -> None:
     """Checks so many drawn values."""
 
     @settings(max_examples=count, database=None, suppress_health_check=list(HealthCheck))
-    @given(st.tuples(*strategies))
-    def run(drawn: tuple[Any, ...]) -> None:
-        check(*drawn)
+    @given(strategy)
+    def run(drawn: Any) -> None:
+        check(drawn)
 
     run()
 

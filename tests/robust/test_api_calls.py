@@ -40,7 +40,7 @@ def world():
 
 
 def draws(count: int, check: Callable[..., None], *strategies: st.SearchStrategy[Any]) -> None:
-    damage.draws(count, lambda *drawn: damage.one_line_or(partial(check, *drawn)), *strategies)
+    damage.draws(count, st.tuples(*strategies), lambda drawn: damage.one_line_or(partial(check, *drawn)))
 
 
 odd = st.sampled_from(ODD)

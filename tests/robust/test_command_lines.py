@@ -123,4 +123,4 @@ COUNTS = {
 @pytest.mark.parametrize("command", COUNTS)
 def test_odd_command_lines(command: str, times: int, place: Path) -> None:
     judge([command, ""], place)
-    draws(times * COUNTS[command], lambda arguments: judge(arguments, place), lines(command))
+    draws(times * COUNTS[command], lines(command), lambda arguments: judge(arguments, place))
