@@ -1,12 +1,12 @@
 """The least a learner that adapts must be, for the commands' tests: it learns nothing, its policy is a ``Finder``."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 
 from bidex_meta.train.learner import AutoresetMode
 from bidex_meta.train.learner import Learner as Contract
+from bidex_meta.world.contract import State, VectorWorld
 from tests.points import Finder
 
 
@@ -28,7 +28,7 @@ class Learner(Contract):
     presets = PRESETS
     adapts = True
 
-    def __init__(self, world: Any, config: Config, seed: int):
+    def __init__(self, world: VectorWorld, config: Config, seed: int):
         self.mode = world.metadata["autoreset_mode"].name
         self.rows, self.env_steps = world.num_envs, 0
 
@@ -40,15 +40,15 @@ class Learner(Contract):
         self.env_steps += self.rows
         return {}
 
-    def policy_state_dict(self) -> dict[str, Any]:
+    def policy_state_dict(self) -> State:
         return {"weights": torch.zeros(1)}
 
     @classmethod
-    def load_policy(cls, state: dict[str, Any], device: str) -> Finder:
+    def load_policy(cls, state: State, device: str) -> Finder:
         return Finder()
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         return {"policy": self.policy_state_dict(), "mode": self.mode, "env_steps": self.env_steps}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         self.env_steps = state["env_steps"]

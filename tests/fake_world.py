@@ -12,7 +12,7 @@ from torch import Tensor
 from bidex_meta.errors import BidexError
 from bidex_meta.world.base import make_spaces, split_rows
 from bidex_meta.world.checked import clean
-from bidex_meta.world.contract import plain_groups
+from bidex_meta.world.contract import Info, Options, State, Step, plain_groups
 from bidex_meta.world.episodes import Clock, Episodes, checked_mode, checked_seed, ended_info, reset_mask
 
 
@@ -20,16 +20,9 @@ class FakeWorld(ABC):
     """Rows of slots, episodes, modes and ``info``.
 
     A subclass names its tensors in ``kept``, and gives ``_start`` (new states in the rows of a mask), ``_observe``
-    (observations (N, d) of all rows) and ``_advance`` (moves the active rows).
-
-    Args:
-        tasks: Number of tasks of each slot, by its name.
-        num_envs: Rows over all slots.
-        sizes: Entries of an observation, actions.
-        limits: Time limit of each slot, steps.
-        mode: SAME_STEP or DISABLED.
-        one_hot: Whether the last entries of an observation are the slot's one-hot.
-        unstable: (step, row) pairs where physics breaks, steps of the world counted from its making.
+    (observations (N, d) of all rows) and ``_advance`` (moves the active rows). ``tasks`` counts those of each slot,
+    ``sizes`` entries of an observation and actions, ``limits`` steps of each slot; with ``one_hot`` an observation
+    ends with the slot's; ``unstable`` are (step, row) pairs where physics breaks.
     """
 
     kept: tuple[str, ...] = ()
@@ -50,7 +43,7 @@ class FakeWorld(ABC):
         self.gammas: tuple[float | None, ...] = (None,) * self.num_tasks
         self.device = torch.device("cpu")
         self.autoreset_mode = checked_mode(mode)
-        self.metadata: dict[str, Any] = {"autoreset_mode": self.autoreset_mode}
+        self.metadata: Info = {"autoreset_mode": self.autoreset_mode}
         self.num_id_columns = self.num_tasks if one_hot else 0
         spaces = make_spaces(Box(-np.inf, np.inf, (sizes[0],), np.float32), sizes[1], num_envs)
         self.single_observation_space, self.single_action_space = spaces.single_observation, spaces.single_action
@@ -98,7 +91,7 @@ class FakeWorld(ABC):
         """Steps that the first episodes of a SAME_STEP world begin with, (N,)."""
         return torch.zeros_like(self.episodes.elapsed)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
         mask = reset_mask(options, self.num_envs, self.device, self._ready)
         if seed is not None:
             self._seed_rows(checked_seed(seed, mask))
@@ -115,7 +108,7 @@ class FakeWorld(ABC):
         self.episodes.begin(mask, elapsed)
         self._start(mask)
 
-    def step(self, action: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+    def step(self, action: Tensor | np.ndarray) -> Step:
         if not self._ready:
             raise BidexError("Expected reset() before step(): the rows have no episode yet.")
         action = torch.as_tensor(action, dtype=torch.float32)
@@ -139,10 +132,10 @@ class FakeWorld(ABC):
     def _end(
         self, active: Tensor, broken: Tensor, final_obs: Tensor, reward: Tensor, terminated: Tensor, truncated: Tensor,
         success: Tensor, unscaled: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:  # fmt: skip
+    ) -> Step:  # fmt: skip
         """Tells the step, and begins new episodes or keeps the flags of ended ones."""
         episodes, ended = self.episodes, (terminated | truncated) & active
-        info: dict[str, Any] = {
+        info: Info = {
             "success": success.clone(),
             "unstable": broken,
             "reward_unscaled": unscaled.clone(),
@@ -164,7 +157,7 @@ class FakeWorld(ABC):
             episodes.finished = episodes.finished | ended
         return self._obs.clone(), reward.clone(), terminated, truncated, info
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         return {
             "seed": self.seed,
             "generator": self.generator.get_state(),
@@ -174,7 +167,7 @@ class FakeWorld(ABC):
             "kept": {name: getattr(self, name).clone() for name in self.kept},
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         self._seed_rows(int(state["seed"]))
         self.generator.set_state(state["generator"])
         self.episodes.load_state_dict(state["episodes"])
@@ -211,9 +204,9 @@ class FakePools(FakeWorld):
         chosen = zip(self.task_id.tolist(), self.task_index.tolist(), strict=True)
         self.goal = torch.from_numpy(np.stack([pools[slot][task] for slot, task in chosen])).float()
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> State:
         return super().state_dict() | {"pools": [torch.from_numpy(np.array(tasks)) for tasks in self.pools]}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: State) -> None:
         self._set_pools([tasks.numpy() for tasks in state["pools"]])
         super().load_state_dict(state)

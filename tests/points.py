@@ -1,12 +1,11 @@
 """Points that look for a hidden goal: a small world with pools of tasks, and agents that adapt in it."""
 
-from typing import Any
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from bidex_meta.agents import Timestep
+from bidex_meta.world.contract import Info, Options
 from tests.fake_world import FakePools
 
 SPEED = 0.25
@@ -50,7 +49,7 @@ class PointWorld(FakePools):
         self.given.append(pools)
         super().set_tasks(pools)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Options | None = None) -> tuple[Tensor, Info]:
         self.seeds.append(seed)
         before = self.episodes.number
         obs, info = super().reset(seed=seed, options=options)
@@ -105,11 +104,11 @@ class Still:
         self._called("reset")
         self.masks.append(env_mask.clone())
 
-    def eval_action(self, obs: Tensor) -> Any:
+    def eval_action(self, obs: Tensor) -> Tensor:
         self._called("eval_action")
         return torch.full((len(obs), 2), 0.1)
 
-    def adapt_action(self, obs: Tensor) -> tuple[Any, dict[str, Any]]:
+    def adapt_action(self, obs: Tensor) -> tuple[Tensor, Info]:
         self._called("adapt_action")
         action = 2 * torch.rand(len(obs), 2, generator=self._generator) - 1
         return action, {"double": 2 * action}
@@ -141,12 +140,12 @@ class Finder(Still):
             self.best = torch.zeros(int(self.of_row.max()) + 1, 2)
             self._reward = torch.full((len(self.best),), -torch.inf)
 
-    def eval_action(self, obs: Tensor) -> Any:
+    def eval_action(self, obs: Tensor) -> Tensor:
         super().eval_action(obs)
         self._know(len(obs))
         return ((self.best[self.of_row] - obs[:, :2]) / SPEED).clamp(-1, 1)
 
-    def adapt_action(self, obs: Tensor) -> tuple[Any, dict[str, Any]]:
+    def adapt_action(self, obs: Tensor) -> tuple[Tensor, Info]:
         self._know(len(obs))
         # Rows go different ways, and hold them.
         angle = torch.arange(len(obs)) * 2.399

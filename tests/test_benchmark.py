@@ -5,7 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -141,37 +140,11 @@ def test_listed_tasks_fix_the_goal_and_share_the_drawn_rest() -> None:
     assert other.train_tasks != mt1.train_tasks
 
 
-@pytest.mark.parametrize(
-    ("name", "split", "observation", "pad_to", "sampling"),
-    [("MT1", "train", "one-hot", 422, "uniform"), ("MT4", "train", "one-hot", 446, "uniform"),
-     ("ML1", "test", "masked", 422, "fixed"), ("ML4", "train", "masked", 446, "fixed"),
-     ("ML4", "test", "masked", 446, "fixed")]
-)  # fmt: skip
-def test_what_a_world_is_asked_for(asked, name, split, observation, pad_to, sampling):
-    world = Benchmark(name, seed=4).make_world(split, num_envs=9, device="cpu", threads=2)
-    assert world.num_envs == 9
-    given = {"device": "cpu", "seed": 4, "threads": 2, "engine": "auto", "stagger": True, "points": None}
-    given |= {"observation": observation, "pad_to": pad_to, "task_sampling": sampling}
-    assert world.options == given | {"autoreset_mode": AutoresetMode.SAME_STEP}
-
-
 def test_evaluation_worlds_keep_their_tasks(asked: None) -> None:
     for mode in ("DISABLED", "Disabled", AutoresetMode.DISABLED):
         options = Benchmark("MT4").make_world(autoreset_mode=mode).options
         assert options["autoreset_mode"] is AutoresetMode.DISABLED and options["task_sampling"] == "fixed"
     assert Benchmark("MT4").make_world(autoreset_mode="same-step").options["task_sampling"] == "uniform"
-
-
-def test_slots(asked: None) -> None:
-    mt1 = Benchmark("MT1")
-    slots = mt1.make_world().slots
-    assert [slot.name for slot in slots] == [f"CatchUnderarm/{name}" for name in ("original", "left", "right", "back")]
-    assert all(slot.tasks.shape == (1, 5) for slot in slots)
-    (slot,) = Benchmark("ML1").make_world("train").slots
-    assert (slot.name, slot.tasks.shape) == ("CatchUnderarm", (3, 5))
-    assert [(slot.name, len(slot.tasks)) for slot in Benchmark("MT4").make_world().slots] == [
-        (n, 50) for n in MT4_CLASSES
-    ]
 
 
 def test_discount_and_reward_scale_reach_slot_and_world(tmp_path: Path) -> None:
@@ -202,7 +175,7 @@ def test_task_world_has_the_tasks_of_the_suites(asked: None) -> None:
         ({"seed": -1}, "seed: expected a whole number"),
     ],
 )
-def test_bad_worlds(arguments: dict[str, Any], message: str) -> None:
+def test_bad_worlds(arguments: dict[str, object], message: str) -> None:
     with pytest.raises(BidexError, match=message):
         Benchmark("MT4").make_world(**arguments)
 

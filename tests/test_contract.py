@@ -115,7 +115,7 @@ def assert_equal(a: list[dict[str, Tensor]], b: list[dict[str, Tensor]]) -> None
         assert not [f"step {step}: {name}" for name in x if not torch.equal(x[name], y[name])]
 
 
-def spoil(state: Any) -> None:
+def spoil(state: object) -> None:
     """Zeroes all tensors in it."""
     if isinstance(state, Tensor):
         state.zero_()

@@ -7,10 +7,10 @@ import re
 import shlex
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
+from gymnasium.spaces import Box
 
 from bidex_meta.cli import COMMANDS, main
 from bidex_meta.cli.parsing import flags_of, parse
@@ -30,7 +30,7 @@ SMALLER = (
 class Adapting(RandomAgent):
     """Stands for the ``agent`` that a page supposes: it adapts to nothing."""
 
-    def adapt_action(self, obs: torch.Tensor) -> tuple[torch.Tensor, dict[str, Any]]:
+    def adapt_action(self, obs: torch.Tensor) -> tuple[torch.Tensor, dict[str, object]]:
         return self.eval_action(obs), {}
 
     def eval_action(self, obs: torch.Tensor) -> torch.Tensor:
@@ -58,9 +58,7 @@ PYTHON = [page for page in PAGES if any(block.language == "python" for block in 
 
 @pytest.mark.parametrize("page", PYTHON, ids=lambda page: str(page.relative_to(ROOT)))
 def test_python_blocks_run(page: Path, folder: Path) -> None:
-    import gymnasium
-
-    names: dict[str, Any] = {"agent": Adapting(gymnasium.spaces.Box(-1.0, 1.0, (1, 52))), "__name__": "page"}
+    names: dict[str, object] = {"agent": Adapting(Box(-1.0, 1.0, (1, 52))), "__name__": "page"}
     with contextlib.redirect_stdout(io.StringIO()):
         for block in blocks(page):
             if block.mark.startswith("needs "):

@@ -7,13 +7,13 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 
 from bidex_meta.cli import main
 from bidex_meta.runs import RunFolder, read_metrics
+from bidex_meta.world.contract import State
 from tests.tasks.tables import SIZES
 
 SMALL = ["--suite", "MT4", "--num-envs", "8", "--threads", "1", "--device", "cpu", "--seed", "3"]
@@ -42,19 +42,19 @@ def command(*arguments: object, cwd: Path) -> str:
     return done.stdout
 
 
-def final(path: Path) -> tuple[dict[str, Any], int]:
+def final(path: Path) -> tuple[State, int]:
     loaded = RunFolder.open(path).checkpoints.load()
     assert loaded is not None
     return loaded
 
 
-def metrics(path: Path) -> list[dict[str, Any]]:
+def metrics(path: Path) -> list[dict[str, float]]:
     """A run's metrics without times."""
     rows = read_metrics(path / "metrics.jsonl")
     return [{k: v for k, v in row.items() if k != "time" and not k.startswith("Perf/")} for row in rows]
 
 
-def differences(a: Any, b: Any, where: str = "") -> list[str]:
+def differences(a: object, b: object, where: str = "") -> list[str]:
     """Where two states differ."""
     if isinstance(a, dict):
         missing = [f"{where}/{key}" for key in a.keys() ^ b.keys()]
@@ -102,7 +102,7 @@ def test_a_killed_run_resumes_to_the_end_of_an_unbroken_one(killed: tuple[Path, 
     assert {file.name for file in tmp_path.iterdir()} == {"whole"}  # nothing is left beside the run, no MuJoCo log
 
 
-def trained(path: Path, threads: int, *options: str, stop: int | None = None) -> tuple[dict[str, Any], Any]:
+def trained(path: Path, threads: int, *options: str, stop: int | None = None) -> tuple[State, list[dict[str, float]]]:
     """Four iterations in this process, broken off and resumed after ``stop``; the end, and the metrics."""
     words = ["run", *SMALL, *options, "--threads", str(threads), "--run-dir", str(path), "--no-evaluate"]
     assert main([*words, "--steps", str((stop or 4) * ITERATION)]) == 0

@@ -10,16 +10,17 @@ import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
 
-from bidex_meta.cli import main
+from bidex_meta.cli import main, run, run_config
+from bidex_meta.cli.run_config import RunPlan, plan_run
 from bidex_meta.config import config_of
 from bidex_meta.errors import BidexError
 from bidex_meta.runs import RunFolder, read_metrics
 from bidex_meta.train.distributed import TIMEOUT
+from bidex_meta.train.launch import launch, resume_command
 from tests.algos.ranks import same
 from tests.test_real_run import environment, final
 
@@ -32,7 +33,8 @@ _SCRIPT = """
 import os, sys
 import torch
 import bidex_meta.train.runner as runner
-from bidex_meta.cli import main
+from bidex_meta.cli import main, run, run_config
+from bidex_meta.cli.run_config import RunPlan, plan_run
 train = runner.train
 def often(learner, world, **keywords):
     stopped = train(learner, world, checkpoint_seconds=0.0, **keywords)
@@ -178,14 +180,11 @@ def test_a_run_of_two_processes_is_not_resumed_by_one(tmp_path: Path, capsys: py
 
 
 def test_each_process_takes_its_share_of_threads_and_a_gpu_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    from bidex_meta.cli import run_config
-    from bidex_meta.train.launch import launch, resume_command
-
     places = {"RANK": 5, "WORLD_SIZE": 8, "LOCAL_RANK": 1, "LOCAL_WORLD_SIZE": 4, "MASTER_ADDR": "a"}
     for name, value in places.items():
         monkeypatch.setenv(name, str(value))
     monkeypatch.setattr(run_config, "usable_cores", lambda: 10)
-    config = run_config.plan_run(["--suite", "MT4", "--device", "cpu"]).config
+    config = plan_run(["--suite", "MT4", "--device", "cpu"]).config
     assert (config.threads, config.processes, config.device) == (2, 8, "cpu")
     assert launch().own_device("cuda") == "cuda:1"
     assert resume_command(Path("r"), 8).startswith("torchrun --nnodes 2 --nproc-per-node 4 -m bidex_meta.cli")
@@ -194,8 +193,6 @@ def test_each_process_takes_its_share_of_threads_and_a_gpu_of_its_own(monkeypatc
 
 
 def test_a_run_from_before_several_processes_is_one_of_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from bidex_meta.cli.run_config import plan_run
-
     folder = RunFolder.create(plan_run(SMALL).config, tmp_path / "r")
     config = folder.config().to_json()
     del config["processes"]
@@ -204,12 +201,9 @@ def test_a_run_from_before_several_processes_is_one_of_one(tmp_path: Path, capsy
 
 
 def test_processes_that_disagree_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    from bidex_meta.cli import run
-    from bidex_meta.cli.run_config import plan_run
-
     plan = plan_run(SMALL)
 
-    def agree(step: int | None = None, **other: Any) -> Any:
+    def agree(step: int | None = None, **other: object) -> RunPlan:
         everyone = SimpleNamespace(share=lambda mine: [mine, (replace(plan.config, **other), step)])
         monkeypatch.setattr(run, "distributed", everyone)
         return run._agree(plan, None)

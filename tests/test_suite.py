@@ -8,7 +8,6 @@ from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import BidexError
 from bidex_meta.suite import load_suite, suite_names
 from bidex_meta.tasks import registry
-from bidex_meta.utils.paths import suites_dir
 
 HEAD = """
 name = "own"
@@ -89,20 +88,6 @@ def test_a_class_takes_its_options(tmp_path: Path) -> None:
         Benchmark(write(tmp_path, text.replace("water =", "watr =")))
 
 
-@pytest.mark.parametrize(("name", "distance"), [("MT1", 0.03), ("ML1", 0.03), ("ML1-wide", 0.12)])
-def test_listed_goals(name: str, distance: float) -> None:
-    (entry,) = load_suite(name).classes
-    goals = {task.name: tuple(task.fixed[f"goal_{axis}"] for axis in "xyz") for task in entry.tasks}
-    assert goals == {
-        "original": (0.0, -0.79, 0.54),
-        "left": (distance, -0.79, 0.54),
-        "right": (-distance, -0.79, 0.54),
-        "back": (0.0, pytest.approx(-0.79 - distance), 0.54),
-    }
-    held_out = [task.name for task in entry.tasks if task.split == "test"]
-    assert held_out == ([] if name == "MT1" else ["back"])
-
-
 def test_names_and_paths(tmp_path: Path) -> None:
     file = write(tmp_path, META)
     assert load_suite(file) == load_suite(str(file)) and load_suite(file).classes[0].reward_scale == 1.0
@@ -170,11 +155,3 @@ def test_any_other_content_is_a_bidex_error(tmp_path_factory: pytest.TempPathFac
     text = "\n".join(f"{key} = {value}" for key, value in content.items())
     with pytest.raises(BidexError):
         load_suite(write(tmp_path_factory.getbasetemp(), text))
-
-
-def test_readme_explains_every_key() -> None:
-    readme = (suites_dir() / "README.md").read_text(encoding="utf-8")
-    for key in [*KEYS[:-1], "description", "split", "reward_scale", "gamma", "options", "tasks", "fixed"]:
-        assert f"| `{key}` |" in readme
-    for name in suite_names():
-        assert f"| {name} |" in readme

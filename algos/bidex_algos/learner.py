@@ -46,14 +46,11 @@ class Learner(Contract):
     where the learner has one for all, or without a one-hot that an option needs.
     """
 
-    remedy: ClassVar[str]
-    """What helps, mostly, when a loss is no longer finite."""
-    config_type: ClassVar[type[LearnerConfig]]
-    """Its config, a dataclass."""
+    remedy: ClassVar[str]  # what helps, mostly, when a loss is no longer finite
+    config_type: ClassVar[type[LearnerConfig]]  # its config, a dataclass
     discounts_by_class: ClassVar[bool] = False
     """Whether it takes the discount of each class where a world has some (``world.gammas``)."""
-    unit_embeddings: ClassVar[bool] = False
-    """Whether the vectors of ``task_embedding`` have length 1."""
+    unit_embeddings: ClassVar[bool] = False  # whether the vectors of ``task_embedding`` have length 1
     going_on: ClassVar[tuple[str, ...]] = ("env_steps",)
     """Attributes (tensors, numbers, None) from which the next iteration goes on: in the checkpoint too."""
     policy_of: ClassVar[Callable[..., nn.Module]]

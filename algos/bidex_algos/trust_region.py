@@ -8,8 +8,7 @@ from torch import Tensor, nn
 
 from bidex_meta.train.distributed import all_sum
 
-Product = Callable[[Tensor], Tensor]
-"""A symmetric positive matrix as the function that multiplies it with a vector (P,)."""
+Product = Callable[[Tensor], Tensor]  # A symmetric positive matrix as a function that multiplies it with a vector (P,)
 
 
 def flatten(tensors: Sequence[Tensor]) -> Tensor:

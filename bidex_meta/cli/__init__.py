@@ -15,22 +15,13 @@ from collections.abc import Iterator, Sequence
 from types import FrameType
 from typing import NamedTuple
 
-from bidex_meta.errors import (
-    EXIT_BAD_INPUT,
-    EXIT_FAILED,
-    EXIT_INTERRUPTED,
-    EXIT_UNREAD,
-    BidexError,
-    known_name,
-    one_line,
-    shortened,
-)
+from bidex_meta import errors
+from bidex_meta.errors import EXIT_BAD_INPUT, BidexError, known_name, one_line, shortened
 from bidex_meta.train.launch import hangup, launch
 from bidex_meta.utils.plugins import own_fault
 from bidex_meta.utils.streams import open_missing, silence, unread
 
-_LONGEST = 2000
-"""Letters of an error: what was given may be any text."""
+_LONGEST = 2000  # letters of an error: what was given may be any text
 
 
 class Command(NamedTuple):
@@ -82,16 +73,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BidexError as error:
         return _failed(str(error), EXIT_BAD_INPUT, debug)
     except FloatingPointError as error:
-        return _failed(f"{error} What was saved before stays as it is.", EXIT_FAILED, debug)
+        return _failed(f"{error} What was saved before stays as it is.", errors.EXIT_FAILED, debug)
     except _Terminated as stop:
         return _failed(f"stopped by {stop}.", 128 + stop.number, debug=False)
     except KeyboardInterrupt:
-        return _failed("interrupted.", EXIT_INTERRUPTED, debug=False)
+        return _failed("interrupted.", errors.EXIT_INTERRUPTED, debug=False)
     except MemoryError as error:
         return _failed(f"out of memory: {error or 'ask for fewer rows'}.", EXIT_BAD_INPUT, debug)
     except BrokenPipeError:
         # A reader of results alone has seen enough (`| head`); without one of stderr work may have been broken off.
-        code = EXIT_UNREAD if unread(sys.stderr) else 0
+        code = errors.EXIT_UNREAD if unread(sys.stderr) else 0
         silence(sys.stdout)  # Python complains otherwise when it flushes at its end
         silence(sys.stderr)
         return code
@@ -116,10 +107,8 @@ class _Terminated(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def _signals_raise() -> Iterator[None]:
-    """Turns SIGTERM and SIGHUP into an exception, so that they leave no half-written file and it is said why it ended.
-
-    Not in one of several processes: a collective operation, which waits outside Python, would hold it up.
-    """
+    """Turns SIGTERM and SIGHUP into an exception, so that no half-written file is left and it is said why."""
+    # Not in one of several processes: a collective operation, which waits outside Python, would hold it up.
     if threading.current_thread() is not threading.main_thread() or launch().count > 1:
         yield
         return

@@ -45,14 +45,10 @@ class BaselineFlags:
     """random: uniform actions; zero: the action 0, joints held in the middle of their range and bases at rest;
     witness: the actions that solve task 0 of a class, in all its tasks; script: hands that a script leads, which knows
     the whole state (seven classes have one)."""
-    suite: str = "MT20"
-    """Suite whose train tasks are played."""
-    episodes: Few = 4
-    """Episodes of each task."""
-    seed: Seed = 0
-    """Seed of tasks, starts and actions."""
-    threads: Threads | None = None
-    """Threads of the physics; None: one per core."""
+    suite: str = "MT20"  # Suite whose train tasks are played.
+    episodes: Few = 4  # Episodes of each task.
+    seed: Seed = 0  # Seed of tasks, starts and actions.
+    threads: Threads | None = None  # Threads of the physics; None: one per core.
     out: Path | None = None
     """JSON file that takes the figures, beside those it has of other classes; None: print them alone. `evaluate` reads
     assets/references/ of the installation, which is not written unless this names it."""

@@ -5,19 +5,21 @@ import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import torch
 import tyro
 
-from bidex_meta.benchmark import Benchmark
 from bidex_meta.cli.parsing import Device, JsonSwitch, parse
 from bidex_meta.cli.tables import Json, plain_table, print_table
 from bidex_meta.config import Steps
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.utils.memory import usable_cores
 from bidex_meta.utils.validation import Environments, Few, Seed, Threads
-from bidex_meta.world import World
+
+if TYPE_CHECKING:
+    from torch import Generator
+
+    from bidex_meta.world import World
 
 
 @dataclass(frozen=True)
@@ -29,21 +31,14 @@ class BenchFlags:
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="world")]
     """world: environment steps per second of the world and of its bare physics, and their ratio."""
-    suite: str = "MT4"
-    """Suite to measure."""
-    num_envs: Environments = 1024
-    """Environments stepped together."""
-    steps: Steps = 40
-    """Environment steps of each repeat."""
-    repeats: Few = 7
-    """Interleaved repeats; medians are reported."""
-    threads: Threads | None = None
-    """Threads of the physics on a CPU; None takes all cores."""
+    suite: str = "MT4"  # Suite to measure.
+    num_envs: Environments = 1024  # Environments stepped together.
+    steps: Steps = 40  # Environment steps of each repeat.
+    repeats: Few = 7  # Interleaved repeats; medians are reported.
+    threads: Threads | None = None  # Threads of the physics on a CPU; None takes all cores.
     device: Device = "cpu"
-    engine: str = "auto"
-    """auto, c or warp."""
-    seed: Seed = 0
-    """Seed of world and actions."""
+    engine: str = "auto"  # auto, c or warp.
+    seed: Seed = 0  # Seed of world and actions.
     json: JsonSwitch = False
 
 
@@ -67,6 +62,10 @@ def world_speed(flags: BenchFlags) -> Json:
     follow the first world's resets outside the clock, so both do the same physics. ``ratio`` is the median of ratios;
     ``groups`` has the number of environments in each engine batch.
     """
+    import torch
+
+    from bidex_meta.benchmark import Benchmark  # torch and MuJoCo, which --help does not need
+
     options = {"device": flags.device, "num_envs": flags.num_envs, "threads": flags.threads, "engine": flags.engine}
     full, bare = (Benchmark(flags.suite, seed=flags.seed).make_world("train", **options) for _ in range(2))
     full.reset(seed=flags.seed)
@@ -84,8 +83,9 @@ def world_speed(flags: BenchFlags) -> Json:
     }  # fmt: skip
 
 
-def paired_steps(full: World, bare: World, steps: int, generator: torch.Generator) -> tuple[float, float]:
+def paired_steps(full: "World", bare: "World", steps: int, generator: "Generator") -> tuple[float, float]:
     """Seconds that a world and the bare engines of its twin take for the same random steps."""
+    import torch
 
     def now() -> float:
         if full.device.type == "cuda":

@@ -19,11 +19,9 @@ class CompareFlags:
     Example: bidex-meta compare runs/MT4/mtppo/* runs/MT4/mttrpo/*
     """
 
-    runs: RunPaths
-    """Run folders, or files of results/data/."""
+    runs: RunPaths  # Run folders, or files of results/data/.
     json: JsonSwitch = False
-    out: Path | None = None
-    """Also draw success and score of the groups, with their intervals, into this picture (.png, .svg, .pdf)."""
+    out: Path | None = None  # Also draw the groups' success and score, with intervals, into this .png, .svg or .pdf.
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -45,10 +43,8 @@ def _row(group: Group, first: Group) -> Json:
         "group": group.label, "seeds": group.seeds, "steps": group.steps, "steps_range": list(group.steps_range),
         "hours": round(group.hours, 3),
     }  # fmt: skip
-    for name, own, over in (
-        ("success", group.success, success_over(group, first)),
-        ("score", group.scores, score_over(group, first)),
-    ):
+    measures = ("success", group.success, success_over(group, first)), ("score", group.scores, score_over(group, first))
+    for name, own, over in measures:
         row[f"{name}_iqm"] = None if own is None else vars(iqm(own))
         row[f"{name}_over_first"] = None if over is None else vars(over)
     row["classes"] = {
@@ -77,10 +73,8 @@ def class_table(groups: Sequence[Group]) -> tuple[list[str], list[list[str]]]:
     names = list(dict.fromkeys(name for group in groups for name in group.classes))
     rows = []
     for group in groups:
-        for measure, table, factor, unit in (
-            ("success", group.success, 100.0, " %"),
-            ("return", group.returns, 1.0, ""),
-        ):
+        measures = ("success", group.success, 100.0, " %"), ("return", group.returns, 1.0, "")
+        for measure, table, factor, unit in measures:
             cells = {
                 name: f"{factor * of.mean():.4g}{unit} ({factor * of.min():.4g} to {factor * of.max():.4g})"
                 for name, of in zip(group.classes, table.T, strict=True)

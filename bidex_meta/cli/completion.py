@@ -25,8 +25,7 @@ class CompletionFlags:
     zsh: write it to a file _bidex-meta in a folder of $fpath; fish: to ~/.config/fish/completions/bidex-meta.fish.
     """
 
-    shell: Annotated[Literal["bash", "zsh", "fish"], tyro.conf.Positional]
-    """The shell."""
+    shell: Annotated[Literal["bash", "zsh", "fish"], tyro.conf.Positional]  # The shell.
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -37,7 +36,6 @@ def main(arguments: Sequence[str]) -> None:
 
     choices = {"--suite": suites_to_run(), "--task": registry.names(), "--algo": list(ALGOS)}
     choices["--object"] = [EGG, *shelf()]
-
     app = tyro.extras.SubcommandApp()
     for name, command in COMMANDS.items():
         found = flags_of(importlib.import_module(command.module).main)

@@ -29,20 +29,13 @@ class ControlFlags:
     For suites whose classes stand in both splits (ML1, ML1-wide). Several runs are seeds of one experiment.
     """
 
-    runs: RunPaths
-    """Run folders that differ in the seed alone."""
-    trials: Few = 25
-    """Adaptations of each task, each from the start and to other episodes."""
-    episodes: Few = 80
-    """Evaluation episodes after each adaptation."""
-    shots: Shots = 1
-    """Adapt so often, one after the other."""
-    rollouts: Few | None = None
-    """Episodes of each task in a shot; None: as the run was trained, but 40 at most."""
-    num_envs: Environments = 1024
-    """Environments stepped together at most; bounds memory."""
-    seed: Seed | None = None
-    """Seed of the episodes' starts; None: one that training does not use."""
+    runs: RunPaths  # Run folders that differ in the seed alone.
+    trials: Few = 25  # Adaptations of each task, each from the start and to other episodes.
+    episodes: Few = 80  # Evaluation episodes after each adaptation.
+    shots: Shots = 1  # Adapt so often, one after the other.
+    rollouts: Few | None = None  # Episodes of each task in a shot; None: as the run was trained, but 40 at most.
+    num_envs: Environments = 1024  # Environments stepped together at most; bounds memory.
+    seed: Seed | None = None  # Seed of the episodes' starts; None: one that training does not use.
     device: Device = "auto"
     engine: Engine = "auto"
     json: JsonSwitch = False

@@ -30,10 +30,8 @@ class DataFlags:
     """list: all, a line each; info: episodes, returns, success and coverage of one; check: every file of one has the
     digest it was written with, every episode is whole and consistent, and its rewards follow from what was observed,
     where that can be computed."""
-    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")] = ""
-    """info, check: a data set's name or folder."""
-    episodes: Few | None = None
-    """check: at most so many episodes, evenly spread; None: all."""
+    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")] = ""  # info, check: name or folder.
+    episodes: Few | None = None  # check: at most so many episodes, evenly spread; None: all.
     json: JsonSwitch = False
 
 

@@ -34,14 +34,11 @@ class EvaluateFlags(Options):
     Learners that adapt (maml, promp, rl2, ...) are shown before and after --shots shots, on train and on test tasks.
     """
 
-    run: RunPath
-    """Run folder."""
-    checkpoint: str = "last"
-    """Which policy: last, best (kept by `bidex-meta run --evaluate-every N`) or a file."""
+    run: RunPath  # Run folder.
+    checkpoint: str = "last"  # Which policy: last, best (kept by `bidex-meta run --evaluate-every N`) or a file.
     split: Literal["auto", "train", "test", "both"] = "auto"
     """Tasks to play: those trained on, or a meta suite's unseen ones; auto: train, and both for learners that adapt."""
-    random: Switch = False
-    """Also play a random policy, and show the difference."""
+    random: Switch = False  # Also play a random policy, and show the difference.
     device: Device = "auto"
     engine: Engine = "auto"
     json: JsonSwitch = False

@@ -75,11 +75,7 @@ def learner_kind(name: str, task: str | None = None) -> LearnerKind:
 
 
 def _from_elsewhere(name: str) -> type[Learner]:
-    """The learner ``package.module:Class``, of an installed package or of the working folder.
-
-    A class that does not derive from :class:`Learner` gets its defaults, and the presets of a class without any are
-    its module's ``PRESETS``.
-    """
+    """The learner ``package.module:Class``, with the defaults of :class:`Learner` and its module's ``PRESETS``."""
     make, module = outside_class(name, "--algo")
     for old, new in _RENAMED.items():
         if old in vars(make):

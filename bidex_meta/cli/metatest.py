@@ -13,12 +13,9 @@ from bidex_meta.evaluation.play import EVALUATION_SEED
 from bidex_meta.utils.validation import Environments, Few, Seed, Shots
 from bidex_meta.worlds import Worlds
 
-TASKS = 5
-"""Default tasks of each class, the first of its pool: all of ML1's, a tenth of ML20's."""
-_ROLLOUTS, _MOST_ROLLOUTS = 10, 40
-"""Episodes of each task in a shot where the run's config has none; the most that are taken from it."""
-_ENVIRONMENTS = 1024
-"""Environments stepped together at most, by default: half a GB for the world."""
+TASKS = 5  # default tasks of each class, the first of its pool: all of ML1's, a tenth of ML20's
+_ROLLOUTS, _MOST_ROLLOUTS = 10, 40  # episodes of a task in a shot where the config has none; the most taken from it
+_ENVIRONMENTS = 1024  # environments stepped together at most, by default: half a GB for the world
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,20 +25,16 @@ class Options:
     episodes: Few | None = None
     """Episodes of each task; None: 4, or 1 where a task fixes its start (metaworld/...); for learners that adapt, as
     many as --rollouts."""
-    shots: Shots | None = None
-    """Adapt so often, one after the other, to --rollouts episodes each; None: 1."""
-    rollouts: Few | None = None
-    """Episodes of each task in a shot; None: as the run was trained, but 40 at most, else 10."""
-    tasks: Few | None = None
-    """Adapt to the first so many tasks of each class; None: 5."""
+    shots: Shots | None = None  # Adapt so often, one after the other, to --rollouts episodes each; None: 1.
+    rollouts: Few | None = None  # Episodes of each task in a shot; None: as the run was trained, 40 at most, else 10.
+    tasks: Few | None = None  # Adapt to the first so many tasks of each class; None: 5.
     trials: Few | None = None
     """Adapt to each task so often, each time from the start and to other episodes; None: once, or as often as makes
     five adaptations of each class, since an interval over one adaptation's episodes says nothing of another."""
     num_envs: Environments | None = None
     """Environments stepped together, a multiple of the number of tasks; None: one per task (metaworld/...: 5 per
     class). For learners that adapt, at most so many, which bounds memory and not results' meaning; None: 1024."""
-    seed: Seed | None = None
-    """Seed of the episodes' starts; None: one that training does not use."""
+    seed: Seed | None = None  # Seed of the episodes' starts; None: one that training does not use.
 
     @property
     def starts(self) -> int:
@@ -50,13 +43,9 @@ class Options:
 
 
 def meta_test(
-    worlds: Worlds,
-    config: RunConfig,
-    load: Callable[[], Agent],
-    options: Options,
-    splits: list[str],
-    say: Callable[[str], None] = lambda text: None,
-) -> dict[str, MetaEvaluation]:
+    worlds: Worlds, config: RunConfig, load: Callable[[], Agent], options: Options, splits: list[str],
+    say: Callable[[str], None] = lambda text: None
+) -> dict[str, MetaEvaluation]:  # fmt: skip
     """The meta-test on some splits of a run's worlds.
 
     ``load`` makes a MetaLearningAgent, anew for each split, so that neither depends on the other; of the config

@@ -44,15 +44,13 @@ def flags_of(command: Callable[[Sequence[str]], None], arguments: Sequence[str] 
     raise TypeError(f"{command.__module__}.main parses no flags")
 
 
-Switch = Annotated[bool, tyro.conf.FlagCreatePairsOff]
-"""A flag without a value and without a ``--no-`` twin."""
+Switch = Annotated[bool, tyro.conf.FlagCreatePairsOff]  # A flag without a value and without a ``--no-`` twin
 JsonSwitch = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="Print JSON.")]
 Device = Annotated[str, tyro.conf.arg(help="auto, cpu or cuda:N.")]
 Engine = Annotated[
     Literal["auto", "c", "warp"], tyro.conf.arg(help="Physics; auto: the one that is fast on the device.")
 ]
-RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-"""A run folder, as the first word."""
+RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]  # A run folder, as the first word
 RunPaths = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
 """Run folders, or files of ``results/data/``."""
 
@@ -63,19 +61,14 @@ class LookFlags:
 
     run: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = None
     """Run folder whose policy is shown; the same as --policy RUN."""
-    task: str | None = None
-    """Task class; None: the run's first one. In a browser it can be changed."""
+    task: str | None = None  # Task class; None: the run's first one. In a browser it can be changed.
     object: str | None = None
     """With --task alone: another object of the class, of the shelf or an MJCF file (docs/objects.md); None: the run's,
     or the class's own."""
-    policy: str = "zero"
-    """zero, random, or a run folder."""
-    checkpoint: str = "last"
-    """Of a run: last, best (see `bidex-meta run --help`, --evaluate-every) or a file."""
-    suite: str | None = None
-    """Show the task as this suite has it; None: on its own, or as in the run."""
-    seed: Seed = 0
-    """Seed of tasks and starts."""
+    policy: str = "zero"  # zero, random, or a run folder.
+    checkpoint: str = "last"  # Of a run: last, best (see `bidex-meta run --help`, --evaluate-every) or a file.
+    suite: str | None = None  # Show the task as this suite has it; None: on its own, or as in the run.
+    seed: Seed = 0  # Seed of tasks and starts.
 
     @property
     def actor(self) -> str:

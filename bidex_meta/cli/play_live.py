@@ -23,16 +23,11 @@ class PlayFlags(LookFlags):
     bidex-meta play --task SwingCup --policy random needs no run.
     """
 
-    speed: Positive = 1.0
-    """Of the clock; 0.5 is slow motion."""
-    browser: Switch = False
-    """In the browser, also where there is a screen."""
-    host: str = "127.0.0.1"
-    """Address the browser's page is served at; 0.0.0.0 lets other machines in."""
-    port: Port = 8080
-    """Port of that page; where it is taken, the next free one."""
-    seconds: NonNegative | None = None
-    """End after so many seconds; None: when the window is closed, or Ctrl-C."""
+    speed: Positive = 1.0  # Of the clock; 0.5 is slow motion.
+    browser: Switch = False  # In the browser, also where there is a screen.
+    host: str = "127.0.0.1"  # Address the browser's page is served at; 0.0.0.0 lets other machines in.
+    port: Port = 8080  # Port of that page; where it is taken, the next free one.
+    seconds: NonNegative | None = None  # End after so many seconds; None: when the window is closed, or Ctrl-C.
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -21,14 +21,11 @@ class PlotFlags:
     Runs that differ in the seed alone are one line, with the 95 % bootstrap interval over runs.
     """
 
-    runs: RunPaths
-    """Run folders, or files of results/data/."""
-    adaptation: Switch = False
-    """Against shots of adaptation, from the meta-test in the run's evaluation.json; of one run."""
+    runs: RunPaths  # Run folders, or files of results/data/.
+    adaptation: Switch = False  # Against shots of adaptation, from the meta-test in evaluation.json; of one run.
     evaluation: Path | None = None
     """The output of another `bidex-meta evaluate RUN --shots K --json`, instead of the run's evaluation.json."""
-    out: Path | None = None
-    """The picture; None: curves.png or adaptation.png, in the run folder or, of several, here."""
+    out: Path | None = None  # The picture; None: curves.png or adaptation.png, in the run folder or, of several, here.
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -6,52 +6,37 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from msgspec import Meta
 
-from bidex_meta.agents import Agent
 from bidex_meta.cli.learners import learner_kind, resolve_device
 from bidex_meta.cli.parsing import Device, Engine, Switch, parse
-from bidex_meta.cli.policies import load_policy
-from bidex_meta.cli.run_data import dataset_metadata
 from bidex_meta.cli.tables import Json, say
 from bidex_meta.config import Steps
 from bidex_meta.data import open_dataset, part_files, writer
-from bidex_meta.data.collect import (
-    Actor,
-    Progress,
-    SamplingAgent,
-    bytes_held,
-    collect,
-    collect_successes,
-    progress,
-    resumed_writer,
-)  # fmt: skip
 from bidex_meta.data.writer import DatasetWriter
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.runs import RunFolder
 from bidex_meta.utils.files import absolute
 from bidex_meta.utils.memory import usable_cores
 from bidex_meta.utils.validation import Environments, Seed, Threads
-from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted, ShiftedStarts
-from bidex_meta.witness.scripts import script_of
 from bidex_meta.witness.store import load_witness
-from bidex_meta.world.contract import PooledWorld
-from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds
+
+if TYPE_CHECKING:  # what loads torch is imported where it is called: --help needs none
+    from bidex_meta.agents import Agent
+    from bidex_meta.data.collect import Actor, Progress
+    from bidex_meta.world.contract import PooledWorld
 
 RUNS = {"random": 0, "medium": 1, "expert": 1, "medium-expert": 2, "replay": 1, "demonstrations": 0}
 """Kinds of data sets, and how many runs each takes."""
 SIZE = {"medium-expert": 2_000_000, "demonstrations": 20_000}
 _USUAL_SIZE = 1_000_000
-_DEMONSTRATORS = {"witness": 32, "tasks": 200}
-"""Environments of demonstrations by default, by ``starts``."""
-_MOST_HELD = 1_200_000_000
-"""Bytes of running episodes beside the world."""
-_PATIENCE = 3
-"""Rounds of demonstrations that may all fail."""
+_DEMONSTRATORS = {"witness": 32, "tasks": 200}  # environments of demonstrations by default, by ``starts``
+_MOST_HELD = 1_200_000_000  # bytes of running episodes beside the world
+_PATIENCE = 3  # rounds of demonstrations that may all fail
 _OF_RUN = {"suite": None, "task": None, "base": "own", "object": None, "points": 0, "seed": None}
 """Entries of a run's config that decide which tasks are played."""
 
@@ -71,22 +56,16 @@ class RecordFlags:
     a stored reference solution (see --starts)."""
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = ()
     """Run folders, as many as the kind takes."""
-    suite: str | None = None
-    """random: suite to play, a name or the path of a TOML file; otherwise the run's own is played."""
-    task: str | None = None
-    """random: class to play on its own, in place of a suite; demonstrations: class of the witness."""
-    base: Literal["own", "moving", "fixed"] = "own"
-    """With --task: whether the hands' bases move; own: as the class has it alone."""
+    suite: str | None = None  # random: suite to play, a name or path of a TOML file; otherwise the run's own is played.
+    task: str | None = None  # random: class to play on its own, not a suite; demonstrations: class of the witness.
+    base: Literal["own", "moving", "fixed"] = "own"  # With --task: whether bases move; own: as the class has it alone.
     size: Steps = 0
-    """Transitions; 0: 1e6, of medium-expert 2e6, of demonstrations 2e4. The last episodes are whole: there may be a few
-    more."""
-    checkpoint: str = "last"
-    """Which policy of a run: last, best or a file."""
+    """Transitions; 0: 1e6, of medium-expert 2e6, of demonstrations 2e4; a few more, since episodes are whole."""
+    checkpoint: str = "last"  # Which policy of a run: last, best or a file.
     actions: Literal["sampled", "mean"] = "sampled"
     """sampled: drawn from the policy's distribution, where it has one; mean: its mean action."""
     noise: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
-    """Standard deviation of Gaussian noise on a policy's actions, for those that have no distribution, or on a
-    witness's."""
+    """Standard deviation of Gaussian noise on the actions of a witness, or of a policy without a distribution."""
     starts: Literal["witness", "tasks"] = "witness"
     """demonstrations: replay the witness from its own start in its own task, objects shifted; or on all tasks of the
     class, from their starts, where it succeeds less often but shows more."""
@@ -95,18 +74,13 @@ class RecordFlags:
     (about a second for 500 steps): seven classes have one, and it succeeds more often."""
     shift: Annotated[float, Meta(ge=0.0, le=0.1)] = 1e-4
     """demonstrations, --starts witness: how far the objects' start is shifted, metres."""
-    num_envs: Environments | None = None
-    """Environments stepped together; None: one per task, 200 at least."""
-    seed: Seed = 0
-    """Seed of starts and actions, and of random's tasks (a run keeps its own tasks)."""
-    out: Path | None = None
-    """Folder of the data set; None: NAME/KIND-v0 in the folder that BIDEX_DATA names, else in data/."""
+    num_envs: Environments | None = None  # Environments stepped together; None: one per task, 200 at least.
+    seed: Seed = 0  # Seed of starts and actions, and of random's tasks (a run keeps its own tasks).
+    out: Path | None = None  # Folder of the data set; None: NAME/KIND-v0 in the folder of BIDEX_DATA, else in data/.
     device: Device = "auto"
     engine: Engine = "auto"
-    threads: Threads | None = None
-    """Threads of torch and of the physics; None: one per core."""
-    estimate: Switch = False
-    """Print what it would take, and stop."""
+    threads: Threads | None = None  # Threads of torch and of the physics; None: one per core.
+    estimate: Switch = False  # Print what it would take, and stop.
 
 
 @dataclass(frozen=True)
@@ -114,17 +88,12 @@ class _Collection:
     """A data set to collect."""
 
     source: Worlds
-    name: str
-    """Kind in the data set's name."""
-    plan: Json
-    """What decides its content; it has ``kind``, ``size`` and ``num_envs``."""
-    policies: list[Json]
-    """Who acts, for the metadata."""
-    world: Callable[[], PooledWorld]
-    episode_share: float
-    """Mean length of an episode as a share of the time limit, at least."""
-    collect: Callable[[PooledWorld, DatasetWriter], None]
-    """Plays in the world until the writer has all transitions."""
+    name: str  # kind in the data set's name
+    plan: Json  # what decides its content; it has ``kind``, ``size`` and ``num_envs``
+    policies: list[Json]  # who acts, for the metadata
+    world: "Callable[[], PooledWorld]"
+    episode_share: float  # mean length of an episode as a share of the time limit, at least
+    collect: "Callable[[PooledWorld, DatasetWriter], None]"  # plays in the world until the writer has all transitions
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -157,6 +126,9 @@ def _check(flags: RecordFlags, kind: str) -> None:
 
 def _record(flags: RecordFlags, collection: _Collection) -> None:
     """Collects a data set, or goes on with it."""
+    from bidex_meta.cli.run_data import dataset_metadata
+    from bidex_meta.data.collect import bytes_held, resumed_writer
+
     plan, size = collection.plan, collection.plan["size"]
     folder, name = writer.dataset_path(flags.out, collection.source.name, collection.name)
     with contextlib.ExitStack() as stack:
@@ -192,6 +164,9 @@ def _record(flags: RecordFlags, collection: _Collection) -> None:
 
 def _episodes(flags: RecordFlags, kind: str) -> _Collection:
     """Episodes of uniform actions, or of runs' policies."""
+    from bidex_meta.data.collect import Actor, collect, progress
+    from bidex_meta.world.threads import set_up_torch
+
     config = _config(flags)
     source = Worlds.open(config)
     # Sums depend on how torch splits them over threads: a collection keeps those that it began with.
@@ -208,7 +183,7 @@ def _episodes(flags: RecordFlags, kind: str) -> _Collection:
     plan = {"kind": kind, "size": size, "num_envs": rows, "noise": flags.noise, "policies": policies}
     plan |= config | {"starts": flags.seed}
 
-    def play(world: PooledWorld, out: DatasetWriter) -> None:
+    def play(world: "PooledWorld", out: DatasetWriter) -> None:
         before = sum(progress(out, len(actors)).steps)
         if out.parts:
             say(f"Going on after {before:,} transitions in {out.parts} parts.")
@@ -218,7 +193,7 @@ def _episodes(flags: RecordFlags, kind: str) -> _Collection:
     return _Collection(source, kind, plan, policies, lambda: source.world("train", rows), 1.0 / 3.0, play)
 
 
-def _report(size: int, before: int, now: Progress, seconds: float) -> None:
+def _report(size: int, before: int, now: "Progress", seconds: float) -> None:
     """A line after each round; ``seconds`` and ``before``, in transitions, of when this process began."""
     done = sum(now.steps)
     speed = (done - before) / max(seconds, 1e-9)
@@ -252,8 +227,11 @@ def _config(flags: RecordFlags) -> Json:
     return config | {"device": resolve_device(flags.device, Worlds.open(config).on_gpu), "engine": flags.engine}
 
 
-def _actor(flags: RecordFlags, path: Path, device: str) -> tuple[Actor, Json]:
+def _actor(flags: RecordFlags, path: Path, device: str) -> "tuple[Actor, Json]":
     """A run's policy, and its metadata."""
+    from bidex_meta.cli.policies import load_policy
+    from bidex_meta.data.collect import Actor, SamplingAgent
+
     folder = RunFolder.open(path)
     algo = folder.config().algo
     if learner_kind(algo).make.adapts:
@@ -267,6 +245,10 @@ def _actor(flags: RecordFlags, path: Path, device: str) -> tuple[Actor, Json]:
 
 def _demonstrations(flags: RecordFlags) -> _Collection:
     """Successful replays of a class's witness or scripted policy, with moving bases, as suites have them."""
+    from bidex_meta.data.collect import collect_successes, progress
+    from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted, ShiftedStarts
+    from bidex_meta.witness.scripts import script_of
+
     if flags.base == "fixed" or flags.engine == "warp" or flags.device not in ("auto", "cpu"):
         raise BidexError(
             "Witnesses are of moving bases and of C MuJoCo on the CPU. Leave --base, --engine, --device out."
@@ -283,17 +265,17 @@ def _demonstrations(flags: RecordFlags) -> _Collection:
     plan = {"kind": "demonstrations", "task": name, "size": size, "num_envs": rows, "seed": flags.seed, **drawn}
     plan |= {"script": True} if flags.script else {}
 
-    def world() -> PooledWorld:
+    def world() -> "PooledWorld":
         if on_tasks:
             return source.world("train", rows)
         return ShiftedStarts(name, rows, flags.shift, flags.threads)  # pyright: ignore[reportAbstractUsage]
 
-    def agent(world: Any, seed: int) -> Agent:
+    def agent(world: Any, seed: int) -> "Agent":
         if flags.script:
             return Scripted(world, flags.noise, seed)
         return OpenLoopReplay(witness, [name], world.task_id, world.single_action_space.shape[0], flags.noise, seed)
 
-    def play(world: PooledWorld, out: DatasetWriter) -> None:
+    def play(world: "PooledWorld", out: DatasetWriter) -> None:
         while (now := progress(out)).steps[0] < size:
             if not now.steps[0] and out.parts >= _PATIENCE:
                 what, mend = (

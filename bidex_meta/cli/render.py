@@ -25,21 +25,16 @@ class RenderFlags(LookFlags):
     """
 
     out: Path | None = None
-    """File to write: .png for a picture, .mp4 for a film, .webp for one that web pages show; None, of a run: a film in
-    its folder videos/."""
+    """File: .png (picture), .mp4 (film) or .webp (film for web pages); None, of a run: a film in its videos/."""
     tiled: Switch = False
     """All classes of the suite beside each other; where an episode ends the next one begins. A name is green from its
     first success to the end of the episode."""
     steps: Steps | None = None
     """Steps to take, 60 a second; None: none for a picture, one episode for a film, with --tiled the longest one."""
-    every: Few | None = None
-    """Steps from one frame of a film to the next; None: 1, with --tiled 2."""
-    width: Pixels | None = None
-    """Pixels, of a tile with --tiled; None: 640, with --tiled 240."""
-    height: Pixels | None = None
-    """Pixels, likewise; None: three quarters of the width."""
-    camera: str | None = None
-    """front, side, top or back; None: front."""
+    every: Few | None = None  # Steps from one frame of a film to the next; None: 1, with --tiled 2.
+    width: Pixels | None = None  # Pixels, of a tile with --tiled; None: 640, with --tiled 240.
+    height: Pixels | None = None  # Pixels, likewise; None: three quarters of the width.
+    camera: str | None = None  # front, side, top or back; None: front.
     points: Switch = False
     """Beside each picture the point cloud of the class's depth camera, seen from there and from the side; as many
     points as the run's observations have, else 768."""

@@ -24,8 +24,7 @@ from bidex_meta.runs.atomic import write_atomic
 from bidex_meta.runs.stored import Run
 from bidex_meta.utils.files import is_file
 
-FILM_BYTES = 40_000_000
-"""Films of a page together at most; what is above is named alone."""
+FILM_BYTES = 40_000_000  # films of a page together at most; what is above is named alone
 _SPEED = {"Perf/steps_per_second": "environment steps / s", "Perf/training_time": "training time (s)"}
 
 
@@ -38,10 +37,8 @@ class ReportFlags:
     The page needs no network and no other file. Runs that differ in the seed alone are one line, with intervals.
     """
 
-    runs: RunPaths
-    """Run folders, or files of results/data/."""
-    out: Path | None = None
-    """The page; None: report.html, in the run folder or, of several, here."""
+    runs: RunPaths  # Run folders, or files of results/data/.
+    out: Path | None = None  # The page; None: report.html, in the run folder or, of several, here.
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -30,8 +30,7 @@ from bidex_meta.train.launch import launch, resume_command
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.world.threads import set_up_torch
 
-Checkpoint = tuple[Json, int]
-"""State and environment steps."""
+Checkpoint = tuple[Json, int]  # state and environment steps
 
 
 def main(arguments: Sequence[str]) -> None:

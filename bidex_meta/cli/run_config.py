@@ -24,8 +24,7 @@ from bidex_meta.utils.validation import Count, Few, Shots
 from bidex_meta.worlds import Worlds
 
 _EXAMPLE = "MT4"  # a suite whose defaults `run --help` shows
-_WIDTH = 1200
-"""Numbers that a step of one environment holds at most: observations before and after, actions, what is computed."""
+_WIDTH = 1200  # numbers that a step of one environment holds at most: two observations, actions, what is computed
 
 
 @dataclass(frozen=True)
@@ -36,27 +35,21 @@ class RunFlags(Generic[LearnerSettings]):
     """
 
     config: Annotated[RunConfig[LearnerSettings], tyro.conf.arg(name="")]
-    run_dir: Path | None = None
-    """Folder of this run; None: runs/SUITE/ALGO/DATE_seedSEED."""
+    run_dir: Path | None = None  # Folder of this run; None: runs/SUITE/ALGO/DATE_seedSEED.
     resume: Path | None = None
     """Continue this run from its last checkpoint, with its own config; only --steps and --minutes may change, which
     count what it has done already, and --logger, --evaluate-every, --video-every and --stop-at-...."""
-    evaluate: bool = True
-    """Evaluate at the end."""
+    evaluate: bool = True  # Evaluate at the end.
     episodes: Few | None = None
     """Episodes of each task in that evaluation; None: 4, or 1 where a task fixes its start (metaworld/...); for
     learners that adapt, as many as --rollouts."""
     split: Literal["auto", "train", "test", "both"] = "auto"
     """Tasks of that evaluation where the learner adapts (maml, promp, rl2, ...). auto: both, on ML20 fifteen classes
     beside the five unseen ones."""
-    shots: Shots | None = None
-    """There: adapt so often, one after the other. None: 1."""
-    rollouts: Few | None = None
-    """There: episodes of each task in a shot. None: as in training, but 40 at most."""
-    tasks: Count | None = None
-    """There: the first so many tasks of each class. None: 5."""
-    print_config: Switch = False
-    """Print the resolved config as JSON and stop."""
+    shots: Shots | None = None  # There: adapt so often, one after the other. None: 1.
+    rollouts: Few | None = None  # There: episodes of each task in a shot. None: as in training, but 40 at most.
+    tasks: Count | None = None  # There: the first so many tasks of each class. None: 5.
+    print_config: Switch = False  # Print the resolved config as JSON and stop.
 
 
 @dataclass(frozen=True)
@@ -84,7 +77,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
     stored = folder.config() if folder else None
 
     def given(name: str) -> str | None:
-        return peek(arguments, f"--{name}") or (stored and getattr(stored, name))
+        return peek(arguments, f"--{name}") or (stored and vars(stored)[name])
 
     dataset = run_data.whole_paths(peek_all(arguments, "--dataset")) or (stored.dataset if stored else ())
     datasets = run_data.open_datasets(dataset)
@@ -123,10 +116,7 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
 
 
 def _resolved(config: RunConfig, source: Worlds, device: str, fresh: bool) -> RunConfig:
-    """The config with names as they are written (``MT4`` where ``--suite mt4`` was given) and whole paths.
-
-    A run may be resumed from another folder.
-    """
+    """The config with names as they are written (``MT4`` of ``mt4``) and whole paths: a resume may be elsewhere."""
     if (config.suite is None) == (config.task is None):
         raise BidexError("Name what to train on: either --suite SUITE or --task TASK, for example --suite MT4.")
     if config.base != "own" and config.task is None:
@@ -136,22 +126,19 @@ def _resolved(config: RunConfig, source: Worlds, device: str, fresh: bool) -> Ru
     name = source.class_name or source.name
     suite = None if config.suite is None else str(absolute(name)) if name.endswith(".toml") else name
     return replace(
-        config,
-        suite=suite,
-        task=None if config.task is None else name,
+        config, suite=suite, task=None if config.task is None else name,
         object=str(absolute(held)) if (held := config.object) and held.endswith(".xml") else held,
         start_from=None if config.start_from is None else str(absolute(config.start_from)),
-        record_share=config.record / max(config.steps, 1) if fresh else config.record_share,
-        processes=launch().count,
+        record_share=config.record / max(config.steps, 1) if fresh else config.record_share, processes=launch().count,
         device=device,
-    )
+    )  # fmt: skip
 
 
 def _check(flags: RunFlags, config: RunConfig, kind: LearnerKind) -> None:
     """Refuses what does not go together, and what this machine has no room for."""
     if config.stop_at_score is not None and config.evaluate_every is None:
         raise BidexError("--stop-at-score is judged by evaluations while training. Add --evaluate-every 50, say.")
-    asked = [name for name in ("split", "shots", "rollouts", "tasks") if getattr(flags, name) not in (None, "auto")]
+    asked = [name for name in ("split", "shots", "rollouts", "tasks") if vars(flags)[name] not in (None, "auto")]
     if asked and not kind.make.adapts:
         raise BidexError(f"--{asked[0]} is for learners that adapt (maml, promp, rl2), not {kind.name}. Leave it out.")
     if config.record:

@@ -13,8 +13,7 @@ from bidex_meta.utils.files import absolute, expanded
 from bidex_meta.world.contract import VectorWorld
 from bidex_meta.worlds import Worlds
 
-UPDATES = 300_000
-"""Updates of an offline run by default."""
+UPDATES = 300_000  # updates of an offline run by default
 _FORM = ("suite", "task", "base", "object", "points")
 
 

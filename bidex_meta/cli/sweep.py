@@ -30,8 +30,7 @@ from bidex_meta.runs.metrics import last_rows
 from bidex_meta.utils.files import exists, is_file, read_text
 from bidex_meta.utils.validation import Few
 
-COMMAND = (sys.executable, "-m", "bidex_meta.cli")
-"""What a run's words are given to."""
+COMMAND = (sys.executable, "-m", "bidex_meta.cli")  # what a run's words are given to
 
 
 @dataclass(frozen=True)
@@ -43,18 +42,12 @@ class SweepFlags:
     docs/sweeps.md explains the file.
     """
 
-    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE.toml")]
-    """The sweep."""
-    workers: Few | None = None
-    """Runs at a time, each on a core of its own; None: one, or one for each of --cores."""
-    cores: str | None = None
-    """Cores that runs are bound to (Linux), such as 1 or 0,2-3; None: the first of those there are."""
-    out: Path = Path("runs")
-    """Where the sweep's folder lies: its runs are OUT/NAME/SUITE-ARM-seedN."""
-    status: Switch = False
-    """Print what is done, what runs, what is left and how long it takes, and stop."""
-    dry_run: Switch = False
-    """Check the file, print the commands of what is left, and stop."""
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE.toml")]  # The sweep.
+    workers: Few | None = None  # Runs at a time, each on a core of its own; None: one, or one for each of --cores.
+    cores: str | None = None  # Cores that runs are bound to (Linux), such as 1 or 0,2-3; None: the first there are.
+    out: Path = Path("runs")  # Where the sweep's folder lies: its runs are OUT/NAME/SUITE-ARM-seedN.
+    status: Switch = False  # Print what is done, what runs, what is left and how long it takes, and stop.
+    dry_run: Switch = False  # Check the file, print the commands of what is left, and stop.
     submit: Literal["slurm", "local"] | None = None
     """Hand the runs to a cluster by submitit (extra slurm), with the parameters of the file's [slurm], instead of
     running them; local: submitit's executor on this machine."""
@@ -150,10 +143,7 @@ class Job:
         self.process: subprocess.Popen[bytes] | None = None
 
     def __call__(self) -> None:
-        """Begins or resumes the run in a process of its own, and waits for the end.
-
-        Raises BidexError where it failed: the last line of its log, which a file beside its folder keeps.
-        """
+        """Begins or resumes the run and waits for its end; BidexError, the last line of its log, where it failed."""
         run = self.run
         while _locked(run) and not self.stopped:  # a process trains it that a killed sweep has left
             time.sleep(1.0)

@@ -20,8 +20,7 @@ from bidex_meta.utils.validation import Seed, Text, check_fields, parse
 _OWN = ("suite", "task", "algo", "seed", "run_dir", "resume", "print_config", "evaluate", "threads", "learner")
 """Flags of a run that no override sets: other entries of the file do, or the sweep."""
 _MOST_RUNS = 10_000
-_IN_NAMES = r"\w.+ -"
-"""Characters of a run folder's name, before blanks become hyphens."""
+_IN_NAMES = r"\w.+ -"  # characters of a run folder's name, before blanks become hyphens
 
 _Name = Annotated[str, Meta(pattern=rf"^[{_IN_NAMES}]{{1,60}}\Z")]
 _Texts = Annotated[tuple[Text, ...], Meta(min_length=1)]

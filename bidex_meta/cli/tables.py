@@ -15,8 +15,7 @@ from bidex_meta.evaluation.results import Difference, Evaluation, compare
 from bidex_meta.evaluation.statistics import Interval
 from bidex_meta.train.launch import launch
 
-Json = dict[str, Any]
-"""What JSON holds, or goes into it."""
+Json = dict[str, Any]  # what JSON holds, or goes into it
 NONE = "–"
 _BROKEN = (
     "unstable: the physics broke; no success, and the return of random actions, or its own if lower (where that is "

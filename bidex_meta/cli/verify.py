@@ -71,16 +71,11 @@ class VerifyFlags:
     Exit code 0 where all is equal bit for bit or within the intervals, 1 where something differs.
     """
 
-    run: RunPath
-    """Run folder."""
-    evaluation: Path | None = None
-    """What `bidex-meta evaluate --json` wrote of the run; None: its evaluation.json."""
-    device: str = "auto"
-    """auto, cpu or cuda:N; auto: where the evaluation was made, if that is here, else the CPU."""
-    engine: Engine | None = None
-    """auto, c or warp; None: as the evaluation was made, on another device auto."""
-    num_envs: Environments | None = None
-    """Environments stepped together; None: as the evaluation was made."""
+    run: RunPath  # Run folder.
+    evaluation: Path | None = None  # What `bidex-meta evaluate --json` wrote of the run; None: its evaluation.json.
+    device: str = "auto"  # auto, cpu or cuda:N; auto: where the evaluation was made, if that is here, else the CPU.
+    engine: Engine | None = None  # auto, c or warp; None: as the evaluation was made, on another device auto.
+    num_envs: Environments | None = None  # Environments stepped together; None: as the evaluation was made.
     json: JsonSwitch = False
 
 

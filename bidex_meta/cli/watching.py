@@ -28,10 +28,8 @@ from bidex_meta.utils import gl_backend
 from bidex_meta.world.contract import PooledWorld
 from bidex_meta.worlds import Worlds
 
-TASKS = 10
-"""Tasks of each class in such an evaluation, the first of its pool; one episode each."""
-_LEAST = 10
-"""Episodes over all classes: where there are fewer tasks each is played several times, so that not one fall decides."""
+TASKS = 10  # tasks of each class in such an evaluation, the first of its pool; one episode each
+_LEAST = 10  # episodes over all classes: fewer tasks are played several times each, so that not one fall decides
 _FILM = {"width": 240, "height": 180}
 _FILM_EVERY, _MOST_FILM_STEPS = 2, 300
 

@@ -10,9 +10,7 @@ from bidex_meta.errors import BidexError, known_name
 from bidex_meta.runs import video
 from bidex_meta.runs.atomic import check_writable
 from bidex_meta.tasks import registry
-from bidex_meta.tasks.base import CONTROL_RATE
 from bidex_meta.utils.validation import Threads
-from bidex_meta.witness.replay import frames, replay
 from bidex_meta.witness.store import load_witness, witness_path
 
 
@@ -23,18 +21,12 @@ class WitnessFlags:
     Example: bidex-meta witness --task CatchUnderarm
     """
 
-    task: str | None = None
-    """Task class."""
-    all: Switch = False
-    """All classes."""
-    file: Path | None = None
-    """Replay this file, not the stored witness."""
-    out: Path | None = None
-    """Also write a film (.mp4) of the witness, or a picture (.png) of its last step."""
-    camera: str | None = None
-    """front, side, top or back."""
-    threads: Threads | None = None
-    """Threads of the physics; None: one per core."""
+    task: str | None = None  # Task class.
+    all: Switch = False  # All classes.
+    file: Path | None = None  # Replay this file, not the stored witness.
+    out: Path | None = None  # Also write a film (.mp4) of the witness, or a picture (.png) of its last step.
+    camera: str | None = None  # front, side, top or back.
+    threads: Threads | None = None  # Threads of the physics; None: one per core.
     json: JsonSwitch = False
 
 
@@ -51,6 +43,9 @@ def main(arguments: Sequence[str]) -> None:
         check_writable(flags.out)
     rows = [_replay(name, flags) for name in names]
     if flags.out is not None:
+        from bidex_meta.tasks.base import CONTROL_RATE
+        from bidex_meta.witness.replay import frames
+
         pictures = frames(names[0], load_witness(names[0], flags.file), camera=flags.camera)
         if video.check_suffix(flags.out) == ".mp4":
             video.write_video(flags.out, pictures, CONTROL_RATE)
@@ -64,6 +59,8 @@ def _replay(name: str, flags: WitnessFlags) -> Json:
     if flags.file is None and not witness_path(name).is_file():
         keys = ("return", "first_success", "shifted", "steps", "deepest_mm", "rival")
         return {"task": name, "found": False, **dict.fromkeys(keys)}
+    from bidex_meta.witness.replay import replay
+
     witness = load_witness(name, flags.file)
     result, rival = replay(name, witness, flags.threads), witness.made.get("rival")
     return {

@@ -46,15 +46,9 @@ def register_ids() -> None:
 
 
 def make_suite_world(
-    suite: str,
-    split: str,
-    num_envs: int = 1,
-    seed: int | None = None,
-    benchmark_seed: int | None = None,
-    render_mode: str | None = None,
-    stagger: bool = False,
-    **options: Any,
-) -> VectorEnv:
+    suite: str, split: str, num_envs: int = 1, seed: int | None = None, benchmark_seed: int | None = None,
+    render_mode: str | None = None, stagger: bool = False, **options: Any
+) -> VectorEnv:  # fmt: skip
     """The world of `gymnasium.make_vec("bidex-meta/MT4-v1", num_envs=...)`, environments over all classes.
 
     `seed` (None: 0) chooses tasks, starts and task draws; `benchmark_seed` the tasks instead, and the rest without a

@@ -25,13 +25,9 @@ class HandsEnv(ParallelEnv):
     metadata = {"name": "bidex_meta", "render_modes": ["rgb_array"], "render_fps": 60}  # noqa: RUF012  (PettingZoo's)
 
     def __init__(
-        self,
-        task: str,
-        agents: Agents = "hands",
-        render_mode: str | None = None,
-        seed: int = 0,
-        device: str | torch.device = "cpu",
-    ) -> None:
+        self, task: str, agents: Agents = "hands", render_mode: str | None = None, seed: int = 0,
+        device: str | torch.device = "cpu"
+    ) -> None:  # fmt: skip
         self._env, self.render_mode = TaskEnv(task, render_mode, seed, device), render_mode
         whole, size = self._env.world.single_observation_space, self._env.world.single_action_space.shape[0]
         views = agent_views(self._env.world.observation_groups, size, agents)

@@ -9,12 +9,9 @@ from dataclasses import astuple, dataclass
 class Capacity:
     """Room per world, or the most of it in use."""
 
-    contacts: int
-    """Candidate pairs of the broadphase, and contacts; all worlds share one pool of so many each."""
-    convex: int
-    """Pairs of a kind that the convex collider (eggs, cylinders) takes on at a time; one pool too."""
-    rows: int
-    """Constraint rows, a hard limit for each world."""
+    contacts: int  # candidate pairs of the broadphase, and contacts; all worlds share one pool of so many each
+    convex: int  # pairs of a kind that the convex collider (eggs, cylinders) takes on at a time; one pool too
+    rows: int  # constraint rows, a hard limit for each world
 
 
 def room_for(seen: Sequence[Capacity]) -> Capacity:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.engine.health import LARGEST, LONGEST, SHORTEST, STATE, checked_state, outside, quaternion_columns
+from bidex_meta.engine.protocol import Engine
 from bidex_meta.errors import BidexError
 from bidex_meta.utils.memory import usable_cores
 
@@ -22,7 +23,7 @@ _TROUBLE = mujoco.mjtWarning.__members__
 _BAD = [int(_TROUBLE[f"mjWARN_{n}"]) for n in ("BADQPOS", "BADQVEL", "BADQACC", "CONTACTFULL", "CNSTRFULL")]
 
 
-class CpuEngine:
+class CpuEngine(Engine):
     """Simulations of models of equal structure, in double precision. See ``Engine`` for the views.
 
     Sensors are refreshed by a velocity stage after each step, which costs about a tenth of the speed but makes
@@ -40,10 +41,7 @@ class CpuEngine:
     def __init__(
         self, models: Sequence[mujoco.MjModel], rows: Sequence[int], threads: int | None = None, refresh: bool = True
     ) -> None:
-        """Builds the batch: the distinct models, and for each simulation the index of its model.
-
-        Results do not depend on ``threads``; None takes all CPUs.
-        """
+        """Builds the batch; ``rows``: each simulation's model. ``threads`` (None: all CPUs) change no result."""
         self.num = len(rows)
         self._after_step = mujoco.mjtStage.mjSTAGE_VEL if refresh else mujoco.mjtStage.mjSTAGE_NONE
         # MuJoCo would print each broken row to stderr and to a log file in the working folder; unstable() reports it.
@@ -123,11 +121,6 @@ class CpuEngine:
     def warnings(self) -> Tensor:
         return torch.from_numpy((self._batch.warning[:, :, 1] > 0).sum(axis=1)) + self._failed
 
-    def placement(self) -> Tensor:
-        if not self._mocap:
-            return self.qpos.clone()
-        return torch.cat((self.qpos, torch.cat(self._mocap, dim=2).flatten(1)), dim=1)
-
     def body_poses(self) -> tuple[Tensor, Tensor]:
         if self._poses is None:  # each field that is bound is copied out after every step
             self._poses = self._bind("xpos"), self._bind("xmat").unflatten(2, (3, 3))
@@ -147,9 +140,6 @@ class CpuEngine:
             position, quaternion = start[:, nq:].unflatten(1, (-1, 7)).split((3, 4), dim=2)
             self._mocap[0][mask], self._mocap[1][mask] = position, quaternion
         self.batch.forward(ids=ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
-
-    def state_dict(self) -> dict[str, Tensor]:
-        return {name: value.clone() for name, value in self._state.items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Refreshes position and velocity sensors."""

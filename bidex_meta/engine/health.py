@@ -12,8 +12,7 @@ from bidex_meta.errors import BidexError
 LARGEST = 1e6
 """Bound of positions (m, rad) and velocities (m/s, rad/s), far from what healthy rows reach (hands/README.md). All
 else (forces, accelerations, controls, time) is bounded by MuJoCo's own 1e10."""
-SHORTEST, LONGEST = 1e-3, 1e3
-"""Bounds of a quaternion's length; MuJoCo would take a shorter one for "not turned" without a word."""
+SHORTEST, LONGEST = 1e-3, 1e3  # bounds of a quaternion's length; MuJoCo takes a shorter one for "not turned"
 STATE = (
     *("time", "qpos", "qvel", "act", "history", "qacc_warmstart", "ctrl", "qfrc_applied", "xfrc_applied", "eq_active"),
     *("mocap_pos", "mocap_quat", "userdata"),

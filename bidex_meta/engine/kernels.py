@@ -13,16 +13,17 @@ import warp as wp
 
 from bidex_meta.engine.health import LARGEST, LONGEST, SHORTEST, quaternion_columns
 
+# Arrays by world (first index), and for some by number of the world (second).
+Flags = wp.array[bool]
+Times = wp.array[float]
+Numbers = wp.array2d[float]
+Points = wp.array2d[wp.vec3]
+Turns = wp.array2d[wp.quat]
+Wrenches = wp.array2d[wp.spatial_vector]
+
 
 @wp.kernel(enable_backward=False)
-def watch(
-    qpos: wp.array2d[float],
-    qvel: wp.array2d[float],
-    qacc: wp.array2d[float],
-    limit: float,
-    limit_of_qacc: float,
-    failed: wp.array[bool],
-):
+def watch(qpos: Numbers, qvel: Numbers, qacc: Numbers, limit: float, limit_of_qacc: float, failed: Flags):
     """Marks worlds with a number that is not finite or beyond its limit (a comparison with NaN is false)."""
     world, i = wp.tid()
     if not (wp.abs(qpos[world, i]) <= limit):
@@ -34,14 +35,9 @@ def watch(
 
 @wp.kernel(enable_backward=False)
 def examine(
-    time: wp.array[float],
-    warmstart: wp.array2d[float],
-    ctrl: wp.array2d[float],
-    qfrc_applied: wp.array2d[float],
-    xfrc_applied: wp.array2d[wp.spatial_vector],
-    limit: float,
-    failed: wp.array[bool],
-):
+    time: Times, warmstart: Numbers, ctrl: Numbers, qfrc_applied: Numbers, xfrc_applied: Wrenches, limit: float,
+    failed: Flags
+):  # fmt: skip
     """Marks worlds whose time, controls, forces or warm start are not finite or beyond the limit."""
     world, i = wp.tid()
     if not (wp.abs(time[world]) <= limit):
@@ -60,15 +56,9 @@ def examine(
 
 @wp.kernel(enable_backward=False)
 def examine_poses(
-    qpos: wp.array2d[float],
-    quaternions: wp.array[int],
-    mocap_pos: wp.array2d[wp.vec3],
-    mocap_quat: wp.array2d[wp.quat],
-    limit: float,
-    shortest: float,
-    longest: float,
-    failed: wp.array[bool],
-):
+    qpos: Numbers, quaternions: wp.array[int], mocap_pos: Points, mocap_quat: Turns, limit: float, shortest: float,
+    longest: float, failed: Flags
+):  # fmt: skip
     """Marks worlds with a fixture out of bounds, or a quaternion (four entries of qpos each) that is no rotation."""
     world, i = wp.tid()
     if i < quaternions.shape[0]:
@@ -83,13 +73,7 @@ def examine_poses(
 
 
 @wp.kernel(enable_backward=False)
-def quarantine(
-    failed: wp.array[bool],
-    qpos0: wp.array2d[float],
-    qpos: wp.array2d[float],
-    qvel: wp.array2d[float],
-    warmstart: wp.array2d[float],
-):
+def quarantine(failed: Flags, qpos0: Numbers, qpos: Numbers, qvel: Numbers, warmstart: Numbers):
     """Puts failed worlds at rest at the reference pose."""
     world, i = wp.tid()
     if failed[world]:
@@ -101,16 +85,9 @@ def quarantine(
 
 @wp.kernel(enable_backward=False)
 def disarm(
-    failed: wp.array[bool],
-    mocap_pos0: wp.array2d[wp.vec3],
-    mocap_quat0: wp.array2d[wp.quat],
-    time: wp.array[float],
-    ctrl: wp.array2d[float],
-    qfrc_applied: wp.array2d[float],
-    xfrc_applied: wp.array2d[wp.spatial_vector],
-    mocap_pos: wp.array2d[wp.vec3],
-    mocap_quat: wp.array2d[wp.quat],
-):
+    failed: Flags, mocap_pos0: Points, mocap_quat0: Turns, time: Times, ctrl: Numbers, qfrc_applied: Numbers,
+    xfrc_applied: Wrenches, mocap_pos: Points, mocap_quat: Turns
+):  # fmt: skip
     """Takes controls and forces from failed worlds, and puts their fixtures back."""
     world, i = wp.tid()
     if not failed[world]:
@@ -129,13 +106,7 @@ def disarm(
 
 @wp.kernel(enable_backward=False)
 def place(
-    mask: wp.array[bool],
-    start: wp.array2d[float],
-    limit: float,
-    qpos: wp.array2d[float],
-    mocap_pos: wp.array2d[wp.vec3],
-    mocap_quat: wp.array2d[wp.quat],
-    failed: wp.array[bool],
+    mask: Flags, start: Numbers, limit: float, qpos: Numbers, mocap_pos: Points, mocap_quat: Turns, failed: Flags
 ):
     """Writes starts where the mask is true: ``qpos``, then position and quaternion of each mocap body.
 

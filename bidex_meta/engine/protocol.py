@@ -23,16 +23,13 @@ class Engine(Protocol):
     masked: bool
     """Whether the engine is of an accelerator's kind: resets are masked writes of full size, and nothing in a step may
     wait for a value or have a shape that depends on one."""
-    qpos: Tensor
-    """Shape (num, nq)."""
-    qvel: Tensor
-    """Shape (num, nv)."""
-    ctrl: Tensor
-    """Position targets, shape (num, nu)."""
-    xfrc_applied: Tensor
-    """World-frame force and torque at bodies' centres of mass, shape (num, nbody, 6)."""
-    sensordata: Tensor
-    """Shape (num, nsensordata)."""
+    qpos: Tensor  # shape (num, nq)
+    qvel: Tensor  # shape (num, nv)
+    ctrl: Tensor  # position targets, shape (num, nu)
+    xfrc_applied: Tensor  # world-frame force and torque at bodies' centres of mass, shape (num, nbody, 6)
+    sensordata: Tensor  # shape (num, nsensordata)
+    _state: dict[str, Tensor]  # views of what a state holds
+    _mocap: list[Tensor]  # positions and quaternions of fixtures that may stand elsewhere, or nothing
 
     def step(self, substeps: int, active: Tensor | None = None) -> None:
         """Advances all simulations, or those of the mask ``active`` (num,), and refreshes their sensors.
@@ -42,7 +39,9 @@ class Engine(Protocol):
 
     def placement(self) -> Tensor:
         """What ``reset`` takes, of every simulation as it stands, a copy. Shape (num, nq + 7 nmocap)."""
-        ...
+        if not self._mocap:
+            return self.qpos.clone()
+        return torch.cat((self.qpos, torch.cat(self._mocap, dim=2).flatten(1)), dim=1)
 
     def body_poses(self) -> tuple[Tensor, Tensor]:
         """Positions (num, nbody, 3), metres, and rotation matrices (num, nbody, 3, 3) of all bodies, world frame.
@@ -52,10 +51,7 @@ class Engine(Protocol):
         ...
 
     def unstable(self) -> Tensor:
-        """Which simulations broke since their last reset, bool (num,).
-
-        Numbers out of bounds or not finite, or no room for contacts.
-        """
+        """Which broke (numbers out of bounds or not finite, no room for contacts) since their reset, bool (num,)."""
         ...
 
     def warnings(self) -> Tensor:
@@ -72,21 +68,16 @@ class Engine(Protocol):
 
     def state_dict(self) -> dict[str, Tensor]:
         """Everything that decides the future of the simulations, copied."""
-        ...
+        return {name: value.clone() for name, value in self._state.items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Restores a ``state_dict``.
-
-        Raises BidexError for a state of another model or number of rows, or with non-finite numbers.
-        """
+        """Restores a ``state_dict``; BidexError for one of another model or number of rows, or not finite."""
 
     def model(self, row: int) -> mujoco.MjModel:
         """The model of a simulation, for pictures and checks."""
-        ...
 
     def data(self, row: int) -> mujoco.MjData:
         """A copy of a simulation's data, forwarded by C MuJoCo, for pictures and checks."""
-        ...
 
     def contact_depth(self, row: int) -> float:
         """Deepest penetration among a simulation's contacts, metres, 0 without contact."""

@@ -22,6 +22,7 @@ from bidex_meta.engine import kernels
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.engine.health import LARGEST, STATE, checked_state
 from bidex_meta.engine.kernels import Guard
+from bidex_meta.engine.protocol import Engine
 from bidex_meta.errors import BidexError
 
 # What a step changes and later steps or readers see.
@@ -36,7 +37,7 @@ _SENSOR_NAMES = (
 _SENSORS = [int(mujoco.mjtSensor.__members__[f"mjSENS_{name}"]) for name in _SENSOR_NAMES.split()]
 
 
-class WarpEngine:
+class WarpEngine(Engine):
     """Simulations of models of equal structure, in single precision. See ``Engine`` for the views.
 
     ``step`` and ``reset`` replay graphs and never wait for the device. Graphs hold pointers: write into arrays in
@@ -50,12 +51,9 @@ class WarpEngine:
     masked = True
 
     def __init__(
-        self,
-        models: Sequence[mujoco.MjModel],
-        rows: Sequence[int],
-        capacity: Capacity,
-        device: str | torch.device = "cpu",
-    ) -> None:
+        self, models: Sequence[mujoco.MjModel], rows: Sequence[int], capacity: Capacity,
+        device: str | torch.device = "cpu"
+    ) -> None:  # fmt: skip
         """Puts the distinct models on the device and compiles the kernels; ``rows``: each simulation's model."""
         wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # no banner and no line for each kernel
         self.num, self.device = len(rows), torch.device(device)
@@ -121,11 +119,6 @@ class WarpEngine:
     def warnings(self) -> Tensor:
         return self.unstable().long()
 
-    def placement(self) -> Tensor:
-        if not self._mocap:
-            return self.qpos.clone()
-        return torch.cat((self.qpos, torch.cat(self._mocap, dim=2).flatten(1)), dim=1)
-
     def body_poses(self) -> tuple[Tensor, Tensor]:
         return wp.to_torch(self._d.xpos), wp.to_torch(self._d.xmat)
 
@@ -142,9 +135,6 @@ class WarpEngine:
     def recapture(self) -> None:
         """Forgets the graphs; the next calls record new ones."""
         self._graphs.clear()
-
-    def state_dict(self) -> dict[str, Tensor]:
-        return {name: value.clone() for name, value in self._state.items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """The state may be of the C engine. Refreshes position and velocity sensors."""
@@ -190,9 +180,8 @@ class WarpEngine:
         self._guard.examine(d)
         for left in reversed(range(self._substeps)):
             self._guard.watch(m, d)
-            m.opt.disableflags = (
-                wanted | int(mjw.DisableBit.SENSOR) if left else wanted
-            )  # only the last substep's forces are read
+            # Only the last substep's forces are read.
+            m.opt.disableflags = wanted | int(mjw.DisableBit.SENSOR) if left else wanted
             mjw.step(m, d)
         m.opt.disableflags = wanted
         self._guard.watch(m, d)

@@ -18,15 +18,11 @@ _MEASURES = ("success", "return")
 class Agreement:
     """One class in both evaluations."""
 
-    name: str
-    """Of the class; of a meta-test with split and shot."""
+    name: str  # of the class; of a meta-test with split and shot
     outcome: str
-    """``equal``: each number is the same bit for bit; ``within``: success and return differ by no more than their
-    intervals allow; ``differs``."""
-    recorded: Json
-    """Its recorded results."""
-    again: Json
-    """Its results now."""
+    """``equal``: bit for bit; ``within``: success and return within what their intervals allow; ``differs``."""
+    recorded: Json  # its recorded results
+    again: Json  # its results now
 
     def to_json(self) -> Json:
         """Ready for JSON."""

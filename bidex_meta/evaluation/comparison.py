@@ -20,34 +20,23 @@ from bidex_meta.utils.plugins import name_with_object, short_name
 
 _SETTINGS = ("algo", "steps", "num_envs", "minutes", "stop_at_return", "stop_at_success", "stop_at_score")
 _SETTINGS += ("base", "points", "object")
-_POINTS = 200
-"""Of a curve over several runs."""
+_POINTS = 200  # of a curve over several runs
 
 
 @dataclass(frozen=True)
 class Group:
     """Runs that differ in nothing but the seed; single-task runs of several classes are one group."""
 
-    label: str
-    """The algo, and settings that differ from other groups of that algo."""
-    seeds: list[int]
-    """In rising order; rows of the arrays below."""
-    classes: list[str]
-    """Columns of the arrays below."""
-    success: np.ndarray
-    """Success rate, (seeds, classes)."""
-    returns: np.ndarray
-    """Mean return, (seeds, classes)."""
-    scores: np.ndarray | None
-    """Normalised score, (seeds, classes); None where a class has no reference."""
-    steps: int
-    """Environment steps of a seed, over all its runs; the mean over seeds, which differ where time ended the runs."""
-    steps_range: tuple[int, int]
-    """Fewest and most steps of a seed."""
-    hours: float
-    """Mean time of a seed's training, over all its runs, without evaluation."""
-    paths: list[Path]
-    """Its run folders, or files of JSON."""
+    label: str  # the algo, and settings that differ from other groups of that algo
+    seeds: list[int]  # in rising order; rows of the arrays below
+    classes: list[str]  # columns of the arrays below
+    success: np.ndarray  # success rate, (seeds, classes)
+    returns: np.ndarray  # mean return, (seeds, classes)
+    scores: np.ndarray | None  # normalised score, (seeds, classes); None where a class has no reference
+    steps: int  # environment steps of a seed, over all its runs: the mean over seeds, which may differ
+    steps_range: tuple[int, int]  # fewest and most steps of a seed
+    hours: float  # mean time of a seed's training, over all its runs, without evaluation
+    paths: list[Path]  # its run folders, or files of JSON
 
     def steps_text(self) -> str:
         """The mean number of steps, with its range where seeds differ."""
@@ -199,28 +188,20 @@ def group_of(label: str, runs: Sequence[Run]) -> Group:
 
     scores = table("score")
     return Group(
-        label=label,
-        seeds=seeds,
-        classes=classes,
-        success=table("success"),
-        returns=table("return"),
-        scores=None if np.isnan(scores).any() else scores,
-        steps=round(sum(steps.values()) / len(steps)),
+        label=label, seeds=seeds, classes=classes, success=table("success"), returns=table("return"),
+        scores=None if np.isnan(scores).any() else scores, steps=round(sum(steps.values()) / len(steps)),
         steps_range=(min(steps.values()), max(steps.values())),
-        hours=float(np.mean([seconds[seed] for seed in seeds])) / 3600.0,
-        paths=[run.path for run in runs],
-    )
+        hours=float(np.mean([seconds[seed] for seed in seeds])) / 3600.0, paths=[run.path for run in runs],
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class History:
     """Runs that differ in the seed alone."""
 
-    label: str
-    """As of :class:`Group`."""
+    label: str  # as of :class:`Group`
     runs: list[Run]
-    curves: dict[str, Curve]
-    """Of each tag that a run has logged."""
+    curves: dict[str, Curve]  # of each tag that a run has logged
 
 
 def read_histories(runs: Sequence[Run]) -> list[History]:

@@ -26,25 +26,16 @@ class Control:
     """The arms of one run: the same episodes in the same order."""
 
     before: Evaluation
-    own: Evaluation
-    """Adapted to data of the tasks themselves."""
-    foreign: list[Evaluation]
-    """Adapted to data of each train task."""
-    adaptations: dict[str, np.ndarray]
-    """Per class which adaptation each episode followed, ``(episodes,)``, as in ``MetaEvaluation``."""
-    rollouts: int
-    """Episodes of each task in a shot."""
+    own: Evaluation  # adapted to data of the tasks themselves
+    foreign: list[Evaluation]  # adapted to data of each train task
+    adaptations: dict[str, np.ndarray]  # per class the adaptation that each episode followed, (episodes,)
+    rollouts: int  # episodes of each task in a shot
 
 
 def control(
-    load: Callable[[], Agent],
-    test_world: TaskWorld,
-    train_world: PooledWorld,
-    shots: int = 1,
-    *,
-    say: Callable[[str], None] = lambda line: None,
-    **played: Any,
-) -> Control:
+    load: Callable[[], Agent], test_world: TaskWorld, train_world: PooledWorld, shots: int = 1, *,
+    say: Callable[[str], None] = lambda line: None, **played: Any
+) -> Control:  # fmt: skip
     """Play all arms; ``played`` goes to ``meta_evaluate``, whose errors are raised.
 
     ``load`` returns the agent, a MetaLearningAgent, anew for each arm, so that all draw the same numbers. The worlds,
@@ -99,11 +90,9 @@ def arms(runs: Sequence[Control], class_name: str, names: Sequence[str]) -> dict
 
 
 def _own_minus(
-    runs: Sequence[Control],
-    others: Sequence[Sequence[ClassResult]],
-    class_name: str,
-    of: Callable[[ClassResult], np.ndarray | None],
-) -> Difference | None:
+    runs: Sequence[Control], others: Sequence[Sequence[ClassResult]], class_name: str,
+    of: Callable[[ClassResult], np.ndarray | None]
+) -> Difference | None:  # fmt: skip
     """Own data minus the mean of others, episode by episode."""
     differences = []
     for run, of_run in zip(runs, others, strict=True):

@@ -22,16 +22,14 @@ MEASURES: dict[str, Callable[[ClassResult], np.ndarray | None]] = {
 }
 """Measures by name: per episode, None where a class does not have it."""
 
-_BATCH = 200
-"""Resamples at a time; bounds memory."""
+_BATCH = 200  # resamples at a time; bounds memory
 
 
 @dataclass(frozen=True)
 class Gains:
     """Differences of means by measure (``return``, ``success``, ``score``); None where a measure is missing."""
 
-    classes: dict[str, dict[str, Difference | None]]
-    """Per class."""
+    classes: dict[str, dict[str, Difference | None]]  # per class
     aggregate: dict[str, Difference | None]
     """Mean over classes. Returns of different classes have different scales: of several classes quote the score."""
 

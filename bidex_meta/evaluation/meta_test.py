@@ -25,8 +25,7 @@ from bidex_meta.runs.atomic import Json
 from bidex_meta.utils.validation import whole_number
 from bidex_meta.world.contract import TaskWorld
 
-MAX_ADAPT_STEPS = 150
-"""Steps after which an episode is long enough to adapt to, by default."""
+MAX_ADAPT_STEPS = 150  # steps after which an episode is long enough to adapt to, by default
 
 _ADAPTS = ("init", "adapt_action", "step", "adapt")
 
@@ -35,20 +34,14 @@ _ADAPTS = ("init", "adapt_action", "step", "adapt")
 class MetaEvaluation:
     """The results of ``meta_evaluate``."""
 
-    by_shot: list[Evaluation]
-    """After 0, 1, ..., K shots (or those of them that were asked for): the same episodes in the same order."""
+    by_shot: list[Evaluation]  # after 0, 1, ..., K shots (or those asked for): the same episodes in the same order
     adaptations: dict[str, np.ndarray]
     """Per class which adaptation (a trial of a task) each of its episodes followed, ``(episodes,)``, numbers from 0."""
-    rollouts: int
-    """Episodes of each task that a shot adapted to."""
-    trials: int
-    """Adaptations of each task, each from the start."""
-    max_adapt_steps: int
-    """Longest episode of adaptation."""
-    adapt_steps: list[int]
-    """Transitions that each shot adapted to, over all tasks."""
-    split: str = ""
-    """Name of these tasks."""
+    rollouts: int  # episodes of each task that a shot adapted to
+    trials: int  # adaptations of each task, each from the start
+    max_adapt_steps: int  # longest episode of adaptation
+    adapt_steps: list[int]  # transitions that each shot adapted to, over all tasks
+    split: str = ""  # name of these tasks
 
     @property
     def before(self) -> Evaluation:
@@ -68,35 +61,18 @@ class MetaEvaluation:
         """Everything but the single episodes, ready for JSON."""
         by_shot = [found.to_json() for found in self.by_shot]
         return {
-            "split": self.split,
-            "shots": len(self.adapt_steps),
-            "rollouts": self.rollouts,
-            "trials": self.trials,
-            "max_adapt_steps": self.max_adapt_steps,
-            "adapt_steps": self.adapt_steps,
-            "before": by_shot[0],
-            "after": by_shot[-1],
-            "gain": self.gains().to_json(),
-            "by_shot": by_shot,
-        }
+            "split": self.split, "shots": len(self.adapt_steps), "rollouts": self.rollouts, "trials": self.trials,
+            "max_adapt_steps": self.max_adapt_steps, "adapt_steps": self.adapt_steps, "before": by_shot[0],
+            "after": by_shot[-1], "gain": self.gains().to_json(), "by_shot": by_shot,
+        }  # fmt: skip
 
 
 def meta_evaluate(
-    agent: Agent,
-    world: TaskWorld,
-    shots: int = 1,
-    *,
-    rollouts: int | None = None,
-    episodes_per_task: int = 4,
-    tasks: int | None = None,
-    trials: int = 1,
-    max_adapt_steps: int = MAX_ADAPT_STEPS,
-    seed: int = EVALUATION_SEED,
-    references: Mapping[str, Reference] | None = None,
-    adapt_world: TaskWorld | None = None,
-    evaluated: Collection[int] | None = None,
-    split: str = "",
-) -> MetaEvaluation:
+    agent: Agent, world: TaskWorld, shots: int = 1, *, rollouts: int | None = None, episodes_per_task: int = 4,
+    tasks: int | None = None, trials: int = 1, max_adapt_steps: int = MAX_ADAPT_STEPS, seed: int = EVALUATION_SEED,
+    references: Mapping[str, Reference] | None = None, adapt_world: TaskWorld | None = None,
+    evaluated: Collection[int] | None = None, split: str = ""
+) -> MetaEvaluation:  # fmt: skip
     """Evaluate an agent as ``evaluate`` does, ``shots`` times after exploring episodes of each task and adaptation.
 
     Environments that play the same task share one adaptation. Where the world has fewer environments than tasks times
@@ -144,12 +120,9 @@ def meta_evaluate(
     return MetaEvaluation(
         by_shot=[Evaluation(classes, episodes_per_task) for classes in by_class],
         adaptations={name: first["adaptation"][first["slot"] == i] for i, name in enumerate(world.task_names)},
-        rollouts=portions.rollouts,
-        trials=trials,
-        max_adapt_steps=max_adapt_steps,
-        adapt_steps=adapt_steps,
+        rollouts=portions.rollouts, trials=trials, max_adapt_steps=max_adapt_steps, adapt_steps=adapt_steps,
         split=split,
-    )
+    )  # fmt: skip
 
 
 def _seed(seed: int, *key: object) -> int:
@@ -213,7 +186,7 @@ def _explore(agent: MetaLearningAgent, world: TaskWorld, obs: Tensor, playing: T
 def _check(agent: Agent, worlds: Sequence[TaskWorld], shots: int, episodes_per_task: int, max_steps: int) -> None:
     whole_number("shots", shots, 0)
     whole_number("max_adapt_steps", max_steps, 1)
-    lacking = [name for name in _ADAPTS if not callable(getattr(agent, name, None))]
+    lacking = [name for name in _ADAPTS if not hasattr(agent, name)]
     if shots and lacking:
         raise BidexError(
             f"Expected an agent that adapts (bidex_meta.agents.MetaLearningAgent), but {type(agent).__name__} has no "

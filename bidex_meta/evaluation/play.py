@@ -22,18 +22,13 @@ from bidex_meta.utils.maths import check_precision
 from bidex_meta.utils.validation import whole_number
 from bidex_meta.world.contract import TaskWorld
 
-EVALUATION_SEED = 1_000_000
-"""Seed of the starts in evaluation: nobody trains with it, so that they are new to the policy."""
+EVALUATION_SEED = 1_000_000  # seed of the starts in evaluation: nobody trains with it, so they are new to the policy
 
 
 def evaluate(
-    agent: Agent,
-    world: TaskWorld,
-    episodes_per_task: int = 4,
-    *,
-    seed: int | None = None,
-    references: Mapping[str, Reference] | None = None,
-) -> Evaluation:
+    agent: Agent, world: TaskWorld, episodes_per_task: int = 4, *, seed: int | None = None,
+    references: Mapping[str, Reference] | None = None
+) -> Evaluation:  # fmt: skip
     """Play every task of ``world`` ``episodes_per_task`` times and report per class.
 
     The world is in autoreset mode DISABLED, with at least one environment for each task; those that share a task share
@@ -86,10 +81,7 @@ def check_world(world: TaskWorld, episodes_per_task: int) -> None:
 
 
 def quota(world: TaskWorld, episodes_per_task: int) -> torch.Tensor:
-    """Episodes each environment has to play, ``(num_envs,)``; those of a task are split over its environments.
-
-    Raises BidexError where it has none.
-    """
+    """Episodes each environment has to play, (num_envs,); BidexError where a task has no environment."""
     tasks = world.task_index
     shares = torch.zeros_like(tasks)
     for slot, name in enumerate(world.task_names):

@@ -30,12 +30,9 @@ class _File(TypedDict):
 class Reference:
     """References of a class."""
 
-    random: float
-    """Mean return of uniform actions."""
-    expert: float | None = None
-    """Mean return of the best known policy; None where none is known that is above the floor."""
-    zero: float | None = None
-    """Mean return of zero actions, where it is known."""
+    random: float  # mean return of uniform actions
+    expert: float | None = None  # mean return of the best known policy; None where none is above the floor
+    zero: float | None = None  # mean return of zero actions, where it is known
 
     @property
     def floor(self) -> float:

@@ -9,29 +9,21 @@ from bidex_meta.evaluation.references import Reference, counted_returns
 from bidex_meta.evaluation.statistics import Estimate, aggregate, bootstrap_interval, mean, mean_difference
 from bidex_meta.runs.atomic import Json
 
-MANY_TASKS = 10
-"""From so many tasks on, intervals resample tasks instead of episodes."""
+MANY_TASKS = 10  # from so many tasks on, intervals resample tasks instead of episodes
 
 
 @dataclass(frozen=True)
 class ClassResult:
     """The episodes of one class; arrays of shape ``(episodes,)``, in the order they were played."""
 
-    returns: np.ndarray
-    """Sum of the unscaled reward, float64; of broken episodes as ``counted_returns``."""
-    successes: np.ndarray
-    """Success by the suite's rule, float64 0 or 1; 0 of broken episodes."""
-    lengths: np.ndarray
-    """Steps, int64."""
-    tasks: np.ndarray
-    """Index of the played task in the class's pool, int64."""
-    unstable: int
-    """Episodes that ended because the physics broke."""
-    once: float | None = None
-    """Share of episodes solved at any step; ``at_end``: in their last steps (``suite.HELD_STEPS``)."""
-    at_end: float | None = None
-    reference: Reference | None = None
-    """For the normalised score and broken episodes, where it is known."""
+    returns: np.ndarray  # sum of the unscaled reward, float64; of broken episodes as ``counted_returns``
+    successes: np.ndarray  # success by the suite's rule, float64 0 or 1; 0 of broken episodes
+    lengths: np.ndarray  # steps, int64
+    tasks: np.ndarray  # index of the played task in the class's pool, int64
+    unstable: int  # episodes that ended because the physics broke
+    once: float | None = None  # share of episodes solved at any step
+    at_end: float | None = None  # share solved in their last steps (``suite.HELD_STEPS``)
+    reference: Reference | None = None  # for the normalised score and broken episodes, where it is known
 
     @property
     def episodes(self) -> int:
@@ -70,28 +62,20 @@ class ClassResult:
     def to_json(self) -> Json:
         """Numbers of this class, ready for JSON."""
         return {
-            "success": self.success,
-            "success_interval": bootstrap_interval(mean, self.drawn(self.successes)),
-            "success_once": self.once,
-            "success_at_end": self.at_end,
-            "return": self.mean_return,
-            "return_interval": bootstrap_interval(mean, self.drawn(self.returns)),
-            "length": float(self.lengths.mean()),
-            "score": self.score,
-            "episodes": self.episodes,
-            "tasks": len(np.unique(self.tasks)),
-            "unstable": self.unstable,
-        }
+            "success": self.success, "success_interval": bootstrap_interval(mean, self.drawn(self.successes)),
+            "success_once": self.once, "success_at_end": self.at_end,
+            "return": self.mean_return, "return_interval": bootstrap_interval(mean, self.drawn(self.returns)),
+            "length": float(self.lengths.mean()), "score": self.score, "episodes": self.episodes,
+            "tasks": len(np.unique(self.tasks)), "unstable": self.unstable,
+        }  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Evaluation:
     """The results of ``evaluate``."""
 
-    classes: dict[str, ClassResult]
-    """Per class, by name, in the world's order of slots."""
-    episodes_per_task: int
-    """Episodes of every task."""
+    classes: dict[str, ClassResult]  # per class, by name, in the world's order of slots
+    episodes_per_task: int  # episodes of every task
 
     def to_json(self) -> Json:
         """Everything but the single episodes, ready for JSON."""
@@ -105,16 +89,13 @@ class Evaluation:
         }
 
 
-Difference = Estimate
-"""Mean return of one policy above another's in a class; tasks of both (of few tasks: episodes) are resampled."""
+Difference = Estimate  # mean return of one policy above another's in a class; tasks of both (few: episodes) resampled
 
 
 def results_by_class(
-    names: Sequence[str],
-    episodes: dict[str, np.ndarray],
-    references: Mapping[str, Reference] | None = None,
-    compared: Sequence[dict[str, np.ndarray]] = (),
-) -> dict[str, ClassResult]:
+    names: Sequence[str], episodes: dict[str, np.ndarray], references: Mapping[str, Reference] | None = None,
+    compared: Sequence[dict[str, np.ndarray]] = ()
+) -> dict[str, ClassResult]:  # fmt: skip
     """Results of episodes of ``play_tasks`` by the names of their slots, broken ones as ``counted_returns``.
 
     ``compared``: episodes of the policies that this one is compared with.
@@ -128,14 +109,9 @@ def results_by_class(
         broken, reference = own["unstable"].astype(bool), (references or {}).get(name)
         classes[name] = ClassResult(
             returns=counted_returns(own["return"], broken, reference, np.concatenate(finished)),
-            successes=(own["success"] & ~broken).astype(np.float64),
-            lengths=own["length"],
-            tasks=own["task"],
-            unstable=int(broken.sum()),
-            once=float((own["once"] & ~broken).mean()),
-            at_end=float((own["at_end"] & ~broken).mean()),
-            reference=reference,
-        )
+            successes=(own["success"] & ~broken).astype(np.float64), lengths=own["length"], tasks=own["task"],
+            unstable=int(broken.sum()), reference=reference,
+        )  # fmt: skip
     return classes
 
 

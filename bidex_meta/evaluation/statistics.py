@@ -8,10 +8,8 @@ import numpy as np
 
 from bidex_meta.runs.atomic import Json
 
-Statistic = Callable[..., Any]
-"""Of samples, along ``axis``."""
-Interval = tuple[float, float]
-"""Lower and upper end of a 95 % bootstrap interval."""
+Statistic = Callable[..., Any]  # of samples, along ``axis``
+Interval = tuple[float, float]  # lower and upper end of a 95 % bootstrap interval
 
 
 @dataclass(frozen=True)
@@ -19,8 +17,7 @@ class Estimate:
     """A number with its uncertainty."""
 
     value: float
-    interval: Interval | None
-    """95 % bootstrap interval; None with fewer than two samples."""
+    interval: Interval | None  # 95 % bootstrap interval; None with fewer than two samples
 
     @property
     def excludes_zero(self) -> bool:

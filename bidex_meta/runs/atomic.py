@@ -11,8 +11,7 @@ from bidex_meta.errors import BidexError, one_line
 from bidex_meta.utils.files import exists
 
 TEMPORARY_SUFFIX = ".tmp"
-Json = dict[str, Any]
-"""An object of JSON."""
+Json = dict[str, Any]  # an object of JSON
 
 
 def write_atomic(path: Path, write: Callable[[IO[bytes]], object]) -> None:

@@ -17,11 +17,9 @@ from bidex_meta.errors import BidexError, one_line, shortened
 from bidex_meta.runs.atomic import refuse_links, remove_leftovers, write_atomic
 from bidex_meta.utils.files import exists, is_file, open_regular
 
-State = dict[str, Any]
-"""Nested dicts and lists of tensors, numbers and strings; nothing that needs code to be read back."""
+State = dict[str, Any]  # nested dicts and lists of tensors, numbers and strings; nothing that needs code to be read
 _STEP_FILE = re.compile(r"step_(\d{1,18})\.pt", re.ASCII)
-FORMAT = 2
-"""Goes up when older code could not read a checkpoint; 1 had no digest."""
+FORMAT = 2  # goes up when older code could not read a checkpoint; 1 had no digest
 _DEEPEST = 100
 
 
@@ -29,10 +27,8 @@ _DEEPEST = 100
 class Checkpoints:
     """The checkpoints of one run."""
 
-    folder: Path
-    """Created by the first ``save``."""
-    keep: int = 3
-    """How many ``step_<N>.pt`` stay: several, so that a file damaged after it was written does not end the run."""
+    folder: Path  # created by the first ``save``
+    keep: int = 3  # how many ``step_<N>.pt`` stay: several, so that one damaged file does not end the run
 
     @property
     def last(self) -> Path:

@@ -31,13 +31,11 @@ from bidex_meta.runs.versions import collect_versions
 from bidex_meta.utils.files import exists, is_file, read_json
 from bidex_meta.utils.plugins import name_with_object, short_name
 
-AnyConfig = RunConfig[Any]
-"""A run's config, its learner's settings in whichever form."""
+AnyConfig = RunConfig[Any]  # A run's config, its learner's settings in whichever form
 _ENTRIES = ("checkpoints", "videos", "metrics.jsonl", "versions.json", "config.json", "replay", "wandb", "wandb-id")
 """In a run folder before its first iteration has ended, beside TensorBoard's file."""
 _EVENTS = "events.out.tfevents."
-_MOST_LOOKED_AT = 2000
-"""Entries that are looked at to find runs below a folder that is none."""
+_MOST_LOOKED_AT = 2000  # entries that are looked at to find runs below a folder that is none
 
 
 class _Part:

@@ -13,8 +13,7 @@ from bidex_meta.runs.atomic import Json, write_atomic
 from bidex_meta.runs.writers import Writer, make_writer
 from bidex_meta.utils.files import bounded, exists, open_regular, read_bytes
 
-_MOST_BYTES = 4_000_000_000
-"""Of a ``metrics.jsonl``; a line an iteration is some kilobytes."""
+_MOST_BYTES = 4_000_000_000  # of a ``metrics.jsonl``; a line an iteration is some kilobytes
 _TAIL = 65_536
 
 

@@ -23,26 +23,19 @@ Axes = Any
 class Curve:
     """A metric against environment steps; arrays (points,)."""
 
-    steps: np.ndarray
-    """Environment steps, rising."""
-    mean: np.ndarray
-    """The metric, over several runs their mean."""
-    low: np.ndarray | None
-    """Lower end of the interval over runs; None of a single run."""
-    high: np.ndarray | None
-    """Upper end."""
+    steps: np.ndarray  # environment steps, rising
+    mean: np.ndarray  # the metric, over several runs their mean
+    low: np.ndarray | None  # lower end of the interval over runs; None of a single run
+    high: np.ndarray | None  # upper end
 
 
-Group = tuple[str, Mapping[str, Curve]]
-"""Runs that are drawn in one colour: their label, and curves by tag."""
-Bar = tuple[str, float, tuple[float, float] | None]
-"""A label, a value, and its interval where it is known."""
+Group = tuple[str, Mapping[str, Curve]]  # runs that are drawn in one colour: their label, and curves by tag
+Bar = tuple[str, float, tuple[float, float] | None]  # A label, a value, and its interval where it is known
 
 _COLUMNS = 4
 _MEASURES = ("return", "success")
 _STYLES = ("-", "--")
-_FEW = 60
-"""Evaluations up to which each is a dot: more of them would hide the dashes."""
+_FEW = 60  # evaluations up to which each is a dot: more of them would hide the dashes
 _COLOURS = {"train": "tab:blue", "test": "tab:orange"}
 _STEPS = "environment steps (millions)"
 _AGAIN = "Write one: bidex-meta evaluate RUN --shots 3 --json > {}"
@@ -87,10 +80,7 @@ def draw_metrics(groups: Sequence[Group], tags: Mapping[str, str]) -> Figure:
 
 
 def draw_panels(panels: Mapping[str, Sequence[Group]], tag: str, title: str) -> Figure:
-    """A metric, labelled ``title``, against environment steps; a panel for each title's groups, all on one scale.
-
-    Groups of one label have one colour.
-    """
+    """A metric, labelled ``title``, against environment steps; a panel for each name's groups, all on one scale."""
     labels = list(dict.fromkeys(label for groups in panels.values() for label, _ in groups))
     figure = _figure(5.2 * len(panels), 3.6)
     axes = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
@@ -120,14 +110,8 @@ def draw_comparison(panels: Mapping[str, Sequence[Bar]]) -> Figure:
 def draw_adaptation(evaluation: Json, where: object) -> Figure:
     """Return and success of every class against shots of adaptation, train classes first, then test classes.
 
-    Bands are the 95 % bootstrap intervals over episodes.
-
-    Args:
-        evaluation: Content of a run's ``evaluation.json``, or of ``bidex-meta evaluate RUN --shots K --json``.
-        where: Its file, for messages.
-
-    Raises:
-        BidexError: It holds no meta-test.
+    Bands are the 95 % bootstrap intervals over episodes. Raises BidexError where ``evaluation`` (of evaluation.json or
+    of ``bidex-meta evaluate RUN --shots K --json``; ``where`` names it in messages) holds no meta-test.
     """
     _matplotlib()
     splits = evaluation.get("splits") if isinstance(evaluation, dict) else None

@@ -113,10 +113,7 @@ class Progress:
 
 
 def counted(items: Iterable[Item], total: int, what: str, stream: TextIO | None = None) -> Iterator[Item]:
-    """The items, their number of at most ``total`` reported on stderr: a bar in a terminal, plain lines elsewhere.
-
-    ``what`` is their name in the plural.
-    """
+    """The items; how many of ``total`` ``what`` there were is a bar in a terminal, plain lines elsewhere, on stderr."""
     console = PlainConsole(file=stream or sys.stderr)
     if console.is_terminal:
         yield from track(items, description=what, total=total, console=console, transient=True)

@@ -21,13 +21,9 @@ class Recorder:
     """
 
     def __init__(
-        self,
-        folder: RunFolder,
-        total_steps: int,
-        total_seconds: float = math.inf,
-        resume_step: int | None = None,
-        logger: str = "tensorboard",
-    ):
+        self, folder: RunFolder, total_steps: int, total_seconds: float = math.inf, resume_step: int | None = None,
+        logger: str = "tensorboard"
+    ):  # fmt: skip
         self._checkpoints, self._videos = folder.checkpoints, folder.videos_path
         self._metrics = MetricsWriter(folder.path, resume_step, logger)
         if resume_step is None:

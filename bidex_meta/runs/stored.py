@@ -25,8 +25,7 @@ from bidex_meta.runs.schemas import check_evaluation, check_versions
 from bidex_meta.utils.files import read_json
 from bidex_meta.utils.validation import Finite, NonNegative, Text, Whole, parse
 
-FORMAT = 1
-"""Of the files; raised where an older reader would misread them."""
+FORMAT = 1  # of the files; raised where an older reader would misread them
 
 
 class _File(TypedDict):

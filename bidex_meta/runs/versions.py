@@ -18,13 +18,11 @@ def collect_versions() -> Json:
     import torch
 
     return {
-        "python": sys.version.split()[0],
-        "packages": package_versions(),
-        "platform": platform.platform(),
+        "python": sys.version.split()[0], "packages": package_versions(), "platform": platform.platform(),
         "cpus": os.cpu_count(),
         "gpus": [torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())],
         "git": git_state(Path(__file__).parent),
-    }
+    }  # fmt: skip
 
 
 def package_versions() -> dict[str, str | None]:

@@ -13,8 +13,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.runs.atomic import write_atomic
 
 SUFFIXES = (".png", ".mp4", ".webp")
-_STRIP = 20
-"""Height of a name, pixels."""
+_STRIP = 20  # height of a name, pixels
 _BACK, _INK, _DONE = (24, 26, 30), (215, 218, 224), (110, 220, 130)
 
 

@@ -46,14 +46,9 @@ class OpenLoopReplay(ActionSequences):
     """
 
     def __init__(
-        self,
-        witnesses: Mapping[str, Witness],
-        task_names: Sequence[str],
-        task_id: Tensor,
-        actions: int,
-        noise: float = 0.0,
-        seed: int = 0,
-    ):
+        self, witnesses: Mapping[str, Witness], task_names: Sequence[str], task_id: Tensor, actions: int,
+        noise: float = 0.0, seed: int = 0
+    ):  # fmt: skip
         longest = max((len(each.actions) for each in witnesses.values()), default=1)
         super().__init__(torch.zeros(len(task_names), longest, actions, device=task_id.device), task_id)
         for slot, name in enumerate(task_names):

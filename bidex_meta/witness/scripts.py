@@ -104,7 +104,6 @@ def pour_water(hands: HandController) -> None:
     grip(kettle, loose=0.025, steps=17)
     hands.bend("right", 1.2, 1.5)
     grip(kettle, steps=17)
-
     sine, cosine = math.sin(_POUR), math.cos(_POUR)
     lip = -0.2 * cosine - 0.053 * sine, 0.053 * cosine - 0.2 * sine  # of a tilted kettle, along ``back`` and up
     way = bucket + (0.07 - lip[0]) * back - kettle

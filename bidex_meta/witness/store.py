@@ -30,8 +30,7 @@ class Witness:
     """Recorded actions that solve a task, and their record."""
 
     actions: np.ndarray  # actions (T, action_size), float32, multiples of 1/127
-    made: Json
-    """Return, step of the first success, return of the best unsuccessful episode (``rival``), settings, versions."""
+    made: Json  # return, first successful step, best unsuccessful episode's return (``rival``), settings, versions
 
 
 def quantised(actions: "Tensor") -> "Tensor":

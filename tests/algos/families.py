@@ -1,6 +1,6 @@
 """Families of tasks to adapt to, with the contract of ``bidex_meta.world.World`` in mode DISABLED."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bidex_meta.agents import MetaLearningAgent, Timestep
 from bidex_meta.world.random import row_keys, uniform
 from tests.fake_world import FakePools
 
@@ -81,6 +82,33 @@ class PointGoals(FakePools):
 
     def best(self, obs: Tensor) -> Tensor:
         return ((obs[:, 2:] - obs[:, :2]) / self.speed).clamp(-1.0, 1.0)
+
+
+def everyone(world: Any) -> Tensor:
+    return torch.ones(world.num_envs, dtype=torch.bool)
+
+
+def played(act: Callable[[Tensor], Tensor], world: PointGoals, seed: int | None = None) -> float:
+    """Mean return of an episode of each row."""
+    obs, _ = world.reset(seed=seed)
+    total = 0.0
+    for _ in range(int(world.max_episode_steps.max())):
+        obs, reward, *_ = world.step(act(obs))
+        total += float(reward.mean())
+    return total
+
+
+def shot(agent: MetaLearningAgent, world: PointGoals, seed: int | None = None) -> None:
+    """An episode in each row, and the adaptation by it."""
+    obs, _ = world.reset(seed=seed)
+    agent.reset(everyone(world))
+    over = ~everyone(world)
+    for _ in range(int(world.max_episode_steps.max())):
+        action, aux = agent.adapt_action(obs)
+        following, reward, terminated, truncated, _ = world.step(action)
+        agent.step(Timestep(obs, action, reward, terminated, truncated, aux, following, ~over))
+        obs, over = following, terminated | truncated
+    agent.adapt()
 
 
 class Recall(FakePools):

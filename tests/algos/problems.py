@@ -1,7 +1,7 @@
 """Toy worlds whose optimum is known, for the tests of all learners: bandits, LQR and a point mass."""
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,6 +9,7 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
+from bidex_algos.replay import Transitions
 from tests.algos.toy import ToyWorld, nearness
 from tests.fake_world import FakeWorld
 
@@ -46,6 +47,9 @@ class _TimedWorld(FakeWorld):
     @abstractmethod
     def _draw(self) -> Tensor: ...
 
+    def _observe(self) -> Tensor:
+        return self.state.clone()
+
     def _start(self, mask: Tensor) -> None:
         self.state = torch.where(mask[:, None], self._draw(), self.state)
 
@@ -64,9 +68,6 @@ class LQR(_TimedWorld):
 
     def _draw(self) -> Tensor:
         return torch.rand(self.num_envs, 2, generator=self.generator) - 0.5
-
-    def _observe(self) -> Tensor:
-        return self.state.clone()
 
     def _advance(self, action: Tensor, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         a, b, q, r = (torch.from_numpy(m).float() for m in (self.a, self.b, self.q, self.r))
@@ -94,17 +95,11 @@ class PointMass(_TimedWorld):
 
     speed = 0.1
 
-    def __init__(self, rows: int = 32, horizon: int = 20, goal_visible: bool = True):
+    def __init__(self, rows: int = 32, horizon: int = 20):
         super().__init__(4, 2, rows, horizon)
-        self.goal_visible = goal_visible
 
     def _draw(self) -> Tensor:
         return torch.rand(self.num_envs, 4, generator=self.generator) - 0.5
-
-    def _observe(self) -> Tensor:
-        shown = self.state.clone()
-        shown[:, 2:] *= float(self.goal_visible)
-        return shown
 
     def _advance(self, action: Tensor, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         position, goal = self.state[:, :2] + self.speed * action, self.state[:, 2:]
@@ -125,6 +120,28 @@ def discounted_return(world: LQR | PointMass, policy: Callable[[Tensor], Tensor]
         obs, reward, *_ = world.step(policy(obs))
         total += gamma**t * reward
     return float(total.mean())
+
+
+def is_near_the_optimum(act: Callable[[Tensor], Tensor], gamma: float, factor: float) -> bool:
+    """Whether it loses less than ``factor`` times what the Riccati controller does in the LQR."""
+    test = LQR(rows=256)
+    best = discounted_return(test, test.best(gamma), gamma, 40)
+    assert discounted_return(test, lambda obs: torch.zeros(len(obs), 2), gamma, 40) < 2.5 * best
+    return discounted_return(test, act, gamma, 40) > factor * best
+
+
+def a_draw(least: float = 1.0, steps: Sequence[int] = (1,) * 6) -> Transitions:
+    """Six transitions of observations (3,) and two actions, of which the second and the fifth end."""
+    obs, following = torch.randn(2, 6, 3, generator=torch.Generator().manual_seed(1))
+    ends = torch.tensor([False, True, False, False, True, False])
+    return Transitions(obs, torch.zeros(6, 2), torch.arange(6.0) + least, following, ends, torch.tensor(steps))
+
+
+def shake(*nets: torch.nn.Module, by: float = 0.3) -> None:
+    noise = torch.Generator().manual_seed(3)
+    with torch.no_grad():
+        for weight in (weight for net in nets for weight in net.parameters()):
+            weight.add_(by * torch.randn(weight.shape, generator=noise))
 
 
 def trained(kind: Any, world: Any, config: Any, iterations: int) -> Any:

@@ -1,5 +1,6 @@
-"""Runs a function in two processes that are joined as torchrun would join them."""
+"""Runs in two processes that are joined as torchrun would join them, and learners that are saved and go on."""
 
+import io
 import multiprocessing
 import os
 import signal
@@ -53,3 +54,29 @@ def same(a: Any, b: Any) -> bool:
     if isinstance(a, list | tuple):
         return len(a) == len(b) and all(map(same, a, b))
     return torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
+
+
+def resumed(make: Callable[[int], Any], iterations: int = 3) -> tuple[Any, Any]:
+    """Two learners after twice as many iterations: one without a break, one saved and loaded half-way.
+
+    ``make``: A learner of a seed, with its world as ``learner.world``; ``iterations``: before the break, and after it.
+    Raises AssertionError: their metrics differ after the break, or their states at the end.
+    """
+    unbroken = make(0)
+    for _ in range(iterations):
+        unbroken.iterate()
+    file = io.BytesIO()
+    torch.save({"learner": unbroken.state_dict(), "env": unbroken.world.state_dict()}, file)
+    file.seek(0)
+    state = torch.load(file, weights_only=True)
+    again = make(77)
+    again.world.load_state_dict(state["env"])
+    again.load_state_dict(state["learner"])
+    for _ in range(iterations):
+        a, b = ({k: v for k, v in each.iterate().items() if "Perf" not in k} for each in (unbroken, again))
+        assert a == b
+    ends = [each.state_dict() for each in (unbroken, again)]
+    for end in ends:
+        end["policy"].pop("seed", None)  # of the learner's making, which the test lets differ
+    assert same(*ends)
+    return unbroken, again

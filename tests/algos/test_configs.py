@@ -32,6 +32,16 @@ WRONG: dict[str, dict[str, Any]] = {
     "bcq": {"perturbation": 2.5, "lower_weight": -0.1, "latent": 0},
     "td3bc": {"alpha": -1.0, "policy_delay": 0},
 }  # fmt: skip
+TOGETHER: list[tuple[str, dict[str, Any], str]] = [
+    ("mtppo", {"architecture": "paco", "task_embedding": 4}, "task_embedding goes with architecture shared"),
+    ("mtppo", {"architecture": "soft_modules", "hidden": (32,)}, "at least two widths"),
+    ("mtppo", {"architecture": "moore", "hidden": (32, 3)}, "no more modules than the last width"),
+    ("mtppo", {"architecture": "moore", "hidden": ()}, "no more modules than the last width"),
+    ("fasttd3", {"architecture": "soft_modules", "critic_hidden": (64,)}, "two widths in critic_hidden"),
+    ("ippo", {"popart": True, "share_parameters": True}, "popart needs a critic for each agent"),
+    ("mappo", {"popart": True, "value_heads": False}, "leave per_task_values and value_heads on"),
+    ("happo", {"agents": "thumbs"}, "agents: expected single"),
+]
 HOSTILE: tuple[Any, ...] = ("1e3", None, True, [1], {}, float("inf"))
 
 
@@ -40,6 +50,12 @@ def test_a_value_out_of_bounds_is_refused_by_its_field(algo: str, field: str) ->
     config = type(learner_kind(algo).presets["laptop"])
     with pytest.raises(BidexError, match=f"{algo}: .*{field}"):
         config(**{field: WRONG[algo][field]})
+
+
+@pytest.mark.parametrize(("algo", "options", "told"), TOGETHER)
+def test_what_does_not_go_together_is_refused(algo: str, options: dict[str, Any], told: str) -> None:
+    with pytest.raises(BidexError, match=told):
+        type(learner_kind(algo).presets["laptop"])(**options)
 
 
 @pytest.mark.parametrize("algo", ALGOS)

@@ -12,8 +12,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.world.contract import plain_groups
 from tests.algos.families import PointClass, PointGoals
 from tests.algos.problems import opposite_bandits
-from tests.algos.ranks import same
-from tests.algos.resume import resumed
+from tests.algos.ranks import resumed, same
 from tests.algos.toy import ToyWorld, nearness
 from tests.offline.stored import as_data, noisy, played
 

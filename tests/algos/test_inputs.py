@@ -1,20 +1,19 @@
 """Observations by named groups: wherever the task id stands, whatever encoder reads a group, and the task embedding."""
 
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.testing import assert_close
 
-from bidex_algos.learner import Learner
 from bidex_algos.meta.promp import ProMP, ProMPConfig
-from bidex_algos.meta.rl2 import RL2, RL2Config
-from bidex_algos.nets.inputs import Columns, GroupEncoder, Inputs, with_task_embedding
+from bidex_algos.nets.inputs import GroupEncoder, Inputs, with_task_embedding
 from bidex_algos.nets.networks import MLP, GaussianActor
 from bidex_algos.nets.normalise import ObservationNormaliser
+from bidex_algos.nets.point_net import PointNet
 from bidex_algos.nets.policy import SquashedActor
 from bidex_algos.nets.shape import Shape
 from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
@@ -30,13 +29,9 @@ PPO = MTPPOConfig(hidden=(16, 16), learning_rate=3e-3, autocast="off")
 SAC = MTSACConfig(hidden=(16, 16), replay_steps=60, cut_share=0.3, warmup_steps=4, batch_size=64, autocast="off")
 
 # Two cameras' points around the task id: groups with gaps, and the id in the middle.
-SCATTERED = Inputs(
-    (
-        ObservationGroup("points", (slice(0, 3), slice(6, 9))),
-        ObservationGroup("goal", (slice(3, 4),)),
-        ObservationGroup("task_id", (slice(4, 6),)),
-    )
-)
+POINTS = ObservationGroup("points", (slice(0, 3), slice(6, 9)))
+SCATTERED = Inputs((POINTS, ObservationGroup("goal", (slice(3, 4),)), ObservationGroup("task_id", (slice(4, 6),))))
+ENCODER = partial(PointNet, widths=(8, 4))
 
 
 def generator() -> torch.Generator:
@@ -49,61 +44,23 @@ def scattered(rows: int = 6) -> Tensor:
     return x
 
 
-class PointNet(nn.Module):
-    """The largest of each feature over points of three numbers each: their order does not matter."""
-
-    def __init__(self, entries: int, generator: torch.Generator):
-        super().__init__()
-        self.size, self.points, self.net = 4, entries // 3, MLP(3, (8,), 4, 1.0, generator)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.net(x.unflatten(-1, (self.points, 3))).amax(-2)
-
-
-@pytest.mark.parametrize("ranges", [[], [(1, 3)], [(0, 1), (1, 4)], [(0, 1), (3, 4)], [(3, 4), (0, 2)]])
-def test_columns_read_and_write(ranges: list[tuple[int, int]]) -> None:
-    columns, index = Columns(slice(*r) for r in ranges), sorted(i for r in ranges for i in range(*r))
-    x = torch.arange(8.0).view(2, 4)
-    assert columns.size == len(index) and torch.equal(columns(x), x[:, index]) and not columns.state_dict()
-    columns.write(x, -columns(x))
-    expected = torch.arange(8.0).view(2, 4)
-    expected[:, index] *= -1
-    assert torch.equal(x, expected)
-
-
-def test_without_encoders_a_network_sees_the_observation_as_it_is() -> None:
-    encoder, x = GroupEncoder(SCATTERED, generator()), scattered()
-    assert encoder(x) is x and encoder.size == 9 and not encoder.state_dict()
-    plain, grouped = (MLP(inputs, (8,), 2, 1.0, generator()) for inputs in (9, SCATTERED))
-    assert torch.equal(plain(x), grouped(x)) and plain.state_dict().keys() == grouped.state_dict().keys()
-
-
 def test_encoded_groups_stand_behind_the_others() -> None:
-    inputs, x = with_task_embedding(SCATTERED.encoded("points", PointNet), 5), scattered()
+    inputs, x = with_task_embedding(SCATTERED.encoded("points", ENCODER), 5), scattered()
     encoder = GroupEncoder(inputs, generator())
     out = encoder(x)
-    assert out.shape == (6, encoder.size) == (6, 1 + 4 + 5)
+    assert out.shape == (6, encoder.size) == (6, 1 + 7 + 5)
     assert torch.equal(out[:, :1], x[:, 3:4])
     points: Any = encoder.groups["points"]
-    assert torch.equal(out[:, 1:5], points(x[:, [0, 1, 2, 6, 7, 8]]))
+    assert torch.equal(out[:, 1:8], points(x[:, [0, 1, 2, 6, 7, 8]]))
     swapped = x[:, [6, 7, 8, 3, 4, 5, 0, 1, 2]]
     assert torch.equal(encoder(swapped), out)
-
-
-def test_a_view_does_not_depend_on_what_it_hides() -> None:
-    own = SCATTERED.only("goal", "task_id").extended("action", 2)
-    x = torch.cat([scattered(), torch.randn(6, 2)], dim=1).requires_grad_()
-    net = MLP(own, (8,), 1, 1.0, generator())
-    (slope,) = torch.autograd.grad(net(x).sum(), x)
-    assert net.encoder.size == 5 and slope[:, [3, 4, 5, 9, 10]].ne(0).any(0).all()
-    assert slope[:, [0, 1, 2, 6, 7, 8]].eq(0).all()
 
 
 def test_unknown_groups_are_named() -> None:
     with pytest.raises(BidexError, match=r"observation group.*'goals'.*goal"):
         SCATTERED.only("goals")
     with pytest.raises(BidexError, match=r"observation group.*'cloud'"):
-        SCATTERED.encoded("cloud", PointNet)
+        SCATTERED.encoded("cloud", ENCODER)
 
 
 def test_heads_and_statistics_find_the_task_id_in_the_middle() -> None:
@@ -126,24 +83,9 @@ def test_heads_and_statistics_find_the_task_id_in_the_middle() -> None:
     assert_close(normaliser.stats.mean.float(), x[:, rest].mean(0))
 
 
-def mtppo(world: Any, seed: int = 0, **more: Any) -> MTPPO:
-    return MTPPO(world, replace(PPO, **more), seed)
-
-
-def mttrpo(world: Any, seed: int = 0, **more: Any) -> MTTRPO:
-    return MTTRPO(world, MTTRPOConfig(hidden=(16, 16), **more), seed)
-
-
-def mtsac(world: Any, seed: int = 0, **more: Any) -> MTSAC:
-    return MTSAC(world, replace(SAC, **more), seed)
-
-
-LEARNERS = pytest.mark.parametrize("make", [mtppo, mttrpo, mtsac])
-
-
-@LEARNERS
-def test_an_embedding_tells_tasks_apart_and_is_learned(make: Callable[..., Any]) -> None:
-    learner = make(opposite_bandits(), task_embedding=4)
+@pytest.mark.parametrize(("kind", "config"), [(MTPPO, PPO), (MTTRPO, MTTRPOConfig(hidden=(16, 16))), (MTSAC, SAC)])
+def test_an_embedding_tells_tasks_apart_and_is_learned(kind: Any, config: Any) -> None:
+    learner = kind(opposite_bandits(), replace(config, task_embedding=4), seed=0)
     actor = next(net for net in learner.policy.actor.children() if isinstance(net, MLP))
     critics = list(learner.critic.nets) if isinstance(learner, MTSAC) else [learner.critic]
     x = torch.cat([torch.zeros(2, 1), torch.eye(2)], dim=1)
@@ -158,60 +100,26 @@ def test_an_embedding_tells_tasks_apart_and_is_learned(make: Callable[..., Any])
         assert (table != was).any(1).all()
 
 
-def test_in_bfloat16_the_rollout_and_the_update_embed_alike() -> None:
-    learner = mtppo(opposite_bandits(), task_embedding=4, autocast="on", epochs=1, num_minibatches=1)
+@pytest.mark.parametrize("autocast", ["off", "on"])
+def test_the_rollout_and_the_update_compute_alike(autocast: str) -> None:
+    config = replace(PPO, task_embedding=4, autocast=autocast, epochs=1, num_minibatches=1)
+    learner = MTPPO(opposite_bandits(), config, seed=0)
     learner.iterate()
     assert learner.iterate()["Policy/kl"] < 1e-12
 
 
-# Learners with an encoder of their own: what a learner from outside would write.
-
-
 class CloudProMP(ProMP):
+    """Has an encoder of its own, as a learner from outside would."""
+
     @classmethod
     def _inputs(cls, config: Any, shape: Shape) -> Inputs:
-        return super()._inputs(config, shape).encoded("cloud", PointNet, scaled=False)
-
-
-class CloudRL2(RL2):
-    @classmethod
-    def _inputs(cls, config: Any, shape: Shape) -> Inputs:
-        return super()._inputs(config, shape).encoded("cloud", PointNet, scaled=False)
-
-
-class CloudGoals(PointGoals):
-    """Point goals that show position and goal with two zeros as two points of three numbers."""
-
-    def __init__(self) -> None:
-        super().__init__(rows=12)
-        self.single_observation_space = type(self.single_observation_space)(-float("inf"), float("inf"), (6,))
-        self._obs = torch.zeros(12, 6)
-        self.observation_groups = (ObservationGroup("cloud", (slice(0, 6),)),)
-
-    def _observe(self) -> Tensor:
-        return torch.cat([super()._observe(), torch.zeros(12, 2)], dim=1)
-
-
-@pytest.mark.parametrize("kind", [CloudProMP, CloudRL2])
-def test_meta_learners_learn_an_encoder(kind: type[Learner]) -> None:
-    config = {
-        CloudProMP: ProMPConfig(hidden=(8,), tasks_per_class=4, max_adapt_steps=8),
-        CloudRL2: RL2Config(hidden=(8,), memory=4, max_adapt_steps=8, chunk=5),
-    }[kind]
-    learner = kind(CloudGoals(), config, 0)
-    weights = {name: p for name, p in learner.policy.named_parameters() if ".groups.cloud." in name}
-    before = {name: weight.detach().clone() for name, weight in weights.items()}
-    assert weights and learner.policy.observations.measured.size == 0
-    for _ in range(2):
-        learner.iterate()
-    assert all((weights[name] != was).any() for name, was in before.items())
-    agent = kind.load_policy(learner.policy_state_dict())
-    agent.reset(torch.ones(12, dtype=torch.bool))
-    assert agent.eval_action(torch.randn(12, 6)).shape == (12, 2)
+        return super()._inputs(config, shape).encoded("cloud", ENCODER, scaled=False)
 
 
 def test_an_inner_step_leaves_encoders_alone() -> None:
-    learner = CloudProMP(CloudGoals(), ProMPConfig(hidden=(8,), tasks_per_class=4, max_adapt_steps=8), 0)
+    world = PointGoals(rows=12)
+    world.observation_groups = (ObservationGroup("cloud", (slice(0, 3),)), ObservationGroup("rest", (slice(3, 4),)))
+    learner = CloudProMP(world, ProMPConfig(hidden=(8,), tasks_per_class=4, max_adapt_steps=8), 0)
     policy = learner.policy
     obs, _ = learner.world.reset()
     policy.assign(torch.arange(12) // 4)

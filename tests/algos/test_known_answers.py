@@ -4,14 +4,19 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-import torch
 
 from bidex_algos.meta.rl2 import RL2, RL2Config
 from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig
 from tests.algos.families import Recall
-from tests.algos.problems import LQR, OFF_POLICY, PointMass, discounted_return, opposite_bandits, trained
+from tests.algos.problems import (
+    LQR,
+    OFF_POLICY,
+    is_near_the_optimum,
+    opposite_bandits,
+    trained,
+)
 
 GAMMA = 0.8
 SHARED: dict[str, Any] = {"hidden": (32, 32), "rollout_steps": 16, "gamma": GAMMA, "init_std": 0.5, "autocast": "off"}
@@ -29,21 +34,7 @@ def mean_actions(learner: Any) -> list[float]:
 @both
 def test_lqr_comes_close_to_the_riccati_optimum(learner_type: Any, config: Any):
     learner = trained(learner_type, LQR(rows=64), config, 20)
-    test = LQR(rows=256)
-    best = discounted_return(test, test.best(GAMMA), GAMMA, 40)
-    nothing = discounted_return(test, lambda obs: torch.zeros(len(obs), 2), GAMMA, 40)
-    assert nothing < 2.5 * best
-    assert discounted_return(test, learner.eval_action, GAMMA, 40) > 1.15 * best
-
-
-@both
-def test_a_point_mass_reaches_its_goal(learner_type: Any, config: Any):
-    learner = trained(learner_type, PointMass(rows=64), config, 25)
-    test = PointMass(rows=256)
-    best = discounted_return(test, test.best, GAMMA, 30)
-    assert discounted_return(test, learner.eval_action, GAMMA, 30) > 1.15 * best
-    *_, info = test.step(torch.zeros(256, 2))
-    assert info["success"].float().mean() > 0.9
+    assert is_near_the_optimum(learner.eval_action, GAMMA, 1.15)
 
 
 PAID_ALIKE = MTPPOConfig(
@@ -70,16 +61,13 @@ def test_two_tasks_that_only_the_one_hot_tells_apart(
     assert mean_actions(learner) == pytest.approx([0.5, -0.5], abs=0.2)
 
 
-# RL² plays the default chunk (whole trials) and, so that the test is known to be able to fail, one of 25 steps.
 REMEMBERING = RL2Config(
     hidden=(16,), activation="tanh", memory=16, init_std=0.6, episodes_per_trial=1, max_adapt_steps=60, gamma=0.9,
     blind_share=0.0, num_minibatches=2, learning_rate=2e-3, learning_rate_range=(3e-4, 1e-2), critic_learning_rate=3e-3,
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("chunk", [REMEMBERING.chunk, 25], ids=["default", "25"])
-def test_what_the_first_of_60_steps_shows_is_used_in_the_last(chunk: int | None):
-    learner = RL2(Recall(steps=60), replace(REMEMBERING, chunk=chunk), seed=0)
+def test_what_the_first_of_60_steps_shows_is_used_in_the_last():
+    learner = RL2(Recall(steps=60), REMEMBERING, seed=0)
     success = [learner.iterate()["Train/success_last_episode"] for _ in range(20)][-1]
-    # Seeds 0 to 3: 0.97, 0.94, 0.97, 0.97 by default; 0.44, 0.48, 0.56, 0.47 with 25, which later learns it too.
-    assert success < 0.65 if chunk == 25 else success > 0.9
+    assert success > 0.9  # seeds 0 to 3: 0.97, 0.94, 0.97, 0.97; by chunks of 25 steps 0.44, 0.48, 0.56, 0.47

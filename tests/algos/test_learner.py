@@ -12,6 +12,7 @@ from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.onpolicy.mtppo import PRESETS as PPO_PRESETS
 from bidex_meta.errors import BidexError
+from tests.algos import problems
 from tests.algos.families import PointGoals
 
 PPO = MTPPOConfig(hidden=(8,), rollout_steps=4, activation="tanh", autocast="off")
@@ -19,10 +20,7 @@ PROMP = ProMPConfig(hidden=(8,), activation="tanh", tasks_per_class=4)
 
 
 def trained():
-    learner = MTPPO(PointGoals(rows=16, autoreset_mode="SAME_STEP"), PPO, seed=3)
-    for _ in range(3):
-        learner.iterate()
-    return learner
+    return problems.trained(MTPPO, PointGoals(rows=16, autoreset_mode="SAME_STEP"), PPO, 3)
 
 
 def test_a_meta_learner_acts_as_the_policy_it_starts_from_and_learns_on():
@@ -50,14 +48,11 @@ def test_learned_step_sizes_are_no_part_of_what_another_run_begins_with():
         assert learner.policy.step_sizes is None or float(learner.policy.step_sizes.mean()) == 1.0
 
 
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        ({"hidden": (9,)}, r"hidden = \[9\], got \[8\]\. Add --learner\.hidden"),
-        ({"activation": "elu"}, "activation = elu, got tanh"),
-        ({"normalise_observations": False}, "normalise_observations = False, got True"),
-    ],
-)
+@pytest.mark.parametrize(("change", "expected"), [
+    ({"hidden": (9,)}, r"hidden = \[9\], got \[8\]\. Add --learner\.hidden"),
+    ({"activation": "elu"}, "activation = elu, got tanh"),
+    ({"normalise_observations": False}, "normalise_observations = False, got True"),
+])  # fmt: skip
 def test_another_form_is_refused(change, expected):
     learner = ProMP(PointGoals(rows=16), replace(PROMP, **change), seed=0)
     with pytest.raises(BidexError, match=expected):
@@ -72,17 +67,12 @@ def test_presets_that_go_on_fit_what_mtppo_learns_on_a_laptop(presets, preset):
         assert getattr(tuned, name) == getattr(given, name)
 
 
-def test_a_squashed_policy_must_have_the_same_bounds():
+def test_a_squashed_policy_must_have_the_same_bounds_and_another_kind_is_refused():
     config = MTSACConfig(hidden=(8,), activation="tanh", normalise_observations=True, replay_steps=8)
     world = PointGoals(rows=16, autoreset_mode="SAME_STEP")
     state = MTSAC(world, config, seed=0).policy_state_dict()
     MTSAC(world, config, seed=1).start_from(state)
     with pytest.raises(BidexError, match=r"std_range = \[0.01, 3.0\], got \[0.02, 2.0\]"):
         MTSAC(world, replace(config, std_range=(0.01, 3.0)), seed=1).start_from(state)
-
-
-def test_another_kind_of_policy_is_refused():
-    config = MTSACConfig(hidden=(8,), activation="tanh", normalise_observations=True, replay_steps=8)
-    learner = MTSAC(PointGoals(rows=16, autoreset_mode="SAME_STEP"), config, seed=0)
     with pytest.raises(BidexError, match="of the same kind"):
-        learner.start_from(trained().policy_state_dict())
+        MTSAC(world, config, seed=0).start_from(trained().policy_state_dict())

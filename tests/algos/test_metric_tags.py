@@ -13,15 +13,14 @@ from tests.algos.toy import ToyWorld, nearness
 from tests.offline.stored import as_data, noisy, played
 from tests.pages import ROOT
 
-SMALL: dict[str, Any] = {"hidden": (8,), "autocast": "off"}
+SMALL: dict[str, Any] = {
+    "hidden": (8,), "autocast": "off", "warmup_steps": 2, "batch_size": 16, "updates_per_iteration": 4,
+    "vae_hidden": (8,),
+}  # fmt: skip
 VARIANTS: dict[str, list[dict[str, Any]]] = {
     "mtppo": [{}, {"gradient_surgery": "pcgrad"}, {"gradient_surgery": "famo"}, {"demonstration_weight": 0.1}],
-    "mttrpo": [{}], "mtsac": [{"warmup_steps": 2, "batch_size": 16}], "mttd3": [{"warmup_steps": 2, "batch_size": 16}],
-    "fasttd3": [{"warmup_steps": 2, "batch_size": 16}], "brc": [{"warmup_steps": 2, "batch_size": 16}],
-    "ddpg": [{"warmup_steps": 2, "batch_size": 16}], "maml": [{}, {"outer": "adam"}, {"step_sizes": "weight"}],
-    "promp": [{}, {"step_sizes": "layer"}], "rl2": [{}], "bc": [{"batch_size": 16, "updates_per_iteration": 4}],
-    "bcq": [{"batch_size": 16, "updates_per_iteration": 4, "vae_hidden": (8,)}],
-    "td3bc": [{"batch_size": 16, "updates_per_iteration": 4}], "iql": [{"batch_size": 16, "updates_per_iteration": 4}],
+    "maml": [{}, {"outer": "adam"}, {"step_sizes": "weight"}], "promp": [{}, {"step_sizes": "layer"}], "mttrpo": [{}],
+    **{name: [{}] for name in ("mtsac", "mttd3", "fasttd3", "brc", "ddpg", "rl2", "bc", "bcq", "td3bc", "iql")},
 }  # fmt: skip
 PLAYING = [algo for algo in VARIANTS if not learner_kind(algo).make.offline]
 TEAM = {"agents": "a=action/0;b=action/1"}
@@ -37,12 +36,9 @@ def told(algo: str, variants: list[dict[str, Any]]) -> set[str]:
         config = replace(config, **{name: value for name, value in known.items() if hasattr(config, name)})
         world = PointGoals(rows=16) if kind.make.adapts else ToyWorld([nearness(0.5), nearness(-0.5)], rows=8)
         learner = kind.make(world, config, seed=0)
-        if known.get("demonstration_weight"):
-            learner.learn_from_demonstrations(
-                as_data(played(world, noisy(lambda obs: torch.zeros(len(obs), 2), 0.5), 9))
-            )
-        if kind.make.offline:
-            learner.learn_from(as_data(played(world, noisy(lambda obs: torch.zeros(len(obs), 2), 0.5), 9)))
+        if known.get("demonstration_weight") or kind.make.offline:
+            data = as_data(played(world, noisy(lambda obs: torch.zeros(len(obs), 2), 0.5), 9))
+            (learner.learn_from if kind.make.offline else learner.learn_from_demonstrations)(data)
         for _ in range(3):
             found = learner.iterate()
         names = "|".join(map(re.escape, world.task_names))

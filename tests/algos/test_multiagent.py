@@ -16,10 +16,8 @@ from bidex_algos.multiagent.mappo import MAPPO, MAPPOConfig
 from bidex_algos.offpolicy.ddpg import DDPG, DDPGConfig
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig
-from bidex_algos.replay import Transitions
-from bidex_algos.rollout import collect
 from bidex_meta.errors import BidexError
-from tests.algos.problems import LQR, opposite_bandits
+from tests.algos.problems import LQR, opposite_bandits, trained
 from tests.algos.toy import ToyWorld, nearness
 
 PAIR = "a=action/0;b=action/1"
@@ -99,9 +97,7 @@ def test_the_factor_is_the_product_of_the_ratios_before(max_factor: float) -> No
 def test_two_tasks_by_two_agents(kind: str) -> None:
     make, config = KINDS[kind]
     faster = {"learning_rate": 3e-3} if kind != "hatrpo" else {"fisher_stride": 1}
-    learner = make(opposite_bandits(0.5), replace(config, **faster), seed=0)
-    for _ in range(30):
-        learner.iterate()
+    learner = trained(make, opposite_bandits(0.5), replace(config, **faster), 30)
     obs, _ = learner.world.reset(seed=1)
     for task, target in enumerate((0.5, -0.5)):
         means = learner.eval_action(obs)[learner.world.task_id == task].mean(0)
@@ -114,10 +110,6 @@ LARGE: dict[str, Any] = {
 }  # fmt: skip
 
 
-def exclusive_or(action: Tensor) -> Tensor:
-    return (action > 0).sum(1).eq(1).float()
-
-
 @pytest.mark.parametrize("seed", range(3))
 @every
 def test_a_matrix_game_needs_turns(kind: str, seed: int) -> None:
@@ -127,13 +119,9 @@ def test_a_matrix_game_needs_turns(kind: str, seed: int) -> None:
     """
     make, config = KINDS[kind]
     in_turns = kind in ("happo", "hatrpo")
-    steps = (
-        LARGE
-        if kind != "hatrpo"
-        else {"max_kl": 3.0, "damping": 0.01, "fisher_stride": 1, "accept_ratio": 0.0, "critic_epochs": 2}
-    )
-    world = ToyWorld([exclusive_or], rows=512, horizon=1, terminal=True)
-    learner = make(world, replace(config, std_range=(0.5, 0.5), **steps), seed=seed)
+    far = {"max_kl": 3.0, "damping": 0.01, "fisher_stride": 1, "accept_ratio": 0.0, "critic_epochs": 2}
+    world = ToyWorld([lambda action: (action > 0).sum(1).eq(1).float()], rows=512, horizon=1, terminal=True)
+    learner = make(world, replace(config, std_range=(0.5, 0.5), **(far if kind == "hatrpo" else LARGE)), seed=seed)
     with torch.no_grad():
         for net in learner.policy.actor.nets:
             net.head.bias.fill_(0.4)
@@ -174,48 +162,22 @@ def test_ippos_critics_see_no_more_than_their_agents() -> None:
     assert x.grad is not None and x.grad.ne(0).any(0).nonzero().flatten().tolist() == list(views[0].columns)
 
 
-def test_ippo_estimates_apart() -> None:
-    learners = [make(LQR(rows=8, horizon=5), config, seed=0) for make, config in (KINDS["ippo"], KINDS["mappo"])]
-    ippo, mappo = learners
-    first, second = ippo.critic.nets
-    second.load_state_dict(first.state_dict())
-    mappo.critic.load_state_dict(first.state_dict())
-    batches = []
-    for learner in learners:
-        learner.return_stats.count.fill_(1e-9)  # known, so that critics are asked, but for next to nothing
-        obs = learner._first_observations()
-        collect(learner.world, learner.rollout, obs, learner._sample, learner._final_value, learner.episodes)
-        batches.append(learner._prepare()[0])
-    assert mappo.rollout.final_values.count_nonzero() > 4
-    for name in ("advantages", "targets"):
-        own, shared = (getattr(batch, name) for batch in batches)
-        torch.testing.assert_close(own, shared[:, None].expand(-1, 2))
-
-
-@pytest.mark.parametrize("popart", [True, False])
 @every
-def test_popart_keeps_values_when_statistics_change(kind: str, popart: bool) -> None:
+def test_popart_keeps_values_when_statistics_change(kind: str) -> None:
     make, config = KINDS[kind]
-    learner = make(opposite_bandits(scale=1000.0), replace(config, popart=popart), seed=0)
+    learner = make(opposite_bandits(scale=1000.0), replace(config, popart=True), seed=0)
     learner.iterate()
     obs, task_id = learner.rollout.last_obs, learner.world.task_id
     before = learner._final_value(obs, task_id).detach()
     stats = learner.return_stats
     learner._merge_returns(stats.mean * 3.0 + 50.0, stats.var * 9.0 + 1.0, torch.full_like(stats.mean, 1e4))
-    same = torch.allclose(learner._final_value(obs, task_id), before, rtol=1e-4, atol=1e-3)
-    assert same == popart
+    torch.testing.assert_close(learner._final_value(obs, task_id).detach(), before, rtol=1e-4, atol=1e-3)
     assert float(before.std()) > 0.0
 
 
 def test_bad_configs_are_one_line() -> None:
-    with pytest.raises(BidexError, match="popart needs a critic for each agent"):
-        IPPOConfig(popart=True, share_parameters=True)
-    with pytest.raises(BidexError, match="leave per_task_values and value_heads on"):
-        MAPPOConfig(popart=True, value_heads=False)
     with pytest.raises(BidexError, match="is of no agent"):
         MAPPO(LQR(), MAPPOConfig(agents="a=action/0", **SMALL), seed=0)
-    with pytest.raises(BidexError, match="agents: expected single"):
-        HAPPOConfig(agents="thumbs")
     with pytest.raises(BidexError, match="200 mini-batches need as many samples"):
         HAPPO(LQR(rows=2), HAPPOConfig(agents=PAIR, num_minibatches=200, **SMALL), seed=0)
 
@@ -234,9 +196,7 @@ def rosenbrock(action: Tensor) -> Tensor:
 
 def test_two_agents_find_a_coupled_optimum() -> None:
     world = ToyWorld([rosenbrock], rows=32, horizon=1, terminal=True)
-    learner = MADDPG(world, MADDPGConfig(agents=CROSSED, **REPLAYED), seed=0)
-    for _ in range(25):
-        learner.iterate()
+    learner = trained(MADDPG, world, MADDPGConfig(agents=CROSSED, **REPLAYED), 25)
     obs, _ = world.reset(seed=1)
     assert learner.eval_action(obs).mean(0).tolist() == pytest.approx([0.5, 0.25], abs=0.1)
 
@@ -253,22 +213,3 @@ def test_one_agent_is_ddpg(heads: bool) -> None:
         assert told[0]["Loss/critic"] == pytest.approx(told[1]["Loss/critic"], abs=1e-5)
     weights = [torch.cat([p.detach().flatten() for p in each.policy.actor.parameters()]) for each in (one, other)]
     torch.testing.assert_close(*weights, rtol=0, atol=1e-5)
-
-
-def test_an_agent_climbs_beside_what_the_others_did() -> None:
-    """Its slope is that of a critic fed with the replay's actions of the others, by autograd on one agent alone."""
-    learner = MADDPG(opposite_bandits(), MADDPGConfig(agents=CROSSED, **REPLAYED), seed=0)
-    for _ in range(3):
-        learner.iterate()
-    draw: Transitions = learner.replay.take(learner.replay.draw(1, learner.batch_per_task, learner.generator)[0])
-    obs, actor = learner.policy.observations(draw.obs), learner.policy.actor
-    count = len(obs)
-    net = actor.nets[0]  # agent a, whose action is the second
-    joint = torch.stack([draw.actions[:, 0], torch.tanh(net(obs))[:, 0]], 1)
-    expected = torch.autograd.grad(-learner.critic(obs, joint, learner.task_of_draw)[0].mean(), net.head.weight)[0]
-    seen: list[Tensor] = []
-    learner.adams["actor"].step = lambda: seen.append(net.head.weight.grad.clone())  # type: ignore[method-assign]
-    learner.config.__dict__["max_grad_norm"] = 1e9
-    counts = torch.full((2,), count / 2)
-    learner._policy_step(obs, draw, torch.ones(count), counts)
-    torch.testing.assert_close(seen[0], expected, rtol=1e-3, atol=1e-5)

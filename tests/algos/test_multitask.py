@@ -1,22 +1,22 @@
-"""Networks that share weights between tasks: soft modules, PaCo, MOORE, heads; alone and in the learners."""
+"""What several tasks share: networks, and the way of their losses to shared weights, against closed forms."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from torch import Tensor
 from torch.testing import assert_close
 
+from bidex_algos.balancing import Famo, conflict_averse, project_conflicting, worst_served
 from bidex_algos.nets.architecture import network_of
 from bidex_algos.nets.inputs import Inputs
 from bidex_algos.nets.multitask import Moore, PaCo, SoftModules, gram_schmidt
 from bidex_algos.nets.networks import MLP
-from bidex_algos.offpolicy.fasttd3 import FastTD3Config
-from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
-from bidex_meta.errors import BidexError
 from bidex_meta.world.contract import ObservationGroup
 from tests.algos.problems import opposite_bandits
 
@@ -55,15 +55,6 @@ def test_gradients_reach_every_weight_and_the_task_decides(name: str, layer_norm
     other = x.clone()
     other[:, 3:6] = torch.eye(3)[(TASKS + 1) % 3]
     assert not torch.isclose(network(other), out).all(1).any()
-
-
-@pytest.mark.parametrize("name", TRUNKS)
-def test_the_output_is_float32_and_near_in_low_precision(name: str):
-    network, x = made(name), observations()
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        low = network(x.bfloat16())
-    assert low.dtype == torch.float32
-    assert_close(low, network(x), rtol=0.1, atol=0.1)
 
 
 @settings(max_examples=30, deadline=None)
@@ -121,24 +112,10 @@ def test_pacos_layers_are_those_of_the_composed_parameters():
         assert_close(network(x)[task == TASKS], expected)
 
 
-# In the learners.
-
 PPO = MTPPOConfig(
     hidden=(32, 32), rollout_steps=8, learning_rate=1e-3, learning_rate_range=(1e-4, 4e-3), std_range=(0.05, 1.0),
     autocast="off",
 )  # fmt: skip
-
-
-@pytest.mark.parametrize("architecture", TRUNKS)
-def test_the_squashed_actor_starts_with_its_deviation_in_every_task(architecture: str):
-    learner = MTSAC(
-        opposite_bandits(),
-        MTSACConfig(hidden=(32, 32), replay_steps=20, architecture=architecture, init_std=0.3),
-        seed=0,
-    )
-    obs, _ = learner.world.reset(seed=0)
-    _, log_std = learner.policy.actor(obs)
-    assert_close(log_std.exp(), torch.full_like(log_std, 0.3), rtol=0.05, atol=0)
 
 
 def test_multi_head_is_the_shared_trunk_with_both_heads():
@@ -161,20 +138,88 @@ def test_a_checkpoint_from_before_there_were_architectures_loads():
     assert isinstance(network_of(PPO)(4, (8,), 1, 1.0, generator()), MLP)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"architecture": "paco", "task_embedding": 4}, "task_embedding goes with architecture shared"),
-        ({"architecture": "soft_modules", "hidden": (32,)}, "at least two widths"),
-        ({"architecture": "moore", "hidden": (32, 3)}, "no more modules than the last width"),
-        ({"architecture": "moore", "hidden": ()}, "no more modules than the last width"),
-    ],
-)
-def test_what_does_not_go_together_is_refused(options: dict[str, Any], message: str):
-    with pytest.raises(BidexError, match=message):
-        replace(PPO, **options)
+seeds = st.integers(0, 2**31)
 
 
-def test_the_critics_own_widths_are_checked_too():
-    with pytest.raises(BidexError, match="two widths in critic_hidden"):
-        FastTD3Config(architecture="soft_modules", critic_hidden=(64,))
+def draw(seed: int, tasks: int, entries: int = 5) -> torch.Tensor:
+    return torch.randn(tasks, entries, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seeds, st.integers(2, 20), st.integers(1, 30), st.integers(1, 30), st.floats(-4, 0), st.floats(0.05, 0.95))
+@example(296, 16, 17, 6, -1.16, 0.87)  # a descent along pairs of weights ended 0.4 below, in squares of the mean
+def test_no_direction_serves_the_worst_served_task_better_than_cagrads(
+    seed: int, tasks: int, entries: int, rank: int, apart: float, c: float
+):
+    # Of low rank, or nearly parallel; sizes differ tenfold.
+    gradients = draw(seed, 1, entries) * (apart < -2) + 10**apart * draw(seed, tasks, rank) @ draw(seed, rank, entries)
+    gradients *= torch.logspace(0, 1, tasks, dtype=torch.float64)[:, None]
+    gram, even = gradients @ gradients.T, torch.full((tasks,), 1 / tasks, dtype=torch.float64)
+    length = gradients.mean(0).norm()
+    direction = conflict_averse(gradients, c)[0] / tasks
+    assert (direction - gradients.mean(0)).norm() <= (c + 1e-6) * length
+    # Whatever the weights, their dual value is no less than what any direction gives.
+    weights = worst_served(gram, even, c * length)
+    assert weights.min() >= 0 and weights.sum() == pytest.approx(1, abs=1e-5)
+    weights /= weights.sum()
+    best = weights @ gram @ even + c * length * (weights @ gram @ weights).clamp_min(0.0).sqrt()
+    assert (gradients @ direction).min() >= best - 1e-4 * length.square()
+
+
+def test_cagrad_without_a_radius_or_a_conflict_is_the_sum():
+    gradients = draw(0, 4)
+    assert_close(conflict_averse(gradients, 0.0)[0], gradients.sum(0))
+    same = gradients[:1].expand(3, -1)
+    assert_close(conflict_averse(same, 0.4)[0], 1.4 * same.sum(0))
+    assert torch.equal(conflict_averse(torch.zeros(3, 5), 0.4)[0], torch.zeros(5))
+    assert_close(conflict_averse(gradients[:1], 0.4)[0], 1.4 * gradients[0])
+
+
+def test_famo_of_two_losses_is_the_closed_form():
+    # l_i = a_i x_i^2 about the least 0, each with a coordinate of its own.
+    famo, a, x = Famo(2, rate=0.1, decay=0.0, device=torch.device("cpu")), torch.tensor([1.0, 8.0]), torch.ones(2)
+    with torch.no_grad():
+        famo.logits.copy_(torch.tensor([0.3, -0.2]))
+    z = [1 / (1 + math.exp(-0.5)), 1 / (1 + math.exp(0.5))]
+    losses = a * x.square()
+    weights = famo.weights(losses)
+    total = z[0] / 1.0 + z[1] / 8.0
+    assert weights.tolist() == pytest.approx([2 * z[0] / 1.0 / total, 2 * z[1] / 8.0 / total])
+    # The direction is the gradient of the mean of log l_i, weighted by z, but for its length.
+    slope = weights * 2 * a * x
+    assert float(slope[0] / slope[1]) == pytest.approx(z[0] / z[1])
+    # The first loss falls to a quarter, the second stays: the second shall weigh more, by J' (log 4, 0).
+    famo.learn(lambda: losses * torch.tensor([0.25, 1.0]))
+    fallen = math.log(4.0)
+    expected = [z[0] * (1 - z[0]) * fallen, -z[1] * z[0] * fallen]
+    gradient = famo.logits.grad
+    assert gradient is not None and gradient.tolist() == pytest.approx(expected)
+    # Adam's first step is its rate long, against the gradient.
+    assert famo.logits.tolist() == pytest.approx([0.3 - 0.1, -0.2 + 0.1], abs=1e-5)
+
+
+def test_famo_leaves_out_a_task_without_samples():
+    famo = Famo(3, rate=0.1, decay=0.0, device=torch.device("cpu"))
+    weights = famo.weights(torch.tensor([1.0, 0.0, 1.0]))
+    assert_close(weights, torch.tensor([1.5, 0.0, 1.5]))
+    famo.learn(lambda: torch.tensor([0.5, 3.0, 0.5]))
+    assert famo.logits[1] > famo.logits[0] == famo.logits[2]
+
+
+def in_a_loop(gradients: Tensor) -> Tensor:
+    total = torch.zeros_like(gradients[0])
+    for i in range(len(gradients)):
+        left = gradients[i].clone()
+        for shift in range(1, len(gradients)):
+            other = gradients[(i + shift) % len(gradients)]
+            if left @ other < 0:
+                left = left - (left @ other) / (other @ other) * other
+        total = total + left
+    return total
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**31), st.integers(1, 6))
+def test_surgery_equals_the_loop_over_tasks(seed: int, tasks: int):
+    gradients = torch.randn(tasks, 7, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    assert_close(project_conflicting(gradients)[0], in_a_loop(gradients))

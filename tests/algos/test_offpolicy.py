@@ -1,12 +1,14 @@
 """What every off-policy learner must do: known optima, time limits, checkpoints, metrics."""
 
 import copy
+import math
 from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
+from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
 from torch.testing import assert_close
 
 from bidex_algos.offpolicy.brc import BRC, BRCConfig
@@ -14,8 +16,18 @@ from bidex_algos.offpolicy.ddpg import DDPG, DDPGConfig, spread
 from bidex_algos.offpolicy.fasttd3 import FastTD3, FastTD3Config
 from bidex_algos.offpolicy.mtsac import MTSAC, MTSACConfig
 from bidex_algos.offpolicy.td3 import TD3, TD3Config
-from bidex_algos.replay import Transitions
-from tests.algos.problems import LQR, OFF_POLICY, PointMass, discounted_return, errors, opposite_bandits, trained
+from bidex_meta.errors import BidexError
+from tests.algos.problems import (
+    LQR,
+    OFF_POLICY,
+    a_draw,
+    errors,
+    is_near_the_optimum,
+    one_step_bandit,
+    opposite_bandits,
+    shake,
+    trained,
+)
 from tests.algos.toy import ToyWorld, nearness
 
 SHARED = OFF_POLICY
@@ -48,22 +60,8 @@ def test_lqr_comes_close_to_the_riccati_optimum(name: str, n_steps: int) -> None
     config = replace(config, n_steps=n_steps)
     if name == "mtsac":
         config = replace(config, target_entropy_per_action=-2.0, learning_rate=2e-3)
-    learner, test = trained(kind, LQR(), config, 20 if name in ("fasttd3", "brc") else 22), LQR(rows=256)
-    best = discounted_return(test, test.best(0.8), 0.8, 40)
-    nothing = discounted_return(test, lambda obs: torch.zeros(len(obs), 2), 0.8, 40)
-    assert nothing < 2.5 * best
-    assert discounted_return(test, learner.eval_action, 0.8, 40) > 1.35 * best
-
-
-@pytest.mark.parametrize("name", ["ddpg", "td3", "mtsac"])
-def test_a_point_mass_reaches_its_goal(name: str) -> None:
-    kind, config = CASES[name]
-    config = replace(config, target_entropy_per_action=-2.0) if name == "mtsac" else config
-    learner, test = trained(kind, PointMass(), config, 18), PointMass(rows=256)
-    best = discounted_return(test, test.best, 0.8, 30)
-    assert discounted_return(test, learner.eval_action, 0.8, 30) > 1.15 * best
-    *_, info = test.step(torch.zeros(256, 2))
-    assert name != "mtsac" or info["success"].float().mean() > 0.9
+    learner = trained(kind, LQR(), config, 20 if name in ("fasttd3", "brc") else 22)
+    assert is_near_the_optimum(learner.eval_action, 0.8, 1.35)
 
 
 @each
@@ -83,13 +81,6 @@ TD3_PLAIN = TD3Config(**PLAIN)
 pair = pytest.mark.parametrize(("kind", "config"), [(DDPG, DDPGConfig(**PLAIN)), (TD3, TD3_PLAIN)], ids=["ddpg", "td3"])
 
 
-def a_draw() -> Transitions:
-    generator = torch.Generator().manual_seed(1)
-    obs, following = torch.randn(2, 6, 3, generator=generator)
-    ends = torch.tensor([False, True, False, False, True, False])
-    return Transitions(obs, torch.zeros(6, 2), torch.arange(6.0) + 1, following, ends)
-
-
 def plain(net: Any, x: Tensor) -> Tensor:
     x = x.double()
     for layer in net.body:
@@ -102,10 +93,7 @@ def test_the_critics_target_is_that_of_the_definition(kind: Any, config: Any) ->
     world = ToyWorld([nearness(0.5), nearness(-0.5)], rows=3)
     config = replace(config, gamma=0.7, batch_per_task=3, cut_share=1.0, per_task_rewards=False)
     learner, draw = kind(world, config, seed=0), a_draw()
-    noise = torch.Generator().manual_seed(3)
-    with torch.no_grad():
-        for weight in [*learner.target_critic.parameters(), *learner.target_actor.parameters()]:
-            weight.add_(0.3 * torch.randn(weight.shape, generator=noise))
+    shake(learner.target_critic, learner.target_actor)
     again = learner.generator.clone_state()
     target = learner._target(draw, draw.next_obs)
     action = plain(learner.target_actor.net, draw.next_obs).tanh()
@@ -148,3 +136,89 @@ def test_the_price_keeps_actions_from_their_corners(kind: Any, config: Any) -> N
 def test_noise_goes_from_little_to_much_over_the_rows_of_each_task() -> None:
     task_id = torch.tensor([0, 0, 0, 1, 2, 2])
     assert_close(spread(0.1, 0.5, task_id, 3), torch.tensor([0.1, 0.3, 0.5, 0.5, 0.1, 0.5]))
+
+
+def test_mtsacs_target_is_that_of_the_definition() -> None:
+    config = replace(SAC, gamma=0.7, batch_per_task=3, init_alpha=0.3)
+    learner, draw = MTSAC(ToyWorld([nearness(0.5), nearness(-0.5)], rows=3), config, seed=0), a_draw()
+    shake(learner.target_critic, by=0.05)
+    with torch.no_grad():
+        learner.log_alpha[1] = 0.4  # temperatures that differ
+    learner.returns.stats.mean.copy_(torch.tensor([0.0, 10.0]))
+    learner.returns.stats.var.copy_(torch.tensor([4.0, 0.0]))
+    noise = torch.randn(6, 2, generator=learner.generator.clone_state()).double()
+    target = learner._target(draw, draw.next_obs)
+    mean, log_std = (x.detach().double() for x in learner.policy.actor(draw.next_obs))
+    action = torch.tanh(mean + log_std.exp() * noise)
+    squashed = Independent(TransformedDistribution(Normal(mean, log_std.exp()), TanhTransform(cache_size=1)), 1)
+    q = torch.stack([net(torch.cat([draw.next_obs, action.float()], 1)) for net in learner.target_critic.nets])
+    q = torch.cat([q[:, :3, 0], q[:, 3:, 1]], 1).amin(0).double()
+    alpha = torch.tensor([0.3] * 3 + [math.exp(0.4)] * 3)
+    scaled = draw.rewards / torch.tensor([2.0] * 3 + [1.0] * 3)
+    expected = scaled + 0.7 * ~draw.terminated * (q - alpha * squashed.log_prob(action)).detach()
+    assert_close(target.double(), expected.double(), rtol=1e-4, atol=1e-4)
+
+
+def test_each_temperature_follows_the_entropy_of_its_own_task() -> None:
+    learner, draw = MTSAC(opposite_bandits(rows=6), replace(SAC, policy_heads=True, batch_per_task=3), seed=0), a_draw()
+    draw.obs[:, 1:] = torch.eye(2).repeat_interleave(3, 0)
+    with torch.no_grad():  # standard deviations of about 0.02 and 2 on either side of the target entropy
+        bias = learner.policy.actor.net.head.bias.view(2, 2, 2)
+        bias[0, 1], bias[1, 1] = -3.0, 3.0
+    before = learner.log_alpha.detach().clone()
+    learner._update(draw, torch.ones(6), torch.full((2,), 3.0))
+    assert (learner.log_alpha.detach() - before).tolist() == pytest.approx([3e-3, -3e-3], rel=1e-3)
+
+
+@pytest.mark.parametrize("target", [-2.0, 0.2])
+def test_the_policy_comes_to_the_entropy_asked_for(target: float):
+    config = replace(SAC, target_entropy_per_action=target, alpha_learning_rate=2e-2)
+    learner = MTSAC(one_step_bandit(0.3), config, seed=0)
+    entropies = [learner.iterate().get("Policy/entropy", 0.0) for _ in range(14)]
+    assert sum(entropies[-4:]) / 4 == pytest.approx(2 * target, abs=1.2)
+
+
+def test_uniform_actions_come_first_and_teach_nothing_yet():
+    learner = MTSAC(one_step_bandit(), replace(SAC, warmup_steps=8, cut_share=1.0), seed=0)
+    before = [p.detach().clone() for p in [*learner.policy.parameters(), *learner.critic.parameters()]]
+    learner.iterate()
+    actions = learner.replay._steps["actions"][:8]
+    assert_close(actions.abs().mean(), torch.tensor(0.5), rtol=0.1, atol=0)
+    assert_close(actions.abs().max(), torch.tensor(1.0), rtol=0.02, atol=0)
+    metrics = learner.iterate()
+    assert "Loss/critic" in metrics
+    after = [*learner.policy.parameters(), *learner.critic.parameters()]
+    assert all((a != b).any() for a, b in zip(before, after, strict=True))
+
+
+def test_rewards_are_scaled_by_the_deviation_of_discounted_returns():
+    learner = MTSAC(ToyWorld([nearness(0.0)], rows=3, horizon=10), replace(SAC, gamma=0.5), seed=0)
+    rewards = torch.tensor([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], [-1.0, 0.0, 1.0]])
+    ended = torch.tensor([[False, True, False], [False] * 3, [False] * 3])
+    for r, e in zip(rewards, ended, strict=True):
+        learner.returns.note(r, e, torch.zeros(3).bool(), torch.zeros(3).bool())
+    returns = torch.tensor([[1.0, 2.0, 3.0], [4.5, 5.0, 7.5], [1.25, 2.5, 4.75]]).double()
+    scale = (returns.var(correction=0) + (0.1 * returns.mean()).square()).sqrt()
+    assert_close(learner._reward_scale().double(), scale[None], rtol=1e-5, atol=0)
+    assert torch.equal(learner.returns.discounted.double(), returns[2])
+
+
+def test_the_replay_is_cut_to_its_memory_and_says_so(capsys: pytest.CaptureFixture[str]):
+    learner = MTSAC(one_step_bandit(), replace(SAC, replay_steps=1000, replay_memory=1e-4), seed=0)
+    line = capsys.readouterr().err
+    steps = learner.replay.steps
+    assert 50 < steps < 200
+    assert line.count("\n") == 1
+    for part in ("1,000 vector steps (32,000 transitions)", "0.0001 GB", f"keeps {steps:,} ({steps * 32:,} tr"):
+        assert part in line
+    with pytest.raises(BidexError, match="replay_memory 1e-06 GB holds not one step of 32 environments"):
+        MTSAC(one_step_bandit(), replace(SAC, replay_memory=1e-6), seed=0)
+
+
+def test_a_batch_is_split_evenly_over_the_tasks_and_one_without_environments_is_refused():
+    world = opposite_bandits()
+    assert MTSAC(world, replace(SAC, batch_size=101), seed=0).batch_per_task == 51
+    assert MTSAC(world, replace(SAC, batch_per_task=7), seed=0).batch_per_task == 7
+    world.task_id = torch.zeros_like(world.task_id)
+    with pytest.raises(BidexError, match="task1 has no environments"):
+        MTSAC(world, SAC, seed=0)

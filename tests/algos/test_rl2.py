@@ -1,6 +1,4 @@
-import math
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
@@ -9,12 +7,9 @@ from torch.testing import assert_close
 
 from bidex_algos.meta.rl2 import RL2, RL2Agent, RL2Config
 from bidex_algos.nets.normalise import RunningStats
-from bidex_algos.nets.recurrent import RecurrentNet
 from bidex_meta.agents import MetaLearningAgent, Timestep
-from bidex_meta.cli.learners import learner_kind
 from bidex_meta.errors import BidexError
-from bidex_meta.worlds import Worlds
-from tests.algos.families import PointClass, PointGoals, circle
+from tests.algos.families import PointClass, PointGoals, circle, everyone, played, shot
 from tests.algos.ranks import same
 
 SMALL = RL2Config(
@@ -26,30 +21,9 @@ TEN = (PointClass(steps=10, count=16),)
 UNEVEN = (PointClass("Short", steps=3, count=3), PointClass("Long", steps=7, scale=100.0, count=2))
 
 
-def everyone(world: PointGoals) -> Tensor:
-    return torch.ones(world.num_envs, dtype=torch.bool)
-
-
 def evaluated(agent: MetaLearningAgent, world: PointGoals) -> float:
-    obs, _ = world.reset()
     agent.reset(everyone(world))
-    total = 0.0
-    for _ in range(int(world.max_episode_steps.max())):
-        obs, reward, *_ = world.step(agent.eval_action(obs))
-        total += float(reward.mean())
-    return total
-
-
-def adapted(agent: MetaLearningAgent, world: PointGoals) -> None:
-    obs, _ = world.reset()
-    agent.reset(everyone(world))
-    over = ~everyone(world)
-    for _ in range(int(world.max_episode_steps.max())):
-        action, aux = agent.adapt_action(obs)
-        following, reward, terminated, truncated, _ = world.step(action)
-        agent.step(Timestep(obs, action, reward, terminated, truncated, aux, following, ~over))
-        obs, over = following, terminated | truncated
-    agent.adapt()
+    return played(agent.eval_action, world)
 
 
 def state_of(agent: RL2Agent) -> Tensor:
@@ -66,94 +40,15 @@ def test_one_shot_closes_most_of_the_gap_to_a_policy_that_knows_the_goal():
     test, shown = PointGoals(80, classes=TEN), PointGoals(80, goal_visible=True, classes=TEN)
     test.set_tasks({"PointGoals": circle(16, first=0.2)})
     agent = RL2.load_policy(learner.policy_state_dict())
-    obs, _ = shown.reset()
-    best = 0.0
-    for _ in range(10):
-        obs, reward, *_ = shown.step(shown.best(obs))
-        best += float(reward.mean())
-    before = evaluated(agent, test)
+    best, before = played(shown.best, shown), evaluated(agent, test)
     assert before == pytest.approx(-10.0, abs=1.0)
-    adapted(agent, test)
+    shot(agent, test)
     after = evaluated(agent, test)
     assert (after - before) / (best - before) > 0.6
     # The second evaluation learns nothing from the first, and without adaptation all is as before.
     assert evaluated(agent, test) == pytest.approx(after, abs=0.3)
     agent.init()
     assert evaluated(agent, test) == pytest.approx(before, abs=0.3)
-    # A shot at the goals opposite misleads.
-    opposite = PointGoals(80, classes=TEN)
-    opposite.set_tasks({"PointGoals": circle(16, first=0.2 + math.pi)})
-    adapted(agent, opposite)
-    assert evaluated(agent, test) < before - 2.0
-
-
-def test_a_chunk_no_shorter_than_a_trial_is_the_whole_of_it():
-    learners = [RL2(PointGoals(6, classes=UNEVEN), replace(TINY, chunk=chunk), seed=0) for chunk in (None, 21, 1000)]
-    for learner in learners:
-        [learner.iterate() for _ in range(2)]
-        batch, _ = learner._prepare()
-        # Three episodes of 7 steps, and the observation after the last one.
-        assert len(learner.trials.obs) == len(batch.weights) == batch.size == 22
-        assert not batch.actor_states.any() and batch.row.tolist() == list(range(6))
-        assert same(learner.policy.state_dict(), learners[0].policy.state_dict())
-
-
-def test_a_new_memory_fades_slowly_and_its_gradient_with_it():
-    short, long = (RecurrentNet(2, (8,), 32, 1, 1.0, torch.Generator().manual_seed(0), lasting=n) for n in (1, 60))
-    gradients = []
-    for net in (short, long):
-        state = torch.zeros(1, 32, requires_grad=True)
-        _, last = net(torch.zeros(60, 1, 2), state)
-        gradients.append(torch.autograd.grad(last.sum(), state)[0].abs().max())
-    assert gradients[0] < 1e-3 and gradients[1] > 0.1
-
-
-def test_the_chunked_forward_equals_a_loop_by_hand():
-    generator = torch.Generator().manual_seed(0)
-    net = RecurrentNet(5, (6,), 7, 3, 1.0, generator, "tanh")
-    x, state = torch.randn(12, 4, 5, generator=generator), torch.randn(4, 7, generator=generator)
-    weights = [getattr(net.gru, name) for name in ("weight_ih_l0", "weight_hh_l0", "bias_ih_l0", "bias_hh_l0")]
-    h, by_hand = state, []
-    for t in range(12):
-        features = torch.tanh(net.encoder[0](x[t]))
-        a, b = (v.chunk(3, 1) for v in (features @ weights[0].T + weights[2], h @ weights[1].T + weights[3]))
-        r, z = torch.sigmoid(a[0] + b[0]), torch.sigmoid(a[1] + b[1])
-        h = (1 - z) * torch.tanh(a[2] + r * b[2]) + z * h
-        by_hand.append(net.head(torch.cat([features, h], 1)))
-    out, last = net(x, state)
-    assert_close(out, torch.stack(by_hand))
-    assert_close(last, h)
-    parts, between = [], state
-    for k in range(3):
-        part, between = net(x[4 * k : 4 * k + 4], between)
-        parts.append(part)
-    assert_close(torch.cat(parts), out)
-    before = torch.get_rng_state()
-    RecurrentNet(5, (6,), 7, 3, 1.0, generator)
-    assert torch.equal(before, torch.get_rng_state())
-
-
-def test_the_update_sees_what_the_rollout_saw():
-    learner = RL2(PointGoals(6, classes=UNEVEN), replace(TINY, blind_share=0.5), seed=0)
-    learner.iterate()
-    seen: list[tuple[Tensor, Tensor]] = []
-    step, world = learner.policy.step, learner.world
-
-    def spy(obs: Tensor, memory: Any) -> tuple[Tensor, Tensor]:
-        playing = ~world.episodes.finished
-        out = step(obs, memory)
-        seen.append((playing, out[0]))
-        return out
-
-    learner.policy.step = spy  # type: ignore[method-assign]
-    learner._update = lambda batch: {}  # type: ignore[method-assign]
-    learner.policy.update_statistics = lambda obs, rewards: None  # type: ignore[method-assign]
-    learner.iterate()
-    batch, _ = learner._prepare()
-    for row in range(6):
-        played = torch.stack([mean[row] for playing, mean in seen if playing[row]])
-        assert len(played) == learner.trials.lengths[row] == 3 * int(world.max_episode_steps[row])
-        assert_close(batch.old_means[: len(played), row], played)
 
 
 def test_rows_of_different_length_are_recorded_without_gaps():
@@ -205,19 +100,6 @@ def test_advantages_are_those_of_the_definition(end_at_goal: bool):
     assert bool(t.terminated[t.filled()].any()) == end_at_goal
 
 
-def test_without_rewards_nothing_that_the_policy_sees_tells_the_task():
-    seen = []
-    for first in (0.0, 1.0):
-        world = PointGoals(8, classes=TEN)
-        world.set_tasks({"PointGoals": circle(8, first)})
-        learner = RL2(world, replace(SMALL, blind_share=1.0), seed=0)
-        learner._update = lambda batch: {}  # type: ignore[method-assign]
-        learner.iterate()
-        t = learner.trials
-        seen.append((learner.policy.see(t.obs[:-1], *t.previous(len(t.obs) - 1)), t.rewards))
-    assert torch.equal(seen[0][0], seen[1][0]) and not torch.equal(seen[0][1], seen[1][1])
-
-
 def test_rewards_are_shown_but_for_blind_episodes():
     learner = RL2(PointGoals(400, classes=TEN), replace(SMALL, blind_share=0.3), seed=0)
     learner.iterate()
@@ -250,7 +132,7 @@ def test_an_evaluation_leaves_the_training_alone():
         learner.iterate()
         if evaluate:
             test = PointGoals(3)
-            adapted(learner.agent, test)
+            shot(learner.agent, test)
             evaluated(learner.agent, test)
         learner.iterate()
         states.append(learner.state_dict())
@@ -262,19 +144,6 @@ def test_bad_input_is_named():
         RL2(PointGoals(4, autoreset_mode="SAME_STEP"), SMALL, seed=0)
     with pytest.raises(BidexError, match="num_envs"):
         RL2(PointGoals(1), SMALL, seed=0)
-
-
-def test_the_run_makes_the_world_that_the_learner_asks_for():
-    source = Worlds.open({"suite": "ML1-wide", "threads": 1})
-    for algo, learner, mode in (
-        ("rl2", {}, "DISABLED"),
-        ("mtppo", {}, "SAME_STEP"),
-        ("promp", {"slice_steps": None}, "DISABLED"),
-        ("promp", {"slice_steps": 8}, "SAME_STEP"),
-    ):
-        world = source.world("train", 3, learner_kind(algo).autoreset(learner))
-        assert world.autoreset_mode.name == mode
-        world.close()
 
 
 def agent_on(world: PointGoals) -> RL2Agent:
@@ -289,7 +158,7 @@ def agent_on(world: PointGoals) -> RL2Agent:
 def test_evaluation_episodes_start_from_what_adaptation_left():
     world = PointGoals(4, classes=TEN)
     agent = agent_on(world)
-    adapted(agent, world)
+    shot(agent, world)
     left = state_of(agent)
     obs = torch.zeros(4, 4)
     first = []
@@ -300,21 +169,11 @@ def test_evaluation_episodes_start_from_what_adaptation_left():
     assert torch.equal(first[0], first[1]) and torch.equal(first[0], first[2])
     assert torch.equal(state_of(agent), left)
     # A second shot goes on from the first, not from an evaluation.
-    adapted(agent, world)
+    shot(agent, world)
     assert not torch.equal(state_of(agent), left)
     agent.init()
     agent.reset(everyone(world))
     assert not state_of(agent).any()
-
-
-def test_reset_of_some_rows_leaves_the_others_in_their_episode():
-    agent = agent_on(PointGoals(4, classes=TEN))
-    obs, mask = torch.ones(4, 4), torch.tensor([True, False, True, False])
-    agent.reset(~mask | mask)
-    first = agent.eval_action(obs)
-    agent.reset(mask)
-    second = agent.eval_action(obs)
-    assert torch.equal(first[mask], second[mask]) and not (first[~mask] == second[~mask]).all(1).any()
 
 
 def test_the_agent_waits_with_rows_whose_episode_is_over():
@@ -332,23 +191,6 @@ def test_the_agent_waits_with_rows_whose_episode_is_over():
         same = (state_of(agent) == before).all(1)
         assert same.tolist() == [t >= 3] * 3 + [False] * 3
     assert agent._learned is not None and agent._learned.done.all()
-
-
-def test_rows_that_play_no_episode_learn_nothing():
-    world = PointGoals(4, classes=TEN)
-    agent, some = agent_on(world), torch.tensor([True, False, True, False])
-    obs, _ = world.reset()
-    agent.reset(some)
-    action, aux = agent.adapt_action(obs)
-    obs, reward, terminated, truncated, _ = world.step(action)
-    agent.step(Timestep(obs, action, reward, terminated, truncated, aux, obs, some))
-    assert torch.equal(state_of(agent).any(1), some)
-    agent.reset(everyone(world))  # an evaluation
-    before = state_of(agent)
-    agent.reset(some)
-    action, aux = agent.adapt_action(obs)
-    agent.step(Timestep(obs, action, reward, terminated, truncated, aux, obs, some))
-    assert torch.equal((state_of(agent) != before).any(1), some)
 
 
 def test_the_agent_plays_the_trial_that_the_training_played():

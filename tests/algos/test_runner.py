@@ -6,8 +6,7 @@ import pytest
 
 from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_meta.train import runner
-from bidex_meta.train.runner import checkpoint, train
-from tests.algos.ranks import same
+from bidex_meta.train.runner import train
 from tests.algos.toy import ToyWorld, nearness
 
 CONFIG = MTPPOConfig(hidden=(8,), rollout_steps=4, autocast="off")
@@ -38,6 +37,11 @@ def make() -> tuple[MTPPO, ToyWorld]:
     return MTPPO(world, CONFIG, seed=0), world
 
 
+def run(notes: Notes, iterations: int = 100, **options: Any) -> tuple[int, MTPPO]:
+    learner, world = make()
+    return train(learner, world, total_steps=iterations * ITERATION, record=notes, **options), learner
+
+
 def test_training_ends_at_the_budget_and_saves_the_end():
     learner, world = make()
     notes = Notes()
@@ -49,46 +53,19 @@ def test_training_ends_at_the_budget_and_saves_the_end():
 
 
 def test_training_ends_with_the_iteration_in_which_the_time_is_up(monkeypatch: pytest.MonkeyPatch):
-    clock = [1000.0]
-    monkeypatch.setattr(runner.time, "monotonic", lambda: clock[0])
-
-    class Timed(Notes):
-        """An iteration takes 10 s."""
-
-        def __init__(self):
-            super().__init__()
-            self.times: list[float] = []
-
-        def log(self, metrics: dict[str, float], step: int) -> None:
-            super().log(metrics, step)
-            self.times.append(metrics["Perf/training_time"])
-            clock[0] += 10.0
-
+    notes = Notes()  # an iteration takes 10 s
+    monkeypatch.setattr(runner.time, "monotonic", lambda: 1000.0 + 10.0 * len(notes.logged))
     learner, world = make()
-    notes = Timed()
     assert train(learner, world, total_steps=100 * ITERATION, total_seconds=25.0, record=notes) == 0
-    assert notes.times == [0.0, 10.0, 20.0]
     assert [step for step, _ in notes.saved] == [3 * ITERATION]
-    resumed = {"spent_seconds": 30.0, "record": notes}
-    train(learner, world, total_steps=100 * ITERATION, total_seconds=25.0, **resumed)
-    assert len(notes.times) == 3
-    train(learner, world, total_steps=100 * ITERATION, total_seconds=45.0, **resumed)
-    assert notes.times[3:] == [30.0, 40.0]
-    train(learner, world, total_steps=6 * ITERATION, total_seconds=1e9, **resumed)
-    assert len(notes.times) == 6  # the steps came first
-
-
-def test_the_time_changes_nothing_of_what_is_learned():
-    (plain, world), (timed, timed_world) = make(), make()
-    train(plain, world, total_steps=3 * ITERATION, record=None)
-    train(timed, timed_world, total_steps=3 * ITERATION, total_seconds=1e9, record=None)
-    assert same(checkpoint(plain, world), checkpoint(timed, timed_world))
+    for steps, seconds in ((100, 25.0), (100, 45.0), (6, 1e9)):  # no iteration, two, one
+        train(learner, world, total_steps=steps * ITERATION, total_seconds=seconds, spent_seconds=30.0, record=notes)
+    assert [told["Perf/training_time"] for told in notes.metrics] == [0.0, 10.0, 20.0, 30.0, 40.0, 30.0]
 
 
 def test_checkpoints_come_in_time_and_the_last_is_not_written_twice():
-    learner, world = make()
     notes = Notes()
-    train(learner, world, total_steps=3 * ITERATION, record=notes, checkpoint_seconds=0.0)
+    run(notes, 3, checkpoint_seconds=0.0)
     assert [step for step, _ in notes.saved] == notes.logged
 
 
@@ -97,9 +74,7 @@ def test_saving_takes_no_more_than_a_fiftieth_of_the_time(monkeypatch: pytest.Mo
     monkeypatch.setattr(runner.time, "monotonic", lambda: clock[0])
     saved: list[float] = []
 
-    class Slow(Notes):
-        """An iteration takes 10 s, a checkpoint 4 s."""
-
+    class Slow(Notes):  # an iteration takes 10 s, a checkpoint 4 s
         def log(self, metrics: dict[str, float], step: int) -> None:
             clock[0] += 10.0
 
@@ -107,8 +82,7 @@ def test_saving_takes_no_more_than_a_fiftieth_of_the_time(monkeypatch: pytest.Mo
             saved.append(clock[0])
             clock[0] += 4.0
 
-    learner, world = make()
-    train(learner, world, total_steps=70 * ITERATION, record=Slow(), checkpoint_seconds=60.0)
+    run(Slow(), 70, checkpoint_seconds=60.0)
     # The first after 60 s, the next 200 s after its end, and so on; the last at the end.
     assert saved == [60.0, 264.0, 468.0, 672.0, 716.0]
 
@@ -116,16 +90,14 @@ def test_saving_takes_no_more_than_a_fiftieth_of_the_time(monkeypatch: pytest.Mo
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_after_the_iteration_and_saves(number: signal.Signals):
     before = signal.getsignal(number)
-    learner, world = make()
     notes = Notes(after=lambda i: os.kill(os.getpid(), number) if i == 2 else None)
-    assert train(learner, world, total_steps=100 * ITERATION, record=notes) == number
+    assert run(notes)[0] == number
     assert [step for step, _ in notes.saved] == [2 * ITERATION]
     assert signal.getsignal(number) is before
 
 
 @pytest.mark.parametrize("where", ["record", "watch", "enough"])
 def test_the_end_of_what_reads_the_output_ends_after_the_iteration_and_saves(where: str):
-    learner, world = make()
     notes, calls = Notes(), []
 
     def print_something(*_: object) -> Any:
@@ -137,7 +109,7 @@ def test_the_end_of_what_reads_the_output_ends_after_the_iteration_and_saves(whe
     if where == "record":
         notes.after = print_something
     others: dict[str, Any] = {} if where == "record" else {where: print_something}
-    assert train(learner, world, total_steps=100 * ITERATION, record=notes, **others) == signal.SIGPIPE
+    assert run(notes, **others)[0] == signal.SIGPIPE
     assert [step for step, _ in notes.saved] == [2 * ITERATION]
 
 
@@ -148,24 +120,17 @@ def test_of_sighup_a_second_one_changes_nothing_and_nohup_ignores_the_first():
             os.kill(os.getpid(), signal.SIGHUP)
 
     before = signal.getsignal(signal.SIGHUP)
-    learner, world = make()
-    assert train(learner, world, total_steps=100 * ITERATION, record=Notes(after=twice)) == signal.SIGHUP
-    assert learner.env_steps == 2 * ITERATION
+    stopped, learner = run(Notes(after=twice))
+    assert (stopped, learner.env_steps) == (signal.SIGHUP, 2 * ITERATION)
     try:
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
-        learner, world = make()
-        assert train(learner, world, total_steps=3 * ITERATION, record=Notes(after=twice)) == 0
-        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN and learner.env_steps == 3 * ITERATION
+        stopped, learner = run(Notes(after=twice), 3)
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+        assert (stopped, learner.env_steps) == (0, 3 * ITERATION)
     finally:
         signal.signal(signal.SIGHUP, before)
 
 
 def test_a_second_signal_acts_at_once():
-    learner, world = make()
-
-    def twice(iteration: int) -> None:
-        os.kill(os.getpid(), signal.SIGINT)
-        os.kill(os.getpid(), signal.SIGINT)
-
     with pytest.raises(KeyboardInterrupt):
-        train(learner, world, total_steps=100 * ITERATION, record=Notes(after=twice))
+        run(Notes(after=lambda iteration: [os.kill(os.getpid(), signal.SIGINT) for _ in range(2)]))

@@ -8,11 +8,9 @@ import pytest
 
 from bidex_meta.cli import main
 from bidex_meta.errors import BidexError
-from bidex_meta.evaluation import meta_test as metatest
 from bidex_meta.evaluation.control_arms import arms, control
 from bidex_meta.evaluation.gains import difference_over_runs
 from bidex_meta.evaluation.meta_test import meta_evaluate
-from bidex_meta.evaluation.play import play_tasks
 from bidex_meta.worlds.own import OwnSuite
 from tests.cli.conftest import FINDER
 from tests.fakes import change
@@ -49,17 +47,6 @@ def test_the_arms_are_those_of_the_meta_test():
     west = meta_evaluate(Finder(), world(NORTH), seed=4, adapt_world=world(WEST), **PLAYED)
     for ours, theirs in ((found.before, own.before), (found.own, own.after), (found.foreign[1], west.after)):
         np.testing.assert_array_equal(ours.classes["Near"].returns, theirs.classes["Near"].returns)
-
-
-def test_only_the_evaluations_that_arms_need_are_played(monkeypatch):
-    counts = []
-    monkeypatch.setattr(metatest, "play_tasks", lambda *a, **k: counts.append(1) or play_tasks(*a, **k))
-    found = control(Finder, world(NORTH), world(EAST, WEST), 3, seed=4, **PLAYED)
-    assert len(counts) == 4  # before, own, two foreign; not between the shots
-    monkeypatch.undo()
-    whole = meta_evaluate(Finder(), world(NORTH), 3, seed=4, **PLAYED)
-    np.testing.assert_array_equal(found.own.classes["Near"].returns, whole.after.classes["Near"].returns)
-    assert whole.to_json()["shots"] == 3 and len(whole.by_shot) == 4
 
 
 def test_what_does_not_adapt_gains_exactly_nothing():

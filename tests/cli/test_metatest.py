@@ -5,7 +5,7 @@ import json
 import pytest
 
 from bidex_meta.cli import main
-from bidex_meta.cli.metatest import environments_for, rollouts_of
+from bidex_meta.cli.metatest import rollouts_of
 from bidex_meta.evaluation.comparison import read_groups
 from bidex_meta.runs import RunFolder
 from bidex_meta.worlds import Worlds
@@ -108,22 +108,6 @@ def test_where_rows_share_nothing_each_plays_one_episode_a_shot(monkeypatch):
     assert [rollouts_of(source, config, asked, 6) for asked in (20, None)] == [20, 10]
     monkeypatch.setattr(Learner, "independent_adaptation", True, raising=False)
     assert [rollouts_of(source, config, asked, 6) for asked in (20, None, 4)] == [6, 6, 4]
-
-
-@pytest.mark.parametrize(
-    ("classes", "adaptations", "rollouts", "limit", "rows"),
-    [
-        (1, 3, 10, 1024, 30),  # ML1: all at once
-        (15, 50, 10, 1024, 15 * 6 * 10),  # ML20: nine portions of six, rather than eight of six and one of two
-        (15, 4, 10, 1024, 15 * 4 * 10),
-        (15, 5, 20, 1024, 15 * 3 * 20),  # two portions of three
-        (15, 5, 20, 200, 15 * 10),  # ten rows a class, two rounds
-        (15, 5, 20, 140, 15 * 5),  # nine would not divide twenty
-        (15, 5, 20, 3, 15),
-    ],
-)
-def test_rows_fit_the_limit_and_the_rollouts(classes, adaptations, rollouts, limit, rows):
-    assert environments_for(classes, adaptations, rollouts, limit) == rows
 
 
 def test_while_training_an_adapting_learner_is_judged_after_a_shot_on_train_tasks(tmp_path):

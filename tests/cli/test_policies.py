@@ -1,7 +1,6 @@
 """From a checkpoint to its policy."""
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -23,7 +22,7 @@ RUNS = Path(__file__).parents[1] / "data" / "old_runs"
     ],
 )
 def test_a_checkpoint_that_asks_for_more_than_its_weights_takes_no_memory(
-    run: str, part: str, change: dict[str, Any]
+    run: str, part: str, change: dict[str, object]
 ) -> None:
     folder = RunFolder.open(RUNS / run)
     state, _ = checkpoint(folder)

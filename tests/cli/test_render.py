@@ -1,6 +1,8 @@
 """``bidex-meta render``: pictures and films, of policies that fit."""
 
+import imageio.v3 as imageio
 import pytest
+from PIL import Image
 
 from bidex_meta.cli import main, policies
 from bidex_meta.tasks import registry
@@ -21,8 +23,6 @@ def test_render_picture_and_film(toy_class, tmp_path, capsys):
     flags = ["render", "--task", "Near", "--width", "64", "--height", "48", "--policy", "random"]
     assert main([*flags, "--out", str(tmp_path / "a.png"), "--steps", "2"]) == 0
     assert capsys.readouterr().out == f"{tmp_path / 'a.png'}\n"
-    import imageio.v3 as imageio
-
     assert imageio.imread(tmp_path / "a.png")[0, :, 0].tolist() == [0] * 2 + [255] * 62
     assert main(["render", "--task", "Nearer", "--out", str(tmp_path / "b.png")]) == 2
     assert "Did you mean 'Near'?" in capsys.readouterr().err
@@ -42,9 +42,6 @@ def test_render_refuses_a_policy_of_other_observations(monkeypatch, toy_class, t
 
 
 def test_a_run_is_filmed_with_all_its_classes_beside_each_other(monkeypatch, toy_class, tmp_path, capsys):
-    import imageio.v3 as imageio
-    from PIL import Image
-
     monkeypatch.setattr(OwnSuite, "task_classes", lambda source: {"Near": None})
     monkeypatch.setattr(OwnSuite, "tasks", lambda source, split: {"Near": ["0"], "Far": ["0"]})
     path = tmp_path / "a"
@@ -69,28 +66,3 @@ def test_a_run_is_filmed_with_all_its_classes_beside_each_other(monkeypatch, toy
     ):
         assert main(["render", *flags]) == 2
         assert told in capsys.readouterr().err
-
-
-def test_a_tile_of_a_row_that_ends_goes_on_and_its_name_is_green_while_solved():
-    import numpy as np
-
-    from bidex_meta.evaluation import filming
-    from tests.fakes import Seeker, ToyWorld
-
-    world, agent, seen = ToyWorld(2, "DISABLED", slot_tasks=[1, 1]), Seeker(), []
-    world.max_episode_steps[:] = 5
-
-    def tiled(pictures, names, done):
-        seen.append((world.episodes.number.tolist(), list(done)))
-        return np.zeros((2, 2, 3), np.uint8)
-
-    original, filming.tiled = filming.tiled, tiled
-    try:
-        list(filming.film_tiles(agent, world, [0, 1], 7, seed=0, width=4, height=4))
-    finally:
-        filming.tiled = original
-    numbers, done = zip(*seen, strict=True)
-    assert len(seen) == 8 and numbers[0] != numbers[-1]
-    assert done[0] == [False, False] and [True, True] in done[1:5]
-    ends = next(i for i in range(1, 8) if numbers[i] != numbers[i - 1])
-    assert done[ends] == [False, False]

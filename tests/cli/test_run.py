@@ -12,6 +12,7 @@ import torch
 from bidex_meta.cli import COMMANDS, main
 from bidex_meta.runs import RunFolder, read_metrics
 from bidex_meta.worlds import Worlds
+from tests.algos.ranks import same
 
 SMALL = ["--suite", "MT4", "--num-envs", "6", "--threads", "1", "--device", "cpu"]
 SMALL += ["--learner.hidden", "8", "--learner.rollout-steps", "4", "--learner.num-minibatches", "2"]
@@ -25,16 +26,6 @@ def final(path):
     loaded = RunFolder.open(path).checkpoints.load()
     assert loaded is not None
     return loaded
-
-
-def same(a, b):
-    if isinstance(a, torch.Tensor):
-        return torch.equal(a, b)
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
-    if isinstance(a, list | tuple):
-        return len(a) == len(b) and all(map(same, a, b))
-    return a == b
 
 
 # Help and errors.

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,6 @@ from bidex_meta.runs import RunFolder
 from tests.cli.test_sweep_plan import FILE
 from tests.fakes import run_config
 from tests.pages import ROOT
-from tools import collect
 
 FAKE = (sys.executable, str(Path(__file__).with_name("fake_run.py")))
 CORES = os.sched_getaffinity(0) if sys.platform == "linux" else {0}
@@ -174,29 +174,11 @@ def _parent(process: Path) -> int | None:
         return None
 
 
-def _wait(so: Any, seconds: float = 60.0) -> None:
+def _wait(so: Callable[[], object], seconds: float = 60.0) -> None:
     end = time.monotonic() + seconds
     while not so():
         assert time.monotonic() < end
         time.sleep(0.05)
-
-
-def test_a_sweep_that_is_not_through_is_collected_as_far_as_it_is(
-    file: Path, tmp_path: Path, monkeypatch, capsys
-) -> None:
-    monkeypatch.setattr("tools.collect._parameters", lambda folder: 1)
-    with pytest.raises(BidexError, match="no run of it has ended"):
-        collect.collect((file,), into=Path("data"))
-    assert main(["sweep", str(file)]) == 0
-    file.write_text(FILE.replace("[0, 1]", "[0, 1, 2]"))
-    runs = read_sweep(file).runs[:2]
-    for run in runs:
-        (run.path / "versions.json").write_text('{"git": {"commit": "0123456789"}}')
-    capsys.readouterr()
-    collect.collect((file,), into=Path("data"))
-    told = capsys.readouterr()
-    assert told.out.split() == [f"data/{run.name}.json" for run in runs] and "1 of 3 runs have not ended" in told.err
-    assert json.loads(Path(told.out.split()[0]).read_text())["arm"] == "ppo"
 
 
 def test_one_sweep_works_in_a_folder_and_a_changed_file_is_noticed(file: Path, tmp_path: Path, capsys) -> None:

@@ -11,7 +11,8 @@ from bidex_meta.cli import main, watching
 from bidex_meta.runs import RunFolder, read_metrics
 from bidex_meta.runs.writers import LOGGERS, Writer
 from bidex_meta.utils import gl_backend
-from tests.cli.test_run import final, run, same
+from tests.algos.ranks import same
+from tests.cli.test_run import final, run
 
 
 @pytest.fixture(autouse=True)
@@ -87,19 +88,6 @@ def test_the_best_policy_is_kept_and_judged(toy_worlds, tmp_path, monkeypatch, s
     assert "There is no worst.pt. Checkpoints in" in refused("evaluate", path, "--checkpoint", "worst.pt")
     (path / "checkpoints" / "best.pt").unlink()
     assert "--evaluate-every" in refused("evaluate", path, "--checkpoint", "best")
-
-
-def test_few_tasks_are_played_ten_times_in_all_and_many_once():
-    from bidex_meta.suite import suite_names
-    from bidex_meta.worlds import Worlds
-    from bidex_meta.worlds.external import HUMANOID
-
-    shipped = {name: watching.played(Worlds.open({"suite": name}).tasks("train")) for name in suite_names()}
-    few = {"MT1": (1, 3), "ML1": (3, 4), "ML1-wide": (3, 4)}
-    assert shipped == dict.fromkeys(shipped, (10, 1)) | few
-    assert watching.played(Worlds.open({"suite": None, "task": "HandOver"}).tasks("train")) == (10, 1)
-    assert watching.played(Worlds.open({"suite": None, "task": HUMANOID}).tasks("train")) == (1, 10)
-    assert watching.played({"a": ["0"], "b": ["0"], "c": ["0"]}) == (1, 4)
 
 
 def test_equal_success_is_settled_by_the_score_or_the_return():

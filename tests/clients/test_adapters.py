@@ -8,12 +8,13 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.wrappers import RecordEpisodeStatistics as SingleStatistics
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from torch import Tensor
 
 from bidex_meta.clients.needs import extra
 from bidex_meta.errors import BidexError
+from bidex_meta.world import World
+from bidex_meta.world.contract import PooledWorld
 from bidex_meta.world.wrapper import NumpyWorld
 from tests.points import PointWorld, ring
 from tests.world.play import class_world, suite_world
@@ -23,7 +24,7 @@ ADAPTERS = {"sb3": ("stable_baselines3", "SB3VecEnv"), "rsl_rl": ("rsl_rl", "Rsl
 ADAPTERS |= {"skrl": ("skrl", "SkrlEnv"), "torchrl": ("torchrl", "TorchRLEnv")}
 
 
-def adapt(client: str, world: Any, **options: Any) -> Any:
+def adapt(client: str, world: PooledWorld, **options: object) -> Any:
     package, name = ADAPTERS[client]
     pytest.importorskip(package)
     return getattr(import_module(f"bidex_meta.clients.{client}_env"), name)(world, **options)
@@ -37,7 +38,7 @@ class Staggered(PointWorld):
     def _first_elapsed(self) -> Tensor:
         return torch.arange(self.num_envs) % 5 * self.stagger
 
-    def get_attr(self, name: str) -> tuple[Any, ...]:
+    def get_attr(self, name: str) -> tuple[object, ...]:
         return (getattr(self, name, None),) * self.num_envs
 
 
@@ -45,7 +46,7 @@ def points(mode: str = "SAME_STEP") -> Staggered:
     return Staggered(ROWS, {"Near": ring(3), "Far": 2 * ring(3)}, (8, 12), ends=True, breaks=(1, 30), mode=mode)
 
 
-def real() -> Any:
+def real() -> World:
     return suite_world("MT4", 8)
 
 
@@ -57,7 +58,7 @@ class Seen(NamedTuple):
     ends: list[tuple[int, bool]]  # row, and whether it was cut
 
 
-def own(world: Any, actions: Tensor) -> Seen:
+def own(world: PooledWorld, actions: Tensor) -> Seen:
     """The world itself."""
     seen = Seen([], [], [])
     world.reset()
@@ -72,7 +73,7 @@ def own(world: Any, actions: Tensor) -> Seen:
     return seen
 
 
-def of_sb3(world: Any, actions: Tensor) -> Seen:
+def of_sb3(world: PooledWorld, actions: Tensor) -> Seen:
     env, seen = adapt("sb3", world, stagger=True), Seen([], [], [])
     obs = env.reset()
     total = np.zeros(env.num_envs)
@@ -93,7 +94,7 @@ def of_sb3(world: Any, actions: Tensor) -> Seen:
     return seen
 
 
-def of_rsl_rl(world: Any, actions: Tensor) -> Seen:
+def of_rsl_rl(world: PooledWorld, actions: Tensor) -> Seen:
     env, seen = adapt("rsl_rl", world, stagger=True), Seen([], [], [])
     assert torch.equal(env.get_observations()["policy"], env.get_observations()["critic"])
     for action in actions:
@@ -108,7 +109,7 @@ def of_rsl_rl(world: Any, actions: Tensor) -> Seen:
     return seen
 
 
-def of_skrl(world: Any, actions: Tensor) -> Seen:
+def of_skrl(world: PooledWorld, actions: Tensor) -> Seen:
     env, seen = adapt("skrl", world, stagger=True), Seen([], [], [])
     obs, _ = env.reset()
     for action in actions:
@@ -125,7 +126,7 @@ def of_skrl(world: Any, actions: Tensor) -> Seen:
     return seen
 
 
-def of_torchrl(world: Any, actions: Tensor) -> Seen:
+def of_torchrl(world: PooledWorld, actions: Tensor) -> Seen:
     env, seen = adapt("torchrl", world, stagger=True), Seen([], [], [])
     state = env.reset()
     whole = world.episodes.counts.clone()
@@ -150,7 +151,7 @@ CLIENTS = {"sb3": of_sb3, "rsl_rl": of_rsl_rl, "skrl": of_skrl, "torchrl": of_to
 
 @pytest.mark.parametrize("client", CLIENTS)
 @pytest.mark.parametrize(("make", "steps", "least"), [(points, 260, 1000), (real, 150, 10)], ids=["points", "MT4"])
-def test_episodes_are_the_worlds_own(client: str, make: Callable[[], Any], steps: int, least: int) -> None:
+def test_episodes_are_the_worlds_own(client: str, make: Callable[[], PooledWorld], steps: int, least: int) -> None:
     world = make()
     generator = torch.Generator().manual_seed(0)
     actions = 2 * torch.rand(steps, *world.action_space.shape, generator=generator) - 1
@@ -244,22 +245,7 @@ def test_no_first_episode_is_shortened_unless_asked(client: str) -> None:
     assert world.episodes.counts.all() and not world.episodes.elapsed.any()
 
 
-STEPS = 75
-"""An episode of CatchUnderarm in which nothing is done."""
-
-
-def counted_by_gymnasium(env: Any, shape: tuple[int, ...], steps: int) -> list[int]:
-    env.reset(seed=0)
-    for _ in range(steps):
-        env.step(np.zeros(shape, np.float32))
-    return [int(length) for length in env.length_queue]
-
-
-def by_gymnasium() -> list[int]:
-    return counted_by_gymnasium(RecordEpisodeStatistics(class_world("CatchUnderarm", 4).to_numpy()), (4, 52), 2 * STEPS)
-
-
-def by_gymnasiums_ids() -> list[int]:
+def test_no_librarys_statistics_count_a_shortened_episode() -> None:
     suite, world = (
         gymnasium.make_vec(f"bidex-meta/{name}-v1", num_envs=4, device="cpu", threads=1).unwrapped
         for name in ("MT4", "CatchUnderarm")
@@ -267,25 +253,10 @@ def by_gymnasiums_ids() -> list[int]:
     for each in (suite, world):
         each.reset(seed=0)
         assert each.episodes.counts.all()  # type: ignore[attr-defined]
-    return counted_by_gymnasium(RecordEpisodeStatistics(NumpyWorld(world, stagger=world.stagger)), (4, 52), STEPS)  # type: ignore[attr-defined, arg-type]
-
-
-def by_gymnasiums_single_environment() -> list[int]:
-    return counted_by_gymnasium(SingleStatistics(gymnasium.make("bidex-meta/CatchUnderarm-v1")), (52,), STEPS)
-
-
-def by_metaworlds_wrappers() -> list[int]:
-    import bidex_meta.metaworld
-
-    env: Any = bidex_meta.metaworld.make_mt_envs("CatchUnderarm", seed=0)
-    env.reset(seed=0)
-    return [int(e["episode"]["l"]) for _ in range(STEPS) if "episode" in (e := env.step(np.zeros(52, np.float32))[-1])]
-
-
-STATISTICS = [function for name, function in list(globals().items()) if name.startswith("by_")]
-
-
-@pytest.mark.parametrize("count", STATISTICS)
-def test_no_librarys_statistics_count_a_shortened_episode(count: Callable[[], list[int]]) -> None:
-    lengths = count()
-    assert lengths and set(lengths) == {STEPS}
+    steps = 75  # an episode of CatchUnderarm in which nothing is done
+    for numpy_world in (class_world("CatchUnderarm", 4).to_numpy(), NumpyWorld(world, stagger=world.stagger)):  # type: ignore[attr-defined, arg-type]
+        env = RecordEpisodeStatistics(numpy_world)
+        env.reset(seed=0)
+        for _ in range(2 * steps):
+            env.step(np.zeros((4, 52), np.float32))
+        assert set(map(int, env.length_queue)) == {steps}

@@ -1,12 +1,9 @@
-import copy
-import pickle
 import subprocess
 import sys
 import warnings
 from pathlib import Path
 
 import gymnasium
-import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
@@ -90,16 +87,3 @@ def test_single_environment_info_has_gymnasiums_keys_alone(env: gymnasium.Env) -
         assert sum(info["reward_terms"].values()) == pytest.approx(reward, abs=1e-5)
     assert info["episode"]["l"] == steps and info["episode"]["r"] == pytest.approx(total)
     assert info["is_success"] is success
-
-
-def test_single_environment_copies(env: gymnasium.Env) -> None:
-    env.reset(seed=0)
-    actions = [env.action_space.sample() for _ in range(6)]
-    for action in actions[:3]:
-        env.step(action)
-    for other in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
-        twin = copy.deepcopy(env)
-        for action in actions[3:]:
-            a, b = twin.step(action), other.step(action)
-            np.testing.assert_array_equal(a[0], b[0])
-            assert a[1:] == b[1:]

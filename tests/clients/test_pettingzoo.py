@@ -10,13 +10,13 @@ from bidex_meta.errors import BidexError
 
 pytest.importorskip("pettingzoo")
 
+from pettingzoo.test import parallel_api_test, parallel_seed_test
+
 from bidex_meta.clients.pettingzoo import parallel_env
 
 
 @pytest.mark.parametrize("agents", ["hands", "fingers"])
 def test_pettingzoos_own_tests(agents: str) -> None:
-    from pettingzoo.test import parallel_api_test, parallel_seed_test
-
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         parallel_api_test(parallel_env("CatchUnderarm", agents), num_cycles=100)

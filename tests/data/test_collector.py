@@ -1,9 +1,7 @@
 """What is stored is what a plain loop saw."""
 
 import tempfile
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,16 +9,17 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bidex_meta.data import open_dataset
+from bidex_meta.data import Episode, open_dataset
 from bidex_meta.data.collector import BROKEN, CUT, SHORTENED, EpisodeCollector, RunCollector, spread_environments
 from bidex_meta.data.writer import DatasetWriter, finish
 from bidex_meta.errors import BidexError
-from tests.data.worlds import Plain, rough, same
+from bidex_meta.world.contract import State
+from tests.data.worlds import Plain, Rough, rough, same
 
 pytest.importorskip("h5py", reason="needs the extra data")
 
 
-def complete(folder: Path, world: Any) -> None:
+def complete(folder: Path, world: Rough) -> None:
     spaces = world.single_observation_space, world.single_action_space
     finish(folder, "Points/test-v0", *spaces, {"tasks": world.task_names, "kind": "test"})
 
@@ -85,7 +84,7 @@ def test_what_is_stored_is_what_a_plain_loop_saw(seed, steps, mode, breaks_at, l
 
 def test_what_is_left_out_is_counted() -> None:
     world = rough(mode="SAME_STEP", breaks_at=((1, 0), (2, 3)), late=(0, 2, 0, 0, 0))
-    found: list[Any] = []
+    found: list[Episode] = []
     recorder = EpisodeCollector(world, found.append, rows=[0, 1, 3])
     recorder.reset(seed=0)
     for _ in range(3):
@@ -109,7 +108,7 @@ def test_rows_are_spread_over_slots_and_checked() -> None:
 def test_a_run_that_goes_on_stores_each_episode_once(tmp_path: Path) -> None:
     """Saved after 12 steps, ended after 20, taken up at 12: as one that was never ended."""
 
-    def drive(recorder: RunCollector, *steps: int) -> dict[str, Any]:
+    def drive(recorder: RunCollector, *steps: int) -> State:
         for step in range(*steps):
             recorder.step(actions(3, step, 5))
         return recorder.state_dict()
@@ -134,22 +133,3 @@ def test_a_run_that_goes_on_stores_each_episode_once(tmp_path: Path) -> None:
     other.open(tmp_path / "other")
     with pytest.raises(BidexError, match="of other rows"):
         other.load_state_dict(state)
-
-
-def test_two_processes_write_one_data_set(tmp_path: Path) -> None:
-    seen, worlds = [], []
-    for rank in range(2):
-        make = partial(rough, seed=rank, breaks_at=((3, rank),))
-        recorder, plain = RunCollector(make(), [0, 2, 4], rank), Plain(make())
-        recorder.open(tmp_path / "set")
-        recorder.reset(seed=rank), plain.reset(seed=rank)
-        for step in range(20):
-            recorder.step(actions(rank, step, 5)), plain.step(actions(rank, step, 5))
-            if step % 8 == 7 or step == 19:
-                recorder.state_dict()
-        worlds.append(recorder)
-        seen += [episode for episode in plain.whole if episode.row in (0, 2, 4)]
-    complete(tmp_path / "set", worlds[0])
-    stored = list(open_dataset(tmp_path / "set").episodes())
-    assert [recorder.writer.parts for recorder in worlds] == [3, 3]
-    assert len(stored) == len(seen) > 10 and all(map(same, stored, seen))

@@ -5,7 +5,7 @@ import os
 import random
 import resource
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +86,7 @@ def test_sets_without_digests_load_as_before(folder: Path, capsys: pytest.Captur
     assert len(verify(open_dataset(folder)).unsealed) == 2
 
 
-def make_foreign(folder: Path, **more: Any) -> None:
+def make_foreign(folder: Path, **more: object) -> None:
     """Makes of a data set what Minari would have written: one file, none of our entries."""
     episodes = list(open_dataset(folder).episodes())
     for path in part_files.parts_of(folder):
@@ -100,7 +100,7 @@ def make_foreign(folder: Path, **more: Any) -> None:
     (folder / part_files.METADATA).write_text(json.dumps(content | more))
 
 
-def instead(name: str, value: Any) -> Callable[[Any], None]:
+def instead(name: str, value: object) -> Callable[[Any], None]:
     """Puts something else in the place of an object."""
 
     def put(file: Any) -> None:
@@ -274,7 +274,7 @@ def test_loops_of_links_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("plan", [[], 3, {"threads": "x"}, {"threads": -1}, {"size": 10**18}, {"kind": "x" * 5000}])
-def test_an_odd_plan_of_a_recording_is_one_line(plan: Any, tmp_path: Path) -> None:
+def test_an_odd_plan_of_a_recording_is_one_line(plan: object, tmp_path: Path) -> None:
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / part_files.RECORDING).write_text(json.dumps(plan))
     for read in (lambda: begin(tmp_path, {"kind": "test"}), lambda: begin(tmp_path, {}) and stored_plan(tmp_path)):
@@ -282,9 +282,9 @@ def test_an_odd_plan_of_a_recording_is_one_line(plan: Any, tmp_path: Path) -> No
 
 
 @pytest.fixture
-def limit(monkeypatch: pytest.MonkeyPatch) -> Any:
+def limit(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int | None], None]]:
     """Sets the bytes that a file may have, as a full disk would; what is printed of errors nobody catches fails."""
-    unraisable: list[Any] = []
+    unraisable: list[object] = []
     monkeypatch.setattr(sys, "unraisablehook", unraisable.append)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (before[0] if size is None else size, before[1]))

@@ -31,7 +31,7 @@ def written(folder: Path, state: Space | None, action: Space | None, **arrays: A
         for name, values in episode.items():
             for key, each in values.items() if isinstance(values, dict) else [("", values)]:
                 file[f"episode_0/{name}/{key}".rstrip("/")] = each
-    content: dict[str, Any] = {"total_episodes": 1, "total_steps": 2, "dataset_id": "other/mine-v0"}
+    content: dict[str, object] = {"total_episodes": 1, "total_steps": 2, "dataset_id": "other/mine-v0"}
     spaces = {"observation_space": state, "action_space": action}
     content |= {name: minari.serialize_space(space) for name, space in spaces.items() if space is not None}
     (inner / "metadata.json").write_text(json.dumps(content))

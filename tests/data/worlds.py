@@ -38,7 +38,14 @@ class Rough(PointWorld):
     first episode of each row begins in SAME_STEP mode.
     """
 
-    def __init__(self, *given: Any, breaks_at: Any = (), brittle: bool = False, late: Any = (), **more: Any):
+    def __init__(
+        self,
+        *given: Any,
+        breaks_at: tuple[tuple[int, int], ...] = (),
+        brittle: bool = False,
+        late: tuple[int, ...] = (),
+        **more: Any,
+    ):
         super().__init__(*given, **more)
         self.unstable, self._brittle, self._late = breaks_at, brittle, late
 
@@ -59,7 +66,7 @@ def rough(num_envs: int = 5, mode: str = "SAME_STEP", **more: Any) -> Rough:
 class Plain:
     """What a plain loop sees of a world: each row's running episode as lists, and those that were whole."""
 
-    world: Any
+    world: Rough
     whole: list[Episode] = field(default_factory=list)
     broken: int = 0
 

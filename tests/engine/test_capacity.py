@@ -2,7 +2,7 @@
 
 import pytest
 
-from bidex_meta.engine.capacity import Capacity, room_for
+from bidex_meta.engine.capacity import room_for
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 
@@ -29,8 +29,3 @@ def test_more_water_gets_more_room() -> None:
     assert room.contacts > 255 and room.convex > 129 and room.rows > 282
     assert few == registry.get("PourWater", True).needs
     assert room_for([few, many]) == room
-
-
-def test_a_group_gets_the_largest_room_of_its_classes() -> None:
-    seen = [registry.get(name, True).needs for name in ("CatchUnderarm", "HandOver")]
-    assert room_for(seen) == Capacity(48, 12, 80)

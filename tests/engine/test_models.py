@@ -6,7 +6,6 @@ import pytest
 from bidex_meta.engine.models import differing_fields, same_structure
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import Scene, build_spec, compile_scene
-from bidex_meta.world.base import split_rows
 from tests.tasks.worlds import CASES
 
 ONE_EGG = {(name, True) for name in ("CatchUnderarm", "CatchOver2Underarm", "CatchAbreast")}
@@ -52,12 +51,3 @@ def test_what_is_another_structure(change: str) -> None:
     assert same_structure(other(""), other(change)) == numbers
     if numbers:
         assert bool(differing_fields(other(""), other(change))) == bool(change)
-
-
-@pytest.mark.parametrize(
-    "num, slots, sizes", [(11, 4, [3, 3, 3, 2]), (8, 4, [2, 2, 2, 2]), (4, 4, [1] * 4), (5, 1, [5])]
-)
-def test_rows_are_split_evenly(num: int, slots: int, sizes: list[int]) -> None:
-    rows = split_rows(num, slots)
-    assert [r.stop - r.start for r in rows] == sizes
-    assert [r.start for r in rows] == [0, *(r.stop for r in rows[:-1])]

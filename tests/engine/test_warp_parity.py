@@ -13,6 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from bidex_meta import Benchmark
 from bidex_meta.engine.capacity import room_for
 from bidex_meta.engine.cpu import CpuEngine
 from bidex_meta.engine.warp import WarpEngine
@@ -220,8 +221,6 @@ def test_the_same_actions_lead_to_the_same_states(names: tuple[str, ...], device
 
 
 def test_the_groups_are_those_of_the_benchmark() -> None:
-    from bidex_meta import Benchmark
-
     world = Benchmark("MT20").make_world("train", num_envs=20, device="cpu", threads=1)
     found = [tuple(world.slots[m.slot].task_class.name for m in part.group.members) for part in world.parts]
     assert found == list(GROUPS)

@@ -138,14 +138,6 @@ def test_an_evaluation_that_is_torn_or_of_fewer_steps_is_refused(tmp_path: Path)
         groups(path)
 
 
-def test_a_run_that_time_ended_is_of_the_steps_it_made(tmp_path: Path):
-    path = change(evaluated_run(tmp_path, 0, {"A": 0.5}), steps=10**9, minutes=4.0)
-    [group] = groups(evaluated_at(path, 1000))
-    assert (group.steps, group.hours) == (1000, 0.5)
-    with pytest.raises(BidexError, match="is of 500 steps, but the run goes on to 1,000"):
-        groups(evaluated_at(path, 500))
-
-
 def test_steps_are_the_mean_over_seeds_that_time_ended_with_their_range(tmp_path: Path, capsys):
     paths = [change(evaluated_run(tmp_path, seed, {"A": 0.5}), steps=10**9, minutes=4.0) for seed in range(3)]
     for path, steps in zip(paths, (1000, 1600, 4000), strict=True):
@@ -159,28 +151,27 @@ def test_steps_are_the_mean_over_seeds_that_time_ended_with_their_range(tmp_path
     assert (row["steps"], row["steps_range"]) == (2200, [1000, 4000])
 
 
-def test_a_run_that_a_return_or_score_ended_is_of_the_steps_it_made(tmp_path: Path):
-    path = evaluated_at(evaluated_run(tmp_path, 0, {"A": 0.5}), 1000)
-    rows = [{"step": 500, "Train/mean_return": 2.0, "Eval/score": None}, {"step": 1000, "Train/mean_return": 8.5}]
-
-    log(path, *rows)
-    change(path, steps=10**9, stop_at_return=8.0)
-    assert groups(path)[0].steps == 1000
-    for ends in ({"stop_at_return": 9.0}, {"stop_at_score": 33.0}, {"evaluate_every": 10}):
-        change(path, **{"stop_at_return": 8.0, "stop_at_score": None, "evaluate_every": None, **ends})
-        if "stop_at_score" in ends:
-            change(path, stop_at_return=None)
+@pytest.mark.parametrize(
+    ("ends", "metrics", "over"),
+    [
+        ({"minutes": 4.0}, {}, True),
+        ({"stop_at_return": 8.0}, {"Train/mean_return": 8.5}, True),
+        ({"stop_at_return": 9.0}, {"Train/mean_return": 8.5}, False),
+        ({"stop_at_return": 8.0, "evaluate_every": 10}, {"Train/mean_return": 8.5}, False),
+        ({"stop_at_score": 33.0}, {"Eval/score": None}, False),
+        ({"stop_at_score": 33.0}, {"Eval/score": 34.0}, True),
+        ({"stop_at_success": 0.8}, {"Train/success_rate": 0.79}, False),
+        ({"stop_at_success": 0.8}, {"Train/success_rate": 0.8}, True),
+    ],
+)
+def test_a_run_that_time_or_a_mark_ended_is_of_the_steps_it_made(tmp_path: Path, ends, metrics, over):
+    path = change(evaluated_at(evaluated_run(tmp_path, 0, {"A": 0.5}), 1000), steps=10**9, **ends)
+    log(path, {"step": 500, "Train/mean_return": 2.0}, {"step": 1000, **metrics})
+    if over:
+        assert groups(path)[0].steps == 1000
+    else:
         with pytest.raises(BidexError, match="is of 1,000 steps, but the run goes on to 1,000,000,000"):
             groups(path)
-    change(path, stop_at_return=None, stop_at_success=0.8, evaluate_every=None)
-    log(path, rows[0], {**rows[1], "Train/success_rate": 0.79})
-    with pytest.raises(BidexError, match="goes on"):
-        groups(path)
-    log(path, rows[0], {**rows[1], "Train/success_rate": 0.8})
-    assert groups(path)[0].steps == 1000
-    change(path, stop_at_success=None, stop_at_score=33.0)
-    log(path, rows[0], {**rows[1], "Eval/score": 34.0})
-    assert groups(path)[0].steps == 1000
 
 
 def test_a_class_without_a_reference_leaves_the_group_without_a_score(tmp_path: Path):

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.gains import paired_gains
 from bidex_meta.evaluation.meta_test import meta_evaluate
@@ -247,51 +246,3 @@ def test_refusals_name_the_mend(agent, place, keywords, expected):
     with pytest.raises(BidexError, match=expected) as error:
         meta_evaluate(agent, place, **keywords)
     assert "\n" not in str(error.value)
-
-
-def test_a_real_world_in_portions_and_with_data_of_another_task():
-    ml1 = Benchmark("ML1")
-
-    class Tuner:
-        """One number a task, moved by the rewards it saw: whatever the data are, it shows which they were."""
-
-        def assign(self, task_of_row):
-            self.of_row = task_of_row
-
-        def init(self):
-            self.level = torch.zeros(int(self.of_row.max()) + 1)
-            self.seen = torch.zeros_like(self.level)
-
-        def reset(self, env_mask):
-            pass
-
-        def eval_action(self, obs):
-            return self.level[self.of_row][:, None].expand(len(obs), 52)
-
-        def adapt_action(self, obs):
-            return torch.full((len(obs), 52), 0.2), {}
-
-        def step(self, timestep):
-            self.seen.index_add_(0, self.of_row, timestep.reward * timestep.valid)
-
-        def adapt(self):
-            self.level = torch.tanh(self.seen)
-
-    def play(split, rows, pool=None, **keywords):
-        place = ml1.make_world(split, rows, device="cpu", autoreset_mode="DISABLED", threads=1)
-        if pool is not None:
-            place.set_tasks({"CatchUnderarm": pool})
-        agent = Tuner()
-        found = meta_evaluate(agent, place, 1, rollouts=1, episodes_per_task=1, max_adapt_steps=15, **keywords)
-        return found.after.classes["CatchUnderarm"], found.before.classes["CatchUnderarm"], agent.level, place
-
-    after, before, _, place = play("train", 2)  # two tasks, then the third and one that fills up
-    assert after.tasks.tolist() == [0, 1, 2] and place.num_slot_tasks == [3]
-    assert np.isfinite(after.returns).all() and (after.returns != before.returns).all()
-    other = ml1.make_world("test", 2, device="cpu", autoreset_mode="DISABLED", threads=1)
-    other.set_tasks({"CatchUnderarm": ml1.train_tasks[0].variation[None]})
-    _, own_before, own, _ = play("test", 2, trials=2)
-    _, foreign_before, foreign, _ = play("test", 2, trials=2, adapt_world=other)
-    assert np.array_equal(own_before.returns, foreign_before.returns)
-    assert (own != foreign).all()
-    assert np.array_equal(other.slots[0].tasks, ml1.train_tasks[0].variation[None])

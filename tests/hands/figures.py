@@ -59,8 +59,6 @@ GEOMS = {
 }
 
 TIPS = ("ffdistal", "mfdistal", "rfdistal", "lfdistal", "thdistal")
-CENTRE_OF_MASS = (0.0016, 0.0081, 0.2917)
-LINEAR_DAMPING, ANGULAR_DAMPING = 501.0, (2.60, 2.65, 1.12)
 
 # Actor at the origin, unrotated; metres, world.
 ZERO_POSE = {

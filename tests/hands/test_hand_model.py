@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bidex_meta.hands.hand import CENTRE_OF_MASS, INNER, SIDES, add_hands, damp_bases, hand, hand_spec
+from bidex_meta.hands.hand import INNER, SIDES, add_hands, hand, hand_spec
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.scene import compile_scene
@@ -14,26 +14,6 @@ from tests.hands import figures
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
     return hand_spec().compile()
-
-
-def pair_model(moving: bool) -> mujoco.MjModel:
-    """Both hands at the origin's height, unrotated, the left one out of reach."""
-    scene = mujoco.MjSpec()
-    add_hands(scene, HandPose((0, 0, 0), (0, 0, 0)), HandPose((5, 0, 0), (0, 0, 0)), moving)
-    model = scene.compile()
-    damp_bases(model)
-    return model
-
-
-def test_counts_and_mass(model: mujoco.MjModel) -> None:
-    assert model.nbody == 26 + 2, "26 bodies besides the world and the massless base"
-    assert (model.nv, model.nu, model.ntendon, model.nsensor) == (24, 20, 4, 72 + 20 + 10 + 4)
-    assert model.body_mass.sum() == pytest.approx(5.011, abs=5e-4)
-    assert model.body("base").mass == 0.0
-    solid = [model.geom(i).name for i in range(model.ngeom) if model.geom_contype[i]]
-    assert len(solid) == 20
-    capsules_and_boxes = {mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX}
-    assert {int(model.geom(name).type[0]) for name in solid} == {int(kind) for kind in capsules_and_boxes}
 
 
 @pytest.mark.parametrize("name", ["CatchUnderarm", "SwingCup", "PourWater"])
@@ -50,15 +30,6 @@ def test_the_hands_float_and_all_else_falls(name: str) -> None:
         mass = model.body_subtreemass[model.jnt_bodyid[joint]]
         np.testing.assert_allclose(pull[model.jnt_dofadr[joint] :][:3], (0.0, 0.0, -9.81 * mass), rtol=1e-6, atol=1e-9)
     assert free
-
-
-def test_centre_of_mass(model: mujoco.MjModel) -> None:
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    np.testing.assert_allclose(data.body("mount").xmat.reshape(3, 3), np.eye(3), atol=1e-12)
-    centre = data.subtree_com[model.body("mount").id] - data.body("mount").xpos
-    np.testing.assert_allclose(centre, figures.CENTRE_OF_MASS, atol=1e-4)
-    np.testing.assert_allclose(data.body("base").xpos - data.body("mount").xpos, CENTRE_OF_MASS, atol=1e-12)
 
 
 def test_joint_tables(model: mujoco.MjModel) -> None:
@@ -111,7 +82,9 @@ def test_collision_geoms(model: mujoco.MjModel) -> None:
 
 @pytest.mark.parametrize("moving", [False, True])
 def test_zero_pose_kinematics(moving: bool) -> None:
-    model = pair_model(moving)
+    scene = mujoco.MjSpec()
+    add_hands(scene, HandPose((0, 0, 0), (0, 0, 0)), HandPose((5, 0, 0), (0, 0, 0)), moving)
+    model = scene.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     for name, expected in figures.ZERO_POSE.items():
@@ -135,16 +108,6 @@ def test_mounts_of_the_classes(name: str, moving: bool) -> None:
         mount = data.body(f"{side}/mount")
         np.testing.assert_allclose(mount.xpos, position, atol=1e-9, err_msg=side)
         assert figures.same_orientation(mount.xquat, quaternion, 2e-3), (side, mount.xquat)
-
-
-@pytest.mark.parametrize("name", registry.names())
-def test_moving_bases_are_damped_as_the_originals(name: str) -> None:
-    model = compile_scene(registry.get(name, True)).model
-    for side in SIDES:
-        first = model.joint(f"{side}/free").dofadr[0]
-        expected = (*(figures.LINEAR_DAMPING,) * 3, *figures.ANGULAR_DAMPING)
-        np.testing.assert_allclose(model.dof_damping[first : first + 6], expected)
-    assert compile_scene(registry.get(name, False)).model.nv == model.nv - 12
 
 
 def kind(geom: str) -> str:

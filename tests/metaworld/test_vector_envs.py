@@ -6,7 +6,7 @@ import random
 import subprocess
 import sys
 from collections.abc import Callable
-from functools import partialmethod
+from types import ModuleType
 from typing import Any
 
 import cloudpickle
@@ -21,6 +21,7 @@ from metaworld import evaluation as original_evaluation
 
 import bidex_meta.metaworld as ours
 from bidex_meta import Benchmark, Task
+from bidex_meta.agents import Timestep
 from bidex_meta.errors import BidexError
 from bidex_meta.metaworld import evaluation as our_evaluation
 from bidex_meta.world.single_env import SuiteEnv
@@ -28,6 +29,7 @@ from bidex_meta.world.single_env import SuiteEnv
 BOTH = pytest.mark.parametrize(
     ("metaworld", "name"), [(original, "reach-v3"), (ours, "HandOver")], ids=["metaworld", "bidex-meta"]
 )
+EVALUATION: dict[ModuleType, ModuleType] = {original: original_evaluation, ours: our_evaluation}
 SHORT: dict[str, Any] = {"max_episode_steps": 8}  # where a test is about the end of episodes
 ITS_OWN_CODE = """
 import metaworld
@@ -74,7 +76,7 @@ def test_many_tasks(name: str) -> None:
 
 
 @BOTH
-def test_an_episode_to_its_end(metaworld: Any, name: str) -> None:
+def test_an_episode_to_its_end(metaworld: ModuleType, name: str) -> None:
     """Its documentation: a scripted policy until the time is up."""
     mt1 = metaworld.MT1(name, seed=1)
     env = mt1.train_classes[name](render_mode=None)
@@ -102,37 +104,38 @@ class Agent:
     def adapt_action(self, observations: np.ndarray) -> tuple[np.ndarray, dict]:
         return self.eval_action(observations), {}
 
-    def step(self, timestep: Any) -> None:
+    def step(self, timestep: Timestep) -> None:
         assert timestep.observation.shape[:1] == timestep.reward.shape == timestep.truncated.shape
         self._called("step")
 
-    def _called(self, name: str, *given: Any) -> None:
+    def _called(self, name: str) -> None:
         self.calls[name] += 1
 
-    reset, init, adapt = (
-        partialmethod(_called, "reset"),
-        partialmethod(_called, "init"),
-        partialmethod(_called, "adapt"),
-    )
+    def reset(self, mask: np.ndarray) -> None:
+        self._called("reset")
+
+    def init(self) -> None:
+        self._called("init")
+
+    def adapt(self) -> None:
+        self._called("adapt")
 
 
 @BOTH
-def test_evaluation_of_multi_task_environments(metaworld: Any, name: str) -> None:
-    module: Any = original_evaluation if metaworld is original else our_evaluation
+def test_evaluation_of_multi_task_environments(metaworld: ModuleType, name: str) -> None:
     envs = metaworld.make_ml_envs(name, seed=1, meta_batch_size=2, vector_strategy="sync", **SHORT)
     agent = Agent(envs)
-    success, mean_return, by_name, returns = module.evaluation(agent, envs, num_episodes=4)
+    success, mean_return, by_name, returns = EVALUATION[metaworld].evaluation(agent, envs, num_episodes=4)
     assert success == by_name[name] == 0.0 and mean_return == pytest.approx(np.mean(returns[name]))
     assert len(returns[name]) == 4 and agent.calls["reset"] == 17
     envs.close()
 
 
 @BOTH
-def test_evaluation_of_an_agent_that_adapts(metaworld: Any, name: str) -> None:
-    module: Any = original_evaluation if metaworld is original else our_evaluation
+def test_evaluation_of_an_agent_that_adapts(metaworld: ModuleType, name: str) -> None:
     envs = metaworld.make_ml_envs_test(name, seed=1, meta_batch_size=2, **SHORT)
     agent = Agent(envs)
-    success, _, by_name = module.metalearning_evaluation(
+    success, _, by_name = EVALUATION[metaworld].metalearning_evaluation(
         agent, envs, num_evals=2, adaptation_steps=1, adaptation_episodes=2, evaluation_episodes=1
     )
     assert success == by_name[name] == 0.0
@@ -141,7 +144,7 @@ def test_evaluation_of_an_agent_that_adapts(metaworld: Any, name: str) -> None:
 
 
 @BOTH
-def test_wrappers_keep_their_meaning(metaworld: Any, name: str) -> None:
+def test_wrappers_keep_their_meaning(metaworld: ModuleType, name: str) -> None:
     plain = metaworld.make_mt_envs(name, seed=1, **SHORT)
     size, actions = plain.observation_space.shape[0], plain.action_space.shape[0]
     options = {"use_one_hot": True, "env_id": 1, "num_tasks": 3, "recurrent_info_in_obs": True}
@@ -353,7 +356,7 @@ def test_constructors_take_what_meta_worlds_take() -> None:
         (lambda: ours.ML4().train_classes["HandOver"]().set_task(ours.MT1("Switch").train_tasks[0]), "one of Switch"),
     ],
 )
-def test_what_cannot_be_had_says_so_in_a_line(call: Callable[[], Any], told: str) -> None:
+def test_what_cannot_be_had_says_so_in_a_line(call: Callable[[], object], told: str) -> None:
     with pytest.raises(BidexError) as error:
         call()
     assert told in str(error.value) and "\n" not in str(error.value)

@@ -73,7 +73,9 @@ def against(
                 out = Path(folder) / f"{algo}{seed}.pt"
                 _train([python, TRAIN, path, algo, str(updates), str(seed), out])
                 theirs.append(judge(Scripted(out)))
-            spans = [_interval(ours), _interval(theirs)]
+            spans = [
+                scipy.stats.t.interval(0.95, seeds - 1, np.mean(each), scipy.stats.sem(each)) for each in (ours, theirs)
+            ]
             overlap = max(span[0] for span in spans) <= min(span[1] for span in spans)
             found[algo] = {"ours": ours, "theirs": theirs, "intervals": spans, "overlap": overlap}
     return found
@@ -87,11 +89,6 @@ def _train(command: Sequence[Any]) -> None:
     )  # fmt: skip
     if done.returncode:
         raise RuntimeError(f"{command} ended with {done.returncode}: {done.stdout[-2000:]}")
-
-
-def _interval(values: Sequence[float]) -> tuple[float, float]:
-    half = scipy.stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values))
-    return float(np.mean(values) - half), float(np.mean(values) + half)
 
 
 def main() -> None:

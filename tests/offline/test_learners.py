@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 import scipy.stats
 import torch
-from torch import Tensor
 from torch.testing import assert_close
 
-from bidex_algos.offline.base import Batches, return_deviation
 from bidex_algos.offline.bc import BC, BCConfig
 from bidex_algos.offline.bcq import BCQ, BCQConfig
-from bidex_algos.offline.iql import IQL, IQLConfig, expectile_loss
+from bidex_algos.offline.iql import IQL, IQLConfig
 from bidex_algos.offline.td3bc import TD3BC, TD3BCConfig
 from bidex_meta.data.joined import Joined
 from bidex_meta.errors import BidexError
@@ -98,10 +96,8 @@ def test_without_a_value_td3bc_is_bc() -> None:
     world, data = bad_bandit()
     bc = learned("bc", world, data, 2)
     still = learned("td3bc", world, data, 2, alpha=0.0, policy_delay=1)
-    other = learned("td3bc", world, data, 2, alpha=0.1, policy_delay=1)
-    own, same, different = (each.policy.actor.state_dict() for each in (bc, still, other))
+    own, same = (each.policy.actor.state_dict() for each in (bc, still))
     assert all(torch.equal(own[name], same[name]) for name in own)
-    assert not all(torch.equal(own[name], different[name]) for name in own)
 
 
 def test_iql_finds_expectile_and_weighted_mean_of_a_bandit() -> None:
@@ -114,14 +110,6 @@ def test_iql_finds_expectile_and_weighted_mean_of_a_bandit() -> None:
     weights = np.minimum(np.exp(3.0 * (rewards - expectile)), 100.0)
     wanted = (weights[:, None] * data.actions.numpy()).sum(0) / weights.sum()
     assert_close(learner.eval_action(obs).mean(0), torch.from_numpy(wanted).float(), atol=0.08, rtol=0)
-
-
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.7, 0.95])
-def test_the_expectile_loss_is_least_where_scipy_says(share: float) -> None:
-    values = torch.from_numpy(np.random.default_rng(0).gamma(2.0, size=500))
-    at = torch.tensor(scipy.stats.expectile(values.numpy(), share), requires_grad=True)
-    expectile_loss(values - at, share).mean().backward()
-    assert at.grad is not None and abs(float(at.grad)) < 1e-7
 
 
 def test_td3bc_actor_loss_by_hand() -> None:
@@ -175,40 +163,6 @@ def test_bcq_target_and_divergence_against_plain_ones(point: tuple[Joined, float
     normal = torch.distributions.Normal
     divergence = torch.distributions.kl_divergence(normal(mean, log_std.exp()), normal(0.0, 1.0)).mean()
     assert_close(learner._fit_model(obs, draw.actions)["Loss/divergence"], divergence)
-
-
-def test_deviation_of_returns_against_a_loop() -> None:
-    world = PointMass(rows=6, horizon=7)
-    episodes = played(world, noisy(world.best, 0.5), 30)
-    data, found = as_data(episodes), []
-    for episode in episodes:
-        total = 0.0
-        for reward in episode.rewards[::-1]:
-            total = float(reward) + 0.9 * total
-            found.append(total)
-    assert_close(return_deviation(data, 1, 0.9), torch.tensor([np.std(found)]).float())
-    assert float(return_deviation(replace(data, rewards=torch.zeros(len(data))), 1, 0.9)) == 1.0
-
-
-def test_batches_are_transitions_of_their_tasks_drawn_evenly() -> None:
-    world = opposite_bandits()
-    episodes = played(world, noisy(lambda obs: torch.zeros(len(obs), 2), 0.5), 20)
-    few = [e for e in episodes if e.task == 0] + [e for e in episodes if e.task == 1][:3]
-    data = as_data(few)
-    batches = Batches(data, 2, 20_000, torch.device("cpu"))
-    draw = batches.take(batches.draw(1, torch.Generator().manual_seed(0))[0])
-    stored = {tuple(torch.cat([*row]).tolist()) for row in rows_of(few)}
-    drawn = torch.cat([draw.obs, draw.actions, draw.rewards[:, None], draw.next_obs], 1)
-    assert {tuple(row) for row in drawn.tolist()} == stored
-    assert draw.obs[:20_000, 1].eq(1).all() and draw.obs[20_000:, 2].eq(1).all()
-
-
-def rows_of(episodes: list[Any]) -> list[tuple[Tensor, ...]]:
-    def row(e: Any, t: int) -> tuple[Tensor, ...]:
-        told = (e.observations[t], e.actions[t], e.rewards[t], e.observations[t + 1])
-        return tuple(torch.from_numpy(np.atleast_1d(each)) for each in told)
-
-    return [row(episode, t) for episode in episodes for t in range(len(episode))]
 
 
 def test_a_checkpoint_of_other_data_is_refused() -> None:

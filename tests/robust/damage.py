@@ -3,10 +3,14 @@
 import json
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+
+from bidex_meta.errors import BidexError
 
 ODD = (
     None, True, -1, 0, 1.5, 1e308, 10**18, 10**30, "", "x", "\x1b[2J", "[/x]", "../..", "x" * 5000, [], [1], {},
@@ -56,7 +60,7 @@ def of_values() -> st.SearchStrategy[Any]:
 
 def _changed(data: bytes, which: float, value: Any, gone: bool) -> bytes:
     content = json.loads(data)
-    places = list(_places(content))
+    places = list(places_in(content))
     inside, key = places[int(which * len(places))]
     if gone and isinstance(inside, dict):
         del inside[key]
@@ -65,14 +69,29 @@ def _changed(data: bytes, which: float, value: Any, gone: bool) -> bytes:
     return json.dumps(content).encode()
 
 
-def _places(content: Any):
+def places_in(content: Any):
+    """Containers and keys of all that is in a content."""
     for key in content if isinstance(content, dict) else range(len(content)):
         yield content, key
         if isinstance(content[key], dict | list):
-            yield from _places(content[key])
+            yield from places_in(content[key])
 
 
 NO_FILES = ("gone", "folder", "pipe", "loop", "dangling", "huge", "device")
+
+
+def of_files(*more: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
+    """Damages of a file for :func:`put`."""
+    return st.one_of(of_bytes(), *more, st.sampled_from(NO_FILES))
+
+
+def put(path: Path, drawn: Any, whole: bytes) -> None:
+    """Damages a file whose content was ``whole``."""
+    if isinstance(drawn, str):
+        replace(path, drawn)
+    else:
+        remove(path)
+        path.write_bytes(drawn[1](whole))
 
 
 def replace(path: Path, kind: str) -> None:
@@ -99,6 +118,26 @@ def remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
+
+
+def draws(count: int, strategy: st.SearchStrategy[Any], check: Callable[[Any], object]) -> None:
+    """Checks so many drawn values."""
+
+    @settings(max_examples=count, database=None, suppress_health_check=list(HealthCheck))
+    @given(strategy)
+    def run(drawn: Any) -> None:
+        check(drawn)
+
+    run()
+
+
+def one_line_or(call: Callable[[], Any]) -> Any:
+    """What a call gives, or None where it refuses in one line."""
+    try:
+        return call()
+    except BidexError as error:
+        assert str(error).strip() and "\n" not in str(error) and len(str(error)) < 3000
+        return None
 
 
 def listing(*folders: Path) -> dict[str, tuple[int, int]]:

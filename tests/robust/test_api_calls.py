@@ -9,14 +9,16 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
 from bidex_meta import Benchmark
 from bidex_meta.benchmark import Task, make_task_world
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import ZeroAgent, evaluate
 from bidex_meta.suite import load_suite
+from tests.fakes import ToyWorld
+from tests.robust import damage
 
 ROWS = 2
 NAN = float("nan")
@@ -38,15 +40,7 @@ def world():
 
 
 def draws(count: int, check: Callable[..., None], *strategies: st.SearchStrategy[Any]) -> None:
-    @settings(max_examples=count, database=None, suppress_health_check=list(HealthCheck))
-    @given(st.tuples(*strategies))
-    def run(drawn: tuple[Any, ...]) -> None:
-        try:
-            check(*drawn)
-        except BidexError as error:
-            assert str(error).strip() and "\n" not in str(error)
-
-    run()
+    damage.draws(count, st.tuples(*strategies), lambda drawn: damage.one_line_or(partial(check, *drawn)))
 
 
 odd = st.sampled_from(ODD)
@@ -115,9 +109,6 @@ def test_steps_resets_and_pools(world: Any) -> None:
 
 @pytest.mark.parametrize("call", ["make", "reset", "step", "evaluate", "learn"])
 def test_another_default_precision_is_refused(call: str, world: Any) -> None:
-    from bidex_algos.onpolicy.mtppo import MTPPO, MTPPOConfig
-    from tests.fakes import ToyWorld
-
     toy = ToyWorld(6, "SAME_STEP")
     world.reset(seed=0)
     calls: dict[str, Callable[[], object]] = {
@@ -141,7 +132,7 @@ def test_saved_states(world: Any) -> None:
 
     def load(which: float, value: Any, gone: bool) -> None:
         state = copy.deepcopy(good)
-        places = list(_places(state))
+        places = list(damage.places_in(state))
         inside, key = places[int(which * len(places))]
         if gone and isinstance(inside, dict):
             del inside[key]
@@ -153,13 +144,6 @@ def test_saved_states(world: Any) -> None:
     draws(30, world.load_state_dict, odd)
     world.load_state_dict(good)
     assert torch.isfinite(world.step(torch.zeros(ROWS, 40))[0]).all()
-
-
-def _places(content: Any):
-    for key in content if isinstance(content, dict) else range(len(content)):
-        yield content, key
-        if isinstance(content[key], dict | list) and len(content[key]):
-            yield from _places(content[key])
 
 
 def test_evaluations_and_tasks(world: Any) -> None:

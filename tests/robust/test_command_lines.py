@@ -4,10 +4,9 @@ import os
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from tests.robust.damage import listing
+from tests.robust.damage import draws, listing
 from tests.robust.lines import called, own_time, working_folder
 
 VALUES = (
@@ -45,22 +44,10 @@ SWITCHES = {
     "witness": ["--all", "--json"],
     "bench": ["--json"],
 }
-PLACED = {
-    "list": 1,
-    "bench": 1,
-    "baseline": 1,
-    "evaluate": 1,
-    "verify": 1,
-    "control": 1,
-    "compare": 2,
-    "plot": 1,
-    "report": 1,
-}
-"""Words before the flags."""
-
-
 NAMED = ("list", "bench", "baseline")
 """Commands whose first word is no run folder."""
+PLACED = dict.fromkeys((*NAMED, "evaluate", "verify", "control", "plot", "report"), 1) | {"compare": 2}
+"""Words before the flags."""
 
 
 @pytest.fixture(scope="module")
@@ -132,23 +119,8 @@ COUNTS = {
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs pipes and links")
+@pytest.mark.parametrize("times", [1, pytest.param(10, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("command", COUNTS)
-def test_odd_command_lines(command: str, place: Path) -> None:
-    @settings(max_examples=COUNTS[command], database=None, suppress_health_check=list(HealthCheck))
-    @given(lines(command))
-    @example([command, ""])
-    def run(arguments: list[str]) -> None:
-        judge(arguments, place)
-
-    run()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("command", COUNTS)
-def test_many_odd_command_lines(command: str, place: Path) -> None:
-    @settings(max_examples=10 * COUNTS[command], database=None, suppress_health_check=list(HealthCheck))
-    @given(lines(command))
-    def run(arguments: list[str]) -> None:
-        judge(arguments, place)
-
-    run()
+def test_odd_command_lines(command: str, times: int, place: Path) -> None:
+    judge([command, ""], place)
+    draws(times * COUNTS[command], lines(command), lambda arguments: judge(arguments, place))

@@ -65,15 +65,12 @@ def test_every_learner_can_be_killed() -> None:
     assert FLAGS.keys() == ALGOS.keys()
 
 
-@pytest.mark.parametrize("algo", ["mtsac", "rl2", "iql"])
-def test_killed_runs_end_as_unbroken_ones(algo: str, killer: subprocess.Popen[str], place: Path) -> None:
-    killed_often(algo, 0, killer, place)
+QUICK = [(algo, 0) for algo in ("mtsac", "rl2", "iql")]
+SLOW = [pytest.param(algo, seed, marks=pytest.mark.slow) for seed in (1, 2) for algo in FLAGS]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2])
-@pytest.mark.parametrize("algo", FLAGS)
-def test_killed_runs_of_every_learner(algo: str, seed: int, killer: subprocess.Popen[str], place: Path) -> None:
+@pytest.mark.parametrize(("algo", "seed"), QUICK + SLOW)
+def test_killed_runs_end_as_unbroken_ones(algo: str, seed: int, killer: subprocess.Popen[str], place: Path) -> None:
     killed_often(algo, seed, killer, place)
 
 
@@ -85,25 +82,17 @@ def test_killed_runs_that_record(algo: str, seed: int, killer: subprocess.Popen[
     assert killed_often(algo, seed, killer, place, record=True)["recorded"]
 
 
-def killed_before_operations(killer: subprocess.Popen[str], place: Path, name: str, stride: int) -> int:
-    """Kills runs of four iterations, each before another operation on a file of its folder; how many."""
-    whole = Victim(killer, arguments("mtppo", 4), place / f"{name}whole")
+@pytest.mark.parametrize("stride", [15, pytest.param(1, marks=pytest.mark.slow)])
+def test_killed_before_operations_on_files(stride: int, killer: subprocess.Popen[str], place: Path) -> None:
+    """Runs of four iterations, each killed before another operation on a file of its folder."""
+    whole = Victim(killer, arguments("mtppo", 4), place / f"{stride}whole")
     assert whole.go_on()["code"] == 0
     expected, operations = outcome(whole.path), whole.counts()["operations"]
     wrong = {}
     for number in range(1, operations + 1, stride):
-        run = Victim(killer, whole.arguments, place / f"{name}{number}")
+        run = Victim(killer, whole.arguments, place / f"{stride}at{number}")
         assert run.go_on(aim=("operations", number))["code"] == KILLED
         assert run.go_on()["code"] == 0, (number, run.log.read_text())
         wrong[number] = unequal(outcome(run.path), expected)
-    assert not any(wrong.values()), f"of {operations}: {wrong}"
-    return len(wrong)
-
-
-def test_killed_before_operations_on_files(killer: subprocess.Popen[str], place: Path) -> None:
-    killed_before_operations(killer, place, "some", 15)
-
-
-@pytest.mark.slow
-def test_killed_beforekilled_before_operations_on_files(killer: subprocess.Popen[str], place: Path) -> None:
-    print(f"kills: {killed_before_operations(killer, place, 'each', 1)} operations")
+    print(f"kills: {len(wrong)} of {operations} operations")
+    assert not any(wrong.values()), wrong

@@ -3,17 +3,20 @@
 import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from io import StringIO
 from pathlib import Path
 
 import pytest
 import torch
 
+from bidex_algos.onpolicy.mtppo import MTPPO
 from bidex_meta.cli import main
-from bidex_meta.runs import RunFolder
+from bidex_meta.runs import Progress, Recorder, RunFolder
 from bidex_meta.worlds.own import OwnSuite
 from tests.fakes import ToyWorld, run_config
 
@@ -69,8 +72,6 @@ def test_a_start_that_was_torn_begins_again(toy: None, tmp_path: Path, capsys: p
 def test_a_run_that_failed_before_it_learned_anything_does_not_block_its_command(
     more: list[str], toy: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from bidex_algos.onpolicy.mtppo import MTPPO
-
     words = ["run", *SMALL, "--steps", "24", "--run-dir", str(tmp_path / "r"), *more]
 
     def fail(learner: object) -> None:
@@ -135,8 +136,6 @@ def test_places_that_cannot_be_written_are_told_before_a_world_is_built(
 
 
 def test_divergence_ends_in_one_line(run: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
-    from bidex_algos.onpolicy.mtppo import MTPPO
-
     def diverge(learner: object) -> None:
         raise FloatingPointError("mtppo: the loss is not finite after 48 steps; lower the step size.")
 
@@ -155,10 +154,6 @@ def test_a_full_disk_is_one_line(run: Path, capsys: pytest.CaptureFixture[str], 
 
 
 def test_a_deleted_run_folder_is_one_line(run: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
-    import shutil
-
-    from bidex_meta.runs import Recorder
-
     save = Recorder.save
     monkeypatch.setattr(Recorder, "save", lambda *a: (shutil.rmtree(run), save(*a)))
     # TensorBoard's thread would open its file anew while the folder is emptied.
@@ -220,10 +215,6 @@ def test_output_that_nobody_takes_is_no_traceback(line: str, code: int, tmp_path
 
 
 def test_a_terminal_that_is_gone_is_a_reader_that_has_ended() -> None:
-    from io import StringIO
-
-    from bidex_meta.runs import Progress
-
     class Gone(StringIO):
         def write(self, text: str) -> int:
             raise OSError(errno.EIO, "Input/output error")

@@ -13,6 +13,7 @@ import os
 import signal
 import sys
 import time
+import traceback
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn
@@ -153,8 +154,6 @@ def _child(job: dict[str, Any]) -> NoReturn:
     except SystemExit as stop:
         code = stop.code if isinstance(stop.code, int) else 70
     except BaseException:
-        import traceback
-
         traceback.print_exc()
     finally:
         sys.stdout.flush(), sys.stderr.flush()

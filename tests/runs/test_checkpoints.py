@@ -10,7 +10,6 @@ import torch
 
 from bidex_meta.errors import BidexError
 from bidex_meta.runs import Checkpoints
-from bidex_meta.runs.atomic import write_atomic
 
 
 def state(value):
@@ -65,20 +64,6 @@ def test_a_checkpoint_cannot_run_code(tmp_path):
     with pytest.raises(BidexError):
         Checkpoints(tmp_path).load()
     assert not (tmp_path / "pwned").exists()
-
-
-def test_a_failing_write_leaves_the_old_file_and_no_litter(tmp_path):
-    path = tmp_path / "file"
-    path.write_bytes(b"old")
-
-    def fail(file):
-        file.write(b"half")
-        raise OSError("disk full")
-
-    with pytest.raises(OSError, match="disk full"):
-        write_atomic(path, fail)
-    assert [found.name for found in tmp_path.iterdir()] == ["file"]
-    assert path.read_bytes() == b"old"
 
 
 _WRITER = """

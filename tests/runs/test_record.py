@@ -2,13 +2,16 @@ import io
 import json
 import math
 import os
+import resource
 
+import imageio.v3 as imageio
 import numpy as np
 import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from bidex_meta.config import RunConfig
 from bidex_meta.errors import BidexError
-from bidex_meta.runs import MetricsWriter, Progress, RunFolder, read_metrics, training_seconds
+from bidex_meta.runs import MetricsWriter, Progress, RunFolder, read_metrics
 from bidex_meta.runs import progress as progress_module
 from bidex_meta.runs.metrics import last_rows
 from bidex_meta.runs.plots import Curve, draw_adaptation, draw_learning, read_evaluation, save, svg
@@ -18,8 +21,6 @@ CONFIG = RunConfig(suite="MT4", task=None, algo="mtppo", seed=3, learner={"hidde
 
 
 def board_points(folder, tag):
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
     events = EventAccumulator(str(folder))
     events.Reload()
     return [(event.step, event.value) for event in events.Scalars(tag)]
@@ -103,13 +104,6 @@ def test_time_left_is_that_of_what_ends_first(rare_lines):
     assert "30 / 1,000,000,000,000,000 steps" in last and "0:00 left" in last
 
 
-def test_training_time_is_counted_over_resumes_and_known_of_older_runs():
-    older = [{"step": 1, "Perf/collection_time": 3.0, "Perf/learning_time": 1.0}, {"step": 2}]
-    assert training_seconds([]) == 0.0
-    assert training_seconds(older) == 4.0
-    assert training_seconds([*older, {"step": 3, "Perf/training_time": 6.0}]) == 6.0
-
-
 def test_progress_in_a_terminal_is_a_table(monkeypatch):
     class Terminal(io.StringIO):
         def isatty(self):
@@ -160,15 +154,7 @@ def test_a_file_without_a_meta_test_is_one_line(text, tmp_path):
         draw_adaptation(read_evaluation(path), path)
 
 
-def test_missing_matplotlib_names_the_extra(tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
-    with pytest.raises(BidexError, match=r"bidex-meta\[plot\]"):
-        draw_learning([])
-
-
 def test_picture_and_film_read_back(tmp_path):
-    import imageio.v3 as imageio
-
     frame = np.zeros((50, 70, 3), np.uint8)
     frame[:, :35, 0] = 255
     write_image(tmp_path / "a.png", frame)
@@ -182,8 +168,6 @@ def test_picture_and_film_read_back(tmp_path):
 @pytest.mark.skipif(os.name != "posix", reason="needs a limit of a file's size")
 @pytest.mark.parametrize("name", ["a.png", "a.webp", "a.mp4", "figure.png"])
 def test_a_disk_that_fills_leaves_what_was_there(name, tmp_path):
-    import resource
-
     path, frames = tmp_path / name, list(np.random.default_rng(0).integers(0, 256, (5, 200, 200, 3), np.uint8))
     path.write_text("earlier")
     figure = draw_learning([("mtppo", {"Train/return/Near": curve(2.0)})])

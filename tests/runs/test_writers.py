@@ -1,11 +1,12 @@
 """The loggers: what TensorBoard's file holds, and what wandb is told, by a fake."""
 
 import sys
+from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from bidex_meta.errors import BidexError
 from bidex_meta.runs.writers import make_writer
@@ -22,8 +23,6 @@ def use(writer, path):
 
 
 def test_tensorboard_holds_numbers_config_and_films(tmp_path):
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
     use(make_writer("tensorboard", tmp_path), tmp_path / "a.mp4")
     board = EventAccumulator(str(tmp_path), size_guidance={"tensors": 0, "images": 0})
     board.Reload()
@@ -40,10 +39,10 @@ class FakeWandb(SimpleNamespace):
     def __init__(self):
         super().__init__(told=[], Video=lambda path, format: (path, format))
 
-    def init(self, **options: Any):
+    def init(self, **options: object):
         self.told.append(("init", options))
 
-        def note(name: str) -> Any:
+        def note(name: str) -> Callable[..., None]:
             return lambda *given, **named: self.told.append((name, given, named))
 
         config = SimpleNamespace(update=note("config"))

@@ -73,9 +73,11 @@ class PushBlock(Bodies):
         return within(terms, d_1 - 0.1, d_2 - 0.1)
 
     def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """Both near their places, now and then exchanged."""
+        places = list(self.places.values())[:: -1 if rng.random() < 0.1 else 1]
         return {
             name: pose(shifted(np.array(place), *rng.uniform(-0.1, 0.1, 2), 0.005), Rotation.identity())
-            for name, place in self.places.items()
+            for name, place in zip(self.places, places, strict=True)
         }
 
 
@@ -169,8 +171,9 @@ class GraspAndPlace(Bodies):
         return Judgement(terms, surely and upright > 0, False, 0.0 if surely != perhaps else abs(upright))
 
     def scatter(self, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """The block over the middle of the bucket, or beside it."""
+        """The block over the middle of the bucket, beside it, under it or over its rim, the bucket any way up."""
         position, turn = start(data, "bucket", task)
-        turn = some_tilt(rng, 1.2) * turn
-        beside = (0.12, 0, 0) if rng.random() < 0.3 else (0, 0, rng.uniform(0.01, 0.025))
-        return {"bucket": pose(position, turn), "block": pose(position + turn.apply(beside), turn)}
+        turn = some_tilt(rng, 1.2 if rng.random() < 0.8 else np.pi) * turn
+        elsewhere = ((0.12, 0.0, 0.0), (0.0, 0.0, -0.085), (0.0, 0.0, 0.08))[rng.integers(3)]
+        place = elsewhere if rng.random() < 0.3 else (0.0, 0.0, rng.uniform(0.01, 0.025))
+        return {"bucket": pose(position, turn), "block": pose(position + turn.apply(place), turn)}

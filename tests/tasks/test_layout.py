@@ -11,7 +11,7 @@ from bidex_meta.world import World
 from tests.hands import figures
 from tests.tasks.formulas import FORMULAS
 from tests.tasks.oracle import Goal, frame
-from tests.tasks.tables import SIZES, TABLES, block_name
+from tests.tasks.tables import EPISODE_STEPS, SIZES, TABLES, block_name
 from tests.tasks.worlds import (
     Lens,
     each_case,
@@ -46,6 +46,7 @@ def test_layout_is_the_printed_table(name: str, moving: bool) -> None:
         assert task.layout.range(block_name(what)) == slice(first, last + 1), what
     assert [first for first, *_ in table] == [0, *(last + 1 for _, last, _ in table[:-1])]
     assert (task.observation_size, task.action_size) == SIZES[name, moving] and task.layout.size == table[-1][1] + 1
+    assert task.episode_steps == EPISODE_STEPS[name] and repr(task).startswith(name)
 
 
 @each_case

@@ -4,15 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from bidex_meta.tasks import registry
 from bidex_meta.world import World
 from tests.tasks.formulas import FAILING, FORMULAS
-from tests.tasks.tables import EPISODE_STEPS
 from tests.tasks.worlds import Lens, each_case, engine_of, mixed_world, scene_of, set_pose, task_of, world_of
 
 ROWS, STEPS = 12, 60
-LAST = 75
-"""How many steps before its time limit an untouched episode begins at the earliest."""
 
 
 def judgements(world: World, name: str, lens: Lens) -> list:
@@ -87,31 +83,6 @@ def test_rewards_success_and_ends_are_the_printed_ones(name: str, moving: bool) 
     assert min(seen["success"], seen["reset"]) >= 5, seen
     assert seen["failure"] >= 5 if name in FAILING else seen["failure"] == 0, seen
     assert seen["success"] < 0.5 * seen["rows"]
-
-
-@each_case
-def test_untouched_rollouts_to_the_time_limit(name: str, moving: bool) -> None:
-    """Nothing moved by hand, autoreset on: rewards of the rows that go on; every end is a failure or the time limit."""
-    world = world_of(name, moving, 4, tasks=3, autoreset_mode="SAME_STEP")
-    generator = torch.Generator().manual_seed(4)
-    world.reset(seed=3)
-    limit = EPISODE_STEPS[name]
-    assert (world.max_episode_steps == limit).all() and registry.get(name, moving).episode_steps == limit
-    world.episodes.elapsed.clamp_(min=limit - LAST)
-    elapsed, ends = world.episodes.elapsed.clone(), 0
-    lens = Lens(scene_of(world).model)
-    for step in range(min(limit, LAST) + 5):
-        action = torch.rand(4, world.action_size, generator=generator) * 2 - 1
-        _, reward, terminated, truncated, info = world.step(action)
-        elapsed += 1
-        ended = terminated | truncated
-        assert torch.equal(ended, info["_final_obs"])
-        if step % 10 == 0:
-            compare(~ended.numpy(), judgements(world, name, lens), reward.numpy(), info)
-        assert torch.equal(truncated, (elapsed >= limit) & ~terminated)
-        ends += int(ended.sum())
-        elapsed[ended] = 0
-    assert ends >= 4
 
 
 @pytest.mark.parametrize("scale", [0.1, 10.0])

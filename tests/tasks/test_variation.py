@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from bidex_meta.errors import BidexError
 from bidex_meta.tasks import registry
-from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.variation import VariationSpace
 from tests.tasks.worlds import each_case
 
@@ -103,29 +101,3 @@ def test_what_is_frozen_is_one_row_a_task(name: str, moving: bool) -> None:
 def test_a_lopsided_space_is_refused() -> None:
     with pytest.raises(ValueError, match="one length"):
         VariationSpace(("a", "b"), (0.0,), (1.0, 1.0))
-
-
-def test_the_registry_names_the_twenty_classes() -> None:
-    assert sorted(registry.names()) == sorted(SPACES) and len(SPACES) == 20
-
-
-@pytest.mark.parametrize("name", registry.names())
-def test_registry_gives_each_class_with_both_bases(name: str) -> None:
-    task = registry.get(name)
-    assert isinstance(task, TaskClass) and task.name == name and task.summary and type(task).__doc__
-    assert task.moving_base == (name != "HandOver")
-    for moving in (True, False):
-        chosen = registry.get(name, moving)
-        assert (chosen.moving_base, chosen.action_size) == (moving, 52 if moving else 40)
-        assert ("moving" if moving else "fixed") in repr(chosen) and name in repr(chosen)
-
-
-@pytest.mark.parametrize(
-    "typo, near", [("CatchUnderam", "CatchUnderarm"), ("handover", "HandOver"), ("TwoCatch", "TwoCatch")]
-)
-def test_an_unknown_class_is_answered_with_the_nearest(typo: str, near: str) -> None:
-    with pytest.raises(BidexError) as caught:
-        registry.get(typo)
-    text = str(caught.value)
-    assert "\n" not in text and typo in text and near in text.split("Known:")[0]
-    assert all(name in text.split("Known:")[1] for name in registry.names())

@@ -1,4 +1,4 @@
-"""Runs as files of JSON: what they keep, that tables and pictures take them like folders, and what is refused."""
+"""Runs as files of JSON: tables and pictures take them like folders; what is refused; the best known."""
 
 import json
 from pathlib import Path
@@ -10,9 +10,10 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import read_groups
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.stored import StoredRun, open_run
+from bidex_meta.witness.replay import Replay
 from tests.fakes import change, evaluated_run, log
-from tests.pages import ROOT
 from tools import collect as tool
+from tools import experts
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 
@@ -20,11 +21,9 @@ COMMIT = "0123456789abcdef0123456789abcdef01234567"
 def evaluated(root: Path, seed: int, success: float, name: str | None = None, rows: int = 500, **learner) -> Path:
     """A run of two classes with a curve, as the commands leave it; without weights."""
     path = evaluated_run(root, seed, {"A": success, "B": 0.25}, **learner)
-    lines = [
-        {"step": 2 * i, "time": 1.0, "Train/success/A": i / rows, "Train/return/B": 1.0, "Perf/training_time": 3.0 * i}
-        for i in range(1, rows + 1)
-    ]
-    log(path, *lines)
+    usual = {"time": 1.0, "Train/return/B": 1.0}
+    steps = range(1, rows + 1)
+    log(path, *({**usual, "step": 2 * i, "Train/success/A": i / rows, "Perf/training_time": 3.0 * i} for i in steps))
     change(path, steps=2 * rows)
     (path / "versions.json").write_text(json.dumps({"git": {"commit": COMMIT, "dirty": False}}))
     return path if name is None else path.rename(root / name)
@@ -57,76 +56,6 @@ def test_tables_of_files_are_those_of_the_folders(tmp_path: Path, capsys: pytest
     assert COMMIT[:10] in (tmp_path / "r.html").read_text()
 
 
-def test_what_a_file_keeps(tmp_path: Path) -> None:
-    folder = RunFolder.open(evaluated(tmp_path, 0, 1 / 3))
-    content = tool.condensed(folder, "x", 7)
-    curves = content["curves"]
-    assert len(curves["step"]) == 60 and curves["step"][-1] == 1000 == content["steps"]
-    assert curves["Perf/training_time"][-1] == 1500.0 == content["seconds"]
-    # Each point is the mean of the stretch that ends with it.
-    first = curves["step"][0] // 2
-    assert curves["Train/success/A"][0] == pytest.approx((first + 1) / 2 / 500, rel=1e-3)
-    assert content["evaluation"]["policy"]["classes"]["A"]["success"] == 0.33333
-    assert (content["suite"], content["parameters"]) == ({"name": "MT4", "version": 1}, 7)
-    assert content["engine"] == "c"
-    path = tmp_path / "x.json"
-    path.write_text(tool.text(content))
-    assert json.loads(path.read_text()) == content
-    assert open_run(path).metrics()[-1] == {"step": 1000, **{t: c[-1] for t, c in curves.items() if t != "step"}}
-
-
-def test_no_folder_of_this_machine_stays(tmp_path: Path) -> None:
-    path, suite = evaluated(tmp_path, 0, 0.5), tmp_path / "own.toml"
-    suite.write_text((ROOT / "suites" / "MT4.toml").read_text().replace('"MT4"', '"own"'))
-    folder = RunFolder.open(path)
-    change(folder.path, suite=str(suite), start_from=str(tmp_path / "other"))
-    found = json.loads((path / "evaluation.json").read_text())
-    (path / "evaluation.json").write_text(json.dumps({"run": str(path), **found}))
-    content = tool.condensed(folder, "x", None)
-    assert str(tmp_path) not in json.dumps(content)
-    assert content["suite"]["name"] == "own" and "CatchUnderarm" in content["suite"]["file"]
-    assert content["config"]["suite"] == "own.toml"
-    change(folder.path, suite=None, task="HandOver", object=str(tmp_path / "mug.xml"))
-    content = tool.condensed(folder, "x", None)
-    assert str(tmp_path) not in json.dumps(content) and content["config"]["object"] == "mug.xml"
-
-
-def test_a_run_that_a_return_ended_is_kept_as_it_ended(tmp_path: Path) -> None:
-    path = evaluated(tmp_path, 0, 0.5)
-    folder = log(path, *({"step": 2 * i, "Train/mean_return": i / 50, "Train/return/A": 1.0} for i in range(1, 501)))
-    found = json.loads((path / "evaluation.json").read_text())
-    (path / "evaluation.json").write_text(json.dumps({"steps": 1000, **found}))
-    change(folder.path, steps=10**9, stop_at_return=10.0)
-    collect(path, into=tmp_path / "data")
-    stored = StoredRun.open(tmp_path / "data" / f"{path.name}.json")
-    [group] = read_groups([stored])
-    assert (stored.content["steps"], stored.goal, group.steps) == (1000, 1000, 1000)
-    change(folder.path, stop_at_return=10.5)
-    with pytest.raises(BidexError, match="evaluated at 1,000 steps"):
-        collect(path, into=tmp_path / "data")
-
-
-def test_a_run_of_changed_code_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    clean, changed = (evaluated(tmp_path, seed, 0.5, f"run{seed}") for seed in (0, 1))
-    (changed / "versions.json").write_text(json.dumps({"git": {"commit": COMMIT, "dirty": True}}))
-    collect(clean, changed, into=tmp_path / "data")
-    told = capsys.readouterr()
-    assert (
-        told.err
-        == f"{tmp_path / 'data' / 'run1.json'} was made by changed code: its commit alone does not make it again.\n"
-    )
-    assert len(told.out.split()) == 2
-
-
-@pytest.mark.parametrize(
-    "name, arm",
-    [("MT4-soft modules-seed0", "soft modules"), ("mt4_gamma_s12", "gamma"), ("2026-11-21_10-00-00_seed0", "mtppo"),
-     ("MT4", "mtppo"), ("again", "again")],
-)  # fmt: skip
-def test_an_arm_is_the_name_without_suite_and_seed(name: str, arm: str) -> None:
-    assert tool.arm_of(Path("runs") / name, {"suite": "MT4", "task": None, "algo": "mtppo"}) == arm
-
-
 def test_what_is_refused_leaves_nothing_written(tmp_path: Path) -> None:
     good, into = evaluated(tmp_path, 0, 0.5, "good"), tmp_path / "data"
     bad = evaluated(tmp_path, 1, 0.5, "bad")
@@ -149,25 +78,11 @@ def test_what_is_refused_leaves_nothing_written(tmp_path: Path) -> None:
     (bad / "versions.json").write_text(json.dumps({"git": {"commit": COMMIT}}))
     (bad / "metrics.jsonl").write_text("")
     refused("holds nothing")
-    (bad / "config.json").write_text("{}")
-    refused("config.json: ")
     collect(good, into=into)
     collect(good, into=into)  # once more is no harm
-    folder = RunFolder.open(good)
-    change(folder.path, seed=5)
+    change(good, seed=5)
     with pytest.raises(BidexError, match="is of another run than"):
         collect(good, into=into)
-
-
-def test_a_meta_test_of_test_tasks_alone_need_not_show_what_was_trained(tmp_path: Path) -> None:
-    run = evaluated(tmp_path, 0, 0.5)
-    rows = {"classes": {"C": {"success": 1.0, "return": 1.0, "score": None}}}
-    of_test = {"before": rows, "after": rows}
-    (run / "evaluation.json").write_text(json.dumps({"splits": {"test": of_test}}))
-    assert tool.condensed(RunFolder.open(run), "x", 7)["evaluation"]["splits"].keys() == {"test"}
-    (run / "evaluation.json").write_text(json.dumps({"splits": {"train": of_test, "test": of_test}}))
-    with pytest.raises(BidexError, match="of another run"):
-        tool.condensed(RunFolder.open(run), "x", 7)
 
 
 def test_a_damaged_file_is_refused(tmp_path: Path) -> None:
@@ -190,3 +105,23 @@ def test_a_damaged_file_is_refused(tmp_path: Path) -> None:
     path.write_text(tool.text(content))
     [group] = read_groups([StoredRun.open(path)])
     assert group.paths == [path]
+
+
+def test_the_expert_is_the_best_of_witness_script_and_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    totals = {"HandOver": 40.0, "CatchAbreast": 5.0, "CatchUnderarm": 90.0}  # of which the last no longer holds
+    monkeypatch.setattr(experts, "witness_path", lambda name: Path(__file__) if name in totals else tmp_path / "none")
+    monkeypatch.setattr(experts, "load_witness", lambda name: name)
+    succeeded = {"CatchUnderarm": 3}
+    monkeypatch.setattr(experts, "replay", lambda name, *_: Replay(totals[name], 1, succeeded.get(name, 9), 0.0))
+    scripts = {"HandOver": {"return": 39.0}, "TwoCatchUnderarm": {"return": 7.0}}
+    monkeypatch.setattr(experts, "load", lambda kind: scripts if kind == "script" else {})
+    suite = evaluated_run(tmp_path, 3, {"HandOver": 3.0, "CatchAbreast": 2.0})
+    experts.experts(
+        (suite, evaluated_run(tmp_path, 3, {"CatchAbreast": 1.0}, task="CatchAbreast")), "MT4", tmp_path / "o"
+    )
+    found = json.loads((tmp_path / "o").read_text())["classes"]
+    assert {name: (row["return"], row["source"]) for name, row in found.items()} == {
+        "HandOver": (40.0, "witness, task 0"),
+        "CatchAbreast": (20.0, "mtppo on MT4, 1,000 steps, seed 3"),
+        "TwoCatchUnderarm": (7.0, "script"),
+    }

@@ -33,12 +33,6 @@ def test_every_class_has_a_section_with_all_that_a_newcomer_asks() -> None:
         assert f"| observation, action | {observation}, {action} |" in section, name
 
 
-def test_ten_classes_hide_nothing_that_matters() -> None:
-    lines = [re.findall(r"^\| ML mask \| (.*) \|$", section, flags=re.M) for section in sections().values()]
-    assert sum(line == ["none"] for line in lines) == 10
-    assert "| ML mask | yaw_change; cup_x, cup_y (success only) |" in sections()["SwingCup"]
-
-
 def test_pictures_are_written_where_the_page_looks_for_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn = []
 
@@ -69,8 +63,3 @@ def test_pictures_are_written_where_the_page_looks_for_them(tmp_path: Path, monk
 def numbered(at: list[int], width: int, height: int) -> list[np.ndarray]:
     """A frame for each step that is asked for, once and in order, as bright as its number."""
     return [np.full((height, width, 3), step, np.uint8) for step in sorted(set(at))]
-
-
-def test_a_witness_that_succeeds_at_once_or_at_the_end_still_has_five_frames() -> None:
-    assert gallery.moments(0, 30) == [0, 0, 1, 1, 30]
-    assert gallery.moments(29, 30) == [0, 10, 20, 30, 30]

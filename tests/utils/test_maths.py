@@ -23,41 +23,18 @@ def normal(q: np.ndarray) -> tuple[torch.Tensor, Rotation]:
     return torch.from_numpy(q), Rotation.from_quat(q)
 
 
-@given(quaternions, quaternions)
-def test_multiply(a: np.ndarray, b: np.ndarray) -> None:
-    (p, first), (q, second) = normal(a), normal(b)
-    found = maths.multiply(p, q)
-    np.testing.assert_allclose(found.numpy(), (first * second).as_quat(), atol=1e-12)
+@given(quaternions, quaternions, vectors, vectors)
+def test_products_inverses_and_turned_vectors(a: np.ndarray, b: np.ndarray, v: np.ndarray, w: np.ndarray) -> None:
+    (p, first), (q, second), x, y = normal(a), normal(b), torch.from_numpy(v), torch.from_numpy(w)
+    np.testing.assert_allclose(maths.multiply(p, q).numpy(), (first * second).as_quat(), atol=1e-12)
     np.testing.assert_allclose(maths.multiply(p[0], q).numpy(), (first[0] * second).as_quat(), atol=1e-12)
-
-
-@given(quaternions)
-def test_conjugate(a: np.ndarray) -> None:
-    q, turn = normal(a)
-    inverse = maths.conjugate(q)
-    np.testing.assert_allclose(Rotation.from_quat(inverse.numpy()).as_matrix(), turn.inv().as_matrix(), atol=1e-12)
-    np.testing.assert_allclose(maths.multiply(q, inverse).numpy(), [[0, 0, 0, 1]] * 4, atol=1e-12)
-
-
-@given(quaternions, vectors)
-def test_rotate(a: np.ndarray, v: np.ndarray) -> None:
-    q, turn = normal(a)
-    np.testing.assert_allclose(maths.rotate(q, torch.from_numpy(v)).numpy(), turn.apply(v), atol=1e-9)
-    np.testing.assert_allclose(maths.rotate(q, torch.from_numpy(v[0])).numpy(), turn.apply(v[0]), atol=1e-9)
-    np.testing.assert_allclose(maths.rotate(q[0], torch.from_numpy(v)).numpy(), turn[0].apply(v), atol=1e-9)
-
-
-@given(vectors, vectors)
-def test_norm_and_dot(a: np.ndarray, b: np.ndarray) -> None:
-    x, y = torch.from_numpy(a), torch.from_numpy(b)
-    np.testing.assert_allclose(maths.norm(x).numpy(), np.linalg.norm(a, axis=1), rtol=1e-12)
-    np.testing.assert_allclose(maths.dot(x, y).numpy(), np.einsum("ij,ij->i", a, b), atol=1e-10)
-
-
-@given(quaternions)
-def test_orders_of_quaternion_entries(a: np.ndarray) -> None:
-    q, turn = normal(a)
-    np.testing.assert_allclose(maths.wxyz(q).numpy(), turn.as_quat(scalar_first=True), atol=1e-15)
+    np.testing.assert_allclose(maths.multiply(q, maths.conjugate(q)).numpy(), [[0, 0, 0, 1]] * 4, atol=1e-12)
+    np.testing.assert_allclose(maths.rotate(q, x).numpy(), second.apply(v), atol=1e-9)
+    np.testing.assert_allclose(maths.rotate(q, x[0]).numpy(), second.apply(v[0]), atol=1e-9)
+    np.testing.assert_allclose(maths.rotate(q[0], x).numpy(), second[0].apply(v), atol=1e-9)
+    np.testing.assert_allclose(maths.norm(x).numpy(), np.linalg.norm(v, axis=1), rtol=1e-12)
+    np.testing.assert_allclose(maths.dot(x, y).numpy(), np.einsum("ij,ij->i", v, w), atol=1e-10)
+    np.testing.assert_allclose(maths.wxyz(q).numpy(), second.as_quat(scalar_first=True), atol=1e-15)
     np.testing.assert_array_equal(maths.xyzw(maths.wxyz(q)).numpy(), q.numpy())
 
 

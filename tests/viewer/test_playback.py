@@ -12,7 +12,7 @@ from bidex_meta.cli import main
 from bidex_meta.evaluation.play import ZeroAgent
 from bidex_meta.utils import gl_backend
 from bidex_meta.viewer import playback
-from bidex_meta.viewer.browser import colour, shape, visible
+from bidex_meta.viewer.browser import Browser, colour, shape, visible
 from bidex_meta.viewer.playback import Stage
 from bidex_meta.worlds import Worlds
 
@@ -119,8 +119,6 @@ def test_shapes_fill_the_boxes_that_mujoco_knows():
 
 def test_the_page_shows_the_row_and_obeys(stage):
     pytest.importorskip("viser")
-    from bidex_meta.viewer.browser import Browser
-
     page = Browser(stage, port=18_080)
     try:
         page.show(stage)

@@ -9,7 +9,8 @@ import torch
 from bidex_meta.engine.cpu import CpuEngine
 from bidex_meta.tasks import registry
 from bidex_meta.world import World
-from tests.world.breaking import ROW, WITHIN, engine_of, ways
+from tests.tasks.worlds import engine_of
+from tests.world.breaking import ROW, WITHIN, ways
 from tests.world.play import class_world, random_actions
 
 ROWS = 3

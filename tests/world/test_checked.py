@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from bidex_meta.errors import BidexError
-from bidex_meta.utils.validation import whole_number
 from bidex_meta.world import World
+from bidex_meta.worlds.humanoid import HumanoidWorld
 from tests.world.play import engine_state, flat, suite_world
 
-NAN, INF = float("nan"), float("inf")
+NAN = float("nan")
 ROWS = 4
 
 
@@ -46,42 +46,23 @@ def unchanged(world: Any, before: dict[str, Any]) -> bool:
     return same(world.state_dict(), before)
 
 
-@pytest.mark.parametrize(
-    "seed", [-1, 1.9, "1", True, [0], np.array([1, 2]), 10**5000, NAN], ids=lambda s: type(s).__name__
-)
-def test_seeds(world: World, seed: Any) -> None:
-    before = world.state_dict()
-    assert "seed" in refused(world.reset, seed=seed)
-    assert unchanged(world, before)
-    fine: Any = np.int64(3)
-    world.reset(seed=fine)
-    assert world.seed == 3 and type(world.seed) is int
-
-
 POOL = np.full((2, 5), 0.1)
 BAD_POOLS = {
     "a NaN": (np.where(np.eye(2, 5) > 0, NAN, 0.1), r"goal_x = nan in row 0"),
-    "an infinity": (np.where(np.eye(2, 5) > 0, -INF, 0.1), "= -inf in row 0"),
     "a size that single precision cannot square": (np.full((1, 5), 1e300), r"1e\+300"),
     "text": (np.full((1, 5), "a"), "no array of real numbers"),
-    "none": (None, "no array of real"),
     "ragged": ([[1.0], [1.0, 2.0]], "no array of real numbers"),
     "complex": (np.full((1, 5), 1j), "no array of real"),
 }
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("kind", BAD_POOLS)
-def test_pools(world: World, kind: str) -> None:
-    bad, message = BAD_POOLS[kind]
+def test_pools(world: World) -> None:
     before = world.state_dict()
-    with pytest.raises(BidexError, match=message):
-        world.set_tasks({"HandOver": POOL, "CatchUnderarm": bad})
-    assert unchanged(world, before)
-
-
-def test_pools_by_slot() -> None:
-    world = suite_world("MT4", ROWS)
+    for bad, message in BAD_POOLS.values():
+        with pytest.raises(BidexError, match=message):
+            world.set_tasks({"HandOver": POOL, "CatchUnderarm": bad})
+        assert unchanged(world, before)
     assert "dict" in refused(world.set_tasks, [POOL])
     assert "got 3" in refused(world.set_tasks, {3: POOL})
 
@@ -103,19 +84,27 @@ def test_the_world_keeps_no_array_of_the_callers() -> None:
     assert "numbers within" in refused(World, slots, ROWS, threads=1)
 
 
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize(
-    "action",
-    [None, "left", torch.zeros(ROWS), torch.zeros(ROWS, 51), torch.zeros(ROWS + 1, 52), torch.zeros(ROWS, 52, 1),
-     torch.zeros(ROWS, 52, dtype=torch.complex64), torch.zeros(ROWS, 52).to_sparse(), np.full((ROWS, 52), "0.1"),
-     np.full((ROWS, 52), None), [[0.0] * 52] * 3 + [[0.0]], torch.zeros(ROWS, 52, device="meta"),
-     {"action": torch.zeros(ROWS, 52)}],
-    ids=lambda value: f"{type(value).__name__} {tuple(getattr(value, 'shape', ()))}"
+ACTIONS: tuple[Any, ...] = (
+    "left", torch.zeros(ROWS), torch.zeros(ROWS, 51), torch.zeros(ROWS, 52, 1), [[0.0] * 52] * 3 + [[0.0]],
+    torch.zeros(ROWS, 52, dtype=torch.complex64), torch.zeros(ROWS, 52).to_sparse(), np.full((ROWS, 52), "0.1"),
+    np.full((ROWS, 52), None), torch.zeros(ROWS, 52, device="meta"), {"action": torch.zeros(ROWS, 52)},
 )  # fmt: skip
-def test_actions(world: World, action: Any) -> None:
+MASKS: tuple[Any, ...] = (
+    torch.ones(ROWS), np.ones(ROWS, int), [True] * (ROWS - 1), torch.ones(ROWS, 1, dtype=torch.bool), "all",
+    np.array([True, None, True, True], object), [[True], [True, False]], {"rows": [0]}, 10**30,
+    torch.ones(ROWS, dtype=torch.bool, device="meta"), torch.ones(ROWS, dtype=torch.bool).to_sparse(),
+)  # fmt: skip
+
+
+@pytest.mark.filterwarnings("error")
+def test_actions_and_masks(world: World) -> None:
     before = world.state_dict()
-    assert "actions of shape (4, 52), got " in refused(world.step, action)
-    assert unchanged(world, before)
+    for action in ACTIONS:
+        assert "actions of shape (4, 52), got " in refused(world.step, action)
+        assert unchanged(world, before)
+    for mask in MASKS:
+        assert "reset_mask of shape (4,)" in refused(world.reset, options={"reset_mask": mask})
+        assert unchanged(world, before)
 
 
 def test_actions_of_other_types_are_taken_without_a_gradient() -> None:
@@ -151,80 +140,35 @@ def _spoilt(value: torch.Tensor) -> torch.Tensor:
     return value
 
 
-BAD_STATES: dict[str, tuple[str, Any]] = {
-    "no seed": ("seed", None),
-    "a negative seed": ("seed", lambda _: -1),
-    "other slots": ("slots", lambda slots: [*slots[1:], "x"]),
-    "no engines": ("engines", None),
-    "fewer engines": ("engines", lambda engines: engines[1:]),
-    "an engine's field missing": ("engines/0/qpos", None),
-    "an engine's field of another shape": ("engines/0/qpos", lambda value: value[:, 1:]),
-    "an engine's field of numbers": ("engines/0/qvel", lambda value: value.tolist()),
-    "NaN in an engine": ("engines/1/qvel", _spoilt),
-    "NaN time": ("engines/1/time", _spoilt),
-    "NaN tasks": ("tasks/0", _spoilt),
-    "tasks of another width": ("tasks/0", lambda value: value[:, 1:]),
-    "fewer pools": ("tasks", lambda tasks: tasks[1:]),
-    "no episodes": ("episodes", lambda _: None),
-    "an episode's counter missing": ("episodes/elapsed", None),
-    "an episode's counter of another type": ("episodes/elapsed", lambda value: value.double()),
-    "NaN observation": ("observation", _spoilt),
-    "a longer observation": ("observation", lambda value: torch.cat((value, value), dim=1)),
-    "NaN action": ("action", _spoilt),
-    "a task beyond the pool": ("task_index", lambda value: value + 50),
-    "a negative task": ("task_index", lambda value: value - 50),
-    "an episode of negative length": ("episodes/length", lambda value: value - 50),
-    "an action without numbers": ("action", lambda value: value.to("meta")),
-    "a sparse observation": ("observation", lambda value: value.to_sparse()),
-    "an engine's field without numbers": ("engines/0/qpos", lambda value: value.to("meta")),
-    "a sparse field of an engine": ("engines/0/qpos", lambda value: value.to_sparse()),
-    "an engine's field of complex numbers": ("engines/0/qpos", lambda value: value.to(torch.complex128)),
-    "an engine's field of whole numbers": ("engines/0/qvel", lambda value: value.long()),
-}
+BAD_STATES: tuple[tuple[str, Any], ...] = (
+    ("seed", None), ("seed", lambda _: -1), ("slots", lambda slots: [*slots[1:], "x"]),
+    ("engines", None), ("engines", lambda engines: engines[1:]), ("engines/0/qpos", None),
+    ("engines/0/qpos", lambda value: value[:, 1:]), ("engines/0/qvel", lambda value: value.tolist()),
+    ("engines/1/qvel", _spoilt), ("engines/1/time", _spoilt), ("engines/0/qpos", lambda value: value.to("meta")),
+    ("engines/0/qpos", lambda value: value.to_sparse()), ("engines/0/qvel", lambda value: value.long()),
+    ("engines/0/qpos", lambda value: value.to(torch.complex128)),
+    ("tasks/0", _spoilt), ("tasks/0", lambda value: value[:, 1:]), ("tasks", lambda tasks: tasks[1:]),
+    ("episodes", lambda _: None), ("episodes/elapsed", None), ("episodes/elapsed", lambda value: value.double()),
+    ("observation", _spoilt), ("observation", lambda value: torch.cat((value, value), dim=1)),
+    ("observation", lambda value: value.to_sparse()), ("action", _spoilt), ("action", lambda value: value.to("meta")),
+    ("task_index", lambda value: value + 50), ("task_index", lambda value: value - 50),
+    ("episodes/length", lambda value: value - 50),
+)  # fmt: skip
+"""What is changed in a state, and how; None: it is missing."""
 
 
-@pytest.mark.parametrize("kind", BAD_STATES)
-def test_states(world: World, kind: str) -> None:
+def test_states(world: World) -> None:
     world.step(torch.zeros(ROWS, 52))
     before, engines = world.state_dict(), engine_state(world)
-    path, change = BAD_STATES[kind]
-    refused(world.load_state_dict, _with(world.state_dict(), path, change))
-    assert unchanged(world, before), "all of it or nothing"
-    assert all(torch.equal(a[n], b[n]) for a, b in zip(engines, engine_state(world), strict=True) for n in a)
-    world.load_state_dict(before)
-    world.step(torch.zeros(ROWS, 52))
-
-
-def test_foreign_states(world: World) -> None:
     other = suite_world("MT4", ROWS + 1)
     other.reset(seed=0)
-    for state in (other.state_dict(), {}, None, [], "state", {"seed": 0}):
-        refused(world.load_state_dict, state)
-
-
-BAD_MASKS = {
-    "none": lambda: torch.ones(ROWS),
-    "whole numbers": lambda: np.ones(ROWS, int),
-    "NaN": lambda: torch.full((ROWS,), NAN),
-    "a row short": lambda: [True] * (ROWS - 1),
-    "a column": lambda: torch.ones(ROWS, 1, dtype=torch.bool),
-    "text": lambda: "all",
-    "texts": lambda: np.full(ROWS, "True"),
-    "objects": lambda: np.array([True, None, True, True], object),
-    "ragged": lambda: [[True], [True, False]],
-    "a dict": lambda: {"rows": [0]},
-    "a slice": lambda: slice(2),
-    "a number beyond any": lambda: 10**30,
-    "without numbers": lambda: torch.ones(ROWS, dtype=torch.bool, device="meta"),
-    "sparse": lambda: torch.ones(ROWS, dtype=torch.bool).to_sparse(),
-}
-
-
-@pytest.mark.parametrize("kind", BAD_MASKS)
-def test_masks(world: World, kind: str) -> None:
-    before = world.state_dict()
-    assert "reset_mask of shape (4,)" in refused(world.reset, options={"reset_mask": BAD_MASKS[kind]()})
-    assert unchanged(world, before)
+    foreign = [other.state_dict(), {}, None, [], "state", {"seed": 0}]
+    for bad in [_with(world.state_dict(), *each) for each in BAD_STATES] + foreign:
+        refused(world.load_state_dict, bad)
+        assert unchanged(world, before), "all of it or nothing"
+        assert all(torch.equal(a[n], b[n]) for a, b in zip(engines, engine_state(world), strict=True) for n in a)
+    world.load_state_dict(before)
+    world.step(torch.zeros(ROWS, 52))
 
 
 def test_masks_of_other_types_start_the_same_rows() -> None:
@@ -241,8 +185,6 @@ def test_masks_of_other_types_start_the_same_rows() -> None:
 
 
 def test_states_of_worlds_of_others() -> None:
-    from bidex_meta.worlds.humanoid import HumanoidWorld
-
     world = HumanoidWorld(2, threads=1)
     world.reset(seed=0)
     good = world.state_dict()
@@ -261,34 +203,17 @@ def test_states_of_worlds_of_others() -> None:
     world.load_state_dict(good)
 
 
-@pytest.mark.parametrize("threads", [0, -1, [], 1.5, "2", True, 10**9])
-def test_threads(world: World, threads: Any) -> None:
-    assert refused(World, world.slots, ROWS, threads=threads).startswith("threads: ")
-
-
 @pytest.mark.parametrize(
     "options",
-    [{"num_envs": 3}, {"num_envs": 4.0}, {"num_envs": 10**12}, {"observation": "one hot"}, {"pad_to": 1.5},
-     {"pad_to": 400}, {"pad_to": 10**9}, {"task_sampling": []}, {"task_sampling": np.zeros(3)}, {"stagger": 2},
-     {"stagger": np.zeros(3)}, {"points": 64}, {"points": (64, True)}, {"engine": []}, {"device": 3.5},
-     {"device": f"cuda:{torch.cuda.device_count()}"}, {"seed": -2}],
+    [{"num_envs": 3}, {"num_envs": 10**12}, {"observation": "one hot"}, {"pad_to": 1.5}, {"pad_to": 400},
+     {"pad_to": 10**9}, {"task_sampling": np.zeros(3)}, {"stagger": np.zeros(3)}, {"points": (64, True)},
+     {"engine": []}, {"device": f"cuda:{torch.cuda.device_count()}"}, {"threads": True}, {"threads": 10**9}],
     ids=str
 )  # fmt: skip
 def test_worlds(world: World, options: dict[str, Any]) -> None:
     refused(World, world.slots, **({"num_envs": ROWS, "threads": 1} | options))
 
 
-@pytest.mark.parametrize(
-    "options",
-    [{"width": -1}, {"width": 0}, {"height": 1.5}, {"row": -1}, {"row": 4}, {"row": None}, {"camera": ["top"]},
-     {"camera": 0}],
-    ids=str
-)  # fmt: skip
-def test_pictures(world: World, options: dict[str, Any]) -> None:
-    assert next(iter(options)) in refused(world.render, **options)
-
-
-def test_whole_numbers() -> None:
-    assert whole_number("n", np.int32(5), 1, 5) == 5 and whole_number("n", torch.tensor(3), 0) == 3
-    assert refused(whole_number, "n", 6, 1, 5) == "n: expected a whole number from 1 to 5, got 6."
-    assert refused(whole_number, "n", 10**5000, 0, 9).endswith("got a int that cannot be printed.")
+def test_pictures(world: World) -> None:
+    for name, value in (("width", 0), ("height", 1.5), ("row", -1), ("row", 4), ("row", 10**5000), ("camera", ["top"])):
+        assert name in refused(world.render, **{name: value})

@@ -95,6 +95,8 @@ def test_without_stagger_first_episodes_are_whole() -> None:
     world = suite_world("MT4", 8)
     whole = World(world.slots, 8, stagger=False, threads=1)
     world.stagger = False
+    staggered, _ = suite_world("MT4", 8).reset(seed=0)
+    assert torch.equal(world.reset(seed=0)[0], staggered), "staggering leaves the start itself alone"
     for other in (whole, world, copy.deepcopy(world)):
         other.reset(seed=0)
         assert torch.equal(other.episodes.elapsed, whole.episodes.elapsed)

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+from bidex_meta import Benchmark
 from bidex_meta.engine.cpu import CpuEngine
 from bidex_meta.world import World, world
 from bidex_meta.world.graphs import GraphCache, fresh
@@ -105,18 +106,6 @@ def test_replayed_steps_are_plain_steps(suite: str, recorded: Callable[..., tupl
     assert len(count) == 4  # controls, transitions, starts, first observations
 
 
-def test_what_a_step_returned_stays(recorded: Callable[..., tuple[World, list[int]]]) -> None:
-    made, count = recorded("MT4", 8)
-    made.reset(seed=0)
-    actions = random_actions(made, 12)
-    play(made, actions[:6])
-    assert count
-    kept = play(made, actions[6:7])
-    copies = [{name: value.clone() for name, value in kept[0].items()}]
-    play(made, actions[7:])
-    assert_same(kept, copies)
-
-
 def test_a_reset_other_tasks_and_a_loaded_state_are_seen(recorded: Callable[..., tuple[World, list[int]]]) -> None:
     plain, (made, count) = suite_world("MT4", 8), recorded("MT4", 8)
     actions = random_actions(plain, 40)
@@ -141,8 +130,6 @@ def test_a_reset_other_tasks_and_a_loaded_state_are_seen(recorded: Callable[...,
 @pytest.mark.gpu
 def test_graphs_on_cuda_are_plain_steps() -> None:
     """Nearly everywhere: sums are made in any order there, and what touches something grows apart from then on."""
-    from bidex_meta import Benchmark
-
     plain, graphs = (Benchmark("MT4").make_world("train", num_envs=64, device="cuda:0") for _ in range(2))
     plain._graphs = None
     actions = random_actions(plain, 12)

@@ -80,34 +80,6 @@ def test_a_broken_row_ends_and_its_neighbours_do_not_notice(
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("how", ["qpos", "fast", "nan action"])
-def test_in_evaluation_a_broken_row_is_frozen_with_its_last_finite_observation(how: str) -> None:
-    world, twin = suite_world("MT4", ROWS, "DISABLED"), suite_world("MT4", ROWS, "DISABLED")
-    actions = random_actions(world, 20)
-    for made in (world, twin):
-        made.reset(seed=2)
-    before = play(world, actions[:4])[-1]["obs"]
-    play(twin, actions[:4])
-    action = actions[4].clone()
-    spoil(world, how, action)
-    steps, others = play(world, [action, *actions[5:]]), play(twin, actions[4:])
-    assert_same(steps, others, REST)
-    for i, step in enumerate(steps):
-        assert all(value.isfinite().all() for value in step.values()), i
-        assert torch.equal(step["obs"][BROKEN], before[BROKEN]), i
-        assert step["truncated"][BROKEN].all() and not step["terminated"][BROKEN].any()
-        assert not step["reward"][BROKEN].any() and not step["info/success"][BROKEN].any()
-        assert step["info/unstable"][BROKEN].tolist() == step["info/_final_obs"][BROKEN].tolist() == [i == 0] * 3
-    mask = torch.zeros(ROWS, dtype=torch.bool)
-    mask[BROKEN] = True
-    obs, _ = world.reset(options={"reset_mask": mask})
-    fresh = world_at(world)
-    assert torch.equal(fresh.reset()[0][BROKEN], obs[BROKEN])
-    again, expected = play(world, actions[:10]), play(fresh, actions[:10])
-    assert all(torch.equal(a["obs"][BROKEN], b["obs"][BROKEN]) for a, b in zip(again, expected, strict=True))
-    assert not torch.stack([s["info/unstable"] for s in again]).any()
-
-
 def test_every_row_may_break_at_once_and_again() -> None:
     world = suite_world("MT4", 4)
     world.reset(seed=0)
@@ -118,16 +90,6 @@ def test_every_row_may_break_at_once_and_again() -> None:
         assert step["info/unstable"].all() and step["truncated"].all()
         assert all(value.isfinite().all() for value in step.values())
     assert not flat(world.step(torch.zeros(4, 52)))["info/unstable"].any()
-
-
-def test_a_row_that_breaks_at_its_time_limit_is_unstable() -> None:
-    world = suite_world("MT4", 4)
-    world.reset(seed=0)
-    world.episodes.elapsed = world.max_episode_steps - 1
-    action = torch.zeros(4, 52)
-    action[2, 0] = math.nan
-    step = flat(world.step(action))
-    assert step["truncated"].all() and step["info/unstable"].tolist() == [False, False, True, False]
 
 
 def test_non_finite_actions_are_echoed_as_zero() -> None:

@@ -11,7 +11,7 @@ from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_mod
 
 from bidex_meta.engine.cpu import CpuEngine
 from bidex_meta.world import World, world
-from tests.world.play import CLASSES, assert_same, class_world, number_of_ends, play, random_actions, suite_world
+from tests.world.play import assert_same, number_of_ends, play, random_actions, suite_world
 
 LOOKS = ("_local_scalar_dense", "is_nonzero", "nonzero", "masked_select", "unique", "equal", "lift_fresh", "item")
 """Operations that wait for a value, have a shape that depends on one, or bring numbers from the host."""
@@ -101,12 +101,6 @@ def test_masked_resets_give_the_same_episodes(mode: str, request: pytest.Fixture
         mask = torch.arange(9) % 2 == 0
         assert_same(*([{"obs": w.reset(options={"reset_mask": mask})[0]}] for w in (one, other)))
         assert_same(play(one, actions[:5]), play(other, actions[:5]))
-
-
-@pytest.mark.parametrize("name", CLASSES)
-def test_a_step_looks_at_no_number(name: str, masked: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = class_world(name, 3)
-    assert_steps_look_at_nothing(rows, monkeypatch)
 
 
 @pytest.mark.parametrize("name", ["MT4", "ML4", "MT20"])

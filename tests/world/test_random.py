@@ -5,8 +5,7 @@ from hypothesis import strategies as st
 
 import bidex_meta.world.starts as starts_module
 from bidex_meta.world.random import row_keys, threefry, uniform
-from bidex_meta.world.starts import Starts
-from tests.world.play import CLASSES, assert_same, class_world, number_of_ends, play, random_actions, suite_world
+from tests.world.play import assert_same, number_of_ends, play, random_actions, suite_world
 
 CPU = torch.device("cpu")
 
@@ -60,25 +59,6 @@ def test_numbers_do_not_depend_on_the_other_rows_or_draws(rows: list[int], draws
     chosen = torch.tensor(rows)
     assert torch.equal(uniform(keys[chosen], episodes[chosen], draws), everything[chosen][:, :draws])
     assert torch.equal(row_keys(3, "A", 40, CPU), keys[:40])
-
-
-@pytest.mark.parametrize("name", CLASSES)
-def test_the_bank_gives_the_starts_that_one_by_one_drawing_gives(name: str) -> None:
-    world = class_world(name, 6)
-    part = world.parts[0]
-    keys, start_draws, pool = world._starts._keys, part.group.members[0].scene.task.start_draws, world._pool_size
-    bank = Starts(world.parts, keys, start_draws, pool)
-    number, kept = torch.arange(6) * 3, torch.zeros(6, dtype=torch.int64)
-    for turn in range(20):
-        mask = torch.arange(6) % (turn % 3 + 1) == 0
-        tasks, share, (qpos,) = bank.take(mask, number, kept)
-        for at, row in enumerate(mask.nonzero().squeeze(1).tolist()):
-            draws = uniform(keys[row : row + 1], number[row : row + 1], start_draws + 2)
-            task = (draws[:, 0] * 50).long()
-            assert task == tasks[row] and draws[0, 1] == share[row]
-            one = part.starts(torch.tensor([row]), 2.0 * draws[:, 2:] - 1.0, task)
-            assert torch.equal(qpos[at], one[0]), (turn, row)
-        number = number + mask
 
 
 def test_how_many_episodes_are_drawn_ahead_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,29 +1,9 @@
-import pytest
 import torch
-from torch import Tensor
 
 from bidex_meta.world import World
-from tests.world.play import (
-    assert_same,
-    class_world,
-    flat,
-    number_of_ends,
-    play,
-    random_actions,
-    suite_world,
-    world_at,
-)
+from tests.world.play import class_world, flat, play, random_actions, suite_world, world_at
 
 ROWS = 12
-
-
-@pytest.fixture(scope="module")
-def played() -> tuple[World, Tensor, Tensor, list[dict[str, Tensor]]]:
-    """A training world after 160 steps: the world, what had elapsed at first, the actions, the steps."""
-    world = suite_world("MT4", ROWS)
-    world.reset(seed=0)
-    elapsed, actions = world.episodes.elapsed.clone(), random_actions(world, 160)
-    return world, elapsed, actions, play(world, actions)
 
 
 def test_first_episodes_start_at_random_elapsed_steps() -> None:
@@ -36,10 +16,11 @@ def test_first_episodes_start_at_random_elapsed_steps() -> None:
     assert (world.episodes.elapsed == 0).all()
 
 
-def test_episode_statistics_are_those_of_a_count_by_hand(
-    played: tuple[World, Tensor, Tensor, list[dict[str, Tensor]]],
-) -> None:
-    world, elapsed, _, steps = played
+def test_episode_statistics_are_those_of_a_count_by_hand() -> None:
+    world = suite_world("MT4", ROWS)
+    world.reset(seed=0)
+    elapsed = world.episodes.elapsed.clone()
+    steps = play(world, random_actions(world, 160))
     total, length = torch.zeros(ROWS), torch.zeros(ROWS, dtype=torch.int64)
     success, whole = torch.zeros(ROWS, dtype=torch.bool), elapsed == 0
     counted = left_out = 0
@@ -109,41 +90,3 @@ def test_success_belongs_to_the_transition_also_in_a_reset_row() -> None:
     assert step["info/success"].tolist() == step["info/so_far/success"].tolist() == [False, True, False]
     assert step["reward"][1] > 0.4 and torch.equal(step["reward"], step["info/reward_terms/pose"])
     assert not world.episodes.success.any() and (world.episodes.reward == 0).all()
-
-
-def test_a_full_reset_goes_on_with_the_next_episodes() -> None:
-    world = suite_world("MT4", ROWS)
-    first, _ = world.reset(seed=0)
-    second, _ = world.reset()
-    again, _ = world.reset(seed=0)
-    assert torch.equal(first, again)
-    assert (first != second).any(dim=1).all()
-    assert (world.episodes.number == 0).all()
-
-
-def test_staggering_leaves_the_episode_itself_alone() -> None:
-    world = suite_world("MT4", ROWS)
-    obs, _ = world.reset(seed=0)
-    fresh = world_at(world)
-    assert torch.equal(fresh.reset()[0], obs)
-    actions = random_actions(world, 5)
-    a, b = play(world, actions), play(fresh, actions)
-    going = ~torch.stack([step["info/_final_obs"] for step in a]).any(dim=0)
-    assert going.sum() > ROWS / 2
-    names = ("obs", "reward", "terminated", "truncated", "info/final_obs")
-    assert_same([{n: s[n] for n in names} for s in a], [{n: s[n] for n in names} for s in b], going)
-    assert number_of_ends(a) < ROWS
-
-
-def test_in_evaluation_worlds_masked_rows_go_through_the_same_episodes_as_all() -> None:
-    world = suite_world("MT4", ROWS, "DISABLED")
-    world.reset(seed=0)
-    assert (world.episodes.elapsed == 0).all() and world.episodes.counts.all()
-    everything = [world.reset()[0], world.reset()[0]]
-    world.reset(seed=0)
-    for number in range(2):
-        found = torch.zeros_like(everything[0])
-        for part in range(3):
-            mask = torch.arange(ROWS) % 3 == part
-            found[mask] = world.reset(options={"reset_mask": mask})[0][mask]
-        assert torch.equal(found, everything[number])

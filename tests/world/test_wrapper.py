@@ -9,7 +9,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import RecordVideo
 from gymnasium.wrappers import vector as wrap
 
@@ -56,13 +55,6 @@ def episode(env: gymnasium.Env) -> tuple[int, dict[str, Any]]:
         if terminated or truncated:
             return step, info
     raise AssertionError("no end within the time limit")
-
-
-def test_gymnasiums_checker_on_the_single_environment() -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", message=".*infinity")
-        check_env(single().unwrapped, skip_render_check=True)
 
 
 def test_sb3s_checker_on_the_single_environment() -> None:

@@ -14,7 +14,7 @@ CORE = Path(paths.__file__).parents[1]
 
 
 @pytest.fixture
-def named(request: pytest.FixtureRequest, tmp_path: Path) -> dict[str, Any]:
+def named(request: pytest.FixtureRequest, tmp_path: Path) -> dict[str, object]:
     """A config; the suite ``mine.toml`` is a file of the user's, with the tasks of MT1."""
     if request.param.get("suite") != "mine.toml":
         return {"threads": 1, **request.param}
@@ -35,7 +35,7 @@ WORLDS: list[Any] = [
 
 
 @pytest.mark.parametrize(("named", "expected"), WORLDS, indirect=["named"])
-def test_worlds_of_each_split(named: dict[str, Any], expected: dict[str, tuple[int, ...]]) -> None:
+def test_worlds_of_each_split(named: dict[str, object], expected: dict[str, tuple[int, ...]]) -> None:
     source = Worlds.open(named)
     assert source.name == (named.get("suite") or named["task"])
     assert source.splits == list(expected)
@@ -95,7 +95,7 @@ def test_a_policy_is_judged_on_every_task_of_its_slots() -> None:
         ({"suite": "metaworld/MT4"}, "Unknown suite 'metaworld/MT4'. Did you mean 'metaworld/MT3'?"),
     ],
 )
-def test_an_unknown_name_is_one_line(config: dict[str, Any], told: str) -> None:
+def test_an_unknown_name_is_one_line(config: dict[str, object], told: str) -> None:
     with pytest.raises(BidexError) as error:
         Worlds.open(config)
     assert str(error.value).startswith(told) and "\n" not in str(error.value)
@@ -112,7 +112,7 @@ def test_an_unknown_name_is_one_line(config: dict[str, Any], told: str) -> None:
         ({"suite": "metaworld/MT3", "engine": "warp"}, "train", "got --engine warp. Add --device cpu."),
     ],
 )
-def test_a_world_that_cannot_be_is_refused(config: dict[str, Any], split: str, told: str) -> None:
+def test_a_world_that_cannot_be_is_refused(config: dict[str, object], split: str, told: str) -> None:
     with pytest.raises(BidexError) as error:
         Worlds.open(config).world(split)
     assert told in str(error.value) and "\n" not in str(error.value)

@@ -15,10 +15,8 @@ from torch.func import grad
 
 from bidex_algos.nets.networks import GaussianActor, gaussian_kl, gaussian_log_prob, stacked_forward
 
-Adapted = Literal["all", "head"]
-"""Which parameters an inner step moves: all, or those of the mean's output layer."""
-StepSizeKind = Literal["fixed", "layer", "weight"]
-"""Whether sizes of the inner step are learned, and of what; see :class:`StepSizes`."""
+Adapted = Literal["all", "head"]  # which parameters an inner step moves: all, or those of the mean's output layer
+StepSizeKind = Literal["fixed", "layer", "weight"]  # whether sizes of the inner step are learned, and of what
 
 
 class StepSizes(nn.Module):
@@ -50,15 +48,12 @@ def _key(name: str) -> str:
     return name.replace(".", "/")
 
 
-Params = dict[str, Tensor]
-"""Parameters of an actor by name; stacked ones have a first axis of tasks."""
+Params = dict[str, Tensor]  # parameters of an actor by name; stacked ones have a first axis of tasks
 
 Objective = Literal["likelihood", "ratio"]
 """What the inner step follows: log-likelihood times advantage (MAML), or likelihood ratio times advantage (ProMP)."""
 
-_TRANSITIONS_AT_ONCE = 8_192
-"""What a CPU's caches hold of layers 64-64: of 40 tasks with 2,000 each, four at a time take two thirds of the time
-that all take."""
+_TRANSITIONS_AT_ONCE = 8_192  # what a CPU's caches hold of layers 64-64; all tasks at once take half as long again
 
 
 @dataclass

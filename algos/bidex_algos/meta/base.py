@@ -132,8 +132,7 @@ class MetaLearner(Learner):
     config: OuterConfig
     policy: MetaPolicy
     remedy = "lower inner_learning_rate or the outer step"
-    objective: ClassVar[Objective]
-    """What its inner step follows."""
+    objective: ClassVar[Objective]  # what its inner step follows
     adapts = True
     going_on = ("obs", "elapsed", "steps_with_tasks", *Learner.going_on)
 

@@ -14,25 +14,18 @@ from bidex_meta.utils.validation import Count, Fraction, Positive, check_rising
 class MetaConfig(LearnerConfig):
     """Policy, sampling and inner steps; the defaults are the preset ``laptop``."""
 
-    hidden: Layers = (128, 128)
-    """Widths of the policy's hidden layers."""
-    activation: Activation = "tanh"
-    """Non-linearity of the hidden layers."""
-    init_std: Positive = 0.8
-    """Standard deviation of the actions at the start; part of what is adapted."""
-    std_range: tuple[Positive, Positive] = (0.1, 1.5)
-    """Bounds of the standard deviation of the actions."""
+    hidden: Layers = (128, 128)  # Widths of the policy's hidden layers.
+    activation: Activation = "tanh"  # Non-linearity of the hidden layers.
+    init_std: Positive = 0.8  # Standard deviation of the actions at the start; part of what is adapted.
+    std_range: tuple[Positive, Positive] = (0.1, 1.5)  # Bounds of the standard deviation of the actions.
     tasks_per_class: Count = 3
     """Tasks of each class in a meta-batch, drawn anew for each; fewer where a class has fewer. The class's rows are
     split over them: that many rollouts has each."""
-    max_adapt_steps: Count = 150
-    """Longest episode that is played to adapt."""
+    max_adapt_steps: Count = 150  # Longest episode that is played to adapt.
     slice_steps: Count | None = None
     """Adapt on so many steps of running episodes, as Bi-DexHands did, instead of whole ones; None: whole ones."""
-    inner_steps: Count = 1
-    """Adaptation steps before the outer objective is measured."""
-    inner_learning_rate: Positive = 0.1
-    """Size of an adaptation step."""
+    inner_steps: Count = 1  # Adaptation steps before the outer objective is measured.
+    inner_learning_rate: Positive = 0.1  # Size of an adaptation step.
     adapted: Adapted = "all"
     """What an adaptation step moves: all parameters, or the mean's output layer alone (ANIL, Raghu et al. 2020)."""
     step_sizes: StepSizeKind = "fixed"
@@ -43,14 +36,10 @@ class MetaConfig(LearnerConfig):
     advantage_scale: Literal["std", "variance"] = "std"
     """What advantages are divided by in each task. With the variance, as in garage and Meta-World's baselines, the
     inner step depends on the scale of the rewards."""
-    first_order: bool = False
-    """Leave out the second derivatives of the inner step."""
-    gamma: Fraction = 0.95
-    """Discount per step."""
-    lam: Fraction = 1.0
-    """Trace decay of the advantage estimate."""
-    normalise_observations: bool = True
-    """Give observations zero mean and unit variance by running statistics."""
+    first_order: bool = False  # Leave out the second derivatives of the inner step.
+    gamma: Fraction = 0.95  # Discount per step.
+    lam: Fraction = 1.0  # Trace decay of the advantage estimate.
+    normalise_observations: bool = True  # Give observations zero mean and unit variance by running statistics.
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -65,10 +54,8 @@ class MetaConfig(LearnerConfig):
 class OuterConfig(MetaConfig):
     """What the outer steps share. The learners' configs hold these as fields, each in its own place among the flags."""
 
-    outer_learning_rate: Positive
-    """Adam's step size for the meta-parameters."""
-    max_grad_norm: Positive
-    """Meta-gradients longer than this are shortened to it."""
+    outer_learning_rate: Positive  # Adam's step size for the meta-parameters.
+    max_grad_norm: Positive  # Meta-gradients longer than this are shortened to it.
 
 
 # Table 48 of the Bi-DexHands appendix (ProMP), but for its outer step: eight steps of running episodes, and an inner

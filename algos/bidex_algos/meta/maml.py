@@ -22,22 +22,14 @@ from bidex_meta.utils.validation import Count, Fraction, NonNegative, Positive
 class MAMLConfig(OuterConfig):
     """Everything that can be set about MAML; the defaults are the preset ``laptop``."""
 
-    outer: Literal["trpo", "adam"] = "trpo"
-    """How the meta-parameters move: a trust-region step, as in the paper, or one step of Adam."""
-    outer_learning_rate: Positive = 1e-3
-    """Adam's step size for the meta-parameters."""
-    max_grad_norm: Positive = 1.0
-    """Before a step of Adam, meta-gradients longer than this are shortened to it."""
-    max_kl: Positive = 0.01
-    """Mean KL of the adapted policies from those that sampled that a trust-region step may not exceed."""
-    damping: NonNegative = 1e-2
-    """Added to the diagonal of the Fisher matrix."""
-    cg_iterations: Count = 10
-    """Conjugate-gradient iterations."""
-    backtracks: Count = 15
-    """Points that the line search tries."""
-    backtrack_factor: Fraction = 0.8
-    """By which the line search shortens the step."""
+    outer: Literal["trpo", "adam"] = "trpo"  # The meta-parameters' step: a trust-region one as in the paper, or Adam's.
+    outer_learning_rate: Positive = 1e-3  # Adam's step size for the meta-parameters.
+    max_grad_norm: Positive = 1.0  # Before a step of Adam, meta-gradients longer than this are shortened to it.
+    max_kl: Positive = 0.01  # Bound of the mean KL of adapted policies from the sampling ones in a trust-region step.
+    damping: NonNegative = 1e-2  # Added to the diagonal of the Fisher matrix.
+    cg_iterations: Count = 10  # Conjugate-gradient iterations.
+    backtracks: Count = 15  # Points that the line search tries.
+    backtrack_factor: Fraction = 0.8  # By which the line search shortens the step.
 
 
 PRESETS: dict[str, MAMLConfig] = {

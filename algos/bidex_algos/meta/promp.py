@@ -21,22 +21,16 @@ from bidex_meta.utils.validation import Count, NonNegative, Positive, check_risi
 class ProMPConfig(OuterConfig):
     """Everything that can be set about ProMP; the defaults are the preset ``laptop``."""
 
-    outer_epochs: Count = 5
-    """Steps of the meta-parameters on one meta-batch; each adapts anew."""
-    outer_learning_rate: Positive = 1e-3
-    """Adam's step size for the meta-parameters, at the start."""
+    outer_epochs: Count = 5  # Steps of the meta-parameters on one meta-batch; each adapts anew.
+    outer_learning_rate: Positive = 1e-3  # Adam's step size for the meta-parameters, at the start.
     desired_kl: Positive | None = None
     """Divide the step size by 1.5 when the KL of the adapted policies from those that sampled exceeds twice this,
     multiply it when below half; None: leave it. For what is learned already (--start-from) a fixed step may be far too
     large."""
-    outer_learning_rate_range: tuple[Positive, Positive] = (1e-5, 1e-2)
-    """Bounds of the step size where it adapts."""
-    clip: Positive = 0.3
-    """How far the likelihood ratio after adaptation may leave 1 before it earns nothing more."""
-    kl_weight: NonNegative = 5e-4
-    """Factor of the KL from the policies that sampled before adaptation."""
-    max_grad_norm: Positive = 1.0
-    """Meta-gradients longer than this are shortened to it."""
+    outer_learning_rate_range: tuple[Positive, Positive] = (1e-5, 1e-2)  # Bounds of the step size where it adapts.
+    clip: Positive = 0.3  # How far the likelihood ratio after adaptation may leave 1 before it earns nothing more.
+    kl_weight: NonNegative = 5e-4  # Factor of the KL from the policies that sampled before adaptation.
+    max_grad_norm: Positive = 1.0  # Meta-gradients longer than this are shortened to it.
 
     def __post_init__(self) -> None:
         super().__post_init__()

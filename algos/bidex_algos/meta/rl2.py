@@ -30,14 +30,10 @@ from bidex_meta.world.contract import PooledWorld
 class RL2Config(PPOConfig, TrialConfig):
     """Everything that can be set about RL²; the defaults are the preset ``laptop``."""
 
-    learning_rate_range: tuple[Positive, Positive] = (1e-5, 3e-3)
-    """Bounds of the adaptive step size."""
-    entropy_weight: Finite = 0.0
-    """Factor of the entropy bonus."""
-    max_grad_norm: Positive = 1.0
-    """Gradients longer than this are shortened to it, actor and critic apart."""
-    normalise_observations: bool = True
-    """Give observations zero mean and unit variance by running statistics."""
+    learning_rate_range: tuple[Positive, Positive] = (1e-5, 3e-3)  # Bounds of the adaptive step size.
+    entropy_weight: Finite = 0.0  # Factor of the entropy bonus.
+    max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it, actor and critic apart.
+    normalise_observations: bool = True  # Give observations zero mean and unit variance by running statistics.
     value_horizon: Positive = 100.0
     """Iterations after which returns fade from the statistics that the critic's targets are normalised by."""
 

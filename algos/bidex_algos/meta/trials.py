@@ -22,30 +22,19 @@ from bidex_meta.world.contract import VectorWorld
 class TrialConfig(LearnerConfig):
     """Networks and trials of RL²."""
 
-    hidden: Widths = (256, 128)
-    """Widths of the encoder's layers, before the memory; of actor and critic alike."""
-    activation: Activation = "elu"
-    """Non-linearity of the encoder."""
-    memory: Count = 128
-    """Numbers that an environment's memory (GRU) holds; actor and critic have one each."""
-    value_heads: bool = True
-    """Give the critic one output per task class instead of one for all."""
-    init_std: Positive = 0.8
-    """Standard deviation of the actions at the start."""
-    std_range: tuple[Positive, Positive] = (0.05, 1.5)
-    """Bounds of the standard deviation of the actions."""
-    episodes_per_trial: Count = 3
-    """Episodes of one task that the memory lasts for: those an evaluation plays to adapt, and one more."""
-    max_adapt_steps: Count = 150
-    """Steps after which an episode of a trial is cut, if its class's time limit has not ended it."""
-    blind_share: Fraction = 0.3
-    """Share of the episodes whose rewards the policy is not shown, as it is not in an evaluation."""
+    hidden: Widths = (256, 128)  # Widths of the encoder's layers, before the memory; of actor and critic alike.
+    activation: Activation = "elu"  # Non-linearity of the encoder.
+    memory: Count = 128  # Numbers that an environment's memory (GRU) holds; actor and critic have one each.
+    value_heads: bool = True  # Give the critic one output per task class instead of one for all.
+    init_std: Positive = 0.8  # Standard deviation of the actions at the start.
+    std_range: tuple[Positive, Positive] = (0.05, 1.5)  # Bounds of the standard deviation of the actions.
+    episodes_per_trial: Count = 3  # Episodes that the memory lasts for: those played to adapt, and one more.
+    max_adapt_steps: Count = 150  # Steps after which an episode of a trial is cut, if its time limit has not ended it.
+    blind_share: Fraction = 0.3  # Share of the episodes whose rewards the policy is not shown, as in an evaluation.
     reward_unit: Positive = 0.01
     """Rewards enter the observation as asinh(reward / reward_unit), then normalised by running statistics."""
-    gamma: Fraction = 0.93
-    """Discount per step, over all episodes of a trial."""
-    lam: Fraction = 0.95
-    """Trace decay of the advantage estimate."""
+    gamma: Fraction = 0.93  # Discount per step, over all episodes of a trial.
+    lam: Fraction = 0.95  # Trace decay of the advantage estimate.
     chunk: Count | None = None
     """Steps that gradients flow back through the memory; None, or no fewer than a trial has: the whole trial."""
 
@@ -214,7 +203,6 @@ def make_batch(
         means.append(mean)
         values.append(of_task(value, task_id))
     old_means = torch.cat(means)
-
     values = return_stats.restore(torch.cat(values), task_id)
     filled = t.filled(slots)
     last = torch.arange(slots, device=task_id.device)[:, None] == t.lengths - 1

@@ -46,20 +46,13 @@ class MultiAgentConfig(OnPolicyConfig):
     agents: Partition = "hands"
     """Who acts: hands (two agents), fingers (twelve: five fingers and the palm of each hand), single, a TOML file with
     a table [agents], or name=unit+unit;name=unit (docs/learners/multiagent.md)."""
-    huber_delta: Positive = 10.0
-    """Error of the critic, in its own units, beyond which its loss grows no faster than the error."""
-    value_clip: NonNegative = 0.0
-    """How far a value may leave the old one before it earns nothing more; 0: as far as it likes."""
-    popart: bool = False
-    """When the statistics of returns change, move the critic's output layer so that its values stay as they were."""
-    max_grad_norm: Positive = 1.0
-    """Gradients longer than this are shortened to it: each agent's, and the critic's."""
-    critic_learning_rate: Positive = 1e-3
-    """Adam's step size of the critic."""
-    num_minibatches: Count = 4
-    """Mini-batches per epoch; each holds shuffled samples of all environments."""
-    adam_eps: NonNegative = 1e-8
-    """What Adam adds to its denominators."""
+    huber_delta: Positive = 10.0  # Error of the critic, in its units, beyond which its loss grows no faster than that.
+    value_clip: NonNegative = 0.0  # How far a value may leave the old one before it earns nothing more; 0: no bound.
+    popart: bool = False  # When the statistics of returns change, move the critic's output layer so that values stay.
+    max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it: each agent's, and the critic's.
+    critic_learning_rate: Positive = 1e-3  # Adam's step size of the critic.
+    num_minibatches: Count = 4  # Mini-batches per epoch; each holds shuffled samples of all environments.
+    adam_eps: NonNegative = 1e-8  # What Adam adds to its denominators.
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -74,12 +67,9 @@ class MultiAgentConfig(OnPolicyConfig):
 class MultiAgentPPOConfig(PPOConfig, MultiAgentConfig):
     """What IPPO, MAPPO and HAPPO share; the defaults are the preset ``laptop``."""
 
-    critic_learning_rate: Positive = 1e-3
-    """Adam's step size of the critic."""
-    value_loss_weight: Finite = 1.0
-    """Factor of the value loss. Adam undoes it; it matters only beside max_grad_norm."""
-    entropy_weight: Finite = 0.0
-    """Factor of the entropy bonus."""
+    critic_learning_rate: Positive = 1e-3  # Adam's step size of the critic.
+    value_loss_weight: Finite = 1.0  # Factor of the value loss. Adam undoes it; it matters only beside max_grad_norm.
+    entropy_weight: Finite = 0.0  # Factor of the entropy bonus.
     desired_kl: Positive = 0.03
     """KL of the sampling policy from the current one, of all agents together, that the adaptive step sizes aim at; each
     agent's has an even share."""
@@ -90,8 +80,7 @@ class InTurnConfig(LearnerConfig):
     """What HAPPO and HATRPO share. A config that is made of this and others puts its fields behind theirs."""
 
     max_factor: NonNegative = 4.0
-    """The most that the ratios of the agents before it, new policy over old, may multiply an agent's advantage with; 0:
-    as much as it comes to."""
+    """The most that the ratios of the agents before it may multiply an agent's advantage with; 0: no bound."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -113,8 +102,7 @@ PAPER_PPO: Options = PAPER | {
 }  # fmt: skip
 """The same with the two tables' passes and clip."""
 
-LIFT: Options = {"rollout_steps": 20, "epochs": 10}
-"""Both tables' column for LiftUnderarm, where it differs."""
+LIFT: Options = {"rollout_steps": 20, "epochs": 10}  # both tables' column for LiftUnderarm, where it differs
 
 
 @torch.no_grad()
@@ -164,8 +152,7 @@ class MultiAgent(OnPolicy):
     def __init__(self, world: VectorWorld, config: MultiAgentConfig, seed: int):
         self.views = agent_views(world.observation_groups, int(world.single_action_space.shape[0]), config.agents)
         self.kl_share = 1.0 / len(self.views)
-        minibatches = config.num_minibatches
-        check_samples(self.name, config.rollout_steps, world.num_envs, minibatches)
+        check_samples(self.name, config.rollout_steps, world.num_envs, config.num_minibatches)
         super().__init__(world, config, seed)
         rate, eps = config.critic_learning_rate, config.adam_eps
         self.critic_adam = torch.optim.Adam(self.critic.parameters(), lr=rate, eps=eps, fused=True)

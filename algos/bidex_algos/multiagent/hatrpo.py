@@ -20,8 +20,7 @@ class HATRPOConfig(InTurnConfig, MTTRPOConfig, MultiAgentConfig):
     """Everything that can be set about HATRPO; the defaults are the preset ``laptop``."""
 
     max_kl: Positive = 0.05
-    """Mean KL of the new policy from the sampling one, of all agents together, that an update may not exceed; each
-    agent's has an even share."""
+    """Mean KL of the new joint policy from the sampling one that no update exceeds; each agent has an even share."""
 
 
 PRESETS: dict[str, HATRPOConfig] = {

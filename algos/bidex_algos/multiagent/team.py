@@ -152,13 +152,9 @@ class TeamCritic(Team):
     """A critic for each agent, on what it sees, with ``heads`` outputs; other arguments as for :class:`Team`."""
 
     def __init__(
-        self,
-        views: Sequence[AgentView],
-        config: NetworkConfig,
-        heads: int,
-        generator: torch.Generator,
-        share: bool = False,
-    ):
+        self, views: Sequence[AgentView], config: NetworkConfig, heads: int, generator: torch.Generator,
+        share: bool = False
+    ):  # fmt: skip
         super().__init__(views, config, [heads] * len(views), 1.0, generator, share)
 
     def forward(self, x: Tensor) -> Tensor:

@@ -14,8 +14,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.train.learner import LearnerConfig
 from bidex_meta.utils.validation import Count, Whole, Widths
 
-Options = dict[str, Any]
-"""Fields of a config by name."""
+Options = dict[str, Any]  # fields of a config by name
 Architecture = Literal["shared", "multi_head", "soft_modules", "paco", "moore"]
 _TRUNKS: dict[str, MakeNetwork] = {"soft_modules": SoftModules, "paco": PaCo, "moore": Moore}
 
@@ -27,12 +26,9 @@ class ArchitectureConfig(LearnerConfig):
     architecture: Architecture = "shared"
     """shared: one trunk for all tasks. multi_head: that with policy_heads and value_heads. soft_modules, paco, moore:
     other trunks, each with or without heads; for MT suites, whose observations show the task."""
-    modules: Count = 4
-    """Modules of a layer of soft_modules, parameter sets of paco, experts of moore."""
-    hidden: Layers = (256, 256)
-    """Widths of the hidden layers, of actor and critics alike."""
-    activation: Activation = "relu"
-    """Non-linearity of the hidden layers."""
+    modules: Count = 4  # Modules of a layer of soft_modules, parameter sets of paco, experts of moore.
+    hidden: Layers = (256, 256)  # Widths of the hidden layers, of actor and critics alike.
+    activation: Activation = "relu"  # Non-linearity of the hidden layers.
 
     @property
     def shares_a_trunk(self) -> bool:
@@ -44,14 +40,12 @@ class ArchitectureConfig(LearnerConfig):
 class NetworkConfig(ArchitectureConfig):
     """Networks of actor and critics; raises BidexError where the layers do not fit the architecture."""
 
-    policy_heads: bool = False
-    """Give the actor an output layer per task; the world must show the task's one-hot."""
+    policy_heads: bool = False  # Give the actor an output layer per task; the world must show the task's one-hot.
     task_embedding: Whole = 0
     """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
     point_widths: Widths = (32, 64)
     """Widths of the layers that all points of a point cloud share (PointNet), where the world shows one."""
-    points_read: Whole = 0
-    """Points of a cloud that they read, evenly out of all; 0: all."""
+    points_read: Whole = 0  # Points of a cloud that they read, evenly out of all; 0: all.
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -14,10 +14,8 @@ from bidex_meta.utils.validation import Width
 
 Activation = Literal["elu", "relu", "tanh"]
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
-Autocast = Literal["auto", "on", "off"]
-"""Whether hidden layers run in bfloat16."""
-Layers = Annotated[tuple[Width, ...], Meta(max_length=64)]
-"""Widths of hidden layers; none makes a linear map."""
+Autocast = Literal["auto", "on", "off"]  # whether hidden layers run in bfloat16
+Layers = Annotated[tuple[Width, ...], Meta(max_length=64)]  # widths of hidden layers; none makes a linear map
 MakeNetwork = Callable[..., Any]
 """Takes the arguments of :class:`MLP`; what it makes has ``output_bias``, the biases of the output (outputs,)."""
 

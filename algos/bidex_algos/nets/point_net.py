@@ -13,8 +13,7 @@ from bidex_algos.nets.products import Linear
 from bidex_meta.errors import BidexError
 from bidex_meta.train.learner import LearnerConfig
 
-POINT_GROUPS = {"points": 3, "kind_points": 4}
-"""Observation groups that are clouds, and the numbers of a point."""
+POINT_GROUPS = {"points": 3, "kind_points": 4}  # observation groups that are clouds, and the numbers of a point
 _SPREAD = 0.2  # what distances from a cloud's centre are divided by, metres: about a hand's length
 _CACHED = 1 << 19  # numbers of a layer that a CPU computes at once
 

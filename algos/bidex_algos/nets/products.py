@@ -12,8 +12,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-_LEAST = 1 << 21
-"""Multiplications from which oneDNN pays: below, what a call costs is more than what it saves."""
+_LEAST = 1 << 21  # multiplications from which oneDNN pays: below, what a call costs is more than what it saves
 
 
 def affine(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:

@@ -30,24 +30,17 @@ from bidex_meta.world.contract import VectorWorld
 class OfflineConfig(NetworkConfig):
     """Networks, batches, statistics; the defaults are the preset ``laptop``."""
 
-    updates_per_iteration: Count = 1000
-    """Updates between two reports; --evaluate-every and --video-every count reports."""
-    batch_size: Count = 256
-    """Transitions of an update, split evenly over the tasks."""
-    batch_per_task: Count | None = None
-    """Take this many of each task instead."""
-    learning_rate: Positive = 3e-4
-    """Adam's step size for the actor."""
-    adam_eps: NonNegative = 1e-8
-    """What Adam adds to its denominators."""
+    updates_per_iteration: Count = 1000  # Updates between two reports, which --evaluate-every and --video-every count.
+    batch_size: Count = 256  # Transitions of an update, split evenly over the tasks.
+    batch_per_task: Count | None = None  # Take this many of each task instead.
+    learning_rate: Positive = 3e-4  # Adam's step size for the actor.
+    adam_eps: NonNegative = 1e-8  # What Adam adds to its denominators.
     max_grad_norm: Positive | None = None
     """Gradients longer than this are shortened to it, those of each network apart; None: none is."""
     normalise_observations: bool = True
     """Give observations zero mean and unit variance by the data's statistics; the task's one-hot stays as it is."""
-    normalise_per_task: bool = False
-    """By the statistics of each task's data apart; the world must show the task's one-hot."""
-    autocast: Autocast = "auto"
-    """Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX."""
+    normalise_per_task: bool = False  # By statistics of each task's data apart; the world must show the task's one-hot.
+    autocast: Autocast = "auto"  # Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX.
 
     def bytes_held(self, num_envs: int, width: int) -> int:
         """Of the networks; the data are counted when they are read."""
@@ -58,18 +51,13 @@ class OfflineConfig(NetworkConfig):
 class CriticConfig(OfflineConfig):
     """What learners with critics add."""
 
-    value_heads: bool = True
-    """Give each critic one output per task instead of one for all."""
+    value_heads: bool = True  # Give each critic one output per task instead of one for all.
     critic_layer_norm: bool = True
     """Normalise the hidden layers of the critics, which keeps values of actions that no data show from growing."""
-    critic_learning_rate: Positive = 3e-4
-    """Adam's step size for the critics."""
-    gamma: BelowOne = 0.99
-    """Discount per step."""
-    tau: Share = 0.005
-    """Share of the networks that enters their targets in each update (1 - Polyak's factor)."""
-    per_task_rewards: bool = True
-    """Divide rewards by the standard deviation of their task's discounted returns in the data."""
+    critic_learning_rate: Positive = 3e-4  # Adam's step size for the critics.
+    gamma: BelowOne = 0.99  # Discount per step.
+    tau: Share = 0.005  # Share of the networks that enters their targets in each update (1 - Polyak's factor).
+    per_task_rewards: bool = True  # Divide rewards by the standard deviation of their task's discounted returns.
 
 
 PAPER: Options = {"value_heads": False, "critic_layer_norm": False, "per_task_rewards": False}

@@ -32,20 +32,13 @@ _LOG_STD = (-4.0, 15.0)
 class BCQConfig(CriticConfig):
     """Everything that can be set about BCQ; the defaults are the preset ``laptop``."""
 
-    vae_hidden: Layers = (256, 256)
-    """Widths of the hidden layers of the model of the data's actions, a variational autoencoder."""
-    vae_learning_rate: Positive = 1e-3
-    """Adam's step size for it."""
-    latent: Count = 2
-    """Entries of its code, for each action."""
-    kl_weight: NonNegative = 0.5
-    """Weight of the codes' divergence from a standard normal beside the squared error of an action."""
-    candidates: Count = 10
-    """Actions that are drawn for a state; the best one is taken."""
-    perturbation: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.05
-    """The most by which a candidate is changed (Phi)."""
-    lower_weight: Fraction = 0.75
-    """Weight of the lower of both critics in a target; the higher one has the rest."""
+    vae_hidden: Layers = (256, 256)  # Widths of the hidden layers of the actions' model, a variational autoencoder.
+    vae_learning_rate: Positive = 1e-3  # Adam's step size for it.
+    latent: Count = 2  # Entries of its code, for each action.
+    kl_weight: NonNegative = 0.5  # Weight of the codes' divergence from a normal beside an action's squared error.
+    candidates: Count = 10  # Actions that are drawn for a state; the best one is taken.
+    perturbation: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.05  # The most by which a candidate is changed (Phi).
+    lower_weight: Fraction = 0.75  # Weight of the lower of both critics in a target; the higher one has the rest.
 
     def bytes_held(self, num_envs: int, width: int) -> int:
         """As of its base, with the autoencoder."""

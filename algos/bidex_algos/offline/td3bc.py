@@ -25,12 +25,9 @@ class TD3BCConfig(CriticConfig):
 
     alpha: NonNegative = 2.5
     """Weight of the value, divided by the mean absolute value of the batch, beside the distance to the data; 0: BC."""
-    target_std: NonNegative = 0.2
-    """Standard deviation of the noise on the target actor's actions."""
-    target_bound: NonNegative = 0.5
-    """That noise is cut to plus and minus this."""
-    policy_delay: Count = 2
-    """Updates of the critics for each of the actor and the targets."""
+    target_std: NonNegative = 0.2  # Standard deviation of the noise on the target actor's actions.
+    target_bound: NonNegative = 0.5  # That noise is cut to plus and minus this.
+    policy_delay: Count = 2  # Updates of the critics for each of the actor and the targets.
 
 
 # "paper": alpha is Table 46's, whose other numbers are the defaults; noise, its bound and the delay, which it leaves

@@ -59,26 +59,18 @@ class BRCConfig(CategoricalConfig, MTSACConfig):
 
     critic_hidden: Layers = (256, 256, 256)
     """Width of the critics as often as there are residual blocks of two layers, and once more for the first layer."""
-    hidden: Layers = (256, 256)
-    """The same of the actor."""
-    value_heads: bool = False
-    """Give each critic one distribution per task instead of one for all."""
+    hidden: Layers = (256, 256)  # The same of the actor.
+    value_heads: bool = False  # Give each critic one distribution per task instead of one for all.
     task_embedding: Whole = 32
     """Size of a learned vector that each network reads in the place of the task's one-hot; 0: the one-hot itself."""
-    updates_per_step: Count = 4
-    """Updates of all networks after each vector step."""
-    n_steps: Count = 3
-    """Steps whose rewards a target takes as they came, before it asks for the value of what follows."""
-    tau: Share = 0.05
-    """Share of the critics that enters the target critics in each update (1 - Polyak's factor)."""
-    clipped_double_q: bool = False
-    """Targets and actor take the critic that says less; off: the mean of both."""
-    weight_decay: NonNegative = 1e-4
-    """Share of its step size by which each step shortens all weights of actor and critics (AdamW)."""
+    updates_per_step: Count = 4  # Updates of all networks after each vector step.
+    n_steps: Count = 3  # Steps whose rewards a target takes as they came, before it asks for the value of what follows.
+    tau: Share = 0.05  # Share of the critics that enters the target critics in each update (1 - Polyak's factor).
+    clipped_double_q: bool = False  # Targets and actor take the critic that says less; off: the mean of both.
+    weight_decay: NonNegative = 1e-4  # Share of its step size by which a step shortens all weights (AdamW).
     target_entropy_per_action: Finite = -0.5
     """Entropy of the squashed policy that each temperature aims at, for each action; uniform actions have 0.69."""
-    one_temperature: bool = False
-    """One temperature for all tasks, led by their mean entropy."""
+    one_temperature: bool = False  # One temperature for all tasks, led by their mean entropy.
 
     def __post_init__(self) -> None:
         super().__post_init__()

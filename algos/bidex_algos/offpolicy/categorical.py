@@ -56,14 +56,10 @@ class Atoms(nn.Module):
 class CategoricalConfig(OffPolicyConfig):
     """The critics' distributions and layers, beside what all off-policy learners have."""
 
-    critic_hidden: Layers = (256, 256)
-    """Widths of the hidden layers of the critics; ``hidden`` is then the actor's alone."""
-    atoms: Annotated[int, Meta(ge=2, le=MOST)] = 101
-    """Values that a distribution of the return gives probabilities to."""
-    value_bound: Positive = 10.0
-    """They lie evenly from minus this to this, in scaled rewards."""
-    clipped_double_q: bool = True
-    """Targets and actor take the critic that says less; off: the mean of both."""
+    critic_hidden: Layers = (256, 256)  # Widths of the critics' hidden layers; ``hidden`` is then the actor's alone.
+    atoms: Annotated[int, Meta(ge=2, le=MOST)] = 101  # Values that a distribution of the return gives probabilities to.
+    value_bound: Positive = 10.0  # They lie evenly from minus this to this, in scaled rewards.
+    clipped_double_q: bool = True  # Targets and actor take the critic that says less; off: the mean of both.
 
     def bytes_held(self, num_envs: int, width: int) -> int:
         """As in the base, where ``hidden`` is of all networks, and the critics'."""
@@ -105,8 +101,7 @@ class CategoricalCritics(nn.Module):
         return self.atoms.mean(self.log_probs(obs, actions, task_id).exp())
 
 
-RECENT = 0.9
-"""Weight of a reward in the recent ones' mean over that of the next: about the last ten steps count."""
+RECENT = 0.9  # weight of a reward in the recent ones' mean over that of the next: about the last ten steps count
 
 
 class ReturnBound(ReturnScale):

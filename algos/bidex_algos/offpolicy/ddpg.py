@@ -28,8 +28,7 @@ class DDPGConfig(OffPolicyConfig):
 
     exploration_std: tuple[NonNegative, NonNegative] = (0.05, 0.5)
     """Standard deviation of the noise on actions: of each task's first environment, of its last; evenly between."""
-    squash_price: NonNegative = 1.0
-    """Price, in the actor's loss, on the mean square of what tanh makes the actions of; 0: none."""
+    squash_price: NonNegative = 1.0  # Price, in the actor's loss, on the mean square of what tanh is taken of; 0: none.
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -20,14 +20,10 @@ from bidex_meta.utils.validation import Count, NonNegative, Share
 class FastTD3Config(CategoricalConfig, TD3Config):
     """Everything that can be set about FastTD3; the defaults are the preset ``laptop``."""
 
-    value_heads: bool = False
-    """Give each critic one distribution per task instead of one for all."""
-    n_steps: Count = 3
-    """Steps whose rewards a target takes as they came, before it asks for the value of what follows."""
-    tau: Share = 0.05
-    """Share of the critics that enters the target critics in each update (1 - Polyak's factor)."""
-    weight_decay: NonNegative = 0.1
-    """Share of its step size by which each step shortens all weights of actor and critics (AdamW)."""
+    value_heads: bool = False  # Give each critic one distribution per task instead of one for all.
+    n_steps: Count = 3  # Steps whose rewards a target takes as they came, before it asks for the value of what follows.
+    tau: Share = 0.05  # Share of the critics that enters the target critics in each update (1 - Polyak's factor).
+    weight_decay: NonNegative = 0.1  # Share of its step size by which a step shortens all weights (AdamW).
 
 
 PRESETS: dict[str, FastTD3Config] = {

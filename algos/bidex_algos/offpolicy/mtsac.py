@@ -26,14 +26,10 @@ from bidex_meta.world.contract import VectorWorld
 class MTSACConfig(OffPolicyConfig):
     """Everything that can be set about MT-SAC; the defaults are the preset ``laptop``."""
 
-    init_std: Positive = 0.5
-    """Standard deviation of the actions at the start, before the squashing."""
-    std_range: tuple[Positive, Positive] = (0.02, 2.0)
-    """Its bounds."""
-    alpha_learning_rate: Positive = 3e-3
-    """Adam's step size for the logarithms of the temperatures."""
-    init_alpha: Positive = 0.001
-    """Temperature of every task at the start."""
+    init_std: Positive = 0.5  # Standard deviation of the actions at the start, before the squashing.
+    std_range: tuple[Positive, Positive] = (0.02, 2.0)  # Its bounds.
+    alpha_learning_rate: Positive = 3e-3  # Adam's step size for the logarithms of the temperatures.
+    init_alpha: Positive = 0.001  # Temperature of every task at the start.
     target_entropy_per_action: Finite = -1.0
     """Entropy of the squashed policy that each temperature aims at, for each action; uniform actions have 0.69."""
 

@@ -17,10 +17,8 @@ from bidex_meta.world.contract import VectorWorld
 class TD3Config(DDPGConfig):
     """Everything that can be set about TD3; the defaults are the preset ``laptop``."""
 
-    target_std: NonNegative = 0.2
-    """Standard deviation of the noise on the actions that targets assume."""
-    target_bound: NonNegative = 0.5
-    """That noise is cut to plus and minus this."""
+    target_std: NonNegative = 0.2  # Standard deviation of the noise on the actions that targets assume.
+    target_bound: NonNegative = 0.5  # That noise is cut to plus and minus this.
     policy_delay: Count = 2
     """Updates of the critics for each of the actor and of what follows them (FastTD3's target critics: at each)."""
 

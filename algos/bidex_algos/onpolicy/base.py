@@ -24,38 +24,26 @@ from bidex_meta.world.contract import VectorWorld
 
 @dataclass(frozen=True)
 class _ValueHeads(ArchitectureConfig):
-    value_heads: bool = True
-    """Give the critic one output per task instead of one for all."""
+    value_heads: bool = True  # Give the critic one output per task instead of one for all.
 
 
 @dataclass(frozen=True)
 class OnPolicyConfig(NetworkConfig, _ValueHeads):
     """Networks, rollouts, statistics; the defaults are the preset ``laptop``."""
 
-    hidden: Layers = (256, 256, 128)
-    """Widths of the hidden layers, of actor and critic alike."""
-    activation: Activation = "elu"
-    """Non-linearity of the hidden layers."""
-    init_std: Positive = 0.8
-    """Standard deviation of the actions at the start."""
-    std_range: tuple[Positive, Positive] = (0.05, 1.5)
-    """Bounds of the standard deviation of the actions."""
-    rollout_steps: Count = 8
-    """Steps taken in every environment between two updates."""
-    gamma: Fraction = 0.93
-    """Discount per step."""
-    lam: Fraction = 0.95
-    """Trace decay of the advantage estimate."""
+    hidden: Layers = (256, 256, 128)  # Widths of the hidden layers, of actor and critic alike.
+    activation: Activation = "elu"  # Non-linearity of the hidden layers.
+    init_std: Positive = 0.8  # Standard deviation of the actions at the start.
+    std_range: tuple[Positive, Positive] = (0.05, 1.5)  # Bounds of the standard deviation of the actions.
+    rollout_steps: Count = 8  # Steps taken in every environment between two updates.
+    gamma: Fraction = 0.93  # Discount per step.
+    lam: Fraction = 0.95  # Trace decay of the advantage estimate.
     normalise_observations: bool = True
     """Give observations zero mean and unit variance by running statistics; the task's one-hot stays as it is."""
-    per_task_values: bool = True
-    """Let the critic predict returns normalised per task by running statistics."""
-    value_horizon: Positive = 100.0
-    """Iterations after which returns fade from those statistics."""
-    per_task_advantages: bool = True
-    """Normalise advantages within each task instead of over the whole batch."""
-    autocast: Autocast = "auto"
-    """Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX or AVX-512's BF16."""
+    per_task_values: bool = True  # Let the critic predict returns normalised per task by running statistics.
+    value_horizon: Positive = 100.0  # Iterations after which returns fade from those statistics.
+    per_task_advantages: bool = True  # Normalise advantages within each task instead of over the whole batch.
+    autocast: Autocast = "auto"  # Hidden layers in bfloat16; auto: on CUDA and on CPUs with AMX or AVX-512's BF16.
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -30,32 +30,23 @@ from bidex_meta.world.contract import VectorWorld
 class MTPPOConfig(PPOConfig, OnPolicyConfig):
     """Everything that can be set about MT-PPO; the defaults are the preset ``laptop``."""
 
-    value_loss_weight: Finite = 2.0
-    """Factor of the value loss. Adam undoes it; it matters only beside max_grad_norm."""
-    entropy_weight: Finite = 0.0
-    """Factor of the entropy bonus."""
-    max_grad_norm: Positive = 1.0
-    """Gradients longer than this are shortened to it."""
+    value_loss_weight: Finite = 2.0  # Factor of the value loss. Adam undoes it; it matters only beside max_grad_norm.
+    entropy_weight: Finite = 0.0  # Factor of the entropy bonus.
+    max_grad_norm: Positive = 1.0  # Gradients longer than this are shortened to it.
     clip_apart: bool = True
     """Shorten the gradients of actor and critic apart, so that a large value error leaves the policy's step alone."""
     gradient_surgery: Balancing = "none"
     """What becomes of the tasks' policy gradients. pcgrad: each loses what points against another task's (Yu et al.
     2020). cagrad: their sum is turned towards the task that it serves worst (Liu et al. 2021). famo: losses are weighed
     so that all fall at one rate (Liu et al. 2023)."""
-    cagrad_radius: BelowOne = 0.4
-    """How far cagrad's direction may leave the mean gradient, in lengths of that; 0: it is the mean."""
-    famo_rate: Positive = 0.025
-    """Adam's step size of famo's weights."""
-    famo_decay: NonNegative = 0.01
-    """By which these weights are drawn back to even ones."""
+    cagrad_radius: BelowOne = 0.4  # How far cagrad's direction may leave the mean gradient, in its lengths; 0: not.
+    famo_rate: Positive = 0.025  # Adam's step size of famo's weights.
+    famo_decay: NonNegative = 0.01  # By which these weights are drawn back to even ones.
     demonstration_weight: NonNegative = 0.1
     """With --demonstrations: weight at the start of the policy's distance from them; 0: they count nothing."""
-    demonstration_half_life: Positive = 500_000.0
-    """Environment steps in which that weight falls to half."""
-    demonstration_batch: Count = 256
-    """Transitions of them in each mini-batch, of each process."""
-    demonstration_cloning: Whole = 0
-    """Steps of so many of them in which the policy is cloned before it plays."""
+    demonstration_half_life: Positive = 500_000.0  # Environment steps in which that weight falls to half.
+    demonstration_batch: Count = 256  # Transitions of them in each mini-batch, of each process.
+    demonstration_cloning: Whole = 0  # Steps of so many of them in which the policy is cloned before it plays.
     critic_first: Whole = 0
     """Environment steps at the start in which the critic alone learns: for a policy that begins with a skill (cloned,
     or of --start-from), which a critic that knows nothing would spoil."""

@@ -26,33 +26,20 @@ from bidex_meta.world.contract import VectorWorld
 class MTTRPOConfig(OnPolicyConfig):
     """Everything that can be set about MT-TRPO; the defaults are the preset ``laptop``."""
 
-    max_kl: Positive = 0.1
-    """Mean KL of the new policy from the sampling one that an update may not exceed."""
-    damping: NonNegative = 0.1
-    """Added to the diagonal of the Fisher matrix, so that the step stays short along directions that the samples tell
-    nothing about."""
-    cg_iterations: Count = 10
-    """Conjugate-gradient iterations."""
-    fisher_stride: Count = 4
-    """Every so many-th sample goes into the Fisher matrix; it needs fewer than the gradient, and is multiplied once an
-    iteration."""
-    backtracks: Count = 10
-    """Points that the line search tries."""
-    backtrack_factor: Fraction = 0.8
-    """By which the line search shortens the step."""
+    max_kl: Positive = 0.1  # Mean KL of the new policy from the sampling one that an update may not exceed.
+    damping: NonNegative = 0.1  # Added to the Fisher matrix's diagonal: shortens steps that samples tell nothing of.
+    cg_iterations: Count = 10  # Conjugate-gradient iterations.
+    fisher_stride: Count = 4  # Every so many-th sample goes into the Fisher matrix; it needs fewer than gradients.
+    backtracks: Count = 10  # Points that the line search tries.
+    backtrack_factor: Fraction = 0.8  # By which the line search shortens the step.
     accept_ratio: Fraction = 0.1
     """Share of the improvement promised by the gradient that must come true where the line search stops; more keeps to
     steps along which the surrogate is almost straight."""
-    critic_learning_rate: Positive = 1e-3
-    """Adam's step size of the critic."""
-    critic_epochs: Count = 4
-    """The critic's passes over the rollout per update."""
-    num_minibatches: Count = 4
-    """The critic's mini-batches per epoch."""
-    max_grad_norm: Positive = 1.0
-    """Gradients of the critic longer than this are shortened to it."""
-    autocast: Autocast = "off"
-    """Hidden layers in bfloat16: too coarse for the Fisher matrix, so off by default."""
+    critic_learning_rate: Positive = 1e-3  # Adam's step size of the critic.
+    critic_epochs: Count = 4  # The critic's passes over the rollout per update.
+    num_minibatches: Count = 4  # The critic's mini-batches per epoch.
+    max_grad_norm: Positive = 1.0  # Gradients of the critic longer than this are shortened to it.
+    autocast: Autocast = "off"  # Hidden layers in bfloat16: too coarse for the Fisher matrix, so off by default.
 
 
 PRESETS: dict[str, MTTRPOConfig] = {

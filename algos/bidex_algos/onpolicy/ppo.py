@@ -17,22 +17,15 @@ from bidex_meta.utils.validation import Count, Positive, check_rising
 class PPOConfig(LearnerConfig):
     """Passes, clip and step sizes. A config that is made of this and others puts its fields behind theirs."""
 
-    num_minibatches: Count = 4
-    """Mini-batches per epoch; each holds shuffled samples of all environments."""
-    epochs: Count = 4
-    """Passes over what was collected, per update."""
-    clip: Positive = 0.2
-    """How far the likelihood ratio may leave 1 before it earns nothing more."""
-    learning_rate: Positive = 3e-4
-    """Adam's step size at the start."""
+    num_minibatches: Count = 4  # Mini-batches per epoch; each holds shuffled samples of all environments.
+    epochs: Count = 4  # Passes over what was collected, per update.
+    clip: Positive = 0.2  # How far the likelihood ratio may leave 1 before it earns nothing more.
+    learning_rate: Positive = 3e-4  # Adam's step size at the start.
     adaptive_learning_rate: bool = True
     """Divide the step size by 1.5 when the KL exceeds twice desired_kl, multiply it when below half."""
-    desired_kl: Positive = 0.03
-    """KL of the sampling policy from the current one that the adaptive step size aims at."""
-    learning_rate_range: tuple[Positive, Positive] = (1e-5, 1e-2)
-    """Bounds of the adaptive step size."""
-    critic_learning_rate: Positive | None = 1e-3
-    """A fixed step size for the critic; None makes it follow the actor's."""
+    desired_kl: Positive = 0.03  # KL of the sampling policy from the current one that the adaptive step size aims at.
+    learning_rate_range: tuple[Positive, Positive] = (1e-5, 1e-2)  # Bounds of the adaptive step size.
+    critic_learning_rate: Positive | None = 1e-3  # A fixed step size for the critic; None makes it follow the actor's.
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -69,8 +62,7 @@ class PolicyLoss(NamedTuple):
         return [self.surrogate.detach(), value.detach(), self.kl, self.outside]
 
 
-NAMES: tuple[str, ...] = ("Loss/surrogate", "Loss/value", "Policy/kl", "Policy/clip_fraction")
-"""Tags of :meth:`PolicyLoss.numbers`."""
+NAMES = ("Loss/surrogate", "Loss/value", "Policy/kl", "Policy/clip_fraction")  # tags of :meth:`PolicyLoss.numbers`
 
 
 def policy_loss(
