@@ -125,7 +125,7 @@ def stack_block(hands: HandController) -> None:
     behind1, behind2 = -0.03 - _FINGERS, 0.05 + _FINGERS
     hands.lead(_from(block2, 0.0, behind2, 0.70), _from(block1, 0.0, behind1 - 0.03, 0.70), 10, speed=0.66)
     hands.lead(_from(block2, 0.0, behind2, 0.655), _from(block1, 0.0, behind1 - 0.03, 0.655), 12)
-    y, goal = float(hands.at("right")[1]), float(hands.frozen("target2")[1])
+    y, goal = float(hands.at("right")[1]), float(hands.frozen("goal2")[1])
     while float(hands.where("block2/position")[1]) > goal + 0.004 and len(hands.actions) < 80:
         y -= 0.0028
         hands.lead((float(block2[0]) + 0.008, y, 0.655), _from(block1, 0.0, -0.05 - _FINGERS, 0.655), speed=0.4)
