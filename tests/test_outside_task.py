@@ -98,7 +98,7 @@ def test_a_mistake_in_a_method_names_class_method_expected_and_received(right: s
     source = (working_folder / "my_tasks.py").read_text()
     assert right in source
     name = f"mistaken_{list(_MISTAKES).index(right)}"
-    source = source.replace("import Layout,", "import Block, Layout,").replace(right, wrong)
+    source = source.replace("import goal_blocks,", "import Block, goal_blocks,").replace(right, wrong)
     (working_folder / f"{name}.py").write_text(source)
     with pytest.raises(BidexError) as raised:
         make_task_world(f"{name}:SlideBlock", 2, device="cpu", threads=1)

@@ -82,7 +82,8 @@ class TaskClass(ABC):
             class says (fixed for HandOver alone).
         solver: What the class asks of the contact solver.
         needs: Most contacts and constraint rows in 30,208 states under rough actions, for mujoco_warp's fixed room,
-            by ``python -m tools.bench capacity --steps 30000``. A class that was not measured has the largest of all.
+            by ``python -m tools.bench capacity --task NAME --steps 30000``. A class that was not measured has the
+            largest of all.
         camera_target: Point that pictures look at, world, metres, from ``camera_distance``.
         depth_camera: Where the camera of point clouds stands and what it looks at, world, metres; None: it looks down
             at ``camera_target`` from the front.
