@@ -111,6 +111,7 @@ def results_by_class(
             returns=counted_returns(own["return"], broken, reference, np.concatenate(finished)),
             successes=(own["success"] & ~broken).astype(np.float64), lengths=own["length"], tasks=own["task"],
             unstable=int(broken.sum()), reference=reference,
+            **{kind: float((own[kind] & ~broken).mean()) for kind in ("once", "at_end") if kind in own},
         )  # fmt: skip
     return classes
 
