@@ -124,7 +124,7 @@ class _Open(_Door):
     wide_space = join(
         component("base_y", -0.08, 0.08),  # farther the handles would start in the hands
         component("start_angle", 0.0, 0.15),
-        *(component(f"{side}_angle", 0.2, 1.4) for side in SIDES),
+        *(component(f"{side}_angle", 0.3, 1.4) for side in SIDES),
     )
 
     def target(self, state: TaskState) -> Tensor:
