@@ -107,14 +107,13 @@ def test_version_2_has_version_1s_classes_splits_and_sizes(name: str) -> None:
     one, two = Benchmark(name), Benchmark(f"{name}-v2")
     assert two.padded_size == one.padded_size and two.suite.splits == one.suite.splits
     for split in one.suite.splits:
-        classes = one.task_classes(split), two.task_classes(split)
-        assert list(classes[0]) == list(classes[1]) and {each.action_size for each in classes[1].values()} == {52}
-        tasks = two.train_tasks if split == "train" else two.test_tasks
-        assert len(tasks) == 50 * len(classes[1]) and {entry.reward_scale for entry in two.suite.classes} == {1.0}
+        classes = two.task_classes(split)
+        assert list(classes) == list(one.task_classes(split)) and all(c.action_size == 52 for c in classes.values())
+        assert len(two.train_tasks if split == "train" else two.test_tasks) == 50 * len(classes)
     if name in ("MT4", "ML4", "ML20"):
-        worlds = [each.make_world(num_envs=15, device="cpu", threads=1) for each in (one, two)]
-        assert worlds[0].single_observation_space.shape == worlds[1].single_observation_space.shape
-        assert worlds[0].num_id_columns == worlds[1].num_id_columns and worlds[0].hides_goals == worlds[1].hides_goals
+        a, b = (each.make_world(num_envs=15, device="cpu", threads=1) for each in (one, two))
+        assert a.single_observation_space.shape == b.single_observation_space.shape
+        assert (a.num_id_columns, a.hides_goals) == (b.num_id_columns, b.hides_goals)
 
 
 RULES = {"reward": "v2", "variation": "wide", "success": "at-end", "starts": "jittered"}
@@ -122,26 +121,25 @@ RULES = {"reward": "v2", "variation": "wide", "success": "at-end", "starts": "ji
 
 @pytest.mark.parametrize("rule", RULES)
 def test_each_rule_of_version_2_works_alone(rule: str, tmp_path: Path) -> None:
-    """What it changes, and what it leaves as it is bit for bit."""
-    given = {'"HandOver"': '"PushBlock"', "base": f'{rule} = "{RULES[rule]}"\nbase'}
-    given |= {'reward = "paper"\n': ""} if rule == "reward" else {}
-    steps, envs = [], []
-    for replaced in ({'"HandOver"': '"PushBlock"'}, given):
+    """What it changes, and what it leaves as it is bit for bit; in worlds and in single environments."""
+    plain = {'"HandOver"': '"PushBlock"'}
+    given = plain | {'reward = "paper"\n': f'{rule} = "{RULES[rule]}"\n' + 'reward = "paper"\n' * (rule != "reward")}
+    found = []
+    for replaced in (plain, given):
         benchmark = Benchmark(own_suite(tmp_path, **replaced))
-        assert vars(benchmark.suite.rules) == vars(V1) | ({rule: RULES[rule]} if replaced is given else {})
         world = benchmark.make_world(num_envs=4, device="cpu", threads=1, stagger=False)
         world.reset(seed=0)
         world.episodes.success |= True
-        steps.append(world.step(torch.zeros(4, 52)))
         env = next(iter(benchmark.train_classes.values()))()
         env.set_task(benchmark.train_tasks[0])
-        envs.append((env.reset(seed=0)[0], env.step(np.zeros(52, np.float32))[1]))
-    (obs, reward, *_, info), (new, paid, *_, told) = steps
-    same = obs.shape == new.shape and torch.equal(obs, new)
-    assert same == (rule not in ("variation", "starts")) and np.array_equal(envs[0][0], envs[1][0]) == same
-    assert torch.equal(reward, paid) == (rule == "success") == (envs[0][1] == envs[1][1])
-    assert (paid.max() < 1.0) == (rule == "reward") and info["so_far"]["success"].all()
-    assert told["so_far"]["success"].any() == (rule != "success")
+        found.append((*world.step(torch.zeros(4, 52)), env.reset(seed=0)[0], env.step(np.zeros(52, np.float32))[1]))
+    assert vars(benchmark.suite.rules) == vars(V1) | {rule: RULES[rule]}
+    (obs, reward, *_, info, first, gain), (new, paid, *_, told, start, got) = found
+    same = rule not in ("variation", "starts")
+    assert torch.equal(obs, new) == np.array_equal(first, start) == same
+    assert torch.equal(reward, paid) == (rule == "success") == (gain == got)
+    assert (paid.max() < 1.0) == (rule == "reward")
+    assert info["so_far"]["success"].all() and told["so_far"]["success"].any() == (rule != "success")
 
 
 def test_tasks_depend_on_seed_class_and_split_only(tmp_path: Path) -> None:

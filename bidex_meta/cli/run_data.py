@@ -25,8 +25,8 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
     ``policies`` are who acted, in the order of ``Episode.policy``. Returned are ``suite`` and ``suite_version``, or
     ``task``, ``base`` and ``object``, the others None; ``points`` of a cloud; ``tasks``, names of the slots;
     ``reward_scales``, factor on the reward by slot; ``rules``, the suite's; ``hides_goals``; ``observation_groups``,
-    [name, index ranges]; ``kind`` (``random``, ``medium``, ...), ``policies``, ``seed`` of the tasks, ``references`` ({class:
-    {random, zero, expert}}, unscaled returns), ``versions`` and ``commit``.
+    [name, index ranges]; ``kind`` (``random``, ``medium``, ...), ``policies``, ``seed`` of the tasks, ``references``
+    ({class: {random, zero, expert}}, unscaled returns), ``versions`` and ``commit``.
     """
     alone, versions = source.class_name, collect_versions()
     names = {name.partition("/")[0] for name in world.task_names}

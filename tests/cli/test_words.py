@@ -20,12 +20,7 @@ def test_help_and_lists_need_no_torch(words):
     heavy = {"torch", "mujoco", "metaworld", "scipy", "tensorboard", "bidex_algos.learner"}
     code = f"import sys; from bidex_meta.cli import main; main({words}); print({heavy} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    named = {
-        "--help": list(COMMANDS),
-        "suites": ["metaworld/MT10", "MT20-v2"],
-        "tasks": registry.names(),
-        "algos": list(ALGOS),
-    }
+    named = {"--help": list(COMMANDS), "suites": ["MT10", "MT20-v2"], "tasks": registry.names(), "algos": list(ALGOS)}
     assert all(name in done.stdout for name in named[words[-1]]) and done.stdout.rstrip().endswith("set()")
 
 
