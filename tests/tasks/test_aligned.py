@@ -39,7 +39,7 @@ def test_the_reward_is_one_where_solved_and_at_most_nine_tenths_elsewhere(name: 
         judged = judge(member.scene.task, state)
         check_range(judged.reward, judged.success)
         count += int(judged.success.sum())
-        for row in range(i % 10, ROWS, 10):
+        for row in range(i % 3, ROWS, 3):
             solved, margin = wide.solved(name, lens.look(engine.placement()[row]), tasks[row])
             if margin > 1e-6:
                 assert bool(judged.success[row]) == solved, row

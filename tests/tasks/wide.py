@@ -71,7 +71,7 @@ def solved(name: str, data: mujoco.MjData, task: Task) -> tuple[bool, float]:
 
 def near(name: str, data: mujoco.MjData, task: Task, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """Positions of free parts and joints about where a task is solved, within less and more than tolerances."""
-    spread = rng.choice((0.3, 1.0, 4.0)) * rng.uniform(-1, 1, 4)
+    spread = rng.choice((0.5, 1.3, 4.0)) * rng.uniform(-1, 1, 4)
     if name in JOINTS:
         joints, tolerance = JOINTS[name]
         offs = zip(joints.items(), tolerance * spread[:, None], strict=False)
