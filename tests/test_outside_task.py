@@ -74,6 +74,17 @@ def test_a_suite_names_it_and_hides_its_goal(working_folder: Path) -> None:
     assert env.reset(seed=0)[0].shape == (422,)
 
 
+@pytest.mark.parametrize("rule", ['reward = "v2"', 'reward = "paper"\nvariation = "wide"'])
+def test_rules_that_it_lacks_are_refused_and_others_work(rule: str, working_folder: Path) -> None:
+    suite = SUITE.replace("base", 'success = "at-end"\nstarts = "jittered"\nbase')
+    (working_folder / "slides.toml").write_text(suite)
+    assert Benchmark("slides.toml").make_world("test", 2, device="cpu", threads=1).reset(seed=0)[0].isfinite().all()
+    (working_folder / "slides.toml").write_text(suite.replace('reward = "paper"', rule))
+    with pytest.raises(BidexError, match=r"slides\.toml.*SlideBlock: .* which the class does not have") as raised:
+        Benchmark("slides.toml")
+    assert rule.split()[-1] in str(raised.value) and "\n" not in str(raised.value)
+
+
 def test_an_object_of_its_own_lies_beside_the_file() -> None:
     world = make_task_world("with_own_object:SlideBlock", 2, device="cpu", threads=1)
     assert world.reset(seed=0)[0].shape == (2, 422)

@@ -21,7 +21,7 @@ def test_help_and_lists_need_no_torch(words):
     heavy = {"torch", "mujoco", "metaworld", "scipy", "tensorboard", "bidex_algos.learner"}
     code = f"import sys; from bidex_meta.cli import main; main({words}); print({heavy} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    named = {"--help": list(COMMANDS), "suites": ["metaworld/MT10"], "tasks": registry.names(), "algos": list(ALGOS)}
+    named = {"--help": list(COMMANDS), "suites": ["MT10", "MT20-v2"], "tasks": registry.names(), "algos": list(ALGOS)}
     assert all(name in done.stdout for name in named[words[-1]]) and done.stdout.rstrip().endswith("set()")
 
 
@@ -84,7 +84,7 @@ def test_bash_completes_commands_flags_and_names(tmp_path, capsys):
     for words, expected in (
         ("ru", {"run"}),
         ("run --learner.gam", {"--learner.gamma"}),
-        ("run --suite MT", {"MT1", "MT1-objects", "MT4", "MT20"}),
+        ("run --suite MT", {"MT1", "MT1-objects", "MT4", "MT20", "MT1-v2", "MT4-v2", "MT20-v2"}),
         ("run --algo mtp", {"mtppo"}),
         ("witness --task Hand", {"HandOver"}),
         ("run --object ha", {"hammer"}),
