@@ -11,7 +11,7 @@ from bidex_meta.cli.parsing import JsonSwitch, parse
 from bidex_meta.cli.tables import Json, plain_table, print_table, say
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.play import EVALUATION_SEED, HeldAgent, RandomAgent, ZeroAgent, evaluate
-from bidex_meta.evaluation.validity import blind_ceiling, identifiability
+from bidex_meta.evaluation.task_inference import blind_ceiling, identifiability
 from bidex_meta.runs.atomic import check_writable, write_json
 from bidex_meta.runs.versions import collect_versions
 from bidex_meta.utils.validation import Seed, Threads

@@ -1,13 +1,9 @@
 """The reward of version 2: one formula for all classes, from how far a state is from solved."""
 
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
-
-if TYPE_CHECKING:
-    from bidex_meta.tasks.base import TaskClass
-    from bidex_meta.tasks.state import TaskState
 
 
 class Hidden(NamedTuple):
@@ -44,21 +40,20 @@ def within(errors: list[Error]) -> Tensor:
     return torch.stack([error.value < error.tolerance for error in errors]).all(dim=0)
 
 
-def aligned_terms(task: "TaskClass", state: "TaskState") -> dict[str, Tensor]:
-    """The reward of version 2, in [0, 1], by terms (n,): 1 where the task is solved, at most 0.9 elsewhere.
+def aligned_terms(solved: Tensor, errors: list[Error], guides: list[Tensor]) -> dict[str, Tensor]:
+    """The reward of version 2, in [0, 1], by terms (n,): 1 where ``solved``, at most 0.9 elsewhere.
 
     ``solved``: 1 or 0. Elsewhere ``far`` and ``near``, means over the class's errors e in units of their tolerances, of
-    1 - tanh(e / 16) and exp(-0.3 e): for an egg 1 - tanh(2 d) and exp(-10 d), d in metres. Classes with points that the
-    hands shall reach add ``reach``, the mean of 1 - tanh(3 d). Weights: far 0.25, near 0.65; with reach 0.2, 0.5, 0.2.
+    1 - tanh(e / 16) and exp(-0.3 e): for an egg 1 - tanh(2 d) and exp(-10 d), d in metres. Classes with ``guides``,
+    distances d of hands to points, add ``reach``, the mean of 1 - tanh(3 d). Weights: far 0.25, near 0.65; with reach
+    0.2, far 0.2 and near 0.5.
     """
-    solved = task.solved_in(state)
-    errors = torch.stack([error.value / error.tolerance for error in task.errors(state)])
-    far, near = (1.0 - torch.tanh(errors / 16.0)).mean(dim=0), torch.exp(-0.3 * errors).mean(dim=0)
-    guides = task.guides(state)
+    off = torch.stack([error.value / error.tolerance for error in errors])
+    far, near = (1.0 - torch.tanh(off / 16.0)).mean(dim=0), torch.exp(-0.3 * off).mean(dim=0)
     if guides:
         reach = (1.0 - torch.tanh(3.0 * torch.stack(guides))).mean(dim=0)
         terms = {"reach": 0.2 * reach, "far": 0.2 * far, "near": 0.5 * near}
     else:
         terms = {"far": 0.25 * far, "near": 0.65 * near}
     shaped = {name: torch.where(solved, 0.0, value) for name, value in terms.items()}
-    return {**shaped, "solved": solved.to(errors.dtype)}
+    return {**shaped, "solved": solved.to(off.dtype)}

@@ -222,7 +222,9 @@ class TaskClass(ABC):
 
     def rewards(self, state: TaskState) -> dict[str, Tensor]:
         """Named terms, each (n,), that sum to the reward by the suite's rules."""
-        return aligned_terms(self, state) if self.rules.reward == "v2" else self.reward_terms(state)
+        if self.rules.reward == "paper":
+            return self.reward_terms(state)
+        return aligned_terms(self.solved_in(state), self.errors(state), self.guides(state))
 
     def failed(self, state: TaskState) -> Tensor:
         """Whether the episode ends here other than by time. Shape (n,), bool; never by default."""

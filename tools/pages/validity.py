@@ -16,8 +16,8 @@ _SHARES = {
 
 
 def validity_table(suite: str, data: Path) -> list[str]:
-    """The table of a suite from ``validity/SUITE.json`` in the folder of data; the last row is the mean of classes."""
-    file = data / "validity" / f"{suite}.json"
+    """The table of a suite from ``validity/SUITE.json`` beside the folder of data; last row: the mean of classes."""
+    file = data.parent / "validity" / f"{suite}.json"
     if not file.is_file():
         raise BidexError(f"Expected {file}. Make it: bidex-meta validity --suite {suite} --out {file}")
     classes = json.loads(file.read_text())["classes"]

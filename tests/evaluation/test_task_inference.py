@@ -8,7 +8,7 @@ import pytest
 
 from bidex_meta import Benchmark
 from bidex_meta.cli import main
-from bidex_meta.evaluation.validity import blind_ceiling, identifiability
+from bidex_meta.evaluation.task_inference import blind_ceiling, identifiability
 from bidex_meta.suite import load_suite
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.aligned import Error
