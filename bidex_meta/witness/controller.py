@@ -17,6 +17,11 @@ _KNUCKLES, _MIDDLES = ("FFJ2", "MFJ2", "RFJ2", "LFJ2"), ("FFJ1", "MFJ1", "RFJ1",
 Point = tuple[float, float, float]
 
 
+def beside(point: Tensor, x: float, y: float, height: float) -> Point:
+    """A point beside another, at a height above the floor, metres."""
+    return float(point[0]) + x, float(point[1]) + y, height
+
+
 def rest_action(size: int) -> Tensor:
     """The action (size,) of zero joint angles and no force on the bases."""
     low, high = (torch.as_tensor(x).float() for x in (hand().control_low, hand().control_high))
@@ -37,6 +42,7 @@ class HandController:
         self.rewards: list[float] = []
         self.success: list[bool] = []
         self.episode_steps = simulator.episode_steps
+        self.wide = simulator.task.rules.wide  # whether a task asks for more than version 1's
         self._rest = rest_action(simulator.action_size)
         self._full_speed = FORCE_PER_SCALE * simulator.task.transition_scale / LINEAR_DAMPING[0]
         self._full_torque = TORQUE_PER_SCALE * simulator.task.orientation_scale
@@ -57,6 +63,11 @@ class HandController:
     def frozen(self, name: str) -> Tensor:
         """A frozen number of the task, (k,)."""
         return self._simulator.frozen(name)[0]
+
+    @property
+    def steps_left(self) -> int:
+        """Control steps to the end of the episode."""
+        return self.episode_steps - len(self.actions)
 
     def at(self, side: str) -> Tensor:
         """Position of a hand's point, metres, (3,)."""
