@@ -22,6 +22,12 @@ def beside(point: Tensor, x: float, y: float, height: float) -> Point:
     return float(point[0]) + x, float(point[1]) + y, height
 
 
+def point(position: Tensor) -> Point:
+    """A position (3,) as three numbers, metres."""
+    x, y, z = position.tolist()
+    return x, y, z
+
+
 def rest_action(size: int) -> Tensor:
     """The action (size,) of zero joint angles and no force on the bases."""
     low, high = (torch.as_tensor(x).float() for x in (hand().control_low, hand().control_high))

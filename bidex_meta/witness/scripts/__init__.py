@@ -8,6 +8,7 @@ from bidex_meta.witness.controller import HandController
 from bidex_meta.witness.scripts.blocks import grasp_and_place, stack_block
 from bidex_meta.witness.scripts.cubes import turn_cubes
 from bidex_meta.witness.scripts.doors import close_outward, open_inward, push
+from bidex_meta.witness.scripts.tools import open_pen, open_scissors, press_switches
 from bidex_meta.witness.scripts.vessels import lift_underarm, pour_water
 
 SCRIPTS: dict[str, Callable[[HandController], None]] = {
@@ -17,9 +18,12 @@ SCRIPTS: dict[str, Callable[[HandController], None]] = {
     "DoorOpenOutward": push,
     "GraspAndPlace": grasp_and_place,
     "LiftUnderarm": lift_underarm,
+    "OpenPenCap": open_pen,
+    "OpenScissors": open_scissors,
     "PourWater": pour_water,
     "ReOrientation": turn_cubes,
     "StackBlock": stack_block,
+    "Switch": press_switches,
 }
 
 

@@ -18,26 +18,50 @@ def grasp_and_place(hands: HandController) -> None:
     hands.hold("right", yaw=0.15)
     hands.hold("left", yaw=-0.15)
     x, y = float(block[0]) + 0.075, float(block[1])
-    low, high = 0.642, 0.775
+    low, high, press = 0.642, 0.775, _PRESS
     hands.lead((x, y + 0.11, high), (x, y - 0.11, high), 30)
     hands.lead((x, y + 0.11, low), (x, y - 0.11, low), 30, speed=0.4)
     hands.lead((x, y + 0.08, low), (x, y - 0.08, low), 20, speed=0.2)
     for _ in range(30):
-        _clamp(hands, x, y, low)
+        _clamp(hands, x, y, low, press)
     for i in range(40):
-        _clamp(hands, x, y, low + (high - low) * (i + 1) / 40)
+        _clamp(hands, x, y, low + (high - low) * (i + 1) / 40, press)
     way = (bucket - hands.where("block/position"))[:2] / 80
     for i in range(90):
         x, y = (x + float(way[0]), y + float(way[1])) if i < 80 else (x, y)
-        _clamp(hands, x, y, high)
+        _clamp(hands, x, y, high, press)
+    if hands.wide:
+        hands.lead((x, y + 0.11, high), (x, y - 0.11, high), 15, speed=0.3)
+        _drag_bucket(hands, high)
     hands.lead((x, y + 0.11, high), (x, y - 0.11, high), hands.episode_steps, speed=0.2)
 
 
-def _clamp(hands: HandController, x: float, y: float, height: float) -> None:
+def _drag_bucket(hands: HandController, high: float) -> None:
+    """Clamps the bucket like the block, drags it over the table to its goal, and lets go."""
+    x, y, _ = (hands.where("bucket/position")).tolist()
+    x, low, press = x + 0.06, 0.65, 0.0015
+    hands.hold("right", yaw=0.4)
+    hands.hold("left", yaw=-0.4)
+    hands.lead((x, y + 0.17, high), (x, y - 0.17, high), 20)
+    hands.lead((x, y + 0.17, low), (x, y - 0.17, low), 25)
+    for _ in range(45):
+        _clamp(hands, x, y, low, press)
+    while hands.steps_left > 40:
+        way = hands.frozen("goal")[:2] - hands.where("bucket/position")[:2]
+        if float(way.norm()) < 0.006:
+            break
+        way *= min(1.0, 0.0018 / float(way.norm()))
+        x, y = x + float(way[0]), y + float(way[1])
+        _clamp(hands, x, y, low, press)
+    right, left = float(hands.at("right")[1]), float(hands.at("left")[1])
+    hands.lead((x, right + 0.06, low), (x, left - 0.06, low), hands.episode_steps, speed=0.1)
+
+
+def _clamp(hands: HandController, x: float, y: float, height: float, press: float) -> None:
     """Presses the hands together, whatever lies between them, and moves their middle in y."""
     right, left = float(hands.at("right")[1]), float(hands.at("left")[1])
     way = y - 0.5 * (right + left)
-    hands.lead((x, right + way - _PRESS, height), (x, left + way + _PRESS, height))
+    hands.lead((x, right + way - press, height), (x, left + way + press, height))
 
 
 def stack_block(hands: HandController) -> None:

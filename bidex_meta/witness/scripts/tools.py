@@ -1,0 +1,112 @@
+"""Scripted policies for switches, pen and scissors, in closed loop on what the task asks for."""
+
+import torch
+from torch import Tensor
+
+from bidex_meta.hands.hand import SIDES
+from bidex_meta.witness.controller import HandController, Point, point
+
+_LEVER = 0.035  # from a rocker's hinge to its button, metres
+_PRESSED = 0.5  # angle to which version 1 presses a rocker, rad
+
+
+def press_switches(hands: HandController) -> None:
+    """Fingertips press each button until its rocker has the angle asked for, and rise again."""
+    goals = hands.frozen("angles").tolist() if hands.wide else [_PRESSED, _PRESSED]
+    buttons = ("switch2", "switch1")  # of the right and the left hand
+    wanted = goals[::-1]
+    for side in SIDES:
+        hands.bend(side, 0.9, 0.5, THJ3=0.5)
+        hands.hold(side)
+
+    def over(height: float, steps: int, speed: float) -> None:
+        for _ in range(steps):
+            hands.lead(*(_tip(hands, side, _button(hands, name), height) for side, name in zip(SIDES, buttons)), 1, speed)
+
+    over(0.06, 30, 1.2)
+    over(0.04, 5, 0.6)
+    done = [False, False]
+    while hands.steps_left:
+        points: list[Point] = []
+        for i, (side, name) in enumerate(zip(SIDES, buttons, strict=True)):
+            left = wanted[i] - float(hands.where(f"{name}/angle"))
+            done[i] = done[i] or left < 0.012
+            above = _tip(hands, side, _button(hands, name), 0.06)
+            x, y, z = hands.at(side).tolist()
+            down = min(0.008, max(0.002, 0.8 * _LEVER * left))
+            points.append((above[0], above[1], z + 0.01 if done[i] else z - down))
+        hands.lead(*points, speed=0.6)
+
+
+def _button(hands: HandController, name: str) -> Tensor:
+    return hands.where(f"{name}/button_position")
+
+
+def _tip(hands: HandController, side: str, target: Tensor, height: float, finger: str = "mf") -> Point:
+    """Where the hand's point must go for a finger's last joint to be ``height`` metres above a target."""
+    goal = target + torch.tensor([0.0, 0.0, height], dtype=target.dtype)
+    return point(hands.at(side) + goal - hands.where(f"{side}/{finger}distal_position"))
+
+
+def open_pen(hands: HandController) -> None:
+    """Both hands press the pen on the table, at body and cap, move apart to the gap asked for, and rise."""
+    gap = float(hands.frozen("gap"))
+    for side in SIDES:
+        hands.bend(side, 0.1, 0.2, THJ3=0.5, WRJ0=0.35)
+        hands.hold(side)
+    ends = {"right": "pen/cap_position", "left": "pen/body_position"}
+
+    def above(height: float, steps: int, speed: float) -> None:
+        for _ in range(steps):
+            hands.lead(*(_over(hands.where(ends[side]), height) for side in SIDES), 1, speed)
+
+    above(0.08, 25, 1.2)
+    above(0.02, 15, 0.5)
+    while hands.steps_left > 15:
+        body, cap = hands.where("pen/body_position"), hands.where("pen/cap_position")
+        out = (cap - body) / (cap - body).norm()
+        way = 0.4 * (gap - float((cap - body).norm()))
+        if abs(way) < 0.002:
+            break
+        way = max(-0.02, min(0.02, way))
+        low = float(hands.at("right")[2]) - 0.006, float(hands.at("left")[2]) - 0.006
+        right, left = hands.at("right") + way * out, hands.at("left") - way * out
+        hands.lead((float(right[0]), float(right[1]), low[0]), (float(left[0]), float(left[1]), low[1]))
+    right, left = hands.at("right").tolist(), hands.at("left").tolist()
+    hands.lead((right[0], right[1], 0.7), (left[0], left[1], 0.7), hands.episode_steps, speed=0.3)
+
+
+def _over(place: Tensor, height: float) -> Point:
+    """The hand's point whose fingers lie across a pen at this place."""
+    return float(place[0]) + 0.05, float(place[1]), float(place[2]) + height
+
+
+_HOOKS = {"right": "ff", "left": "lf"}  # the finger of each hand on the side of the other
+
+
+def open_scissors(hands: HandController) -> None:
+    """A bent finger of each hand goes into its loop; they pull the loops apart to the angle asked for, and rise."""
+    target = float(hands.frozen("target"))
+    loops = {"right": "scissors/right_handle_position", "left": "scissors/left_handle_position"}
+    for side in SIDES:
+        hands.bend(side, 0.0, 0.0, THJ3=0.5, **{f"{_HOOKS[side].upper()}J2": 1.5})
+        hands.hold(side)
+
+    def over(height: float, steps: int, speed: float) -> None:
+        for _ in range(steps):
+            hands.lead(*(_tip(hands, side, hands.where(loops[side]), height, _HOOKS[side]) for side in SIDES), 1, speed)
+
+    over(0.08, 28, 1.6)
+    over(0.022, 16, 0.5)
+    while hands.steps_left > 20:
+        left = target - float(hands.where("scissors/angle"))
+        if abs(left) < 0.01:
+            break
+        right_loop, left_loop = hands.where(loops["right"]), hands.where(loops["left"])
+        out = (right_loop - left_loop) / (right_loop - left_loop).norm()
+        way = max(-0.025, min(0.025, 0.2 * left)) * out
+        a, b = hands.at("right") + way, hands.at("left") - way
+        heights = [_tip(hands, side, hands.where(loops[side]), 0.022, _HOOKS[side])[2] for side in SIDES]
+        hands.lead((float(a[0]), float(a[1]), heights[0]), (float(b[0]), float(b[1]), heights[1]))
+    right, left_ = hands.at("right").tolist(), hands.at("left").tolist()
+    hands.lead((right[0], right[1], 0.85), (left_[0], left_[1], 0.85), hands.episode_steps, speed=0.3)
