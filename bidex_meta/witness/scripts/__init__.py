@@ -5,7 +5,7 @@ from collections.abc import Callable
 from bidex_meta.errors import BidexError
 from bidex_meta.tasks.registry import plain_name
 from bidex_meta.witness.controller import HandController
-from bidex_meta.witness.scripts.blocks import grasp_and_place, stack_block
+from bidex_meta.witness.scripts.blocks import grasp_and_place, push_blocks, stack_block
 from bidex_meta.witness.scripts.cubes import turn_cubes
 from bidex_meta.witness.scripts.doors import close_outward, open_inward, push
 from bidex_meta.witness.scripts.tools import open_pen, open_scissors, press_switches
@@ -21,6 +21,7 @@ SCRIPTS: dict[str, Callable[[HandController], None]] = {
     "OpenPenCap": open_pen,
     "OpenScissors": open_scissors,
     "PourWater": pour_water,
+    "PushBlock": push_blocks,
     "ReOrientation": turn_cubes,
     "StackBlock": stack_block,
     "Switch": press_switches,

@@ -49,36 +49,36 @@ def _tip(hands: HandController, side: str, target: Tensor, height: float, finger
 
 
 def open_pen(hands: HandController) -> None:
-    """Both hands press the pen on the table, at body and cap, move apart to the gap asked for, and rise."""
+    """Both hands close around the pen, at body and cap, and move apart to the gap asked for."""
     gap = float(hands.frozen("gap"))
-    for side in SIDES:
-        hands.bend(side, 0.1, 0.2, THJ3=0.5, WRJ0=0.35)
-        hands.hold(side)
     ends = {"right": "pen/cap_position", "left": "pen/body_position"}
 
     def above(height: float, steps: int, speed: float) -> None:
         for _ in range(steps):
             hands.lead(*(_over(hands.where(ends[side]), height) for side in SIDES), 1, speed)
 
-    above(0.08, 25, 1.2)
-    above(0.02, 15, 0.5)
-    while hands.steps_left > 15:
+    def bend(knuckles: float, middles: float) -> None:
+        for side in SIDES:
+            hands.bend(side, knuckles, middles, THJ3=0.6, THJ4=0.6)
+            hands.hold(side)
+
+    bend(0.6, 0.6)
+    above(0.06, 22, 1.4)
+    bend(0.9, 1.0)
+    above(0.025, 8, 0.6)
+    bend(1.5, 1.57)
+    above(0.02, 12, 0.4)
+    while hands.steps_left:
         body, cap = hands.where("pen/body_position"), hands.where("pen/cap_position")
         out = (cap - body) / (cap - body).norm()
-        way = 0.4 * (gap - float((cap - body).norm()))
-        if abs(way) < 0.002:
-            break
-        way = max(-0.02, min(0.02, way))
-        low = float(hands.at("right")[2]) - 0.006, float(hands.at("left")[2]) - 0.006
+        way = max(-0.03, min(0.03, 0.5 * (gap - float((cap - body).norm()))))
         right, left = hands.at("right") + way * out, hands.at("left") - way * out
-        hands.lead((float(right[0]), float(right[1]), low[0]), (float(left[0]), float(left[1]), low[1]))
-    right, left = hands.at("right").tolist(), hands.at("left").tolist()
-    hands.lead((right[0], right[1], 0.7), (left[0], left[1], 0.7), hands.episode_steps, speed=0.3)
+        hands.lead((float(right[0]), float(right[1]), 0.64), (float(left[0]), float(left[1]), 0.64))
 
 
 def _over(place: Tensor, height: float) -> Point:
-    """The hand's point whose fingers lie across a pen at this place."""
-    return float(place[0]) + 0.05, float(place[1]), float(place[2]) + height
+    """The hand's point whose fingers close around a pen at this place."""
+    return float(place[0]) + 0.01, float(place[1]), float(place[2]) + height
 
 
 _HOOKS = {"right": "ff", "left": "lf"}  # the finger of each hand on the side of the other
@@ -98,15 +98,11 @@ def open_scissors(hands: HandController) -> None:
 
     over(0.08, 28, 1.6)
     over(0.022, 16, 0.5)
-    while hands.steps_left > 20:
+    while hands.steps_left:
         left = target - float(hands.where("scissors/angle"))
-        if abs(left) < 0.01:
-            break
         right_loop, left_loop = hands.where(loops["right"]), hands.where(loops["left"])
         out = (right_loop - left_loop) / (right_loop - left_loop).norm()
         way = max(-0.025, min(0.025, 0.2 * left)) * out
         a, b = hands.at("right") + way, hands.at("left") - way
         heights = [_tip(hands, side, hands.where(loops[side]), 0.022, _HOOKS[side])[2] for side in SIDES]
         hands.lead((float(a[0]), float(a[1]), heights[0]), (float(b[0]), float(b[1]), heights[1]))
-    right, left_ = hands.at("right").tolist(), hands.at("left").tolist()
-    hands.lead((right[0], right[1], 0.85), (left_[0], left_[1], 0.85), hands.episode_steps, speed=0.3)
