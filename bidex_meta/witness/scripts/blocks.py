@@ -64,6 +64,8 @@ def _clamp(hands: HandController, x: float, y: float, height: float, press: floa
     hands.lead((x, right + way - press, height), (x, left + way + press, height))
 
 
+_SPREAD = (0.3, -0.3)
+_CLEAR, _LOW = 0.09, 0.642
 _BEHIND = 0.06  # from a fork's block to the hand's point, metres
 
 
@@ -72,7 +74,7 @@ def push_blocks(hands: HandController) -> None:
     blocks, goals = {"right": "block2", "left": "block1"}, {"right": "goal2", "left": "goal1"}
     for side in SIDES:
         fist = {"MFJ2": 1.4, "MFJ1": 1.4, "RFJ2": 1.4, "RFJ1": 1.4}
-        hands.bend(side, 0.0, 0.0, THJ3=0.5, WRJ0=_DOWN, FFJ3=-0.3, LFJ3=-0.3, **fist)
+        hands.bend(side, 0.0, 0.0, THJ3=0.5, THJ1=-0.5, THJ0=-1.5, WRJ0=_DOWN, FFJ3=_SPREAD[0], LFJ3=_SPREAD[1], **fist)
         hands.hold(side)
 
     def behind(x: float, height: float, steps: int, speed: float) -> None:
@@ -81,16 +83,18 @@ def push_blocks(hands: HandController) -> None:
             hands.lead(*(beside(each, x, 0.0, height) for each in at), 1, speed)
 
     behind(0.16, 0.68, 20, 1.6)
-    behind(0.15, 0.645, 8, 1.0)
-    behind(_BEHIND + 0.01, 0.645, 15, 0.6)
+    behind(0.15, _LOW, 8, 1.0)
+    behind(_BEHIND + 0.01, _LOW, 15, 0.6)
     while hands.steps_left:
         points = []
         for side in SIDES:
             place = hands.where(f"{blocks[side]}/position")
             way = hands.frozen(goals[side])[:2] - place[:2]
-            way = way * min(1.0, 0.06 / (float(way.norm()) + 1e-9)) * (0.0 if float(way.norm()) < 0.01 else 1.0)
-            x, y, _ = hands.at(side).tolist()
-            points.append((x + min(0.0, float(way[0])), y + float(way[1]), 0.645))
+            far = float(way.norm())
+            lead = way * (0.05 / far if far > 0.05 else 0.0 if far < 0.01 else 1.0)
+            # Where the fork is, if it follows its block; it never runs ahead.
+            ahead = float(lead[0])
+            points.append(beside(place, _BEHIND + ahead if ahead < -0.004 else _CLEAR, float(lead[1]), _LOW))
         hands.lead(*points, speed=0.5)
 
 

@@ -1,5 +1,7 @@
 """Scripted policies for switches, pen and scissors, in closed loop on what the task asks for."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -51,6 +53,8 @@ def _tip(hands: HandController, side: str, target: Tensor, height: float, finger
 def open_pen(hands: HandController) -> None:
     """Both hands close around the pen, at body and cap, and move apart to the gap asked for."""
     gap = float(hands.frozen("gap"))
+    along = hands.where("pen/cap_position") - hands.where("pen/body_position")
+    yaw = math.atan2(-float(along[0]), float(along[1]))
     ends = {"right": "pen/cap_position", "left": "pen/body_position"}
 
     def above(height: float, steps: int, speed: float) -> None:
@@ -60,20 +64,20 @@ def open_pen(hands: HandController) -> None:
     def bend(knuckles: float, middles: float) -> None:
         for side in SIDES:
             hands.bend(side, knuckles, middles, THJ3=0.6, THJ4=0.6)
-            hands.hold(side)
+            hands.hold(side, yaw=yaw)
 
     bend(0.6, 0.6)
-    above(0.06, 22, 1.4)
+    above(0.06, 20, 1.6)
     bend(0.9, 1.0)
     above(0.025, 8, 0.6)
     bend(1.5, 1.57)
-    above(0.02, 12, 0.4)
+    above(0.02, 9, 0.4)
     while hands.steps_left:
         body, cap = hands.where("pen/body_position"), hands.where("pen/cap_position")
         out = (cap - body) / (cap - body).norm()
-        way = max(-0.03, min(0.03, 0.5 * (gap - float((cap - body).norm()))))
+        way = max(-0.04, min(0.04, 0.6 * (gap - float((cap - body).norm()))))
         right, left = hands.at("right") + way * out, hands.at("left") - way * out
-        hands.lead((float(right[0]), float(right[1]), 0.64), (float(left[0]), float(left[1]), 0.64))
+        hands.lead((float(right[0]), float(right[1]), 0.65), (float(left[0]), float(left[1]), 0.65))
 
 
 def _over(place: Tensor, height: float) -> Point:
