@@ -71,7 +71,7 @@ def open_pen(hands: HandController) -> None:
     bend(0.9, 1.0)
     above(0.025, 8, 0.6)
     bend(1.5, 1.57)
-    above(0.02, 9, 0.4)
+    above(0.02, 12, 0.4)
     while hands.steps_left:
         body, cap = hands.where("pen/body_position"), hands.where("pen/cap_position")
         out = (cap - body) / (cap - body).norm()
@@ -82,7 +82,7 @@ def open_pen(hands: HandController) -> None:
 
 def _over(place: Tensor, height: float) -> Point:
     """The hand's point whose fingers close around a pen at this place."""
-    return float(place[0]) + 0.01, float(place[1]), float(place[2]) + height
+    return float(place[0]) - 0.008, float(place[1]), float(place[2]) + height
 
 
 _HOOKS = {"right": "ff", "left": "lf"}  # the finger of each hand on the side of the other
