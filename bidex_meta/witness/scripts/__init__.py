@@ -6,7 +6,7 @@ from bidex_meta.errors import BidexError
 from bidex_meta.tasks.registry import plain_name
 from bidex_meta.witness.controller import HandController
 from bidex_meta.witness.scripts.blocks import grasp_and_place, push_blocks, stack_block
-from bidex_meta.witness.scripts.caps import pull_cap
+from bidex_meta.witness.scripts.caps import pull_cap, swing_cup
 from bidex_meta.witness.scripts.cubes import turn_cubes
 from bidex_meta.witness.scripts.doors import close_outward, open_inward, push
 from bidex_meta.witness.scripts.tools import open_pen, open_scissors, press_switches
@@ -26,6 +26,7 @@ SCRIPTS: dict[str, Callable[[HandController], None]] = {
     "PushBlock": push_blocks,
     "ReOrientation": turn_cubes,
     "StackBlock": stack_block,
+    "SwingCup": swing_cup,
     "Switch": press_switches,
 }
 

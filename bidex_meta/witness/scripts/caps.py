@@ -1,4 +1,6 @@
-"""Scripted policy for the bottle: a finger drags the cap to where it shall stand out."""
+"""Scripted policies in which one finger moves a part: a bottle's cap, and a cup by its ear."""
+
+import math
 
 import torch
 from torch import Tensor
@@ -28,11 +30,11 @@ def pull_cap(hands: HandController) -> None:
     hands.bend("right", 0.5, 0.6, **_HELD)
     hands.bend("left", 0.0, 0.0, **_FIST)
     first = hands.at("left") - 0.07 * ahead
-    hands.lead(stay, point(first), 12, speed=0.4)
+    hands.lead(stay, point(first), 10, speed=0.4)
     hands.bend("right", 0.9, 1.0, **_HELD)
-    for _ in range(32):
+    for _ in range(27):
         hands.lead(stay, poke(0.04), speed=0.4)
-    for _ in range(12):
+    for _ in range(11):
         hands.lead(stay, poke(-0.002), speed=0.2)
     still = 0
     while hands.steps_left:
@@ -54,3 +56,43 @@ def _ahead(hands: HandController) -> Tensor:
     """Where the left hand's straight fingers point, world."""
     way = hands.where("left/palm_position") - hands.where("left/mount_position")
     return way / way.norm()
+
+
+_RADIUS, _TOUCH = 0.068, 0.2  # of a peg's circle about the cup, metres; how far it is behind an ear that it pushes, rad
+
+
+def swing_cup(hands: HandController) -> None:
+    """The right hand turns its palm down, and a finger bent to a peg pushes the ear around, to the turn asked for."""
+    # At an ear, friction on the foot lets the cup turn on its place sooner than slide.
+    left = hands.at("left").tolist()
+    away = left[0] + 0.02, left[1] - 0.08, left[2] + 0.06
+    hands.hold("right", roll=0.5 * math.pi)
+    hands.hold("left")
+    hands.bend("left", 0.0, 0.0)
+    hands.bend("right", -0.2, 0.0, THJ3=0.5, MFJ2=1.57)
+    goal = hands.frozen("goal")
+    wanted = 2.0 * math.atan2(float(goal[5]), float(goal[6]))
+
+    def peg(behind: float, height: float, radius: float = _RADIUS) -> Point:
+        """The right hand's point for a peg at an angle behind the ear, and at a height above the cup's origin."""
+        cup, angle = hands.where("cup/position"), _yaw(hands) - behind
+        way = torch.tensor([radius * math.cos(angle), radius * math.sin(angle), height], dtype=cup.dtype)
+        return point(hands.at("right") + cup + way - hands.where("right/mfdistal_position"))
+
+    x, y, z = hands.at("right").tolist()
+    hands.lead((x, y + 0.05, z + 0.1), away, 65, speed=0.3)
+    for _ in range(30):
+        hands.lead(peg(0.9, 0.12, 0.1), away, speed=0.4)
+    for _ in range(20):
+        hands.lead(peg(0.8, 0.045, 0.09), away, speed=0.4)
+    while hands.steps_left:
+        missing = (wanted - _yaw(hands) + math.pi) % (2.0 * math.pi) - math.pi
+        missing += 2.0 * math.pi if missing < -1.0 else 0.0
+        ahead = min(0.4, 1.0 * missing) if missing > 0.04 else -0.15
+        hands.lead(peg(_TOUCH - ahead, 0.045), away, speed=0.3)
+
+
+def _yaw(hands: HandController) -> float:
+    """Angle of the right ear about the vertical, rad."""
+    turn = hands.orientation("cup/quaternion")
+    return 2.0 * math.atan2(float(turn[2]), float(turn[3]))
