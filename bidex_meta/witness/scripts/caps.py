@@ -58,38 +58,43 @@ def _ahead(hands: HandController) -> Tensor:
     return way / way.norm()
 
 
+_PEG = 0.015  # height of a peg above the cup's origin: higher ones tip it, metres
 _RADIUS, _TOUCH = 0.068, 0.2  # of a peg's circle about the cup, metres; how far it is behind an ear that it pushes, rad
 
 
 def swing_cup(hands: HandController) -> None:
-    """The right hand turns its palm down, and a finger bent to a peg pushes the ear around, to the turn asked for."""
-    # At an ear, friction on the foot lets the cup turn on its place sooner than slide.
-    left = hands.at("left").tolist()
-    away = left[0] + 0.02, left[1] - 0.08, left[2] + 0.06
-    hands.hold("right", roll=0.5 * math.pi)
-    hands.hold("left")
-    hands.bend("left", 0.0, 0.0)
-    hands.bend("right", -0.2, 0.0, THJ3=0.5, MFJ2=1.57)
+    """The left hand turns its palm down, and its little finger, bent to a peg, pulls the ear around to its goal."""
+    # At an ear, friction on the foot lets the cup turn on its place sooner than slide. The left hand's thumb stays
+    # clear of the lid up to about 130 degrees; the right hand's would not.
+    x, y, z = hands.at("right").tolist()
+    away = x + 0.1, y + 0.3, z - 0.1
+    hands.hold("left", roll=-0.5 * math.pi)
+    hands.hold("right")
+    hands.bend("right", 0.0, 0.0)
+    hands.bend("left", 0.0, 0.0, THJ4=-1.04, THJ1=-0.5, LFJ2=1.57, **_FIST)
     goal = hands.frozen("goal")
     wanted = 2.0 * math.atan2(float(goal[5]), float(goal[6]))
 
     def peg(behind: float, height: float, radius: float = _RADIUS) -> Point:
-        """The right hand's point for a peg at an angle behind the ear, and at a height above the cup's origin."""
-        cup, angle = hands.where("cup/position"), _yaw(hands) - behind
+        """The left hand's point for a peg at an angle behind the ear, and at a height above the cup's origin."""
+        cup, angle = hands.where("cup/position"), _yaw(hands) + math.pi - behind
         way = torch.tensor([radius * math.cos(angle), radius * math.sin(angle), height], dtype=cup.dtype)
-        return point(hands.at("right") + cup + way - hands.where("right/mfdistal_position"))
+        return point(hands.at("left") + cup + way - hands.where("left/lfdistal_position"))
 
-    x, y, z = hands.at("right").tolist()
-    hands.lead((x, y + 0.05, z + 0.1), away, 65, speed=0.3)
+    x, y, z = hands.at("left").tolist()
+    hands.lead(away, (x, y - 0.05, z + 0.1), 65, speed=0.3)
     for _ in range(30):
-        hands.lead(peg(0.9, 0.12, 0.1), away, speed=0.4)
+        hands.lead(away, peg(0.9, 0.12, 0.1), speed=0.4)
     for _ in range(20):
-        hands.lead(peg(0.8, 0.045, 0.09), away, speed=0.4)
+        hands.lead(away, peg(0.8, _PEG, 0.1), speed=0.4)
     while hands.steps_left:
         missing = (wanted - _yaw(hands) + math.pi) % (2.0 * math.pi) - math.pi
         missing += 2.0 * math.pi if missing < -1.0 else 0.0
-        ahead = min(0.4, 1.0 * missing) if missing > 0.04 else -0.15
-        hands.lead(peg(_TOUCH - ahead, 0.045), away, speed=0.3)
+        if missing < 0.05:
+            break
+        hands.lead(away, peg(_TOUCH - min(0.3, missing), _PEG), speed=0.2)
+    # The hand stays: a cup that is bumped on its way back turns on.
+    hands.lead(away, point(hands.at("left")), hands.episode_steps)
 
 
 def _yaw(hands: HandController) -> float:
