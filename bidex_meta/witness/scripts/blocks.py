@@ -18,18 +18,18 @@ def grasp_and_place(hands: HandController) -> None:
     hands.hold("right", yaw=0.15)
     hands.hold("left", yaw=-0.15)
     x, y = float(block[0]) + 0.075, float(block[1])
-    low, high, press = 0.642, 0.775, _PRESS
+    low, high = 0.642, 0.775
     hands.lead((x, y + 0.11, high), (x, y - 0.11, high), 30)
     hands.lead((x, y + 0.11, low), (x, y - 0.11, low), 30, speed=0.4)
     hands.lead((x, y + 0.08, low), (x, y - 0.08, low), 20, speed=0.2)
     for _ in range(30):
-        _clamp(hands, x, y, low, press)
+        _clamp(hands, x, y, low)
     for i in range(40):
-        _clamp(hands, x, y, low + (high - low) * (i + 1) / 40, press)
+        _clamp(hands, x, y, low + (high - low) * (i + 1) / 40)
     way = (bucket - hands.where("block/position"))[:2] / 80
     for i in range(90):
         x, y = (x + float(way[0]), y + float(way[1])) if i < 80 else (x, y)
-        _clamp(hands, x, y, high, press)
+        _clamp(hands, x, y, high)
     if hands.wide:
         hands.lead((x, y + 0.11, high), (x, y - 0.11, high), 15, speed=0.3)
         _drag_bucket(hands, high)
@@ -38,43 +38,41 @@ def grasp_and_place(hands: HandController) -> None:
 
 def _drag_bucket(hands: HandController, high: float) -> None:
     """Clamps the bucket like the block, drags it over the table to its goal, and lets go."""
-    x, y, _ = (hands.where("bucket/position")).tolist()
-    x, low, press = x + 0.06, 0.65, 0.0015
-    hands.hold("right", yaw=0.4)
-    hands.hold("left", yaw=-0.4)
+    x, y, _ = hands.where("bucket/position").tolist()
+    low = 0.655
     hands.lead((x, y + 0.17, high), (x, y - 0.17, high), 20)
     hands.lead((x, y + 0.17, low), (x, y - 0.17, low), 25)
     for _ in range(45):
-        _clamp(hands, x, y, low, press)
+        _clamp(hands, x, y, low)
     while hands.steps_left > 40:
         way = hands.frozen("goal")[:2] - hands.where("bucket/position")[:2]
         if float(way.norm()) < 0.006:
             break
-        way *= min(1.0, 0.0018 / float(way.norm()))
+        way *= min(1.0, 0.0025 / float(way.norm()))
         x, y = x + float(way[0]), y + float(way[1])
-        _clamp(hands, x, y, low, press)
+        _clamp(hands, x, y, low)
     right, left = float(hands.at("right")[1]), float(hands.at("left")[1])
     hands.lead((x, right + 0.06, low), (x, left - 0.06, low), hands.episode_steps, speed=0.1)
 
 
-def _clamp(hands: HandController, x: float, y: float, height: float, press: float) -> None:
+def _clamp(hands: HandController, x: float, y: float, height: float) -> None:
     """Presses the hands together, whatever lies between them, and moves their middle in y."""
     right, left = float(hands.at("right")[1]), float(hands.at("left")[1])
     way = y - 0.5 * (right + left)
-    hands.lead((x, right + way - press, height), (x, left + way + press, height))
+    hands.lead((x, right + way - _PRESS, height), (x, left + way + _PRESS, height))
 
 
-_SPREAD = (0.3, -0.3)
-_CLEAR, _LOW = 0.09, 0.642
-_BEHIND = 0.06  # from a fork's block to the hand's point, metres
+# Of a fork: from its block to the hand's point where it pushes, and where it lets go of it; height above the floor;
+# angles that spread forefinger and little finger. Metres, rad.
+_BEHIND, _CLEAR, _LOW = 0.06, 0.09, 0.642
+_FORK = {"FFJ3": 0.3, "LFJ3": -0.3, "MFJ2": 1.4, "MFJ1": 1.4, "RFJ2": 1.4, "RFJ1": 1.4}
 
 
 def push_blocks(hands: HandController) -> None:
     """Each hand takes its block between forefinger and little finger and pushes it to its goal."""
     blocks, goals = {"right": "block2", "left": "block1"}, {"right": "goal2", "left": "goal1"}
     for side in SIDES:
-        fist = {"MFJ2": 1.4, "MFJ1": 1.4, "RFJ2": 1.4, "RFJ1": 1.4}
-        hands.bend(side, 0.0, 0.0, THJ3=0.5, THJ1=-0.5, THJ0=-1.5, WRJ0=_DOWN, FFJ3=_SPREAD[0], LFJ3=_SPREAD[1], **fist)
+        hands.bend(side, 0.0, 0.0, THJ3=0.5, THJ1=-0.5, THJ0=-1.5, WRJ0=_DOWN, **_FORK)
         hands.hold(side)
 
     def behind(x: float, height: float, steps: int, speed: float) -> None:

@@ -15,16 +15,15 @@ _FIST = {f"{finger}J{joint}": 1.4 for finger in ("FF", "MF", "RF") for joint in 
 
 def pull_cap(hands: HandController) -> None:
     """The left little finger presses on the cap's side and drags it along the bottle; friction keeps it there."""
-    slide = float(hands.frozen("slide")) if hands.wide else 0.04
+    slide = float(hands.frozen("slide"))
     stay = point(hands.at("right"))
     for side in ("right", "left"):
         hands.hold(side)
     ahead = _ahead(hands)
 
-    def poke(back: float, aside: float = 0.0) -> Point:
+    def poke(back: float) -> Point:
         """The left hand's point with the little finger so far before the cap, metres."""
         cap = hands.where("bottle/cap_position") - (_TIP + back) * ahead
-        cap[0] += aside
         return point(hands.at("left") + cap - hands.where("left/lfdistal_position"))
 
     hands.bend("right", 0.5, 0.6, **_HELD)

@@ -81,11 +81,10 @@ def close_outward(hands: HandController) -> None:
     go(start, back=0.2, steps=16, speed=1.0)
     go(start, steps=22, speed=1.2)
     led = start
-    lasts = [goal - 0.1 for goal in _goals(hands, 0.0)] if hands.wide else [-0.2, -0.2]  # a finger has so much room
+    lasts = _goals(hands, -0.2, 0.1)  # a finger has so much room
     while len(hands.actions) < hands.episode_steps:
         led = [
-            max(angle - 0.012, now - 0.22, last)
-            for angle, now, last in zip(led, _angles(hands), lasts, strict=True)
+            max(angle - 0.012, now - 0.22, last) for angle, now, last in zip(led, _angles(hands), lasts, strict=True)
         ]
         go(led)
 
@@ -95,7 +94,7 @@ def push(hands: HandController) -> None:
     # Both classes that push turn a leaf the same way: from open towards the hands over shut to open away from them.
     inward = abs(float(hands.orientation("object/quaternion")[1])) > 0.5
     leaves, sign = (_INWARD, 1.0) if inward else (_OUTWARD, -1.0)
-    goals = [sign * goal for goal in _goals(hands, 0.0 if inward else 1.3)]
+    goals = [sign * goal for goal in hands.frozen("leaves").tolist()]
 
     def go(angles: Sequence[float], back: float, steps: int = 1, speed: float = 0.6) -> None:
         """Fists before leaves that stand open towards the hands by these angles, ``back`` from them."""
@@ -116,9 +115,9 @@ def push(hands: HandController) -> None:
         go(led, back=0.0)
 
 
-def _goals(hands: HandController, usual: float) -> list[float]:
-    """The angle to which the right and the left leaf shall be brought, rad; ``usual`` where the task gives none."""
-    return hands.frozen("leaves").tolist() if hands.wide else [usual, usual]
+def _goals(hands: HandController, usual: float, less: float = 0.0) -> list[float]:
+    """Angles of a task for the right and the left leaf, rad, ``less`` so much; ``usual`` where it has none."""
+    return (hands.frozen("leaves") - less).tolist() if hands.wide else [usual, usual]
 
 
 def _angles(hands: HandController) -> list[float]:

@@ -9,21 +9,23 @@ from bidex_meta.hands.hand import SIDES
 from bidex_meta.witness.controller import HandController, Point, point
 
 _LEVER = 0.035  # from a rocker's hinge to its button, metres
-_PRESSED = 0.5  # angle to which version 1 presses a rocker, rad
 
 
 def press_switches(hands: HandController) -> None:
     """Fingertips press each button until its rocker has the angle asked for, and rise again."""
-    goals = hands.frozen("angles").tolist() if hands.wide else [_PRESSED, _PRESSED]
+    wanted = hands.frozen("angles").tolist()[::-1]
     buttons = ("switch2", "switch1")  # of the right and the left hand
-    wanted = goals[::-1]
     for side in SIDES:
         hands.bend(side, 0.9, 0.5, THJ3=0.5)
         hands.hold(side)
 
     def over(height: float, steps: int, speed: float) -> None:
         for _ in range(steps):
-            hands.lead(*(_tip(hands, side, _button(hands, name), height) for side, name in zip(SIDES, buttons)), 1, speed)
+            hands.lead(
+                *(_tip(hands, side, _button(hands, name), height) for side, name in zip(SIDES, buttons, strict=True)),
+                1,
+                speed,
+            )
 
     over(0.06, 30, 1.2)
     over(0.04, 5, 0.6)
@@ -34,9 +36,9 @@ def press_switches(hands: HandController) -> None:
             left = wanted[i] - float(hands.where(f"{name}/angle"))
             done[i] = done[i] or left < 0.012
             above = _tip(hands, side, _button(hands, name), 0.06)
-            x, y, z = hands.at(side).tolist()
+            height = float(hands.at(side)[2])
             down = min(0.008, max(0.002, 0.8 * _LEVER * left))
-            points.append((above[0], above[1], z + 0.01 if done[i] else z - down))
+            points.append((above[0], above[1], height + 0.01 if done[i] else height - down))
         hands.lead(*points, speed=0.6)
 
 
