@@ -3,6 +3,8 @@
 A script reads sensors' means over all copies of the start; its recorded actions replay without it.
 """
 
+from collections.abc import Iterable
+
 import torch
 from torch import Tensor
 
@@ -117,6 +119,11 @@ class HandController:
             self.actions.append(action)
             self.rewards.append(float(trace.rewards[0, 0]))
             self.success.append(bool(trace.success[0, 0]))
+
+    def lead_each(self, points: Iterable[Point], speed: float = 0.6) -> None:
+        """``lead`` for a step, to the right and the left hand's point."""
+        right, left = points
+        self.lead(right, left, 1, speed)
 
     def _torque(self, side: str) -> Tensor:
         """The actions (3,) that turn a hand to the orientation it is held at; zeros for a free hand."""

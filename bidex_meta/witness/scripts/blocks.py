@@ -78,7 +78,7 @@ def push_blocks(hands: HandController) -> None:
     def behind(x: float, height: float, steps: int, speed: float) -> None:
         for _ in range(steps):
             at = (hands.where(f"{blocks[side]}/position") for side in SIDES)
-            hands.lead(*(beside(each, x, 0.0, height) for each in at), 1, speed)
+            hands.lead_each((beside(each, x, 0.0, height) for each in at), speed)
 
     behind(0.16, 0.68, 20, 1.6)
     behind(0.15, _LOW, 8, 1.0)
@@ -93,7 +93,7 @@ def push_blocks(hands: HandController) -> None:
             # Where the fork is, if it follows its block; it never runs ahead.
             ahead = float(lead[0])
             points.append(beside(place, _BEHIND + ahead if ahead < -0.004 else _CLEAR, float(lead[1]), _LOW))
-        hands.lead(*points, speed=0.5)
+        hands.lead_each(points, 0.5)
 
 
 def stack_block(hands: HandController) -> None:

@@ -21,8 +21,8 @@ def press_switches(hands: HandController) -> None:
 
     def over(height: float, steps: int, speed: float) -> None:
         for _ in range(steps):
-            hands.lead(
-                *(_tip(hands, side, _button(hands, name), height) for side, name in zip(SIDES, buttons, strict=True)),
+            hands.lead_each(
+                (_tip(hands, side, _button(hands, name), height) for side, name in zip(SIDES, buttons, strict=True)),
                 1,
                 speed,
             )
@@ -39,7 +39,7 @@ def press_switches(hands: HandController) -> None:
             height = float(hands.at(side)[2])
             down = min(0.008, max(0.002, 0.8 * _LEVER * left))
             points.append((above[0], above[1], height + 0.01 if done[i] else height - down))
-        hands.lead(*points, speed=0.6)
+        hands.lead_each(points, 0.6)
 
 
 def _button(hands: HandController, name: str) -> Tensor:
@@ -61,7 +61,7 @@ def open_pen(hands: HandController) -> None:
 
     def above(height: float, steps: int, speed: float) -> None:
         for _ in range(steps):
-            hands.lead(*(_over(hands.where(ends[side]), height) for side in SIDES), 1, speed)
+            hands.lead(*(_over(hands.where(ends[side]), height) for side in SIDES), speed)
 
     def bend(knuckles: float, middles: float) -> None:
         for side in SIDES:
@@ -100,7 +100,9 @@ def open_scissors(hands: HandController) -> None:
 
     def over(height: float, steps: int, speed: float) -> None:
         for _ in range(steps):
-            hands.lead(*(_tip(hands, side, hands.where(loops[side]), height, _HOOKS[side]) for side in SIDES), 1, speed)
+            hands.lead_each(
+                (_tip(hands, side, hands.where(loops[side]), height, _HOOKS[side]) for side in SIDES), speed
+            )
 
     over(0.08, 28, 1.6)
     over(0.022, 16, 0.5)
