@@ -23,7 +23,6 @@ def press_switches(hands: HandController) -> None:
         for _ in range(steps):
             hands.lead_each(
                 (_tip(hands, side, _button(hands, name), height) for side, name in zip(SIDES, buttons, strict=True)),
-                1,
                 speed,
             )
 
@@ -61,7 +60,7 @@ def open_pen(hands: HandController) -> None:
 
     def above(height: float, steps: int, speed: float) -> None:
         for _ in range(steps):
-            hands.lead(*(_over(hands.where(ends[side]), height) for side in SIDES), speed)
+            hands.lead_each((_over(hands.where(ends[side]), height) for side in SIDES), speed)
 
     def bend(knuckles: float, middles: float) -> None:
         for side in SIDES:
