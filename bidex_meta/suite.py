@@ -57,6 +57,11 @@ class Rules:
         return self.variation == "wide"
 
     @property
+    def as_printed(self) -> bool:
+        """Whether returns compare with those of version 1: the same tasks and reward."""
+        return self.reward == "paper" and not self.wide
+
+    @property
     def jittered(self) -> bool:
         """Whether starts are jittered."""
         return self.starts == "jittered"

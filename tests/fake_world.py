@@ -142,7 +142,7 @@ class FakeWorld(ABC):
             "reward_terms": {"all": unscaled},
             "final_obs": final_obs,
             "_final_obs": ended,
-            "so_far": episodes.statistics(),
+            "so_far": episodes.statistics(at_end=False),
             "counted": ended & episodes.counts,
         }
         if ended.any():

@@ -1,4 +1,4 @@
-"""What stands in the pages as code: README.md and docs/. A comment before a block says what is special about it.
+"""What stands in the pages as code: docs/ and the READMEs. A comment before a block says what is special about it.
 
 ``<!-- code: file NAME -->``: the block is this file; ``<!-- code: skip REASON -->``: it is not run, and why;
 ``<!-- code: needs MODULE -->``: it is run where that is installed.
@@ -10,7 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-PAGES = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "algos" / "README.md", ROOT / "suites" / "README.md")
+PAGES = (ROOT / "README.md", ROOT / "CONTRIBUTING.md")
+PAGES += tuple(ROOT / folder / "README.md" for folder in ("algos", "assets", "suites"))
+PAGES += tuple(sorted((ROOT / "bidex_meta").glob("*/README.md")))
 PAGES += tuple(sorted((ROOT / "docs").rglob("*.md")))
 _BLOCK = re.compile(
     r"(?:^<!-- code: (?P<mark>.*?) -->\n)?^```(?P<language>\w*)\n(?P<text>.*?)^```$", re.MULTILINE | re.DOTALL

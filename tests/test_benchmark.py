@@ -17,7 +17,7 @@ import bidex_meta.benchmark
 from bidex_meta.benchmark import Benchmark, Task, make_task_world
 from bidex_meta.errors import BidexError
 from bidex_meta.metaworld import CustomML
-from bidex_meta.suite import suite_names
+from bidex_meta.suite import V1, suite_names
 
 MT4_CLASSES = ["CatchUnderarm", "HandOver", "CatchAbreast", "TwoCatchUnderarm"]
 
@@ -100,6 +100,46 @@ def test_tasks_are_distinct_and_disjoint(name: str) -> None:
     classes = benchmark.task_classes("train") | benchmark.task_classes("test")
     if not benchmark.suite.classes[0].tasks:
         assert all(classes[task.env_name].variation_space.contains(task.variation) for task in tasks)
+
+
+@pytest.mark.parametrize("name", ["MT1", "MT4", "MT20", "ML1", "ML4", "ML20"])
+def test_version_2_has_version_1s_classes_splits_and_sizes(name: str) -> None:
+    one, two = Benchmark(name), Benchmark(f"{name}-v2")
+    assert two.padded_size == one.padded_size and two.suite.splits == one.suite.splits
+    for split in one.suite.splits:
+        classes = two.task_classes(split)
+        assert list(classes) == list(one.task_classes(split)) and all(c.action_size == 52 for c in classes.values())
+        assert len(two.train_tasks if split == "train" else two.test_tasks) == 50 * len(classes)
+    if name in ("MT4", "ML4", "ML20"):
+        a, b = (each.make_world(num_envs=15, device="cpu", threads=1) for each in (one, two))
+        assert a.single_observation_space.shape == b.single_observation_space.shape
+        assert (a.num_id_columns, a.hides_goals) == (b.num_id_columns, b.hides_goals)
+
+
+RULES = {"reward": "v2", "variation": "wide", "success": "at-end", "starts": "jittered"}
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_each_rule_of_version_2_works_alone(rule: str, tmp_path: Path) -> None:
+    """What it changes, and what it leaves as it is bit for bit; in worlds and in single environments."""
+    plain = {'"HandOver"': '"PushBlock"'}
+    given = plain | {'reward = "paper"\n': f'{rule} = "{RULES[rule]}"\n' + 'reward = "paper"\n' * (rule != "reward")}
+    found = []
+    for replaced in (plain, given):
+        benchmark = Benchmark(own_suite(tmp_path, **replaced))
+        world = benchmark.make_world(num_envs=4, device="cpu", threads=1, stagger=False)
+        world.reset(seed=0)
+        world.episodes.success |= True
+        env = next(iter(benchmark.train_classes.values()))()
+        env.set_task(benchmark.train_tasks[0])
+        found.append((*world.step(torch.zeros(4, 52)), env.reset(seed=0)[0], env.step(np.zeros(52, np.float32))[1]))
+    assert vars(benchmark.suite.rules) == vars(V1) | {rule: RULES[rule]}
+    (obs, reward, *_, info, first, gain), (new, paid, *_, told, start, got) = found
+    same = rule not in ("variation", "starts")
+    assert torch.equal(obs, new) == np.array_equal(first, start) == same
+    assert torch.equal(reward, paid) == (rule == "success") == (gain == got)
+    assert (paid.max() < 1.0) == (rule == "reward")
+    assert info["so_far"]["success"].all() and told["so_far"]["success"].any() == (rule != "success")
 
 
 def test_tasks_depend_on_seed_class_and_split_only(tmp_path: Path) -> None:

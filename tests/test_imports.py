@@ -1,4 +1,4 @@
-"""Imports run one way: each room only from rooms above it in ``ORDER``; read from the source, lazy imports too."""
+"""Imports run one way: each package only from those above it in ``ORDER``; read from the source, lazy imports too."""
 
 import ast
 import re
@@ -10,10 +10,11 @@ import pytest
 
 import bidex_algos
 import bidex_meta
+from tests.pages import PAGES, ROOT
 
 PACKAGES = {package.__name__: Path(next(iter(package.__path__))) for package in (bidex_meta, bidex_algos)}
 
-SHARED = ("advantages", "balancing", "nets", "replay", "rollout", "step_size", "trust_region")
+SHARED = ("advantages", "balancing", "nets", "replay", "rollout", "trust_region")
 """What learners share."""
 
 ORDER = (
@@ -28,9 +29,9 @@ ORDER = (
     ("bidex_meta", "bidex_algos.offpolicy", "bidex_algos.onpolicy"),  # bidex_meta: the package's own names
     ("cli", "bidex_algos.meta", "bidex_algos.multiagent", "bidex_algos.offline"),
 )
-"""A room imports from earlier lines only, not from its own neighbours; a module outside rooms counts as one."""
+"""A package imports from earlier lines only, not from its own neighbours; a module at the top counts as one."""
 
-LEVEL = {room: level for level, rooms in enumerate(ORDER) for room in rooms}
+LEVEL = {name: level for level, names in enumerate(ORDER) for name in names}
 
 MUTUAL = {
     ("bidex_meta.worlds.base", "bidex_meta.worlds.own"),  # Worlds.open chooses among its kinds
@@ -40,7 +41,7 @@ MUTUAL = {
 """Modules that import each other all the same."""
 
 TWICE = {"base", "config", "learner", "replay", "starts"}
-"""Names of several modules. ``base`` is a room's own, ``learner`` contract and base; the others are older."""
+"""Names of several modules. ``base`` is a package's own, ``learner`` contract and base; the others are older."""
 
 
 def _name(package: str, path: Path) -> str:
@@ -76,8 +77,8 @@ def is_package(module: str) -> bool:
     return any(name.startswith(f"{module}.") for name in modules())
 
 
-def room(module: str) -> str:
-    """The room of a module: ``world``, ``bidex_algos.nets``."""
+def package_of(module: str) -> str:
+    """The package of a module: ``world``, ``bidex_algos.nets``."""
     package, *rest = module.split(".")
     if not rest:
         return package
@@ -85,11 +86,12 @@ def room(module: str) -> str:
 
 
 @pytest.mark.parametrize("module", modules())
-def test_imports_come_from_earlier_rooms(module: str) -> None:
-    own = room(module)
-    assert own in LEVEL, f"{own} is a new room: give it a place in ORDER, and in docs/architecture.md"
-    wrong = {name for name in imported(modules()[module]) if room(name) != own and LEVEL[room(name)] >= LEVEL[own]}
-    assert not wrong, f"{module} imports {sorted(wrong)}, of no earlier room"
+def test_imports_come_from_earlier_packages(module: str) -> None:
+    own = package_of(module)
+    assert own in LEVEL, f"{own} is a new package: give it a line in ORDER and in docs/architecture.md"
+    others = {name: package_of(name) for name in imported(modules()[module])}
+    wrong = sorted(name for name, other in others.items() if other != own and LEVEL[other] >= LEVEL[own])
+    assert not wrong, f"{module} imports {wrong}, of no earlier package"
 
 
 def test_packages_do_not_know_the_tools() -> None:
@@ -130,12 +132,15 @@ def test_a_name_means_one_module() -> None:
 
 
 def test_pages_name_modules_that_are_there() -> None:
-    root = Path(__file__).parents[1]
-    pages = [*root.glob("*.md"), *root.glob("docs/**/*.md"), *root.glob("algos/*.md")]
     named = {
-        (page.name, path)
-        for page in pages
+        (page, ROOT / path)
+        for page in (*PAGES, ROOT / "CHANGELOG.md")
         for path in re.findall(r"\b(?:bidex_meta|algos/bidex_algos)/[\w/]+\.(?:py|md)\b", page.read_text())
     }
     assert len(named) > 25
-    assert not [(page, path) for page, path in sorted(named) if not (root / path).is_file()]
+    beside = {page: page.parent for page in PAGES if page.parent.parent.name == "bidex_meta"}
+    beside[ROOT / "algos" / "README.md"] = PACKAGES["bidex_algos"]
+    for page, folder in beside.items():
+        paths = re.findall(r"`([\w/]+\.py)`", page.read_text())  # in this folder, or from the root
+        named |= {(page, (ROOT if path.startswith(("bidex_meta/", "tests/")) else folder) / path) for path in paths}
+    assert not [(page.name, path) for page, path in sorted(named) if not path.is_file()]

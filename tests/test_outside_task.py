@@ -74,6 +74,17 @@ def test_a_suite_names_it_and_hides_its_goal(working_folder: Path) -> None:
     assert env.reset(seed=0)[0].shape == (422,)
 
 
+@pytest.mark.parametrize("rule", ['reward = "v2"', 'reward = "paper"\nvariation = "wide"'])
+def test_rules_that_it_lacks_are_refused_and_others_work(rule: str, working_folder: Path) -> None:
+    suite = SUITE.replace("base", 'success = "at-end"\nstarts = "jittered"\nbase')
+    (working_folder / "slides.toml").write_text(suite)
+    assert Benchmark("slides.toml").make_world("test", 2, device="cpu", threads=1).reset(seed=0)[0].isfinite().all()
+    (working_folder / "slides.toml").write_text(suite.replace('reward = "paper"', rule))
+    with pytest.raises(BidexError, match=r"slides\.toml.*SlideBlock: .* which the class does not have") as raised:
+        Benchmark("slides.toml")
+    assert rule.split()[-1] in str(raised.value) and "\n" not in str(raised.value)
+
+
 def test_an_object_of_its_own_lies_beside_the_file() -> None:
     world = make_task_world("with_own_object:SlideBlock", 2, device="cpu", threads=1)
     assert world.reset(seed=0)[0].shape == (2, 422)
@@ -98,7 +109,7 @@ def test_a_mistake_in_a_method_names_class_method_expected_and_received(right: s
     source = (working_folder / "my_tasks.py").read_text()
     assert right in source
     name = f"mistaken_{list(_MISTAKES).index(right)}"
-    source = source.replace("import Layout,", "import Block, Layout,").replace(right, wrong)
+    source = source.replace("import goal_blocks,", "import Block, goal_blocks,").replace(right, wrong)
     (working_folder / f"{name}.py").write_text(source)
     with pytest.raises(BidexError) as raised:
         make_task_world(f"{name}:SlideBlock", 2, device="cpu", threads=1)

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import BidexError
-from bidex_meta.suite import load_suite, suite_names
+from bidex_meta.suite import V1, V2, load_suite, suite_names
 from bidex_meta.tasks import registry
 
 HEAD = """
@@ -59,7 +59,9 @@ def test_shipped_suite_is_sound(name: str) -> None:
     suite = load_suite(name)
     assert suite.name == name
     assert {entry.class_name for entry in suite.classes} <= set(registry.names())
-    assert suite.observation == ("masked" if suite.kind == "meta" else "one-hot")
+    shown = "plain" if name == "MT1-v2" else "one-hot"  # there is one class, and no list of tasks
+    assert suite.observation == ("masked" if suite.kind == "meta" else shown)
+    assert suite.rules == (V2 if name.endswith("-v2") else V1) and suite.version == 1 + name.endswith("-v2")
     assert suite.splits == (("train", "test") if suite.kind == "meta" else ("train",))
 
 
@@ -93,7 +95,7 @@ def test_names_and_paths(tmp_path: Path) -> None:
     assert load_suite(file) == load_suite(str(file)) and load_suite(file).classes[0].reward_scale == 1.0
     with pytest.raises(BidexError, match=r"absent\.toml, but No such file"):
         load_suite(tmp_path / "absent.toml")
-    known = "ML1, ML1-objects, ML1-wide, ML20, ML4, MT1, MT1-objects, MT20, MT4"
+    known = "ML1, ML1-objects, ML1-v2, ML1-wide, ML20, ML20-v2, ML4, ML4-v2, MT1, MT1-objects, MT1-v2, MT20, MT20-v2"
     with pytest.raises(BidexError, match=rf"Did you mean 'MT4'\? Known: {known}"):
         load_suite("MT44")
 
@@ -130,6 +132,10 @@ FAULTS = {
     "listed and counted": (LISTED, "version = 1", COUNTED, "tasks_per_class: expected nothing"),
     "value is no number": (LISTED, "goal_x = 0.1", 'goal_x = "0.1"', "classes[0].tasks[1].fixed[...]: expected"),
     "value is not finite": (LISTED, "goal_x = 0.1", "goal_x = nan", "classes[0].tasks[1].fixed[...]: expected"),
+    "unknown reward": (META, '"paper"', '"v3"', "reward: expected"),
+    "unknown variation": (META, "version = 1", 'version = 1\nvariation = "v2"', "variation: expected"),
+    "unknown success": (META, "version = 1", 'version = 1\nsuccess = "at_end"', "success: expected"),
+    "starts as a switch": (META, "version = 1", "version = 1\nstarts = true", "starts: expected"),
     "no TOML": (META, 'name = "own"', "name: own", "expected a suite file in TOML, but"),
 }
 
@@ -147,6 +153,7 @@ def test_fault_names_file_key_and_mend(fault: str, tmp_path: Path) -> None:
 
 
 KEYS = ["name", "version", "kind", "observation", "task_id", "reward", "base", "tasks_per_class", "classes", "other"]
+KEYS += ["variation", "success", "starts"]
 VALUES = ["3", "-1", "true", '"train"', '"class"', "[]", "{}", "1.5", "[{}]", '[{ name = "HandOver" }]']
 
 

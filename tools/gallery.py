@@ -97,6 +97,7 @@ def _section(task: TaskClass, random: dict | None) -> str:
         ("success", task.solved),
         ("variation", _variation(task.variation_space)),
         ("ML mask", _mask(task)),
+        *_of_version_2(registry.get(f"{task.name}-v2", True)),
         ("deviations", " ".join(task.deviations) or "none"),
     ]
     if random is not None:
@@ -105,6 +106,19 @@ def _section(task: TaskClass, random: dict | None) -> str:
     table = "\n".join(f"| {key} | {value} |" for key, value in rows)
     strip = f"![{task.name}, witness]({_image(task.name, 'witness')})\n" if witness_path(task.name).is_file() else ""
     return f"## {task.name}\n\n{task.summary}.\n\n{pictures}\n\n| | |\n|---|---|\n{table}\n\n{strip}"
+
+
+def _of_version_2(task: TaskClass) -> list[tuple[str, str]]:
+    space = task.variation_space
+    bounds = {
+        name: f"{low:.3g} … {high:.3g}" for name, low, high in zip(space.names, space.low, space.high, strict=True)
+    }
+    parts = []
+    for part in task.hides():
+        ranges = ", ".join(f"{name} {bounds[name]}" for name in part.names)
+        parts.append(ranges if part.kind == "sign" else f"{ranges} (within {part.tolerance:.3g})")
+    solved = task.wide_solved or task.solved
+    return [("version 2 hides", "; ".join(parts)), ("version 2 success", f"{solved}, for the last 0.25 s")]
 
 
 def _mask(task: TaskClass) -> str:

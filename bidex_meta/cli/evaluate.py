@@ -22,6 +22,8 @@ from bidex_meta.runs.versions import package_versions
 from bidex_meta.world.threads import set_up_torch
 from bidex_meta.worlds import Worlds
 
+_OTHER_SEED = 500_000
+"""Added to a run's seed for tasks that it was not trained on."""
 _PACKAGES = ("bidex-meta", "mujoco", "torch", "numpy")
 
 
@@ -39,6 +41,7 @@ class EvaluateFlags(Options):
     split: Literal["auto", "train", "test", "both"] = "auto"
     """Tasks to play: those trained on, or a meta suite's unseen ones; auto: train, and both for learners that adapt."""
     random: Switch = False  # Also play a random policy, and show the difference.
+    other_tasks: Switch = False  # Also play as many tasks that no run trained on, drawn by another seed.
     device: Device = "auto"
     engine: Engine = "auto"
     json: JsonSwitch = False
@@ -74,8 +77,17 @@ def _evaluate(flags: EvaluateFlags, folder: RunFolder, config: RunConfig, worlds
     split = "train" if flags.split == "auto" else flags.split
     title = f"{config.algo} on {worlds.name}, {split} tasks, {step:,} steps"
     result, table = judged(worlds, policy, step, split, flags, flags.random, title)
+    tables = [table]
+    if flags.other_tasks:
+        drawn = worlds.seed + _OTHER_SEED
+        others = Worlds.open(replace(config, task_seed=drawn).to_json())
+        title = f"{config.algo} on {worlds.name}, other tasks (seed {drawn})"
+        found, table = judged(others, policy, step, split, flags, flags.random, title)
+        result["other_tasks"] = {"task_seed": drawn, **found}
+        tables.append(table)
     if not flags.json:
-        print_table(table)
+        for table in tables:
+            print_table(table)
     return result
 
 
@@ -98,6 +110,8 @@ def _meta_test(flags: EvaluateFlags, folder: RunFolder, config: RunConfig, world
     """As ``_evaluate``, of a learner that adapts."""
     if flags.random:
         raise BidexError(f"{config.algo} is compared with itself before adaptation. Leave --random out.")
+    if flags.other_tasks:
+        raise BidexError(f"{config.algo} adapts: its test tasks are others. Leave --other-tasks out.")
     check_worlds(worlds, config.algo)
     splits = splits_of(worlds, flags.split)
     load, step = policy_loader(folder, config.device, flags.checkpoint)

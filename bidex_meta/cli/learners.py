@@ -64,14 +64,17 @@ def learner_kind(name: str, task: str | None = None) -> LearnerKind:
     """
     if is_outside(name):
         make = _from_elsewhere(name)
+        presets = make.presets
     else:
         name = known_name("algo", name, ALGOS)
         module_name, _, class_name = ALGOS[name].partition(":")
         try:
-            make = vars(importlib.import_module(module_name))[class_name]
+            module = vars(importlib.import_module(module_name))
         except ModuleNotFoundError as error:
             raise BidexError(f"The algo {name!r} needs {error.name}, which is not installed.") from error
-    return LearnerKind(name, make, {**make.presets, **make.task_presets.get(task or "", {})})
+        make = module[class_name]
+        presets = make.presets or module.get("PRESETS", {})
+    return LearnerKind(name, make, {**presets, **make.task_presets.get(task or "", {})})
 
 
 def _from_elsewhere(name: str) -> type[Learner]:

@@ -14,7 +14,7 @@ import tyro
 from bidex_meta.cli.learners import ALGOS
 from bidex_meta.cli.parsing import JsonSwitch, parse
 from bidex_meta.cli.tables import Json, print_rows
-from bidex_meta.errors import known_name
+from bidex_meta.errors import BidexError, known_name
 from bidex_meta.tasks import registry
 from bidex_meta.worlds import listed
 
@@ -43,8 +43,13 @@ def _tasks() -> list[Json]:
     for name in registry.names():
         place = registry.module_of(name), name
         moves, steps, summary = (_constant(*place, key) for key in ("moves_by_default", "episode_steps", "summary"))
-        (size,) = re.findall(r"\((\d{3})[;)]", _docstring(*place))  # as in "Observation: Table 10 (422)."
-        sizes = {"observation": int(size), "action": 52 if moves else 40}
+        found = re.findall(r"\((\d{3})[;)]", _docstring(*place))
+        if len(found) != 1:
+            raise BidexError(
+                f"{name}: expected the observation's size once in the docstring, as in 'Observation: Table 10 (422).', "
+                f"got {found}."
+            )
+        sizes = {"observation": int(found[0]), "action": 52 if moves else 40}
         rows.append({"name": name, **sizes, "episode_steps": steps, "summary": summary})
     return rows
 
@@ -53,7 +58,7 @@ def _algos() -> list[Json]:
     rows = []
     for name, path in ALGOS.items():
         module, _, class_name = path.partition(":")
-        presets = _keys(*_attribute(module, class_name, "presets"))
+        presets = _keys(*_attribute(module, class_name, "presets")) or _keys(*_found(module, "PRESETS"))
         rows.append({"name": name, "presets": presets, "summary": _docstring(module, class_name).splitlines()[0]})
     return rows
 

@@ -2,12 +2,14 @@
 
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 
 from bidex_meta.cli.learners import ALGOS, LearnerKind, learner_kind
 from bidex_meta.cli.tables import Json
 from bidex_meta.data import Dataset, open_dataset
 from bidex_meta.errors import BidexError, known_name
 from bidex_meta.runs.versions import collect_versions
+from bidex_meta.suite import V1
 from bidex_meta.train.launch import launch
 from bidex_meta.utils.files import absolute, expanded
 from bidex_meta.world.contract import VectorWorld
@@ -22,9 +24,9 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
 
     ``policies`` are who acted, in the order of ``Episode.policy``. Returned are ``suite`` and ``suite_version``, or
     ``task``, ``base`` and ``object``, the others None; ``points`` of a cloud; ``tasks``, names of the slots;
-    ``reward_scales``, factor on the printed reward by slot; ``hides_goals``; ``observation_groups``, [name, index
-    ranges]; ``kind`` (``random``, ``medium``, ...), ``policies``, ``seed`` of the tasks, ``references`` ({class:
-    {random, zero, expert}}, unscaled returns), ``versions`` and ``commit``.
+    ``reward_scales``, factor on the reward by slot; ``rules``, the suite's; ``hides_goals``; ``observation_groups``,
+    [name, index ranges]; ``kind`` (``random``, ``medium``, ...), ``policies``, ``seed`` of the tasks, ``references``
+    ({class: {random, zero, expert}}, unscaled returns), ``versions`` and ``commit``.
     """
     alone, versions = source.class_name, collect_versions()
     names = {name.partition("/")[0] for name in world.task_names}
@@ -36,6 +38,7 @@ def dataset_metadata(source: Worlds, world: VectorWorld, kind: str, policies: Se
         "base": {None: "own", True: "moving", False: "fixed"}[source.moving_base] if alone else None,
         "tasks": list(world.task_names),
         "reward_scales": {slot.name: slot.reward_scale for slot in getattr(world, "slots", ())},
+        "rules": next((asdict(slot.task_class.rules) for slot in getattr(world, "slots", ())), asdict(V1)),
         "hides_goals": source.hides_goals,
         "observation_groups": [[g.name, [[p.start, p.stop] for p in g.where]] for g in world.observation_groups],
         "kind": kind, "policies": list(policies), "seed": source.seed,

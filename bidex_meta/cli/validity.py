@@ -16,7 +16,7 @@ from bidex_meta.runs.atomic import check_writable, write_json
 from bidex_meta.runs.versions import collect_versions
 from bidex_meta.utils.validation import Seed, Threads
 from bidex_meta.witness.demonstrators import OpenLoopReplay
-from bidex_meta.witness.store import Witness, load_witness, witness_path
+from bidex_meta.witness.store import load_witness, witness_path
 from bidex_meta.world.world import World
 from bidex_meta.worlds import WorldConfig, Worlds
 
@@ -28,7 +28,8 @@ class ValidityFlags:
     Example: bidex-meta validity --suite ML20-v2 --out validity.json
 
     For each class: the success that a policy can have at best without knowing what the task hides; how often the hidden
-    parts can be told from the rewards of one exploring episode; and the success of policies that have learned nothing.
+    parts can be told from the rewards of one exploring episode (rough actions, or a witness's with noise); and the
+    success of policies that have learned nothing.
     """
 
     suite: str = "ML20-v2"
@@ -87,7 +88,8 @@ def _of_split(worlds: Worlds, split: str, flags: ValidityFlags) -> dict[str, Jso
         if hidden:
             say(f"{slot.name}: what rewards tell")
             one = World([slot], len(slot.tasks), engine="c", threads=flags.threads, autoreset_mode="DISABLED")
-            told = identifiability(one, _actions(witnesses.get(slot.name)), flags.seed)
+            explored = [None, witnesses[slot.name].actions] if slot.name in witnesses else [None]
+            told = max((identifiability(one, each, flags.seed) for each in explored), key=lambda found: found.share)
             rows[slot.name] |= {"identified": told.share, "error_90": float(np.quantile(told.errors, 0.9))}
     for name, agent in policies.items():
         say(f"{name} actions in all tasks")
@@ -97,7 +99,3 @@ def _of_split(worlds: Worlds, split: str, flags: ValidityFlags) -> dict[str, Jso
             rows[slot_name][name] = None if unknown else result.success
     world.close()
     return rows
-
-
-def _actions(witness: Witness | None) -> np.ndarray | None:
-    return None if witness is None else witness.actions

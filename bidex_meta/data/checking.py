@@ -17,6 +17,7 @@ from bidex_meta.data.dataset import Dataset
 from bidex_meta.data.part_files import Episode, Json
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.references import Reference
+from bidex_meta.suite import Rules
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.layout import CLIP, Block
@@ -122,6 +123,7 @@ class _Formulas:
     def __init__(self, dataset: Dataset) -> None:
         self._dataset, about = dataset, dataset.metadata
         self._scales = about.get("reward_scales", {})
+        self._rules = Rules(**about.get("rules", {}))
         # A suite's file, which says whether bases move, may have gone: the number of actions shows it.
         self._bases = {"own": (None,), "moving": (True,), "fixed": (False,)}.get(about.get("base") or "", (True, None))
         self._clouds = any(name in POINT_ENTRIES for name, _ in about.get("observation_groups", ()))
@@ -169,6 +171,7 @@ class _Formulas:
         classes, actions = [registry.get(name, base) for base in self._bases], self._dataset.action_size
         for task in classes:
             if task.action_size == actions:
+                task.adopt(self._rules)
                 return task
         sizes = " or ".join(str(size) for size in sorted({task.action_size for task in classes}))
         raise BidexError(f"{name} has {sizes} actions here, the data {actions}")

@@ -15,6 +15,7 @@ from msgspec import Meta
 from bidex_meta.data import other_formats, part_files, seals
 from bidex_meta.data.part_files import H5, Episode, Json
 from bidex_meta.errors import BidexError, shortened, unknown_name
+from bidex_meta.suite import V1, Rules
 from bidex_meta.utils.files import expanded, is_file, read_bytes, read_json
 from bidex_meta.utils.memory import check_memory
 from bidex_meta.utils.validation import Finite, Positive, Seed, Text, Whole, parse
@@ -49,6 +50,7 @@ class _Collected:
     left_out: dict[str, Whole] = field(default_factory=dict)
     references: dict[str, _Reference] = field(default_factory=dict)
     reward_scales: dict[str, Positive] = field(default_factory=dict)
+    rules: Rules = V1
     hides_goals: bool = False
     base: Literal["own", "moving", "fixed"] | None = None
     suite: Text | None = None

@@ -1,1 +1,1 @@
-"""Physics engines behind one protocol. Tasks and learners never import an engine."""
+"""Physics engines behind one protocol. Tasks import only ``Capacity`` from here, learners nothing."""

@@ -100,9 +100,9 @@ def references() -> dict[str, Reference]:
 
 
 def references_of(world: object) -> dict[str, Reference]:
-    """Those of a world's classes by name; none of foreign classes, nor where bases are fixed."""
-    slots = getattr(world, "slots", ())
-    return references() if slots and all(slot.task_class.moving_base for slot in slots) else {}
+    """Those of a world's classes by name; none of foreign classes, of version 2, nor where bases are fixed."""
+    classes = [slot.task_class for slot in getattr(world, "slots", ())]
+    return references() if classes and all(each.moving_base and each.rules.as_printed for each in classes) else {}
 
 
 def rescored(classes: Json, config: AnyConfig) -> Json:

@@ -21,9 +21,9 @@ class ClassResult:
     lengths: np.ndarray  # steps, int64
     tasks: np.ndarray  # index of the played task in the class's pool, int64
     unstable: int  # episodes that ended because the physics broke
+    reference: Reference | None = None  # for the normalised score and broken episodes, where it is known
     once: float | None = None  # share of episodes solved at any step
     at_end: float | None = None  # share solved in their last steps (``suite.HELD_STEPS``)
-    reference: Reference | None = None  # for the normalised score and broken episodes, where it is known
 
     @property
     def episodes(self) -> int:
@@ -111,6 +111,7 @@ def results_by_class(
             returns=counted_returns(own["return"], broken, reference, np.concatenate(finished)),
             successes=(own["success"] & ~broken).astype(np.float64), lengths=own["length"], tasks=own["task"],
             unstable=int(broken.sum()), reference=reference,
+            **{kind: float((own[kind] & ~broken).mean()) for kind in ("once", "at_end") if kind in own},
         )  # fmt: skip
     return classes
 

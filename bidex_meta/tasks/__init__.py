@@ -1,1 +1,1 @@
-"""The task classes: one file each."""
+"""The task classes, a module for each kind; ``registry`` says which module holds a class."""

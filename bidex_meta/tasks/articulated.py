@@ -218,7 +218,7 @@ class Switch(ReachTask):
     variation_space = join(*(component(f"switch{i}_{axis}", -SHIFT, SHIFT) for i in (1, 2) for axis in "xy"))
     wide_space = join(
         *(component(f"switch{i}_{axis}", -3 * SHIFT, 3 * SHIFT) for i in (1, 2) for axis in "xy"),
-        *(component(f"switch{i}_angle", 0.05, _TRAVEL) for i in (1, 2)),
+        *(component(f"switch{i}_angle", 0.1, _TRAVEL) for i in (1, 2)),
     )
     wide_solved = "each rocker within 0.08 rad of its angle"
     jittered_fixtures = ("switch1", "switch2")

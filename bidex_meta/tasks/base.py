@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bidex_meta.engine.capacity import Capacity
 from bidex_meta.errors import BidexError
+from bidex_meta.hands.hand import hand
 from bidex_meta.hands.poses import HandPose
 from bidex_meta.hands.starts import noisy_joints
 from bidex_meta.suite import V1, Rules
@@ -18,6 +19,7 @@ from bidex_meta.tasks.aligned import Error, Hidden, aligned_terms
 from bidex_meta.tasks.layout import Block, Layout, both_hands
 from bidex_meta.tasks.state import TaskState
 from bidex_meta.tasks.variation import VariationSpace
+from bidex_meta.utils.maths import constant
 from bidex_meta.utils.validation import true_or_false
 
 
@@ -82,7 +84,8 @@ class TaskClass(ABC):
             class says (fixed for HandOver alone).
         solver: What the class asks of the contact solver.
         needs: Most contacts and constraint rows in 30,208 states under rough actions, for mujoco_warp's fixed room,
-            by ``python -m tools.bench capacity --steps 30000``. A class that was not measured has the largest of all.
+            by ``python -m tools.bench capacity --task NAME --steps 30000``. A class that was not measured has the
+            largest of all.
         camera_target: Point that pictures look at, world, metres, from ``camera_distance``.
         depth_camera: Where the camera of point clouds stands and what it looks at, world, metres; None: it looks down
             at ``camera_target`` from the front.
@@ -183,7 +186,9 @@ class TaskClass(ABC):
         sizes = [self.start_draws, *[24] * len(self.jittered_hands), *[2] * len(self.jittered_fixtures)]
         _, *parts = draws.split(sizes, dim=1)
         for side, part in zip(self.jittered_hands, parts, strict=False):
-            qpos[f"{side}/joints"].copy_(noisy_joints(part, JOINT_NOISE))
+            joints = qpos[f"{side}/joints"]
+            low, high = (constant(tuple(ends.tolist()), joints) for ends in (hand().low, hand().high))
+            joints.copy_((joints + noisy_joints(part, JOINT_NOISE)).clamp(low, high))
         for name, part in zip(self.jittered_fixtures, parts[len(self.jittered_hands) :], strict=True):
             qpos[name][:, :2] += JITTER * part
 

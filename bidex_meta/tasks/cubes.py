@@ -179,7 +179,7 @@ class StackBlock(_TwoBlocks):
         frozen = super().freeze(variation)
         if not self.rules.wide:
             return frozen | {"goal1": top, "goal2": bottom, "goal": _unturned(top)}
-        upper = torch.where(variation[:, 8:] < 0.0, -1.0, 1.0)
+        upper = 1.0 - 2.0 * (variation[:, 8:] < 0.0).to(variation.dtype)
         first, second = torch.where(upper > 0.0, top, bottom), torch.where(upper > 0.0, bottom, top)
         return frozen | {"goal1": first, "goal2": second, "upper": upper}
 

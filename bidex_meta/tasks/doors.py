@@ -122,9 +122,9 @@ class _Open(_Door):
     )
     variation_space = join(component("base_y", -0.05, 0.05), component("start_angle", 0.0, 0.15))
     wide_space = join(
-        component("base_y", -0.15, 0.15),
+        component("base_y", -0.08, 0.08),  # farther the handles would start in the hands
         component("start_angle", 0.0, 0.15),
-        *(component(f"{side}_angle", 0.2, 1.4) for side in SIDES),
+        *(component(f"{side}_angle", 0.3, 1.4) for side in SIDES),
     )
 
     def target(self, state: TaskState) -> Tensor:

@@ -125,8 +125,9 @@ class Worlds(ABC):
         return {"physics": physics_of(self.task_classes()), "suite_version": None}
 
     def references(self) -> dict[str, Reference]:
-        """References of the normalised score and of broken episodes; none where the bases do not move as there."""
-        return references() if self.moving_bases else {}
+        """References of the normalised score and of broken episodes; none where bases, tasks or reward are others."""
+        as_printed = all(task_class.rules.as_printed for task_class in self.task_classes().values())
+        return references() if self.moving_bases and as_printed else {}
 
     def judge(self, agent: "Agent", world: "PooledWorld", episodes: int | None, seed: int) -> Evaluation:
         """Evaluates a policy on all tasks of a split (mode DISABLED), ``default_episodes`` or so many of each."""

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from bidex_meta.cli import COMMANDS, main
+from bidex_algos.onpolicy.mtppo import MTPPO, PRESETS
+from bidex_meta.cli import COMMANDS, listing, main
 from bidex_meta.cli.learners import ALGOS, learner_kind
 from bidex_meta.tasks import registry
 
@@ -20,7 +21,7 @@ def test_help_and_lists_need_no_torch(words):
     heavy = {"torch", "mujoco", "metaworld", "scipy", "tensorboard", "bidex_algos.learner"}
     code = f"import sys; from bidex_meta.cli import main; main({words}); print({heavy} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    named = {"--help": list(COMMANDS), "suites": ["metaworld/MT10"], "tasks": registry.names(), "algos": list(ALGOS)}
+    named = {"--help": list(COMMANDS), "suites": ["MT10", "MT20-v2"], "tasks": registry.names(), "algos": list(ALGOS)}
     assert all(name in done.stdout for name in named[words[-1]]) and done.stdout.rstrip().endswith("set()")
 
 
@@ -35,6 +36,18 @@ def test_lists_read_from_source_are_as_the_classes_say(shown):
         kind = learner_kind(row["name"])
         assert row["presets"] == list(kind.presets) and "arXiv" in row["summary"]
         assert (kind.make.__doc__ or "").startswith(row["summary"])
+
+
+def test_a_class_whose_docstring_gives_no_size_is_named(monkeypatch, capsys):
+    monkeypatch.setattr(listing, "_docstring", lambda *place: "Throw an egg.")
+    assert main(["list", "tasks"]) == 2
+    told = capsys.readouterr().err
+    assert "HandOver: expected the observation's size" in told and told.count("\n") == 1
+
+
+def test_a_listed_learner_without_presets_has_those_of_its_module(monkeypatch):
+    monkeypatch.setattr(MTPPO, "presets", {})
+    assert learner_kind("mtppo").presets == PRESETS
 
 
 def test_names_are_taken_in_any_case_and_kept_as_they_are_written(capsys):
@@ -71,7 +84,7 @@ def test_bash_completes_commands_flags_and_names(tmp_path, capsys):
     for words, expected in (
         ("ru", {"run"}),
         ("run --learner.gam", {"--learner.gamma"}),
-        ("run --suite MT", {"MT1", "MT1-objects", "MT4", "MT20"}),
+        ("run --suite MT", {"MT1", "MT1-objects", "MT4", "MT20", "MT1-v2", "MT4-v2", "MT20-v2"}),
         ("run --algo mtp", {"mtppo"}),
         ("witness --task Hand", {"HandOver"}),
         ("run --object ha", {"hammer"}),

@@ -15,6 +15,8 @@ from bidex_meta.tasks import registry
 ROOT = Path(__file__).parents[2]
 SUITES = "MT1 MT4 MT20 ML1-train ML1-test MT1-objects ML1-objects-train ML1-objects-test ML1-wide-train ML1-wide-test"
 SUITE_IDS = [f"bidex-meta/{name}-v1" for name in f"{SUITES} ML4-train ML4-test ML20-train ML20-test".split()]
+SUITE_IDS += [f"bidex-meta/MT{n}-v2" for n in (1, 4, 20)]
+SUITE_IDS += [f"bidex-meta/ML{n}-{split}-v2" for n in (1, 4, 20) for split in ("train", "test")]
 
 
 def test_every_suite_has_its_ids() -> None:
@@ -45,10 +47,13 @@ def test_public_names_are_there() -> None:
         bidex_meta.Bench  # noqa: B018
 
 
+@pytest.mark.parametrize("version", ["v1", "v2"])
 @pytest.mark.parametrize("split", ["train", "test"])
-def test_make_vec_gives_the_split_it_names(split: str) -> None:
-    world = gymnasium.make_vec(f"bidex-meta/ML4-{split}-v1", num_envs=6, device="cpu", threads=1, benchmark_seed=2)
-    classes = bidex_meta.Benchmark("ML4", seed=2)
+def test_make_vec_gives_the_split_it_names(split: str, version: str) -> None:
+    asked = f"bidex-meta/ML4-{split}-{version}"
+    world = gymnasium.make_vec(asked, num_envs=6, device="cpu", threads=1, benchmark_seed=2)
+    classes = bidex_meta.Benchmark("ML4" if version == "v1" else "ML4-v2", seed=2)
+    assert {slot.task_class.rules for slot in world.unwrapped.slots} == {classes.suite.rules}  # type: ignore[attr-defined]
     expected = classes.train_classes if split == "train" else classes.test_classes
     assert world.unwrapped.task_names == list(expected) and world.num_envs == 6  # type: ignore[attr-defined]
 

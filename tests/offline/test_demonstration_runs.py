@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from bidex_meta.cli import record
-from bidex_meta.data import open_dataset, writer
+from bidex_meta.data import collect, open_dataset, writer
 from bidex_meta.runs import RunFolder
 from bidex_meta.witness.demonstrators import ShiftedStarts
 from bidex_meta.witness.replay import Simulator
@@ -58,7 +58,7 @@ def test_only_what_succeeds_is_kept_and_a_recording_goes_on(
     assert whole.num_steps >= 300 and bool(whole.table["success"].all())
     assert (whole.metadata["kind"], whole.metadata["base"]) == ("demonstrations", "moving")
     torn = [*RECORD, "--size", "300", "--out", sets / "sets" / "torn-v0"]
-    play, rounds = record.collect_successes, []
+    play, rounds = collect.collect_successes, []
 
     def once(*given: Any) -> None:
         if rounds:
@@ -66,7 +66,7 @@ def test_only_what_succeeds_is_kept_and_a_recording_goes_on(
         rounds.append(play(*given))
 
     with monkeypatch.context() as patch:
-        patch.setattr(record, "collect_successes", once)
+        patch.setattr(collect, "collect_successes", once)
         printed(capsys, *torn, code=130)
     asked, room = [], writer.check_room
     with monkeypatch.context() as patch:

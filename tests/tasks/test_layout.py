@@ -148,6 +148,34 @@ def expected(
 
 
 @each_case
+def test_version_2_shows_the_same_but_goals_and_signs(name: str, moving: bool) -> None:
+    """In the same state: quaternions have w >= 0; classes without a goal block get one at the end."""
+    one, two = (world_of(name + version, moving, 8, tasks=8, observation="plain") for version in ("", "-v2"))
+    one.reset(seed=0)
+    two.reset(seed=0)
+    engine_of(two).reset(torch.ones(8, dtype=torch.bool), engine_of(one).placement())
+    action = torch.rand(8, one.action_size, generator=torch.Generator().manual_seed(5)) * 2 - 1
+    before, after = one.step(action)[0], two.step(action)[0]
+    layout, size = two.slots[0].task_class.layout, one.observation_size
+    if name in ("BottleCap", "PushBlock", "GraspAndPlace"):
+        assert layout.goal_indices() == list(range(size, size + 11)) and after[:, size:].any()
+    else:
+        assert layout.size == size and layout.goal_indices() == one.slots[0].task_class.layout.goal_indices()
+    before = torch.nn.functional.pad(before, (0, layout.size - size))
+    free = [i for i in range(size) if i not in layout.goal_indices()]
+    last = [
+        stop for _, stop, what in TABLES[name, moving] if what.endswith(("pose", "quaternion")) or " rot - " in what
+    ]
+    tips = [first for first, _, what in TABLES[name, moving] if "fingertip pose" in what]
+    scalars = [*last, *(first + 6 + 13 * tip for first in tips for tip in range(5))]
+    turned = torch.zeros_like(before, dtype=torch.bool)
+    for at in scalars:
+        turned[:, at - 3 : at + 1] = before[:, at : at + 1] < 0
+    assert (after[:, scalars] >= 0).all()
+    assert torch.equal(torch.where(turned, -before, before)[:, free], after[:, free])
+
+
+@each_case
 def test_every_range_equals_plain_mujoco(worlds: dict[tuple[str, bool], World], name: str, moving: bool) -> None:
     world = started(worlds, name, moving)
     generator = torch.Generator().manual_seed(11)

@@ -9,7 +9,8 @@ from bidex_meta.tasks import registry
 from bidex_meta.tasks.hidden import hidden
 from bidex_meta.world import World
 from tests.tasks.formulas import FORMULAS
-from tests.tasks.worlds import each_case, engine_of, mixed_world, world_of
+from tests.tasks.wide import ENTERING, HIDDEN
+from tests.tasks.worlds import each_version, engine_of, mixed_world, world_of
 
 RULES = ["plain", "one-hot", "masked"]
 
@@ -25,7 +26,7 @@ def variants(name: str, moving: bool) -> tuple[list[str], np.ndarray]:
     space = registry.get(name, moving).variation_space
     low, high = np.array(space.low), np.array(space.high)
     base = low + 0.2 * (high - low)
-    chosen = [label for label in space.names if label not in FIXTURES.get(name, ())]
+    chosen = [label for label in space.names if label not in FIXTURES.get(name.removesuffix("-v2"), ())]
     changed = [base + 0.35 * (high - low) * (np.array(space.names) == label) for label in chosen]
     return chosen, np.stack([base, *changed])
 
@@ -44,15 +45,23 @@ def twins(name: str, moving: bool, rule: str) -> tuple[list[str], Tensor, Tensor
     return changed, obs, reward
 
 
-@each_case
+def entering(name: str) -> tuple[set[str], set[str]]:
+    """The components that enter the reward of a given state, and its success alone; no places of fixtures."""
+    plain = name.removesuffix("-v2")
+    task, oracle = registry.get(name, True), FORMULAS[plain]
+    of_reward = set(task.variation_space.names) if oracle.entering is None else oracle.entering
+    return (ENTERING[plain] if plain != name else of_reward) - FIXTURES.get(plain, set()), set(oracle.deciding)
+
+
+@each_version
 @pytest.mark.parametrize("rule", RULES)
 def test_tasks_are_told_apart_exactly_where_they_should_be(name: str, moving: bool, rule: str) -> None:
     changed, obs, reward = twins(name, moving, rule)
-    entering = FORMULAS[name].entering
-    enters = np.array([entering is None or component in entering for component in changed], dtype=bool)
+    of_reward, of_success = entering(name)
+    enters = np.isin(changed, list(of_reward))
     np.testing.assert_array_equal((reward[1:] != reward[0]).numpy(), enters, err_msg=str(changed))
     differs = (obs[1:] != obs[0]).any(dim=1).numpy()
-    enters |= np.isin(changed, list(FORMULAS[name].deciding))
+    enters |= np.isin(changed, list(of_success))
     if rule == "masked":
         assert not differs.any(), np.array(changed)[differs]
     else:
@@ -83,7 +92,7 @@ def played(world: World) -> list[Tensor]:
     return [*found, obs]
 
 
-@each_case
+@each_version
 def test_the_mask_zeroes_the_goal_and_nothing_else(name: str, moving: bool) -> None:
     goal = registry.get(name, moving).layout.goal_indices()
     plain, masked = (played(world_of(name, moving, 4, observation=rule)) for rule in ("plain", "masked"))
@@ -119,11 +128,10 @@ OPEN = {name for name in FORMULAS if name.startswith("Door")} | set(
 """The ten classes whose tasks are told apart by nothing that reward or success depends on, or by a fixture's place."""
 
 
-@pytest.mark.parametrize("name", registry.names())
+@pytest.mark.parametrize("name", [*registry.names(), *(f"{name}-v2" for name in registry.names())])
 def test_what_the_mask_hides_is_what_the_formulas_use(name: str) -> None:
-    task, oracle = registry.get(name, True), FORMULAS[name]
-    entering = set(task.variation_space.names) if oracle.entering is None else oracle.entering
-    found = hidden(task)
-    assert set(found.reward) == entering - FIXTURES.get(name, set())
-    assert set(found.success) == set(oracle.deciding)
+    found, task = hidden(registry.get(name, True)), registry.get(name, True)
+    assert (set(found.reward), set(found.success)) == entering(name)
     assert (not found.reward and not found.success) == (name in OPEN)
+    told = {component for part in task.hides() for component in part.names}
+    assert told == HIDDEN[name.removesuffix("-v2")] & set(task.variation_space.names)

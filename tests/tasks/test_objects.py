@@ -52,7 +52,7 @@ def joints_of(scene: Scene) -> list[str]:
     return [joint for joint in worlds.object_joints_of(scene) if not joint.startswith("water")]
 
 
-@pytest.mark.parametrize("name", STANDING)
+@pytest.mark.parametrize("name", [*STANDING, *(f"{name}-v2" for name in STANDING)])
 def test_objects_rest_where_they_start(name: str) -> None:
     """No jump, no drift, no falling over; caps and lids stay on, leaves and rockers where they are."""
     world = alone(registry.get(name, True), 3)

@@ -6,7 +6,8 @@ import torch
 
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.variation import VariationSpace
-from tests.tasks.worlds import each_case
+from tests.tasks.wide import HIDDEN
+from tests.tasks.worlds import each_case, each_version
 
 TURN = np.deg2rad(15)
 
@@ -56,7 +57,7 @@ SPACES = {
 }
 
 
-@each_case
+@each_version
 def test_samples_lie_inside_and_fill_the_box(name: str, moving: bool) -> None:
     space = registry.get(name, moving).variation_space
     samples = space.sample(np.random.default_rng(0), 500)
@@ -83,7 +84,22 @@ def test_a_task_freezes_its_documented_ranges(name: str, moving: bool) -> None:
         assert found[component] == pytest.approx(ends, abs=1e-9), component
 
 
+WIDER = {"PushBlock": 3, "GraspAndPlace": 3, "Switch": 3, "DoorCloseOutward": 3, "OpenScissors": 2, "OpenPenCap": 2}
+WIDER |= dict.fromkeys(("DoorOpenOutward", "DoorOpenInward"), 1.6)
+
+
 @each_case
+def test_version_2_varies_as_much_or_more_and_adds_what_it_hides(name: str, moving: bool) -> None:
+    space = registry.get(f"{name}-v2", moving).variation_space
+    found = dict(zip(space.names, zip(space.low, space.high, strict=True), strict=True))
+    assert found.keys() == SPACES[name].keys() | HIDDEN[name]
+    for component, (low, high) in SPACES[name].items():
+        assert found[component][0] <= low and found[component][1] >= high, component
+        if component not in {*HIDDEN[name], "start_angle"} and "goal" not in component:
+            assert np.diff(found[component]) == pytest.approx(WIDER.get(name, 1) * (high - low)), component
+
+
+@each_version
 def test_what_is_frozen_is_one_row_a_task(name: str, moving: bool) -> None:
     """Each (n, k) in the variation's precision, the rows of tasks independent of each other, and so the ghosts."""
     task = registry.get(name, moving)

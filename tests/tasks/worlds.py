@@ -22,6 +22,8 @@ CASES = list(TABLES)
 """Every class with each base it is used with."""
 MOVING = [name for name, moving in CASES if moving]
 each_case = pytest.mark.parametrize("name, moving", CASES, ids=[f"{n}-{'moving' if m else 'fixed'}" for n, m in CASES])
+V2 = [(f"{name}-v2", moving) for name, moving in CASES]
+each_version = pytest.mark.parametrize("name, moving", [*CASES, *V2])
 each_moving = pytest.mark.parametrize("name", MOVING)
 
 

@@ -59,8 +59,8 @@ def test_a_hand_turns_about_the_worlds_axes_as_fast_as_it_is_asked() -> None:
     assert angle == pytest.approx(1.2 * 30 / CONTROL_RATE, rel=0.1) and float(turned[:2].norm()) < 0.02
 
 
-@pytest.mark.parametrize("name", ["DoorCloseOutward", "DoorOpenInward", "ReOrientation"])
-def test_both_leaves_are_pulled_and_both_cubes_turned(name: str) -> None:
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_each_script_solves_its_class(name: str) -> None:
     simulator = Simulator(name, 1, threads=1)
     simulator.load(simulator.starts(0))
     hands = HandController(simulator)

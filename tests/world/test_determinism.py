@@ -41,7 +41,12 @@ def test_torchs_threads_change_nothing() -> None:
     assert_same(*played)
 
 
-SIZES = [*((name, 40, 8) for name in CLASSES), ("TwoCatchUnderarm", 20, 1), ("TwoCatchUnderarm", 20, 3)]
+SIZES = [
+    *((name, 40, 8) for name in CLASSES),
+    ("TwoCatchUnderarm", 20, 1),
+    ("TwoCatchUnderarm", 20, 3),
+    ("BottleCap-v2", 40, 8),
+]
 
 
 @pytest.mark.parametrize(("name", "steps", "small"), [*SIZES, ("CatchOver2Underarm", 120, 8)])
@@ -55,7 +60,7 @@ def test_a_rows_trajectory_does_not_depend_on_the_number_of_rows(name: str, step
     assert_same(*played, rows_a=slice(None), rows_b=slice(small))
 
 
-@pytest.mark.parametrize("name", CLASSES)
+@pytest.mark.parametrize("name", [*CLASSES, "DoorCloseInward-v2"])
 def test_128_resets_equal_128_fresh_worlds(name: str) -> None:
     used = class_world(name, 128, "DISABLED", moving_base=True)
     used.reset(seed=0)
@@ -82,7 +87,8 @@ def same_engines(a: World, b: World) -> None:
 
 
 @pytest.mark.parametrize(
-    ("suite", "mode", "before"), [("MT4", "SAME_STEP", 57), ("ML4", "SAME_STEP", 5), ("MT4", "DISABLED", 20)]
+    ("suite", "mode", "before"),
+    [("MT4", "SAME_STEP", 57), ("ML4", "SAME_STEP", 5), ("MT4", "DISABLED", 20), ("MT4-v2", "SAME_STEP", 57)],
 )
 def test_a_loaded_world_continues_bit_for_bit(suite: str, mode: str, before: int) -> None:
     world, other = (suite_world(suite, 12, mode, seed=seed) for seed in (0, 9))

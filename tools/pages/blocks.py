@@ -23,6 +23,7 @@ from tools.pages.gained import gains_table
 from tools.pages.offline import offline_table
 from tools.pages.scaling import rows_figure, rows_table
 from tools.pages.studies import curves_figure, points_figure, read_studies
+from tools.pages.validity import validity_table
 
 _BLOCK = re.compile(r"(?P<head><!-- results: (?P<words>[^\n]*?) -->\n).*?(?P<end><!-- end -->)", re.DOTALL)
 _TABLES = {
@@ -91,6 +92,9 @@ def _lines(block: Block, page: Path, data: Path, check: bool, changed: list[Path
     """Markdown lines of a block; draws its pictures."""
     if block.show == "references":
         yield from tables.references_table()
+        return
+    if block.show == "validity":
+        yield from validity_table(block.on or "", data)
         return
     if not block.study:
         raise ValueError("expected the name of a study")

@@ -1,0 +1,48 @@
+"""Whether there is something to learn about tasks: what needs no training, and that a broken class is found out."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bidex_meta import Benchmark
+from bidex_meta.cli import main
+from bidex_meta.evaluation.validity import blind_ceiling, identifiability
+from bidex_meta.suite import load_suite
+from bidex_meta.tasks import registry
+from bidex_meta.tasks.aligned import Error
+from tests.tasks.worlds import scene_of, world_of
+
+
+def test_blind_policies_cannot_do_much_in_version_2() -> None:
+    benchmark = Benchmark("ML20-v2")
+    classes = benchmark.task_classes("train") | benchmark.task_classes("test")
+    found = {name: blind_ceiling(task, 2000) for name, task in classes.items()}
+    assert len(found) == 20 and max(found.values()) <= 0.25 and np.mean(list(found.values())) <= 0.15, found
+    # Tolerance over range.
+    assert (found["BottleCap"], found["SwingCup"]) == pytest.approx((0.2, 24 / 135), abs=0.03)
+    known = {"CatchUnderarm": 0.52, "StackBlock": 0.79, "DoorOpenOutward": 1.0}
+    version_1 = {name: blind_ceiling(registry.get(name, True)) for name in known}
+    assert version_1 == pytest.approx(known, abs=0.015)
+
+
+@pytest.mark.parametrize("name", ["CatchUnderarm", "BottleCap"])
+def test_rewards_of_one_episode_tell_what_is_hidden_and_a_broken_class_is_found_out(name: str) -> None:
+    world = world_of(f"{name}-v2", True, 4, tasks=4)
+    found = identifiability(world)
+    assert found.share == 1.0 and (found.errors < 0.1).all()
+    task = scene_of(world).task
+    task.errors = lambda state: [Error(state["left/palm_position"].norm(dim=1), 0.1)]  # type: ignore[method-assign]
+    found = identifiability(world)
+    assert found.share <= 0.5 and found.errors.max() > 1.0
+
+
+def test_the_command_measures_a_suite_and_replays_witnesses(tmp_path: Path) -> None:
+    text = load_suite("MT1-v2").file.read_text().replace("CatchUnderarm", "BottleCap").replace("= 50", "= 4")
+    (tmp_path / "own.toml").write_text(text)
+    suite, out = str(tmp_path / "own.toml"), str(tmp_path / "v.json")
+    assert main(["validity", "--suite", suite, "--threads", "1", "--out", out]) == 0
+    (row,) = json.loads((tmp_path / "v.json").read_text())["classes"].values()
+    assert row["hidden"] == ["cap_slide"] and 0.18 < row["blind"] < 0.25 and row["identified"] == 1.0
+    assert row["uniform"] == row["zero"] == row["held"] == 0.0 and row["witness"] <= 0.5

@@ -1,0 +1,50 @@
+"""A class of version 2 on the other engine, as points, for several agents, and recorded."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from bidex_meta import make_task_world
+from bidex_meta.data.checking import verify
+from bidex_meta.evaluation.references import references_of
+from bidex_meta.tasks import registry
+from bidex_meta.world import World
+from bidex_meta.world.agent_views import agent_views
+from tests.data.test_commands import recorded
+from tests.tasks.worlds import slot
+from tests.world.play import flat, suite_world
+
+
+@pytest.mark.xdist_group("warp")
+def test_the_warp_engine_agrees_with_c() -> None:
+    worlds = [World([slot(registry.get("BottleCap-v2"))], 2, engine=engine, threads=1) for engine in ("c", "warp")]
+    action = torch.rand(2, 52, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    torch.testing.assert_close(*(world.reset(seed=0)[0] for world in worlds), rtol=0, atol=1e-5)
+    ours, theirs = (flat(world.step(action)) for world in worlds)
+    assert ours.keys() == theirs.keys()
+    torch.testing.assert_close(theirs["reward"], ours["reward"], rtol=0, atol=1e-4)
+
+
+def test_points_hide_the_object_and_show_the_goal() -> None:
+    state, points = (make_task_world("PushBlock-v2", 2, "cpu", threads=1, points=n) for n in (0, 32))
+    layout, (seen, cloud) = state.slots[0].task_class.layout, [world.reset(seed=0)[0] for world in (state, points)]
+    goal, block = layout.range("goal_pose"), layout.range("block1_pose")
+    assert torch.equal(seen[:, goal], cloud[:, goal]) and cloud[:, layout.size :].any()
+    assert seen[:, block].any() and not cloud[:, block].any()
+
+
+def test_agents_see_the_goal_and_references_are_those_of_version_1() -> None:
+    world = suite_world("MT4-v2", 4)
+    sizes = [(len(view.columns), len(view.actions)) for view in agent_views(world.observation_groups, 52, "hands")]
+    assert sizes == [(450 - 199, 26)] * 2
+    assert not references_of(world) and references_of(suite_world("MT4", 4))
+
+
+@pytest.mark.parametrize("of", [{"suite": "MT1-v2"}, {"task": "CatchUnderarm-v2"}, {"task": "CatchUnderarm"}])
+def test_recorded_rewards_are_computed_again_by_the_right_formula(of: dict[str, str], tmp_path: Path) -> None:
+    pytest.importorskip("h5py", reason="needs the extra data")
+    dataset, v2 = recorded(tmp_path, **of), "-v2" in str(of)
+    found = verify(dataset)
+    assert found.count == 0 and list(found.recomputed.values()) == [found.steps], found
+    assert (dataset.metadata["rules"]["reward"] == "v2") == v2 and (dataset.metadata["references"] == {}) == v2

@@ -1,0 +1,38 @@
+"""Tables of what ``bidex-meta validity`` measured."""
+
+import json
+from pathlib import Path
+
+from bidex_meta.errors import BidexError
+
+_SHARES = {
+    "blind": "blind at best",
+    "identified": "told by rewards",
+    "uniform": "uniform",
+    "zero": "zero",
+    "held": "held",
+    "witness": "one witness",
+}
+
+
+def validity_table(suite: str, data: Path) -> list[str]:
+    """The table of a suite from ``validity/SUITE.json`` in the folder of data; the last row is the mean of classes."""
+    file = data / "validity" / f"{suite}.json"
+    if not file.is_file():
+        raise BidexError(f"Expected {file}. Make it: bidex-meta validity --suite {suite} --out {file}")
+    classes = json.loads(file.read_text())["classes"]
+    lines = [f"| class | hidden | {' | '.join(_SHARES.values())} |", "|---|---|" + "---|" * len(_SHARES)]
+    for name, row in classes.items():
+        cells = (_percent(row[key]) for key in _SHARES)
+        lines.append(f"| {name} | {', '.join(row['hidden']) or 'nothing'} | {' | '.join(cells)} |")
+    means = (_mean([row[key] for row in classes.values()]) for key in _SHARES)
+    return [*lines, f"| mean | | {' | '.join(map(_percent, means))} |"]
+
+
+def _mean(values: list[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
+
+
+def _percent(share: float | None) -> str:
+    return "" if share is None else f"{100 * share:.1f} %"
