@@ -7,10 +7,10 @@ from bidex_meta.tasks.registry import plain_name
 from bidex_meta.witness.controller import HandController
 from bidex_meta.witness.scripts.blocks import grasp_and_place, push_blocks, stack_block
 from bidex_meta.witness.scripts.caps import pull_cap, swing_cup
-from bidex_meta.witness.scripts.cubes import turn_cubes
-from bidex_meta.witness.scripts.doors import close_outward, open_inward, push
+from bidex_meta.witness.scripts.pots import lift_underarm, pour_water
+from bidex_meta.witness.scripts.swing_doors import close_outward, open_inward, push
 from bidex_meta.witness.scripts.tools import open_pen, open_scissors, press_switches
-from bidex_meta.witness.scripts.vessels import lift_underarm, pour_water
+from bidex_meta.witness.scripts.turning import turn_cubes
 
 Script = Callable[[HandController], None]
 
