@@ -33,6 +33,11 @@ def module_of(name: str) -> str:
     return f"bidex_meta.tasks.{_MODULES[name]}"
 
 
+def plain_name(name: str) -> str:
+    """A class's name without the ``-v2`` that gives it the rules of version 2."""
+    return name.removesuffix(_V2)
+
+
 def resolve(name: str, kind: str = "task class") -> str:
     """The name by which ``get`` knows a class, given in any case; ``package.module:Class`` stays as it is.
 
@@ -63,7 +68,7 @@ def get(name: str, moving_base: bool | None = None, **options: float | str) -> "
     """
     if is_outside(name):
         task_class = _outside(name)
-    elif (plain := name.removesuffix(_V2)) in _MODULES:
+    elif (plain := plain_name(name)) in _MODULES:
         task_class = vars(importlib.import_module(module_of(plain)))[plain]
     else:
         raise unknown_name("task class", name, _MODULES)

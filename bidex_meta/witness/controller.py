@@ -3,6 +3,8 @@
 A script reads sensors' means over all copies of the start; its recorded actions replay without it.
 """
 
+from collections.abc import Iterable
+
 import torch
 from torch import Tensor
 
@@ -15,6 +17,17 @@ GAIN = 8.0  # speed of a hand over its distance to its target, and of its turn o
 _KNUCKLES, _MIDDLES = ("FFJ2", "MFJ2", "RFJ2", "LFJ2"), ("FFJ1", "MFJ1", "RFJ1", "LFJ1")
 
 Point = tuple[float, float, float]
+
+
+def beside(point: Tensor, x: float, y: float, height: float) -> Point:
+    """A point beside another, at a height above the floor, metres."""
+    return float(point[0]) + x, float(point[1]) + y, height
+
+
+def point(position: Tensor) -> Point:
+    """A position (3,) as three numbers, metres."""
+    x, y, z = position.tolist()
+    return x, y, z
 
 
 def rest_action(size: int) -> Tensor:
@@ -37,6 +50,7 @@ class HandController:
         self.rewards: list[float] = []
         self.success: list[bool] = []
         self.episode_steps = simulator.episode_steps
+        self.wide = simulator.task.rules.wide  # whether a task asks for more than version 1's
         self._rest = rest_action(simulator.action_size)
         self._full_speed = FORCE_PER_SCALE * simulator.task.transition_scale / LINEAR_DAMPING[0]
         self._full_torque = TORQUE_PER_SCALE * simulator.task.orientation_scale
@@ -57,6 +71,11 @@ class HandController:
     def frozen(self, name: str) -> Tensor:
         """A frozen number of the task, (k,)."""
         return self._simulator.frozen(name)[0]
+
+    @property
+    def steps_left(self) -> int:
+        """Control steps to the end of the episode."""
+        return self.episode_steps - len(self.actions)
 
     def at(self, side: str) -> Tensor:
         """Position of a hand's point, metres, (3,)."""
@@ -100,6 +119,11 @@ class HandController:
             self.actions.append(action)
             self.rewards.append(float(trace.rewards[0, 0]))
             self.success.append(bool(trace.success[0, 0]))
+
+    def lead_each(self, points: Iterable[Point], speed: float = 0.6) -> None:
+        """``lead`` for a step, to the right and the left hand's point."""
+        right, left = points
+        self.lead(right, left, 1, speed)
 
     def _torque(self, side: str) -> Tensor:
         """The actions (3,) that turn a hand to the orientation it is held at; zeros for a free hand."""

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import unknown_name
+from bidex_meta.tasks.registry import plain_name
 from bidex_meta.witness.store import Witness
 from bidex_meta.world import Slot, World
 from bidex_meta.world.part import judge
@@ -31,13 +32,17 @@ class Trace:
 
 
 def task_slot(name: str) -> Slot:
-    """The slot of a class with the one task that witnesses are about; raises BidexError for another class."""
-    benchmark = Benchmark(SUITE, seed=SEED)
+    """The slot of a class with the one task that witnesses are about; raises BidexError for another class.
+
+    ``DoorOpenInward-v2`` has the rules of version 2, and a task of them.
+    """
+    plain = plain_name(name)
+    benchmark = Benchmark(SUITE if plain == name else f"{SUITE}-v2", seed=SEED)
     classes = benchmark.task_classes()
-    if name not in classes:
+    if plain not in classes:
         raise unknown_name("task", name, classes)
-    task = next(t for t in benchmark.train_tasks if t.env_name == name)
-    return Slot(name, classes[name], task.variation[None])
+    task = next(t for t in benchmark.train_tasks if t.env_name == plain)
+    return Slot(name, classes[plain], task.variation[None])
 
 
 class Simulator:

@@ -66,3 +66,22 @@ def test_each_script_solves_its_class(name: str) -> None:
     hands = HandController(simulator)
     script_of(name)(hands)
     assert any(hands.success) and len(hands.actions) == hands.episode_steps
+
+
+@pytest.mark.parametrize(
+    "name", ["BottleCap", "DoorCloseInward", "DoorOpenOutward", "OpenPenCap", "OpenScissors", "PushBlock", "Switch"]
+)
+def test_a_script_of_version_2_brings_things_to_where_a_task_wants_them(name: str) -> None:
+    world = make_task_world(f"{name}-v2", 50, "cpu", autoreset_mode="DISABLED", moving_base=True, threads=1)
+    world.reset(seed=3)
+    agent, rows = Scripted(world), torch.arange(50) < 4
+    agent.reset(rows)
+    for _ in range(int(world.max_episode_steps.max())):
+        *_, info = world.step(agent.eval_action(torch.zeros(50, 1)))
+    assert int(info["so_far"]["success"][rows].sum()) >= 2 and not bool(info["so_far"]["success"][~rows].any())
+
+
+def test_version_1_has_no_more_scripts_than_it_had() -> None:
+    with pytest.raises(BidexError, match="Expected a class with a script"):
+        script_of("Switch")
+    assert script_of("StackBlock-v2") is script_of("StackBlock")

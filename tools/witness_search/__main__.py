@@ -122,7 +122,7 @@ class Whole(Improvement):
 
 @dataclass(frozen=True, kw_only=True)
 class Script(Search):
-    """Play the class's script (bidex_meta/witness/scripts.py) in sixteen slightly shifted copies of the start."""
+    """Play the class's script (bidex_meta/witness/scripts/) in sixteen slightly shifted copies of the start."""
 
     def run(self) -> None:
         """Plays the script once."""

@@ -1,0 +1,142 @@
+"""Scripted policies for the four doors."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from bidex_meta.hands.hand import SIDES
+from bidex_meta.witness.controller import HandController, Point
+
+_ABOVE = 1.0  # height at which a hand is clear of the bars, metres
+_DOOR_HEIGHT = 0.72  # of the hands at a door, between the ends of the bars, metres
+# From a hand's point to its fingers' middle joints: ahead, and away from where the palm faces, metres.
+_TO_FINGERS, _TO_PALM = 0.06, 0.02
+
+
+@dataclass(frozen=True)
+class _Leaf:
+    """A leaf from above, as on the right hand's side, where y grows outwards; metres (assets/objects/door.xml).
+
+    ``hinge``: its x, and its y from the door's middle; ``along`` and ``over``: from it to the bar that faces the hands.
+    """
+
+    hinge: tuple[float, float]
+    along: float
+    over: float
+
+    def place(self, along: float, over: float, angle: float) -> tuple[float, float]:
+        """A point of the leaf that stands open by this angle towards the hands (away from them: negative)."""
+        sine, cosine = math.sin(angle), math.cos(angle)
+        return self.hinge[0] + over * cosine + along * sine, self.hinge[1] + over * sine - along * cosine
+
+
+_INWARD = _Leaf((0.0085, 0.4265), 0.3752, 0.0710), _Leaf((0.0056, 0.4204), 0.3761, 0.0738)
+_OUTWARD = _Leaf((-0.0085, 0.4265), 0.3752, 0.0830), _Leaf((-0.0056, 0.4204), 0.3761, 0.0802)
+
+
+def open_inward(hands: HandController) -> None:
+    """Fingers bent to hooks go behind the bars from the side, and pull the leaves open; the hands turn with them."""
+    # One leaf open and the other shut pays as much as both half open.
+
+    def go(angles: Sequence[float], aside: float = 0.0, back: float = 0.0, steps: int = 1, speed: float = 0.6) -> None:
+        """Hooks behind the bars of leaves that stand open by these angles, or ``aside`` and ``back`` of that."""
+        at = [
+            leaf.place(leaf.along - 0.009 - aside, leaf.over + 0.01 + back, angle)
+            for leaf, angle in zip(_INWARD, angles, strict=True)
+        ]
+        _lead(hands, at, angles, steps, speed)
+
+    for side in SIDES:
+        hands.bend(side, 0.0, 1.45)
+    led = _angles(hands)
+    go(led, aside=0.11, back=0.02, steps=22, speed=0.8)
+    go(led, aside=0.11, steps=6, speed=0.5)
+    go(led, steps=15, speed=0.5)
+    while len(hands.actions) < hands.episode_steps:
+        led = [
+            min(angle + 0.0075, now + 0.1, last)
+            for angle, now, last in zip(led, _angles(hands), _goals(hands, 1.35), strict=True)
+        ]
+        go(led)
+
+
+def close_outward(hands: HandController) -> None:
+    """Straight fingers go between each bar and its leaf, and pull the leaves shut; the hands turn with them."""
+    # Leaves that stand away from the hands cannot be pushed shut. The distance between hand and leaf is bounded, since
+    # more force straightens bent fingers.
+    start = _angles(hands)
+
+    def go(angles: Sequence[float], back: float = 0.0, steps: int = 1, speed: float = 0.6) -> None:
+        """Fingers behind the bars of leaves that stand open by these angles, or ``back`` of that."""
+        yaws = [0.8 * (first - angle) for first, angle in zip(start, angles, strict=True)]
+        at = []
+        for leaf, angle, yaw in zip(_OUTWARD, angles, yaws, strict=True):
+            x, y = leaf.place(leaf.along, leaf.over - 0.04, -angle)
+            ahead, sine, cosine = _TO_FINGERS + back, math.sin(yaw), math.cos(yaw)
+            at.append((x + ahead * cosine + _TO_PALM * sine, y + ahead * sine - _TO_PALM * cosine))
+        _lead(hands, at, yaws, steps, speed)
+
+    for side in SIDES:
+        hands.bend(side, 0.0, 0.0)
+    go(start, back=0.2, steps=16, speed=1.0)
+    go(start, steps=22, speed=1.2)
+    led = start
+    lasts = _goals(hands, -0.2, 0.1)  # a finger has so much room
+    while len(hands.actions) < hands.episode_steps:
+        led = [
+            max(angle - 0.012, now - 0.22, last) for angle, now, last in zip(led, _angles(hands), lasts, strict=True)
+        ]
+        go(led)
+
+
+def push(hands: HandController) -> None:
+    """Fists above the bars push the leaves away from the hands, each to its angle, and then let go of it."""
+    # Both classes that push turn a leaf the same way: from open towards the hands over shut to open away from them.
+    inward = abs(float(hands.orientation("object/quaternion")[1])) > 0.5
+    leaves, sign = (_INWARD, 1.0) if inward else (_OUTWARD, -1.0)
+    goals = [sign * goal for goal in hands.frozen("leaves").tolist()]
+
+    def go(angles: Sequence[float], back: float, steps: int = 1, speed: float = 0.6) -> None:
+        """Fists before leaves that stand open towards the hands by these angles, ``back`` from them."""
+        at = [leaf.place(0.33, 0.06 + back, angle) for leaf, angle in zip(leaves, angles, strict=True)]
+        _lead(hands, at, [0.0, 0.0], steps, speed, height=_ABOVE)
+
+    for side in SIDES:
+        hands.bend(side, 1.4, 1.4, THJ3=0.5, THJ0=-1.2)
+    led = [sign * angle for angle in _angles(hands)]
+    go(led, back=0.1, steps=30, speed=1.2)
+    while hands.steps_left:
+        now = [sign * angle for angle in _angles(hands)]
+        left = [angle - goal for angle, goal in zip(now, goals, strict=True)]
+        led = [
+            max(was - 0.012, angle - 0.3) if more > 0.04 else angle + 0.1
+            for was, angle, more in zip(led, now, left, strict=True)
+        ]
+        go(led, back=0.0)
+
+
+def _goals(hands: HandController, usual: float, less: float = 0.0) -> list[float]:
+    """Angles of a task for the right and the left leaf, rad, ``less`` so much; ``usual`` where it has none."""
+    return (hands.frozen("leaves") - less).tolist() if hands.wide else [usual, usual]
+
+
+def _angles(hands: HandController) -> list[float]:
+    """How far the right and the left leaf stand open, rad."""
+    return [float(hands.where(f"object/hinge{leaf}_angle")) for leaf in (1, 2)]
+
+
+def _lead(
+    hands: HandController,
+    at: Sequence[tuple[float, float]],
+    yaws: Sequence[float],
+    steps: int,
+    speed: float,
+    height: float = _DOOR_HEIGHT,
+) -> None:
+    """Moves the right hand to its point and the left one to its point mirrored, turned outwards."""
+    middle = float(hands.where("object/position")[1])
+    points: list[Point] = []
+    for side, sign, (x, y), yaw in zip(SIDES, (1.0, -1.0), at, yaws, strict=True):
+        hands.hold(side, yaw=sign * yaw)
+        points.append((x, middle + sign * y, height))
+    hands.lead(*points, steps=steps, speed=speed)
