@@ -16,9 +16,10 @@ from bidex_meta.evaluation.play import EVALUATION_SEED, RandomAgent, ZeroAgent, 
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.runs.atomic import check_writable
 from bidex_meta.runs.versions import collect_versions
+from bidex_meta.suite import V1, V2
 from bidex_meta.utils.validation import Few, Seed, Threads
 from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted
-from bidex_meta.witness.scripts import SCRIPTS
+from bidex_meta.witness.scripts import SCRIPTS, WIDE_SCRIPTS
 from bidex_meta.witness.store import load_witness, witness_path
 from bidex_meta.world.world import World
 from bidex_meta.worlds import WorldConfig, Worlds
@@ -97,14 +98,20 @@ def _played(what: str, worlds: Worlds, flags: BaselineFlags) -> Evaluation:
 
 def _scripted(worlds: Worlds, flags: BaselineFlags) -> Evaluation:
     """Each class that has a script on its own: alone it has the tasks that it has in suites."""
-    names = [name for name in worlds.task_classes() if name in SCRIPTS]
+    versions = {V1: (SCRIPTS, ""), V2: (WIDE_SCRIPTS, "-v2")}
+    rules = next(iter(worlds.task_classes().values())).rules
+    if rules not in versions:
+        raise BidexError(f"Scripts play version 1 or 2, but {flags.suite} has rules of its own: {rules}.")
+    scripts, version = versions[rules]
+    names = [name for name in worlds.task_classes() if name in scripts]
     if not names:
-        raise BidexError(f"Expected a suite with a class that has a script ({', '.join(SCRIPTS)}), got {flags.suite}.")
+        raise BidexError(f"Expected a suite with a class that has a script ({', '.join(scripts)}), got {flags.suite}.")
     classes = {}
     for name in names:
-        config = WorldConfig(task=name, base="moving", seed=flags.seed, engine="c", threads=flags.threads)
+        config = WorldConfig(task=name + version, base="moving", seed=flags.seed, engine="c", threads=flags.threads)
         world = Worlds.open(config).world()
         assert isinstance(world, World)
-        classes |= evaluate(Scripted(world), world, flags.episodes, seed=EVALUATION_SEED, references={}).classes
+        found = evaluate(Scripted(world), world, flags.episodes, seed=EVALUATION_SEED, references={})
+        classes[name] = found.classes[name + version]
         world.close()
     return Evaluation(classes, flags.episodes)
