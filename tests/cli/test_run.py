@@ -95,7 +95,7 @@ def test_each_help_opens_with_a_sentence_and_an_example(command, capsys):
         ("run", "either --suite SUITE or --task TASK"),
         ("run --suite MT4 --task HandOver", "either --suite SUITE or --task TASK"),
         ("run --suite MT5", "Did you mean 'MT4'?"),
-        ("run --suite MT5", "MT20, MT4, metaworld/MT10, metaworld/MT3."),
+        ("run --suite MT5", "MT4-v2, metaworld/MT10, metaworld/MT3."),
         ("run --suite mt10", "Did you mean 'metaworld/MT10'?"),
         ("run --task handove", "Did you mean 'HandOver'?"),
         ("run --resume nowhere", "not a run folder"),
