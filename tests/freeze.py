@@ -127,7 +127,8 @@ def _tensors(value: Any) -> Iterator[str]:
     if isinstance(value, torch.Tensor):
         yield _digest(f"{value.dtype} {tuple(value.shape)}".encode() + value.contiguous().numpy().tobytes())
     elif isinstance(value, dict | list | tuple):
-        for each in value.values() if isinstance(value, dict) else value:
+        # ``held`` of the worlds' episodes came after the record.
+        for each in [v for k, v in value.items() if k != "held"] if isinstance(value, dict) else value:
             yield from _tensors(each)
 
 
