@@ -47,8 +47,8 @@ def evaluation_table(
 
     Both evaluations are on the same tasks.
     """
-    caption = "[..] 95 % bootstrap interval over tasks (of few: episodes); success: at any step of the episode"
-    headers = ["episodes", "length", "success", "return [95 %]", "score"]
+    caption = "[..] 95 % bootstrap interval over tasks (of few: episodes); success: by the suite's rule, once or at end"
+    headers = ["episodes", "length", "success", "once", "at end", "return [95 %]", "score"]
     if random is not None:
         headers += ["random success", "random return [95 %]", "return above random [95 %]"]
     if gains is not None:
@@ -62,6 +62,7 @@ def evaluation_table(
     for name, row in rows["classes"].items():
         episodes = f"{row['episodes']}" + (f" ({row['unstable']} unstable)" if row["unstable"] else "")
         cells = [plain(name), episodes, f"{row['length']:.1f}", percent(row["success"])]
+        cells += [NONE if row[key] is None else percent(row[key]) for key in ("success_once", "success_at_end")]
         cells += [ranged(row["return"], row["return_interval"]), _score(row["score"])]
         if others is not None:
             other, difference = others["classes"][name], differences[name]
@@ -72,7 +73,7 @@ def evaluation_table(
         table.add_row(*cells)
     for key, label in (("mean", "mean over tasks"), ("iqm", "interquartile mean")):
         success, score = rows["aggregate"]["success"], rows["aggregate"]["score"]
-        cells = [label, "", "", percent(success[key]), "", _score(score[key] if score else None)]
+        cells = [label, "", "", percent(success[key]), "", "", "", _score(score[key] if score else None)]
         if others is not None:
             cells += [percent(others["aggregate"]["success"][key])]
         if gains is not None and key == "mean":
