@@ -27,9 +27,9 @@ class ValidityFlags:
 
     Example: bidex-meta validity --suite ML20-v2 --out validity.json
 
-    For each class: the success that a policy can have at best without knowing what the task hides; how often the hidden
-    parts can be told from the rewards of one exploring episode (rough actions, or a witness's with noise); and the
-    success of policies that have learned nothing.
+    For each class: the success that a policy can have at best without knowing what the task hides; how often the rewards
+    of one exploring episode (rough actions, or a witness's with noise) identify the hidden parts; and the success of
+    policies that have learned nothing.
     """
 
     suite: str = "ML20-v2"
@@ -89,8 +89,10 @@ def _of_split(worlds: Worlds, split: str, flags: ValidityFlags) -> dict[str, Jso
             say(f"{slot.name}: what rewards tell")
             one = World([slot], len(slot.tasks), engine="c", threads=flags.threads, autoreset_mode="DISABLED")
             explored = [None, witnesses[slot.name].actions] if slot.name in witnesses else [None]
-            told = max((identifiability(one, each, flags.seed) for each in explored), key=lambda found: found.share)
-            rows[slot.name] |= {"identified": told.share, "error_90": float(np.quantile(told.errors, 0.9))}
+            identified = max(
+                (identifiability(one, each, flags.seed) for each in explored), key=lambda found: found.share
+            )
+            rows[slot.name] |= {"identified": identified.share, "error_90": float(np.quantile(identified.errors, 0.9))}
     for name, agent in policies.items():
         say(f"{name} actions in all tasks")
         found = evaluate(agent, world, 1, seed=EVALUATION_SEED, references={})

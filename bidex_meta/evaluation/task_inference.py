@@ -53,7 +53,7 @@ def distances(part: Hidden, values: Tensor, centre: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Identified:
-    """How well hidden parts are told by the rewards of one exploring episode."""
+    """How well hidden parts are identified from the rewards of one exploring episode."""
 
     share: float
     """Of episodes: every part is fitted within its tolerance."""

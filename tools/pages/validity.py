@@ -7,7 +7,7 @@ from bidex_meta.errors import BidexError
 
 _SHARES = {
     "blind": "blind at best",
-    "identified": "told by rewards",
+    "identified": "identified",
     "uniform": "uniform",
     "zero": "zero",
     "held": "held",
