@@ -27,7 +27,7 @@ class ValidityFlags:
 
     Example: bidex-meta validity --suite ML20-v2 --out validity.json
 
-    For each class: the success that a policy can have at best without knowing what the task hides; how often the rewards
+    For each class: the success that a policy can have at best without knowing what a task hides; how often the rewards
     of one exploring episode (rough actions, or a witness's with noise) identify the hidden parts; and the success of
     policies that have learned nothing.
     """
