@@ -70,8 +70,8 @@ def check_room(folder: Path, needed: int, what: str) -> None:
     there = next(above for above in (folder.absolute(), *folder.absolute().parents) if exists(above))
     free = shutil.disk_usage(there).free
     if needed * _MARGIN > free:
-        told = f"{what} would take about {needed / 1e9:,.1f} GB, and {free / 1e9:,.1f} are free at {there}"
-        raise BidexError(f"{told}. Lower --size, or name another path by --out.")
+        needs = f"{what} would take about {needed / 1e9:,.1f} GB, and {free / 1e9:,.1f} are free at {there}"
+        raise BidexError(f"{needs}. Lower --size, or name another path by --out.")
 
 
 class DatasetWriter:
