@@ -45,7 +45,7 @@ class Rules:
     """The printed formula of each class, or ``aligned_terms``."""
     variation: Literal["narrow", "wide"] = "narrow"
     """Whether goals vary about as much as success tolerates, or several times as much, with a hidden quantity in every
-    class. Wide observations also give quaternions with w >= 0."""
+    class. Wide observations also give objects' and goals' quaternions with w >= 0."""
     success: Literal["once", "at-end"] = "once"
     """Whether the condition must hold at any step of an episode, or for its last ``HELD_STEPS``."""
     starts: Literal["plain", "jittered"] = "plain"

@@ -66,11 +66,16 @@ class Observer:
         self._scale[where] = 1.0
 
     def _of_quaternions(self, scene: Scene) -> list[int]:
-        """First entries of the quaternions whose sign the scene's rules choose; of a pose the last four are one."""
+        """First entries of the quaternions whose sign the scene's rules choose; of a pose the last four are one.
+
+        None of the hands': joints turn them from one start, so that each has one sign, also where its w is near 0.
+        """
         if not scene.task.rules.wide:
             return []
         found = []
         for block, where in self.layout:
+            if block.name in _HAND_OF:
+                continue
             if block.goal:
                 found += [where.stop - 4]
             at = where.start
@@ -80,7 +85,7 @@ class Observer:
         return found
 
     def choose_signs(self, values: Tensor) -> None:
-        """Turns the sign of quaternions in observations (n, width), in place, so that w >= 0 (wide variation only)."""
+        """Turns quaternions of objects and goals in observations (n, width), in place, to w >= 0 (wide variation)."""
         if len(self._quaternions):
             columns = (self._quaternions[:, None] + torch.arange(4, device=values.device)).flatten()
             turns = values[:, columns].unflatten(1, (-1, 4))
