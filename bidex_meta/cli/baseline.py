@@ -16,10 +16,9 @@ from bidex_meta.evaluation.play import EVALUATION_SEED, RandomAgent, ZeroAgent, 
 from bidex_meta.evaluation.results import Evaluation
 from bidex_meta.runs.atomic import check_writable
 from bidex_meta.runs.versions import collect_versions
-from bidex_meta.suite import V1, V2
 from bidex_meta.utils.validation import Few, Seed, Threads
 from bidex_meta.witness.demonstrators import OpenLoopReplay, Scripted
-from bidex_meta.witness.scripts import SCRIPTS, WIDE_SCRIPTS
+from bidex_meta.witness.scripts import scripts_of
 from bidex_meta.witness.store import load_witness, witness_path
 from bidex_meta.world.world import World
 from bidex_meta.worlds import WorldConfig, Worlds
@@ -28,7 +27,7 @@ _POLICIES = {
     "random": "uniform actions",
     "zero": "zero actions",
     "witness": "the witness of task 0, open loop",
-    "script": "the script of the class, led anew from each start",
+    "script": "the script of the class, by the state of each step",
 }
 
 
@@ -97,21 +96,13 @@ def _played(what: str, worlds: Worlds, flags: BaselineFlags) -> Evaluation:
 
 
 def _scripted(worlds: Worlds, flags: BaselineFlags) -> Evaluation:
-    """Each class that has a script on its own: alone it has the tasks that it has in suites."""
-    versions = {V1: (SCRIPTS, ""), V2: (WIDE_SCRIPTS, "-v2")}
-    rules = next(iter(worlds.task_classes().values())).rules
-    if rules not in versions:
-        raise BidexError(f"Scripts play version 1 or 2, but {flags.suite} has rules of its own: {rules}.")
-    scripts, version = versions[rules]
+    """Each class that has a script."""
+    scripts = scripts_of(next(iter(worlds.task_classes().values())).rules)
     names = [name for name in worlds.task_classes() if name in scripts]
     if not names:
         raise BidexError(f"Expected a suite with a class that has a script ({', '.join(scripts)}), got {flags.suite}.")
-    classes = {}
-    for name in names:
-        config = WorldConfig(task=name + version, base="moving", seed=flags.seed, engine="c", threads=flags.threads)
-        world = Worlds.open(config).world()
-        assert isinstance(world, World)
-        found = evaluate(Scripted(world), world, flags.episodes, seed=EVALUATION_SEED, references={})
-        classes[name] = found.classes[name + version]
-        world.close()
-    return Evaluation(classes, flags.episodes)
+    world = worlds.world()
+    assert isinstance(world, World)
+    found = evaluate(Scripted(world, names=names), world, flags.episodes, seed=EVALUATION_SEED, references={})
+    world.close()
+    return replace(found, classes={name: found.classes[name] for name in names})

@@ -259,7 +259,7 @@ def _demonstrations(flags: RecordFlags) -> _Collection:
         raise BidexError(f"{name} is none of the classes that have witnesses (bidex-meta witness --all).")
     witness = {} if flags.script else {name: load_witness(name)}
     if flags.script:
-        script_of(name)  # refuses a class without one
+        script_of(source.task_classes()[name])  # refuses a class without one
     on_tasks = flags.starts == "tasks"
     drawn: Json = {"noise": flags.noise, **({"starts": "tasks"} if on_tasks else {"shift": flags.shift})}
     plan = {"kind": "demonstrations", "task": name, "size": size, "num_envs": rows, "seed": flags.seed, **drawn}

@@ -1,22 +1,24 @@
 """Hand controller: moves both hands to points in closed loop, for scripted policies.
 
-A script reads sensors' means over all copies of the start; its recorded actions replay without it.
+A script is a generator of actions: it yields one for each control step, and reads the state in which that is taken.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 
 import torch
 from torch import Tensor
 
 from bidex_meta.hands.hand import ANGULAR_DAMPING, FORCE_PER_SCALE, LINEAR_DAMPING, SIDES, TORQUE_PER_SCALE, hand
+from bidex_meta.tasks.base import TaskClass
 from bidex_meta.utils.maths import conjugate, multiply, quaternion_from_rpy, rotate, xyzw
-from bidex_meta.witness.replay import Simulator
 from bidex_meta.witness.store import quantised
 
 GAIN = 8.0  # speed of a hand over its distance to its target, and of its turn over its angle to its target, 1/s
 _KNUCKLES, _MIDDLES = ("FFJ2", "MFJ2", "RFJ2", "LFJ2"), ("FFJ1", "MFJ1", "RFJ1", "LFJ1")
 
 Point = tuple[float, float, float]
+Actions = Iterator[Tensor]
+"""Of a script or a part of one, each (action_size,)."""
 
 
 def beside(point: Tensor, x: float, y: float, height: float) -> Point:
@@ -39,43 +41,33 @@ def rest_action(size: int) -> Tensor:
 
 
 class HandController:
-    """Moves both hands of a class to points, from the present state of a simulator of copies of one start.
+    """Moves both hands of an environment of a class to points, from the state that it reads.
 
-    ``noise``: standard deviation on each action; ``actions``, ``rewards``, ``success``: of the first copy's steps.
+    ``sensor`` gives a sensor's present values by its name, (k,) in double precision, ``frozen`` a frozen number of the
+    task, (k,).
     """
 
-    def __init__(self, simulator: Simulator, noise: float = 0.0, generator: torch.Generator | None = None):
-        self._simulator, self._noise, self._generator = simulator, noise, generator
-        self.actions: list[Tensor] = []
-        self.rewards: list[float] = []
-        self.success: list[bool] = []
-        self.episode_steps = simulator.episode_steps
-        self.wide = simulator.task.rules.wide  # whether a task asks for more than version 1's
-        self._rest = rest_action(simulator.action_size)
-        self._full_speed = FORCE_PER_SCALE * simulator.task.transition_scale / LINEAR_DAMPING[0]
-        self._full_torque = TORQUE_PER_SCALE * simulator.task.orientation_scale
+    def __init__(self, task: TaskClass, sensor: Callable[[str], Tensor], frozen: Callable[[str], Tensor]):
+        self.where, self.frozen = sensor, frozen
+        self.episode_steps, self.taken = task.episode_steps, 0
+        self.wide = task.rules.wide  # whether a task asks for more than version 1's
+        self._rest = rest_action(task.action_size)
+        self._full_speed = FORCE_PER_SCALE * task.transition_scale / LINEAR_DAMPING[0]
+        self._full_torque = TORQUE_PER_SCALE * task.orientation_scale
         self._held: dict[str, Tensor] = {}
         self._first = {side: self.where(f"{side}/mount_quaternion") for side in SIDES}
-        half, self._joints = simulator.action_size // 2, len(hand().control_low)
+        half, self._joints = task.action_size // 2, len(hand().control_low)
         self._fingers = {side: self._rest[i * half :][: self._joints] for i, side in enumerate(SIDES)}
 
-    def where(self, sensor: str) -> Tensor:
-        """A sensor's mean over the copies, (k,)."""
-        return self._simulator.sensor(sensor).mean(0)
-
     def orientation(self, sensor: str) -> Tensor:
-        """The mean over the copies of a sensor's quaternion, (x, y, z, w), (4,)."""
-        mean = self.where(sensor)
-        return xyzw(mean / mean.norm())
-
-    def frozen(self, name: str) -> Tensor:
-        """A frozen number of the task, (k,)."""
-        return self._simulator.frozen(name)[0]
+        """A sensor's quaternion, (x, y, z, w), (4,)."""
+        value = self.where(sensor)
+        return xyzw(value / value.norm())
 
     @property
     def steps_left(self) -> int:
         """Control steps to the end of the episode."""
-        return self.episode_steps - len(self.actions)
+        return self.episode_steps - self.taken
 
     def at(self, side: str) -> Tensor:
         """Position of a hand's point, metres, (3,)."""
@@ -102,9 +94,9 @@ class HandController:
         turn = torch.cat((torch.sin(0.5 * angle) * way / (angle + 1e-9), torch.cos(0.5 * angle)[None]))
         self._held[side] = multiply(turn, self.orientation(f"{side}/mount_quaternion"))
 
-    def lead(self, right: Point, left: Point, steps: int = 1, speed: float = 0.6) -> None:
-        """Moves the hands' points towards two points (world, metres), at most at ``speed`` (m/s), until its end."""
-        for _ in range(min(steps, self.episode_steps - len(self.actions))):
+    def lead(self, right: Point, left: Point, steps: int = 1, speed: float = 0.6) -> Actions:
+        """Moves the hands' points towards two points (world, metres), at most at ``speed`` (m/s)."""
+        for _ in range(min(steps, self.steps_left)):
             action, half = self._rest.clone(), len(self._rest) // 2
             for i, (side, goal) in enumerate(zip(SIDES, (right, left), strict=True)):
                 way = GAIN * (torch.tensor(goal, dtype=torch.float64) - self.at(side))
@@ -112,18 +104,13 @@ class HandController:
                 action[i * half :][: self._joints] = self._fingers[side]
                 action[i * half + self._joints :][:3] = (way / self._full_speed).float().clamp(-1.0, 1.0)
                 action[i * half + self._joints :][3:6] = self._torque(side).float()
-            if self._noise:
-                action += self._noise * torch.randn(action.shape, generator=self._generator)
-            action = quantised(action.clamp(-1.0, 1.0))
-            trace = self._simulator.play(action.expand(1, self._simulator.num, -1))
-            self.actions.append(action)
-            self.rewards.append(float(trace.rewards[0, 0]))
-            self.success.append(bool(trace.success[0, 0]))
+            self.taken += 1
+            yield quantised(action.clamp(-1.0, 1.0))
 
-    def lead_each(self, points: Iterable[Point], speed: float = 0.6) -> None:
+    def lead_each(self, points: Iterable[Point], speed: float = 0.6) -> Actions:
         """``lead`` for a step, to the right and the left hand's point."""
         right, left = points
-        self.lead(right, left, 1, speed)
+        yield from self.lead(right, left, 1, speed)
 
     def _torque(self, side: str) -> Tensor:
         """The actions (3,) that turn a hand to the orientation it is held at; zeros for a free hand."""

@@ -1,13 +1,13 @@
 """Witnesses and scripted policies as agents, and the shifted starts from which demonstrations begin."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import torch
 from torch import Tensor
 
 from bidex_meta.errors import BidexError
-from bidex_meta.witness.controller import HandController
-from bidex_meta.witness.replay import SEED, Simulator, task_slot
+from bidex_meta.witness.controller import Actions, HandController
+from bidex_meta.witness.replay import SEED, task_slot
 from bidex_meta.witness.scripts import script_of
 from bidex_meta.witness.store import Witness
 from bidex_meta.world import World
@@ -65,30 +65,59 @@ class OpenLoopReplay(ActionSequences):
         return action
 
 
-class Scripted(ActionSequences):
-    """Plays a class's script, computed at the start of each episode in a copy of the environment with full state.
+class Scripted:
+    """Plays the scripts of a world's classes, each row's from the state that it is in.
 
-    ``world`` is of one class with moving bases, on C MuJoCo, in autoreset mode DISABLED; the script reacts to the noise
-    (standard deviation) on its actions. Raises BidexError for a class without a script.
+    ``world`` is on C MuJoCo and has moving bases; ``names``: of the slots that play, None for all, others get zero
+    actions. A script begins with its row's episode, and reacts to whatever moved the hands: noise (of this standard
+    deviation), or another policy's actions. After its end it repeats its last action. Raises BidexError for a class
+    without a script.
     """
 
-    def __init__(self, world: World, noise: float = 0.0, seed: int = 0):
-        (name,), rows = world.task_names, world.num_envs
-        self._script, self._world = script_of(name), world
-        self._copy = Simulator(name, 1, threads=1)
-        super().__init__(torch.zeros(rows, self._copy.episode_steps, self._copy.action_size), torch.arange(rows))
-        self._noise, self._generator = noise, torch.Generator().manual_seed(seed)
+    def __init__(self, world: World, noise: float = 0.0, seed: int = 0, names: Collection[str] | None = None):
+        self._world, self._noise, self._generator = world, noise, torch.Generator().manual_seed(seed)
+        names = world.task_names if names is None else names
+        self._scripts = {slot.name: script_of(slot.task_class) for slot in world.slots if slot.name in names}
+        self._playing: dict[int, Actions] = {}  # by row of the world
+        self._sensors = [part.group.engine.sensordata for part in world.parts]
+        self._actions = torch.zeros(world.num_envs, world.action_size)
+        self._places = {
+            row: (i, member, k)
+            for i, part in enumerate(world.parts)
+            for k, member in enumerate(part.group.members)
+            if world.slots[member.slot].name in self._scripts
+            for row in range(member.world_rows.start, member.world_rows.stop)
+        }
+
+    def eval_action(self, obs: Tensor) -> Tensor:
+        """The next actions (num_envs, action)."""
+        self._sensors = [part.group.engine.sensordata.clone() for part in self._world.parts]
+        for row, script in self._playing.items():
+            action = next(script, None)
+            if action is not None:
+                self._actions[row, : len(action)] = action
+        if not self._noise:
+            return self._actions.clone()
+        noise = torch.randn(self._actions.shape, generator=self._generator)
+        return (self._actions + self._noise * noise).clamp(-1.0, 1.0)
 
     def reset(self, env_mask: Tensor) -> None:
         """These environments are at the start of an episode."""
-        super().reset(env_mask)
-        states = self._world.parts[0].group.engine.state_dict()
         for row in env_mask.nonzero().flatten().tolist():
-            task = self._world.slots[0].tasks[int(self._world.task_index[row])]
-            self._copy.take(task, {name: value[row].clone() for name, value in states.items()})
-            hands = HandController(self._copy, self._noise, self._generator)
-            self._script(hands)
-            self._store(row, torch.stack(hands.actions))
+            if row in self._places:
+                self._playing[row] = self._begin(row)
+
+    def _begin(self, row: int) -> Actions:
+        """The script of a row; reads nothing before its first action is asked for."""
+        i, member, k = self._places[row]
+        engine_row, slot = member.engine_rows.start + row - member.world_rows.start, self._world.slots[member.slot]
+        frozen = self._world.parts[i].frozen(k, self._world.task_index[row : row + 1])
+        hands = HandController(
+            slot.task_class,
+            lambda name: self._sensors[i][engine_row, member.scene.sensors[name]],
+            lambda name: frozen[name][0],
+        )
+        yield from self._scripts[slot.name](hands)
 
 
 class ShiftedStarts(PooledWorldWrapper):

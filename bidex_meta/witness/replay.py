@@ -10,6 +10,7 @@ from torch import Tensor
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import unknown_name
 from bidex_meta.tasks.registry import plain_name
+from bidex_meta.witness.controller import Actions, HandController
 from bidex_meta.witness.store import Witness
 from bidex_meta.world import Slot, World
 from bidex_meta.world.part import judge
@@ -50,7 +51,7 @@ class Simulator:
 
     def __init__(self, name: str, num: int, threads: int | None = None):
         slot = task_slot(name)
-        self._name, self.num, self.task = name, num, slot.task_class
+        self.num, self.task = num, slot.task_class
         self.action_size, self.episode_steps = self.task.action_size, self.task.episode_steps
         self._world = World([slot], num, autoreset_mode="DISABLED", seed=SEED, threads=threads)
         self._world.reset(seed=SEED)
@@ -85,12 +86,6 @@ class Simulator:
         share = self.num // len(states)
         self._engine.load_state_dict({name: each.repeat_interleave(share, dim=0) for name, each in stacked.items()})
 
-    def take(self, task: np.ndarray, start: State) -> None:
-        """Puts all environments into another task, its variation (variation_space.size,), and a start of it."""
-        self._world.set_tasks({self._name: task[None]})
-        self._world.reset(seed=SEED)
-        self.load([start])
-
     def play(self, actions: Tensor, each_step: Callable[[], None] | None = None) -> Trace:
         """Plays actions (T, N, action_size) in [-1, 1] from the present state, with a callback after each step."""
         alive = torch.ones(self.num, dtype=torch.bool)
@@ -108,6 +103,12 @@ class Simulator:
             if each_step is not None:
                 each_step()
         return Trace(torch.stack(rewards), torch.stack(least), torch.stack(success), alive)
+
+    def led(self, script: Callable[[HandController], Actions]) -> Iterator[tuple[Tensor, Trace]]:
+        """Plays a script by the means of sensors over all environments; yields its actions (action_size,) and steps."""
+        hands = HandController(self.task, lambda name: self.sensor(name).mean(0), lambda name: self.frozen(name)[0])
+        for action in script(hands):
+            yield action, self.play(action.expand(1, self.num, -1))
 
     def sensor(self, name: str) -> Tensor:
         """A sensor's values, (N, k), a copy."""

@@ -149,7 +149,7 @@ def expected(
 
 @each_case
 def test_version_2_shows_the_same_but_goals_and_signs(name: str, moving: bool) -> None:
-    """In the same state: objects' and goals' quaternions have w >= 0; classes without a goal block get one at the end."""
+    """In the same state: quaternions but the hands' have w >= 0; classes without a goal block get one at the end."""
     one, two = (world_of(name + version, moving, 8, tasks=8, observation="plain") for version in ("", "-v2"))
     one.reset(seed=0)
     two.reset(seed=0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from bidex_meta.witness.controller import HandController
+from bidex_meta.witness.controller import Actions, HandController
 from bidex_meta.witness.replay import replay
 from bidex_meta.witness.scripts import SCRIPTS
 from bidex_meta.witness.store import LEVELS, Witness, load_witness
@@ -57,8 +57,8 @@ def test_steadying_keeps_an_episode_that_nothing_betters(
 def test_an_episode_of_a_script_that_does_not_hold_is_kept_in_a_named_file_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def stay(hands: HandController) -> None:
-        hands.lead(tuple(hands.at("right").tolist()), tuple(hands.at("left").tolist()), steps=3)
+    def stay(hands: HandController) -> Actions:
+        yield from hands.lead(tuple(hands.at("right").tolist()), tuple(hands.at("left").tolist()), steps=3)
 
     monkeypatch.setitem(SCRIPTS, "StackBlock", stay)
     monkeypatch.chdir(tmp_path)

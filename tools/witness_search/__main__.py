@@ -11,7 +11,6 @@ import tyro
 
 from bidex_meta.errors import BidexError
 from bidex_meta.runs.versions import collect_versions
-from bidex_meta.witness.controller import HandController
 from bidex_meta.witness.replay import SHIFTED, Replay, Simulator, replay
 from bidex_meta.witness.scripts import script_of
 from bidex_meta.witness.store import Witness, load_witness, save_witness
@@ -126,11 +125,11 @@ class Script(Search):
 
     def run(self) -> None:
         """Plays the script once."""
-        play, simulator = script_of(self.task), Simulator(self.task, 16, self.threads)
+        simulator = Simulator(self.task, 16, self.threads)
+        play = script_of(simulator.task)
         simulator.load(simulator.starts(15, seed=7))
-        hands = HandController(simulator)
-        play(hands)
-        self.keep(np.stack([action.numpy() for action in hands.actions]), {"script": play.__name__, "rival": None})
+        actions = np.stack([action.numpy() for action, _ in simulator.led(play)])
+        self.keep(actions, {"script": play.__name__, "rival": None})
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

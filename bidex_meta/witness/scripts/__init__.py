@@ -3,8 +3,9 @@
 from collections.abc import Callable
 
 from bidex_meta.errors import BidexError
-from bidex_meta.tasks.registry import plain_name
-from bidex_meta.witness.controller import HandController
+from bidex_meta.suite import Rules
+from bidex_meta.tasks.base import TaskClass
+from bidex_meta.witness.controller import Actions, HandController
 from bidex_meta.witness.scripts.blocks import grasp_and_place, push_blocks, stack_block
 from bidex_meta.witness.scripts.caps import pull_cap, swing_cup
 from bidex_meta.witness.scripts.pots import lift_underarm, pour_water
@@ -12,7 +13,7 @@ from bidex_meta.witness.scripts.swing_doors import close_outward, open_inward, p
 from bidex_meta.witness.scripts.tools import open_pen, open_scissors, press_switches
 from bidex_meta.witness.scripts.turning import turn_cubes
 
-Script = Callable[[HandController], None]
+Script = Callable[[HandController], Actions]
 
 SCRIPTS: dict[str, Script] = {
     "DoorCloseOutward": close_outward,
@@ -37,10 +38,14 @@ WIDE_SCRIPTS: dict[str, Script] = SCRIPTS | {
 """Of version 2: they read what a task hides."""
 
 
-def script_of(name: str) -> Script:
-    """The script of a class, ``X`` or ``X-v2``; raises BidexError where it has none."""
-    plain = plain_name(name)
-    known = SCRIPTS if plain == name else WIDE_SCRIPTS
-    if plain not in known:
-        raise BidexError(f"Expected a class with a script ({', '.join(known)}), got {name}; leave --script out.")
-    return known[plain]
+def scripts_of(rules: Rules) -> dict[str, Script]:
+    """The scripts that play by a suite's rules, by class."""
+    return WIDE_SCRIPTS if rules.wide else SCRIPTS
+
+
+def script_of(task: TaskClass) -> Script:
+    """The script of a class by its rules; raises BidexError where it has none."""
+    known = scripts_of(task.rules)
+    if task.name not in known:
+        raise BidexError(f"Expected a class with a script ({', '.join(known)}), got {task.name}; leave --script out.")
+    return known[task.name]

@@ -6,14 +6,14 @@ import torch
 from torch import Tensor
 
 from bidex_meta.utils.maths import rotate
-from bidex_meta.witness.controller import HandController, Point, point
+from bidex_meta.witness.controller import Actions, HandController, Point, point
 
 _TIP = 0.035  # from a finger's last joint to what its tip touches on a cap's axis, metres
 _HELD = {"THJ4": -1.04, "THJ3": 1.2, "THJ0": -1.57}  # the right thumb stays behind the bottle, rad
 _FIST = {f"{finger}J{joint}": 1.4 for finger in ("FF", "MF", "RF") for joint in (1, 2)}
 
 
-def pull_cap(hands: HandController) -> None:
+def pull_cap(hands: HandController) -> Actions:
     """The left little finger presses on the cap's side and drags it along the bottle; friction keeps it there."""
     slide = float(hands.frozen("slide"))
     stay = point(hands.at("right"))
@@ -29,21 +29,21 @@ def pull_cap(hands: HandController) -> None:
     hands.bend("right", 0.5, 0.6, **_HELD)
     hands.bend("left", 0.0, 0.0, **_FIST)
     first = hands.at("left") - 0.07 * ahead
-    hands.lead(stay, point(first), 10, speed=0.4)
+    yield from hands.lead(stay, point(first), 10, speed=0.4)
     hands.bend("right", 0.9, 1.0, **_HELD)
     for _ in range(27):
-        hands.lead(stay, poke(0.04), speed=0.4)
+        yield from hands.lead(stay, poke(0.04), speed=0.4)
     for _ in range(11):
-        hands.lead(stay, poke(-0.002), speed=0.2)
+        yield from hands.lead(stay, poke(-0.002), speed=0.2)
     still = 0
     while hands.steps_left:
         left = slide - float(hands.where("bottle/slide"))
         still = still + 1 if abs(left) < 0.0015 or still > 3 else 0
         if still > 3:
-            hands.lead(stay, point(hands.at("left") - 0.01 * ahead), speed=0.2)
+            yield from hands.lead(stay, point(hands.at("left") - 0.01 * ahead), speed=0.2)
             continue
         way = max(-0.012, min(0.012, 0.45 * left)) * _axis(hands) + 0.0012 * ahead
-        hands.lead(stay, point(hands.at("left") + way), speed=0.3)
+        yield from hands.lead(stay, point(hands.at("left") + way), speed=0.3)
 
 
 def _axis(hands: HandController) -> Tensor:
@@ -61,7 +61,7 @@ _PEG = 0.015  # height of a peg above the cup's origin: higher ones tip it, metr
 _RADIUS, _TOUCH = 0.068, 0.2  # of a peg's circle about the cup, metres; how far it is behind an ear that it pushes, rad
 
 
-def swing_cup(hands: HandController) -> None:
+def swing_cup(hands: HandController) -> Actions:
     """The left hand turns its palm down, and its little finger, bent to a peg, pulls the ear around to its goal."""
     # At an ear, friction on the foot lets the cup turn on its place sooner than slide. The left hand's thumb stays
     # clear of the lid up to about 130 degrees; the right hand's would not.
@@ -81,19 +81,19 @@ def swing_cup(hands: HandController) -> None:
         return point(hands.at("left") + cup + way - hands.where("left/lfdistal_position"))
 
     x, y, z = hands.at("left").tolist()
-    hands.lead(away, (x, y - 0.05, z + 0.1), 65, speed=0.3)
+    yield from hands.lead(away, (x, y - 0.05, z + 0.1), 65, speed=0.3)
     for _ in range(30):
-        hands.lead(away, peg(0.9, 0.12, 0.1), speed=0.4)
+        yield from hands.lead(away, peg(0.9, 0.12, 0.1), speed=0.4)
     for _ in range(20):
-        hands.lead(away, peg(0.8, _PEG, 0.1), speed=0.4)
+        yield from hands.lead(away, peg(0.8, _PEG, 0.1), speed=0.4)
     while hands.steps_left:
         missing = (wanted - _yaw(hands) + math.pi) % (2.0 * math.pi) - math.pi
         missing += 2.0 * math.pi if missing < -1.0 else 0.0
         if missing < 0.05:
             break
-        hands.lead(away, peg(_TOUCH - min(0.3, missing), _PEG), speed=0.2)
+        yield from hands.lead(away, peg(_TOUCH - min(0.3, missing), _PEG), speed=0.2)
     # The hand stays: a cup that is bumped on its way back turns on.
-    hands.lead(away, point(hands.at("left")), hands.episode_steps)
+    yield from hands.lead(away, point(hands.at("left")), hands.episode_steps)
 
 
 def _yaw(hands: HandController) -> float:

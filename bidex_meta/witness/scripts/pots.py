@@ -4,7 +4,7 @@ import math
 
 from torch import Tensor
 
-from bidex_meta.witness.controller import HandController, Point, beside
+from bidex_meta.witness.controller import Actions, HandController, Point, beside
 
 _BACK = 0.698  # how far a wrist bends back, rad
 # Position of a hand's point, from the pot's origin, if its fingertips carry a grip of the pot, metres.
@@ -13,7 +13,7 @@ _REACH, _GRIP_HEIGHT = 0.1755 + 0.085, 0.068
 _TROUGH, _POUR = math.radians(59.0), math.radians(50.0)
 
 
-def lift_underarm(hands: HandController) -> None:
+def lift_underarm(hands: HandController) -> Actions:
     """The hands go under the pot's grips, bent back as far as their wrists allow, and lift the pot to its goal."""
     # A pot that is thrown to its goal pays before one that is lifted there.
     pot = hands.where("object/position")
@@ -24,29 +24,29 @@ def lift_underarm(hands: HandController) -> None:
         hands.hold(side, roll=sign * (_BACK + 0.1), yaw=yaw)
     out[2] = 0.0
 
-    def under(middle: Tensor, height: float, steps: int, speed: float, reach: float = _REACH) -> None:
+    def under(middle: Tensor, height: float, steps: int, speed: float, reach: float = _REACH) -> Actions:
         right, left = middle + reach * out, middle - reach * out
-        hands.lead(beside(right, 0.0, 0.0, height), beside(left, 0.0, 0.0, height), steps, speed)
+        yield from hands.lead(beside(right, 0.0, 0.0, height), beside(left, 0.0, 0.0, height), steps, speed)
 
     height = float(pot[2]) + _GRIP_HEIGHT
-    under(pot, height - 0.06, 25, 0.6, reach=_REACH + 0.1)
-    under(pot, height - 0.04, 30, 0.3)
-    under(pot, height, 30, 0.1)
+    yield from under(pot, height - 0.06, 25, 0.6, reach=_REACH + 0.1)
+    yield from under(pot, height - 0.04, 30, 0.3)
+    yield from under(pot, height, 30, 0.1)
     way = hands.frozen("goal")[:3] - pot
     for i in range(150):
         share = (i + 1) / 150
-        under(pot + share * way, height + share * float(way[2]), 1, 0.6)
-    under(pot + way, height + float(way[2]), hands.episode_steps, 0.6)
+        yield from under(pot + share * way, height + share * float(way[2]), 1, 0.6)
+    yield from under(pot + way, height + float(way[2]), hands.episode_steps, 0.6)
 
 
-def pour_water(hands: HandController) -> None:
+def pour_water(hands: HandController) -> Actions:
     """The right hand grips the handle, the left goes under the spout; they lift the kettle and tilt it."""
     # Water itself is not paid.
     kettle, bucket = hands.where("kettle/position"), hands.where("bucket/position")
     back = hands.where("kettle/handle_position") - kettle  # from spout to handle
     back = back / back.norm()
 
-    def grip(origin: Tensor, tilt: float = 0.0, aside: float = 0.0, loose: float = -0.003, steps: int = 1) -> None:
+    def grip(origin: Tensor, tilt: float = 0.0, aside: float = 0.0, loose: float = -0.003, steps: int = 1) -> Actions:
         """Leads the hands to where they hold a kettle at this place, or ``loose`` metres off it, ``aside`` in x."""
 
         def at(x: float, along: float, up: float) -> Point:
@@ -56,14 +56,16 @@ def pour_water(hands: HandController) -> None:
 
         hands.hold("right", roll=tilt)
         hands.hold("left", roll=_TROUGH + tilt)
-        hands.lead(at(-0.005, 0.159 + 0.2 * loose, -0.004), at(0.065, -0.153, 0.030 - loose), steps, speed=1.0)
+        yield from hands.lead(
+            at(-0.005, 0.159 + 0.2 * loose, -0.004), at(0.065, -0.153, 0.030 - loose), steps, speed=1.0
+        )
 
     hands.bend("right", 0.0, 0.0)
     hands.bend("left", 0.0, 0.0, THJ4=1.047, THJ3=1.222)  # its thumb across the palm, off the kettle's wall
-    grip(kettle, aside=0.15, loose=0.025, steps=26)
-    grip(kettle, loose=0.025, steps=17)
+    yield from grip(kettle, aside=0.15, loose=0.025, steps=26)
+    yield from grip(kettle, loose=0.025, steps=17)
     hands.bend("right", 1.2, 1.5)
-    grip(kettle, steps=17)
+    yield from grip(kettle, steps=17)
     sine, cosine = math.sin(_POUR), math.cos(_POUR)
     lip = -0.2 * cosine - 0.053 * sine, 0.053 * cosine - 0.2 * sine  # of a tilted kettle, along ``back`` and up
     way = bucket + (0.07 - lip[0]) * back - kettle
@@ -72,5 +74,5 @@ def pour_water(hands: HandController) -> None:
         share = (i + 1) / 34
         there = kettle + share * way
         there[2] = kettle[2] + min(1.0, 1.3 * share) * way[2]  # up first: the left hand must clear the bucket's rim
-        grip(there, share * _POUR)
-    grip(kettle + way, _POUR, steps=hands.episode_steps)
+        yield from grip(there, share * _POUR)
+    yield from grip(kettle + way, _POUR, steps=hands.episode_steps)

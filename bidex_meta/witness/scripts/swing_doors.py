@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from bidex_meta.hands.hand import SIDES
-from bidex_meta.witness.controller import HandController, Point
+from bidex_meta.witness.controller import Actions, HandController, Point
 
 _ABOVE = 1.0  # height at which a hand is clear of the bars, metres
 _DOOR_HEIGHT = 0.72  # of the hands at a door, between the ends of the bars, metres
@@ -34,39 +34,41 @@ _INWARD = _Leaf((0.0085, 0.4265), 0.3752, 0.0710), _Leaf((0.0056, 0.4204), 0.376
 _OUTWARD = _Leaf((-0.0085, 0.4265), 0.3752, 0.0830), _Leaf((-0.0056, 0.4204), 0.3761, 0.0802)
 
 
-def open_inward(hands: HandController) -> None:
+def open_inward(hands: HandController) -> Actions:
     """Fingers bent to hooks go behind the bars from the side, and pull the leaves open; the hands turn with them."""
     # One leaf open and the other shut pays as much as both half open.
 
-    def go(angles: Sequence[float], aside: float = 0.0, back: float = 0.0, steps: int = 1, speed: float = 0.6) -> None:
+    def go(
+        angles: Sequence[float], aside: float = 0.0, back: float = 0.0, steps: int = 1, speed: float = 0.6
+    ) -> Actions:
         """Hooks behind the bars of leaves that stand open by these angles, or ``aside`` and ``back`` of that."""
         at = [
             leaf.place(leaf.along - 0.009 - aside, leaf.over + 0.01 + back, angle)
             for leaf, angle in zip(_INWARD, angles, strict=True)
         ]
-        _lead(hands, at, angles, steps, speed)
+        yield from _lead(hands, at, angles, steps, speed)
 
     for side in SIDES:
         hands.bend(side, 0.0, 1.45)
     led = _angles(hands)
-    go(led, aside=0.11, back=0.02, steps=22, speed=0.8)
-    go(led, aside=0.11, steps=6, speed=0.5)
-    go(led, steps=15, speed=0.5)
-    while len(hands.actions) < hands.episode_steps:
+    yield from go(led, aside=0.11, back=0.02, steps=22, speed=0.8)
+    yield from go(led, aside=0.11, steps=6, speed=0.5)
+    yield from go(led, steps=15, speed=0.5)
+    while hands.steps_left:
         led = [
             min(angle + 0.0075, now + 0.1, last)
             for angle, now, last in zip(led, _angles(hands), _goals(hands, 1.35), strict=True)
         ]
-        go(led)
+        yield from go(led)
 
 
-def close_outward(hands: HandController) -> None:
+def close_outward(hands: HandController) -> Actions:
     """Straight fingers go between each bar and its leaf, and pull the leaves shut; the hands turn with them."""
     # Leaves that stand away from the hands cannot be pushed shut. The distance between hand and leaf is bounded, since
     # more force straightens bent fingers.
     start = _angles(hands)
 
-    def go(angles: Sequence[float], back: float = 0.0, steps: int = 1, speed: float = 0.6) -> None:
+    def go(angles: Sequence[float], back: float = 0.0, steps: int = 1, speed: float = 0.6) -> Actions:
         """Fingers behind the bars of leaves that stand open by these angles, or ``back`` of that."""
         yaws = [0.8 * (first - angle) for first, angle in zip(start, angles, strict=True)]
         at = []
@@ -74,37 +76,37 @@ def close_outward(hands: HandController) -> None:
             x, y = leaf.place(leaf.along, leaf.over - 0.04, -angle)
             ahead, sine, cosine = _TO_FINGERS + back, math.sin(yaw), math.cos(yaw)
             at.append((x + ahead * cosine + _TO_PALM * sine, y + ahead * sine - _TO_PALM * cosine))
-        _lead(hands, at, yaws, steps, speed)
+        yield from _lead(hands, at, yaws, steps, speed)
 
     for side in SIDES:
         hands.bend(side, 0.0, 0.0)
-    go(start, back=0.2, steps=16, speed=1.0)
-    go(start, steps=22, speed=1.2)
+    yield from go(start, back=0.2, steps=16, speed=1.0)
+    yield from go(start, steps=22, speed=1.2)
     led = start
     lasts = _goals(hands, -0.2, 0.1)  # a finger has so much room
-    while len(hands.actions) < hands.episode_steps:
+    while hands.steps_left:
         led = [
             max(angle - 0.012, now - 0.22, last) for angle, now, last in zip(led, _angles(hands), lasts, strict=True)
         ]
-        go(led)
+        yield from go(led)
 
 
-def push(hands: HandController) -> None:
+def push(hands: HandController) -> Actions:
     """Fists above the bars push the leaves away from the hands, each to its angle, and then let go of it."""
     # Both classes that push turn a leaf the same way: from open towards the hands over shut to open away from them.
     inward = abs(float(hands.orientation("object/quaternion")[1])) > 0.5
     leaves, sign = (_INWARD, 1.0) if inward else (_OUTWARD, -1.0)
     goals = [sign * goal for goal in hands.frozen("leaves").tolist()]
 
-    def go(angles: Sequence[float], back: float, steps: int = 1, speed: float = 0.6) -> None:
+    def go(angles: Sequence[float], back: float, steps: int = 1, speed: float = 0.6) -> Actions:
         """Fists before leaves that stand open towards the hands by these angles, ``back`` from them."""
         at = [leaf.place(0.33, 0.06 + back, angle) for leaf, angle in zip(leaves, angles, strict=True)]
-        _lead(hands, at, [0.0, 0.0], steps, speed, height=_ABOVE)
+        yield from _lead(hands, at, [0.0, 0.0], steps, speed, height=_ABOVE)
 
     for side in SIDES:
         hands.bend(side, 1.4, 1.4, THJ3=0.5, THJ0=-1.2)
     led = [sign * angle for angle in _angles(hands)]
-    go(led, back=0.1, steps=30, speed=1.2)
+    yield from go(led, back=0.1, steps=30, speed=1.2)
     while hands.steps_left:
         now = [sign * angle for angle in _angles(hands)]
         left = [angle - goal for angle, goal in zip(now, goals, strict=True)]
@@ -112,7 +114,7 @@ def push(hands: HandController) -> None:
             max(was - 0.012, angle - 0.3) if more > 0.04 else angle + 0.1
             for was, angle, more in zip(led, now, left, strict=True)
         ]
-        go(led, back=0.0)
+        yield from go(led, back=0.0)
 
 
 def _goals(hands: HandController, usual: float, less: float = 0.0) -> list[float]:
@@ -132,11 +134,11 @@ def _lead(
     steps: int,
     speed: float,
     height: float = _DOOR_HEIGHT,
-) -> None:
+) -> Actions:
     """Moves the right hand to its point and the left one to its point mirrored, turned outwards."""
     middle = float(hands.where("object/position")[1])
     points: list[Point] = []
     for side, sign, (x, y), yaw in zip(SIDES, (1.0, -1.0), at, yaws, strict=True):
         hands.hold(side, yaw=sign * yaw)
         points.append((x, middle + sign * y, height))
-    hands.lead(*points, steps=steps, speed=speed)
+    yield from hands.lead(*points, steps=steps, speed=speed)

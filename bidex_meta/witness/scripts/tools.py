@@ -6,12 +6,12 @@ import torch
 from torch import Tensor
 
 from bidex_meta.hands.hand import SIDES
-from bidex_meta.witness.controller import HandController, Point, point
+from bidex_meta.witness.controller import Actions, HandController, Point, point
 
 _LEVER = 0.035  # from a rocker's hinge to its button, metres
 
 
-def press_switches(hands: HandController) -> None:
+def press_switches(hands: HandController) -> Actions:
     """Fingertips press each button until its rocker has the angle asked for, and rise again."""
     wanted = hands.frozen("angles").tolist()[::-1]
     buttons = ("switch2", "switch1")  # of the right and the left hand
@@ -19,15 +19,15 @@ def press_switches(hands: HandController) -> None:
         hands.bend(side, 0.9, 0.5, THJ3=0.5)
         hands.hold(side)
 
-    def over(height: float, steps: int, speed: float) -> None:
+    def over(height: float, steps: int, speed: float) -> Actions:
         for _ in range(steps):
-            hands.lead_each(
+            yield from hands.lead_each(
                 (_tip(hands, side, _button(hands, name), height) for side, name in zip(SIDES, buttons, strict=True)),
                 speed,
             )
 
-    over(0.06, 30, 1.2)
-    over(0.04, 5, 0.6)
+    yield from over(0.06, 30, 1.2)
+    yield from over(0.04, 5, 0.6)
     done = [False, False]
     while hands.steps_left:
         points: list[Point] = []
@@ -38,7 +38,7 @@ def press_switches(hands: HandController) -> None:
             height = float(hands.at(side)[2])
             down = min(0.008, max(0.002, 0.8 * _LEVER * left))
             points.append((above[0], above[1], height + 0.01 if done[i] else height - down))
-        hands.lead_each(points, 0.6)
+        yield from hands.lead_each(points, 0.6)
 
 
 def _button(hands: HandController, name: str) -> Tensor:
@@ -51,16 +51,16 @@ def _tip(hands: HandController, side: str, target: Tensor, height: float, finger
     return point(hands.at(side) + goal - hands.where(f"{side}/{finger}distal_position"))
 
 
-def open_pen(hands: HandController) -> None:
+def open_pen(hands: HandController) -> Actions:
     """Both hands close around the pen, at body and cap, and move apart to the gap asked for."""
     gap = float(hands.frozen("gap"))
     along = hands.where("pen/cap_position") - hands.where("pen/body_position")
     yaw = math.atan2(-float(along[0]), float(along[1]))
     ends = {"right": "pen/cap_position", "left": "pen/body_position"}
 
-    def above(height: float, steps: int, speed: float) -> None:
+    def above(height: float, steps: int, speed: float) -> Actions:
         for _ in range(steps):
-            hands.lead_each((_over(hands.where(ends[side]), height) for side in SIDES), speed)
+            yield from hands.lead_each((_over(hands.where(ends[side]), height) for side in SIDES), speed)
 
     def bend(knuckles: float, middles: float) -> None:
         for side in SIDES:
@@ -68,17 +68,17 @@ def open_pen(hands: HandController) -> None:
             hands.hold(side, yaw=yaw)
 
     bend(0.6, 0.6)
-    above(0.06, 20, 1.6)
+    yield from above(0.06, 20, 1.6)
     bend(0.9, 1.0)
-    above(0.025, 8, 0.6)
+    yield from above(0.025, 8, 0.6)
     bend(1.5, 1.57)
-    above(0.02, 12, 0.4)
+    yield from above(0.02, 12, 0.4)
     while hands.steps_left:
         body, cap = hands.where("pen/body_position"), hands.where("pen/cap_position")
         out = (cap - body) / (cap - body).norm()
         way = max(-0.04, min(0.04, 0.6 * (gap - float((cap - body).norm()))))
         right, left = hands.at("right") + way * out, hands.at("left") - way * out
-        hands.lead((float(right[0]), float(right[1]), 0.65), (float(left[0]), float(left[1]), 0.65))
+        yield from hands.lead((float(right[0]), float(right[1]), 0.65), (float(left[0]), float(left[1]), 0.65))
 
 
 def _over(place: Tensor, height: float) -> Point:
@@ -89,7 +89,7 @@ def _over(place: Tensor, height: float) -> Point:
 _HOOKS = {"right": "ff", "left": "lf"}  # the finger of each hand on the side of the other
 
 
-def open_scissors(hands: HandController) -> None:
+def open_scissors(hands: HandController) -> Actions:
     """A bent finger of each hand goes into its loop; they pull the loops apart to the angle asked for, and rise."""
     target = float(hands.frozen("target"))
     loops = {"right": "scissors/right_handle_position", "left": "scissors/left_handle_position"}
@@ -97,14 +97,14 @@ def open_scissors(hands: HandController) -> None:
         hands.bend(side, 0.0, 0.0, THJ3=0.5, **{f"{_HOOKS[side].upper()}J2": 1.5})
         hands.hold(side)
 
-    def over(height: float, steps: int, speed: float) -> None:
+    def over(height: float, steps: int, speed: float) -> Actions:
         for _ in range(steps):
-            hands.lead_each(
+            yield from hands.lead_each(
                 (_tip(hands, side, hands.where(loops[side]), height, _HOOKS[side]) for side in SIDES), speed
             )
 
-    over(0.08, 28, 1.6)
-    over(0.022, 16, 0.5)
+    yield from over(0.08, 28, 1.6)
+    yield from over(0.022, 16, 0.5)
     while hands.steps_left:
         left = target - float(hands.where("scissors/angle"))
         right_loop, left_loop = hands.where(loops["right"]), hands.where(loops["left"])
@@ -112,4 +112,4 @@ def open_scissors(hands: HandController) -> None:
         way = max(-0.025, min(0.025, 0.2 * left)) * out
         a, b = hands.at("right") + way, hands.at("left") - way
         heights = [_tip(hands, side, hands.where(loops[side]), 0.022, _HOOKS[side])[2] for side in SIDES]
-        hands.lead((float(a[0]), float(a[1]), heights[0]), (float(b[0]), float(b[1]), heights[1]))
+        yield from hands.lead((float(a[0]), float(a[1]), heights[0]), (float(b[0]), float(b[1]), heights[1]))

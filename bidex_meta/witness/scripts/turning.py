@@ -2,7 +2,7 @@
 
 from bidex_meta.hands.hand import SIDES
 from bidex_meta.utils.maths import conjugate, multiply, rotate, rotation_angle
-from bidex_meta.witness.controller import GAIN, HandController, Point
+from bidex_meta.witness.controller import GAIN, Actions, HandController, Point
 
 _CUBES = {"right": ("object2", "goal2"), "left": ("object1", "goal1")}
 # Joint angles of a hand that waits for its cube, and that holds it, rad.
@@ -15,13 +15,13 @@ _RATE, _FASTEST = 4.0, 1.8
 _FOLLOW = 0.5
 
 
-def turn_cubes(hands: HandController) -> None:
+def turn_cubes(hands: HandController) -> Actions:
     """Each hand stays below its cube until that lies in the cup, closes to a fist, and turns it at its goal."""
     # Noise on the bases throws cubes off open hands, and a turn moves its cube, which costs as much as it earns. All is
     # a function of the state alone, so that it can be cloned.
-    while len(hands.actions) < hands.episode_steps:
+    while hands.steps_left:
         points = {side: _next(hands, side) for side in SIDES}
-        hands.lead(points["right"], points["left"])
+        yield from hands.lead(points["right"], points["left"])
 
 
 def _next(hands: HandController, side: str) -> Point:
