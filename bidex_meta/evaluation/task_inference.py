@@ -1,16 +1,20 @@
 """What a class of a suite can measure: how well one does without knowing its hidden parts, and whether rewards tell.
 
 Blind ceiling and identifiability need no policy. They assume that the hidden parts are drawn independently and
-uniformly, as ``TaskClass.variation_space`` is.
+uniformly, as ``TaskClass.variation_space`` is. Whether return and success agree is known from what policies got.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.stats import rankdata
 from torch import Tensor
 
+from bidex_meta.agents import Agent
+from bidex_meta.evaluation.results import ClassResult
 from bidex_meta.tasks.aligned import Hidden
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.scene import Scene
@@ -24,7 +28,34 @@ _STEPS = 40
 _HOLD = 10
 """Steps for which an exploring action is held."""
 _NOISE = 0.3
-"""Share of rough actions in those that are given."""
+"""Share of rough actions in those of a policy."""
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Whether who returns more also succeeds more, in a class."""
+
+    rank: float
+    """Rank-biserial correlation of return and success over all episodes: of a successful and an unsuccessful one, how
+    much more often the first returns more than less. It reaches 1 whatever the share of successes; Spearman's does
+    not."""
+    solved: float
+    """Mean return of the successful episodes."""
+    unsolved: float
+    """Largest mean return of a policy that never succeeds."""
+
+
+def alignment(results: Mapping[str, ClassResult]) -> Alignment | None:
+    """Of policies' results in one class, by policy; None where no episode succeeds, or no policy always fails."""
+    returns, solved = (
+        np.concatenate([getattr(result, name) for result in results.values()]) for name in ("returns", "successes")
+    )
+    good, failing = returns[solved > 0.0], [each for each in results.values() if not each.successes.any()]
+    if not len(good) or not failing:
+        return None
+    pairs = len(good) * (len(returns) - len(good))
+    wins = rankdata(returns)[solved > 0.0].sum() - len(good) * (len(good) + 1) / 2  # ties count half
+    return Alignment(2.0 * wins / pairs - 1.0, float(good.mean()), max(each.mean_return for each in failing))
 
 
 def blind_ceiling(task: TaskClass, draws: int = 20_000, seed: int = 0) -> float:
@@ -61,16 +92,16 @@ class Identified:
     """Largest error of a part in units of its tolerance, (episodes,)."""
 
 
-def identifiability(world: World, actions: np.ndarray | None = None, seed: int = 0) -> Identified:
+def identifiability(world: World, explorer: Agent | None = None, seed: int = 0) -> Identified:
     """Plays one exploring episode in each environment, and fits the hidden parts to its rewards.
 
-    ``world`` has one class, in autoreset mode DISABLED, an environment for each task. Exploring actions are ``actions``
-    (steps, action) with noise, else rough ones: uniform, held for ten steps. The fit searches the class's ranges for
-    what gives the rewards seen, knowing all else of the task.
+    ``world`` has one class, in autoreset mode DISABLED, an environment for each task. Exploring actions are those of
+    ``explorer`` with noise, else rough ones: uniform, held for ten steps. The fit searches the class's ranges for what
+    gives the rewards seen, knowing all else of the task.
     """
     (part,) = world.parts
     (member,) = part.group.members
-    sensors, rewards, alive = _explore(world, actions, seed)
+    sensors, rewards, alive = _explore(world, explorer, seed)
     pool = torch.from_numpy(world.pools[0])[world.task_index]
     errors = []
     for row in range(world.num_envs):
@@ -81,18 +112,19 @@ def identifiability(world: World, actions: np.ndarray | None = None, seed: int =
     return Identified(float((worst < 1.0).mean()), worst)
 
 
-def _explore(world: World, actions: np.ndarray | None, seed: int) -> tuple[Tensor, Tensor, Tensor]:
+def _explore(world: World, explorer: Agent | None, seed: int) -> tuple[Tensor, Tensor, Tensor]:
     """Sensors (T, n, s), rewards and whether the step was of a running episode, (T, n)."""
-    world.reset(seed=seed)
+    obs, _ = world.reset(seed=seed)
+    if explorer is not None:
+        explorer.reset(torch.ones(world.num_envs, dtype=torch.bool))
     generator, engine = torch.Generator().manual_seed(seed), world.parts[0].group.engine
     sensors, rewards, alive, running = [], [], [], torch.ones(world.num_envs, dtype=torch.bool)
     action = rough = torch.zeros(world.num_envs, world.action_size)
     for step in range(int(world.max_episode_steps.max())):
         if step % _HOLD == 0:
             rough = 2.0 * torch.rand(action.shape, generator=generator) - 1.0
-        led = None if actions is None else torch.from_numpy(actions[min(step, len(actions) - 1)])
-        action = rough if led is None else led + _NOISE * rough
-        _, _, terminated, truncated, info = world.step(action)
+        action = rough if explorer is None else explorer.eval_action(obs) + _NOISE * rough
+        obs, _, terminated, truncated, info = world.step(action)
         sensors.append(engine.sensordata.cpu().clone())
         rewards.append(info["reward_unscaled"].cpu())
         alive.append(running & ~info["unstable"].cpu())

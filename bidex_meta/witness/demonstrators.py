@@ -70,14 +70,18 @@ class Scripted:
 
     ``world`` is on C MuJoCo and has moving bases; ``names``: of the slots that play, None for all, others get zero
     actions. A script begins with its row's episode, and reacts to whatever moved the hands: noise (of this standard
-    deviation), or another policy's actions. After its end it repeats its last action. Raises BidexError for a class
-    without a script.
+    deviation), or another policy's actions. After its end it repeats its last action. ``misled``: each row's is told
+    the next task of its pool, as one that has to guess. Raises BidexError for a class without a script.
     """
 
-    def __init__(self, world: World, noise: float = 0.0, seed: int = 0, names: Collection[str] | None = None):
+    def __init__(
+        self, world: World, noise: float = 0.0, seed: int = 0, names: Collection[str] | None = None,
+        misled: bool = False
+    ):  # fmt: skip
         self._world, self._noise, self._generator = world, noise, torch.Generator().manual_seed(seed)
         names = world.task_names if names is None else names
         self._scripts = {slot.name: script_of(slot.task_class) for slot in world.slots if slot.name in names}
+        self._ahead = int(misled)
         self._playing: dict[int, Actions] = {}  # by row of the world
         self._sensors = [part.group.engine.sensordata for part in world.parts]
         self._actions = torch.zeros(world.num_envs, world.action_size)
@@ -111,7 +115,8 @@ class Scripted:
         """The script of a row; reads nothing before its first action is asked for."""
         i, member, k = self._places[row]
         engine_row, slot = member.engine_rows.start + row - member.world_rows.start, self._world.slots[member.slot]
-        frozen = self._world.parts[i].frozen(k, self._world.task_index[row : row + 1])
+        task = (self._world.task_index[row : row + 1] + self._ahead) % len(slot.tasks)
+        frozen = self._world.parts[i].frozen(k, task)
         hands = HandController(
             slot.task_class,
             lambda name: self._sensors[i][engine_row, member.scene.sensors[name]],

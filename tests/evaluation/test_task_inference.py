@@ -8,7 +8,8 @@ import pytest
 
 from bidex_meta import Benchmark
 from bidex_meta.cli import main
-from bidex_meta.evaluation.task_inference import blind_ceiling, identifiability
+from bidex_meta.evaluation.results import ClassResult
+from bidex_meta.evaluation.task_inference import Alignment, alignment, blind_ceiling, identifiability
 from bidex_meta.suite import load_suite
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.aligned import Error
@@ -45,4 +46,21 @@ def test_the_command_measures_a_suite_and_replays_witnesses(tmp_path: Path) -> N
     assert main(["validity", "--suite", suite, "--threads", "1", "--out", out]) == 0
     (row,) = json.loads((tmp_path / "v.json").read_text())["classes"].values()
     assert row["hidden"] == ["cap_slide"] and 0.18 < row["blind"] < 0.25 and row["identified"] == 1.0
-    assert row["uniform"] == row["zero"] == row["held"] == 0.0 and row["witness"] <= 0.5
+    assert row["uniform"] == row["zero"] == 0.0 and row["witness"] <= 0.5 and row["held"] <= 0.25
+    script, misled = row["policies"]["script"], row["policies"]["misled"]
+    assert row["solved"] == script[0] >= 0.5 > misled[0] and script[1] > misled[1]
+    aligned = row["alignment"]
+    assert aligned["rank"] > 0.8 and aligned["solved"] > aligned["unsolved"] >= row["policies"]["zero"][1]
+
+
+def result(returns: list[float], successes: list[float]) -> ClassResult:
+    tasks = np.arange(len(returns))
+    return ClassResult(np.array(returns), np.array(successes), np.ones(len(returns), np.int64), tasks, 0)
+
+
+def test_alignment_counts_pairs_of_successful_and_other_episodes() -> None:
+    found = alignment({"a": result([5.0, 2.0, 1.0], [1.0, 1.0, 0.0]), "b": result([2.0, 4.0], [0.0, 0.0])})
+    # 5 is above 1, 2, 4; 2 is above 1, ties with 2, is below 4.
+    assert found == Alignment(rank=pytest.approx((3 + 1 - 1) / 6), solved=3.5, unsolved=3.0)
+    assert alignment({"a": result([1.0, 2.0], [1.0, 0.0])}) is None, "no policy always fails"
+    assert alignment({"b": result([1.0, 2.0], [0.0, 0.0])}) is None, "nobody succeeds"

@@ -56,6 +56,20 @@ def test_a_script_is_led_by_each_rows_state(monkeypatch: pytest.MonkeyPatch) -> 
     assert not torch.equal(agent.eval_action(obs), last)
 
 
+def test_a_misled_script_is_told_the_next_task() -> None:
+    world = make_task_world("DoorOpenOutward-v2", 50, "cpu", autoreset_mode="DISABLED", threads=1)
+    world.reset(seed=0)
+    told: list[list[torch.Tensor]] = []
+    for misled in (False, True):
+        agent = Scripted(world, misled=misled)
+        seen: list[torch.Tensor] = []
+        agent._scripts["DoorOpenOutward-v2"] = lambda hands, seen=seen: iter(seen.append(hands.frozen("leaves")) or [])
+        agent.reset(torch.ones(50, dtype=torch.bool))
+        agent.eval_action(torch.zeros(50, 1))
+        told.append(seen)
+    assert torch.equal(torch.stack(told[1]), torch.stack(told[0]).roll(-1, 0))
+
+
 def test_noise_is_added_to_what_a_script_does() -> None:
     world = make_task_world("StackBlock", 50, "cpu", autoreset_mode="DISABLED", threads=1)
     world.reset(seed=3)
