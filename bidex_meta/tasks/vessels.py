@@ -214,7 +214,7 @@ class SwingCup(OwnObjectClass):
     camera_target = (0.08, 0.0, 0.68)
     variation_space = join(placed("cup"), component("yaw_change", 0.5 * math.pi, math.pi))
     wide_space = join(placed("cup"), component("yaw_change", 0.25 * math.pi, math.pi))  # a small table
-    wide_solved = "cup within 12 degrees of its goal and within 20 cm of its start"
+    wide_solved = "cup within 8 degrees of its goal and within 20 cm of its start"
     blocks = (
         *object_blocks("cup"),
         *goal_blocks("goal"),
@@ -232,7 +232,7 @@ class SwingCup(OwnObjectClass):
         return 5.0 / (_angle(state) + 0.1)
 
     def hides(self) -> tuple[Hidden, ...]:
-        return (Hidden(("yaw_change",), math.radians(12.0) if self.rules.wide else 0.25 * math.pi),)
+        return (Hidden(("yaw_change",), math.radians(8.0) if self.rules.wide else 0.25 * math.pi),)
 
     def errors(self, state: TaskState) -> list[Error]:
         return [Error(_angle(state), self.hides()[0].tolerance)]

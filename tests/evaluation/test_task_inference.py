@@ -22,7 +22,7 @@ def test_blind_policies_cannot_do_much_in_version_2() -> None:
     found = {name: blind_ceiling(task, 2000) for name, task in classes.items()}
     assert len(found) == 20 and max(found.values()) <= 0.25 and np.mean(list(found.values())) <= 0.15, found
     # Tolerance over range.
-    assert (found["BottleCap"], found["SwingCup"]) == pytest.approx((0.2, 24 / 135), abs=0.03)
+    assert (found["BottleCap"], found["SwingCup"]) == pytest.approx((0.2, 16 / 135), abs=0.03)
     known = {"CatchUnderarm": 0.52, "StackBlock": 0.79, "DoorOpenOutward": 1.0}
     version_1 = {name: blind_ceiling(registry.get(name, True)) for name in known}
     assert version_1 == pytest.approx(known, abs=0.015)

@@ -14,7 +14,7 @@ JOINTS = {
     **dict.fromkeys((name for name in FORMULAS if name.startswith("Door")), (LEAVES, 0.15)),
     "BottleCap": ({"bottle/slide": "cap_slide"}, 0.005),
     "OpenScissors": ({"scissors/hinge": "target_angle"}, 0.04),
-    "OpenPenCap": ({"pen/slide": "gap"}, 0.025),
+    "OpenPenCap": ({"pen/slide": "gap"}, 0.0125),
     "Switch": ({f"switch{i}/hinge": f"switch{i}_angle" for i in (1, 2)}, 0.08),
 }
 """Classes that ask for joints: which component says where each shall be, and the tolerance, rad or m."""
@@ -64,7 +64,7 @@ def solved(name: str, data: mujoco.MjData, task: Task) -> tuple[bool, float]:
             edges = [length(data.body("bucket/object").xpos - goal) - 0.04]
         elif name == "SwingCup":
             turn = FORMULAS[name].goals(data, task)["goal"][1]
-            edges = [rotation_distance(frame(data, "cup/object")[1], turn) - np.deg2rad(12)]
+            edges = [rotation_distance(frame(data, "cup/object")[1], turn) - np.deg2rad(8)]
         return told.success and all(edge < 0 for edge in edges), min(told.margin, *map(abs, edges), 1.0)
     return max(edges) < 0, min(map(abs, edges))
 
@@ -80,7 +80,7 @@ def near(name: str, data: mujoco.MjData, task: Task, rng: np.random.Generator) -
         offs = 0.04 * spread.reshape(2, 2)
         return {f"block{i}": pose(shifted(_pushed(task, i), *offs[i - 1], 0), Rotation.identity()) for i in (1, 2)}
     if name == "SwingCup":
-        turn = about_z(np.pi / 2 + task["yaw_change"] + np.deg2rad(12) * spread[0])
+        turn = about_z(np.pi / 2 + task["yaw_change"] + np.deg2rad(8) * spread[0])
         return {"cup": pose(shifted(start_of(data, "cup", task)[0], *0.1 * spread[1:3], 0), turn)}
     if name in BUCKETS:
         task = task | {f"bucket_{axis}": task[f"goal_{axis}"] + 0.03 * spread[i] for i, axis in enumerate("xy")}
