@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from bidex_meta.benchmark import Benchmark, make_task_world
+from bidex_meta.suite import V2
 from bidex_meta.tasks import registry
 from bidex_meta.witness.replay import replay
 from bidex_meta.witness.store import load_witness, witness_path
@@ -38,7 +39,7 @@ def stability(
     and from shifted ones.
 
     Args:
-        suite: Test the classes of this suite, with the bases they have there.
+        suite: Test the classes of this suite, with the bases they have there, by its version's rules.
         task: Test this class, with a moving base and, where it has one of its own, the fixed one. With neither suite
             nor task every class is tested.
         steps: Environment steps a class.
@@ -79,7 +80,8 @@ def variants(suite: str | None, task: str | None) -> list[tuple[str, bool]]:
     if suite is not None and task is None:
         benchmark = Benchmark(suite)
         classes = benchmark.task_classes("train") | benchmark.task_classes("test")
-        return [(name, task_class.moving_base) for name, task_class in classes.items()]
+        version = {name: "-v2" if task_class.rules == V2 else "" for name, task_class in classes.items()}
+        return [(name + version[name], task_class.moving_base) for name, task_class in classes.items()]
     names = [task] if task else registry.names()
     return [(n, moving) for n in names for moving in (True, False) if moving or not registry.get(n).moving_base]
 
