@@ -3,17 +3,21 @@
 from pathlib import Path
 
 import numpy as np
+import torch
 import tyro
 
 from bidex_meta.benchmark import make_task_world
 from bidex_meta.errors import BidexError
 from bidex_meta.evaluation import references
 from bidex_meta.runs import video
+from bidex_meta.suite import V2
 from bidex_meta.tasks import registry
 from bidex_meta.tasks.base import TaskClass
 from bidex_meta.tasks.hidden import hidden
 from bidex_meta.tasks.variation import VariationSpace
+from bidex_meta.witness.demonstrators import Scripted
 from bidex_meta.witness.replay import frames, replay
+from bidex_meta.witness.scripts import scripts_of
 from bidex_meta.witness.store import Witness, load_witness, witness_path
 
 VIEWS = ("back", "side")
@@ -31,8 +35,9 @@ in radians. *left* and *right* are distances from a [hand's point](figures.md#ha
 | uniform actions | mean return and success |
 | witness | a reference solution: recorded actions that solve task 0 |
 
-The last pictures of a class show its witness: at the start, a third and two thirds of the way to the first success, at
-the first success and at the end. `make gallery` generates this page from the task classes.
+Below come the witness (at the start, a third and two thirds of the way to the first success, at the first success and
+at the end), and three tasks of version 2: as a script has solved them, of eggs at the start. `make gallery` generates
+this page from the task classes.
 """
 
 
@@ -50,6 +55,8 @@ def gallery(out: Path = Path("docs/tasks.md"), width: int = 360, height: int = 2
         if witness_path(name).is_file():
             strip = _strip(name, load_witness(name), width * 2 // 3, height * 2 // 3)
             video.write_image(out.parent / _image(name, "witness"), strip)
+        tasks = _three_tasks(name, width * 2 // 3, height * 2 // 3)
+        video.write_image(out.parent / _image(name, "v2"), tasks)
     out.write_text(text())
     print(out)
 
@@ -88,6 +95,22 @@ def _strip(name: str, witness: Witness, width: int, height: int) -> np.ndarray:
     return np.concatenate([shown[i] for i in wanted], axis=1)
 
 
+def _three_tasks(name: str, width: int, height: int) -> np.ndarray:
+    """Three tasks of version 2 side by side, (height, 3 * width, 3) uint8: at the end of the script, else the start."""
+    world = make_task_world(f"{name}-v2", num_envs=50, seed=0, autoreset_mode="DISABLED", threads=1)
+    obs, _ = world.reset(seed=0)
+    rows, solved = [0, 1, 2], torch.ones(50, dtype=torch.bool)
+    if name in scripts_of(V2):
+        agent = Scripted(world)
+        agent.reset(solved)
+        for _ in range(int(world.max_episode_steps[0])):
+            obs, *_, info = world.step(agent.eval_action(obs))
+        rows = info["so_far"]["success"].nonzero().flatten().tolist()[:3]
+    pictures = [world.render(row=row, width=width, height=height, camera=VIEWS[0]) for row in rows]
+    world.close()
+    return np.concatenate(pictures, axis=1)
+
+
 def _section(task: TaskClass, random: dict | None) -> str:
     pictures = " ".join(f"![{task.name}, {view}]({_image(task.name, view)})" for view in VIEWS)
     rows = [
@@ -105,20 +128,14 @@ def _section(task: TaskClass, random: dict | None) -> str:
     rows.append(("witness", _witness(task.name)))
     table = "\n".join(f"| {key} | {value} |" for key, value in rows)
     strip = f"![{task.name}, witness]({_image(task.name, 'witness')})\n" if witness_path(task.name).is_file() else ""
-    return f"## {task.name}\n\n{task.summary}.\n\n{pictures}\n\n| | |\n|---|---|\n{table}\n\n{strip}"
+    tasks = f"![{task.name}, three tasks of version 2]({_image(task.name, 'v2')})\n"
+    return f"## {task.name}\n\n{task.summary}.\n\n{pictures}\n\n| | |\n|---|---|\n{table}\n\n{strip}\n{tasks}"
 
 
 def _of_version_2(task: TaskClass) -> list[tuple[str, str]]:
-    space = task.variation_space
-    bounds = {
-        name: f"{low:.3g} … {high:.3g}" for name, low, high in zip(space.names, space.low, space.high, strict=True)
-    }
-    parts = []
-    for part in task.hides():
-        ranges = ", ".join(f"{name} {bounds[name]}" for name in part.names)
-        parts.append(ranges if part.kind == "sign" else f"{ranges} (within {part.tolerance:.3g})")
+    parts = "; ".join(part.described(task.variation_space) for part in task.hides())
     solved = task.wide_solved or task.solved
-    return [("version 2 hides", "; ".join(parts)), ("version 2 success", f"{solved}, for the last 0.25 s")]
+    return [("version 2 hides", parts), ("version 2 success", f"{solved}, for the last 0.25 s")]
 
 
 def _mask(task: TaskClass) -> str:

@@ -21,20 +21,21 @@ from bidex_meta.worlds import listed
 
 @dataclass(frozen=True)
 class ListFlags:
-    """The suites, tasks, algos or objects there are.
+    """The suites, tasks, hidden parts of tasks, algos or objects there are.
 
     Example: bidex-meta list tasks --json
     """
 
-    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="suites|tasks|algos|objects")]
-    """suites, tasks, algos or objects (what the throwing classes throw)."""
+    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="suites|tasks|hidden|algos|objects")]
+    """suites, tasks, hidden (what version 2's tasks hide, with ranges and tolerances in metres and rad), algos or
+    objects (what the throwing classes throw)."""
     json: JsonSwitch = False
 
 
 def main(arguments: Sequence[str]) -> None:
     """Print a table or JSON, one row for each."""
     flags = parse(ListFlags, arguments, "list")
-    kinds = {"suites": listed, "tasks": _tasks, "algos": _algos, "objects": _objects}
+    kinds = {"suites": listed, "tasks": _tasks, "hidden": _hidden, "algos": _algos, "objects": _objects}
     print_rows(kinds[known_name("list", flags.what, kinds)](), flags.json)
 
 
@@ -52,6 +53,11 @@ def _tasks() -> list[Json]:
         sizes = {"observation": int(found[0]), "action": 52 if moves else 40}
         rows.append({"name": name, **sizes, "episode_steps": steps, "summary": summary})
     return rows
+
+
+def _hidden() -> list[Json]:
+    tasks = [registry.get(f"{name}-v2") for name in registry.names()]
+    return [{"name": t.name, "hides": [part.described(t.variation_space) for part in t.hides()]} for t in tasks]
 
 
 def _algos() -> list[Json]:

@@ -5,6 +5,8 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from bidex_meta.tasks.variation import VariationSpace
+
 
 class Hidden(NamedTuple):
     """A part of a task that only goal entries show: success asks for each part on its own."""
@@ -14,6 +16,12 @@ class Hidden(NamedTuple):
     tolerance: float
     """Distance from it that success allows, or angle of rotations; of a choice by sign infinite."""
     kind: Literal["point", "orientation", "sign"] = "point"
+
+    def described(self, space: VariationSpace) -> str:
+        """Its components with their ranges, and its tolerance."""
+        ends = dict(zip(space.names, zip(space.low, space.high, strict=True), strict=True))
+        ranges = ", ".join(f"{name} {ends[name][0]:.3g} … {ends[name][1]:.3g}" for name in self.names)
+        return ranges if self.kind == "sign" else f"{ranges} (within {self.tolerance:.3g})"
 
 
 class Error(NamedTuple):

@@ -37,7 +37,8 @@ def test_pictures_are_written_where_the_page_looks_for_them(tmp_path: Path, monk
     drawn = []
 
     class Fake:
-        def reset(self, seed: int) -> None: ...
+        def reset(self, seed: int) -> tuple[None, None]:
+            return None, None
 
         def close(self) -> None: ...
 
@@ -46,6 +47,7 @@ def test_pictures_are_written_where_the_page_looks_for_them(tmp_path: Path, monk
             return np.zeros((height, width, 3), np.uint8)
 
     monkeypatch.setattr(gallery, "make_task_world", lambda *_, **__: Fake())
+    monkeypatch.setattr(gallery, "scripts_of", lambda rules: {})
     monkeypatch.setattr(gallery, "witness_path", lambda name: Path(__file__) if name == "HandOver" else tmp_path / name)
     witness = Witness(np.zeros((40, 52), np.float32), {"first_success": 5, "return": 3.0})
     monkeypatch.setattr(gallery, "load_witness", lambda name: witness)
@@ -53,9 +55,10 @@ def test_pictures_are_written_where_the_page_looks_for_them(tmp_path: Path, monk
     monkeypatch.setattr(gallery, "frames", lambda name, witness, at, width, height: numbered(at, width, height))
     gallery.gallery(tmp_path / "tasks.md", width=8, height=6)
     links = re.findall(r"!\[[^]]*\]\(([^)]*)\)", (tmp_path / "tasks.md").read_text())
-    assert len(links) == 2 * len(registry.names()) + 1 and len(drawn) == 2 * len(registry.names())
+    assert len(links) == 3 * len(registry.names()) + 1 and len(drawn) == 5 * len(registry.names())
     assert set(drawn) == set(gallery.VIEWS)
     assert all((tmp_path / link).is_file() for link in links)
+    assert imageio.imread(tmp_path / "images/tasks/HandOver_v2.png").shape == (4, 15, 3)
     strip = imageio.imread(tmp_path / "images/tasks/HandOver_witness.png")
     assert strip.shape == (4, 25, 3) and strip[0, ::5, 0].tolist() == [0, 4, 8, 12, 40]
 
