@@ -135,7 +135,8 @@ def _section(task: TaskClass, random: dict | None) -> str:
 def _of_version_2(task: TaskClass) -> list[tuple[str, str]]:
     parts = "; ".join(part.described(task.variation_space) for part in task.hides())
     solved = task.wide_solved or task.solved
-    return [("version 2 hides", parts), ("version 2 success", f"{solved}, for the last 0.25 s")]
+    rows = [("version 2 episode", f"{task.wide_steps} steps")] if task.wide_steps else []
+    return [*rows, ("version 2 hides", parts), ("version 2 success", f"{solved}, for the last 0.25 s")]
 
 
 def _mask(task: TaskClass) -> str:

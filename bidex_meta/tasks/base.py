@@ -69,7 +69,7 @@ class TaskClass(ABC):
         name: Name of the class, e.g. ``CatchUnderarm``; ``summary``: what it asks for, one line.
         formula: The printed reward; ``solved``: when it counts as solved, one line.
         deviations: What differs from the appendix on purpose, a line each.
-        episode_steps: Time limit, control steps.
+        episode_steps: Time limit, control steps; ``wide_steps`` with wide variation, where that takes longer.
         right: Start pose of the right hand; ``left`` of the left one.
         transition_scale: Scale of the base forces (docs/figures.md, base); ``orientation_scale`` of the torques.
         start_draws: How many uniform numbers the start of an episode takes.
@@ -96,7 +96,8 @@ class TaskClass(ABC):
     formula: ClassVar[str]
     solved: ClassVar[str]
     deviations: ClassVar[tuple[str, ...]] = ()
-    episode_steps: ClassVar[int]
+    episode_steps: int
+    wide_steps: ClassVar[int | None] = None
     right: ClassVar[HandPose]
     left: ClassVar[HandPose]
     transition_scale: ClassVar[float]
@@ -127,6 +128,7 @@ class TaskClass(ABC):
         if rules.reward == "v2" and type(self).errors is TaskClass.errors:
             raise BidexError(f'{self.name}: expected reward = "paper", got "v2", which the class does not have.')
         if rules.wide:
+            self.episode_steps = self.wide_steps or self.episode_steps
             self.widen()
 
     def widen(self) -> None:
