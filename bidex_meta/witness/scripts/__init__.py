@@ -8,6 +8,7 @@ from bidex_meta.tasks.base import TaskClass
 from bidex_meta.witness.controller import Actions, HandController
 from bidex_meta.witness.scripts.blocks import grasp_and_place, push_blocks, stack_block
 from bidex_meta.witness.scripts.caps import pull_cap, swing_cup
+from bidex_meta.witness.scripts.carrying import carry_egg
 from bidex_meta.witness.scripts.pots import lift_underarm, pour_water
 from bidex_meta.witness.scripts.swing_doors import close_outward, open_inward, push
 from bidex_meta.witness.scripts.tools import open_pen, open_scissors, press_switches
@@ -27,8 +28,10 @@ SCRIPTS: dict[str, Script] = {
 """Of version 1; they play version 2 too."""
 WIDE_SCRIPTS: dict[str, Script] = SCRIPTS | {
     "BottleCap": pull_cap,
+    "CatchUnderarm": carry_egg,
     "DoorCloseInward": push,
     "DoorOpenOutward": push,
+    "HandOver": carry_egg,
     "OpenPenCap": open_pen,
     "OpenScissors": open_scissors,
     "PushBlock": push_blocks,
