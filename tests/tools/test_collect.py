@@ -10,7 +10,6 @@ from bidex_meta.errors import BidexError
 from bidex_meta.evaluation.comparison import read_groups
 from bidex_meta.runs import RunFolder
 from bidex_meta.runs.stored import StoredRun, open_run
-from bidex_meta.witness.replay import Replay
 from tests.fakes import change, evaluated_run, log
 from tools import collect as tool
 from tools import experts
@@ -107,21 +106,18 @@ def test_a_damaged_file_is_refused(tmp_path: Path) -> None:
     assert group.paths == [path]
 
 
-def test_the_expert_is_the_best_of_witness_script_and_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    totals = {"HandOver": 40.0, "CatchAbreast": 5.0, "CatchUnderarm": 90.0}  # of which the last no longer holds
-    monkeypatch.setattr(experts, "witness_path", lambda name: Path(__file__) if name in totals else tmp_path / "none")
-    monkeypatch.setattr(experts, "load_witness", lambda name: name)
-    succeeded = {"CatchUnderarm": 3}
-    monkeypatch.setattr(experts, "replay", lambda name, *_: Replay(totals[name], 1, succeeded.get(name, 9), 0.0))
-    scripts = {"HandOver": {"return": 39.0}, "TwoCatchUnderarm": {"return": 7.0}}
-    monkeypatch.setattr(experts, "load", lambda kind: scripts if kind == "script" else {})
-    suite = evaluated_run(tmp_path, 3, {"HandOver": 3.0, "CatchAbreast": 2.0})
-    experts.experts(
-        (suite, evaluated_run(tmp_path, 3, {"CatchAbreast": 1.0}, task="CatchAbreast")), "MT4", tmp_path / "o"
-    )
-    found = json.loads((tmp_path / "o").read_text())["classes"]
+def test_the_expert_is_the_best_that_solves_half_of_the_tasks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    known = {
+        "script": {"HandOver": {"return": 39.0, "success": 0.5}, "TwoCatchUnderarm": {"return": 7.0, "success": 0.49}},
+        "witness": {"HandOver": {"return": 40.0, "success": 0.2}, "CatchUnderarm": {"return": 5.0, "success": 0.9}},
+    }
+    monkeypatch.setattr(experts, "load", known.__getitem__)
+    out, suite = tmp_path / "o", evaluated_run(tmp_path, 3, {"HandOver": 0.4, "CatchAbreast": 0.6})
+    out.write_text('{"classes": {"Switch": {"return": 1.0}}}')  # is not kept
+    experts.experts((suite, evaluated_run(tmp_path, 3, {"CatchAbreast": 0.5}, task="CatchAbreast")), "MT4", out)
+    found = json.loads(out.read_text())["classes"]
     assert {name: (row["return"], row["source"]) for name, row in found.items()} == {
-        "HandOver": (40.0, "witness, task 0"),
-        "CatchAbreast": (20.0, "mtppo on MT4, 1,000 steps, seed 3"),
-        "TwoCatchUnderarm": (7.0, "script"),
+        "HandOver": (39.0, "script"),
+        "CatchAbreast": (6.0, "mtppo on MT4, 1,000 steps, seed 3"),
+        "CatchUnderarm": (5.0, "witness"),
     }

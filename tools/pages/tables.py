@@ -99,6 +99,7 @@ def best_table(studies: Sequence[Study]) -> Iterator[str]:
     several = sum(len(study.runs) for study in studies) > 1
     order = registry.names()
     references = [load("witness"), load("script")]
+    experts = {name: row["return"] for name, row in load("expert").items()}  # of whom a score would say nothing
     rows = []
     for name in sorted(found, key=lambda name: order.index(name) if name in order else len(order)):
         run, best = max(found[name], key=lambda pair: (pair[1]["success"], pair[1]["return"]))
@@ -108,7 +109,7 @@ def best_table(studies: Sequence[Study]) -> Iterator[str]:
         cells = [
             _measure(best, "success").text(100.0, " %", ".4g"),
             _measure(best, "return").text(form=".4g"),
-            "–" if best["score"] is None else f"{best['score']:.0f}",
+            "–" if best["score"] is None or best["return"] == experts.get(name) else f"{best['score']:.0f}",
             "–" if random is None else f"{random['return']:.4g}",
             *(f"{100 * known[name]['success']:.4g} %" if name in known else "–" for known in references),
         ]
