@@ -79,16 +79,23 @@ def _evaluate(flags: EvaluateFlags, folder: RunFolder, config: RunConfig, worlds
     result, table = judged(worlds, policy, step, split, flags, flags.random, title)
     tables = [table]
     if flags.other_tasks:
-        drawn = worlds.seed + _OTHER_SEED
-        others = Worlds.open(replace(config, task_seed=drawn).to_json())
-        title = f"{config.algo} on {worlds.name}, other tasks (seed {drawn})"
-        found, table = judged(others, policy, step, split, flags, flags.random, title)
-        result["other_tasks"] = {"task_seed": drawn, **found}
+        result["other_tasks"], table = judged_on_others(config, policy, step, split, flags, flags.random)
         tables.append(table)
     if not flags.json:
         for table in tables:
             print_table(table)
     return result
+
+
+def judged_on_others(
+    config: RunConfig, policy: Agent, step: int, split: str, options: Options, random: bool
+) -> tuple[Json, Table]:
+    """``judged`` on as many tasks of each class that the run was not trained on."""
+    drawn = Worlds.open(config.to_json()).seed + _OTHER_SEED
+    others = Worlds.open({**config.to_json(), "task_seed": drawn})
+    title = f"{config.algo} on {others.name}, other tasks (seed {drawn})"
+    found, table = judged(others, policy, step, split, options, random, title)
+    return {"task_seed": drawn, **found}, table
 
 
 def judged(

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from bidex_meta.cli import metatest, run_data, run_recording, watching
-from bidex_meta.cli.evaluate import conditions, judged
+from bidex_meta.cli.evaluate import conditions, judged, judged_on_others
 from bidex_meta.cli.policies import checkpoint, fitting
 from bidex_meta.cli.run_config import RunPlan, plan_run
 from bidex_meta.cli.tables import Json, print_table, say
@@ -241,8 +241,15 @@ def _evaluate(plan: RunPlan, folder: RunFolder, learner: Any) -> None:
     title = f"{plan.config.algo} on {source.name}, {learner.env_steps:,} steps"
     options = metatest.Options(episodes=episodes)
     found, table = judged(source, learner, learner.env_steps, "train", options, random=True, title=title)
+    tables = [table]
+    if plan.flags.other_tasks:
+        config = replace(plan.config, device=launch().own_device(plan.config.device))
+        step = learner.env_steps
+        found["other_tasks"], table = judged_on_others(config, learner, step, "train", options, random=True)
+        tables.append(table)
     write_json(folder.evaluation_path, {"run": str(folder.path), **found, "conditions": conditions(source)})
-    print_table(table)
+    for table in tables:
+        print_table(table)
     say(f"Again: bidex-meta evaluate {folder.path}   Curves: bidex-meta plot {folder.path}")
 
 

@@ -43,6 +43,8 @@ class RunFlags(Generic[LearnerSettings]):
     episodes: Few | None = None
     """Episodes of each task in that evaluation; None: 4, or 1 where a task fixes its start (metaworld/...); for
     learners that adapt, as many as --rollouts."""
+    other_tasks: Switch = False
+    """Evaluate on as many tasks that the run was not trained on, too; not for learners that adapt."""
     split: Literal["auto", "train", "test", "both"] = "auto"
     """Tasks of that evaluation where the learner adapts (maml, promp, rl2, ...). auto: both, on ML20 fifteen classes
     beside the five unseen ones."""
@@ -141,6 +143,8 @@ def _check(flags: RunFlags, config: RunConfig, kind: LearnerKind) -> None:
     asked = [name for name in ("split", "shots", "rollouts", "tasks") if vars(flags)[name] not in (None, "auto")]
     if asked and not kind.make.adapts:
         raise BidexError(f"--{asked[0]} is for learners that adapt (maml, promp, rl2), not {kind.name}. Leave it out.")
+    if flags.other_tasks and kind.make.adapts:
+        raise BidexError(f"{kind.name} adapts: its test tasks are others. Leave --other-tasks out.")
     if config.record:
         part_files.hdf5()  # refuses it where it is not installed
     if config.device.startswith("cpu") and not flags.print_config:

@@ -144,10 +144,11 @@ def test_preset_sets_what_no_flag_sets(shown):
 # Run, resume, evaluate, plot, render.
 
 
-def test_run_trains_evaluates_and_can_be_looked_at_again(toy_worlds, tmp_path, capsys, shown):
+def test_run_trains_evaluates_and_can_be_looked_at_again(toy_worlds, tmp_path, capsys, shown, refused):
     path = tmp_path / "r"
-    assert run("--steps", 240, "--run-dir", path, "--episodes", 2) == 0
+    assert run("--steps", 240, "--run-dir", path, "--episodes", 2, "--other-tasks") == 0
     captured = capsys.readouterr()
+    assert "other tasks (seed 500000)" in captured.out
     for text in ("Near", "Far", "random return", "return above random"):
         assert text in captured.out
     assert "Preset laptop: the device is a CPU." in captured.err
@@ -156,12 +157,14 @@ def test_run_trains_evaluates_and_can_be_looked_at_again(toy_worlds, tmp_path, c
     assert final(path)[1] == 240
     report = json.loads((path / "evaluation.json").read_text())
     assert report["policy"]["classes"]["Near"]["episodes"] == 6
+    assert report["other_tasks"]["task_seed"] == 500_000
 
-    found = json.loads(shown("evaluate", path, "--random", "--json", "--episodes", 2))
+    found = json.loads(shown("evaluate", path, "--random", "--json", "--episodes", 2, "--other-tasks"))
     # The policy of the checkpoint is the one that was trained.
     assert found["steps"] == 240 and found | {"conditions": None} == report | {"conditions": None}
     assert set(found["return_above_random"]["Far"]) == {"value", "interval"}
     assert "Near" in shown("evaluate", path)
+    assert "adapts" in refused("run", *SMALL[:6], "--algo", "maml", "--other-tasks")
     shown("plot", path)
     assert (path / "curves.png").stat().st_size > 0
 
