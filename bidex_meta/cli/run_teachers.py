@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -38,7 +39,9 @@ def check_teachers(kind: LearnerKind, config: RunConfig, source: Worlds) -> None
     if not config.teacher:
         raise BidexError(f"{kind.name} learns from teachers. Add --teacher scripts, or --teacher RUN.")
     if source.hides_goals:
-        raise BidexError(f"{kind.name}: its policy cannot find out the goals that {source.name} hides. Name an MT suite.")
+        raise BidexError(
+            f"{kind.name}: its policy cannot find out the goals that {source.name} hides. Name an MT suite."
+        )
     if SCRIPTS in config.teacher and (config.device != "cpu" or config.engine == "warp"):
         raise BidexError("--teacher scripts reads states of C MuJoCo. Add --device cpu, and leave --engine out.")
     if not teacher_of_class(config.teacher, source):
@@ -46,7 +49,7 @@ def check_teachers(kind: LearnerKind, config: RunConfig, source: Worlds) -> None
 
 
 def teacher_of_class(names: Sequence[str], source: Worlds) -> dict[str, str]:
-    """The first teacher that knows a class, by the class's name among ``source.task_classes()``, of those that have one.
+    """The first teacher that knows a class, by the class's name in ``source.task_classes()``; others are left out.
 
     Raises BidexError for a run that cannot teach here.
     """
@@ -61,7 +64,9 @@ def teacher_of_class(names: Sequence[str], source: Worlds) -> dict[str, str]:
 def _scripted(source: Worlds) -> set[str]:
     """Classes with a script; raises BidexError where bases do not move."""
     if not source.moving_bases:
-        raise BidexError(f"--teacher scripts moves the hands' bases, which are fixed in {source.name}. Add --base moving.")
+        raise BidexError(
+            f"--teacher scripts moves the hands' bases, which are fixed in {source.name}. Add --base moving."
+        )
     return {name for name, task in source.task_classes().items() if task.name in scripts_of(task.rules)}
 
 
@@ -81,8 +86,8 @@ def _known_to(name: str, source: Worlds) -> set[str]:
         known = {task for task, here in own.items() if _alike(here, taught)}
     if not known or source.points != other.points or (source.points and other.class_name is not None):
         raise BidexError(
-            f"--teacher {name} has learned {other.name}, which {source.name} does not have in the same form. Expected a "
-            "run on the same suite, or on one of its classes with the same rules, bases and objects."
+            f"--teacher {name} has learned {other.name}, which {source.name} does not have in the same form. Expected "
+            "a run on the same suite, or on one of its classes with the same rules, bases and objects."
         )
     return known
 
@@ -112,7 +117,7 @@ def teachers_of(config: RunConfig, source: Worlds, world: VectorWorld) -> Teache
     scripted = [task for task, teacher in assigned.items() if teacher == SCRIPTS]
     if not scripted:
         return Teachers(world, tutors)
-    inner = getattr(world, "unwrapped", world)
+    inner: Any = getattr(world, "unwrapped", world)  # without a recorder
     names = [inner.slots[i].name for i, task in enumerate(slots) if task in scripted]
     mask = torch.zeros(world.num_envs, dtype=torch.bool)
     mask[_rows(world, slots, scripted)] = True
