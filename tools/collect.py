@@ -32,7 +32,7 @@ _TAG = re.compile(
     r"|Perf/steps_per_second"
 )
 _TRAINED = "Train/return/"
-_PATHS = {"suite": 1, "object": 1, "start_from": 1, "dataset": 2, "demonstrations": 2}
+_PATHS = {"suite": 1, "object": 1, "start_from": 1, "dataset": 2, "demonstrations": 2, "teacher": 1}
 """Entries of a config that are paths, and how many of their last parts are kept."""
 _OF_SHOTS = ("success", "return", "score", "success_interval", "return_interval")
 """What is kept of a class after each shot; the evaluation after the last one has counts and lengths too."""

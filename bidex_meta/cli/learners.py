@@ -32,6 +32,8 @@ ALGOS: dict[str, str] = {
     "sac": "bidex_algos.offpolicy.mtsac:SAC",
     "ddpg": "bidex_algos.offpolicy.ddpg:DDPG",
     "td3": "bidex_algos.offpolicy.td3:TD3",
+    # From teachers (`--teacher`), of one class or of many.
+    "dagger": "bidex_algos.imitation.dagger:DAgger",
     # These learn from data sets (`--dataset`), of one class or of many.
     "bc": "bidex_algos.offline.bc:BC",
     "bcq": "bidex_algos.offline.bcq:BCQ",

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bidex_meta.cli import metatest, run_data, run_recording, watching
+from bidex_meta.cli import metatest, run_data, run_recording, run_teachers, watching
 from bidex_meta.cli.evaluate import conditions, judged, judged_on_others
 from bidex_meta.cli.policies import checkpoint, fitting
 from bidex_meta.cli.run_config import RunPlan, plan_run
@@ -147,7 +147,7 @@ def _agree(plan: RunPlan, loaded: Checkpoint | None) -> RunPlan:
 
 
 def _make_learner(plan: RunPlan, world: VectorWorld, fresh: bool) -> Any:
-    """The learner with its data; a fresh one with the weights that it shall start from."""
+    """The learner with its data and teachers; a fresh one with the weights that it shall start from."""
     config = plan.config
     learner = plan.kind.make(world, config.learner, config.seed)
     if plan.kind.make.offline:
@@ -155,6 +155,8 @@ def _make_learner(plan: RunPlan, world: VectorWorld, fresh: bool) -> Any:
     if config.demonstrations:
         demonstrations = run_data.announced(config.demonstrations, "Demonstrations:")
         learner.learn_from_demonstrations(join(demonstrations, world, every=False))
+    if config.teacher:
+        learner.learn_from_teachers(run_teachers.teachers_of(config, plan.source, world))
     if fresh and config.start_from is not None:
         start = RunFolder.open(Path(config.start_from))
         state, step = checkpoint(start)

@@ -9,7 +9,7 @@ from typing import Annotated, Generic, Literal
 
 import tyro
 
-from bidex_meta.cli import run_data
+from bidex_meta.cli import run_data, run_teachers
 from bidex_meta.cli.learners import LearnerKind, choose_preset, learner_kind, resolve_device
 from bidex_meta.cli.parsing import Switch, parse, peek, peek_all
 from bidex_meta.cli.tables import Json
@@ -105,13 +105,18 @@ def plan_run(arguments: Sequence[str]) -> RunPlan:
         )  # fmt: skip
     # The learner's flags are among those of its config; lists begin empty, since flags add to them.
     options: type[RunFlags] = RunFlags[type(default.learner)]  # pyright: ignore
-    flags = parse(options, arguments, "run", RunFlags(replace(default, dataset=(), demonstrations=())))
+    flags = parse(options, arguments, "run", RunFlags(replace(default, dataset=(), demonstrations=(), teacher=())))
     run_data.check_offline(kind, flags.config.record, datasets, source)
     demonstrations = run_data.whole_paths(flags.config.demonstrations) or default.demonstrations
-    config = replace(flags.config, dataset=dataset, demonstrations=demonstrations, algo=kind.name, preset=preset)
+    teacher = run_teachers.whole_paths(flags.config.teacher) or default.teacher
+    config = replace(
+        flags.config, dataset=dataset, demonstrations=demonstrations, teacher=teacher, algo=kind.name, preset=preset
+    )
     config = _resolved(config, source, device, fresh=folder is None)
     _check(flags, config, kind)
-    run_data.check_demonstrations(kind, config.demonstrations, Worlds.open(config.to_json()))
+    worlds = Worlds.open(config.to_json())
+    run_data.check_demonstrations(kind, config.demonstrations, worlds)
+    run_teachers.check_teachers(kind, config, worlds)
     if folder and stored:
         _refuse_changes(default, config, folder)
     return RunPlan(flags, kind, config, folder, reason)

@@ -171,9 +171,9 @@ def _words(flag: str, value: object) -> list[str]:
     if isinstance(value, bool):
         before, dot, last = flag.rpartition(".")
         return [f"--{flag}" if value else f"--{before}{dot}no-{last}"]
-    if isinstance(value, list) and flag not in ("dataset", "demonstrations"):
+    if isinstance(value, list) and flag not in ("dataset", "demonstrations", "teacher"):
         return [f"--{flag}", *map(_text, value)]
-    # Of these two each value is given with the flag's name.
+    # Of these each value is given with the flag's name.
     return [f"--{flag}={_text(each)}" for each in (value if isinstance(value, list) else [value])]
 
 

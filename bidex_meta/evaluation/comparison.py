@@ -59,6 +59,10 @@ def run_kind(config: AnyConfig, split: str = "train") -> Json:
     kind |= {"on": config.suite or "one class at a time", "split": split}
     kind["started"] = "afresh" if config.start_from is None else "from another run"  # which: one for each seed
     kind |= {"dataset": _data(config, config.dataset), "demonstrations": _data(config, config.demonstrations)}
+    # Of runs not which: a group's runs of single classes each have one for their own.
+    kind["teacher"] = (
+        " + ".join(sorted({"scripts" if name == "scripts" else "runs" for name in config.teacher})) or None
+    )
     return kind | {f"learner.{name}": value for name, value in config.learner_values.items()}
 
 

@@ -58,6 +58,8 @@ class Learner(ABC):
     """Whether it learns from data sets (:meth:`learn_from`) and never steps the world."""
     imitates: ClassVar[bool] = False
     """Whether it takes demonstrations while it learns by playing (:meth:`learn_from_demonstrations`)."""
+    taught: ClassVar[bool] = False
+    """Whether it plays and teachers label what it comes to (:meth:`learn_from_teachers`)."""
     per_process: tuple[str, ...] = ()
     """Entries of ``state_dict`` that differ from process to process; the others are equal in all."""
     env_steps: int
@@ -105,6 +107,10 @@ class Learner(ABC):
     def learn_from_demonstrations(self, data: Any) -> None:
         """Takes transitions to imitate (likewise), before the first iteration and before a checkpoint is loaded."""
         raise BidexError(f"{self.name}: imitates no demonstrations.")
+
+    def learn_from_teachers(self, teachers: Any) -> None:
+        """Takes who labels (``bidex_meta.witness.teachers.Teachers``), likewise."""
+        raise BidexError(f"{self.name}: learns from no teachers.")
 
     def start_from(self, policy: State) -> None:
         """Takes the policy of another run's checkpoint in the place of fresh weights."""

@@ -1,24 +1,41 @@
 """Hand controller: moves both hands to points in closed loop, for scripted policies.
 
-A script is a generator of actions: it yields one for each control step, and reads the state in which that is taken.
+A script is a generator: for each control step it yields where the hands shall go (:class:`Lead`), and reads the state
+in which that is taken. :class:`HandActions` makes the actions of many environments at once.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import cache
+from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from bidex_meta.hands.hand import ANGULAR_DAMPING, FORCE_PER_SCALE, LINEAR_DAMPING, SIDES, TORQUE_PER_SCALE, hand
 from bidex_meta.tasks.base import TaskClass
-from bidex_meta.utils.maths import conjugate, multiply, quaternion_from_rpy, rotate, xyzw
+from bidex_meta.utils.maths import conjugate, constant, multiply, quaternion_from_rpy, rotate, xyzw
 from bidex_meta.witness.store import quantised
 
 GAIN = 8.0  # speed of a hand over its distance to its target, and of its turn over its angle to its target, 1/s
 _KNUCKLES, _MIDDLES = ("FFJ2", "MFJ2", "RFJ2", "LFJ2"), ("FFJ1", "MFJ1", "RFJ1", "LFJ1")
 
 Point = tuple[float, float, float]
-Actions = Iterator[Tensor]
-"""Of a script or a part of one, each (action_size,)."""
+_Quaternion = tuple[float, float, float, float]  # (x, y, z, w)
+
+
+class Lead(NamedTuple):
+    """What a script asks for in a control step; pairs are of the right and the left hand."""
+
+    points: tuple[Point, Point]  # where the hands' points shall go, world, metres
+    speed: float  # at most, m/s
+    fingers: tuple[np.ndarray, np.ndarray]  # actions of the joints, (20,) each
+    held: tuple[_Quaternion, _Quaternion]  # orientations, world; zeros for a hand that may turn
+
+
+Actions = Iterator[Lead]
+"""Of a script or a part of one."""
 
 
 def beside(point: Tensor, x: float, y: float, height: float) -> Point:
@@ -41,7 +58,7 @@ def rest_action(size: int) -> Tensor:
 
 
 class HandController:
-    """Moves both hands of an environment of a class to points, from the state that it reads.
+    """Leads both hands of an environment of a class to points, by the state that it reads.
 
     ``sensor`` gives a sensor's present values by its name, (k,) in double precision, ``frozen`` a frozen number of the
     task, (k,).
@@ -51,13 +68,9 @@ class HandController:
         self.where, self.frozen = sensor, frozen
         self.episode_steps, self.taken = task.episode_steps, 0
         self.wide = task.rules.wide  # whether a task asks for more than version 1's
-        self._rest = rest_action(task.action_size)
-        self._full_speed = FORCE_PER_SCALE * task.transition_scale / LINEAR_DAMPING[0]
-        self._full_torque = TORQUE_PER_SCALE * task.orientation_scale
-        self._held: dict[str, Tensor] = {}
-        self._first = {side: self.where(f"{side}/mount_quaternion") for side in SIDES}
-        half, self._joints = task.action_size // 2, len(hand().control_low)
-        self._fingers = {side: self._rest[i * half :][: self._joints] for i, side in enumerate(SIDES)}
+        self._held: dict[str, _Quaternion] = {side: (0.0, 0.0, 0.0, 0.0) for side in SIDES}
+        self._first = {side: _numbers(xyzw(self.where(f"{side}/mount_quaternion"))) for side in SIDES}
+        self._fingers: dict[str, np.ndarray] = {side: _joint_actions(()) for side in SIDES}
 
     def orientation(self, sensor: str) -> Tensor:
         """A sensor's quaternion, (x, y, z, w), (4,)."""
@@ -75,49 +88,93 @@ class HandController:
 
     def bend(self, side: str, knuckles: float, middles: float, **others: float) -> None:
         """Bends the four fingers of a hand, and sets other joints by their names (the rest to 0), rad."""
-        low, high = (torch.as_tensor(x).float() for x in (hand().control_low, hand().control_high))
-        angles = torch.zeros(self._joints)
-        names = [hand().joints[i] for i in hand().actuated]
         bent = {**dict.fromkeys(_KNUCKLES, knuckles), **dict.fromkeys(_MIDDLES, middles), **others}
-        for joint, angle in bent.items():
-            angles[names.index(joint)] = angle
-        self._fingers[side] = (2.0 * (angles - low) / (high - low) - 1.0).clamp(-1.0, 1.0)
+        self._fingers[side] = _joint_actions(bent.items())
 
     def hold(self, side: str, roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> None:
         """From now on holds a hand's start orientation, turned about the world's axes, rad; a free hand may turn."""
-        turn = torch.tensor(quaternion_from_rpy((roll, pitch, yaw)), dtype=torch.float64)
-        self._held[side] = multiply(xyzw(turn), xyzw(self._first[side]))
+        w, x, y, z = quaternion_from_rpy((roll, pitch, yaw))
+        self._held[side] = _product((x, y, z, w), self._first[side])
 
     def turn(self, side: str, way: Tensor) -> None:
         """Turns a hand from its present orientation by a small ``way``: axis times angle (3,), world, rad."""
-        angle = way.norm()
-        turn = torch.cat((torch.sin(0.5 * angle) * way / (angle + 1e-9), torch.cos(0.5 * angle)[None]))
-        self._held[side] = multiply(turn, self.orientation(f"{side}/mount_quaternion"))
+        x, y, z = way.tolist()
+        angle = math.sqrt(x * x + y * y + z * z)
+        sine = math.sin(0.5 * angle) / (angle + 1e-9)
+        turn = sine * x, sine * y, sine * z, math.cos(0.5 * angle)
+        self._held[side] = _product(turn, _numbers(self.orientation(f"{side}/mount_quaternion")))
 
     def lead(self, right: Point, left: Point, steps: int = 1, speed: float = 0.6) -> Actions:
         """Moves the hands' points towards two points (world, metres), at most at ``speed`` (m/s)."""
+        a, b = SIDES
         for _ in range(min(steps, self.steps_left)):
-            action, half = self._rest.clone(), len(self._rest) // 2
-            for i, (side, goal) in enumerate(zip(SIDES, (right, left), strict=True)):
-                way = GAIN * (torch.tensor(goal, dtype=torch.float64) - self.at(side))
-                way *= min(1.0, speed / (float(way.norm()) + 1e-9))
-                action[i * half :][: self._joints] = self._fingers[side]
-                action[i * half + self._joints :][:3] = (way / self._full_speed).float().clamp(-1.0, 1.0)
-                action[i * half + self._joints :][3:6] = self._torque(side).float()
             self.taken += 1
-            yield quantised(action.clamp(-1.0, 1.0))
+            fingers, held = (self._fingers[a], self._fingers[b]), (self._held[a], self._held[b])
+            yield Lead((right, left), speed, fingers, held)
 
     def lead_each(self, points: Iterable[Point], speed: float = 0.6) -> Actions:
         """``lead`` for a step, to the right and the left hand's point."""
         right, left = points
         yield from self.lead(right, left, 1, speed)
 
-    def _torque(self, side: str) -> Tensor:
-        """The actions (3,) that turn a hand to the orientation it is held at; zeros for a free hand."""
-        if side not in self._held:
-            return torch.zeros(3)
-        now = self.orientation(f"{side}/mount_quaternion")
-        error = multiply(self._held[side], conjugate(now))
-        way = 2.0 * error[:3] * error[3].sign()  # rad, for small angles
-        torque = rotate(now, rotate(conjugate(now), way) * torch.tensor(ANGULAR_DAMPING, dtype=torch.float64))
-        return (GAIN * torque / self._full_torque).clamp(-1.0, 1.0)
+
+class HandActions:
+    """The actions of environments of a class whose hands are led."""
+
+    def __init__(self, task: TaskClass):
+        self._full_speed = FORCE_PER_SCALE * task.transition_scale / LINEAR_DAMPING[0]
+        self._full_torque = TORQUE_PER_SCALE * task.orientation_scale
+
+    def __call__(self, leads: Sequence[Lead], sensor: Callable[[str], Tensor]) -> Tensor:
+        """Actions (n, action_size) of n environments, whose values of a sensor are (n, k), in double precision."""
+        at, now = (
+            torch.stack([sensor(f"{side}/{name}") for side in SIDES], 1)
+            for name in ("hand_point_position", "mount_quaternion")
+        )
+        goals, held = at.new_tensor([lead.points for lead in leads]), at.new_tensor([lead.held for lead in leads])
+        speed = at.new_tensor([lead.speed for lead in leads])[:, None, None]
+        way = GAIN * (goals - at)
+        way *= (speed / (way.norm(dim=-1, keepdim=True) + 1e-9)).clamp_max(1.0)
+        fingers = torch.from_numpy(np.stack([lead.fingers for lead in leads]))
+        force = (way / self._full_speed).float()
+        return quantised(torch.cat([fingers, force, self._torque(held, now).float()], -1).flatten(1))
+
+    def _torque(self, held: Tensor, now: Tensor) -> Tensor:
+        """The actions (n, 2, 3) that turn hands to where they are held, from ``now``, (w, x, y, z); zeros if free."""
+        now = xyzw(now / now.norm(dim=-1, keepdim=True))
+        error = multiply(held, conjugate(now))
+        way = 2.0 * error[..., :3] * error[..., 3:].sign()  # rad, for small angles
+        torque = rotate(now, rotate(conjugate(now), way) * constant(ANGULAR_DAMPING, now))
+        return GAIN * torque / self._full_torque
+
+
+def _numbers(quaternion: Tensor) -> _Quaternion:
+    x, y, z, w = quaternion.tolist()
+    return x, y, z, w
+
+
+def _product(a: _Quaternion, b: _Quaternion) -> _Quaternion:
+    """As ``multiply``, of plain numbers: an operation on a tensor takes fifty times as long."""
+    (ax, ay, az, aw), (bx, by, bz, bw) = a, b
+    return (
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
+
+
+@cache
+def _joints() -> tuple[dict[str, int], np.ndarray, np.ndarray]:
+    """The place of each actuated joint by its name, and the bounds of their targets, rad, float32."""
+    low, high = (np.asarray(x, np.float32) for x in (hand().control_low, hand().control_high))
+    return {hand().joints[joint]: i for i, joint in enumerate(hand().actuated)}, low, high
+
+
+def _joint_actions(angles: Iterable[tuple[str, float]]) -> np.ndarray:
+    """The actions (20,) of joint angles by name, rad, the others 0."""
+    places, low, high = _joints()
+    all_angles = np.zeros_like(low)
+    for joint, angle in angles:
+        all_angles[places[joint]] = angle
+    return np.clip(np.float32(2.0) * (all_angles - low) / (high - low) - np.float32(1.0), -1.0, 1.0)

@@ -6,13 +6,14 @@ import torch
 from torch import Tensor
 
 from bidex_meta.errors import BidexError
-from bidex_meta.witness.controller import Actions, HandController
+from bidex_meta.witness.controller import Actions, HandActions, HandController
 from bidex_meta.witness.replay import SEED, task_slot
 from bidex_meta.witness.scripts import script_of
 from bidex_meta.witness.store import Witness
 from bidex_meta.world import World
 from bidex_meta.world.contract import Info, Options
-from bidex_meta.world.part import base_rotations
+from bidex_meta.world.groups import Member
+from bidex_meta.world.part import Part, base_rotations
 from bidex_meta.world.wrapper import PooledWorldWrapper
 
 
@@ -80,26 +81,18 @@ class Scripted:
     ):  # fmt: skip
         self._world, self._noise, self._generator = world, noise, torch.Generator().manual_seed(seed)
         names = world.task_names if names is None else names
-        self._scripts = {slot.name: script_of(slot.task_class) for slot in world.slots if slot.name in names}
-        self._ahead = int(misled)
-        self._playing: dict[int, Actions] = {}  # by row of the world
-        self._sensors = [part.group.engine.sensordata for part in world.parts]
-        self._actions = torch.zeros(world.num_envs, world.action_size)
-        self._places = {
-            row: (i, member, k)
-            for i, part in enumerate(world.parts)
+        self._classes = [
+            _Class(world, part, k, member, int(misled))
+            for part in world.parts
             for k, member in enumerate(part.group.members)
-            if world.slots[member.slot].name in self._scripts
-            for row in range(member.world_rows.start, member.world_rows.stop)
-        }
+            if world.slots[member.slot].name in names
+        ]
+        self._actions = torch.zeros(world.num_envs, world.action_size)
 
     def eval_action(self, obs: Tensor) -> Tensor:
         """The next actions (num_envs, action)."""
-        self._sensors = [part.group.engine.sensordata.clone() for part in self._world.parts]
-        for row, script in self._playing.items():
-            action = next(script, None)
-            if action is not None:
-                self._actions[row, : len(action)] = action
+        for each in self._classes:
+            each.write(self._actions)
         if not self._noise:
             return self._actions.clone()
         noise = torch.randn(self._actions.shape, generator=self._generator)
@@ -107,22 +100,44 @@ class Scripted:
 
     def reset(self, env_mask: Tensor) -> None:
         """These environments are at the start of an episode."""
-        for row in env_mask.nonzero().flatten().tolist():
-            if row in self._places:
-                self._playing[row] = self._begin(row)
+        for each in self._classes:
+            each.begin(env_mask)
+
+
+class _Class:
+    """The scripts of a class's environments, which are led together."""
+
+    def __init__(self, world: World, part: Part, number: int, member: Member, ahead: int):
+        task = world.slots[member.slot].task_class
+        self._tasks, self._ahead = len(world.slots[member.slot].tasks), ahead
+        self._world, self._part, self._number, self._member, self._task = world, part, number, member, task
+        self._script, self._hand_actions = script_of(task), HandActions(task)
+        self._playing: dict[int, Actions] = {}  # by row among the class's
+        self._sensors = part.group.engine.sensordata[member.engine_rows]
+
+    def write(self, actions: Tensor) -> None:
+        """Puts the next actions of scripts that have not ended into those (N, a) of the world."""
+        self._sensors = self._part.group.engine.sensordata[self._member.engine_rows].clone()
+        leads = {row: lead for row, script in self._playing.items() if (lead := next(script, None)) is not None}
+        if leads:
+            rows = torch.tensor(list(leads))
+            sensors = self._sensors[rows]
+            found = self._hand_actions(list(leads.values()), lambda name: sensors[:, self._member.scene.sensors[name]])
+            actions[self._member.world_rows][rows, : found.shape[1]] = found
+
+    def begin(self, env_mask: Tensor) -> None:
+        """A new script in the environments of the class among a mask (N,)."""
+        for row in env_mask[self._member.world_rows].nonzero().flatten().tolist():
+            self._playing[row] = self._begin(row)
 
     def _begin(self, row: int) -> Actions:
         """The script of a row; reads nothing before its first action is asked for."""
-        i, member, k = self._places[row]
-        engine_row, slot = member.engine_rows.start + row - member.world_rows.start, self._world.slots[member.slot]
-        task = (self._world.task_index[row : row + 1] + self._ahead) % len(slot.tasks)
-        frozen = self._world.parts[i].frozen(k, task)
-        hands = HandController(
-            slot.task_class,
-            lambda name: self._sensors[i][engine_row, member.scene.sensors[name]],
-            lambda name: frozen[name][0],
-        )
-        yield from self._scripts[slot.name](hands)
+        place = self._member.world_rows.start + row
+        told = (self._world.task_index[place : place + 1] + self._ahead) % self._tasks
+        frozen = self._part.frozen(self._number, told)
+        places = self._member.scene.sensors
+        hands = HandController(self._task, lambda name: self._sensors[row, places[name]], lambda name: frozen[name][0])
+        yield from self._script(hands)
 
 
 class ShiftedStarts(PooledWorldWrapper):

@@ -10,7 +10,7 @@ from torch import Tensor
 from bidex_meta.benchmark import Benchmark
 from bidex_meta.errors import unknown_name
 from bidex_meta.tasks.registry import plain_name
-from bidex_meta.witness.controller import Actions, HandController
+from bidex_meta.witness.controller import Actions, HandActions, HandController
 from bidex_meta.witness.store import Witness
 from bidex_meta.world import Slot, World
 from bidex_meta.world.part import judge
@@ -107,7 +107,9 @@ class Simulator:
     def led(self, script: Callable[[HandController], Actions]) -> Iterator[tuple[Tensor, Trace]]:
         """Plays a script by the means of sensors over all environments; yields its actions (action_size,) and steps."""
         hands = HandController(self.task, lambda name: self.sensor(name).mean(0), lambda name: self.frozen(name)[0])
-        for action in script(hands):
+        actions = HandActions(self.task)
+        for lead in script(hands):
+            (action,) = actions([lead], lambda name: self.sensor(name).mean(0, keepdim=True))
             yield action, self.play(action.expand(1, self.num, -1))
 
     def sensor(self, name: str) -> Tensor:

@@ -111,6 +111,37 @@ class PointMass(_TimedWorld):
         return ((obs[:, 2:] - obs[:, :2]) / self.speed).clamp(-1.0, 1.0)
 
 
+class Track(_TimedWorld):
+    """A point beside a winding track drifts away from it by a fifth a step; observations are place and position.
+
+    The teacher, which starts on the track, never leaves it: its data do not show how to get back. Success: within 0.1
+    of the track.
+    """
+
+    drift, pull = 1.2, 0.2
+
+    def __init__(self, rows: int = 32, horizon: int = 60):
+        super().__init__(3, 1, rows, horizon)
+
+    def _draw(self) -> Tensor:
+        angle = 2.0 * torch.pi * torch.rand(self.num_envs, generator=self.generator)
+        return torch.stack([angle.sin(), angle.cos(), 0.5 * angle.sin()], 1)
+
+    def off(self) -> Tensor:
+        return self.state[:, 2] - 0.5 * self.state[:, 0]
+
+    def best(self, obs: Tensor) -> Tensor:
+        off = obs[:, 2] - 0.5 * obs[:, 0]
+        return (0.5 * obs[:, 1] - self.drift / self.pull * off)[:, None].clamp(-1.0, 1.0)
+
+    def _advance(self, action: Tensor, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        off = self.drift * self.off() + self.pull * (action[:, 0] - 0.5 * self.state[:, 1])
+        angle = torch.atan2(self.state[:, 0], self.state[:, 1]) + 0.1
+        state = torch.stack([angle.sin(), angle.cos(), 0.5 * angle.sin() + off.clamp(-2.0, 2.0)], 1)
+        self.state = torch.where(active[:, None], state, self.state)
+        return -self.off().abs(), self.off().abs() < 0.1, self.never
+
+
 def discounted_return(world: LQR | PointMass, policy: Callable[[Tensor], Tensor], gamma: float, steps: int) -> float:
     """Mean discounted return of ``policy`` from the starts of seed 1, in a world that nobody trains on: none ends."""
     world.max_episode_steps.fill_(10**9)

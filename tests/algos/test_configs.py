@@ -31,6 +31,7 @@ WRONG: dict[str, dict[str, Any]] = {
     "iql": {"expectile": 1.0, "beta": -1.0, "std_range": (2.0, 1.0)},
     "bcq": {"perturbation": 2.5, "lower_weight": -0.1, "latent": 0},
     "td3bc": {"alpha": -1.0, "policy_delay": 0},
+    "dagger": {"teacher_steps": -1, "noise_std": -0.1, "samples": 0, "updates_per_iteration": 0, "max_grad_norm": 0.0},
 }  # fmt: skip
 TOGETHER: list[tuple[str, dict[str, Any], str]] = [
     ("mtppo", {"architecture": "paco", "task_embedding": 4}, "task_embedding goes with architecture shared"),

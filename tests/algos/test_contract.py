@@ -9,6 +9,8 @@ import torch
 
 from bidex_meta.cli.learners import ALGOS, learner_kind
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.play import ZeroAgent
+from bidex_meta.witness.teachers import Teachers, Tutor
 from bidex_meta.world.contract import plain_groups
 from tests.algos.families import PointClass, PointGoals
 from tests.algos.problems import opposite_bandits
@@ -25,6 +27,12 @@ ATOMS: dict[str, Any] = OFF | {"critic_hidden": (16, 16), "atoms": 51}
 META: dict[str, Any] = {"hidden": (16, 16), "tasks_per_class": 3, "max_adapt_steps": 30}
 DATA: dict[str, Any] = {"hidden": (16, 16), "batch_size": 32, "updates_per_iteration": 5, "autocast": "off"}
 PAIR = "a=action/0;b=action/1"
+
+
+def still_teachers(world: Any) -> Teachers:
+    """Policies without motion, of all environments."""
+    still = ZeroAgent(world.action_space)
+    return Teachers(world, [Tutor(still, torch.arange(world.num_envs), world.single_observation_space.shape[0])])
 
 
 @dataclass(frozen=True)
@@ -50,6 +58,8 @@ class Case:
             learner.world.reset(seed=0)
             still = noisy(lambda obs: torch.zeros(len(obs), 2), 0.4)
             learner.learn_from(as_data(played(opposite_bandits(rows=4), still, 20)))
+        if learner.taught:
+            learner.learn_from_teachers(still_teachers(learner.world))
         return learner
 
     def trained(self, world: Any = None) -> Any:
@@ -71,6 +81,7 @@ CASES = {
     "promp sizes": Case("promp", META | {"step_sizes": "layer"}),
     "rl2": Case("rl2", {"hidden": (8,), "memory": 8, "chunk": 4, "num_minibatches": 2}), "bc": Case("bc", DATA),
     "td3bc": Case("td3bc", DATA), "iql": Case("iql", DATA), "bcq": Case("bcq", DATA | {"vae_hidden": (16, 16)}),
+    "dagger": Case("dagger", DATA),
 }  # fmt: skip
 SHARING = {
     f"{algo} {name}": Case(algo, more | shared | {"hidden": (16, 8)})
@@ -146,7 +157,9 @@ def test_a_loss_that_is_no_number_ends_the_training_by_its_name(case: Case) -> N
     if case.algo == "rl2":
         learner.iterate()
     with torch.no_grad():
-        for weight in (learner.policy if case.algo in ("maml", "promp", "bc") else learner.critic).parameters():
+        for weight in (
+            learner.policy if case.algo in ("maml", "promp", "bc", "dagger") else learner.critic
+        ).parameters():
             weight.fill_(float("nan"))
     with pytest.raises(FloatingPointError, match=rf"{case.algo}: the loss is not finite after \d+ steps; lower "):
         learner.iterate()
@@ -162,4 +175,4 @@ def test_every_preset_of_those_with_tasks_side_by_side_makes_a_learner(algo: str
     for preset in kind.presets.values():
         config = replace(preset, **{name: value for name, value in small.items() if name in vars(preset)})
         learner = kind.make(opposite_bandits(), config, seed=0)
-        assert learner.offline or any(name.startswith("Loss/") for name in learner.iterate())
+        assert learner.offline or learner.taught or any(name.startswith("Loss/") for name in learner.iterate())

@@ -12,6 +12,7 @@ import torch
 from torch.testing import assert_close
 
 from bidex_algos import learner as base
+from bidex_algos.imitation.dagger import DAgger, DAggerConfig
 from bidex_algos.meta.rl2 import RL2, RL2Config
 from bidex_algos.multiagent.happo import HAPPOConfig
 from bidex_algos.multiagent.hatrpo import HATRPOConfig
@@ -24,8 +25,10 @@ from bidex_algos.onpolicy.mttrpo import MTTRPO, MTTRPOConfig
 from bidex_algos.rollout import collect
 from bidex_meta.cli.learners import learner_kind
 from bidex_meta.errors import BidexError
+from bidex_meta.evaluation.play import ZeroAgent
 from bidex_meta.train import attendance, distributed
 from bidex_meta.train.runner import checkpoint, resume, train
+from bidex_meta.witness.teachers import Teachers, Tutor
 from tests.algos.families import PointClass, PointGoals
 from tests.algos.problems import opposite_bandits
 from tests.algos.ranks import exit_codes, in_two_processes, same
@@ -52,6 +55,7 @@ PLAIN_SAC = replace(
     SAC, adam_eps=10.0, max_grad_norm=1e9, learning_rate=0.5, critic_learning_rate=0.5, alpha_learning_rate=0.5
 )
 RECURRENT = RL2Config(hidden=(8,), memory=8, episodes_per_trial=2, chunk=5, num_minibatches=2, epochs=2)
+TAUGHT = DAggerConfig(hidden=(8,), batch_size=32, updates_per_iteration=3, teacher_steps=800, autocast="off")
 UPDATES = (ONE_BATCH, SURGERY, CONFLICT_AVERSE, LOSS_WEIGHTS, TRUST_REGION, *TEAMS)
 Learner = MTPPO | MTTRPO
 ROWS = 16
@@ -170,6 +174,13 @@ def rl2(goals: int = 8) -> RL2:
     return RL2(PointGoals(6, classes=classes), RECURRENT, seed=0)
 
 
+def dagger() -> DAgger:
+    world = opposite_bandits(rows=4)
+    learner = DAgger(world, TAUGHT, seed=0)
+    learner.learn_from_teachers(Teachers(world, [Tutor(ZeroAgent(world.action_space), torch.arange(8), 3)]))
+    return learner
+
+
 def mtsac_moves() -> torch.Tensor:
     learner, moved = mtsac(PLAIN_SAC), []
     for _ in range(2):
@@ -188,9 +199,10 @@ def rl2_tells() -> torch.Tensor:
 
 
 TWINS: dict[str, Callable[[], torch.Tensor]] = {"mtsac": mtsac_moves, "rl2": rl2_tells}
-OTHERS: dict[str, Callable[[], Any]] = {"mtsac": mtsac, "brc": partial(mtsac, ATOMS, BRC), "rl2": rl2}
+OTHERS: dict[str, Callable[[], Any]] = {"mtsac": mtsac, "brc": partial(mtsac, ATOMS, BRC), "rl2": rl2, "dagger": dagger}
 REPLAYING = 2 * 3 * SAC.steps_per_iteration * 8
 STEPS = {"mtppo": 4 * ITERATION, "mtsac": REPLAYING, "brc": REPLAYING, "rl2": 2 * 3 * 2 * (3 * 4 + 3 * 7)}
+STEPS["dagger"] = 2 * 3 * TAUGHT.rollout_steps * 8
 
 
 def three_iterations(make: Callable[[], Any]) -> dict[str, Any]:
@@ -259,7 +271,10 @@ def test_an_update_of_twins_is_that_of_one(found, name):
         assert_close(twin, alone, rtol=1e-3, atol=tolerance)
 
 
-@pytest.mark.parametrize(("name", "make"), [("mtppo", MTPPO), ("mtsac", MTSAC), ("brc", BRC), ("rl2", RL2)])
+KINDS = [("mtppo", MTPPO), ("mtsac", MTSAC), ("brc", BRC), ("rl2", RL2), ("dagger", DAgger)]
+
+
+@pytest.mark.parametrize(("name", "make"), KINDS)
 def test_networks_and_metrics_are_those_of_all_noise_differs_and_a_run_is_resumed(found, name, make):
     a, b = (here[name]["whole"]["learner"] for here in found)
     own = make.per_process

@@ -8,6 +8,8 @@ import pytest
 import torch
 
 from bidex_meta.cli.learners import learner_kind
+from bidex_meta.evaluation.play import ZeroAgent
+from bidex_meta.witness.teachers import Teachers, Tutor
 from tests.algos.families import PointGoals
 from tests.algos.toy import ToyWorld, nearness
 from tests.offline.stored import as_data, noisy, played
@@ -21,6 +23,7 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
     "mtppo": [{}, {"gradient_surgery": "pcgrad"}, {"gradient_surgery": "famo"}, {"demonstration_weight": 0.1}],
     "maml": [{}, {"outer": "adam"}, {"step_sizes": "weight"}], "promp": [{}, {"step_sizes": "layer"}], "mttrpo": [{}],
     **{name: [{}] for name in ("mtsac", "mttd3", "fasttd3", "brc", "ddpg", "rl2", "bc", "bcq", "td3bc", "iql")},
+    "dagger": [{}],
 }  # fmt: skip
 PLAYING = [algo for algo in VARIANTS if not learner_kind(algo).make.offline]
 TEAM = {"agents": "a=action/0;b=action/1"}
@@ -39,6 +42,9 @@ def told(algo: str, variants: list[dict[str, Any]]) -> set[str]:
         if known.get("demonstration_weight") or kind.make.offline:
             data = as_data(played(world, noisy(lambda obs: torch.zeros(len(obs), 2), 0.5), 9))
             (learner.learn_from if kind.make.offline else learner.learn_from_demonstrations)(data)
+        if kind.make.taught:
+            rows, width = torch.arange(world.num_envs), world.single_observation_space.shape[0]
+            learner.learn_from_teachers(Teachers(world, [Tutor(ZeroAgent(world.action_space), rows, width)]))
         for _ in range(3):
             found = learner.iterate()
         names = "|".join(map(re.escape, world.task_names))

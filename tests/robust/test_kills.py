@@ -13,7 +13,7 @@ if sys.platform != "linux":
 
 from bidex_meta.cli.learners import ALGOS
 from tests.robust.kills import KILLED, Victim, outcome, quick_folder, server, unequal
-from tests.robust.victims import FLAGS, OFFLINE, arguments
+from tests.robust.victims import FLAGS, OFFLINE, TAUGHT, arguments
 
 ITERATIONS = 12
 pytestmark = pytest.mark.xdist_group("kills")  # one server for all
@@ -35,13 +35,14 @@ def killed_often(
     algo: str, seed: int, killer: subprocess.Popen[str], place: Path, record: bool = False
 ) -> dict[str, object]:
     """The unbroken run's outcome, which the killed one's equals."""
-    draw, data = random.Random(f"{algo} {seed}"), None
-    if algo in OFFLINE:
+    draw, given = random.Random(f"{algo} {seed}"), None
+    if algo in OFFLINE + TAUGHT:
         pytest.importorskip("h5py")
-        data = stored(killer, place)
+        recorded = run_that_recorded(killer, place)
+        given = recorded / "replay" if algo in OFFLINE else recorded
     often = draw.random() < 0.5 or record  # each checkpoint begins another part of what is recorded
     whole = Victim(
-        killer, arguments(algo, ITERATIONS, record=record, dataset=data), place / f"{algo}{seed}whole{record}"
+        killer, arguments(algo, ITERATIONS, record=record, given=given), place / f"{algo}{seed}whole{record}"
     )
     answer = whole.go_on()
     assert answer["code"] == 0, whole.log.read_text()
@@ -53,12 +54,12 @@ def killed_often(
     return expected
 
 
-def stored(killer: subprocess.Popen[str], place: Path) -> Path:
-    """The data set of a run that recorded."""
+def run_that_recorded(killer: subprocess.Popen[str], place: Path) -> Path:
+    """A run whose policy teaches others, and whose data set they learn from."""
     run = Victim(killer, arguments("mtppo", ITERATIONS, record=True), place / "stored")
     if not run.path.exists():
         assert run.go_on()["code"] == 0, run.log.read_text()
-    return run.path / "replay"
+    return run.path
 
 
 def test_every_learner_can_be_killed() -> None:

@@ -49,6 +49,7 @@ FLAGS = {
     "rl2": f"{_ADAPTS} --learner.memory 8 --learner.chunk 4 --learner.episodes-per-trial 2",
     **dict.fromkeys(("bc", "td3bc", "iql"), _STORED),
     "bcq": f"{_STORED} --learner.vae-hidden 8 --learner.candidates 2",
+    "dagger": f"{_STORED} --learner.rollout-steps 4 --learner.teacher-steps 200",
 }
 """Of each learner; ``tests/robust/test_kills.py`` holds that none is missing."""
 _LOADED = ("bidex_meta.benchmark", "bidex_meta.cli", "scipy.optimize", "scipy.stats", "torch._dynamo", "typeguard")
@@ -57,15 +58,19 @@ _LOADED += tuple(f"bidex_meta.evaluation.{name}" for name in ("meta_test", "play
 """What each process would load by itself, for longer than it runs."""
 ADAPTS = ("promp", "maml", "rl2")
 OFFLINE = ("bc", "bcq", "td3bc", "iql")
+TAUGHT = ("dagger",)
 ROWS = 8
 
 
 def arguments(
-    algo: str, iterations: int, processes: int = 1, record: bool = False, dataset: Path | None = None
+    algo: str, iterations: int, processes: int = 1, record: bool = False, given: Path | None = None
 ) -> list[str]:
-    """A run of so many iterations of a learner, without its folder; ``dataset`` is of those that play nothing."""
+    """A run of so many iterations of a learner, without its folder.
+
+    ``given`` is the data set of those that play nothing, and the run of the teacher of those that have one.
+    """
     if algo in OFFLINE:
-        words = ["run", "--suite", "MT4", "--algo", algo, "--dataset", str(dataset), "--seed", "5"]
+        words = ["run", "--suite", "MT4", "--algo", algo, "--dataset", str(given), "--seed", "5"]
         words += ["--steps", str(iterations * 4), "--threads", "1", "--device", "cpu", "--logger", "none"]
         return [*words, *FLAGS[algo].split(), "--episodes", "1", "--evaluate-every", "4"]
     # One that adapts plays two phases of four steps.
@@ -73,6 +78,7 @@ def arguments(
     steps = iterations * ROWS * processes * (8 if adapts else 4)
     words = ["run", "--suite", "ML4" if adapts else "MT4", "--algo", algo, "--num-envs", str(ROWS), "--seed", "5"]
     words += ["--steps", str(steps), "--threads", "1", "--device", "cpu", "--logger", "none", *FLAGS[algo].split()]
+    words += ["--teacher", str(given)] if algo in TAUGHT else []
     return [*words, "--episodes", "1", "--evaluate-every", "4", *(["--record", str(steps)] if record else [])]
 
 
@@ -126,6 +132,9 @@ def prepare() -> None:
     """Puts points in the place of physics, for this process and those forked of it."""
     OwnSuite.world = _world  # type: ignore[method-assign, assignment]
     OwnSuite.tasks = lambda source, split: {n: [""] * c for n, c in POOLS[split].items() if _has(source, split)}  # type: ignore[method-assign]
+    OwnSuite.task_classes = lambda source: dict(  # type: ignore[method-assign]
+        zip(POOLS["train"], source.benchmark.task_classes().values(), strict=False)
+    )
 
 
 def _has(source: Any, split: str) -> bool:

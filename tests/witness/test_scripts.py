@@ -14,7 +14,7 @@ from bidex_meta.utils.maths import conjugate, multiply, xyzw
 from bidex_meta.witness.controller import GAIN, Actions, HandController, point
 from bidex_meta.witness.demonstrators import Scripted
 from bidex_meta.witness.replay import Simulator
-from bidex_meta.witness.scripts import SCRIPTS, script_of
+from bidex_meta.witness.scripts import SCRIPTS, WIDE_SCRIPTS, script_of
 
 
 def test_a_class_without_a_script_is_refused() -> None:
@@ -56,18 +56,21 @@ def test_a_script_is_led_by_each_rows_state(monkeypatch: pytest.MonkeyPatch) -> 
     assert not torch.equal(agent.eval_action(obs), last)
 
 
-def test_a_misled_script_is_told_the_next_task() -> None:
+def test_a_misled_script_is_told_the_next_task(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[torch.Tensor] = []
+
+    def listen(hands: HandController) -> Actions:
+        told.append(hands.frozen("leaves"))
+        yield from ()
+
+    monkeypatch.setitem(WIDE_SCRIPTS, "DoorOpenOutward", listen)
     world = make_task_world("DoorOpenOutward-v2", 50, "cpu", autoreset_mode="DISABLED", threads=1)
     world.reset(seed=0)
-    told: list[list[torch.Tensor]] = []
     for misled in (False, True):
         agent = Scripted(world, misled=misled)
-        seen: list[torch.Tensor] = []
-        agent._scripts["DoorOpenOutward-v2"] = lambda hands, seen=seen: iter(seen.append(hands.frozen("leaves")) or [])
         agent.reset(torch.ones(50, dtype=torch.bool))
         agent.eval_action(torch.zeros(50, 1))
-        told.append(seen)
-    assert torch.equal(torch.stack(told[1]), torch.stack(told[0]).roll(-1, 0))
+    assert torch.equal(torch.stack(told[50:]), torch.stack(told[:50]).roll(-1, 0))
 
 
 def test_noise_is_added_to_what_a_script_does() -> None:

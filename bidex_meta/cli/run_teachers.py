@@ -1,0 +1,130 @@
+"""Teachers of ``bidex-meta run`` (--teacher): which class learns from whom, and their policies."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bidex_meta.cli import run_data
+from bidex_meta.cli.learners import ALGOS, LearnerKind, learner_kind
+from bidex_meta.cli.policies import load_policy, slots_of
+from bidex_meta.cli.tables import say
+from bidex_meta.config import RunConfig
+from bidex_meta.errors import BidexError
+from bidex_meta.runs import RunFolder
+from bidex_meta.train.launch import launch
+from bidex_meta.witness.demonstrators import Scripted
+from bidex_meta.witness.scripts import scripts_of
+from bidex_meta.witness.teachers import Teachers, Tutor
+from bidex_meta.world.contract import VectorWorld
+from bidex_meta.worlds import Worlds
+
+SCRIPTS = "scripts"
+
+
+def whole_paths(names: Sequence[str]) -> tuple[str, ...]:
+    """Teachers as a config holds them: of run folders the whole path."""
+    return tuple(name if name == SCRIPTS else run_data.whole_paths([name])[0] for name in names)
+
+
+def check_teachers(kind: LearnerKind, config: RunConfig, source: Worlds) -> None:
+    """Refuses teachers that do not go with the learner or its worlds, before anything is built."""
+    if not kind.make.taught:
+        if config.teacher:
+            takers = ", ".join(name for name in ALGOS if learner_kind(name).make.taught)
+            raise BidexError(f"{kind.name} has no teachers; --teacher goes with {takers}. Leave one of them out.")
+        return
+    if not config.teacher:
+        raise BidexError(f"{kind.name} learns from teachers. Add --teacher scripts, or --teacher RUN.")
+    if source.hides_goals:
+        raise BidexError(
+            f"{kind.name}: its policy cannot find out the goals that {source.name} hides. Name an MT suite."
+        )
+    if SCRIPTS in config.teacher and (config.device != "cpu" or config.engine == "warp"):
+        raise BidexError("--teacher scripts reads states of C MuJoCo. Add --device cpu, and leave --engine out.")
+    if not teacher_of_class(config.teacher, source):
+        raise BidexError(f"No class of {source.name} has a teacher among {', '.join(config.teacher)}. Name another.")
+
+
+def teacher_of_class(names: Sequence[str], source: Worlds) -> dict[str, str]:
+    """The first teacher that knows a class, by the class's name in ``source.task_classes()``; others are left out.
+
+    Raises BidexError for a run that cannot teach here.
+    """
+    knows = {name: _scripted(source) if name == SCRIPTS else _known_to(name, source) for name in names}
+    return {
+        task: next(name for name in names if task in knows[name])
+        for task in source.task_classes()
+        if any(task in known for known in knows.values())
+    }
+
+
+def _scripted(source: Worlds) -> set[str]:
+    """Classes with a script; raises BidexError where bases do not move."""
+    if not source.moving_bases:
+        raise BidexError(
+            f"--teacher scripts moves the hands' bases, which are fixed in {source.name}. Add --base moving."
+        )
+    return {name for name, task in source.task_classes().items() if task.name in scripts_of(task.rules)}
+
+
+def _known_to(name: str, source: Worlds) -> set[str]:
+    """Classes that the policy of a run has learned, in the same form."""
+    config = RunFolder.open(Path(name)).config()
+    if learner_kind(config.algo).make.adapts:
+        raise BidexError(f"--teacher {name}: {config.algo} adapts to tasks; expected a policy that acts at once.")
+    other = Worlds.open(config.to_json())
+    own, theirs = source.task_classes(), other.task_classes()
+    if other.class_name is None:
+        same = slots_of(source) == slots_of(other) and not other.hides_goals
+        agree = same and all(_alike(own[task], theirs[task]) for task in own)
+        known = set(own) if agree else set[str]()
+    else:
+        (taught,) = theirs.values()
+        known = {task for task, here in own.items() if _alike(here, taught)}
+    if not known or source.points != other.points or (source.points and other.class_name is not None):
+        raise BidexError(
+            f"--teacher {name} has learned {other.name}, which {source.name} does not have in the same form. Expected "
+            "a run on the same suite, or on one of its classes with the same rules, bases and objects."
+        )
+    return known
+
+
+def _alike(one: object, other: object) -> bool:
+    """Whether two classes are the same one, observed and controlled alike."""
+    names = ("name", "rules", "layout", "action_size", "object")
+    return all(getattr(one, name, None) == getattr(other, name, None) for name in names)
+
+
+def teachers_of(config: RunConfig, source: Worlds, world: VectorWorld) -> Teachers:
+    """The teachers of a run in its world, after a line of who teaches what."""
+    assigned = teacher_of_class(config.teacher, source)
+    classes, slots, device = source.task_classes(), slots_of(source), launch().own_device(config.device)
+    tutors = []
+    for name in config.teacher:
+        learn = [task for task, teacher in assigned.items() if teacher == name]
+        say(f"Teacher {name}: {', '.join(learn) or 'no class is left for it'}.")
+        rows = _rows(world, slots, learn)
+        if name != SCRIPTS and len(rows):
+            policy, _ = load_policy(RunFolder.open(Path(name)), device)
+            single = Worlds.open(RunFolder.open(Path(name)).config().to_json()).class_name is not None
+            width = classes[learn[0]].observation_size if single else int(world.single_observation_space.shape[0])
+            tutors.append(Tutor(policy, rows, width))
+    if untaught := [task for task in classes if task not in assigned]:
+        say(f"Without a teacher, and not learned: {', '.join(untaught)}.")
+    scripted = [task for task, teacher in assigned.items() if teacher == SCRIPTS]
+    if not scripted:
+        return Teachers(world, tutors)
+    inner: Any = getattr(world, "unwrapped", world)  # without a recorder
+    names = [inner.slots[i].name for i, task in enumerate(slots) if task in scripted]
+    mask = torch.zeros(world.num_envs, dtype=torch.bool)
+    mask[_rows(world, slots, scripted)] = True
+    return Teachers(world, tutors, Scripted(inner, names=names), mask)
+
+
+def _rows(world: VectorWorld, slots: Sequence[str], tasks: Sequence[str]) -> Tensor:
+    """The environments of some classes, int64 (k,)."""
+    chosen = torch.tensor([i for i, task in enumerate(slots) if task in tasks], device=world.device)
+    return torch.isin(world.task_id, chosen).nonzero().squeeze(1)

@@ -1,0 +1,66 @@
+"""Teachers: policies and scripts that say what they would do in the states of a world, whoever plays there."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from bidex_meta.agents import Agent
+from bidex_meta.witness.demonstrators import Scripted
+from bidex_meta.world.contract import VectorWorld
+
+
+@dataclass(frozen=True)
+class Tutor:
+    """A policy, the environments that it labels, int64 (k,), and how many entries of an observation it reads.
+
+    A policy of one class reads the first entries of a suite's observation: what follows is padding and the task id.
+    """
+
+    policy: Agent
+    rows: Tensor
+    width: int
+
+
+class Teachers:
+    """Labels actions of a world's environments; an agent, to be asked in every step and told where episodes begin.
+
+    ``known``: the environments that have a teacher, bool (N,). ``scripted`` plays those of ``scripted_rows``, bool
+    (N,); ``tutors`` have others, each its own.
+    """
+
+    def __init__(
+        self,
+        world: VectorWorld,
+        tutors: Sequence[Tutor] = (),
+        scripted: Scripted | None = None,
+        scripted_rows: Tensor | None = None,
+    ) -> None:
+        self._tutors, self._scripted = tutors, scripted
+        self._shape = world.action_space.shape
+        self.known = torch.zeros(world.num_envs, dtype=torch.bool, device=world.device)
+        if scripted_rows is not None:
+            self.known |= scripted_rows
+        for tutor in tutors:
+            self.known[tutor.rows] = True
+
+    @property
+    def follow(self) -> bool:
+        """Whether a teacher knows more than the state: it follows each episode from its start, as a script does."""
+        return self._scripted is not None
+
+    def eval_action(self, obs: Tensor) -> Tensor:
+        """What they would do now, (N, a) in [-1, 1], for observations (N, d); zeros where nobody is ``known``."""
+        labels = obs.new_zeros(self._shape) if self._scripted is None else self._scripted.eval_action(obs)
+        for tutor in self._tutors:
+            actions = tutor.policy.eval_action(obs[tutor.rows, : tutor.width])
+            labels[tutor.rows, : actions.shape[1]] = actions
+        return labels
+
+    def reset(self, env_mask: Tensor) -> None:
+        """These environments are at the start of an episode."""
+        if self._scripted is not None:
+            self._scripted.reset(env_mask)
+        for tutor in self._tutors:
+            tutor.policy.reset(env_mask[tutor.rows])

@@ -1,0 +1,75 @@
+"""``--teacher``: short runs on real physics with scripts and with a run's policy, and what is refused."""
+
+from pathlib import Path
+
+import pytest
+
+from bidex_meta.cli import main
+from bidex_meta.runs import RunFolder, read_metrics
+from tests.cli.conftest import Command
+
+SMALL = "--algo dagger --num-envs 4 --threads 1 --device cpu --logger none --no-evaluate --learner.hidden 32 "
+SMALL += "--learner.batch-size 64 --learner.updates-per-iteration 10 --learner.teacher-steps 100"
+SUITE = """
+name = "pair"
+version = 1
+kind = "multi-task"
+description = "A class with a script and one without"
+observation = "one-hot"
+task_id = "class"
+reward = "v2"
+variation = "wide"
+success = "at-end"
+starts = "jittered"
+base = "moving"
+tasks_per_class = 2
+classes = [{ name = "CatchAbreast" }, { name = "Switch" }]
+"""
+
+
+def run(path: Path, steps: int, *words: str) -> list[dict[str, float]]:
+    assert main(["run", *words, *SMALL.split(), "--steps", str(steps), "--run-dir", str(path)]) == 0
+    return read_metrics(path / "metrics.jsonl")
+
+
+@pytest.fixture(scope="module")
+def student(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that learned Switch from its script."""
+    path = tmp_path_factory.mktemp("teachers") / "student"
+    rows = run(path, 256, "--task", "Switch-v2", "--teacher", "scripts")
+    assert rows[-1]["Loss/imitation"] < 0.3 * rows[0]["Loss/imitation"]
+    return path
+
+
+def test_a_run_with_scripts_is_resumed_with_new_episodes(student: Path) -> None:
+    assert main(["run", "--resume", str(student), "--steps", "320", "--no-evaluate"]) == 0
+    assert [row["step"] for row in read_metrics(student / "metrics.jsonl")] == [*range(32, 321, 32)]
+
+
+def test_a_suite_learns_from_a_run_of_one_class_and_leaves_others_out(
+    student: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "pair.toml").write_text(SUITE)
+    words = "--suite", str(tmp_path / "pair.toml"), "--teacher", str(student), "--teacher", "scripts"
+    rows = run(tmp_path / "r", 64, *words)
+    said = capsys.readouterr().err
+    assert f"Teacher {student}: Switch." in said and "Teacher scripts: no class is left for it." in said
+    assert "Without a teacher, and not learned: CatchAbreast." in said
+    assert "Loss/imitation/Switch" in rows[-1] and "Loss/imitation/CatchAbreast" not in rows[-1]
+    assert RunFolder.open(tmp_path / "r").config().teacher == (str(student), "scripts")
+
+
+def test_teachers_that_do_not_fit_are_refused(student: Path, refused: Command) -> None:
+    def told(*words: object) -> str:
+        return refused("run", "--device", "cpu", *words)
+
+    assert "Add --teacher scripts" in told("--suite", "MT4-v2", "--algo", "dagger")
+    assert "goes with dagger" in told("--suite", "MT4-v2", "--algo", "mtppo", "--teacher", "scripts")
+    assert "No class of MT1 has" in told("--suite", "MT1", "--algo", "dagger", "--teacher", "scripts")
+    assert "that ML20-v2 hides" in told("--suite", "ML20-v2", "--algo", "dagger", "--teacher", "scripts")
+    for words in (("--suite", "MT4-v2"), ("--task", "Switch")):
+        assert "in the same form" in told(*words, "--algo", "dagger", "--teacher", student)
+    fixed = "--task", "Switch-v2", "--base", "fixed", "--algo", "dagger", "--teacher", "scripts"
+    assert "Add --base moving" in told(*fixed)
+    warp = "--task", "Switch-v2", "--engine", "warp", "--algo", "dagger", "--teacher", "scripts"
+    assert "leave --engine out" in told(*warp)
