@@ -10,6 +10,7 @@ from bidex_meta.witness.scripts.blocks import grasp_and_place, push_blocks, stac
 from bidex_meta.witness.scripts.bucket import place_in_bucket
 from bidex_meta.witness.scripts.caps import pull_cap, swing_cup
 from bidex_meta.witness.scripts.pots import lift_underarm, pour_water
+from bidex_meta.witness.scripts.stack import stack_in_order
 from bidex_meta.witness.scripts.swing_doors import close_outward, open_inward, push
 from bidex_meta.witness.scripts.tools import open_pen, open_scissors, press_switches
 from bidex_meta.witness.scripts.turning import turn_cubes
@@ -34,6 +35,7 @@ WIDE_SCRIPTS: dict[str, Script] = SCRIPTS | {
     "OpenPenCap": open_pen,
     "OpenScissors": open_scissors,
     "PushBlock": push_blocks,
+    "StackBlock": stack_in_order,
     "SwingCup": swing_cup,
     "Switch": press_switches,
 }

@@ -1,0 +1,63 @@
+"""Scripted policy of version 2 for two blocks that are stacked at a given place in a given order."""
+
+import math
+
+from torch import Tensor
+
+from bidex_meta.hands.hand import SIDES
+from bidex_meta.witness.controller import Actions, HandController, beside
+from bidex_meta.witness.scripts.between import around, clamp, middle, move, reach
+
+# Heights of the hands' points whose fingers point down: where the tips are 1 cm above the table, and over all blocks.
+_LOW, _HIGH = 0.690, 0.765
+_APART, _TOUCH, _AHEAD = 0.085, 0.052, 0.017  # from a block to the hands' points: before they close on it, and there; from them to the fingers
+
+
+def stack_in_order(hands: HandController) -> Actions:
+    """The backs of both hands' fingers clamp the lower block, carry it to its target, and put the other on it."""
+    upper, lower = ("block1", "block2") if float(hands.frozen("upper")) > 0.0 else ("block2", "block1")
+    for side in SIDES:
+        hands.hold(side)
+    for _ in range(7):  # up, before the fingers swing down
+        yield from hands.lead_each(beside(hands.at(side), 0.0, 0.0, _HIGH) for side in SIDES)
+    for side in SIDES:
+        hands.bend(side, 1.57, 0.0)
+    yield from _carry(hands, lower, upper, 0.005)
+    yield from _carry(hands, upper, lower, 0.06)
+    x, y, _ = hands.frozen("goal1").tolist()
+    yield from hands.lead((x, y + 0.2, _HIGH), (x, y - 0.2, _HIGH), hands.episode_steps)
+
+
+def _carry(hands: HandController, block: str, other: str, lift: float) -> Actions:
+    """Takes a block to its target; the inner hand's fingers go between the blocks."""
+    goal, place = hands.frozen(f"goal{block[-1]}"), hands.where(f"{block}/position")
+    gap = float((hands.where(f"{other}/position") - place)[1])
+    sides = {1.0: _APART, -1.0: _APART}
+    sides[math.copysign(1.0, gap)] = min(_APART, 0.5 * abs(gap) + _AHEAD)
+
+    def beside_it(height: float, steps: int) -> Actions:
+        x, y = place[:2].tolist()
+        right, left = (x, y + sides[1.0], height), (x, y - sides[-1.0], height)
+        yield from reach(hands, right, left, steps)
+
+    yield from beside_it(_HIGH, 40)
+    yield from beside_it(_LOW, 20)
+    yield from _grip(hands, place)
+    yield from clamp(hands, place, _LOW + lift, 12 if lift > 0.01 else 0)
+    yield from move(hands, f"{block}/position", goal, _LOW + lift, 0.05)
+    put = _LOW + float(goal[2]) - 0.625
+    yield from clamp(hands, middle(hands), put, 10)
+    where = middle(hands)
+    yield from around(hands, where, 0.0, _TOUCH + 0.014, put, 6)
+    yield from around(hands, where, 0.0, _TOUCH + 0.014, _HIGH + float(goal[2]) - 0.625, 12)
+
+
+def _grip(hands: HandController, place: Tensor) -> Actions:
+    """Closes the hands until the block between them stops them."""
+    before, wide = math.inf, 1.0
+    for i in range(30):
+        if i > 8 and before - wide < 0.001:
+            break
+        before = wide
+        yield from clamp(hands, place, _LOW, press=0.015)
+        wide = float((hands.at("right") - hands.at("left"))[1])
