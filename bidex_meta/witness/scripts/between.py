@@ -9,15 +9,17 @@ from bidex_meta.witness.controller import Actions, HandController, Point
 PRESS = 0.002  # distance inside what a hand presses to which it is led, metres: about 8 N
 
 
-def move(hands: HandController, what: str, goal: Tensor, height: float, reach: float) -> Actions:
+def move(
+    hands: HandController, what: str, goal: Tensor, height: float, far: float, press: float = PRESS
+) -> Actions:
     """Carries what is clamped over a goal."""
     for _ in range(100):
         place = hands.where(what)
         way = goal[:2] - place[:2]
         if float(way.norm()) < 0.006 or float(hands.at("right")[2] - place[2]) > 0.09:
             break
-        way *= min(1.0, reach / float(way.norm()))
-        yield from clamp(hands, middle(hands) + way, height)
+        way *= min(1.0, far / float(way.norm()))
+        yield from clamp(hands, middle(hands) + way, height, press=press)
 
 
 def around(

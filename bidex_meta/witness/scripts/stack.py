@@ -11,6 +11,8 @@ from bidex_meta.witness.scripts.between import around, clamp, middle, move, reac
 # Heights of the hands' points whose fingers point down: where the tips are 1 cm above the table, and over all blocks.
 _LOW, _HIGH = 0.690, 0.765
 _APART, _TOUCH, _AHEAD = 0.085, 0.052, 0.017  # from a block to the hands' points: before they close on it, and there; from them to the fingers
+# Distance inside a block to which a hand is led, metres: about 5 N, since more would turn the weak bases.
+_PRESS = 0.004
 
 
 def stack_in_order(hands: HandController) -> Actions:
@@ -22,8 +24,8 @@ def stack_in_order(hands: HandController) -> Actions:
         yield from hands.lead_each(beside(hands.at(side), 0.0, 0.0, _HIGH) for side in SIDES)
     for side in SIDES:
         hands.bend(side, 1.57, 0.0)
-    yield from _carry(hands, lower, upper, 0.005)
-    yield from _carry(hands, upper, lower, 0.06)
+    yield from _carry(hands, lower, upper, 0.0)
+    yield from _carry(hands, upper, lower, 0.075)
     x, y, _ = hands.frozen("goal1").tolist()
     yield from hands.lead((x, y + 0.2, _HIGH), (x, y - 0.2, _HIGH), hands.episode_steps)
 
@@ -42,11 +44,15 @@ def _carry(hands: HandController, block: str, other: str, lift: float) -> Action
 
     yield from beside_it(_HIGH, 40)
     yield from beside_it(_LOW, 20)
+    yield from around(hands, place, 0.0, _TOUCH + 0.006, _LOW, 10)
     yield from _grip(hands, place)
-    yield from clamp(hands, place, _LOW + lift, 12 if lift > 0.01 else 0)
-    yield from move(hands, f"{block}/position", goal, _LOW + lift, 0.05)
+    for _ in range(20):
+        if float(hands.where(f"{block}/position")[2]) > float(goal[2]) + 0.012 or not lift:
+            break
+        yield from clamp(hands, place, _LOW + lift, press=_PRESS)
+    yield from move(hands, f"{block}/position", goal, _LOW + lift, 0.05, _PRESS)
     put = _LOW + float(goal[2]) - 0.625
-    yield from clamp(hands, middle(hands), put, 10)
+    yield from clamp(hands, middle(hands), put, 10, press=_PRESS)
     where = middle(hands)
     yield from around(hands, where, 0.0, _TOUCH + 0.014, put, 6)
     yield from around(hands, where, 0.0, _TOUCH + 0.014, _HIGH + float(goal[2]) - 0.625, 12)
@@ -56,8 +62,8 @@ def _grip(hands: HandController, place: Tensor) -> Actions:
     """Closes the hands until the block between them stops them."""
     before, wide = math.inf, 1.0
     for i in range(30):
-        if i > 8 and before - wide < 0.001:
+        if i > 4 and before - wide < 0.0006:
             break
         before = wide
-        yield from clamp(hands, place, _LOW, press=0.015)
+        yield from clamp(hands, place, _LOW, press=0.008)
         wide = float((hands.at("right") - hands.at("left"))[1])
